@@ -1,0 +1,91 @@
+"""Entry point: the list of commands, and how an error becomes one sentence and an exit code."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from importlib import import_module
+
+import click
+
+from fdhil.errors import ConfigError, FdhilError
+
+# command -> ("module:function", the line of `fdhil --help`); listed here so that --help imports none of them
+COMMANDS: Mapping[str, tuple[str, str]] = {
+    "demo": ("fdhil.cli.demo:demo", "Run the whole loop on the simulated machine and write a report."),
+    "run": ("fdhil.cli.service:run", "Run the daemon: listen, identify, predict; correct only when armed."),
+    "status": ("fdhil.cli.service:status", "Ask the running daemon how it is."),
+    "arm": ("fdhil.cli.service:arm", "Arm the correction of one program."),
+    "disarm": ("fdhil.cli.service:disarm", "Ramp the correction to zero and disarm."),
+    "sim": ("fdhil.cli.sim:sim", "Run the simulated machine: drives, sensors, NC."),
+    "identify": ("fdhil.cli.identify:identify", "Identify a drive from recordings."),
+    "interpret": ("fdhil.cli.program:interpret", "List the motions of an NC program."),
+    "predict": ("fdhil.cli.prediction:predict", "Predict the path error of a program before it is cut."),
+    "correct": ("fdhil.cli.prediction:correct", "Plan the correction of a program."),
+    "replay": ("fdhil.cli.records:replay", "Analyse a recorded window again, bit by bit as the daemon did."),
+    "history": ("fdhil.cli.records:history", "Show how the parameters moved."),
+    "report": ("fdhil.cli.records:report", "Write an HTML report of the stored history."),
+    "export": ("fdhil.cli.records:export", "Write a recording as CSV."),
+}
+
+
+class LazyGroup(click.Group):
+    """A group that imports a command's module when that command is called."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the commands in the order of the workflow."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import one command; None for an unknown name."""
+        if cmd_name not in COMMANDS:
+            return None
+        module, _, attribute = COMMANDS[cmd_name][0].partition(":")
+        command = getattr(import_module(module), attribute)
+        assert isinstance(command, click.Command)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the list of commands without importing any of them."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="fdhil", prog_name="fdhil")
+def cli() -> None:
+    """Identify feed drives during rapid moves, predict path errors, and feed corrections back.
+
+    A fresh installation sends no frame: writing to a drive needs commissioning, then arming. Exit codes: 0 done, 1 the
+    answer is no, 2 wrong option or config, 3 device, file or port trouble.
+
+    Shell completion: eval "$(_FDHIL_COMPLETE=bash_source fdhil)" (or zsh_source, fish_source).
+    """
+
+
+def main() -> None:
+    """Run the command line; an error of fdhil is one sentence on stderr and its exit code."""
+    sys.exit(run_safely(cli))
+
+
+def run_safely(command: click.Command) -> int:
+    """Run a click command and return the exit code, with errors told as sentences."""
+    try:
+        result = command.main(standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except click.exceptions.Abort:
+        click.echo("stopped by the operator", err=True)
+        return 130
+    except ConfigError as error:
+        click.echo(f"fdhil: {error.source} cannot be used:", err=True)
+        for fault in error.faults:
+            click.echo(f"  {fault}", err=True)
+        return error.exit_code
+    except FdhilError as error:
+        click.echo(f"fdhil: {error}", err=True)
+        return error.exit_code
+    except BrokenPipeError:
+        return 0
+    return int(result or 0)

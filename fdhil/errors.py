@@ -1,0 +1,93 @@
+"""The error tree. Every message is one sentence that names the cause and the next action.
+
+Expected outcomes (a refused window, a correction that would not help) are values, not exceptions: see
+:mod:`fdhil.records`. What is raised here is the unexpected, and ``exit_code`` is what the command line returns for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+class FdhilError(Exception):
+    """Base of all errors that fdhil raises on purpose; ``str(error)`` is a sentence for the operator."""
+
+    exit_code = 3
+
+
+@dataclass(frozen=True)
+class ConfigFault:
+    """One fault of a configuration: where it is, what is wrong, and what to write instead."""
+
+    path: str
+    what: str
+    suggestion: str = ""
+
+    def __str__(self) -> str:
+        hint = f" ({self.suggestion})" if self.suggestion else ""
+        return f"{self.path}: {self.what}{hint}"
+
+
+class ConfigError(FdhilError):
+    """The configuration (or an option) cannot be used; carries all faults at once, not only the first."""
+
+    exit_code = 2
+
+    def __init__(self, source: str, faults: Sequence[ConfigFault]) -> None:
+        self.source = source
+        self.faults = tuple(faults)
+        super().__init__(f"{source}: " + "; ".join(str(fault) for fault in self.faults))
+
+
+class DeviceError(FdhilError):
+    """A drive, sensor, bus or port does not do what it must; ``device`` names it."""
+
+    def __init__(self, device: str, message: str) -> None:
+        self.device = device
+        super().__init__(f"{device}: {message}")
+
+
+class ConnectError(DeviceError):
+    """A bus, port or peer cannot be reached."""
+
+
+class DeviceTimeout(DeviceError):
+    """A device did not answer within its deadline."""
+
+
+class ProtocolError(DeviceError):
+    """A device answered something that its protocol does not allow."""
+
+
+class SdoAbort(ProtocolError):
+    """An SDO transfer was aborted; ``code`` is the CiA 301 abort code."""
+
+    def __init__(self, device: str, message: str, code: int) -> None:
+        self.code = code
+        super().__init__(device, message)
+
+
+class DriveFault(DeviceError):
+    """A drive is in, or fell into, a state in which it must not be used."""
+
+
+class EdsError(DeviceError):
+    """An EDS or DCF file cannot be read."""
+
+
+class StoreError(FdhilError):
+    """The store (recordings, history, journal) cannot be read or written."""
+
+
+class RecordingError(FdhilError):
+    """A recording cannot be read: it is truncated, empty, misses a column, or holds text where a number belongs."""
+
+
+class ProgramError(FdhilError):
+    """An NC program cannot be interpreted; ``line`` is the 1-based source line, ``word`` the word at fault."""
+
+    def __init__(self, line: int, word: str, message: str) -> None:
+        self.line = line
+        self.word = word
+        super().__init__(f"line {line}, {word!r}: {message}" if word else f"line {line}: {message}")

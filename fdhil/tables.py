@@ -1,0 +1,37 @@
+"""The literal registries: name -> "module:factory". Nothing registers itself; being listed here is being tested.
+
+Config checks names against these tables without importing the rooms behind them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+ESTIMATORS: Mapping[str, str] = {
+    "least_squares": "fdhil.identification.estimators.least_squares:estimate",
+}
+CORRECTIONS: Mapping[str, str] = {
+    "mirror": "fdhil.correction.mirror:plan",
+}
+REGULATORS: Mapping[str, str] = {
+    "p_pi_pi": "fdhil.model.p_pi_pi:simulate",
+}
+VOLTAGE_SOURCES: Mapping[str, str] = {
+    "drive": "fdhil.drivers.cia402_drive:VoltageObject",
+    "modbus": "fdhil.drivers.modbus_voltage:ModbusVoltage",
+}
+EVENT_SOURCES: Mapping[str, str] = {
+    "inferred": "fdhil.drivers.g0_inferred:InferredG0",
+    "digital_input": "fdhil.drivers.g0_digital_input:DigitalInputG0",
+}
+DRIVE_PROFILES: Mapping[str, str] = {
+    "fdhil_twin": "fdhil.drivers.profiles.fdhil_twin:PROFILE",
+}
+
+
+def load(table: Mapping[str, str], name: str) -> Any:
+    """Import and return the factory that ``table`` lists under ``name``; KeyError when it lists none."""
+    module, _, attribute = table[name].partition(":")
+    return getattr(import_module(module), attribute)
