@@ -89,3 +89,7 @@ def run_safely(command: click.Command) -> int:
     except BrokenPipeError:
         return 0
     return int(result or 0)
+
+
+if __name__ == "__main__":
+    main()
