@@ -1,0 +1,61 @@
+# Two commands on a fresh Debian 12 with python3-venv and make: `make demo` and `make test`. Each makes .venv when it is missing.
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+VCAN   := bash tests/integration/vcan-vm.sh -t 280
+
+.PHONY: help setup demo test test-vcan test-full lint bench study lock clean
+
+help:            ## list the targets
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
+
+$(VENV)/.ok: pyproject.toml requirements.lock
+	@$(PYTHON) -c 'import ensurepip, sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+	  echo "fdhil needs Python 3.11 or newer with venv: on Debian 12, apt-get install python3-venv" >&2; exit 1; }
+	@echo "setting up $(VENV) (once, under a minute)"
+	@$(PYTHON) -m venv $(VENV)
+	@if command -v uv >/dev/null 2>&1; then \
+	  uv pip install -q --python $(BIN)/python --require-hashes -r requirements.lock && \
+	  uv pip install -q --python $(BIN)/python --no-deps --no-build-isolation -e .; \
+	else \
+	  $(BIN)/python -m pip install -q --disable-pip-version-check --require-hashes -r requirements.lock && \
+	  $(BIN)/python -m pip install -q --disable-pip-version-check --no-deps --no-build-isolation -e .; \
+	fi
+	@touch $@
+
+setup: $(VENV)/.ok  ## make .venv with everything in it
+
+demo: setup      ## the whole loop on the simulated machine; the report is out/report.html
+	@$(BIN)/fdhil demo --out out
+
+test: setup      ## the default tests: in-process bus and loopback hub, no Debian packages
+	@$(BIN)/python -m pytest -q -m "not socketcan and not debian" -n 2 --dist loadfile
+
+test-vcan: setup ## the integration suite on a real SocketCAN interface
+	@$(VCAN) $(BIN)/python -m pytest -q -p no:cacheprovider -m socketcan tests/integration
+
+test-full: test  ## adds the tests against LinuxCNC (Debian package linuxcnc-uspace)
+	@command -v rs274 >/dev/null || { echo "make test-full needs rs274: apt-get install linuxcnc-uspace" >&2; exit 1; }
+	@$(BIN)/python -m pytest -q -m debian
+
+lint: setup      ## ruff, mypy, import-linter, deptry, codespell, and the house rules
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports
+	@$(BIN)/deptry .
+	@$(BIN)/codespell
+	@! grep -n '://' requirements.lock || { echo "requirements.lock names an address" >&2; exit 1; }
+
+bench: setup     ## the benchmarks; results go to docs/benchmarks.md
+	@$(BIN)/python -m benchmarks
+
+study: setup     ## the Monte-Carlo studies; results go to docs/
+	@$(BIN)/python -m studies
+
+lock:            ## resolve requirements.lock anew (needs uv)
+	uv pip compile --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --upgrade \
+	  --group dev pyproject.toml -o requirements.lock >/dev/null
+
+clean:           ## remove what the targets made
+	rm -rf $(VENV) out .pytest_cache .mypy_cache .ruff_cache .hypothesis

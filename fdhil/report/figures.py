@@ -1,0 +1,214 @@
+"""The paper's figures as inline SVG: pure functions from records to text.
+
+Figure numbers in the docstrings are those of [DES] (Desforges, Habbadi, Dessein).
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fdhil.model.feed_drive import simulate_plant
+from fdhil.records import Float, Parameters, Window
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+INK, SOFT, REFERENCE = "#1d2733", "#5b6876", "#9aa5b1"
+# colours that stay apart in print and for colour-blind readers (Okabe and Ito)
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+
+_STYLE = {
+    "font.size": 9.5,
+    "font.family": "sans-serif",
+    "axes.edgecolor": SOFT,
+    "axes.labelcolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e6eaee",
+    "grid.linewidth": 0.7,
+    "xtick.color": SOFT,
+    "ytick.color": SOFT,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "lines.linewidth": 1.3,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "fdhil",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """A labelled path (n, 2) in mm."""
+
+    label: str
+    path_mm: Float
+    dashed: bool = False
+
+
+@contextmanager
+def _drawing(width: float = 6.4, height: float = 3.6) -> Iterator[tuple[Figure, Axes, list[str]]]:
+    """A figure with one pair of axes; on leaving, the list holds its SVG."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    svg: list[str] = []
+    with rc_context(_STYLE):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        yield figure, figure.subplots(), svg
+        text = io.StringIO()
+        figure.savefig(text, format="svg", metadata={"Date": None})
+    body = text.getvalue()
+    body = body[body.index("<svg") :]
+    # several figures share one page: identifiers must not meet
+    mark = f"f{zlib.crc32(body.encode()):08x}"
+    body = re.sub(r'id="', f'id="{mark}-', body)
+    body = re.sub(r'(xlink:href="#|url\(#)', rf"\g<1>{mark}-", body)
+    svg.append(body)
+
+
+def signals(window: Window) -> str:
+    """Measured voltage, current and speed of one rapid (Figure 4)."""
+    time_s = np.arange(window.n) * window.dt_s
+    with _drawing() as (_, axes, svg):
+        if window.voltage_v is not None:
+            axes.plot(time_s, window.voltage_v, label="voltage (V)", color=COLOURS[1])
+        axes.plot(time_s, window.current_a, label="current (A)", color=COLOURS[2])
+        axes.plot(time_s, window.speed_rad_s, label="speed (rad/s)", color=COLOURS[0])
+        axes.set_xlabel("time (s)")
+        axes.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    return svg[0]
+
+
+def torque(cases: Sequence[tuple[str, Window, Parameters]]) -> str:
+    """Estimated torque Jt dw/dt + ft w + Cd sign(w) of rapids at several temperatures (Figure 5)."""
+    with _drawing() as (_, axes, svg):
+        for (label, window, parameters), colour in zip(cases, COLOURS, strict=False):
+            speed = simulated_speed(window, parameters)
+            time_s = np.arange(window.n) * window.dt_s
+            estimated = (
+                parameters.Jt * np.gradient(speed, window.dt_s) + parameters.ft * speed + parameters.Cd * np.sign(speed)
+            )
+            axes.plot(time_s, estimated, label=label, color=colour)
+        axes.set_xlabel("time (s)")
+        axes.set_ylabel("torque (N.m)")
+        axes.legend()
+    return svg[0]
+
+
+def simulated_speed(window: Window, parameters: Parameters) -> Float:
+    """Shaft speed (n,), rad/s, that the model answers to the measured voltage; the measured one without a voltage."""
+    if window.voltage_v is None:
+        return window.speed_rad_s
+    voltage = np.nan_to_num(window.voltage_v)
+    _, speed = simulate_plant(parameters, voltage, window.dt_s, window.voltage_sampling)
+    return speed
+
+
+def drift(symbol: str, unit: str, series: Mapping[str, tuple[Float, Float, Float]]) -> str:
+    """A parameter against slide-way temperature with two-sigma bars (Figures 6 and 7).
+
+    ``series`` maps an axis to (temperature_c, value, standard deviation), each (n,).
+    """
+    with _drawing(4.8, 3.2) as (_, axes, svg):
+        for (label, (celsius, value, std)), colour in zip(series.items(), COLOURS, strict=False):
+            axes.errorbar(celsius, value, 2 * std, fmt="o", ms=3.5, capsize=2, color=colour, label=label, lw=1.0)
+            if celsius.size > 2 and np.ptp(celsius) > 0:
+                slope, start = np.polyfit(celsius, value, 1)
+                span = np.array([celsius.min(), celsius.max()])
+                axes.plot(span, start + slope * span, color=colour, lw=0.9, ls="--")
+        axes.set_xlabel("slide-way temperature (degC)")
+        axes.set_ylabel(f"{symbol} ({unit})")
+        axes.legend()
+    return svg[0]
+
+
+def model_against_drive(window: Window, parameters: Parameters, fit_percent: float | None) -> str:
+    """Measured speed and the model's answer to the same voltage (Figure 8)."""
+    time_s = np.arange(window.n) * window.dt_s
+    fit = "" if fit_percent is None else f", fit {fit_percent:.2f} %"
+    with _drawing() as (_, axes, svg):
+        axes.plot(time_s, window.speed_rad_s, color=REFERENCE, lw=2.4, label="drive, measured")
+        axes.plot(time_s, simulated_speed(window, parameters), color=COLOURS[1], lw=1.0, label=f"model{fit}")
+        axes.set_xlabel("time (s)")
+        axes.set_ylabel("speed (rad/s)")
+        axes.legend()
+    return svg[0]
+
+
+def path(reference_mm: Float, points: Mapping[str, tuple[float, float]]) -> str:
+    """The programmed path with its named points (Figures 10 and 19)."""
+    with _drawing() as (_, axes, svg):
+        axes.plot(*reference_mm.T, color=INK)
+        for name, (x, y) in points.items():
+            axes.plot(x, y, "o", ms=3.5, color=COLOURS[1])
+            axes.annotate(name, (x, y), xytext=(4, 5), textcoords="offset points", color=COLOURS[1], fontweight="bold")
+        _equal(axes)
+    return svg[0]
+
+
+def corner(curves: Sequence[Curve], centre_mm: tuple[float, float], half_width_mm: float) -> str:
+    """A place of the path enlarged (Figures 11-15, 17, 18, 20): reference grey, the others in colour."""
+    with _drawing(4.8, 3.6) as (_, axes, svg):
+        for k, curve in enumerate(curves):
+            colour, width = (REFERENCE, 2.2) if k == 0 else (COLOURS[(k - 1) % len(COLOURS)], 1.3)
+            axes.plot(*curve.path_mm.T, color=colour, lw=width, ls="--" if curve.dashed else "-", label=curve.label)
+        x, y = centre_mm
+        axes.set_xlim(x - half_width_mm, x + half_width_mm)
+        axes.set_ylim(y - 0.75 * half_width_mm, y + 0.75 * half_width_mm)
+        axes.ticklabel_format(useOffset=False)
+        axes.set_xlabel("X (mm)")
+        axes.set_ylabel("Y (mm)")
+        axes.legend(loc="best")
+    return svg[0]
+
+
+def contour_errors(time_s: Float, cases: Mapping[str, Float]) -> str:
+    """Contour error (um) along the path, one curve a case."""
+    with _drawing(6.4, 3.2) as (_, axes, svg):
+        for (label, error_um), colour in zip(cases.items(), COLOURS, strict=False):
+            axes.plot(time_s[: error_um.size], error_um, label=label, color=colour, lw=1.1)
+        axes.set_xlabel("time (s)")
+        axes.set_ylabel("contour error (um)")
+        axes.set_ylim(bottom=0)
+        axes.legend()
+    return svg[0]
+
+
+def error_map(path_mm: Float, error_um: Float, largest_um: float) -> str:
+    """The path coloured by its contour error, from 0 to ``largest_um``."""
+    from matplotlib.collections import LineCollection
+
+    segments = np.stack([path_mm[:-1], path_mm[1:]], axis=1)
+    with _drawing() as (figure, axes, svg):
+        lines = LineCollection(list(segments), array=error_um[1:], cmap="viridis", lw=3.5)
+        lines.set_clim(0, largest_um)
+        axes.add_collection(lines)
+        axes.autoscale()
+        figure.colorbar(lines, ax=axes, label="contour error (um)", shrink=0.85)
+        _equal(axes)
+    return svg[0]
+
+
+def history(symbol: str, unit: str, when: Sequence[float], value: Float, std: Float, xlabel: str) -> str:
+    """A parameter's revisions with two-sigma bars against time or temperature."""
+    with _drawing(4.8, 3.0) as (_, axes, svg):
+        axes.errorbar(when, value, 2 * std, fmt="o-", ms=3, lw=0.9, capsize=2, color=COLOURS[0])
+        axes.set_xlabel(xlabel)
+        axes.set_ylabel(f"{symbol} ({unit})")
+    return svg[0]
+
+
+def _equal(axes: Axes) -> None:
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel("X (mm)")
+    axes.set_ylabel("Y (mm)")

@@ -1,0 +1,57 @@
+"""One self-contained HTML page: no script, no font, no picture from elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+
+from fdhil.errors import FdhilError
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """A table: ``head`` names the columns, each row has as many cells."""
+
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A titled part of the page: text, tables, then figures as (caption, inline SVG)."""
+
+    title: str
+    text: str = ""
+    tables: Sequence[Table] = ()
+    figures: Sequence[tuple[str, str]] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A report: its headline figures as (label, value), then its sections."""
+
+    title: str
+    subtitle: str
+    headline: Sequence[tuple[str, str]] = ()
+    sections: Sequence[Section] = field(default_factory=tuple)
+
+
+def write(page: Page, path: Path) -> None:
+    """Render ``page`` to ``path`` (a temporary name first, so that a reader never sees half a page)."""
+    try:
+        from jinja2 import Environment
+    except ImportError:
+        raise FdhilError("a report needs the extra 'report': pip install 'fdhil[report]'") from None
+    template = files("fdhil.report").joinpath("page.html.j2").read_text("utf-8")
+    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    text = environment.from_string(template).render(page=page)
+    part = path.with_suffix(path.suffix + ".part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text(text, "utf-8")
+        part.replace(path)
+    except OSError as error:
+        raise FdhilError(f"the report {path} cannot be written: {error.strerror}; choose another --out") from None

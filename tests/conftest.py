@@ -1,0 +1,24 @@
+"""House rules for every test: warnings are errors (pyproject), and nothing may be left behind."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def no_thread_left() -> Iterator[None]:
+    """Fail a test that leaves a thread behind; pools of the numeric libraries keep theirs."""
+    before = set(threading.enumerate())
+    yield
+    deadline = time.monotonic() + 2.0
+    while (left := _ours(set(threading.enumerate()) - before)) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not left, f"threads left behind: {[thread.name for thread in left]}"
+
+
+def _ours(threads: set[threading.Thread]) -> list[threading.Thread]:
+    return [t for t in threads if t.is_alive() and not t.name.startswith(("asyncio_", "ThreadPoolExecutor", "pyarrow"))]
