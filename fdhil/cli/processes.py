@@ -1,0 +1,120 @@
+"""Child processes of the demonstration: the twin with its panel, the guard, the daemon."""
+
+from __future__ import annotations
+
+import json
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from fdhil.errors import ConnectError, DeviceTimeout
+
+
+class Process:
+    """A command of fdhil as a child process; stderr goes to a log file, stdout is read line by line.
+
+    ConnectError when it ends before it is ready, DeviceTimeout when an awaited event does not come.
+    """
+
+    def __init__(self, name: str, arguments: list[str], log: Path) -> None:
+        self.name = name
+        self._log = log
+        with log.open("ab") as errors:
+            self._child = subprocess.Popen(
+                [sys.executable, "-m", *arguments],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                text=True,
+            )
+        self._lines: queue.Queue[str | None] = queue.Queue()
+        self._reader = threading.Thread(target=self._read, name=f"{name} events", daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._child.stdout is not None
+        for line in self._child.stdout:
+            self._lines.put(line)
+        self._lines.put(None)
+
+    def event(self, kind: str, timeout_s: float) -> dict[str, Any]:
+        """Return the next event of this kind; what comes before it is dropped."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                line = self._lines.get(timeout=max(0.0, deadline - time.monotonic()))
+            except queue.Empty:
+                raise DeviceTimeout(self.name, f"said no {kind!r} within {timeout_s:.0f} s; see {self._log}") from None
+            if line is None:
+                raise ConnectError(self.name, f"ended before it said {kind!r}: {self._last_words()}")
+            event = json.loads(line)
+            if event.get("event") == "error":
+                raise ConnectError(self.name, str(event.get("text")))
+            if event.get("event") == kind:
+                return dict(event)
+
+    def command(self, command: str, **fields: Any) -> None:
+        """Send one command of the operator's panel."""
+        assert self._child.stdin is not None
+        try:
+            self._child.stdin.write(json.dumps({"command": command, **fields}) + "\n")
+            self._child.stdin.flush()
+        except BrokenPipeError:
+            raise ConnectError(self.name, f"has ended: {self._last_words()}") from None
+
+    def check(self) -> None:
+        """Raise ConnectError when the process has ended by itself."""
+        if self._child.poll() is not None:
+            raise ConnectError(self.name, f"ended with exit code {self._child.returncode}: {self._last_words()}")
+
+    def stop(self, timeout_s: float = 10.0) -> int:
+        """Ask the process to end (SIGTERM), insist after ``timeout_s``, and return its exit code."""
+        if self._child.poll() is None:
+            self._child.terminate()
+        try:
+            self._child.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self._child.kill()
+            self._child.wait()
+        self._reader.join(timeout_s)
+        for stream in (self._child.stdin, self._child.stdout):
+            if stream is not None:
+                stream.close()
+        return self._child.returncode
+
+    def _last_words(self) -> str:
+        lines = self._log.read_text("utf-8", "replace").strip().splitlines()
+        return lines[-1] if lines else "it said nothing"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+
+class Twin(Process):
+    """The simulated machine with its operator's panel; ``ready`` is its first event."""
+
+    def __init__(self, config: Path, log: Path) -> None:
+        super().__init__("simulated machine", ["fdhil", "sim", str(config), "--json"], log)
+        try:
+            self.ready: Mapping[str, Any] = self.event("ready", 60.0)
+        except BaseException:
+            self.stop()
+            raise
+
+    def play(self, program: Path, trace: Path | None = None, timeout_s: float = 120.0) -> dict[str, Any]:
+        """Let the NC play a program or demand; return its ``finished`` event (late offset frames, trace file)."""
+        if trace is not None:
+            self.command("trace", file=str(trace))
+        self.command("play", file=str(program))
+        return self.event("finished", timeout_s)
