@@ -77,7 +77,11 @@ class EdsError(DeviceError):
 
 
 class StoreError(FdhilError):
-    """The store (recordings, history, journal) cannot be read or written."""
+    """The store (recordings, history, journal) cannot be read or written; ``code`` is the class the operator sees."""
+
+    def __init__(self, message: str, code: str = "StoreFault") -> None:
+        self.code = code
+        super().__init__(message)
 
 
 class RecordingError(FdhilError):

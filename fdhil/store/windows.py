@@ -1,0 +1,269 @@
+"""G0 windows as Parquet, one file each: what goes in comes out bit by bit.
+
+A column that came from a drive is stored as the drive's own integers with scale and unit in the metadata (a 1 s window
+takes some 10 kB); the store tries the scales it is given and falls back to floats where a column is no exact multiple.
+Files are numbered, never dated: the order holds however wrong the wall clock is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from fdhil.errors import RecordingError, StoreError
+from fdhil.records import Float, Stages, Window, frozen
+from fdhil.store.atomic import store_error, sync_folder, write_file
+
+FORMAT = "fdhil-window-1"
+MAX_FILE_BYTES = 64 * 1024 * 1024
+MAX_ROWS = 4_000_000
+COLUMNS: Mapping[str, str] = {
+    "demand_mm": "mm",
+    "position_mm": "mm",
+    "speed_rad_s": "rad/s",
+    "current_a": "A",
+    "voltage_v": "V",
+}
+_NAME = re.compile(r"w(\d{8,12})-([A-Z])\.parquet")
+_META = b"fdhil"
+_NEXT = "make a new recording or use an older one"
+
+Bits = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class RawScale:
+    """How a drive's integer q becomes a value: q * ``factor`` / ``divisor``, in this order of operations."""
+
+    factor: float = 1.0
+    divisor: float = 1.0
+
+    def decode(self, raw: Float) -> Float:
+        """Return the values of raw integers (n,), given as floats; NaN stays NaN."""
+        return raw * self.factor / self.divisor
+
+    def encode(self, values: Float) -> Float | None:
+        """Return the raw integers (n,) that decode to exactly ``values``, NaN where they are NaN, or None."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            raw = np.rint(values * self.divisor / self.factor)
+        finite = np.isfinite(values)
+        if not np.array_equal(np.isnan(values), ~finite) or np.any(np.abs(raw[finite]) >= 2.0**53):
+            return None
+        raw = np.where(finite, raw + 0.0, np.nan)  # an integer has no negative zero
+        return raw if np.array_equal(_bits(self.decode(raw)), _bits(values)) else None
+
+
+def _bits(values: Float) -> Bits:
+    """Return the bit patterns; all NaN are one, since a lost sample has no payload."""
+    return np.where(np.isnan(values), np.nan, values).view(np.int64)
+
+
+Scales = Mapping[str, Sequence[RawScale]]
+
+
+def encode_window(window: Window, config_digest: str, scales: Scales | None = None) -> bytes:
+    """Return a window as the bytes of a Parquet file; ``scales`` names the candidates of each drive column."""
+    columns: dict[str, Any] = {}
+    described: dict[str, Any] = {}
+    encodings = {"tick": "DELTA_BINARY_PACKED"}
+    ticks = window.start_tick + np.arange(window.n, dtype=np.int64)
+    columns["tick"] = pa.array(ticks)
+    for name, unit in COLUMNS.items():
+        values = getattr(window, name)
+        if values is None:
+            continue
+        scale, columns[name] = _column(values, (scales or {}).get(name, ()))
+        raw = scale is not None
+        encodings[name] = "DELTA_BINARY_PACKED" if raw else "BYTE_STREAM_SPLIT"
+        described[name] = {"unit": unit} | ({"factor": scale.factor, "divisor": scale.divisor} if scale else {})
+    head = _head(window) | {"columns": described, "config_digest": config_digest}
+    head["digest"] = _digest(window)
+    table = pa.table(columns).replace_schema_metadata({_META: json.dumps(head).encode()})
+    sink = io.BytesIO()
+    pq.write_table(
+        table, sink, compression="zstd", use_dictionary=False, column_encoding=encodings, write_page_checksum=True
+    )
+    return sink.getvalue()
+
+
+def _column(values: Float, candidates: Sequence[RawScale]) -> tuple[RawScale | None, Any]:
+    for scale in candidates:
+        raw = scale.encode(values)
+        if raw is not None:
+            lost = np.isnan(raw)
+            return scale, pa.array(np.where(lost, 0.0, raw).astype(np.int64), mask=lost)
+    return None, pa.array(values)
+
+
+def _head(window: Window) -> dict[str, Any]:
+    """The fields of a window that are no arrays, as JSON keeps them exactly."""
+    stages = window.stages
+    return {
+        "format": FORMAT,
+        "clock": "SYNC tick",
+        "axis": window.axis,
+        "start_tick": window.start_tick,
+        "start_s": window.start_s,
+        "dt_s": window.dt_s,
+        "voltage_sampling": window.voltage_sampling,
+        "stages": {"accelerate": stages.accelerate, "cruise": stages.cruise, "brake": stages.brake},
+        "direction": window.direction,
+        "rapid_speed_rad_s": window.rapid_speed_rad_s,
+        "pitch_mm": window.pitch_mm,
+        "gaps": window.gaps,
+        "temperature_c": window.temperature_c,
+        "voltage_delay_s": window.voltage_delay_s,
+        "source": window.source,
+    }
+
+
+def _digest(window: Window) -> str:
+    """SHA-256 of a window's meaning: no bit of it can change unseen."""
+    digest = hashlib.sha256(json.dumps(_head(window), sort_keys=True).encode())
+    for name in COLUMNS:
+        values = getattr(window, name)
+        digest.update(name.encode() + (b"-" if values is None else _bits(values).tobytes()))
+    return digest.hexdigest()
+
+
+def decode_window(content: bytes, source: str = "recording") -> Window:
+    """Return the window of a Parquet file's bytes; RecordingError when it is foreign, truncated or damaged."""
+    try:
+        window, digest = _decode(content)
+    except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
+        first = (str(error).splitlines() or [type(error).__name__])[0]
+        raise RecordingError(f"{source} is no window recording of fdhil: {first}; {_NEXT}") from None
+    if digest != _digest(window):
+        raise RecordingError(f"{source} is damaged: its digest does not match its content; {_NEXT}")
+    return window
+
+
+def _decode(content: bytes) -> tuple[Window, str]:
+    file = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True)
+    if file.metadata.num_rows > MAX_ROWS:
+        raise ValueError(f"it declares {file.metadata.num_rows} rows, {MAX_ROWS} are allowed")
+    head = json.loads((file.metadata.metadata or {}).get(_META, b"{}"))
+    if head.get("format") != FORMAT:
+        raise ValueError(f"its format is {head.get('format')!r}, not {FORMAT}")
+    table = file.read()
+    arrays: dict[str, Float | None] = {}
+    for name in COLUMNS:
+        described = head["columns"].get(name)
+        arrays[name] = None if described is None else _values(table.column(name), described)
+    present = [array for array in arrays.values() if array is not None]
+    if len(present) < len(COLUMNS) - 1 or arrays["speed_rad_s"] is None or len({a.size for a in present}) != 1:
+        raise ValueError("a column is missing")
+    return _window(head, arrays), str(head["digest"])
+
+
+def _values(column: Any, described: Mapping[str, Any]) -> Float:
+    values = np.asarray(column.to_numpy(), dtype=np.float64)
+    if "factor" in described:
+        values = RawScale(float(described["factor"]), float(described["divisor"])).decode(values)
+    return frozen(values)
+
+
+def _window(head: Mapping[str, Any], arrays: Mapping[str, Any]) -> Window:
+    known = {field.name for field in fields(Window)}
+    plain = {key: value for key, value in head.items() if key in known}
+    stages = {key: None if span is None else (int(span[0]), int(span[1])) for key, span in head["stages"].items()}
+    plain["stages"] = Stages(**stages)
+    plain["gaps"] = tuple((int(start), int(end)) for start, end in head["gaps"])
+    return Window(**plain, **arrays)
+
+
+def read_window(path: Path) -> Window:
+    """Read one window file. RecordingError when it cannot be read, is too large, foreign, truncated or damaged."""
+    try:
+        size = path.stat().st_size
+        if size > MAX_FILE_BYTES:
+            raise RecordingError(f"{path} is larger than 64 MiB, which no window is; {_NEXT}")
+        content = path.read_bytes()
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read: {error.strerror}; check the path and the rights") from None
+    return decode_window(content, str(path))
+
+
+@dataclass(frozen=True, slots=True)
+class WindowFile:
+    """One stored window: its running ``number``, axis and path."""
+
+    number: int
+    axis: str
+    path: Path
+
+
+@dataclass(frozen=True, slots=True)
+class Listing:
+    """What is in the folder: ``windows`` oldest first, and the names of ``strays``, which are ignored."""
+
+    windows: tuple[WindowFile, ...]
+    strays: tuple[str, ...]
+
+
+def list_windows(folder: Path) -> Listing:
+    """List the window files of a folder; a folder that does not exist is empty. StoreError when it cannot be read."""
+    windows, strays = [], []
+    try:
+        entries = sorted(folder.iterdir()) if folder.exists() else []
+        for path in entries:
+            match = _NAME.fullmatch(path.name)
+            if match and path.is_file() and not path.is_symlink():
+                windows.append(WindowFile(int(match[1]), match[2], path))
+            else:
+                strays.append(path.name)
+    except OSError as error:
+        raise StoreError(f"{folder} cannot be listed: {error.strerror}; check its rights") from None
+    windows.sort(key=lambda file: file.number)
+    return Listing(tuple(windows), tuple(strays))
+
+
+class WindowStore:
+    """The folder of windows, written by one daemon: append, and let the oldest go beyond ``keep`` files."""
+
+    def __init__(self, folder: Path, keep: int, config_digest: str) -> None:
+        """Open, and create where needed. StoreError when the folder cannot be made or listed."""
+        self.folder = folder
+        self._keep = keep
+        self._config_digest = config_digest
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise store_error(folder, error) from None
+        listing = list_windows(folder)
+        self.strays = listing.strays
+        self._files = list(listing.windows)
+
+    def append(self, window: Window, scales: Scales | None = None, at_least: int = 0) -> WindowFile:
+        """Write a window durably and return its file; its number exceeds every stored one and ``at_least``.
+
+        StoreError when it cannot be written: nothing half-written is left under the window's name.
+        """
+        number = max(self._files[-1].number if self._files else 0, at_least) + 1
+        file = WindowFile(number, window.axis, self.folder / f"w{number:08d}-{window.axis}.parquet")
+        write_file(file.path, encode_window(window, self._config_digest, scales))
+        self._files.append(file)
+        self._prune()
+        return file
+
+    def _prune(self) -> None:
+        if len(self._files) <= self._keep:
+            return
+        try:
+            while len(self._files) > self._keep:
+                self._files[0].path.unlink(missing_ok=True)
+                self._files.pop(0)
+            sync_folder(self.folder)
+        except OSError as error:
+            raise store_error(self._files[0].path, error) from None

@@ -1,0 +1,29 @@
+"""An exported window is a recording: the same numbers, the same gaps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from fdhil.store.export import export_csv
+from tests.store.made import window
+
+
+def test_the_csv_has_every_sample_to_the_last_bit_and_no_row_for_a_lost_one(tmp_path: Path) -> None:
+    made = window()
+    path = tmp_path / "out.csv"
+    export_csv(made, path)
+    lines = path.read_text().splitlines()
+    headers = dict(line[2:].split(": ", 1) for line in lines if line.startswith("# "))
+    body = np.loadtxt(lines, delimiter=",", skiprows=len(headers) + 1)
+    kept = np.isfinite(made.speed_rad_s)
+    assert headers["format"] == "fdhil-recording-1"
+    assert (headers["sample_rate_hz"], headers["axis"], headers["pitch_m_per_rev"]) == ("1000", "X", "0.02")
+    assert (headers["rapid_speed_m_per_s"], headers["temperature_C"]) == ("0.5", "21.37")
+    assert made.voltage_v is not None
+    assert np.array_equal(body[:, 1], made.voltage_v[kept])
+    assert np.array_equal(body[:, 3], made.speed_rad_s[kept])
+    assert np.array_equal(body[:, 4], made.position_mm[kept] / 1000)
+    assert body.shape == (597, 6)
+    assert np.allclose(body[:, 0], np.flatnonzero(kept) * 0.001, atol=1e-12)

@@ -1,0 +1,116 @@
+"""The history keeps what was published, in the order it was published, whatever the clock says."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil.errors import StoreError
+from fdhil.records import Notice, Parameters, Skill
+from fdhil.store.history import FILE_NAME, History, Stamp, latest_parameters
+from tests.store.made import BENCH, STAMP, outcome, published
+
+DRIFTED = Parameters(0.5, 0.005, 0.8, 0.075, 0.01 + 1e-17, 1.0 / 3.0)
+
+
+def test_a_revision_comes_back_bit_by_bit(tmp_path: Path) -> None:
+    with History.open(tmp_path) as history:
+        number = history.add_revision(published(), [4, 5], STAMP)
+    with History.read(tmp_path) as history:
+        (revision,) = history.revisions()
+    assert (revision.number, revision.window_ids, revision.stamp) == (number, (4, 5), STAMP)
+    stored, made = revision.set, published()
+    assert stored.parameters == made.parameters
+    assert stored.covariance.tobytes() == made.covariance.tobytes()
+    assert (stored.axis, stored.revision, stored.windows, stored.tick) == ("X", 1, 3, 12_346)
+    assert (stored.temperature_c, stored.config_digest) == (21.5, "0123456789abcdef")
+
+
+def test_the_newest_parameters_are_the_last_written_whatever_the_clock_says(tmp_path: Path) -> None:
+    assert latest_parameters(tmp_path) == {}
+    with History.open(tmp_path) as history:
+        history.add_revision(published(1, "X", BENCH), [], STAMP)
+        history.add_revision(published(1, "Y", BENCH), [], STAMP)
+        history.add_revision(published(2, "X", DRIFTED), [], Stamp(0.0, "boot-2", 1))  # booted in 1970
+        assert [r.set.revision for r in history.revisions("X")] == [1, 2]
+        assert [r.set.revision for r in history.revisions("X", limit=1)] == [2]
+    assert latest_parameters(tmp_path) == {"X": DRIFTED, "Y": BENCH}
+
+
+def test_windows_keep_verdict_reasons_and_parameters(tmp_path: Path) -> None:
+    with History.open(tmp_path) as history:
+        history.add_window(outcome(), "w00000007-X.parquet", STAMP)
+        history.add_window(outcome(accepted=False, missing="ft"), "", STAMP)
+        good, bad = history.windows("X")
+        assert history.counts("X") == (1, 1)
+        assert history.counts("Y") == (0, 0)
+        assert history.last_window_number() == 7
+    assert good.accepted
+    assert good.parameters is not None
+    assert good.parameters["Jt"] == {"value": 0.075, "std": pytest.approx(0.00075)}
+    assert bad.reasons == ("MissingStage(cruise): no plateau",)
+    assert bad.parameters is not None
+    assert bad.parameters["ft"] == {"value": None, "reason": "MissingStage(cruise): no plateau"}
+    assert bad.fit_percent == 97.25
+
+
+def test_skills_and_notices(tmp_path: Path) -> None:
+    with History.open(tmp_path) as history:
+        history.add_skill(Skill("X", 5, 0.25, 1.5, math.nan, 24.0), STAMP)
+        history.add_notice(Notice("LoadChanged", "MAJOR", "Jt rose by 13 %", "X", 9), STAMP)
+        (skill,) = history.skills("X")
+        assert history.notices() == [(STAMP, Notice("LoadChanged", "MAJOR", "Jt rose by 13 %", "X", 9))]
+    assert (skill.rms_um, skill.measured_rms_um) == (0.25, 24.0)
+    assert np.isnan(skill.delay_ms)
+
+
+def test_readers_work_beside_the_writer(tmp_path: Path) -> None:
+    with History.open(tmp_path) as writer, History.read(tmp_path) as reader:
+        writer.add_revision(published(), [], STAMP)
+        assert len(reader.revisions()) == 1
+
+
+def test_a_read_only_store_is_read_and_its_writer_told(tmp_path: Path) -> None:
+    History.open(tmp_path).close()
+    with History.read(tmp_path) as history, pytest.raises(StoreError) as error:
+        history.add_revision(published(), [], STAMP)
+    assert error.value.code == "ReadOnlyStore"
+
+
+def test_nothing_recorded_yet(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="nothing was recorded") as error:
+        History.read(tmp_path)
+    assert error.value.code == "NoHistory"
+
+
+def test_another_schema_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
+    History.open(tmp_path).close()
+    db = sqlite3.connect(tmp_path / FILE_NAME)
+    db.execute("PRAGMA user_version = 99")
+    db.close()
+    for opened in (History.open, History.read):
+        with pytest.raises(StoreError, match="schema 99") as error:
+            opened(tmp_path)
+        assert error.value.code == "SchemaVersion"
+
+
+@pytest.mark.parametrize(
+    "content", [b"this is no database at all, not even nearly" * 100, b"SQLite format 3\0" + b"\xff" * 5000]
+)
+def test_a_broken_database_is_told(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / FILE_NAME).write_bytes(content)
+    for opened in (History.open, History.read):
+        with pytest.raises(StoreError) as error:
+            opened(tmp_path)
+        assert error.value.code == "CorruptFile"
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(StoreError) as error:
+        History.open(tmp_path / "file" / "store")
+    assert error.value.code == "ReadOnlyStore"
