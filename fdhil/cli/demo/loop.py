@@ -1,0 +1,236 @@
+"""The demonstration's loop: commission, shuttle, identify, predict, cut, arm, cut corrected, warm, cut again."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import shutil
+import time
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdhil import config as machine_config
+from fdhil.cli.demo.processes import Process, Twin
+from fdhil.cli.demo.report import Cut, Loop, Published
+from fdhil.config import MachineConfig
+from fdhil.daemon.control import SOCKET_NAME, ask
+from fdhil.drivers.commissioning import commission
+from fdhil.errors import DeviceTimeout, FdhilError, RecordingError
+from fdhil.prediction import contour_error_um, predict
+from fdhil.program import load_trajectory
+from fdhil.records import PARAMETERS, Parameters, Trajectory, Window
+from fdhil.store.history import History
+from fdhil.store.windows import read_window
+
+Say = Callable[[str], None]
+
+PROGRAMS: Mapping[str, str] = {
+    "10 m/min": "bench_10m.ngc",
+    "20 m/min": "bench_20m.ngc",
+    "rounded": "bench_rounded_10m.ngc",
+    "shuttle": "shuttle.ngc",
+}
+WARM_C = (20.5, 21.0, 21.5, 22.0)
+READY_S = 120.0  # the kernels are compiled on the very first run
+
+
+@dataclass
+class Stage:
+    """What is needed to drive the demonstration: the twin with its panel, and the daemon's socket."""
+
+    out: Path
+    config: MachineConfig
+    twin: Twin
+    say: Say
+    programs: Mapping[str, Path]
+    cuts: list[Cut] = field(default_factory=list)
+
+    def ask(self, request: str, **fields: Any) -> dict[str, Any]:
+        """Ask the daemon; FdhilError with the daemon's own words when it refuses."""
+        run = self.config.store.run_directory
+        assert run is not None
+        answer = ask(run / SOCKET_NAME, {"request": request, **fields}, timeout_s=30.0)
+        if not answer.get("ok"):
+            raise FdhilError(f"the daemon refuses to {request}: {answer.get('code')}: {answer.get('text')}")
+        return answer
+
+
+def run_loop(out: Path, realtime: bool, say: Say) -> Loop:
+    """Run the whole loop below ``out`` and return what was measured; FdhilError when a step fails."""
+    out.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        say("starting the simulated machine: two drives, two voltage sensors, an NC")
+        stage = _start_twin(out, realtime, say, stack)
+        _commission(stage)
+        for name, module in (("guard", ["fdhil.cli.guard"]), ("daemon", ["fdhil", "run"])):
+            stack.enter_context(_daemon(name, [*module, str(out / "machine.toml")], out))
+        _await(lambda: _alive(stage), READY_S, "the daemon did not get ready", stage)
+        stage.twin.command("nc", on=True)
+        stage.twin.event("nc", 30.0)
+        return _measure(stage)
+
+
+def _start_twin(out: Path, realtime: bool, say: Say, stack: ExitStack) -> Stage:
+    shutil.rmtree(out / "data", ignore_errors=True)
+    source = Path(__file__).with_name("machine.toml")
+    document = tomllib.loads(source.read_text("utf-8"))
+    document["sim"]["pace"] = "realtime" if realtime else "lockstep"
+    (out / "twin.toml").write_text(_toml(document), "utf-8")
+    twin = stack.enter_context(Twin(out / "twin.toml", out / "twin.log"))
+    bus = twin.ready["buses"]["can0"]
+    document["bus"] = {
+        "can0": {"interface": "socketcand", "channel": bus["channel"], "host": bus["host"], "port": bus["port"]}
+    }
+    (out / "machine.toml").write_text(_toml(document), "utf-8")
+    folder = source.parent / "programs"
+    programs = {label: folder / name for label, name in PROGRAMS.items()}
+    return Stage(out, machine_config.load(out / "machine.toml"), twin, say, programs)
+
+
+def _toml(document: Mapping[str, Any], path: str = "") -> str:
+    """Write a document of nested tables of plain values; enough for the demonstration's own file."""
+    plain = {key: value for key, value in document.items() if not isinstance(value, Mapping)}
+    lines = [f"[{path}]"] if path and plain else []
+    lines += [f"{key} = {json.dumps(value)}" for key, value in plain.items()]
+    for key, value in document.items():
+        if isinstance(value, Mapping):
+            lines.append(_toml(value, f"{path}.{key}" if path else key))
+    return "\n".join(lines) + "\n"
+
+
+def _daemon(name: str, arguments: list[str], out: Path) -> Process:
+    return Process(name, arguments, out / f"{name}.log")
+
+
+def _alive(stage: Stage) -> bool:
+    try:
+        return bool(stage.ask("status"))
+    except FdhilError:
+        return False
+
+
+def _await(done: Callable[[], bool], timeout_s: float, failure: str, stage: Stage) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not done():
+        stage.twin.check()
+        if time.monotonic() > deadline:
+            raise DeviceTimeout("demonstration", f"{failure} within {timeout_s:.0f} s; see the logs in {stage.out}")
+        time.sleep(0.05)
+
+
+def _commission(stage: Stage) -> None:
+    for axis in stage.config.axis:
+        stage.say(f"commissioning {axis}: identity, read-back, +10 um, feed-forward, watchdog")
+        record = asyncio.run(commission(stage.config, axis))
+        where = "sees" if record.offset_in_feedforward else "does not see"
+        stage.say(f"  the offset moved the axis {record.sign_test_um:+.1f} um; the feed-forward {where} it")
+
+
+def _measure(stage: Stage) -> Loop:
+    config = stage.config
+    programs = {label: load_trajectory(path, config) for label, path in stage.programs.items() if label != "shuttle"}
+    published: dict[str, list[Published]] = {axis: [] for axis in config.axis}
+    stage.say("shuttling both axes at rapid speed, listening")
+    cold = _shuttle(stage, published)
+    models = {axis: found[0].parameters for axis, found in published.items()}
+    predicted = predict(programs["10 m/min"], models, config)
+    stage.say(f"predicted contour error of the path: {float((predicted.contour_um**2).mean() ** 0.5):.1f} um RMS")
+    _cut(stage, "uncorrected", 20.0, armed=False)
+    _cut(stage, "corrected", 20.0, armed=True)
+    warm = cold
+    for celsius in WARM_C:
+        stage.say(f"slide-ways at {celsius:.1f} degC, shuttling")
+        stage.twin.command("temperature", celsius=celsius)
+        warm = _shuttle(stage, published)
+    _cut(stage, "warm, corrected anew", WARM_C[-1], armed=True)
+    counters = stage.ask("status")["frames"]
+    return Loop(
+        config=config,
+        truth=_truth(config),
+        published=published,
+        cold=cold,
+        warm={axis: window for axis, (window, _) in warm.items()},
+        predicted=predicted,
+        programs=programs,
+        cuts=stage.cuts,
+        frames=(int(counters["received"]), int(counters["lost"])),
+    )
+
+
+def _truth(config: MachineConfig) -> dict[str, Parameters]:
+    truth = {}
+    for axis, settings in config.axis.items():
+        real = config.sim.axis[axis].model_dump()
+        nominal = settings.nominal.model_dump()
+        truth[axis] = Parameters(**{name: real[name] or nominal[name] for name in PARAMETERS})
+    return truth
+
+
+def _shuttle(stage: Stage, published: dict[str, list[Published]]) -> dict[str, tuple[Window, float | None]]:
+    """Play the shuttle, wait until both axes publish, and return the last accepted window of each with its fit."""
+    before = _revisions(stage)
+    stage.twin.play(stage.programs["shuttle"])
+    _await(lambda: _settled(stage, before), 30.0, "no validated parameters came from the shuttle", stage)
+    newest: dict[str, tuple[Window, float | None]] = {}
+    with History.read(stage.config.store.directory) as history:
+        for axis in stage.config.axis:
+            revision = history.revisions(axis, limit=1)[0].set
+            std = dict(zip(PARAMETERS, np.sqrt(np.diag(revision.covariance)).tolist(), strict=True))
+            published[axis].append(Published(revision.parameters, std, revision.temperature_c or 20.0))
+            stored = [row for row in history.windows(axis) if row.accepted][-1]
+            window = read_window(stage.config.store.directory / "windows" / stored.file)
+            newest[axis] = (window, stored.fit_percent)
+    return newest
+
+
+def _revisions(stage: Stage) -> dict[str, int]:
+    try:
+        with History.read(stage.config.store.directory) as history:
+            return {axis: len(history.revisions(axis)) for axis in stage.config.axis}
+    except FdhilError:
+        return dict.fromkeys(stage.config.axis, 0)
+
+
+def _settled(stage: Stage, before: Mapping[str, int]) -> bool:
+    """Each rapid of the shuttle was analysed: two per axis and pass, so that many revisions came."""
+    now = _revisions(stage)
+    return all(now[axis] >= before[axis] + 2 for axis in stage.config.axis)
+
+
+def _cut(stage: Stage, label: str, celsius: float, armed: bool) -> None:
+    program = stage.programs["10 m/min"]
+    if armed:
+        stage.say("arming: predicted to help, inside the limits, drives commissioned")
+        stage.ask("arm", program=str(program), token=_token(stage))
+    trace = stage.out / f"cut-{len(stage.cuts) + 1}.csv"
+    finished = stage.twin.play(program, trace)
+    reference, table = read_trace(trace, tuple(stage.config.axis))
+    contour = contour_error_um(reference, table, stage.config.machine.sync_period_s)
+    late = sum(int(n) for n in finished["late_rpdo"].values())
+    cut = Cut(label, celsius, reference, table, contour, late)
+    stage.cuts.append(cut)
+    stage.say(f"cut {label}: {cut.rms_um:.2f} um RMS, {cut.max_um:.1f} um at most, {late} late offset frames")
+
+
+def _token(stage: Stage) -> str:
+    run = stage.config.store.run_directory
+    assert run is not None
+    return (run / "token").read_text("utf-8").strip()
+
+
+def read_trace(path: Path, axes: Sequence[str]) -> tuple[Any, Any]:
+    """Return reference and table positions (n, axes) in mm of a trace that the twin wrote; RecordingError otherwise."""
+    rows = np.genfromtxt(path, delimiter=",", names=True)
+    if rows.dtype.names is None or rows.size == 0:
+        raise RecordingError(f"the trace {path} is empty")
+    pick = [np.column_stack([rows[f"{axis}_{what}_mm"] for axis in axes]) for what in ("reference", "table")]
+    return pick[0], pick[1]
+
+
+__all__ = ["Trajectory", "read_trace", "run_loop"]

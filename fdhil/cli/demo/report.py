@@ -1,0 +1,263 @@
+"""The demonstration's report: the paper's figures for the machine that was just identified."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fdhil.config import MachineConfig
+from fdhil.correction import plan as plan_correction
+from fdhil.prediction import predict
+from fdhil.records import PARAMETERS, UNITS, Correction, Float, Parameters, Prediction, Trajectory, Window
+from fdhil.report import Page, Section, Table, figures
+from fdhil.report.figures import Curve
+
+# the named places of the bench path, mm
+POINTS: Mapping[str, tuple[float, float]] = {
+    "A": (0.0, 55.0), "B": (50.0, 55.0), "C": (100.0, 55.0), "D": (150.0, 5.0), "E": (200.0, 55.0), "F": (225.0, 55.0),
+    "G": (250.0, 55.0),
+}  # fmt: skip
+# [DES] 5.3: the drifts whose effect at E is shown, on X only
+DRIFTS: Sequence[tuple[str, Mapping[str, float]]] = (
+    ("ft 0.01, Cd 1 on X", {"ft": 0.01, "Cd": 1.0}),
+    ("Jt + 13 % on X", {"Jt": 1.13}),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """One pass over the path as the twin measured it at its own table."""
+
+    label: str
+    temperature_c: float
+    reference_mm: Float
+    table_mm: Float
+    contour_um: Float
+    late_offsets: int
+
+    @property
+    def rms_um(self) -> float:
+        """RMS contour error."""
+        return float(np.sqrt(np.mean(self.contour_um**2)))
+
+    @property
+    def max_um(self) -> float:
+        """Largest contour error."""
+        return float(self.contour_um.max())
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """One published parameter set: values, standard deviations, and the slide-way temperature it belongs to."""
+
+    parameters: Parameters
+    std: Mapping[str, float]
+    temperature_c: float
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """All that the demonstration measured."""
+
+    config: MachineConfig
+    truth: Mapping[str, Parameters]
+    published: Mapping[str, Sequence[Published]]
+    cold: Mapping[str, tuple[Window, float | None]]
+    warm: Mapping[str, Window]
+    predicted: Prediction
+    programs: Mapping[str, Trajectory]
+    cuts: Sequence[Cut]
+    frames: tuple[int, int]
+
+
+def page(loop: Loop) -> Page:
+    """Lay the loop out as a report."""
+    before, after = loop.cuts[0], loop.cuts[1]
+    return Page(
+        title="From rapid moves to a corrected path",
+        subtitle="A simulated two-axis machine, identified while it moved, predicted, and corrected over its own bus.",
+        headline=[
+            ("contour error before, RMS", f"{before.rms_um:.1f} um"),
+            ("predicted before it was cut", f"{_rms(loop.predicted.contour_um):.1f} um"),
+            ("after the correction, RMS", f"{after.rms_um:.2f} um"),
+            ("smaller by", f"{before.rms_um / after.rms_um:.1f} x"),
+        ],
+        sections=[
+            _identified(loop),
+            _drifted(loop),
+            _path(loop),
+            _predicted(loop),
+            _corrected(loop),
+        ],
+    )
+
+
+def _rms(values: Float) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def parameter_rows(loop: Loop) -> list[list[str]]:
+    """Return the table of true and identified parameters: axis, symbol, truth, identified with interval, deviation."""
+    rows = []
+    for axis, truth in loop.truth.items():
+        found = loop.published[axis][0]
+        for name in PARAMETERS:
+            true, value, std = getattr(truth, name), getattr(found.parameters, name), found.std[name]
+            rows.append(
+                [axis, name, f"{true:.5g} {UNITS[name]}", f"{value:.5g} +- {2 * std:.2g}", f"{_percent(value, true)}"]
+            )
+    return rows
+
+
+def _percent(value: float, true: float) -> str:
+    return f"{100 * (value / true - 1):+.2f} %"
+
+
+def cut_rows(loop: Loop) -> list[list[str]]:
+    """Return the table of contour errors: predicted, then each cut as measured at the table."""
+    rows = [["predicted", "", f"{_rms(loop.predicted.contour_um):.2f}", f"{loop.predicted.contour_um.max():.1f}", ""]]
+    rows += [
+        [cut.label, f"{cut.temperature_c:.1f}", f"{cut.rms_um:.2f}", f"{cut.max_um:.1f}", str(cut.late_offsets)]
+        for cut in loop.cuts
+    ]
+    return rows
+
+
+CUT_HEAD = ("pass", "slide-way degC", "RMS um", "max um", "late offsets")
+PARAMETER_HEAD = ("axis", "symbol", "true", "identified (2 sigma)", "deviation")
+
+
+def _identified(loop: Loop) -> Section:
+    pictures = []
+    for axis, (window, fit_percent) in loop.cold.items():
+        found = loop.published[axis][0].parameters
+        pictures.append((f"{axis}: measured signals of a rapid (paper: Figure 4)", figures.signals(window)))
+        pictures.append(
+            (f"{axis}: model against drive (Figure 8)", figures.model_against_drive(window, found, fit_percent))
+        )
+    received, lost = loop.frames
+    return Section(
+        "Identified during rapid moves",
+        f"Voltage, current and speed were recorded over CANopen while the axes shuttled; {received:,} frames were "
+        f"received and {lost} lost. Each parameter is shown with two standard deviations, beside the twin's own.",
+        tables=[Table(PARAMETER_HEAD, parameter_rows(loop))],
+        figures=pictures,
+    )
+
+
+def _drifted(loop: Loop) -> Section:
+    pictures = []
+    for axis, warm in loop.warm.items():
+        cold, first, last = loop.cold[axis][0], loop.published[axis][0], loop.published[axis][-1]
+        cases = [
+            (f"{first.temperature_c:.1f} degC", cold, first.parameters),
+            (f"{last.temperature_c:.1f} degC", warm, last.parameters),
+        ]
+        pictures.append((f"{axis}: estimated torque of a rapid, cold and warm (Figure 5)", figures.torque(cases)))
+    for symbol, number in (("ft", 6), ("Cd", 7)):
+        series = {axis: _series(sets, symbol) for axis, sets in loop.published.items()}
+        caption = f"Drift of {symbol} with the slide-way temperature (Figure {number})"
+        pictures.append((caption, figures.drift(symbol, UNITS[symbol], series)))
+    return Section(
+        "Drift with the slide-ways' temperature",
+        "The slide-ways were warmed while the axes went on shuttling. Nothing but the rapids was used.",
+        figures=pictures,
+    )
+
+
+def _series(sets: Sequence[Published], symbol: str) -> tuple[Float, Float, Float]:
+    return (
+        np.array([found.temperature_c for found in sets]),
+        np.array([getattr(found.parameters, symbol) for found in sets]),
+        np.array([found.std[symbol] for found in sets]),
+    )
+
+
+def _models(loop: Loop) -> dict[str, Parameters]:
+    return {axis: sets[0].parameters for axis, sets in loop.published.items()}
+
+
+def _xy(positions: Mapping[str, Float]) -> Float:
+    return np.column_stack([positions["X"], positions["Y"]])
+
+
+def _path(loop: Loop) -> Section:
+    slow = _xy(loop.programs["10 m/min"].position_mm)
+    rounded = _xy(loop.programs["rounded"].position_mm)
+    return Section(
+        "The programmed path",
+        figures=[
+            ("The path and its named places (Figure 10)", figures.path(slow, POINTS)),
+            ("The rounded variant for a 40 mm cutter (Figure 19)", figures.path(rounded, {})),
+        ],
+    )
+
+
+def _predicted(loop: Loop) -> Section:
+    models = _models(loop)
+    feeds = {feed: predict(loop.programs[feed], models, loop.config) for feed in ("10 m/min", "20 m/min")}
+    slow = loop.programs["10 m/min"]
+    pictures = []
+    for place, number in (("A", 11), ("C", 12), ("E", 13)):
+        curves = [Curve("desired", _xy(slow.position_mm))]
+        curves += [Curve(feed, _xy(answer.predicted_mm)) for feed, answer in feeds.items()]
+        caption = f"Predicted path at {place} for two feeds (Figure {number})"
+        pictures.append((caption, figures.corner(curves, POINTS[place], 0.5)))
+    for (label, change), number in zip(DRIFTS, (14, 15), strict=True):
+        drifted = predict(slow, models | {"X": _drift(models["X"], change)}, loop.config)
+        curves = [
+            Curve("desired", _xy(slow.position_mm)),
+            Curve("as identified", _xy(feeds["10 m/min"].predicted_mm)),
+            Curve(label, _xy(drifted.predicted_mm), dashed=True),
+        ]
+        pictures.append((f"Effect at E of {label} (Figure {number})", figures.corner(curves, POINTS["E"], 0.2)))
+    worst = [[f"{z.start_s:.2f} - {z.end_s:.2f}", z.where, f"{z.max_um:.1f}", z.cause] for z in loop.predicted.zones]
+    return Section(
+        "Predicted before the cut",
+        "The closed loops of both drives were simulated with the identified parameters; nothing of this was measured.",
+        tables=[Table(("time s", "where", "max um", "cause"), worst, "Zones of the path, 10 m/min")],
+        figures=pictures,
+    )
+
+
+def _drift(parameters: Parameters, change: Mapping[str, float]) -> Parameters:
+    """Apply a drift of the paper: friction as its absolute value, inertia as a factor."""
+    values = {name: value * parameters.Jt if name == "Jt" else value for name, value in change.items()}
+    return replace(parameters, **values)
+
+
+def _corrected(loop: Loop) -> Section:
+    before, after = loop.cuts[0], loop.cuts[1]
+    measured = [
+        Curve("desired", before.reference_mm),
+        Curve("uncorrected", before.table_mm),
+        Curve("corrected", after.table_mm),
+    ]
+    slow = loop.programs["10 m/min"]
+    errors = {cut.label: cut.contour_um for cut in loop.cuts}
+    rounded = plan_correction(loop.programs["rounded"], _models(loop), loop.config, "mirror")
+    largest = float(before.contour_um.max())
+    return Section(
+        "Cut without and with the correction",
+        "Measured by the twin at its own table, with the offsets sent over the bus by the guard and checked there.",
+        tables=[Table(CUT_HEAD, cut_rows(loop), "Contour error, 10 m/min")],
+        figures=[
+            ("Contour error along the path (Figure 16 closes this loop)", figures.contour_errors(slow.time_s, errors)),
+            ("Where the error is, uncorrected", figures.error_map(before.reference_mm, before.contour_um, largest)),
+            ("Area A, measured (Figure 17)", figures.corner(measured, POINTS["A"], 0.5)),
+            ("Area B, measured (Figure 18)", figures.corner(measured, (85.0, 55.0), 0.05)),
+            ("Area E, measured", figures.corner(measured, POINTS["E"], 0.5)),
+            ("Rounded path at the end of A, simulated (Figure 20)", _rounded_figure(rounded)),
+        ],
+    )
+
+
+def _rounded_figure(correction: Correction) -> str:
+    curves = [
+        Curve("desired", _xy(correction.before.reference.position_mm)),
+        Curve("without correction", _xy(correction.before.predicted_mm)),
+        Curve("mirror", _xy(correction.after.predicted_mm)),
+    ]
+    return figures.corner(curves, (20.0, 75.0), 2.0)
