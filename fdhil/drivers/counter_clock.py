@@ -1,0 +1,78 @@
+"""Where on a timeline the samples of a free-running counter lie, from bounds. Pure.
+
+Each query tells that sample ``counter`` had just been completed at some instant between asking and answer. Both ends
+are hard bounds, so all queries together leave a narrow band of lines counter -> time, and its middle is the estimate;
+slow queries bound little and do no harm (the same idea as Klipper's clock synchronisation, with bounds instead of a
+regression, because delays are one-sided and not normal). The timeline may be the host's clock in ns or the SYNC count:
+a simulated machine that is held up stops both its SYNC and its sensor, and only the SYNC count stays true.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+KEPT_QUERIES = 256
+RATE_TOLERANCE = 200e-6  # two quartz clocks
+_SLOPE_QUERIES = 32
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """Sample c begins at ``start`` + ``step`` * (c - ``origin``) of the timeline, to +- ``error``."""
+
+    origin: int
+    start: float
+    step: float
+    error: float
+
+    def at(self, counter: int) -> float:
+        """Return where sample ``counter`` begins."""
+        return self.start + self.step * (counter - self.origin)
+
+
+class CounterClock:
+    """Gathers queries; ``step`` is the nominal length of one sample on the timeline."""
+
+    def __init__(self, step: float) -> None:
+        self._step = step
+        self._queries: deque[tuple[int, float, float]] = deque(maxlen=KEPT_QUERIES)
+
+    def add(self, counter: int, asked: float, answered: float) -> None:
+        """Add one query: ``counter`` is the newest complete sample, ``asked`` <= ``answered`` lie on the timeline.
+
+        A counter that fell means that the sensor was restarted: what was known of it is forgotten.
+        """
+        if self._queries and counter < self._queries[-1][0]:
+            self._queries.clear()
+        self._queries.append((counter, asked, answered))
+
+    def line(self) -> Line | None:
+        """Return the middle of the band, None before the first query.
+
+        Bounds that contradict each other (a counter that stalled, a clock that is off) give an ``error`` that says so.
+        """
+        if not self._queries:
+            return None
+        counter, asked, answered = (np.array(column) for column in zip(*self._queries, strict=True))
+        origin = int(counter[-1])
+        step = self._rate(counter, asked, answered)
+        begun = step * (counter - origin)
+        # sample c is complete at start + step (c - origin + 1), and c + 1 is not yet
+        latest = np.min(answered - begun - step)
+        earliest = np.max(asked - begun - 2 * step)
+        return Line(origin, float(latest + earliest) / 2, step, max(abs(float(latest - earliest)) / 2, step * 1e-3))
+
+    def _rate(self, counter: np.ndarray, asked: np.ndarray, answered: np.ndarray) -> float:
+        """Slope through the quickest half of the queries, kept within quartz tolerance of the nominal step."""
+        if counter.size < _SLOPE_QUERIES:
+            return self._step
+        quick = answered - asked <= np.median(answered - asked)
+        x, y = counter[quick] - counter[-1], (asked + answered)[quick] / 2
+        spread = x - x.mean()
+        if not spread.any():
+            return self._step
+        slope = float(spread @ (y - y.mean()) / (spread @ spread))
+        return float(np.clip(slope, self._step * (1 - RATE_TOLERANCE), self._step * (1 + RATE_TOLERANCE)))

@@ -1,0 +1,134 @@
+"""A Modbus TCP unit behind pymodbus: one request at a time, our own deadline and retries, one error per fault.
+
+pymodbus repeats a request by itself (12 s of silence by default), logs every fault at ERROR and closes the line after
+a few silent requests; none of it suits a sensor that is asked 20 times a second, so ``retries`` is 0 and its logger is
+quiet, and what an answer must be is checked here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import struct
+from collections.abc import Sequence
+
+from pymodbus import ModbusException
+from pymodbus.client import AsyncModbusTcpClient
+from pymodbus.pdu import ModbusPDU
+
+from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
+
+MAX_REGISTERS = 125
+BUSY = 6
+EXCEPTIONS = {
+    1: "illegal function",
+    2: "illegal register address",
+    3: "illegal value",
+    4: "device failure",
+    5: "acknowledge",
+    6: "busy",
+    8: "memory parity error",
+    10: "gateway path unavailable",
+    11: "gateway target does not answer",
+}
+
+logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
+
+
+class ModbusRefused(ProtocolError):
+    """The unit answered with an exception; ``code`` is its number."""
+
+    def __init__(self, device: str, message: str, code: int) -> None:
+        self.code = code
+        super().__init__(device, message)
+
+
+def float32(registers: Sequence[int], at: int = 0) -> float:
+    """Return the big-endian float32 in two registers.
+
+    >>> float32([0x4248, 0x0000])
+    50.0
+    """
+    return float(struct.unpack(">f", struct.pack(">HH", *registers[at : at + 2]))[0])
+
+
+def uint32(registers: Sequence[int], at: int = 0) -> int:
+    """Return the big-endian unsigned integer in two registers."""
+    return registers[at] << 16 | registers[at + 1]
+
+
+class ModbusLink:
+    """A connection to one unit; ``name`` is used in messages."""
+
+    def __init__(self, name: str, host: str, port: int, unit: int, timeout_s: float) -> None:
+        self.name = name
+        self._where = f"{host}:{port}"
+        self._unit = unit
+        self._timeout_s = timeout_s
+        self._client = AsyncModbusTcpClient(host, port=port, timeout=timeout_s, retries=0, reconnect_delay=0)
+
+    async def connect(self) -> None:
+        """Connect; ConnectError when nobody answers there."""
+        connected = False
+        try:
+            async with asyncio.timeout(self._timeout_s + 1.0):
+                connected = await self._client.connect()
+        except TimeoutError:
+            pass
+        if not connected:
+            raise ConnectError(
+                self.name, f"the Modbus sensor {self._where} cannot be reached; check its supply, host and port"
+            )
+
+    @property
+    def connected(self) -> bool:
+        """Whether the TCP connection stands."""
+        return bool(self._client.connected)
+
+    async def read_input(self, address: int, count: int) -> list[int]:
+        """Read ``count`` <= 125 input registers with one request (so that no value is torn between two)."""
+        answer = await self._request(
+            self._client.read_input_registers(address, count=count, device_id=self._unit), address
+        )
+        registers = list(answer.registers)
+        if len(registers) != count:
+            raise ProtocolError(
+                self.name, f"{len(registers)} registers came for {count} asked; check that one client asks at a time"
+            )
+        return registers
+
+    async def write(self, address: int, value: int) -> None:
+        """Write one holding register."""
+        await self._request(self._client.write_register(address, value, device_id=self._unit), address)
+
+    async def _request(self, call: object, address: int) -> ModbusPDU:
+        try:
+            async with asyncio.timeout(self._timeout_s + 0.2):
+                answer: ModbusPDU = await call  # type: ignore[misc]  # pymodbus types its calls as T of a mixin
+        except TimeoutError:
+            raise self._silent(address) from None
+        except ModbusException as error:
+            if not self.connected:
+                raise ConnectError(
+                    self.name, f"the connection to the Modbus sensor {self._where} is gone; check its supply and cable"
+                ) from error
+            raise self._silent(address) from error
+        if answer.isError():
+            code = int(answer.exception_code)
+            what = EXCEPTIONS.get(code, f"exception {code}")
+            raise ModbusRefused(
+                self.name, f"register {address} is refused ({what}); compare the register map with the config", code
+            )
+        return answer
+
+    def _silent(self, address: int) -> DeviceError:
+        # a late answer must not be taken for the next one's: the connection is made anew
+        self._client.close()
+        return DeviceTimeout(
+            self.name,
+            f"register {address} was not answered within {self._timeout_s:g} s; check the sensor and its line",
+        )
+
+    def close(self) -> None:
+        """End the connection."""
+        self._client.close()

@@ -1,0 +1,122 @@
+"""What the nodes say about themselves: EMCY, boot-up, heartbeat, NMT state. Pure: ``now_ns`` comes from the caller.
+
+The frames are read here and not by the canopen library, which drops an EMCY shorter than 8 bytes, never notices a
+heartbeat that stops, and believes an NMT command as soon as it is sent.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from fdhil.cia402 import COB_EMCY, COB_HEARTBEAT, Nmt
+from fdhil.drivers.frames import Frames
+from fdhil.records import Notice
+
+_MAX_EMCY_CODES = 32
+_HEARTBEATS_TO_LEARN = 3
+_NMT_STATES = frozenset(int(state) for state in Nmt)
+
+# error classes of CiA 301, 7.2.7.1
+_EMCY_CLASS = {
+    0x10: "generic error",
+    0x20: "current",
+    0x30: "voltage",
+    0x40: "temperature",
+    0x50: "device hardware",
+    0x60: "device software",
+    0x70: "additional modules",
+    0x80: "monitoring",
+    0x90: "external error",
+    0xF0: "additional functions",
+    0xFF: "device specific",
+}
+_EMCY_TEXT = {
+    0x8110: "CAN overrun",
+    0x8120: "CAN in error passive mode",
+    0x8130: "heartbeat or life guarding lost",
+    0x8140: "recovered from bus-off",
+    0x8150: "COB-ID collision",
+    0x8210: "PDO not processed, too short",
+    0x8220: "PDO too long",
+    0x8611: "following error",
+}
+
+
+def emcy_text(code: int) -> str:
+    """Return what an EMCY code means (CiA 301, table 26).
+
+    >>> emcy_text(0x8611)
+    'following error'
+    """
+    if code in _EMCY_TEXT:
+        return _EMCY_TEXT[code]
+    high = code >> 8
+    return _EMCY_CLASS.get(high, _EMCY_CLASS.get(high & 0xF0, "unknown"))
+
+
+class NodeWatch:
+    """Watches one node; ``feed`` returns edge-triggered notices."""
+
+    def __init__(self, axis: str, node_id: int) -> None:
+        self._axis = axis
+        self._node_id = node_id
+        self.nmt: Nmt | None = None
+        self.emcy_count = 0
+        self.boots = 0
+        self._codes: set[int] = set()
+        self._beats: list[int] = []
+        self._lost = False
+
+    def feed(self, frames: Frames, now_ns: int) -> list[Notice]:
+        """Take a block of frames; ``now_ns`` is the host's monotonic time."""
+        notices = []
+        for frame in frames[frames["id"] == COB_EMCY + self._node_id]:
+            notices += self._emergency(int(frame["dlc"]), int(frame["data"]))
+        for frame in frames[frames["id"] == COB_HEARTBEAT + self._node_id]:
+            notices += self._heartbeat(int(frame["data"]) & 0x7F, int(frame["t_ns"]))
+        return notices + self._silence(now_ns)
+
+    def _notice(self, code: str, severity: Literal["info", "minor", "MAJOR"], text: str) -> Notice:
+        return Notice(code, severity, f"Drive {self._axis} {text}", self._axis)
+
+    def _emergency(self, length: int, data: int) -> list[Notice]:
+        """One notice per code; a flood is counted, not repeated."""
+        self.emcy_count += 1
+        code = data & 0xFFFF if length >= 2 else 0x1000
+        if code >> 8 == 0:
+            self._codes.clear()
+            return [self._notice("DriveEmergency", "info", "reports that its error is gone.")]
+        if code in self._codes or len(self._codes) >= _MAX_EMCY_CODES:
+            return []
+        self._codes.add(code)
+        detail = (data & (1 << 8 * length) - 1).to_bytes(8, "little")[:length].hex(" ")
+        text = f"reports error {code:04X} ({emcy_text(code)}; {detail}); look it up in the drive's manual."
+        return [self._notice("DriveEmergency", "MAJOR", text)]
+
+    def _heartbeat(self, state: int, t_ns: int) -> list[Notice]:
+        notices = []
+        if state == Nmt.BOOT_UP:
+            self.boots += 1
+            self._beats = []
+            text = "booted, its offset and set-up are unknown; check its supply and commission it again."
+            notices.append(self._notice("NodeRebooted", "MAJOR", text))
+        elif self.nmt is Nmt.OPERATIONAL and state != Nmt.OPERATIONAL:
+            text = "left the NMT state Operational, it takes no set-points; see what the NC did."
+            notices.append(self._notice("NmtStateWrong", "MAJOR", text))
+        if self._lost:
+            self._lost, self._beats = False, []
+            notices.append(self._notice("HeartbeatLost", "info", "sends its heartbeat again."))
+        self._beats = [*self._beats, t_ns][-_HEARTBEATS_TO_LEARN - 1 :]
+        self.nmt = Nmt(state) if state in _NMT_STATES else self.nmt
+        return notices
+
+    def _silence(self, now_ns: int) -> list[Notice]:
+        """Three learned periods and 0.1 s without a heartbeat are silence; a drive that sends none is not judged."""
+        if self._lost or len(self._beats) <= _HEARTBEATS_TO_LEARN:
+            return []
+        period_ns = (self._beats[-1] - self._beats[0]) / _HEARTBEATS_TO_LEARN
+        if now_ns - self._beats[-1] <= 3 * period_ns + 100_000_000:
+            return []
+        self._lost = True
+        text = "sends no heartbeat any more and may be dead; check its supply and the bus."
+        return [self._notice("HeartbeatLost", "MAJOR", text)]

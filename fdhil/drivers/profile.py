@@ -1,0 +1,119 @@
+"""What must be known of a drive model, as data: its PDOs, which object carries which signal, and in which unit.
+
+A new vendor is a new module in ``profiles`` with one ``PROFILE`` and a line in ``tables.DRIVE_PROFILES``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from fdhil import tables
+from fdhil.cia402 import PdoEntry, lay_out, pdo_length
+from fdhil.config import Axis
+
+ObjectKey = tuple[int, int]
+"""Index and sub-index."""
+
+
+@dataclass(frozen=True, slots=True)
+class PdoSpec:
+    """One PDO: its COB-ID is ``cob_base`` + node-ID; it comes with every ``every_sync``-th SYNC.
+
+    ``number`` is its place in the communication parameters (1 -> 0x1400/0x1800). ``valid`` is False when the drive's
+    default has bit 31 of the COB-ID set: mapped, but not exchanged.
+    """
+
+    name: str
+    number: int
+    cob_base: int
+    entries: tuple[PdoEntry, ...]
+    every_sync: int = 1
+    valid: bool = True
+
+    @property
+    def length(self) -> int:
+        """Data bytes of a complete frame."""
+        return pdo_length(self.entries)
+
+    def entry(self, key: ObjectKey) -> PdoEntry | None:
+        """Return the entry that maps ``key``, or None."""
+        return next((e for e in self.entries if (e.index, e.sub) == key), None)
+
+
+def pdo(
+    name: str, cob_base: int, entries: Sequence[tuple[int, int, int, bool]], every_sync: int = 1, valid: bool = True
+) -> PdoSpec:
+    """Build a PdoSpec; the number is the name's last character, entries are (index, sub, bits, signed)."""
+    return PdoSpec(name, int(name[-1]), cob_base, lay_out(entries), every_sync, valid)
+
+
+@dataclass(frozen=True, slots=True)
+class DriveProfile:
+    """A drive model: mapping, signals and units.
+
+    ``voltage`` is the object of the terminal voltage, None when the drive has none; ``voltage_v_per_count`` its scale.
+    ``speed_unit`` and ``current_unit`` say what 606C and the current object count in. ``strict_abort_options`` are
+    the values of 0x6007 that stop the drive when communication is lost. ``vendor_id`` and ``product_code`` None: any.
+    """
+
+    name: str
+    rpdos: tuple[PdoSpec, ...]
+    tpdos: tuple[PdoSpec, ...]
+    target: ObjectKey = (0x607A, 0)
+    offset: ObjectKey = (0x60B0, 0)
+    position: ObjectKey = (0x6064, 0)
+    speed: ObjectKey = (0x606C, 0)
+    current: ObjectKey = (0x6078, 0)
+    statusword: ObjectKey = (0x6041, 0)
+    position_demand: ObjectKey = (0x6062, 0)
+    digital_inputs: ObjectKey = (0x60FD, 0)
+    voltage: ObjectKey | None = None
+    voltage_v_per_count: float = 0.0
+    speed_unit: Literal["increments_per_s", "rpm", "millirpm"] = "increments_per_s"
+    current_unit: Literal["permille_of_rated", "mA"] = "permille_of_rated"
+    temperature: ObjectKey | None = None
+    temperature_c_per_count: float = 0.01
+    strict_abort_options: tuple[int, ...] = (1, 3)
+    vendor_id: int | None = None
+    product_code: int | None = None
+
+    def find_tpdo(self, key: ObjectKey) -> tuple[PdoSpec, PdoEntry] | None:
+        """Return the TPDO and entry that carry ``key``, or None."""
+        return _find(self.tpdos, key)
+
+    def find_rpdo(self, key: ObjectKey) -> tuple[PdoSpec, PdoEntry] | None:
+        """Return the RPDO and entry that carry ``key``, or None."""
+        return _find(self.rpdos, key)
+
+    def speed_rad_s_per_count(self, axis: Axis) -> float:
+        """Scale of the speed object, the axis' sign included."""
+        per_count = {
+            "increments_per_s": 2 * math.pi / axis.drive.increments_per_rev,
+            "rpm": 2 * math.pi / 60,
+            "millirpm": 2 * math.pi / 60_000,
+        }[self.speed_unit]
+        return axis.drive.sign * per_count
+
+    def current_a_per_count(self, axis: Axis) -> float:
+        """Scale of the current object, the axis' sign included."""
+        per_count = axis.drive.rated_current_a / 1000 if self.current_unit == "permille_of_rated" else 1e-3
+        return axis.drive.sign * per_count
+
+
+def _find(pdos: Sequence[PdoSpec], key: ObjectKey) -> tuple[PdoSpec, PdoEntry] | None:
+    for spec in pdos:
+        entry = spec.entry(key)
+        if entry is not None:
+            return spec, entry
+    return None
+
+
+def load_profile(name: str) -> DriveProfile:
+    """Return the profile that ``tables.DRIVE_PROFILES`` lists under ``name``."""
+    profile = tables.load(tables.DRIVE_PROFILES, name)
+    if not isinstance(profile, DriveProfile):
+        raise TypeError(f"{tables.DRIVE_PROFILES[name]} is no DriveProfile")
+    return profile

@@ -1,0 +1,1 @@
+"""Drive models, one module each with a ``PROFILE``."""

@@ -1,0 +1,65 @@
+"""Host time against SYNC count, from the arrivals of SYNC. Pure."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fdhil.records import Float, TickTimes
+
+KEPT_TICKS = 8192
+_STALE_TICKS = 50.0
+
+
+class TickClock:
+    """The newest arrivals of SYNC; between two of them time is linear, so a producer that was held up bends nothing."""
+
+    def __init__(self, sync_period_s: float) -> None:
+        self.period_ns = sync_period_s * 1e9
+        self._tick = np.empty(0, np.int64)
+        self._t_ns = np.empty(0, np.int64)
+
+    def add(self, times: TickTimes) -> None:
+        """Append arrivals; a count that began anew forgets the old one."""
+        if times.tick.size == 0:
+            return
+        if self._tick.size and times.tick[0] <= self._tick[-1]:
+            self._tick, self._t_ns = self._tick[:0], self._t_ns[:0]
+        self._tick = np.concatenate([self._tick, times.tick])[-KEPT_TICKS:]
+        self._t_ns = np.concatenate([self._t_ns, times.t_ns])[-KEPT_TICKS:]
+
+    @property
+    def running(self) -> bool:
+        """Whether there is a SYNC count at all."""
+        return self._tick.size > 1
+
+    @property
+    def newest_tick(self) -> int:
+        """The newest tick, 0 before the first."""
+        return int(self._tick[-1]) if self._tick.size else 0
+
+    def covers(self, t_ns: int) -> bool:
+        """Whether SYNCs up to host time ``t_ns`` are known."""
+        return self._t_ns.size > 0 and int(self._t_ns[-1]) >= t_ns
+
+    def bounds(self, from_ns: int, to_ns: int) -> tuple[float, float] | None:
+        """Return fractional ticks that surely enclose the span; None when SYNC does not run at that time.
+
+        A span that ends after the newest SYNC is carried on at the nominal period, as far as the SYNC is not overdue.
+        """
+        if not self.running or from_ns < self._t_ns[0] or to_ns - self._t_ns[-1] > _STALE_TICKS * self.period_ns:
+            return None
+        low, high = (self._tick_at(t) for t in (from_ns, to_ns))
+        return low, high
+
+    def _tick_at(self, t_ns: int) -> float:
+        beyond = t_ns - int(self._t_ns[-1])
+        if beyond > 0:
+            return float(self._tick[-1] + beyond / self.period_ns)
+        return float(np.interp(t_ns, self._t_ns, self._tick))
+
+    def time_ns(self, tick: Float) -> Float:
+        """Return the host time (n,) of fractional ticks (n,), carried on at the nominal period at both ends."""
+        inside = np.interp(tick, self._tick, self._t_ns)
+        before = np.minimum(tick - self._tick[0], 0) * self.period_ns
+        after = np.maximum(tick - self._tick[-1], 0) * self.period_ns
+        return np.asarray(inside + before + after, dtype=np.float64)
