@@ -1,0 +1,185 @@
+"""The power state machine of CiA 402-2: controlword in, state out, with the option codes for every kind of stop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import Enum, auto
+
+
+class State(Enum):
+    """The states; the value is the statusword's pattern in bits 0-3, 5 and 6."""
+
+    NOT_READY = 0x00
+    SWITCH_ON_DISABLED = 0x40
+    READY = 0x21
+    SWITCHED_ON = 0x23
+    OPERATION_ENABLED = 0x27
+    QUICK_STOP_ACTIVE = 0x07
+    FAULT_REACTION_ACTIVE = 0x0F
+    FAULT = 0x08
+
+
+class Ramp(Enum):
+    """How the drive comes to rest before it changes its state."""
+
+    SLOW_DOWN = 0x6084
+    QUICK_STOP = 0x6085
+
+
+class _Command(Enum):
+    SHUTDOWN = auto()
+    SWITCH_ON = auto()  # from Operation enabled: disable operation
+    ENABLE = auto()
+    DISABLE_VOLTAGE = auto()
+    QUICK_STOP = auto()
+
+
+_S, _C = State, _Command
+# transitions without a stop, numbers of CiA 402-2 figure 3: 2, 3, 7, 4, 6, 10, 9, 12
+_PLAIN = {
+    (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN): _S.READY,
+    (_S.READY, _C.SWITCH_ON): _S.SWITCHED_ON,
+    (_S.READY, _C.ENABLE): _S.SWITCHED_ON,
+    (_S.READY, _C.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,
+    (_S.READY, _C.QUICK_STOP): _S.SWITCH_ON_DISABLED,
+    (_S.SWITCHED_ON, _C.ENABLE): _S.OPERATION_ENABLED,
+    (_S.SWITCHED_ON, _C.SHUTDOWN): _S.READY,
+    (_S.SWITCHED_ON, _C.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,
+    (_S.SWITCHED_ON, _C.QUICK_STOP): _S.SWITCH_ON_DISABLED,
+    (_S.OPERATION_ENABLED, _C.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,
+    (_S.QUICK_STOP_ACTIVE, _C.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,
+}
+_QUICK_STOP_CODES = frozenset({0, 1, 2, 5, 6})
+
+
+def _decode(word: int) -> _Command | None:
+    if word & 0x80:
+        return None
+    if not word & 0x02:
+        return _C.DISABLE_VOLTAGE
+    if not word & 0x04:
+        return _C.QUICK_STOP
+    if not word & 0x01:
+        return _C.SHUTDOWN
+    return _C.ENABLE if word & 0x08 else _C.SWITCH_ON
+
+
+class PowerStage:
+    """The state, and the ramp on the way to the next one.
+
+    ``option`` returns the value of an option code object (0x605A, 0x605B, 0x605C, 0x605E). ``ramp`` is set while the
+    drive must slow down by itself; the drive calls :meth:`at_rest` when its demand stands still.
+    """
+
+    def __init__(self, option: Callable[[int], int]) -> None:
+        self._option = option
+        self.state = State.NOT_READY
+        self.ramp: Ramp | None = None
+        self._after_ramp = State.SWITCH_ON_DISABLED
+        self._last_word: int | None = None
+        self._stopped_by_word: int | None = None  # transition 16 needs another word than the one at the quick stop
+
+    def start(self) -> None:
+        """Transitions 0 and 1: power-on and self-test."""
+        self._enter(State.SWITCH_ON_DISABLED)
+        self._last_word = None
+
+    @property
+    def powered(self) -> bool:
+        """Whether current flows."""
+        return self.state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
+
+    @property
+    def follows(self) -> bool:
+        """Whether the drive follows the set-points it is given."""
+        return self.state is State.OPERATION_ENABLED and self.ramp is None
+
+    def control(self, word: int) -> bool:
+        """Evaluate a controlword (a level: it may be given again and again); True when a fault was reset."""
+        rising_reset = word & 0x80 and (self._last_word is None or not self._last_word & 0x80)
+        self._last_word = word
+        if self.state is State.FAULT:
+            if rising_reset:
+                self._enter(State.SWITCH_ON_DISABLED)
+                return True
+            return False
+        command = _decode(word)
+        while command is not None and self._follow(command, word):
+            pass
+        return False
+
+    def _follow(self, command: _Command, word: int) -> bool:
+        """Make one transition; False when the command asks for none."""
+        target = _PLAIN.get((self.state, command))
+        if target is not None:
+            self._enter(target)
+            return True
+        if self.state is State.OPERATION_ENABLED:
+            self._stop_operation(command, word)
+        elif (
+            self.state is State.QUICK_STOP_ACTIVE
+            and command is _C.ENABLE
+            and self._option(0x605A) >= 5
+            and word != self._stopped_by_word
+        ):
+            self._enter(State.OPERATION_ENABLED)
+        return False
+
+    def _stop_operation(self, command: _Command, word: int) -> None:
+        if command is _C.ENABLE:
+            self.ramp = None  # a stop that was under way is taken back
+        elif command is _C.QUICK_STOP:
+            self.quick_stop(word)
+        elif self.ramp is None:
+            option, target = (0x605B, State.READY) if command is _C.SHUTDOWN else (0x605C, State.SWITCHED_ON)
+            if self._option(option) == 0:
+                self._enter(target)
+            else:
+                self.ramp, self._after_ramp = Ramp.SLOW_DOWN, target
+
+    def quick_stop(self, word: int | None = None) -> None:
+        """Transition 11, by controlword or by the abort connection option."""
+        if self.state is not State.OPERATION_ENABLED:
+            return
+        code = self._option(0x605A)
+        if code == 0:
+            self._enter(State.SWITCH_ON_DISABLED)
+            return
+        self._enter(State.QUICK_STOP_ACTIVE)
+        self._stopped_by_word = self._last_word if word is None else word
+        self.ramp = Ramp.SLOW_DOWN if code in (1, 5) else Ramp.QUICK_STOP
+        self._after_ramp = State.QUICK_STOP_ACTIVE if code >= 5 else State.SWITCH_ON_DISABLED
+
+    def disable_voltage(self) -> None:
+        """Transitions 7, 9, 10 and 12 by the drive itself."""
+        if self.state not in (State.FAULT, State.FAULT_REACTION_ACTIVE, State.NOT_READY):
+            self._enter(State.SWITCH_ON_DISABLED)
+
+    def fault(self) -> None:
+        """Transitions 13 and 14: react by 0x605E, at once when no current flows."""
+        if self.state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+            return
+        code = self._option(0x605E)
+        if not self.powered or code == 0:
+            self._enter(State.FAULT)
+            return
+        self._enter(State.FAULT_REACTION_ACTIVE)
+        self.ramp = Ramp.SLOW_DOWN if code == 1 else Ramp.QUICK_STOP
+        self._after_ramp = State.FAULT
+
+    def at_rest(self) -> None:
+        """The ramp has brought the demand to rest."""
+        if self.ramp is None:
+            return
+        if self.state is State.QUICK_STOP_ACTIVE and self._after_ramp is State.QUICK_STOP_ACTIVE:
+            return  # option codes 5 and 6 hold the position in Quick stop active
+        self._enter(self._after_ramp)
+
+    def _enter(self, state: State) -> None:
+        self.state = state
+        self.ramp = None
+
+
+def known_quick_stop_code(code: int) -> bool:
+    """Whether 0x605A may hold ``code``: disable, slow-down or quick-stop ramp, and both with staying in the state."""
+    return code in _QUICK_STOP_CODES

@@ -1,0 +1,103 @@
+"""What the drive's sensors report: white noise, resolution, and the faults that a test or a fault script orders."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fdhil.config import Noise
+
+SIGNALS = ("position", "speed", "current", "voltage")
+_BLOCK = 1024
+
+
+@dataclass(slots=True)
+class SignalFault:
+    """What is wrong with one reported signal, in its own unit (increments, rad/s, A, V); applied in this order.
+
+    ``delay_cycles``: slow. ``gain``, ``offset``: wrong. ``clip``: saturates at +-clip. ``resolution``: coarse.
+    ``garbage``: random values of up to +-``garbage``. ``stuck``: the last value for ever.
+    """
+
+    delay_cycles: int = 0
+    gain: float = 1.0
+    offset: float = 0.0
+    clip: float | None = None
+    resolution: float = 0.0
+    garbage: float = 0.0
+    stuck: bool = False
+    _late: deque[float] = field(default_factory=deque, repr=False)
+    _held: float | None = field(default=None, repr=False)
+
+    def apply(self, value: float, rng: np.random.Generator) -> float:
+        """Return what is reported for ``value``."""
+        if self.delay_cycles:
+            self._late.append(value)
+            value = self._late[0]
+            while len(self._late) > self.delay_cycles:
+                self._late.popleft()
+        value = value * self.gain + self.offset
+        if self.clip is not None:
+            value = min(max(value, -self.clip), self.clip)
+        if self.resolution:
+            value = round(value / self.resolution) * self.resolution
+        if self.garbage:
+            value = float(rng.uniform(-self.garbage, self.garbage))
+        if not self.stuck:
+            self._held = None
+        elif self._held is None:
+            self._held = value
+        return value if self._held is None else self._held
+
+
+@dataclass(slots=True)
+class DriveFaults:
+    """The mutable fault state of one drive; what is left at its default does no harm.
+
+    ``signals`` maps position, speed, current or voltage to a :class:`SignalFault`. ``drop_tpdo`` maps a TPDO number to
+    the frames still to be lost (-1: all). ``ignore_offset``: writes to 0x60B0 are lost. ``offset_scale``: the offset
+    acts this many times. ``not_csp``: 0x6061 shows profile position and the set-points are not followed.
+    ``no_heartbeat_consumer``: 0x1016 does nothing. ``load_torque_nm``: Tl, in the drive's direction.
+    """
+
+    signals: dict[str, SignalFault] = field(default_factory=dict)
+    drop_tpdo: dict[int, int] = field(default_factory=dict)
+    ignore_offset: bool = False
+    offset_scale: float = 1.0
+    not_csp: bool = False
+    no_heartbeat_consumer: bool = False
+    load_torque_nm: float = 0.0
+
+    def signal(self, name: str) -> SignalFault:
+        """Return the fault of a signal, made when there is none yet; KeyError for a name that is not in SIGNALS."""
+        if name not in SIGNALS:
+            raise KeyError(name)
+        return self.signals.setdefault(name, SignalFault())
+
+
+class Sensors:
+    """Adds white noise to voltage, current and speed, drawn from ``rng`` in blocks: one row per sample, used or not."""
+
+    def __init__(self, noise: Noise, faults: DriveFaults, rng: np.random.Generator) -> None:
+        self._std = np.array([noise.voltage_v, noise.current_a, noise.speed_rad_s])
+        self._faults = faults
+        self._rng = rng
+        self._rows: list[list[float]] = []
+
+    def read(self, position: float, speed: float, current: float, voltage: float) -> tuple[float, float, float, float]:
+        """Return what is reported: increments, rad/s, A, V."""
+        if not self._rows:
+            self._rows = (self._rng.standard_normal((_BLOCK, 3)) * self._std).tolist()
+        noise = self._rows.pop()
+        speed, current, voltage = speed + noise[2], current + noise[1], voltage + noise[0]
+        faults = self._faults.signals
+        if not faults:
+            return position, speed, current, voltage
+        true = (position, speed, current, voltage)
+        reported = [
+            faults[name].apply(value, self._rng) if name in faults else value
+            for name, value in zip(SIGNALS, true, strict=True)
+        ]
+        return reported[0], reported[1], reported[2], reported[3]
