@@ -1,0 +1,67 @@
+"""The command line as a whole: the list of commands, exit codes, and no traceback for wrong input."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from importlib import import_module
+
+import click
+import pytest
+
+from fdhil.cli.main import COMMANDS, cli, run_safely
+from fdhil.errors import ConfigError, ConfigFault, ConnectError
+
+
+def fdhil(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "fdhil", *arguments], capture_output=True, text=True, timeout=60)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_is_there_and_explains_itself(name: str) -> None:
+    module, _, attribute = COMMANDS[name][0].partition(":")
+    command = getattr(import_module(module), attribute)
+    assert isinstance(command, click.Command)
+    text = command.get_help(click.Context(command, info_name=name))
+    assert len(text.splitlines()) > 5
+    assert command.help
+
+
+def test_help_imports_no_numerics() -> None:
+    code = "import sys; from fdhil.cli.main import cli; cli.main(['--help'], standalone_mode=False); print(sorted(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert "Commands:" in done.stdout
+    for heavy in ("numpy", "scipy", "numba", "pyarrow", "canopen", "pymodbus", "pydantic", "rich"):
+        assert f"'{heavy}'" not in done.stdout
+
+
+def test_an_unknown_command_and_option_are_usage_errors() -> None:
+    assert fdhil("identfy").returncode == 2
+    done = fdhil("predict", "--no-such-option")
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+
+
+def test_errors_are_sentences_with_their_exit_code(capsys: pytest.CaptureFixture[str]) -> None:
+    @click.command()
+    def broken() -> None:
+        raise ConnectError("can0", "is not there; bring it up with `ip link set can0 up`")
+
+    @click.command()
+    def misconfigured() -> None:
+        raise ConfigError("machine.toml", [ConfigFault("axis.X", "is missing"), ConfigFault("nc", "is no table")])
+
+    argv, sys.argv = sys.argv, ["fdhil"]
+    try:
+        assert run_safely(broken) == 3
+        assert run_safely(misconfigured) == 2
+    finally:
+        sys.argv = argv
+    said = capsys.readouterr().err
+    assert "fdhil: can0: is not there; bring it up" in said
+    assert "axis.X: is missing" in said
+    assert "nc: is no table" in said
+
+
+def test_the_list_is_in_the_order_of_the_workflow() -> None:
+    assert cli.list_commands(click.Context(cli))[:2] == ["demo", "run"]
