@@ -28,11 +28,13 @@ def test_every_command_is_there_and_explains_itself(name: str) -> None:
 
 
 def test_help_imports_no_numerics() -> None:
-    code = "import sys; from fdhil.cli.main import cli; cli.main(['--help'], standalone_mode=False); print(sorted(sys.modules))"
+    code = (
+        "import sys; from fdhil.cli.main import cli; cli.main(['--help'], standalone_mode=False); print(*sys.modules)"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert "Commands:" in done.stdout
     for heavy in ("numpy", "scipy", "numba", "pyarrow", "canopen", "pymodbus", "pydantic", "rich"):
-        assert f"'{heavy}'" not in done.stdout
+        assert heavy not in done.stdout.split()
 
 
 def test_an_unknown_command_and_option_are_usage_errors() -> None:
