@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fdhil.errors import RecordingError
 from fdhil.records import Window
 from fdhil.store.atomic import write_file
 
@@ -15,7 +16,10 @@ COLUMNS = "time_s,voltage_V,current_A,speed_rad_per_s,position_m,demand_m"
 
 
 def csv_lines(window: Window) -> Iterator[str]:
-    """Yield the lines of a recording without line ends; a lost sample is a missing row, which readers see as a gap."""
+    """Yield the lines of a recording without line ends; a lost sample is a missing row, which readers see as a gap.
+
+    RecordingError when the window has no voltage.
+    """
     rapid_m_s = window.rapid_speed_rad_s / (2 * math.pi) * window.pitch_mm / 1000
     headers = {
         "format": "fdhil-recording-1",
@@ -31,10 +35,11 @@ def csv_lines(window: Window) -> Iterator[str]:
     }
     yield from (f"# {key}: {value}" for key, value in headers.items() if value is not None)
     yield COLUMNS
-    voltage_v = np.full(window.n, np.nan) if window.voltage_v is None else window.voltage_v
-    signals = (voltage_v, window.current_a, window.speed_rad_s, window.position_mm / 1000, window.demand_mm / 1000)
-    rows = np.column_stack(signals)
-    for k in np.flatnonzero(np.isfinite(window.speed_rad_s)):
+    if window.voltage_v is None:
+        raise RecordingError("this window has no voltage, which a recording needs; see why the sensor gave none")
+    path_m = (window.position_mm / 1000, window.demand_mm / 1000)
+    rows = np.column_stack((window.voltage_v, window.current_a, window.speed_rad_s, *path_m))
+    for k in np.flatnonzero(np.isfinite(rows).all(axis=1)):
         yield f"{k * window.dt_s:.9g}," + ",".join(repr(float(value)) for value in rows[k])
 
 

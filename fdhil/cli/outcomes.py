@@ -1,0 +1,45 @@
+"""Outcomes as JSON documents, values to full precision."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from fdhil.daemon.status import parameters_status
+from fdhil.records import UNITS, Notice, Outcome, ParameterSet, Skill, WindowOutcome
+from fdhil.store.history import described
+
+
+def as_document(outcome: Outcome) -> dict[str, Any]:
+    """Return an outcome as JSON has it; ``kind`` is window, parameters, skill or notice."""
+    if isinstance(outcome, WindowOutcome):
+        return _window(outcome)
+    if isinstance(outcome, ParameterSet):
+        return {
+            "kind": "parameters",
+            "axis": outcome.axis,
+            "revision": outcome.revision,
+            "windows_used": outcome.windows,
+            "tick": outcome.tick,
+            "temperature_c": outcome.temperature_c,
+            "parameters": parameters_status(outcome),
+        }
+    assert isinstance(outcome, Skill | Notice)
+    return {"kind": "skill" if isinstance(outcome, Skill) else "notice", **asdict(outcome)}
+
+
+def _window(outcome: WindowOutcome) -> dict[str, Any]:
+    window, verdict = outcome.window, outcome.verdict
+    return {
+        "kind": "window",
+        "axis": window.axis,
+        "start_s": window.start_s,
+        "end_s": window.start_s + window.n * window.dt_s,
+        "start_tick": window.start_tick,
+        "direction": window.direction,
+        "validated": verdict.accepted,
+        "fit_percent": verdict.fit_percent,
+        "reasons": [str(reason) for reason in verdict.reasons],
+        "method": outcome.estimate and outcome.estimate.method,
+        "parameters": {name: told | {"unit": UNITS[name]} for name, told in described(outcome).items()},
+    }

@@ -1,0 +1,174 @@
+"""``fdhil replay``, ``history``, ``report`` and ``export``: what was recorded, again."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fdhil import config as machine_config
+from fdhil import tables
+from fdhil.errors import RecordingError
+
+if TYPE_CHECKING:
+    from fdhil.records import Outcome, Window
+    from fdhil.store.history import Revision
+
+AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
+FILE = click.Path(path_type=Path)
+
+
+@click.command()
+@click.argument("recordings", type=FILE, nargs=-1, required=True, metavar="RECORDING...")
+@click.option("--config", "config", type=FILE, help="The machine's config; left out: what the recordings say.")
+@click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Left out: the config's, else the best.")
+@AS_JSON
+def replay(recordings: tuple[Path, ...], config: Path | None, method: str | None, as_json: bool) -> None:
+    """Analyse recorded windows (.parquet) or recordings (.csv) again, bit by bit as the daemon did.
+
+    Windows of one axis are fed in the order given, so that a pool of them is repeated too. Exit 1 when a window is not
+    validated, or there is none.
+    """
+    machine = machine_config.load(config) if config else None
+    from fdhil.cli.outcomes import as_document
+    from fdhil.daemon.journal import line_of
+
+    files = []
+    validated = True
+    for path, outcomes in _replayed(recordings, machine, method):
+        documents = [as_document(outcome) for outcome in outcomes]
+        windows = [document for document in documents if document["kind"] == "window"]
+        validated &= bool(windows) and all(document["validated"] for document in windows)
+        files.append({"file": str(path), "outcomes": documents})
+        for outcome in () if as_json else outcomes:
+            click.echo(line_of(outcome)[0])
+        if not windows and not as_json:
+            click.echo(f"{path}: NoWindow: there is no rapid move in it")
+    if as_json:
+        click.echo(json.dumps({"schema": "fdhil-replay-1", "validated": validated, "files": files}))
+    if not validated:
+        click.get_current_context().exit(1)
+
+
+def _replayed(
+    recordings: tuple[Path, ...], machine: machine_config.MachineConfig | None, method: str | None
+) -> list[tuple[Path, list[Outcome]]]:
+    from fdhil.pipeline import AxisPipeline
+
+    pipelines: dict[str, AxisPipeline] = {}
+    replayed: list[tuple[Path, list[Outcome]]] = []
+    for path in recordings:
+        outcomes: list[Outcome] = []
+        for window in read_windows(path):
+            if window.axis not in pipelines:
+                settings = machine or _config_of(window)
+                if window.axis not in settings.axis:
+                    raise RecordingError(f"{path} is of axis {window.axis}, which --config does not have; use its own")
+                pipelines[window.axis] = AxisPipeline(window.axis, settings, method)
+            outcomes += pipelines[window.axis].feed(window)
+        replayed.append((path, outcomes))
+    return replayed
+
+
+def read_windows(path: Path) -> list[Window]:
+    """Return the windows of a stored window (.parquet) or of a recording (.csv). RecordingError when it is neither."""
+    if path.suffix == ".parquet":
+        from fdhil.store.windows import read_window
+
+        return [read_window(path)]
+    from fdhil.identification.windows import find_windows
+    from fdhil.store.recording_csv import read_recording
+
+    return find_windows(read_recording(path))
+
+
+def _config_of(window: Window) -> machine_config.MachineConfig:
+    """Return a config with what a window says of its axis; what it cannot say is not used in a replay."""
+    unknown = dict.fromkeys(("R", "L", "K", "Jt", "ft", "Cd"), 1.0)
+    gains = ("position_gain_per_s", "speed_kp", "speed_ki", "current_kp", "current_ki")
+    regulators = dict.fromkeys((*gains, "current_limit_a", "voltage_limit_v"), 1.0)
+    axis = {
+        "screw_pitch_mm": window.pitch_mm,
+        "rapid_speed_mm_s": abs(window.rapid_speed_rad_s) * window.pitch_mm / 6.283185307179586,
+        "max_acceleration_mm_s2": 1.0,
+        "nominal": unknown,
+        "regulators": regulators,
+    }
+    machine = {"name": "replay", "sync_period_s": min(window.dt_s, 0.02)}
+    return machine_config.parse({"machine": machine, "axis": {window.axis: axis}}, "recording")
+
+
+@click.command()
+@click.argument("config", type=FILE)
+@click.option("--axis", help="One axis only.")
+@click.option("--plot", type=FILE, help="Also write the courses of the parameters as a PNG.")
+@AS_JSON
+def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) -> None:
+    """Show how the identified parameters of CONFIG's machine moved."""
+    machine = machine_config.load(config)
+    rows = _revision_rows(machine, axis)
+    if plot is not None:
+        from fdhil.cli.history_plot import write_plot
+
+        write_plot(rows, plot)
+    if as_json:
+        click.echo(json.dumps({"schema": "fdhil-history-1", "revisions": rows}))
+        return
+    if not rows:
+        click.echo("no parameters were published yet")
+        return
+    from fdhil.cli.status_view import show_history
+
+    show_history(rows)
+
+
+def _revision_rows(machine: machine_config.MachineConfig, axis: str | None) -> list[dict[str, Any]]:
+    from fdhil.store.history import History
+
+    with History.read(machine.store.directory) as stored:
+        return [_row(revision) for revision in stored.revisions(axis)]
+
+
+def _row(revision: Revision) -> dict[str, Any]:
+    from fdhil.daemon.status import parameters_status
+
+    published = revision.set
+    return {
+        "axis": published.axis,
+        "revision": published.revision,
+        "time": datetime.fromtimestamp(revision.stamp.wall_s, UTC).isoformat(timespec="seconds"),
+        "tick": published.tick,
+        "temperature_c": published.temperature_c,
+        "windows_used": published.windows,
+        "window_ids": list(revision.window_ids),
+        "config_digest": published.config_digest,
+        "parameters": parameters_status(published),
+    }
+
+
+@click.command()
+@click.argument("recording", type=FILE)
+@click.option("--out", required=True, type=FILE, help="The CSV file to write.")
+def export(recording: Path, out: Path) -> None:
+    """Write a stored window (.parquet) as CSV of the recording format."""
+    from fdhil.store.export import export_csv
+    from fdhil.store.windows import read_window
+
+    window = read_window(recording)
+    if out.exists() and out.samefile(recording):
+        raise click.UsageError("--out is the recording itself; choose another name")
+    export_csv(window, out)
+
+
+@click.command()
+@click.argument("config", type=FILE)
+@click.option("--out", required=True, type=FILE, help="The HTML file to write.")
+def report(config: Path, out: Path) -> None:
+    """Write an HTML report of the stored history of CONFIG's machine."""
+    machine = machine_config.load(config)
+    from fdhil.cli.history_report import write_report
+
+    write_report(machine, _revision_rows(machine, None), out)

@@ -1,0 +1,125 @@
+"""The control socket: one JSON object per line and request, one per answer, over a UNIX socket.
+
+A request is {"request": "status" | "arm" | "disarm" | "stop", ...}; an answer is {"ok": true, ...} or
+{"ok": false, "code", "text", "advice"}. The socket is mode 0600: who may open it may read; arming needs the token.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import socket
+import stat
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+from fdhil.errors import ConnectError, DeviceTimeout, FdhilError
+
+SOCKET_NAME = "daemon.sock"
+MAX_LINE = 64 * 1024
+MAX_CLIENTS = 16
+IDLE_S = 60.0
+
+Answer = Mapping[str, Any]
+Handler = Callable[[Mapping[str, Any]], Awaitable[Answer]]
+
+
+def refusal(code: str, text: str, advice: str = "") -> Answer:
+    """Return the answer that says no: its class, cause and next action."""
+    return {"ok": False, "code": code, "text": text, "advice": advice}
+
+
+class ControlServer:
+    """Serves requests to ``handle``; each client has its own task, a slow or dead one delays nobody else."""
+
+    def __init__(self, handle: Handler) -> None:
+        self._handle = handle
+        self._clients: set[asyncio.Task[None]] = set()
+        self.refused_clients = 0
+
+    @asynccontextmanager
+    async def serving(self, path: Path) -> AsyncIterator[None]:
+        """Listen at ``path`` (mode 0600) until the block is left; a socket file left by a crash is replaced."""
+        with contextlib.suppress(FileNotFoundError):
+            if stat.S_ISSOCK(path.lstat().st_mode):
+                path.unlink()
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            listener.bind(str(path))
+            path.chmod(0o600)
+        except OSError as error:
+            listener.close()
+            text = f"cannot be opened: {error.strerror or error}; set another [store] run_directory"
+            raise ConnectError(str(path), text) from None
+        server = await asyncio.start_unix_server(self._accept, sock=listener, limit=MAX_LINE)
+        try:
+            yield
+        finally:
+            server.close()
+            for task in list(self._clients):
+                task.cancel()
+            await asyncio.gather(*self._clients, return_exceptions=True)
+            with contextlib.suppress(FileNotFoundError):
+                path.unlink()
+
+    async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if len(self._clients) >= MAX_CLIENTS:
+            self.refused_clients += 1
+            writer.close()
+            return
+        task = asyncio.current_task()
+        assert task is not None
+        self._clients.add(task)
+        try:
+            await self._converse(reader, writer)
+        except (OSError, asyncio.LimitOverrunError, ValueError, TimeoutError):
+            pass  # a client that left, talks too much or never reads loses its connection, nothing else
+        except asyncio.CancelledError:
+            pass  # the daemon stops; the stream's own callback must not see a cancelled task
+        finally:
+            self._clients.discard(task)
+            writer.close()
+
+    async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while line := await asyncio.wait_for(reader.readline(), IDLE_S):
+            answer = await self._answer(line)
+            writer.write(json.dumps(answer).encode() + b"\n")
+            await asyncio.wait_for(writer.drain(), IDLE_S)
+
+    async def _answer(self, line: bytes) -> Answer:
+        try:
+            request = json.loads(line)
+        except (ValueError, RecursionError):
+            return refusal("BadRequest", "the request is no JSON", "send one JSON object per line")
+        if not isinstance(request, dict) or not isinstance(request.get("request"), str):
+            return refusal("BadRequest", "the request has no text under 'request'", "status, arm, disarm or stop")
+        try:
+            return await self._handle(request)
+        except FdhilError as error:
+            return refusal(type(error).__name__, str(error))
+
+
+def ask(path: Path, request: Mapping[str, Any], timeout_s: float = 10.0) -> dict[str, Any]:
+    """Send one request to a running daemon and return its answer (blocking; for the command line).
+
+    ConnectError when no daemon listens, DeviceTimeout when it does not answer.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
+        client.settimeout(timeout_s)
+        try:
+            client.connect(str(path))
+            client.sendall(json.dumps(request).encode() + b"\n")
+            with client.makefile("rb") as lines:
+                line = lines.readline()
+        except TimeoutError:
+            text = f"did not answer within {timeout_s:.0f} s; see its log"
+            raise DeviceTimeout("daemon", text) from None
+        except OSError as error:
+            text = f"is not running ({path}: {error.strerror or error}); start it with `fdhil run CONFIG`"
+            raise ConnectError("daemon", text) from None
+    if not line:
+        raise ConnectError("daemon", "closed the connection without an answer; see its log")
+    return dict(json.loads(line))

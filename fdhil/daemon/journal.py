@@ -1,0 +1,81 @@
+"""One log line per outcome, for a person; under systemd with the priority that the journal understands."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from typing import Literal
+
+from fdhil.records import PARAMETERS, UNITS, Notice, Outcome, ParameterSet, Skill, WindowOutcome
+
+Severity = Literal["info", "minor", "MAJOR"]
+# syslog priorities, see sd-daemon(3)
+_PRIORITY = {"info": 6, "minor": 4, "MAJOR": 3}
+BURST = 20  # lines of one class that are written before a flood of it is only counted
+REFILL_PER_S = 1.0
+
+Log = Callable[[str, Severity], None]
+
+
+def printable(text: str) -> str:
+    """Escape what could steer a terminal or forge a line: names, EMCY texts and file names come from outside."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def write_line(text: str, severity: Severity = "info") -> None:
+    """Write one line to stderr, with a journal prefix when stderr is the journal."""
+    prefix = f"<{_PRIORITY[severity]}>" if os.environ.get("JOURNAL_STREAM") else ""
+    sys.stderr.write(f"{prefix}{printable(text)}\n")
+    sys.stderr.flush()
+
+
+def line_of(outcome: Outcome) -> tuple[str, Severity]:
+    """Return an outcome as one line an operator understands, and how much it matters."""
+    if isinstance(outcome, Notice):
+        axis = f"{outcome.axis}: " if outcome.axis else ""
+        return f"{axis}{outcome.code}: {outcome.text}", outcome.severity
+    if isinstance(outcome, WindowOutcome):
+        return _window_line(outcome), "info"
+    if isinstance(outcome, ParameterSet):
+        return _set_line(outcome), "info"
+    return _skill_line(outcome), "info"
+
+
+def _window_line(outcome: WindowOutcome) -> str:
+    window, verdict = outcome.window, outcome.verdict
+    head = f"{window.axis}: G0 {'+' if window.direction > 0 else '-'} at {window.start_s:.2f} s ({window.n} samples)"
+    fit = "" if verdict.fit_percent is None else f", fit {verdict.fit_percent:.2f} %"
+    if verdict.accepted:
+        return f"{head} accepted{fit}"
+    return f"{head} refused{fit}: " + ("; ".join(str(reason) for reason in verdict.reasons) or "no reason given")
+
+
+def _set_line(published: ParameterSet) -> str:
+    values = (f"{name} {getattr(published.parameters, name):.5g} {UNITS[name]}" for name in PARAMETERS)
+    windows = f"{published.windows} window" + ("" if published.windows == 1 else "s")
+    return f"{published.axis}: parameters, revision {published.revision} from {windows}: " + ", ".join(values)
+
+
+def _skill_line(skill: Skill) -> str:
+    return (
+        f"{skill.axis}: following error of the move at tick {skill.tick} predicted within {skill.rms_um:.2f} um RMS, "
+        f"{skill.max_um:.2f} um at most, of {skill.measured_rms_um:.1f} um RMS"
+    )
+
+
+class FloodGate:
+    """A token bucket per class of line: a flood becomes a few lines and a count (time is an input)."""
+
+    def __init__(self) -> None:
+        self._buckets: dict[str, tuple[float, float, int]] = {}
+
+    def admit(self, code: str, now_s: float) -> int | None:
+        """Return how many lines of this class were held back before this one, or None to hold this one back too."""
+        tokens, then, held = self._buckets.get(code, (float(BURST), now_s, 0))
+        tokens = min(float(BURST), tokens + (now_s - then) * REFILL_PER_S)
+        if tokens < 1.0:
+            self._buckets[code] = (tokens, now_s, held + 1)
+            return None
+        self._buckets[code] = (tokens - 1.0, now_s, 0)
+        return held

@@ -1,0 +1,162 @@
+"""What the daemon keeps of each outcome, and what happens when the disk refuses: a notice, and it goes on in shadow."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+
+from fdhil.config import MachineConfig
+from fdhil.drivers.profile import load_profile
+from fdhil.errors import StoreError
+from fdhil.pipeline import POOL_WINDOWS
+from fdhil.records import Notice, Outcome, ParameterSet, WindowOutcome
+from fdhil.store.history import FILE_NAME, History, Revision, Stamp
+from fdhil.store.windows import RawScale, Scales, WindowStore
+
+WINDOWS_FOLDER = "windows"
+
+
+def boot_id() -> str:
+    """Return the kernel's identifier of this boot; monotonic times compare only within one."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
+    except OSError:
+        return ""
+
+
+def raw_scales(config: MachineConfig, axis: str) -> Scales:
+    """Return how the drive's integers of each column become values: the drivers' own scales, in their own order."""
+    settings = config.axis[axis]
+    profile = load_profile(settings.drive.profile)
+    position = (RawScale(settings.scaling.sign / settings.scaling.increments_per_mm),)
+    voltage = profile.voltage_v_per_count
+    return {
+        "demand_mm": position,
+        "position_mm": position,
+        "speed_rad_s": (RawScale(profile.speed_rad_s_per_count(settings)),),
+        "current_a": (RawScale(profile.current_a_per_count(settings)),),
+        "voltage_v": (RawScale(voltage), RawScale(-voltage)) if voltage else (),
+    }
+
+
+class Keeper:
+    """Writes outcomes to the windows' folder and to the history. Safe to call from several worker threads.
+
+    A store that refuses never stops the daemon: ``fault`` is the class of the refusal (None while all is well), the
+    outcome stays in memory only, and each next one is tried again (a window always as a new file).
+    """
+
+    def __init__(self, config: MachineConfig) -> None:
+        self._config = config
+        self._directory = config.store.directory
+        self._lock = threading.Lock()
+        self._scales = {axis: raw_scales(config, axis) for axis in config.axis}
+        self._boot = boot_id()
+        self._history: History | None = None
+        self._windows: WindowStore | None = None
+        self._pool_ids = {axis: deque[int](maxlen=POOL_WINDOWS) for axis in config.axis}
+        self.fault: str | None = None
+        self.strays: tuple[str, ...] = ()
+
+    def open(self) -> list[Notice]:
+        """Open or create the store; a damaged history is put aside, never deleted. Return what must be told."""
+        notices = []
+        try:
+            self._open()
+        except StoreError as error:
+            if error.code == "CorruptFile":
+                notices += self._put_aside(error)
+            else:
+                notices += self._refused(error)
+        if self.strays:
+            names = ", ".join(self.strays[:5])
+            folder = self._directory / WINDOWS_FOLDER
+            text = f"{len(self.strays)} files in {folder} are no windows and are ignored: {names}."
+            notices.append(Notice("StrayFiles", "minor", text))
+        return notices
+
+    def _open(self) -> None:
+        self._history = History.open(self._directory)
+        folder = self._directory / WINDOWS_FOLDER
+        self._windows = WindowStore(folder, self._config.store.keep_windows, self._config.digest)
+        self.strays = self._windows.strays
+
+    def _put_aside(self, error: StoreError) -> list[Notice]:
+        path = self._directory / FILE_NAME
+        k = 1
+        while (aside := path.with_name(f"{FILE_NAME}.corrupt-{k}")).exists():
+            k += 1
+        try:
+            path.rename(aside)
+            for suffix in ("-wal", "-shm"):  # they belong to the damaged one
+                path.with_name(FILE_NAME + suffix).unlink(missing_ok=True)
+            self._open()
+        except (OSError, StoreError):
+            return self._refused(error)
+        text = f"The history was damaged, it is kept as {aside.name} and a new one was begun; check the disk."
+        return [Notice("CorruptFile", "MAJOR", text)]
+
+    def close(self) -> None:
+        """Close the history."""
+        with self._lock:
+            if self._history is not None:
+                self._history.close()
+                self._history = None
+
+    def newest(self) -> dict[str, Revision]:
+        """Return the newest revision of each axis that the history has."""
+        if self._history is None:
+            return {}
+        found = {}
+        for axis in self._config.axis:
+            for revision in self._history.revisions(axis, limit=1):
+                found[axis] = revision
+        return found
+
+    def counts(self, axis: str) -> tuple[int, int]:
+        """Return how many windows of an axis were ever accepted and refused."""
+        return (0, 0) if self._history is None else self._history.counts(axis)
+
+    def keep(self, outcomes: Sequence[Outcome]) -> list[Notice]:
+        """Store outcomes durably in their order; return a notice when that fails, and one when it works again."""
+        with self._lock:
+            try:
+                if self._history is None or self._windows is None:
+                    self._open()
+                for outcome in outcomes:
+                    self._keep(outcome)
+            except StoreError as error:
+                return self._refused(error)
+            if self.fault is not None and any(isinstance(outcome, WindowOutcome) for outcome in outcomes):
+                self.fault = None
+                text = "The store can be written again; what came in between was not kept, arm again when needed."
+                return [Notice("StoreRecovered", "info", text)]
+        return []
+
+    def _keep(self, outcome: Outcome) -> None:
+        assert self._history is not None
+        assert self._windows is not None
+        stamp = Stamp(time.time(), self._boot, time.monotonic_ns())
+        if isinstance(outcome, WindowOutcome):
+            axis = outcome.window.axis
+            last = self._history.last_window_number()
+            file = self._windows.append(outcome.window, self._scales[axis], last)
+            number = self._history.add_window(outcome, file.path.name, stamp)
+            if outcome.verdict.accepted:
+                self._pool_ids[axis].append(number)
+        elif isinstance(outcome, ParameterSet):
+            ids = list(self._pool_ids[outcome.axis])[-outcome.windows :]
+            self._history.add_revision(outcome, ids, stamp)
+        elif isinstance(outcome, Notice):
+            self._history.add_notice(outcome, stamp)
+        else:
+            self._history.add_skill(outcome, stamp)
+
+    def _refused(self, error: StoreError) -> list[Notice]:
+        again, self.fault = self.fault == error.code, error.code
+        if again:
+            return []
+        return [Notice(error.code, "MAJOR", f"{error}; the daemon goes on in shadow and cannot be armed.")]

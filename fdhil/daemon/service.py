@@ -1,0 +1,266 @@
+"""The daemon: one task group that carries records from the machine to the pipelines, and outcomes to the store.
+
+Sources restart with back-off; a pipeline never does. An unexpected exception in any task ramps the correction down
+(the guard is told to disarm) and ends the process: there is no half-alive daemon. Nothing is ever sent from here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import time
+import traceback
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager
+from typing import Any, Protocol
+
+from fdhil.config import MachineConfig
+from fdhil.daemon import journal
+from fdhil.daemon.control import SOCKET_NAME, Answer, ControlServer, refusal
+from fdhil.daemon.keeping import Keeper
+from fdhil.daemon.lock import sole_owner
+from fdhil.daemon.notify import notify
+from fdhil.daemon.status import Watch
+from fdhil.daemon.warm import warm
+from fdhil.errors import DeviceError, FdhilError
+from fdhil.pipeline import AxisPipeline, Record
+from fdhil.records import Notice, Outcome, TickTimes
+
+QUEUE_RECORDS = 4000  # per axis: more than half a minute of blocks; beyond it the newest are dropped and counted
+NOTICE_QUEUE = 200
+FIRST_RETRY_S = 0.1
+LAST_RETRY_S = 5.0
+WATCHDOG_S = 2.0
+STUCK_S = 60.0  # a batch that is digested for so long hangs
+
+
+class Source(Protocol):
+    """What the daemon needs of a machine: its records in blocks, and what was received and lost."""
+
+    def records(self) -> AsyncIterator[Record | Notice]:
+        """Yield records as they come, until the source ends; DeviceError when a device fails for good."""
+
+    def counters(self) -> Mapping[str, Any]:
+        """Return frames received, lost and the like."""
+
+
+OpenSource = Callable[[MachineConfig], AbstractAsyncContextManager[Source]]
+
+
+class InternalError(FdhilError):
+    """A fault of fdhil itself ended the daemon."""
+
+
+class Service:
+    """One running daemon of one machine."""
+
+    def __init__(self, config: MachineConfig, open_source: OpenSource, method: str | None = None) -> None:
+        self._config = config
+        self._open_source = open_source
+        self._method = method
+        self._run_directory = config.store.run_directory or config.store.directory / "run"
+        self._keeper = Keeper(config)
+        self._watch = Watch(config, time.monotonic())
+        self._pipelines: dict[str, AxisPipeline] = {}
+        self._queues = {axis: asyncio.Queue[Record](QUEUE_RECORDS) for axis in config.axis}
+        self._busy_since_s: dict[str, float] = {}
+        self._dropped = dict.fromkeys(config.axis, 0)
+        self._notices = asyncio.Queue[Notice](NOTICE_QUEUE)
+        self._gate = journal.FloodGate()
+        self._opened = asyncio.Event()
+        self._stop = asyncio.Event()
+        self._source: Source | None = None
+        self._frames_seen = -1
+
+    async def run(self) -> None:
+        """Serve until SIGTERM or SIGINT. BusLocked when another daemon serves this config."""
+        loop = asyncio.get_running_loop()
+        with sole_owner(self._run_directory):
+            for number in (signal.SIGTERM, signal.SIGINT):
+                loop.add_signal_handler(number, self._stop.set)
+            try:
+                await self._serve()
+            finally:
+                notify("STOPPING=1")
+                await asyncio.to_thread(self._keeper.close)
+                for number in (signal.SIGTERM, signal.SIGINT):
+                    loop.remove_signal_handler(number)
+        self._log("stopped, offset 0")
+
+    async def _serve(self) -> None:
+        self._say(await asyncio.to_thread(self._keeper.open))
+        await asyncio.to_thread(self._prepare)
+        control = ControlServer(self._handle).serving(self._run_directory / SOCKET_NAME)
+        async with control, asyncio.TaskGroup() as tasks:
+            acquiring = tasks.create_task(self._acquire(), name="acquire")
+            others = [tasks.create_task(self._work(axis), name=f"axis {axis}") for axis in self._config.axis]
+            others.append(tasks.create_task(self._keep_notices(), name="notices"))
+            others.append(tasks.create_task(self._feed_watchdog(), name="watchdog"))
+            others.append(tasks.create_task(self._say_ready(), name="ready"))
+            await self._stop.wait()
+            notify("STOPPING=1")
+            acquiring.cancel()
+            await asyncio.wait([acquiring])
+            await asyncio.gather(*(queue.join() for queue in self._queues.values()), self._notices.join())
+            for task in others:
+                task.cancel()
+
+    def _prepare(self) -> None:
+        """Begin each axis with what the history knows, and compile the kernels."""
+        newest = self._keeper.newest()
+        for axis in self._config.axis:
+            published = newest[axis].set if axis in newest else None
+            self._pipelines[axis] = AxisPipeline(axis, self._config, self._method, published)
+            self._watch.begin(axis, published, self._keeper.counts(axis))
+        warm(self._config, self._method)
+
+    async def _say_ready(self) -> None:
+        await self._opened.wait()
+        self._log(
+            f"ready: {self._config.machine.name}, axes {', '.join(self._config.axis)}; listening, sending nothing"
+        )
+        notify("READY=1\nSTATUS=listening, sending nothing")
+
+    def _log(self, text: str, severity: journal.Severity = "info") -> None:
+        journal.write_line(text, severity)
+
+    # from the machine to the pipelines -------------------------------------------------------------------------
+
+    async def _acquire(self) -> None:
+        """Read the machine's records for ever; a source that fails is opened again, later and later.
+
+        What cannot be opened at the start ends the daemon with the reason: it is a fault of the set-up.
+        """
+        delay_s = FIRST_RETRY_S
+        while True:
+            try:
+                async with self._open_source(self._config) as source:
+                    self._source = source
+                    self._watch.source_opened(time.monotonic())
+                    self._opened.set()
+                    async for record in source.records():
+                        delay_s = FIRST_RETRY_S
+                        self._take(record)
+                cause = "the source ended"
+            except (DeviceError, OSError) as error:
+                if not self._opened.is_set():
+                    raise
+                cause = str(error)
+            self._source = None
+            self._watch.source_lost(time.monotonic())
+            text = f"{cause}; it is opened again in {delay_s:.1f} s, what was learnt is kept."
+            self._tell([Notice("SourceLost", "MAJOR", text)])
+            await asyncio.sleep(delay_s)
+            delay_s = min(LAST_RETRY_S, 2 * delay_s)
+
+    def _take(self, record: Record | Notice) -> None:
+        self._watch.record_came(record, time.monotonic())
+        if isinstance(record, Notice):
+            self._tell([record])
+            return
+        for axis in self._config.axis if isinstance(record, TickTimes) else (record.axis,):
+            if axis in self._queues:
+                if self._queues[axis].full():
+                    self._dropped[axis] += 1
+                else:
+                    self._queues[axis].put_nowait(record)
+
+    async def _work(self, axis: str) -> None:
+        """Feed one axis' pipeline, in order, in a worker thread; a batch takes all that waits."""
+        queue = self._queues[axis]
+        while True:
+            batch = [await queue.get()]
+            while not queue.empty():
+                batch.append(queue.get_nowait())
+            self._busy_since_s[axis] = time.monotonic()
+            outcomes, notices = await asyncio.to_thread(self._digest, axis, batch)
+            del self._busy_since_s[axis]
+            self._say([*outcomes, *notices])
+            for _ in batch:
+                queue.task_done()
+
+    def _digest(self, axis: str, batch: Sequence[Record]) -> tuple[list[Outcome], list[Notice]]:
+        """In the worker thread: records through the pipeline, outcomes into the store."""
+        outcomes = [outcome for record in batch for outcome in self._pipelines[axis].feed(record)]
+        return outcomes, self._keeper.keep(outcomes) if outcomes else []
+
+    # what is said and kept -------------------------------------------------------------------------------------
+
+    def _tell(self, notices: Sequence[Notice]) -> None:
+        """Show notices and have them stored; what a flood held back is not stored either."""
+        for notice in self._say(notices):
+            if isinstance(notice, Notice) and not self._notices.full():
+                self._notices.put_nowait(notice)
+
+    async def _keep_notices(self) -> None:
+        while True:
+            notice = await self._notices.get()
+            self._say(await asyncio.to_thread(self._keeper.keep, [notice]))
+            self._notices.task_done()
+
+    def _say(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
+        """Show outcomes: one log line each (a flood becomes a count), the newest in the status. Return those shown."""
+        now_s, shown = time.monotonic(), []
+        for outcome in outcomes:
+            self._watch.outcome_came(outcome, now_s)
+            text, severity = journal.line_of(outcome)
+            held = self._gate.admit(outcome.code if isinstance(outcome, Notice) else type(outcome).__name__, now_s)
+            if held is not None:
+                shown.append(outcome)
+                self._log(text + (f" ({held} more like this were not written)" if held else ""), severity)
+        return shown
+
+    async def _feed_watchdog(self) -> None:
+        """Feed systemd's watchdog while blocks arrive, or it is known why none can: a restart mends neither."""
+        period_s = int(os.environ.get("WATCHDOG_USEC", WATCHDOG_S * 2e6)) / 1e6 / 2
+        while True:
+            if self._alive(period_s):
+                notify("WATCHDOG=1")
+            await asyncio.sleep(min(period_s, WATCHDOG_S))
+
+    def _alive(self, period_s: float) -> bool:
+        now_s = time.monotonic()
+        if any(now_s - since_s > STUCK_S for since_s in self._busy_since_s.values()):
+            return False
+        frames = int(self._source.counters().get("frames", 0)) if self._source is not None else 0
+        moved, self._frames_seen = frames != self._frames_seen, frames
+        return moved or self._watch.source_alive(now_s, period_s)
+
+    # control ---------------------------------------------------------------------------------------------------
+
+    async def _handle(self, request: Mapping[str, Any]) -> Answer:
+        if request["request"] == "status":
+            return self._status()
+        if request["request"] == "stop":
+            self._stop.set()
+            return {"ok": True, "text": "stopping"}
+        return refusal("BadRequest", f"{request['request']!r} is no request", "send status, arm, disarm or stop")
+
+    def _status(self) -> Answer:
+        counters = dict(self._source.counters()) if self._source is not None else {}
+        store = {
+            "directory": str(self._config.store.directory),
+            "fault": self._keeper.fault,
+            "strays": list(self._keeper.strays),
+        }
+        status = self._watch.status(time.monotonic())
+        return {"ok": True, **status, "counters": counters, "store": store, "dropped": self._dropped}
+
+
+def run(config: MachineConfig, open_source: OpenSource, method: str | None = None) -> None:
+    """Run the daemon until it is told to stop. FdhilError when it cannot start or meets what it must not survive."""
+    try:
+        asyncio.run(Service(config, open_source, method).run())
+    except ExceptionGroup as group:
+        first = _first(group)
+        if isinstance(first, FdhilError):
+            raise first from None
+        for line in "".join(traceback.format_exception(group)).splitlines():
+            journal.write_line(line, "MAJOR")
+        text = f"InternalError: {first!r} ended the daemon and nothing is sent any more; report the lines above"
+        raise InternalError(text) from None
+
+
+def _first(error: BaseException) -> BaseException:
+    return _first(error.exceptions[0]) if isinstance(error, BaseExceptionGroup) else error

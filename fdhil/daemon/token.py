@@ -1,0 +1,53 @@
+"""The operator's token: who can read it (mode 0600, in the run directory) may arm. It is never logged nor shown."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import stat
+from pathlib import Path
+
+from fdhil.errors import ConnectError, DeviceError
+
+TOKEN_NAME = "token"
+MAX_BYTES = 256
+
+
+def ensure_token(run_directory: Path) -> str:
+    """Return the token of a run directory; make one where there is none. DeviceError when it cannot be kept secret."""
+    path = run_directory / TOKEN_NAME
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    except FileExistsError:
+        return read_token(run_directory)
+    except OSError as error:
+        raise DeviceError(str(path), f"cannot be written: {error.strerror}; check [store] run_directory") from None
+    try:
+        token = secrets.token_hex(32)
+        os.write(descriptor, token.encode())
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+    return token
+
+
+def read_token(run_directory: Path) -> str:
+    """Return the token. ConnectError when there is none, DeviceError when others can read it."""
+    path = run_directory / TOKEN_NAME
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+    except FileNotFoundError:
+        raise ConnectError(
+            "daemon", f"has never run here ({path} is missing); start it with `fdhil run CONFIG`"
+        ) from None
+    except OSError as error:
+        raise DeviceError(str(path), f"cannot be read: {error.strerror}; only the daemon's user may arm") from None
+    try:
+        mode = stat.S_IMODE(os.fstat(descriptor).st_mode)
+        if mode & 0o077:
+            raise DeviceError(
+                str(path), f"has mode {mode:04o}, others can read it; delete it and start the daemon again"
+            )
+        return os.read(descriptor, MAX_BYTES).decode("ascii", "replace").strip()
+    finally:
+        os.close(descriptor)

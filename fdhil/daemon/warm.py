@@ -1,0 +1,60 @@
+"""Compiling before the daemon says READY: a compile under way holds the interpreter for seconds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fdhil.config import Axis, MachineConfig
+from fdhil.pipeline import AxisPipeline
+from fdhil.records import Float, Stages, Window, frozen
+
+
+def warm(config: MachineConfig, method: str | None = None) -> None:
+    """Send made-up rapids of the nominal drive through a pipeline of each axis, so that every kernel is compiled."""
+    for name, axis in config.axis.items():
+        pipeline = AxisPipeline(name, config, method)
+        for direction in (1, -1):
+            pipeline.feed(nominal_rapid(name, axis, config.machine.sync_period_s, direction))
+
+
+def nominal_rapid(name: str, axis: Axis, dt_s: float, direction: int = 1) -> Window:
+    """Return a rapid that the nominal drive would make (equations [1] and [2] solved for the voltage), with noise."""
+    nominal, top = axis.nominal, axis.rapid_speed_rad_s
+    ramp_s = axis.rapid_speed_mm_s / axis.max_acceleration_mm_s2
+    margin, ramp, cruise = (round(seconds / dt_s) for seconds in (0.1, ramp_s, 0.4))
+    speed = direction * top * _trapezoid(margin, ramp, cruise)
+    torque = nominal.Jt * np.gradient(speed, dt_s) + nominal.ft * speed + nominal.Cd * np.sign(speed)
+    current = torque / nominal.K
+    voltage = nominal.R * current + nominal.L * np.gradient(current, dt_s) + nominal.K * speed
+    if axis.voltage.sampling == "interval_mean":
+        voltage = (voltage + np.append(voltage[1:], voltage[-1])) / 2
+    turned = np.cumsum(speed) - 0.5 * (speed + speed[0])  # trapezoids
+    position = turned * dt_s * axis.screw_pitch_mm / (2 * math.pi)
+    rng = np.random.default_rng(1)
+    noisy = [frozen(s + rng.normal(0, 1e-3 * np.abs(s).max(), s.size)) for s in (speed, current, voltage)]
+    begin, end = margin, speed.size - margin
+    return Window(
+        axis=name,
+        start_tick=0,
+        start_s=0.0,
+        dt_s=dt_s,
+        demand_mm=frozen(position),
+        position_mm=frozen(position),
+        speed_rad_s=noisy[0],
+        current_a=noisy[1],
+        voltage_v=noisy[2],
+        voltage_sampling=axis.voltage.sampling,
+        stages=Stages((begin, begin + ramp), (begin + ramp, end - ramp), (end - ramp, end)),
+        direction=direction,
+        rapid_speed_rad_s=top,
+        pitch_mm=axis.screw_pitch_mm,
+        source="warm-up",
+    )
+
+
+def _trapezoid(margin: int, ramp: int, cruise: int) -> Float:
+    """Return a speed profile 0..1 with smooth corners: rest, ramp, cruise, ramp, rest."""
+    up = 0.5 - 0.5 * np.cos(np.pi * (np.arange(ramp) + 0.5) / ramp)
+    return np.concatenate([np.zeros(margin), up, np.ones(cruise), up[::-1], np.zeros(margin)])

@@ -1,0 +1,212 @@
+"""The sequence of one axis: samples in, outcomes out. No I/O, no clock: the same input gives the same bits.
+
+:class:`AxisPipeline` keeps a bounded ring of recent samples, cuts a window when a rapid move is over, has it analysed,
+pools the accepted windows, and publishes a parameter set when the pool is validated. A replayed window takes the very
+same way (``feed(window)``).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fdhil import validation
+from fdhil.config import Identification, MachineConfig
+from fdhil.identification.windows import find_windows
+from fdhil.pipeline.ring import Ring, Stretch
+from fdhil.records import (
+    AxisSamples,
+    MoveEvent,
+    MoveKind,
+    Notice,
+    Outcome,
+    ParameterSet,
+    Recording,
+    Temperature,
+    TickTimes,
+    VoltageSamples,
+    Window,
+    WindowOutcome,
+    frozen,
+)
+
+RING_S = 30.0  # a rapid that is longer than this is cut short, and then refused for its missing stage
+LEAD_S = 0.25  # standstill wanted before a rapid
+SETTLE_S = 0.30  # after the demand has ended: the shaft comes to rest, and stays there for the window's margin
+VOLTAGE_PATIENCE_S = 1.0  # how much later than the drive's samples a separate sensor may deliver
+POOL_WINDOWS = (
+    6  # both directions, several speeds: enough to tell viscous from dry friction, few enough to follow drift
+)
+
+Record = AxisSamples | VoltageSamples | TickTimes | MoveEvent | Temperature | Window
+
+
+@dataclass(frozen=True, slots=True)
+class _Rapid:
+    """A rapid move that the NC ordered: from ``start`` to ``end`` (None while it lasts)."""
+
+    start: int
+    end: int | None
+    source: str
+
+
+class AxisPipeline:
+    """Everything that is known of one axis, and what follows from the next record of it."""
+
+    def __init__(
+        self, axis: str, config: MachineConfig, method: str | None = None, published: ParameterSet | None = None
+    ) -> None:
+        """``method`` names an estimator (None: the config's choice); ``published`` is the newest set of the history."""
+        self.axis = axis
+        self._config = config
+        self._settings = _settings(config, method)
+        self._period_s = config.machine.sync_period_s
+        self._ring = Ring(self._ticks(RING_S), self._period_s)
+        self._separate_voltage = config.axis[axis].voltage.source != "drive"
+        self._rapids: deque[_Rapid] = deque()
+        self._first_tick: int | None = None
+        self._temperature: Temperature | None = None
+        self._pool: deque[WindowOutcome] = deque(maxlen=POOL_WINDOWS)
+        self._published = published
+
+    @property
+    def published(self) -> ParameterSet | None:
+        """The newest published parameter set."""
+        return self._published
+
+    def _ticks(self, seconds: float) -> int:
+        return round(seconds / self._period_s)
+
+    def feed(self, record: Record) -> list[Outcome]:
+        """Take one record and return what follows from it; a record of another axis is ignored."""
+        if isinstance(record, TickTimes):
+            self._ring.add(record)
+            return self._cut_what_is_over()
+        if record.axis != self.axis:
+            return []
+        if isinstance(record, Window):
+            return self._analyse(record)
+        if isinstance(record, MoveEvent):
+            self._note_move(record)
+        elif isinstance(record, Temperature):
+            self._temperature = record
+        else:
+            if isinstance(record, AxisSamples) and record.tick.size:
+                self._note_grid(record)
+            self._ring.add(record)
+        return self._cut_what_is_over()
+
+    def _note_grid(self, samples: AxisSamples) -> None:
+        newest = self._ring.newest_tick
+        if newest is not None and samples.tick[0] <= newest:  # the SYNC count began anew
+            self._ring.clear()
+            self._rapids.clear()
+            self._first_tick = None
+        if self._first_tick is None:
+            self._first_tick = int(samples.tick[0])
+
+    def _note_move(self, event: MoveEvent) -> None:
+        if self._rapids and self._rapids[-1].end is None:
+            self._rapids[-1] = replace(self._rapids[-1], end=event.tick)
+        if event.kind is MoveKind.RAPID:
+            self._rapids.append(_Rapid(event.tick, None, event.source))
+
+    def _cut_what_is_over(self) -> list[Outcome]:
+        outcomes: list[Outcome] = []
+        while self._rapids and self._is_over(self._rapids[0]):
+            for window in self._cut(self._rapids.popleft()):
+                outcomes += self._analyse(window)
+        return outcomes
+
+    def _is_over(self, rapid: _Rapid) -> bool:
+        newest = self._ring.newest_tick
+        if newest is None:
+            return False
+        if rapid.end is None:
+            return newest - rapid.start > self._ticks(RING_S)
+        last = rapid.end + self._ticks(SETTLE_S)
+        if newest < last:
+            return False
+        patient = newest < last + self._ticks(VOLTAGE_PATIENCE_S)
+        return not (self._separate_voltage and patient and not self._ring.voltage_reaches(last))
+
+    def _cut(self, rapid: _Rapid) -> list[Window]:
+        """Return the window of a rapid that is over; none when the shaft never came near the rapid speed."""
+        first, newest = self._first_tick, self._ring.newest_tick
+        assert first is not None
+        assert newest is not None
+        end = newest if rapid.end is None else rapid.end
+        start = max(first, rapid.start - self._ticks(LEAD_S), newest - self._ticks(RING_S))
+        stretch = self._ring.cut(start, min(newest, end + self._ticks(SETTLE_S)) + 1, self._separate_voltage)
+        found = find_windows(self._recording(stretch), self._config.axis[self.axis].rapid_speed_rad_s)
+        return [
+            self._placed(window, stretch, rapid.source, first)
+            for window in found
+            # the neighbours of a rapid may reach into its stretch; they have their own
+            if rapid.start <= stretch.start_tick + window.start_tick + window.n // 2 <= end
+        ]
+
+    def _recording(self, stretch: Stretch) -> Recording:
+        n = stretch.speed_rad_s.size
+        axis = self._config.axis[self.axis]
+        voltage = frozen(np.full(n, np.nan)) if stretch.voltage_v is None else stretch.voltage_v
+        return Recording(
+            axis=self.axis,
+            dt_s=self._period_s,
+            time_s=frozen(np.arange(n) * self._period_s),
+            voltage_v=voltage,
+            current_a=stretch.current_a,
+            speed_rad_s=stretch.speed_rad_s,
+            position_mm=stretch.position_mm,
+            demand_mm=stretch.demand_mm,
+            voltage_sampling=axis.voltage.sampling,
+            pitch_mm=axis.screw_pitch_mm,
+            rapid_speed_rad_s=axis.rapid_speed_rad_s,
+            gaps=stretch.gaps,
+        )
+
+    def _placed(self, window: Window, stretch: Stretch, source: str, first_tick: int) -> Window:
+        """Give a window, whose ticks count from its stretch, its place since the first tick, and what was around it."""
+        tick = stretch.start_tick + window.start_tick
+        return replace(
+            window,
+            start_tick=tick,
+            start_s=(tick - first_tick) * self._period_s,
+            voltage_v=None if stretch.voltage_v is None else window.voltage_v,
+            voltage_delay_s=stretch.voltage_delay_s,
+            temperature_c=None if self._temperature is None else self._temperature.celsius,
+            source=source,
+        )
+
+    def _analyse(self, window: Window) -> list[Outcome]:
+        outcome = validation.analyse(window, self._settings)
+        outcomes: list[Outcome] = [outcome]
+        if outcome.verdict.accepted:
+            self._pool.append(outcome)
+            outcomes += self._publish(outcome)
+        return outcomes
+
+    def _publish(self, newest: WindowOutcome) -> list[Outcome]:
+        estimate, verdict = validation.pool(tuple(self._pool), self._settings)
+        if estimate is None or not verdict.accepted:
+            text = "The accepted windows do not agree as a pool, the parameters before stay; " + "; ".join(
+                str(reason) for reason in verdict.reasons
+            )
+            return [Notice("ValidationFailed", "minor", text, self.axis, newest.window.start_tick)]
+        self._published = ParameterSet(
+            axis=self.axis,
+            revision=1 if self._published is None else self._published.revision + 1,
+            parameters=estimate.parameters(),
+            covariance=estimate.covariance,
+            windows=len(self._pool),
+            tick=newest.window.start_tick + newest.window.n,
+            temperature_c=newest.window.temperature_c,
+            config_digest=self._config.digest,
+        )
+        return [self._published]
+
+
+def _settings(config: MachineConfig, method: str | None) -> Identification:
+    return config.identification if method is None else config.identification.model_copy(update={"method": method})

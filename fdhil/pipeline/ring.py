@@ -1,0 +1,170 @@
+"""The recent past of one axis on the SYNC grid, and the cutting of a stretch of it.
+
+Pure: nothing here knows a clock. A lost sample stays NaN, and a separate sensor's voltage is placed by the offset
+between its own count and the SYNC count, never by single arrival times.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdhil.records import AxisSamples, Bool, Float, Int, TickTimes, VoltageSamples
+
+PLACING_BLOCKS = 40  # some 2 s of a sensor that is asked every 50 ms
+RATE_TOLERANCE = 0.01  # a sensor's rate may be off a multiple of the SYNC rate by this much
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Signals of the ticks ``start_tick`` + 0..n-1, arrays (n,), NaN where lost; ``gaps`` half-open.
+
+    Row k of ``voltage_v`` is the mean over the period that begins at tick k (or the instant, as the source samples);
+    None without a source. ``voltage_delay_s`` is what the placing on whole ticks left over.
+    """
+
+    start_tick: int
+    demand_mm: Float
+    position_mm: Float
+    speed_rad_s: Float
+    current_a: Float
+    voltage_v: Float | None
+    voltage_delay_s: float | None
+    gaps: tuple[tuple[int, int], ...]
+
+
+class Ring:
+    """The newest ``capacity`` ticks of one axis' samples, of its voltage sensor and of the SYNC's arrival times."""
+
+    def __init__(self, capacity: int, period_s: float) -> None:
+        self._capacity = capacity
+        self._period_ns = period_s * 1e9
+        self._samples: deque[AxisSamples] = deque()
+        self._voltage: deque[VoltageSamples] = deque()
+        self._times: deque[TickTimes] = deque()
+
+    @property
+    def newest_tick(self) -> int | None:
+        """The newest tick that was sampled, None before the first."""
+        return int(self._samples[-1].tick[-1]) if self._samples else None
+
+    def clear(self) -> None:
+        """Forget everything: the SYNC count began anew."""
+        self._samples.clear()
+        self._voltage.clear()
+        self._times.clear()
+
+    def add(self, block: AxisSamples | VoltageSamples | TickTimes) -> None:
+        """Append a block and let go what is older than the capacity; an empty block is nothing."""
+        if isinstance(block, AxisSamples):
+            if block.tick.size:
+                self._samples.append(block)
+                while self._samples[-1].tick[-1] - self._samples[0].tick[-1] > self._capacity:
+                    self._samples.popleft()
+        elif block.t_ns.size and isinstance(block, VoltageSamples):
+            self._voltage.append(block)
+            while self._too_old(self._voltage[0].t_ns, block.t_ns):
+                self._voltage.popleft()
+        elif block.t_ns.size and isinstance(block, TickTimes):
+            self._times.append(block)
+            while self._too_old(self._times[0].t_ns, block.t_ns):
+                self._times.popleft()
+
+    def _too_old(self, old: Int, new: Int) -> bool:
+        return bool(new[-1] - old[-1] > self._capacity * self._period_ns)
+
+    def voltage_reaches(self, tick: int) -> bool:
+        """Whether the separate sensor has delivered past ``tick``; False until its place on the grid is known."""
+        place = self._placing()
+        return place is not None and int(self._voltage[-1].counter[-1]) >= place.counter_of(tick + 1)
+
+    def cut(self, start: int, stop: int, separate_voltage: bool) -> Stretch:
+        """Return the ticks ``start`` .. ``stop`` - 1; what was never received is NaN."""
+        n = stop - start
+        blocks = [b for b in self._samples if b.tick[-1] >= start and b.tick[0] < stop]
+        tick = np.concatenate([b.tick for b in blocks]) if blocks else np.empty(0, np.int64)
+        inside = (tick >= start) & (tick < stop)
+
+        def placed(parts: Iterable[Float]) -> Float:
+            values = np.full(n, np.nan)
+            values[tick[inside] - start] = np.concatenate([np.empty(0), *parts])[inside]
+            return values
+
+        speed = placed(b.speed_rad_s for b in blocks)
+        voltage, delay = None, None
+        if separate_voltage:
+            voltage, delay = self._separate(start, stop)
+        elif blocks and all(b.voltage_v is not None for b in blocks):
+            voltage = placed(b.voltage_v for b in blocks if b.voltage_v is not None)
+        return Stretch(
+            start,
+            placed(b.demand_mm for b in blocks),
+            placed(b.position_mm for b in blocks),
+            speed,
+            placed(b.current_a for b in blocks),
+            voltage,
+            delay,
+            runs(~np.isfinite(speed)),
+        )
+
+    def _separate(self, start: int, stop: int) -> tuple[Float | None, float | None]:
+        place = self._placing()
+        if place is None:
+            return None, None
+        values = np.full((stop - start) * place.ratio, np.nan)
+        for block in self._voltage:
+            row = block.counter - place.counter_of(start)
+            inside = (row >= 0) & (row < values.size)
+            values[row[inside]] = block.voltage_v[inside]
+        return values.reshape(-1, place.ratio).mean(axis=1), place.delay_s
+
+    def _placing(self) -> _Placing | None:
+        """Return the sensor's place on the grid; None while it is not known or its rate is no multiple of SYNC's."""
+        if not self._voltage or not self._times:
+            return None
+        samples = self._period_ns * 1e-9 * self._voltage[-1].sample_rate_hz
+        ratio = round(samples)
+        if ratio < 1 or abs(samples / ratio - 1) > RATE_TOLERANCE:
+            return None
+        recent = list(self._voltage)[-PLACING_BLOCKS:]
+        return _Placing.fit(list(self._times), recent, ratio, self._period_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class _Placing:
+    """Sensor sample ``offset`` + ``ratio`` * k begins with tick k, but that the voltage is late by ``delay_s``."""
+
+    ratio: int
+    offset: int
+    delay_s: float
+
+    def counter_of(self, tick: int) -> int:
+        """Return the sensor's count at a tick."""
+        return self.offset + self.ratio * tick
+
+    @classmethod
+    def fit(cls, times: list[TickTimes], blocks: list[VoltageSamples], ratio: int, period_ns: float) -> _Placing | None:
+        """Look up the fractional tick at which each sample begins among the SYNC's arrivals; the median decides.
+
+        The newest blocks alone are used: two clocks that drift apart move by less than 0.1 sample in that time.
+        """
+        tick_ns = np.concatenate([b.t_ns for b in times])
+        tick = np.concatenate([b.tick for b in times])
+        counter = np.concatenate([b.counter for b in blocks])
+        begins_ns = np.concatenate([b.t_ns for b in blocks])
+        inside = (begins_ns >= tick_ns[0]) & (begins_ns <= tick_ns[-1] + period_ns)
+        if not inside.any():
+            return None
+        begins = np.interp(begins_ns[inside], tick_ns, tick)
+        ahead = float(np.median(counter[inside] - ratio * begins))
+        offset = round(ahead)
+        return cls(ratio, offset, (ahead - offset) / ratio * period_ns * 1e-9)
+
+
+def runs(marked: Bool) -> tuple[tuple[int, int], ...]:
+    """Return the half-open ranges in which ``marked`` (n,) is set."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]]).astype(np.int8)))
+    return tuple((int(a), int(b)) for a, b in edges.reshape(-1, 2))

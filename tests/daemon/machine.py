@@ -1,0 +1,126 @@
+"""A machine for the daemon's tests: its drive really is the nominal one, and it shuttles at rapid speed."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdhil import config as machine_config
+from fdhil.config import MachineConfig
+from fdhil.daemon.warm import nominal_rapid
+from fdhil.errors import ConnectError
+from fdhil.pipeline import Record
+from fdhil.records import AxisSamples, MoveEvent, MoveKind, Notice, TickTimes, frozen, frozen_ints
+
+NOMINAL = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
+REGULATORS = {
+    "position_gain_per_s": 50.0,
+    "speed_kp": 23.562,
+    "speed_ki": 1184.35,
+    "current_limit_a": 200.0,
+    "current_kp": 12.566,
+    "current_ki": 1256.64,
+    "voltage_limit_v": 300.0,
+}
+AXIS = {
+    "screw_pitch_mm": 20.0,
+    "rapid_speed_mm_s": 500.0,
+    "max_acceleration_mm_s2": 4000.0,
+    "nominal": NOMINAL,
+    "regulators": REGULATORS,
+    "correction": {"max_offset_um": 250.0, "max_speed_mm_s": 20.0, "max_acceleration_mm_s2": 2000.0},
+}
+
+
+def config_of(folder: Path, axes: Sequence[str] = ("X",), **sections: Any) -> MachineConfig:
+    """Return the bench's configuration with its store in ``folder``."""
+    document = {"machine": {"name": "bench"}, "axis": dict.fromkeys(axes, AXIS), **sections}
+    return machine_config.parse(document, "test", folder)
+
+
+def rapids(config: MachineConfig, axis: str = "X", count: int = 2, first_tick: int = 0) -> list[Record]:
+    """Return the records of ``count`` rapids, to and fro, in blocks of 40 samples with 0.4 s of rest between them."""
+    dt_s = config.machine.sync_period_s
+    windows = [nominal_rapid(axis, config.axis[axis], dt_s, 1 if k % 2 == 0 else -1) for k in range(count)]
+    rest = round(0.4 / dt_s)
+    rng = np.random.default_rng(3)
+    signals: dict[str, list[Any]] = {
+        name: [] for name in ("demand_mm", "position_mm", "speed_rad_s", "current_a", "voltage_v")
+    }
+    events: list[MoveEvent] = []
+    place, tick = 0.0, first_tick
+    for window in windows:
+        base = {"demand_mm": place, "position_mm": place}
+        noise = {"speed_rad_s": 0.15, "current_a": 0.05, "voltage_v": 0.06}
+        for name, parts in signals.items():
+            values = getattr(window, name)
+            still = np.full(rest, float(values[0]) if name in base else 0.0) + rng.normal(0, noise.get(name, 0.0), rest)
+            parts += [still + base.get(name, 0.0), values + base.get(name, 0.0)]
+        begin, end = window.stages.accelerate, window.stages.brake
+        assert begin is not None
+        assert end is not None
+        events.append(MoveEvent(axis, MoveKind.RAPID, tick + rest + begin[0], "test"))
+        events.append(MoveEvent(axis, MoveKind.REST, tick + rest + end[1], "test"))
+        place += float(window.position_mm[-1])
+        tick += rest + window.n
+    joined = {name: np.concatenate([*parts, parts[-1][-1:].repeat(rest)]) for name, parts in signals.items()}
+    return _blocks(axis, joined, events, first_tick, dt_s)
+
+
+def _blocks(axis: str, signals: dict[str, Any], events: list[MoveEvent], first_tick: int, dt_s: float) -> list[Record]:
+    records: list[Record] = []
+    n = signals["speed_rad_s"].size
+    for start in range(0, n, 40):
+        part = slice(start, min(n, start + 40))
+        tick = first_tick + np.arange(part.start, part.stop)
+        records.append(TickTimes(frozen_ints(tick), frozen_ints(tick * round(dt_s * 1e9))))
+        block: dict[str, Any] = {name: frozen(values[part]) for name, values in signals.items()}
+        zeros = np.zeros(tick.size)
+        records.append(
+            AxisSamples(axis, frozen_ints(tick), offset_mm=frozen(zeros), statusword=frozen_ints(zeros), **block)
+        )
+        records += [event for event in events if tick[0] <= event.tick <= tick[-1]]
+    return records
+
+
+class Machine:
+    """A source that yields what it is given, and more when ``give`` is called; ``fail`` makes it fail."""
+
+    def __init__(self, records: Sequence[Record | Notice] = ()) -> None:
+        self.queue: asyncio.Queue[Record | Notice | Exception] = asyncio.Queue()
+        self.opened = 0
+        self.unreachable = 0
+        self.taken = 0
+        self.give(*records)
+
+    def give(self, *records: Record | Notice | Exception) -> None:
+        """Let the source yield these next; an exception is raised in it."""
+        for record in records:
+            self.queue.put_nowait(record)
+
+    @asynccontextmanager
+    async def open(self, config: MachineConfig) -> AsyncIterator[Machine]:
+        """Open, unless it is ``unreachable`` for so many times."""
+        if self.unreachable > 0:
+            self.unreachable -= 1
+            raise ConnectError("can0", "cannot be reached; check the wiring")
+        self.opened += 1
+        yield self
+
+    async def records(self) -> AsyncIterator[Record | Notice]:
+        """Yield what was given."""
+        while True:
+            record = await self.queue.get()
+            if isinstance(record, Exception):
+                raise record
+            self.taken += 1
+            yield record
+
+    def counters(self) -> dict[str, int]:
+        """Return frames received and lost."""
+        return {"frames": self.taken, "lost": 0}

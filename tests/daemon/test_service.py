@@ -1,0 +1,146 @@
+"""The daemon on a made-up machine: what comes in is identified, kept, told; what goes wrong is told and survived."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil.config import MachineConfig
+from fdhil.daemon.control import ask
+from fdhil.daemon.lock import BusLocked
+from fdhil.daemon.service import Service
+from fdhil.errors import ConnectError, DeviceError
+from fdhil.records import Notice
+from fdhil.store.history import History
+from fdhil.store.windows import list_windows
+from tests.daemon.machine import NOMINAL, Machine, config_of, rapids
+
+
+async def _exists(path: Path) -> None:
+    for _ in range(6000):
+        if path.exists():
+            return
+        await asyncio.sleep(0.01)
+    raise TimeoutError(path)
+
+
+@asynccontextmanager
+async def serving(config: MachineConfig, machine: Machine) -> AsyncIterator[Path]:
+    """Run a daemon in this process until the block is left; yield its control socket."""
+    task = asyncio.create_task(Service(config, machine.open).run())
+    assert config.store.run_directory is not None
+    path = config.store.run_directory / "daemon.sock"
+    await asyncio.wait([task, asyncio.create_task(_exists(path))], return_when=asyncio.FIRST_COMPLETED)
+    try:
+        yield path
+    finally:
+        if not task.done():
+            os.kill(os.getpid(), signal.SIGTERM)
+        await task
+
+
+async def status_when(path: Path, ready: Any) -> dict[str, Any]:
+    """Ask for the status until ``ready(status)``."""
+    while True:
+        status = await asyncio.to_thread(ask, path, {"request": "status"})
+        if ready(status):
+            return status
+        await asyncio.sleep(0.02)
+
+
+async def test_rapids_become_parameters_with_intervals_in_status_and_history(tmp_path: Path) -> None:
+    config = config_of(tmp_path)
+    machine = Machine(rapids(config, count=2))
+    async with serving(config, machine) as path:
+        status = await status_when(path, lambda s: s["axes"]["X"]["accepted"] == 2)
+    axis = status["axes"]["X"]
+    assert status["source"]["state"] == "listening"
+    assert status["sync"]["rate_hz"] == pytest.approx(1000.0)
+    assert (axis["refused"], axis["revision"]) == (0, 2)
+    for name, true in NOMINAL.items():
+        told = axis["parameters"][name]
+        assert told["low"] < told["value"] < told["high"]
+        assert told["value"] == pytest.approx(true, rel=0.1), name
+    with History.read(config.store.directory) as history:
+        assert [r.set.revision for r in history.revisions("X")] == [1, 2]
+        assert history.revisions("X")[1].window_ids == (1, 2)
+        assert [w.accepted for w in history.windows("X")] == [True, True]
+    listing = list_windows(config.store.directory / "windows")
+    assert [file.number for file in listing.windows] == [1, 2]
+    assert not path.exists()
+
+
+async def test_a_restarted_daemon_goes_on_where_the_history_ends(tmp_path: Path) -> None:
+    config = config_of(tmp_path)
+    for expected in (1, 2):
+        async with serving(config, Machine(rapids(config, count=1))) as path:
+            status = await status_when(path, lambda s, n=expected: s["axes"]["X"]["accepted"] == n)
+        assert status["axes"]["X"]["revision"] == expected
+
+
+async def test_a_source_that_fails_is_opened_again_and_the_pipeline_keeps_what_it_knows(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = config_of(tmp_path)
+    records = rapids(config, count=1)
+    machine = Machine(records[:30])
+    async with serving(config, machine) as path:
+        machine.unreachable = 0
+        machine.give(DeviceError("can0", "went away"))
+        machine.give(*records[30:])
+        await status_when(path, lambda s: s["axes"]["X"]["accepted"] == 1)
+    assert machine.opened == 2
+    assert "SourceLost: can0: went away" in capsys.readouterr().err
+
+
+async def test_what_is_not_there_at_the_start_ends_the_daemon(tmp_path: Path) -> None:
+    machine = Machine()
+    machine.unreachable = 1
+    with pytest.raises(ExceptionGroup) as error:
+        await Service(config_of(tmp_path), machine.open).run()
+    assert error.group_contains(ConnectError, match="cannot be reached")
+
+
+async def test_a_second_daemon_of_one_machine_is_refused(tmp_path: Path) -> None:
+    config = config_of(tmp_path)
+    async with serving(config, Machine()):
+        with pytest.raises(BusLocked, match=f"process {os.getpid()}"):
+            await Service(config, Machine().open).run()
+
+
+async def test_a_flood_of_notices_is_a_few_lines_and_a_count(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = config_of(tmp_path)
+    machine = Machine([Notice("DriveEmergency", "MAJOR", f"code {k}", "X") for k in range(2000)])
+    async with serving(config, machine) as path:
+        await status_when(path, lambda s: s["counters"]["frames"] == 2000)
+    assert 10 < capsys.readouterr().err.count("DriveEmergency") < 40
+    with History.read(config.store.directory) as history:
+        assert len(history.notices()) < 40
+
+
+async def test_nonsense_on_the_socket_is_answered_and_harms_nobody(tmp_path: Path) -> None:
+    async with serving(config_of(tmp_path), Machine()) as path:
+        for line in (b"no json", b"[1]", b'{"request": 5}', b'{"request": "fly"}', b"[" * 5000):
+            reader, writer = await asyncio.open_unix_connection(str(path))
+            writer.write(line + b"\n")
+            answer = json.loads(await reader.readline())
+            assert (answer["ok"], answer["code"]) == (False, "BadRequest")
+            writer.close()
+            await writer.wait_closed()
+        silent = await asyncio.open_unix_connection(str(path))
+        reader, writer = await asyncio.open_unix_connection(str(path))
+        writer.write(b"x" * 200_000 + b"\n")
+        assert await reader.read() == b""
+        assert (await asyncio.to_thread(ask, path, {"request": "status"}))["ok"]
+        for stream in (silent[1], writer):
+            stream.close()
