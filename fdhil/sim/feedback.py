@@ -19,12 +19,18 @@ _LIMIT_SWITCHES = 0b11
 
 def clip16(value: float) -> int:
     """Round to INTEGER16; beyond its range the end value."""
-    return max(min(round(value), 0x7FFF), -0x8000)
+    whole = round(value)
+    if -0x8000 <= whole <= 0x7FFF:
+        return whole
+    return 0x7FFF if whole > 0 else -0x8000
 
 
 def clip32(value: float) -> int:
     """Round to INTEGER32; beyond its range the end value."""
-    return max(min(round(value), 0x7FFFFFFF), -0x80000000)
+    whole = round(value)
+    if -0x80000000 <= whole <= 0x7FFFFFFF:
+        return whole
+    return 0x7FFFFFFF if whole > 0 else -0x80000000
 
 
 class Feedback:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from enum import Enum, auto
+from operator import itemgetter
 
 from fdhil.sim.dictionary import Dictionary
 from fdhil.sim.objects import CYCLIC_POSITION, PROFILE_POSITION, Ratings
@@ -14,7 +15,7 @@ from fdhil.sim.setpoints import Command, CyclicSetpoints, Profile, Target
 _REST: Command = (0.0,) * 8
 _NEW_SETPOINT, _AT_ONCE, _RELATIVE, _HALT = 0x10, 0x20, 0x40, 0x100
 # target, position offset, velocity offset, torque offset, software limits
-_CYCLIC_KEYS = (0x607A00, 0x60B000, 0x60B100, 0x60B200, 0x607D01, 0x607D02)
+_cyclic = itemgetter(0x607A00, 0x60B000, 0x60B100, 0x60B200, 0x607D01, 0x607D02)
 _TARGET_REACHED, _MODE_SPECIFIC = 1 << 10, 1 << 12
 
 
@@ -25,6 +26,9 @@ class Source(Enum):
     CYCLIC = auto()
     PROFILE = auto()
     STOP = auto()
+
+
+_SOURCES = {CYCLIC_POSITION: Source.CYCLIC, PROFILE_POSITION: Source.PROFILE}
 
 
 class Motion:
@@ -60,7 +64,7 @@ class Motion:
         """The mode in force, 0x6061."""
         if self._faults.not_csp:
             return PROFILE_POSITION
-        return self._dictionary.number(0x6060)
+        return self._dictionary.numbers[0x606000]
 
     @property
     def status_bits(self) -> int:
@@ -128,7 +132,7 @@ class Motion:
 
     def _push(self) -> None:
         values = self._dictionary.numbers
-        position, offset, speed, torque, low, high = (values[key] for key in _CYCLIC_KEYS)
+        position, offset, speed, torque, low, high = _cyclic(values)
         acting = offset * self._faults.offset_scale
         self.limited = not low <= position + acting <= high
         target = min(max(position + acting, low), high) - acting if self.limited else position
@@ -137,11 +141,10 @@ class Motion:
     def _choose(self) -> Source:
         if not self._power.powered:
             return Source.OFF
-        if not self._power.follows or self._dictionary.number(0x6040) & _HALT:
+        numbers = self._dictionary.numbers
+        if not self._power.follows or numbers[0x604000] & _HALT or self._faults.not_csp:
             return Source.STOP
-        if self._faults.not_csp:
-            return Source.STOP
-        return {CYCLIC_POSITION: Source.CYCLIC, PROFILE_POSITION: Source.PROFILE}.get(self.mode, Source.STOP)
+        return _SOURCES.get(numbers[0x606000], Source.STOP)
 
     def _own_motion(self, source: Source, position: float) -> None:
         if self.source is Source.OFF:

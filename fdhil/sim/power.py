@@ -49,6 +49,7 @@ _PLAIN = {
     (_S.OPERATION_ENABLED, _C.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,
     (_S.QUICK_STOP_ACTIVE, _C.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,
 }
+_POWERED = frozenset({_S.OPERATION_ENABLED, _S.QUICK_STOP_ACTIVE, _S.FAULT_REACTION_ACTIVE})
 _QUICK_STOP_CODES = frozenset({0, 1, 2, 5, 6})
 
 
@@ -67,13 +68,14 @@ def _decode(word: int) -> _Command | None:
 class PowerStage:
     """The state, and the ramp on the way to the next one.
 
-    ``option`` returns the value of an option code object (0x605A, 0x605B, 0x605C, 0x605E). ``ramp`` is set while the
-    drive must slow down by itself; the drive calls :meth:`at_rest` when its demand stands still.
+    ``option`` returns the value of an option code object (0x605A, 0x605B, 0x605C, 0x605E). ``powered``: current flows.
+    ``ramp`` is set while the drive must slow down by itself; it calls :meth:`at_rest` when its demand stands still.
     """
 
     def __init__(self, option: Callable[[int], int]) -> None:
         self._option = option
         self.state = State.NOT_READY
+        self.powered = False
         self.ramp: Ramp | None = None
         self._after_ramp = State.SWITCH_ON_DISABLED
         self._last_word: int | None = None
@@ -85,17 +87,14 @@ class PowerStage:
         self._last_word = None
 
     @property
-    def powered(self) -> bool:
-        """Whether current flows."""
-        return self.state in (State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE)
-
-    @property
     def follows(self) -> bool:
         """Whether the drive follows the set-points it is given."""
         return self.state is State.OPERATION_ENABLED and self.ramp is None
 
     def control(self, word: int) -> bool:
         """Evaluate a controlword (a level: it may be given again and again); True when a fault was reset."""
+        if word == self._last_word and word & 0x8F == 0x0F and self.follows:
+            return False  # the usual case, every cycle
         rising_reset = word & 0x80 and (self._last_word is None or not self._last_word & 0x80)
         self._last_word = word
         if self.state is State.FAULT:
@@ -178,6 +177,7 @@ class PowerStage:
     def _enter(self, state: State) -> None:
         self.state = state
         self.ramp = None
+        self.powered = state in _POWERED
 
 
 def known_quick_stop_code(code: int) -> bool:

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from typing import NamedTuple
 
 Command = tuple[float, float, float, float, float, float, float, float]
 
 
-@dataclass(frozen=True, slots=True)
-class Target:
+class Target(NamedTuple):
     """One cycle's set-point: target and offset in increments, speed offset in rad/s, current offset in A."""
 
     position: float
