@@ -1,0 +1,106 @@
+"""The signed-off record of a commissioned drive, as JSON in the store; one that was changed is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from fdhil.config import MachineConfig
+from fdhil.errors import StoreError
+
+SCHEMA = "fdhil-commissioning-1"
+MAX_RECORD_BYTES = 64 * 1024
+
+
+@dataclass(frozen=True, slots=True)
+class CommissioningRecord:
+    """What was found and proven on one drive.
+
+    ``config_digest`` is :func:`axis_digest`. ``options`` holds 0x6007, 0x605A, 0x605E, 0x6065 and 0x6085 by their
+    hexadecimal index. ``offset_in_feedforward`` None: could not be told. ``watchdog`` is ``proven`` when the drive
+    stopped after our heartbeat did.
+    """
+
+    axis: str
+    vendor_id: int
+    product_code: int
+    revision: int
+    serial: int
+    config_digest: str
+    mapping_fingerprint: str
+    options: Mapping[str, int]
+    following_error_window_um: float
+    offset_in_feedforward: bool | None
+    sign_test_um: float
+    readback_ok: bool
+    watchdog: str
+    created_utc: str
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over all that the record says."""
+        text = json.dumps({"schema": SCHEMA, **asdict(self)}, sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+def axis_digest(config: MachineConfig, axis: str) -> str:
+    """SHA-256, 16 hexadecimal digits, of all in the configuration that a commissioning depends on.
+
+    Where sensors are reached and what the motor's data sheet says may change without commissioning again.
+    """
+    settings = config.axis[axis].model_dump(mode="json", exclude={"voltage", "nominal", "regulators"})
+    guard = config.guard.model_dump(mode="json", include={"node_id", "heartbeat_s"})
+    text = json.dumps([settings, guard, config.machine.sync_period_s, config.node_id(axis)], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def record_path(directory: Path, axis: str) -> Path:
+    """Return where an axis' record is kept."""
+    return directory / f"commissioning-{axis}.json"
+
+
+def save_record(record: CommissioningRecord, directory: Path) -> Path:
+    """Write the record (a temporary file, then renamed) and return its path; StoreError."""
+    path = record_path(directory, record.axis)
+    document = {"schema": SCHEMA, **asdict(record), "digest": record.digest}
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_suffix(".tmp")
+        with temporary.open("w", encoding="utf-8") as file:
+            json.dump(document, file, indent=2)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        raise StoreError(f"{path} cannot be written ({error.strerror}); check the directory and free space") from None
+    return path
+
+
+def load_record(directory: Path, axis: str) -> CommissioningRecord | None:
+    """Read an axis' record, None when there is none; StoreError when it is damaged, foreign or was changed."""
+    path = record_path(directory, axis)
+    try:
+        raw = path.read_bytes()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise StoreError(f"{path} cannot be read ({error.strerror}); commission the axis again") from None
+    try:
+        document = json.loads(raw[:MAX_RECORD_BYTES])
+        record = _record(document)
+    except (ValueError, KeyError, TypeError):
+        raise StoreError(f"{path} is no commissioning record; commission the axis again") from None
+    if document.get("schema") != SCHEMA or record.axis != axis or document.get("digest") != record.digest:
+        raise StoreError(f"{path} was changed after it was signed off; commission the axis again")
+    return record
+
+
+def _record(document: Any) -> CommissioningRecord:
+    values = {f.name: document[f.name] for f in fields(CommissioningRecord)}
+    values["options"] = {str(key): int(value) for key, value in values["options"].items()}
+    return CommissioningRecord(**values)

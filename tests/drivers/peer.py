@@ -1,0 +1,48 @@
+"""A simulated drive as a peer on a bus inside this process: a thread that takes and gives frames."""
+
+from __future__ import annotations
+
+import threading
+import time
+from types import TracebackType
+
+import can
+import numpy as np
+
+from fdhil.config import MachineConfig
+from fdhil.sim.drive import Drive
+
+
+class DrivePeer:
+    """Runs a twin drive on the ``virtual`` bus of the config; ``sent`` counts its frames, ``heard`` those of others."""
+
+    def __init__(self, config: MachineConfig, axis: str = "X") -> None:
+        self.drive = Drive(axis, config, np.random.default_rng(1))
+        self._bus = can.Bus(interface="virtual", channel=next(iter(config.bus.values())).channel)
+        self._stopping = threading.Event()
+        self.heard: list[int] = []
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def _run(self) -> None:
+        self._send(self.drive.power_on())
+        while not self._stopping.is_set():
+            message = self._bus.recv(0.001)
+            self._send(self.drive.wall_clock(time.monotonic()))
+            if message is not None:
+                self.heard.append(message.arbitration_id)
+                self._send(self.drive.receive(message.arbitration_id, bytes(message.data)))
+
+    def _send(self, frames: list[tuple[int, bytes]]) -> None:
+        for can_id, data in frames:
+            self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+
+    def __enter__(self) -> DrivePeer:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stopping.set()
+        self._thread.join(timeout=5)
+        self._bus.shutdown()
