@@ -1,0 +1,243 @@
+"""``fdhil-guard CONFIG``: opens the transmit descriptor of the machine's bus and becomes the guard's process."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import socket
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from fdhil import config as machine_config
+from fdhil.cia402 import PdoEntry
+from fdhil.cli.main import run_safely
+from fdhil.config import Axis, CanBus, MachineConfig
+from fdhil.errors import ConfigError, ConfigFault, ConnectError, DeviceError, ProtocolError
+from fdhil.guard.limits import Limits
+from fdhil.guard.settings import AxisSettings, Layout, Pdo, Settings, to_json
+
+if TYPE_CHECKING:
+    from fdhil.drivers.profile import DriveProfile, PdoSpec
+
+SETTINGS_NAME = "guard.json"
+VARIATION_MM = 3.0
+CONNECT_S = 5.0
+
+
+@click.command(context_settings={"help_option_names": ["-h", "--help"]})
+@click.argument("config", type=click.Path(path_type=Path))
+@click.option("--check", is_flag=True, help="Write the settings and stop: opens no bus.")
+def guard(config: Path, check: bool) -> None:
+    """Run the guard of the machine in CONFIG: the only process of fdhil that may send an offset to a drive.
+
+    It sends no frame until the daemon arms a correction, checks every interlock at each SYNC, and ramps to zero when
+    anything is not as it must be: also when the daemon dies, and before it stops itself. Events are JSON lines on
+    stdout. Exit codes: 0 stopped with nothing applied, 2 wrong config, 3 bus trouble, or an offset may be left.
+    """
+    machine = machine_config.load(config)
+    name = corrected_bus(machine, str(config))
+    run_directory = machine.store.run_directory or machine.store.directory / "run"
+    token = operator_token(run_directory)
+    settings = settings_of(machine, name, run_directory, hashlib.sha256(token.encode()).hexdigest())
+    file = run_directory / SETTINGS_NAME
+    _write(file, to_json(settings))
+    if check:
+        click.echo(f"{file}: {len(settings.axes)} axes on {name}")
+        return
+    lock = lock_bus(machine.bus[name])
+    transmit = open_bus(name, machine.bus[name])
+    lock.set_inheritable(True)
+    transmit.set_inheritable(True)
+    arguments = ["-m", "fdhil.guard", "--settings", str(file), "--descriptor", str(transmit.fileno())]
+    sys.stdout.flush()
+    os.execv(sys.executable, [sys.executable, *arguments])
+
+
+def corrected_bus(machine: MachineConfig, source: str) -> str:
+    """Return the one bus with axes that may be corrected; ConfigError when there is none, or more than one."""
+    buses = {axis.drive.bus for axis in machine.axis.values() if axis.correction is not None}
+    if not buses:
+        fault = ConfigFault(
+            "axis.*.correction", "no axis has this section, so that writing is off", "add it to an axis"
+        )
+        raise ConfigError(source, [fault])
+    if len(buses) > 1:
+        fault = ConfigFault("axis.*.drive.bus", f"corrected axes are on {', '.join(sorted(buses))}", "use one bus")
+        raise ConfigError(source, [fault])
+    return buses.pop()
+
+
+def settings_of(machine: MachineConfig, bus: str, run_directory: Path, token_sha256: str) -> Settings:
+    """Return what the guard needs of the config and the drives' profiles; ConfigError when a profile cannot do it."""
+    axes = [_axis(machine, name, axis) for name, axis in machine.axis.items() if axis.correction is not None]
+    return Settings(
+        bus=bus,
+        transport="can_raw" if machine.bus[bus].interface == "socketcan" else "socketcand",
+        sync_period_s=machine.machine.sync_period_s,
+        clock=machine.guard.clock,
+        heartbeat_s=machine.guard.heartbeat_s,
+        node_id=machine.guard.node_id,
+        token_sha256=token_sha256,
+        run_directory=str(run_directory),
+        axes=tuple(axes),
+    )
+
+
+def limits_of(axis: Axis, sync_period_s: float) -> Limits:
+    """Return the config's limits in whole increments per SYNC cycle, rounded down, rate and acceleration at least 1."""
+    assert axis.correction is not None
+    per_mm = axis.scaling.increments_per_mm
+    rate = axis.correction.max_speed_mm_s * per_mm * sync_period_s
+    acceleration = axis.correction.max_acceleration_mm_s2 * per_mm * sync_period_s**2
+    return Limits(
+        offset=max(1, math.floor(axis.correction.max_offset_um * 1e-3 * per_mm + 1e-9)),
+        rate=max(1, math.floor(rate + 1e-9)),
+        acceleration=max(1, math.floor(acceleration + 1e-9)),
+        variation=max(1, math.floor(VARIATION_MM * per_mm)),
+        window=max(10, round(1.0 / sync_period_s)),
+    )
+
+
+def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
+    from fdhil.drivers.profile import load_profile  # late: the drivers' room is heavy, --help is not
+
+    profile = load_profile(axis.drive.profile)
+    node_id = machine.node_id(name)
+    target, offset = _rpdo(profile, profile.target, name), _rpdo(profile, profile.offset, name)
+    if len(offset.entries) != 1:
+        fault = ConfigFault(
+            f"axis.{name}.drive.profile", "its offset RPDO maps more than 0x60B0", "give it its own RPDO"
+        )
+        raise ConfigError(profile.name, [fault])
+    return AxisSettings(
+        name=name,
+        node_id=node_id,
+        target=_pdo(target, node_id),
+        offset=_pdo(offset, node_id),
+        tpdos=tuple(_pdo(spec, node_id) for spec in profile.tpdos if spec.valid),
+        increments_per_mm=axis.scaling.increments_per_mm,
+        sign=axis.drive.sign,
+        limits=limits_of(axis, machine.machine.sync_period_s),
+        window=round(axis.drive.following_error_window_mm * axis.scaling.increments_per_mm),
+        setpoint_delay_cycles=axis.drive.setpoint_delay_cycles,
+    )
+
+
+def _rpdo(profile: DriveProfile, key: tuple[int, int], axis: str) -> PdoSpec:
+    found = profile.find_rpdo(key)
+    if found is None or not found[0].valid:
+        fault = ConfigFault(f"axis.{axis}.drive.profile", f"{profile.name} maps no {key[0]:04X} into an RPDO", "map it")
+        raise ConfigError(profile.name, [fault])
+    return found[0]
+
+
+def _pdo(spec: PdoSpec, node_id: int) -> Pdo:
+    return Pdo(spec.cob_base + node_id, _layout(spec.entries), spec.every_sync)
+
+
+def _layout(entries: tuple[PdoEntry, ...]) -> Layout:
+    return tuple((entry.index, entry.sub, entry.bits, entry.signed) for entry in entries)
+
+
+def operator_token(run_directory: Path) -> str:
+    """Return the token that arming needs, made at the first start of guard or daemon. DeviceError."""
+    from fdhil.daemon.token import ensure_token  # late, as above
+
+    try:
+        run_directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+    except OSError as error:
+        text = f"cannot be made ({error.strerror}); check [store] run_directory and its rights"
+        raise DeviceError(str(run_directory), text) from None
+    return ensure_token(run_directory)
+
+
+def _write(file: Path, text: str) -> None:
+    temporary = file.with_suffix(".new")
+    try:
+        temporary.write_text(text, "utf-8")
+        temporary.replace(file)
+    except OSError as error:
+        raise DeviceError(str(file), f"cannot be written ({error.strerror}); check the run directory") from None
+
+
+def lock_bus(bus: CanBus) -> socket.socket:
+    """Hold the name of this bus for as long as the process lives; DeviceError (``BusLocked``) when another has it."""
+    place = f"{bus.interface}:{bus.host}:{bus.port}:{bus.channel}" if bus.interface != "socketcan" else bus.channel
+    lock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        lock.bind(f"\0fdhil-guard:{place}")
+    except OSError:
+        lock.close()
+        raise DeviceError(
+            place, "BusLocked: another guard already owns this bus, and nothing was sent; stop that one first"
+        ) from None
+    return lock
+
+
+def open_bus(name: str, bus: CanBus) -> socket.socket:
+    """Open the transmit descriptor; ConnectError when the bus cannot be had."""
+    if bus.interface == "socketcan":
+        return _open_raw(name, bus.channel)
+    if bus.interface == "socketcand":
+        return _open_socketcand(name, bus)
+    text = f"the interface {bus.interface!r} lives inside one process; set socketcan or socketcand"
+    raise ConnectError(f"bus {name}", text)
+
+
+def _open_raw(name: str, channel: str) -> socket.socket:
+    try:
+        raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        raw.bind((channel,))
+    except OSError as error:
+        text = f"the CAN interface {channel} cannot be opened ({error.strerror}); bring it up with ip link"
+        raise ConnectError(f"bus {name}", text) from None
+    return raw
+
+
+def _open_socketcand(name: str, bus: CanBus) -> socket.socket:
+    """Connect to the hub and go through its greeting, byte by byte, so that no frame is swallowed."""
+    deadline_s = time.monotonic() + CONNECT_S
+    try:
+        hub = socket.create_connection((bus.host, bus.port), timeout=CONNECT_S)
+    except OSError as error:
+        text = f"no hub answers at {bus.host} port {bus.port} ({error.strerror or error}); start the hub first"
+        raise ConnectError(f"bus {name}", text) from None
+    hub.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    try:
+        _expect(hub, "hi", deadline_s)
+        for command in (f"open {bus.channel}", "rawmode"):
+            hub.sendall(f"< {command} >".encode("ascii"))
+            _expect(hub, "ok", deadline_s)
+    except OSError as error:
+        hub.close()
+        text = f"the hub at {bus.host} port {bus.port} broke off its greeting ({error}); check that it is a socketcand"
+        raise ConnectError(f"bus {name}", text) from None
+    return hub
+
+
+def _expect(hub: socket.socket, word: str, deadline_s: float) -> None:
+    answer = b""
+    while not answer.endswith(b">"):
+        hub.settimeout(max(0.001, deadline_s - time.monotonic()))
+        byte = hub.recv(1)
+        if not byte or len(answer) > 200:
+            raise ConnectionError("connection closed")
+        answer += byte
+    if answer.split() != [b"<", word.encode(), b">"]:
+        hub.close()
+        shown = answer.decode("ascii", "replace")
+        raise ProtocolError("hub", f"answered {shown!r} where '< {word} >' belongs; check [bus] channel and port")
+
+
+def main() -> None:
+    """Run the command; an error is one sentence on stderr and its exit code."""
+    sys.exit(run_safely(guard))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,203 @@
+"""The two ways onto a CAN bus, on a descriptor that somebody else opened: CAN_RAW and the socketcand text protocol.
+
+What may leave is checked here, where the bytes leave: our heartbeat and the configured offset RPDOs, nothing else.
+"""
+
+from __future__ import annotations
+
+import errno
+import socket
+import struct
+from collections.abc import Iterable
+from typing import Literal
+
+Frame = tuple[int, bytes, float]
+"""COB-ID, data, time stamp of the frame in seconds; the COB-ID ``ERROR`` stands for a controller state in ``data``."""
+
+ERROR = -1
+_CAN_FRAME = struct.Struct("=IB3x8s")
+_CAN_FILTER = struct.Struct("=II")
+_TIMEVAL = struct.Struct("@ll")
+SO_TIMESTAMP = 29
+SO_RXQ_OVFL = 40
+CAN_RAW_ERR_FILTER = 2
+CAN_ERR_FLAG = 0x20000000
+CAN_SFF_ONLY = 0xC00007FF
+RETRY = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EINTR)
+FULL = (errno.ENOBUFS, errno.EAGAIN, errno.EWOULDBLOCK)
+MAX_PENDING_BYTES = 1 << 16
+
+
+class BusDown(Exception):
+    """The bus is gone; ``str`` says why."""
+
+
+class ForbiddenFrame(Exception):
+    """Something tried to send a frame that the guard must never send."""
+
+
+class CanSocket:
+    """What both transports share: the descriptor and the filter of what may be sent."""
+
+    def __init__(self, descriptor: socket.socket, allowed: Iterable[int]) -> None:
+        self._socket = descriptor
+        self._allowed = frozenset(allowed)
+        self.lost_frames = 0
+        descriptor.setblocking(False)
+
+    def fileno(self) -> int:
+        """The descriptor, for poll."""
+        return self._socket.fileno()
+
+    def receive(self) -> list[Frame]:
+        """Return all frames that wait, without waiting; BusDown when the bus is gone."""
+        raise NotImplementedError
+
+    def send(self, cob_id: int, data: bytes) -> bool:
+        """Send one frame now; False when the queue is full. BusDown, ForbiddenFrame."""
+        if cob_id not in self._allowed:
+            raise ForbiddenFrame(f"{cob_id:03X} is none of the COB-IDs that this process may send")
+        try:
+            return self._send(cob_id, data)
+        except OSError as error:
+            if error.errno in FULL:
+                return False
+            raise BusDown(error.strerror or str(error)) from None
+
+    def _send(self, cob_id: int, data: bytes) -> bool:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Close the descriptor."""
+        self._socket.close()
+
+
+class RawCan(CanSocket):
+    """SocketCAN's CAN_RAW; ``lost_frames`` counts what the kernel dropped because it was not read."""
+
+    def __init__(self, descriptor: socket.socket, allowed: Iterable[int], wanted: Iterable[int]) -> None:
+        super().__init__(descriptor, allowed)
+        filters = b"".join(_CAN_FILTER.pack(cob_id, CAN_SFF_ONLY) for cob_id in wanted)
+        descriptor.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
+        descriptor.setsockopt(socket.SOL_CAN_RAW, CAN_RAW_ERR_FILTER, 0x1FFFFFFF)
+        descriptor.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMP, 1)
+        descriptor.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+        self._overflow = 0
+
+    def receive(self) -> list[Frame]:
+        """Return all frames that wait, error frames as controller states."""
+        frames: list[Frame] = []
+        while True:
+            try:
+                data, ancillary, _, _ = self._socket.recvmsg(16, 64)
+            except OSError as error:
+                if error.errno in RETRY:
+                    return frames
+                raise BusDown(error.strerror or str(error)) from None
+            can_id, length, payload = _CAN_FRAME.unpack(data)
+            stamp_s = self._ancillary(ancillary)
+            if can_id & CAN_ERR_FLAG:
+                frames += [(ERROR, name.encode(), stamp_s) for name in controller_states(can_id, payload)]
+            elif can_id <= 0x7FF:
+                frames.append((can_id, payload[:length], stamp_s))
+
+    def _ancillary(self, ancillary: list[tuple[int, int, bytes]]) -> float:
+        stamp_s = 0.0
+        for _, kind, data in ancillary:
+            if kind == SO_TIMESTAMP:
+                seconds, microseconds = _TIMEVAL.unpack(data[: _TIMEVAL.size])
+                stamp_s = seconds + microseconds * 1e-6
+            elif kind == SO_RXQ_OVFL:
+                total = int.from_bytes(data[:4], "little")
+                self.lost_frames += total - self._overflow
+                self._overflow = total
+        return stamp_s
+
+    def _send(self, cob_id: int, data: bytes) -> bool:
+        self._socket.send(_CAN_FRAME.pack(cob_id, len(data), data))
+        return True
+
+
+def controller_states(can_id: int, data: bytes) -> list[str]:
+    """Return what an error frame says about the controller (linux/can/error.h): off, restarted, passive, active."""
+    states = []
+    if can_id & 0x40:
+        states.append("off")
+    if can_id & 0x100:
+        states.append("restarted")
+    if can_id & 0x4:
+        if data[1] & 0x30:
+            states.append("passive")
+        elif data[1] & 0x0C:
+            states.append("warning")
+        elif data[1] & 0x40:
+            states.append("active")
+    return states
+
+
+class SocketcandText(CanSocket):
+    """The socketcand protocol in raw mode, the greeting already done: ``< frame 123 23.424242 11 22 >``."""
+
+    def __init__(self, descriptor: socket.socket, allowed: Iterable[int], wanted: Iterable[int]) -> None:
+        super().__init__(descriptor, allowed)
+        descriptor.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._wanted = {f"{cob_id:03X}".encode(): cob_id for cob_id in wanted}
+        self._wanted |= {name.lower(): cob_id for name, cob_id in self._wanted.items()}
+        self._rest = b""
+
+    def receive(self) -> list[Frame]:
+        """Return the wanted frames of everything that waits."""
+        chunks = [self._rest]
+        while True:
+            try:
+                chunk = self._socket.recv(1 << 16)
+            except OSError as error:
+                if error.errno in RETRY:
+                    break
+                raise BusDown(error.strerror or str(error)) from None
+            if not chunk:
+                raise BusDown("the hub closed the connection")
+            chunks.append(chunk)
+            if len(chunk) < 1 << 16:
+                break
+        *pieces, self._rest = b"".join(chunks).split(b">")
+        if len(self._rest) > MAX_PENDING_BYTES:
+            raise BusDown("the hub does not speak the socketcand protocol")
+        return [frame for piece in pieces if (frame := self._parse(piece)) is not None]
+
+    def _parse(self, piece: bytes) -> Frame | None:
+        words = piece.split()
+        if len(words) < 4:
+            return None
+        if words[1] == b"error":
+            return self._controller(words)
+        cob_id = self._wanted.get(words[2])
+        if cob_id is None or words[1] != b"frame":
+            return None
+        try:
+            return cob_id, bytes.fromhex(b"".join(words[4:]).decode("ascii")), float(words[3])
+        except ValueError:
+            return None
+
+    @staticmethod
+    def _controller(words: list[bytes]) -> Frame | None:
+        try:
+            states = controller_states(int(words[2], 16), bytes(8))
+        except ValueError:
+            return None
+        return (ERROR, states[0].encode(), 0.0) if states else None
+
+    def _send(self, cob_id: int, data: bytes) -> bool:
+        text = f"< send {cob_id:03X} {len(data):X} {data.hex(' ')} >".encode("ascii")
+        sent = self._socket.send(text)
+        if sent != len(text):  # half a command cannot be taken back: what follows would be garbage
+            raise BusDown("the hub took only a part of a frame")
+        return True
+
+
+def adopt_descriptor(
+    transport: Literal["can_raw", "socketcand"], descriptor: int, allowed: Iterable[int], wanted: Iterable[int]
+) -> CanSocket:
+    """Take over an open descriptor; OSError when it is none of that kind."""
+    kind = RawCan if transport == "can_raw" else SocketcandText
+    return kind(socket.socket(fileno=descriptor), allowed, wanted)

@@ -1,0 +1,144 @@
+"""The daemon's end of the guard's control socket. Blocking and small; ``alive`` never blocks.
+
+Call ``alive`` at least every 0.2 s from the loop turn that checks the daemon's own health, not from a thread of its
+own: a daemon that hangs must look dead. The connection that armed is the one whose end ramps the offset down.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
+from fdhil.guard import table
+from fdhil.guard.control import SOCKET_NAME
+
+TABLE_NAME = "guard.table"
+
+
+class GuardLost(DeviceError):
+    """The guard closed the connection: it has stopped, after ramping to zero where it could."""
+
+
+class GuardClient:
+    """A connection to the guard of a run directory; ConnectError when none listens there.
+
+    Answers are the guard's JSON documents: {"ok": true, ...}, or {"ok": false, "code", "axis", "text", "advice",
+    "refused": [...]}: a refusal is a value, not an exception. GuardLost when the connection ends, DeviceTimeout when
+    no answer comes. Safe to use from two threads: ``alive`` may be called while another waits for an answer.
+    """
+
+    def __init__(self, run_directory: Path, timeout_s: float = 5.0) -> None:
+        self._table = run_directory / TABLE_NAME
+        self._timeout_s = timeout_s
+        self._asking, self._sending = threading.Lock(), threading.Lock()
+        self._number = 0
+        self._inbox = b""
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        path = run_directory / SOCKET_NAME
+        try:
+            self._socket.settimeout(timeout_s)
+            self._socket.connect(str(path))
+        except OSError as error:
+            self._socket.close()
+            text = f"no guard answers ({error.strerror or error}); start fdhil-guard with this machine's config"
+            raise ConnectError(str(path), text) from None
+
+    def status(self) -> dict[str, Any]:
+        """Return the guard's status document."""
+        return self.ask({"request": "status"})
+
+    def load(
+        self,
+        axes: Sequence[str],
+        demand: Mapping[str, Sequence[int]],
+        offset: Mapping[str, Sequence[int]],
+        program_digest: str,
+        first: int = 0,
+        final: bool = True,
+    ) -> dict[str, Any]:
+        """Write a table (or with ``first`` and ``final`` a piece of a streamed one) and have it checked and loaded.
+
+        Rows per axis: demand and offset in drive increments (sequences of int or numpy integer arrays). StoreError when
+        the file cannot be written, ValueError when a value is no 32 bit integer.
+        """
+        body = table.encode(axes, demand, offset, program_digest, first, final)
+        table.write(self._table, body)
+        return self.ask({"request": "table"}, timeout_s=self._timeout_s + len(body) / 1e6)
+
+    def arm(self, token: str, program_digest: str, facts: Mapping[str, bool]) -> dict[str, Any]:
+        """Arm the loaded table; ``facts`` as in ``interlocks.FACTS``."""
+        request = {"request": "arm", "token": token, "program_digest": program_digest, "facts": dict(facts)}
+        return self.ask(request)
+
+    def disarm(self) -> dict[str, Any]:
+        """Ramp to zero; the answer comes at once, ``status`` shows when the state is OFF."""
+        return self.ask({"request": "disarm"})
+
+    def adopt(self, token: str) -> dict[str, Any]:
+        """Take over what the drives hold and ramp it to zero (after FROZEN, or a stale offset)."""
+        return self.ask({"request": "adopt", "token": token})
+
+    def alive(self, facts: Mapping[str, bool] | None = None) -> None:
+        """Say that the daemon is well, and what it still vouches for; GuardLost when the guard is gone."""
+        message: dict[str, Any] = {"request": "alive"}
+        if facts is not None:
+            message["facts"] = dict(facts)
+        self._send(message)
+
+    def ask(self, request: Mapping[str, Any], timeout_s: float | None = None) -> dict[str, Any]:
+        """Send one request and wait for its answer."""
+        with self._asking:
+            self._number += 1
+            number = self._number
+            self._send({**request, "id": number})
+            deadline_s = time.monotonic() + (timeout_s or self._timeout_s)
+            while True:
+                answer = self._line(deadline_s)
+                if answer.pop("id", None) == number:
+                    return answer
+
+    def _send(self, message: Mapping[str, Any]) -> None:
+        try:
+            with self._sending:
+                self._socket.sendall(json.dumps(message).encode() + b"\n")
+        except OSError as error:
+            raise self._lost(error.strerror or str(error)) from None
+
+    def _line(self, deadline_s: float) -> dict[str, Any]:
+        while b"\n" not in self._inbox:
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0:
+                raise DeviceTimeout("guard", "gave no answer; look at its journal, then restart it")
+            self._socket.settimeout(left_s)
+            try:
+                chunk = self._socket.recv(1 << 16)
+            except TimeoutError:
+                continue
+            except OSError as error:
+                raise self._lost(error.strerror or str(error)) from None
+            if not chunk:
+                raise self._lost("connection closed")
+            self._inbox += chunk
+        line, self._inbox = self._inbox.split(b"\n", 1)
+        answer = json.loads(line)
+        return answer if isinstance(answer, dict) else {}
+
+    @staticmethod
+    def _lost(why: str) -> GuardLost:
+        return GuardLost("guard", f"is gone ({why}); look at its journal, then start it again")
+
+    def close(self) -> None:
+        """Close the connection: an armed correction is ramped down (MainLost)."""
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,444 @@
+"""The guard's decisions: ``step(state, inputs, settings) -> (state, output)``, a pure function, once per SYNC.
+
+No clock, no I/O: time is the SYNC count in the state. Every way out of a state leads toward OFF, but for the operator's
+arm and adopt. The order within a step: what the drives and the bus say, the interlocks, the request, the place on the
+path, the motion of the offset, and a check of the frame by other formulas than those that made it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from fdhil.guard.interlocks import Alarm, AxisView, Reaction, failing, not_ready, withheld
+from fdhil.guard.limits import brake, follow, violation
+from fdhil.guard.path import EPS, Path, Place, advance, around
+from fdhil.guard.settings import AxisSettings, Settings
+from fdhil.guard.state import (
+    IN_CHARGE,
+    LANDING,
+    SENDING,
+    AxisInput,
+    AxisState,
+    Inputs,
+    Mode,
+    Output,
+    Request,
+    State,
+)
+
+SETTLED_CYCLES = 100
+STILL_CYCLES = 10
+HOLD_CYCLES = 10
+FEED_HOLD_S = 10.0
+RESERVE_S = 1.0
+MISSED_CYCLES = 10
+FAILED_SENDS = 3
+ZEROS = 3
+ZEROS_UNCONFIRMED = 50
+
+Views = tuple[AxisView, ...]
+Alarms = tuple[Alarm, ...]
+
+
+def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Output]:
+    """Decide what leaves the guard now. ``inputs.sync`` False is the local timer's step, taken when SYNC is silent."""
+    before = state.mode
+    state = _observe(state, inputs, settings)
+    views = tuple(map(_view, settings.axes, inputs.axes, state.axes))
+    alarms = _alarms(state, inputs, views)
+    state = replace(state, good_for=0 if alarms else state.good_for + inputs.sync)
+    state, refused = _request(state, inputs, alarms, views, settings)
+    state = _react(state, inputs, alarms, settings)
+    state = _adopt_at_start(state, inputs, alarms)
+    if inputs.sync:
+        state = _follow_path(state, inputs, alarms, settings)
+    state, output = _move(state, inputs, settings)
+    moved = None if state.mode is before else (before, state.mode, state.cause)
+    return state, replace(output, refused=refused, transition=moved)
+
+
+# --- what the drives and the bus say ---
+
+
+def _observe(state: State, inputs: Inputs, settings: Settings) -> State:
+    """Take in what was sampled: failed frames, read-backs, following errors, the targets just latched."""
+    axes = state.axes if inputs.transmitted else tuple(map(_not_sent, state.axes))
+    failed = 0 if inputs.transmitted else state.failed_run + 1
+    if not inputs.sync:
+        return replace(state, axes=axes, failed_run=failed, tick=state.tick + (not settings.offset_synchronous))
+    heard = [axis.target for axis in inputs.axes]
+    targets = None if None in heard else tuple([target for target in heard if target is not None])
+    depth = max([axis.setpoint_delay_cycles for axis in settings.axes]) + 2
+    history = (targets, *state.targets)[:depth]
+    sampled = [
+        _sampled(axis, seen, setting, k, history)
+        for k, (axis, seen, setting) in enumerate(zip(axes, inputs.axes, settings.axes, strict=True))
+    ]
+    return replace(
+        state,
+        axes=tuple(sampled),
+        tick=state.tick + 1,
+        targets=history,
+        failed_run=failed,
+        missed=state.missed + (inputs.late and state.mode in SENDING),
+        missed_run=state.missed_run + 1 if inputs.late else 0,
+    )
+
+
+def _not_sent(axis: AxisState) -> AxisState:
+    """The last frame did not leave: the value before it is still in force, at rest."""
+    return replace(axis, offset=axis.sent[1], rate=0, sent=(axis.sent[1], *axis.sent[1:]))
+
+
+def _sampled(
+    axis: AxisState, seen: AxisInput, setting: AxisSettings, k: int, history: tuple[tuple[int, ...] | None, ...]
+) -> AxisState:
+    """Compare what the drive showed at the SYNC before with what was in force then.
+
+    ``axis.sent[0]`` left after that SYNC, ``sent[1]`` after the one before it and was latched at it. The set-point
+    followed then was latched ``setpoint_delay_cycles`` earlier, together with its offset.
+    """
+    error: float = axis.following_error
+    latched = history[1 + setting.setpoint_delay_cycles] if len(history) > 1 + setting.setpoint_delay_cycles else None
+    if seen.following_error is not None:
+        error = seen.following_error
+    elif seen.position is not None:
+        offset = axis.sent[1 + setting.setpoint_delay_cycles]
+        error = float("nan") if latched is None else latched[k] + offset - seen.position
+    if seen.read_back is None:
+        return axis if error == axis.following_error else replace(axis, following_error=error)
+    late = seen.read_back != axis.sent[1] and seen.read_back in axis.sent[2:4]
+    wrong = seen.read_back != axis.sent[1] and not late
+    return replace(
+        axis,
+        following_error=error,
+        read_back=seen.read_back,
+        echo_misses=axis.echo_misses + 1 if wrong else 0,
+        late_echoes=axis.late_echoes + late,
+        zero_shown=axis.zero_shown or (seen.read_back == 0 and not any(axis.sent[:2])),
+    )
+
+
+def _view(setting: AxisSettings, seen: AxisInput, axis: AxisState) -> AxisView:
+    return AxisView(
+        setting.name,
+        seen.feedback_age,
+        seen.heartbeat_age_s,
+        setting.heartbeat_timeout_s,
+        seen.nmt,
+        seen.statusword,
+        seen.mode,
+        axis.following_error,
+        setting.window,
+        setting.limits.offset,
+        axis.echo_misses,
+        axis.read_back,
+        seen.target is not None,
+        seen.short_frames,
+        seen.long_frames,
+    )
+
+
+def _alarms(state: State, inputs: Inputs, views: Views) -> Alarms:
+    """Everything that is not good at this step, events first."""
+    own = []
+    if state.missed_run > MISSED_CYCLES:
+        own.append(Alarm("LoopOverrun"))
+    if state.failed_run >= FAILED_SENDS:
+        own.append(Alarm("TxQueueFull"))
+    return (*inputs.alarms, *own, *failing(inputs.bus, views))
+
+
+def standing(state: State, inputs: Inputs, settings: Settings) -> Alarms:
+    """Return what was not good at the step that took ``inputs``, what forbids arming included; for the status."""
+    views = tuple(map(_view, settings.axes, inputs.axes, state.axes))
+    return (*_alarms(state, inputs, views), *not_ready(views))
+
+
+# --- requests ---
+
+
+def _request(
+    state: State, inputs: Inputs, alarms: Alarms, views: Views, settings: Settings
+) -> tuple[State, Alarms | None]:
+    """Answer the request: the new state and the refusals (empty: granted), None when nothing was asked."""
+    request = inputs.request
+    if request is None:
+        return state, None
+    if request.kind == "arm":
+        refused = _refusals(state, inputs, request, alarms, views)
+        return (state, refused) if refused else (_armed(state, inputs), ())
+    if request.kind == "adopt":
+        refused = _adopt_refusals(state, request, alarms, settings)
+        return (state, refused) if refused else (_adopting(state), ())
+    if state.mode in IN_CHARGE:
+        state = _ramp_down(state, Alarm("Disarmed" if request.kind == "disarm" else "Stopped"))
+    return state, ()
+
+
+def _refusals(state: State, inputs: Inputs, request: Request, alarms: Alarms, views: Views) -> Alarms:
+    """All that forbids arming; an empty answer is the only way from OFF to ARMED."""
+    refused: list[Alarm] = []
+    if state.mode is not Mode.OFF:
+        refused.append(Alarm("NotOff", detail=state.mode.value))
+    if request.token_valid is not True:
+        refused.append(Alarm("AuthRequired"))
+    if inputs.main_alive is not True:
+        refused.append(Alarm("MainLost"))
+    refused += [*withheld(request.facts), *alarms, *not_ready(views)]
+    if not alarms and not state.good_for >= SETTLED_CYCLES:
+        refused.append(Alarm("NotSettled", detail=f"{state.good_for} so far"))
+    path = inputs.path
+    if path is None or not request.program_digest or path.program_digest != request.program_digest or path.first:
+        refused.append(Alarm("ProgramMismatch"))
+    return tuple(refused)
+
+
+def _armed(state: State, inputs: Inputs) -> State:
+    assert inputs.path is not None
+    return replace(
+        state,
+        mode=Mode.ARMED,
+        program_digest=inputs.path.program_digest,
+        start_row=inputs.path.standing_rows(),
+        axes=tuple([_at_rest(axis, 0) for axis in state.axes]),
+        places=(),
+        still_for=0,
+        held_for=0,
+        cause=None,
+    )
+
+
+def _adopt_refusals(state: State, request: Request, alarms: Alarms, settings: Settings) -> Alarms:
+    refused = [alarm for alarm in alarms if alarm.reaction is Reaction.FREEZE]
+    for setting, axis in zip(settings.axes, state.axes, strict=True):
+        if setting.reads_back and axis.read_back is None:
+            refused.append(Alarm("StaleData", setting.name, "its offset was not read yet"))
+    if state.mode not in (Mode.OFF, Mode.FROZEN):
+        refused.append(Alarm("NotOff", detail=state.mode.value))
+    if request.token_valid is not True:
+        refused.append(Alarm("AuthRequired"))
+    return tuple(refused)
+
+
+def _adopting(state: State) -> State:
+    """Take over what the drives hold: the first value sent is the value read."""
+    axes = tuple([_at_rest(axis, axis.sent[0] if axis.read_back is None else axis.read_back) for axis in state.axes])
+    return replace(state, mode=Mode.ADOPT, axes=axes, zeros_sent=0, adopt_checked=True, cause=Alarm("StaleOffset"))
+
+
+def _at_rest(axis: AxisState, offset: int) -> AxisState:
+    return AxisState(offset, 0, (offset,) * len(axis.sent), axis.travel, axis.read_back, late_echoes=axis.late_echoes)
+
+
+# --- reactions ---
+
+
+def _ramp_down(state: State, cause: Alarm) -> State:
+    return replace(state, mode=Mode.RAMP_DOWN, cause=cause, places=(), zeros_sent=0)
+
+
+def _frozen(state: State, cause: Alarm) -> State:
+    """Stop sending: what the drive holds is unknown, unless only zeros were sent."""
+    if not any(any(axis.sent) for axis in state.axes):
+        return replace(state, mode=Mode.OFF, cause=cause, places=())
+    unread = tuple([replace(axis, read_back=None) for axis in state.axes])
+    return replace(state, mode=Mode.FROZEN, cause=cause, places=(), axes=unread)
+
+
+def _react(state: State, inputs: Inputs, alarms: Alarms, settings: Settings) -> State:
+    """Freeze or ramp down, whichever the worst alarm asks for; a lost daemon is one."""
+    if state.mode not in SENDING:
+        return state
+    worst = max(alarms, key=lambda alarm: _reaction(alarm, settings), default=None)
+    reaction = Reaction.REFUSE if worst is None else _reaction(worst, settings)
+    if worst is not None and reaction is Reaction.FREEZE:
+        return _frozen(state, worst)
+    if state.failed_run >= 2 * FAILED_SENDS:
+        return _frozen(state, Alarm("TxQueueFull"))
+    if state.mode not in IN_CHARGE:
+        return state
+    if worst is not None and reaction is Reaction.RAMP_DOWN:
+        return _ramp_down(state, worst)
+    if inputs.main_alive is not True:
+        return _ramp_down(state, Alarm("MainLost"))
+    return _ramp_down(state, inputs.withdrawn[0]) if inputs.withdrawn else state
+
+
+def _reaction(alarm: Alarm, settings: Settings) -> Reaction:
+    """Without SYNC an event-driven RPDO can still be ramped, a synchronous one is not applied."""
+    if alarm.code == "SyncLost" and not settings.offset_synchronous:
+        return Reaction.RAMP_DOWN
+    return alarm.reaction
+
+
+def _adopt_at_start(state: State, inputs: Inputs, alarms: Alarms) -> State:
+    """Once after the start: a drive that already holds an offset gets it ramped to zero, by us, from its value."""
+    if state.adopt_checked or state.mode is not Mode.OFF or not inputs.sync:
+        return state
+    if any(alarm.code in ("SyncJitter", "OffsetHijack", "BusLocked") for alarm in alarms):
+        return state
+    if any(alarm.reaction is Reaction.FREEZE for alarm in alarms) or any(a.read_back is None for a in state.axes):
+        return state
+    if any(axis.read_back for axis in state.axes):
+        return _adopting(state)
+    return replace(state, adopt_checked=True)
+
+
+# --- the place on the path ---
+
+
+def _follow_path(state: State, inputs: Inputs, alarms: Alarms, settings: Settings) -> State:
+    """Find the row that this SYNC latched; hold when it cannot be told, ramp down when that lasts or the path ends."""
+    if state.mode not in IN_CHARGE:
+        return state
+    path = inputs.path
+    if path is None or path.program_digest != state.program_digest:
+        return _ramp_down(state, Alarm("ProgramMismatch"))
+    hold = next((alarm for alarm in alarms if alarm.reaction is Reaction.HOLD), None)
+    if state.mode is Mode.ARMED:
+        return _held(state, hold, settings) if hold else _await_start(replace(state, held_for=0), path)
+    state, lost = _track(state, path)
+    hold = hold or lost
+    if path.final and state.places[0].row >= path.end - 1:
+        return _ramp_down(state, Alarm("Finished"))
+    if not path.final and path.end - state.places[0].row < settings.cycles(RESERVE_S):
+        return _ramp_down(state, Alarm("TableStarved"))
+    if hold is not None:
+        return _held(state, hold, settings)
+    if state.mode is Mode.HOLD:
+        return replace(state, mode=Mode.RAMPING, held_for=0, cause=None)
+    return replace(state, held_for=0)
+
+
+def _held(state: State, alarm: Alarm, settings: Settings) -> State:
+    """Hold the offset, or when that has lasted too long ramp it down; before the start there is nothing to hold."""
+    allowed = settings.cycles(FEED_HOLD_S) if alarm.code == "FeedHold" else HOLD_CYCLES
+    if state.held_for >= allowed:
+        return _ramp_down(state, alarm)
+    mode = Mode.ARMED if state.mode is Mode.ARMED else Mode.HOLD
+    return replace(state, mode=mode, held_for=state.held_for + 1, cause=alarm)
+
+
+def _await_start(state: State, path: Path) -> State:
+    """Armed: once the targets have stood at the path's begin, the first that leaves it says where the path is."""
+    now, last = state.targets[0], state.targets[1] if len(state.targets) > 1 else None
+    if now is None:
+        return state
+    if now == last:
+        distance = path.mismatch(path.first, now)
+        at_start = distance is not None and distance <= EPS
+        return replace(state, still_for=state.still_for + 1 if at_start else 0)
+    if state.still_for < STILL_CYCLES:
+        return replace(state, still_for=0)
+    places = around(path, state.start_row + 1, now)
+    if not places:
+        return _ramp_down(state, Alarm("Misaligned", detail="the first move leaves the path"))
+    return replace(state, mode=Mode.RAMPING, places=places, anchor=places[0].row, cause=None)
+
+
+def _track(state: State, path: Path) -> tuple[State, Alarm | None]:
+    """Move along the path by what the targets say; an alarm when they say something else."""
+    targets = state.targets[0]
+    places = advance(path, state.places, targets)
+    if places:
+        return replace(state, places=places, anchor=places[0].row if targets else state.anchor, resuming=False), None
+    assert targets is not None
+    distance = path.mismatch(state.anchor, targets)
+    if targets == state.targets[1] and distance is not None and distance <= EPS:
+        return replace(state, places=(Place(state.anchor),), resuming=True), Alarm("FeedHold")
+    places = around(path, state.anchor + 1, targets) if state.resuming else ()
+    if places:
+        return replace(state, places=places, anchor=places[0].row, resuming=False), None
+    return replace(state, places=advance(path, state.places, None), resuming=False), Alarm("Misaligned")
+
+
+# --- the motion of the offset ---
+
+
+def _move(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Output]:
+    """Compute, check and hand out the next offsets; a step that is too late sends nothing and stands still."""
+    if state.mode not in SENDING:
+        return state, Output()
+    if not inputs.sync and (settings.offset_synchronous or not inputs.bus.silent):
+        return state, Output()
+    if inputs.late:
+        mode = Mode.RAMPING if state.mode is Mode.ACTIVE else state.mode
+        return replace(state, mode=mode, axes=tuple(map(_stands, state.axes))), Output()
+    offsets, broken = _next_offsets(state, inputs.path, settings)
+    if broken is not None:
+        state = _ramp_down(state, broken)
+        offsets, _ = _next_offsets(state, inputs.path, settings)
+    wrong = _wrong_frame(state, offsets, settings)
+    if wrong is not None:
+        return _frozen(state, wrong), Output()
+    axes = tuple([_sent(axis, o, s) for axis, o, s in zip(state.axes, offsets, settings.axes, strict=True)])
+    state = _arrived(replace(state, axes=axes), inputs.path, settings)
+    heartbeat = state.tick % settings.heartbeat_cycles == 0
+    return state, Output(offsets, heartbeat)
+
+
+def _next_offsets(state: State, path: Path | None, settings: Settings) -> tuple[tuple[int, ...], Alarm | None]:
+    """Return the next offset of each axis, and the alarm when the table itself asks for more than is allowed."""
+    if state.mode is Mode.ARMED:
+        return (0,) * len(state.axes), None
+    if state.mode is Mode.HOLD:
+        return tuple([brake(s.limits, a.offset, a.rate) for s, a in zip(settings.axes, state.axes, strict=True)]), None
+    if state.mode in LANDING or path is None:
+        return tuple(
+            [follow(s.limits, a.offset, a.rate, 0, 0) for s, a in zip(settings.axes, state.axes, strict=True)]
+        ), None
+    row = state.places[0].row
+    wanted, current = path.offsets_at(row + 1), path.offsets_at(row)
+    offsets = []
+    for s, axis, goal, here in zip(settings.axes, state.axes, wanted, current, strict=True):
+        offset = follow(s.limits, axis.offset, axis.rate, goal, goal - here)
+        if state.mode is Mode.ACTIVE and offset != goal:
+            return (), Alarm(violation(s.limits, axis.offset, axis.rate, goal) or "OffsetRate", s.name)
+        if not axis.travel.total <= s.limits.variation:
+            return (), Alarm("OffsetEnergy", s.name)
+        offsets.append(offset)
+    return tuple(offsets), None
+
+
+def _wrong_frame(state: State, offsets: tuple[int, ...], settings: Settings) -> Alarm | None:
+    """Check the frames by the limits alone, whatever made them; they are wrong only if this program is."""
+    for s, axis, offset in zip(settings.axes, state.axes, offsets, strict=True):
+        if type(offset) is not int or violation(s.limits, axis.offset, axis.rate, offset) is not None:
+            return Alarm("InternalError", s.name, f"{axis.offset} + {axis.rate} -> {offset}")
+    return None
+
+
+def _sent(axis: AxisState, offset: int, setting: AxisSettings) -> AxisState:
+    move = offset - axis.offset
+    return replace(
+        axis,
+        offset=offset,
+        rate=move,
+        sent=(offset, *axis.sent[:-1]),
+        travel=axis.travel.add(move, setting.limits.window),
+        zero_shown=axis.zero_shown and offset == 0,
+    )
+
+
+def _stands(axis: AxisState) -> AxisState:
+    """Nothing was sent in this cycle: the drive keeps the value."""
+    return replace(axis, rate=0, sent=(axis.sent[0], *axis.sent[:-1]))
+
+
+def _arrived(state: State, path: Path | None, settings: Settings) -> State:
+    """Leave RAMPING when on the table, and a landing when the drives show 0."""
+    if state.mode is Mode.RAMPING and path is not None and len(state.places) == 1:
+        on_table = tuple([axis.offset for axis in state.axes]) == path.offsets_at(state.places[0].row + 1)
+        return replace(state, mode=Mode.ACTIVE) if on_table else state
+    if state.mode not in LANDING:
+        return state
+    if any(axis.offset or axis.rate for axis in state.axes):
+        return replace(state, zeros_sent=0)
+    sent = state.zeros_sent + 1
+    shown = all(a.zero_shown or not s.reads_back for s, a in zip(settings.axes, state.axes, strict=True))
+    if sent > ZEROS and shown:
+        return replace(state, mode=Mode.OFF, axes=tuple([_at_rest(axis, 0) for axis in state.axes]), zeros_sent=sent)
+    if sent > ZEROS_UNCONFIRMED:
+        return replace(state, mode=Mode.FROZEN, cause=Alarm("EchoMismatch", detail="no zero was read back"))
+    return replace(state, zeros_sent=sent)

@@ -1,0 +1,270 @@
+"""From frames to what the core may know at a SYNC: pure bookkeeping, no socket and no clock of its own.
+
+A TPDO is sampled at a SYNC and arrives after it, so that at the next SYNC it is one cycle old. The target that a SYNC
+latches is the last one that came before it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from statistics import median
+
+from fdhil.cia402 import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SYNC, Nmt, NmtCommand, PdoEntry, pdo_length, unpack
+from fdhil.guard.interlocks import Alarm, BusView
+from fdhil.guard.settings import AxisSettings, Pdo, Settings
+from fdhil.guard.state import AxisInput
+
+INF = float("inf")
+NEVER = 1 << 30
+INTERVALS = 32
+FOREIGN_CYCLES = 3
+TARGET, POSITION, READ_BACK, STATUSWORD, MODE, FOLLOWING = 0x607A, 0x6064, 0x60B0, 0x6041, 0x6061, 0x60F4
+
+
+@dataclass(slots=True)
+class _PdoState:
+    """One PDO that is listened to: its last content and age in SYNC cycles, and what is wrong with it."""
+
+    axis: int
+    entries: tuple[PdoEntry, ...]
+    length: int
+    every_sync: int
+    where: dict[int, int]
+    data: bytes = b""
+    age: int = NEVER
+    fresh: bool = False
+    twice: bool = False
+    twice_run: int = 0
+    short: int = 0
+    long: int = 0
+    values: tuple[int, ...] = ()
+
+    def take(self, data: bytes) -> None:
+        """Take one frame: short ones are dropped and counted, of long ones the mapped bytes are used."""
+        if len(data) < self.length:
+            self.short += 1
+            return
+        self.long += len(data) > self.length
+        self.short = 0
+        if self.fresh and data != self.data:
+            self.twice = True
+        self.data, self.fresh, self.age = data, True, 0
+
+    def at_sync(self) -> None:
+        """Age by one cycle and decode what came."""
+        self.twice_run = self.twice_run + 1 if self.twice else 0
+        self.age += 1
+        if self.fresh:
+            self.values = unpack(self.entries, self.data)
+        self.twice = False
+
+    def get(self, index: int) -> int | None:
+        """The last value of an object, None when it was never heard or is not mapped here."""
+        place = self.where.get(index)
+        return None if place is None or not self.values else self.values[place]
+
+
+def _pdo_state(axis: int, pdo: Pdo) -> _PdoState:
+    entries = pdo.entries
+    where = {entry.index: k for k, entry in enumerate(entries) if entry.sub == 0}
+    return _PdoState(axis, entries, pdo_length(entries), max(1, pdo.every_sync), where)
+
+
+@dataclass(slots=True)
+class _Node:
+    nmt: int | None = None
+    heartbeat_at_s: float = -INF
+
+
+@dataclass(slots=True)
+class Listener:
+    """Gathers frames (``take``) and gives the axes' inputs and the bus' view at a SYNC (``at_sync``).
+
+    The bus does not give back what we send ourselves: a frame with one of our COB-IDs is another node's.
+    """
+
+    settings: Settings
+    bus_state: str = "active"
+    lost_frames: int = 0
+    foreign_ids: frozenset[int] = frozenset()
+    duplicates: int = 0
+    emergencies: int = 0
+    _pdos: dict[int, _PdoState] = field(default_factory=dict)
+    _tpdos: list[list[_PdoState]] = field(default_factory=list)
+    _targets: list[_PdoState] = field(default_factory=list)
+    _nodes: list[_Node] = field(default_factory=list)
+    _node_of: dict[int, int] = field(default_factory=dict)
+    _alarms: list[Alarm] = field(default_factory=list)
+    _counter: int | None = None
+    _last_sync_s: tuple[float, float] | None = None
+    _intervals: deque[float] = field(default_factory=lambda: deque(maxlen=INTERVALS))
+
+    def __post_init__(self) -> None:
+        for k, axis in enumerate(self.settings.axes):
+            target = _pdo_state(k, axis.target)
+            self._targets.append(target)
+            self._tpdos.append([_pdo_state(k, pdo) for pdo in axis.tpdos])
+            self._pdos[axis.target.cob_id] = target
+            self._pdos.update(zip([pdo.cob_id for pdo in axis.tpdos], self._tpdos[k], strict=True))
+            self._nodes.append(_Node())
+            self._node_of[axis.node_id] = k
+        self.foreign_ids = self.settings.sent_ids
+
+    def wanted_ids(self) -> tuple[int, ...]:
+        """All COB-IDs that the guard must hear, for a receive filter."""
+        nodes = list(self._node_of)
+        ids = {COB_NMT, COB_SYNC, *self._pdos, *self.foreign_ids}
+        return tuple(sorted(ids | {COB_EMCY + n for n in nodes} | {COB_HEARTBEAT + n for n in nodes}))
+
+    def take(self, cob_id: int, data: bytes, now_s: float) -> None:
+        """Take any frame but SYNC; ``now_s`` is monotonic time."""
+        pdo = self._pdos.get(cob_id)
+        if pdo is not None:
+            pdo.take(data)
+        elif cob_id in self.foreign_ids:
+            code = "BusLocked" if cob_id >= COB_HEARTBEAT else "OffsetHijack"
+            self._alarm(Alarm(code, detail=f"{cob_id:03X} {data.hex()}"))
+        elif cob_id == COB_NMT:
+            self._nmt_command(data)
+        elif cob_id > COB_HEARTBEAT and cob_id - COB_HEARTBEAT in self._node_of:
+            self._heartbeat(self._node_of[cob_id - COB_HEARTBEAT], data, now_s)
+        elif COB_EMCY < cob_id <= COB_EMCY + 127 and cob_id - COB_EMCY in self._node_of:
+            self._emergency(self._node_of[cob_id - COB_EMCY], data)
+
+    def error(self, state: str) -> None:
+        """The controller reported its error state: active, warning, passive, off, down or restarted."""
+        if state == "restarted":
+            self._alarm(Alarm("BusRestarted"))
+            state = "active"
+        self.bus_state = state
+
+    def _alarm(self, alarm: Alarm) -> None:
+        if len(self._alarms) < 16:  # a flood is one alarm
+            self._alarms.append(alarm)
+
+    def _nmt_command(self, data: bytes) -> None:
+        if len(data) < 2 or data[0] == NmtCommand.START:
+            return
+        for node, axis in self._node_of.items():
+            if data[1] in (0, node):
+                self._alarm(Alarm("NmtStateWrong", self.settings.axes[axis].name, f"NMT command {data[0]:02X}"))
+
+    def _heartbeat(self, axis: int, data: bytes, now_s: float) -> None:
+        if len(data) != 1:
+            return
+        node, state = self._nodes[axis], data[0] & 0x7F
+        node.nmt, node.heartbeat_at_s = state, now_s
+        if state == Nmt.BOOT_UP:
+            self._alarm(Alarm("NodeRebooted", self.settings.axes[axis].name))
+
+    def _emergency(self, axis: int, data: bytes) -> None:
+        code = int.from_bytes(data[:2], "little")
+        if code >> 8 == 0 and len(data) >= 2:  # error reset or no error
+            return
+        self.emergencies += 1
+        self._alarm(Alarm("DriveEmergency", self.settings.axes[axis].name, f"{code:04X}, data {data.hex()}"))
+
+    def at_sync(self, data: bytes, stamp_s: float, now_s: float) -> tuple[tuple[AxisInput, ...], BusView]:
+        """Close the cycle at a SYNC with its frame time ``stamp_s``; the view of the bus and of the axes."""
+        self._count(data)
+        regular = self._interval(stamp_s, now_s)
+        axes = tuple([self._axis_at_sync(k, axis, now_s) for k, axis in enumerate(self.settings.axes)])
+        lost, self.lost_frames = self.lost_frames, 0
+        return axes, BusView(self.bus_state, regular, silent=False, lost_frames=lost)
+
+    def in_silence(self, now_s: float, silent: bool) -> tuple[tuple[AxisInput, ...], BusView]:
+        """The same between two SYNC: nothing is closed."""
+        axes = [self._axis_input(k, axis, now_s, None) for k, axis in enumerate(self.settings.axes)]
+        return tuple(axes), BusView(self.bus_state, sync_regular=False, silent=silent)
+
+    def alarms(self) -> tuple[Alarm, ...]:
+        """Return and forget the events since the last call."""
+        alarms, self._alarms = tuple(self._alarms), []
+        return alarms
+
+    def forget_sync(self) -> None:
+        """After a silence the next SYNC starts a new series."""
+        self._counter = self._last_sync_s = None
+        self._intervals.clear()
+
+    def _count(self, data: bytes) -> None:
+        if len(data) != 1:
+            self._counter = None
+            return
+        before, self._counter = self._counter, data[0]
+        if before is None or data[0] == before + 1 or (data[0] == 1 and before >= 2):
+            return
+        if before < data[0] <= before + 3:
+            self._alarm(Alarm("RxOverflow", detail=f"SYNC {before} to {data[0]}"))
+        else:
+            self._alarm(Alarm("SyncCollision", detail=f"SYNC {before} to {data[0]}"))
+
+    def _interval(self, stamp_s: float, now_s: float) -> bool:
+        """Whether SYNC is regular: the interval not above three periods, the median of the last within 2 %.
+
+        The frame's stamp and its arrival are both looked at and the better one counts: a late reader spoils the
+        arrival, a wall clock that is set spoils the stamp, and neither is the bus' fault.
+        """
+        last, self._last_sync_s = self._last_sync_s, (stamp_s, now_s)
+        if last is None:
+            return False
+        period = self.settings.sync_period_s
+        if self.settings.clock == "sync":
+            return True
+        interval = min(stamp_s - last[0], now_s - last[1], key=lambda seconds: abs(seconds - period))
+        self._intervals.append(interval)
+        typical = median(self._intervals)
+        return not (interval > 3 * period or not abs(typical - period) <= 0.02 * period)
+
+    def _axis_at_sync(self, k: int, axis: AxisSettings, now_s: float) -> AxisInput:
+        target_pdo = self._targets[k]
+        for pdo in (target_pdo, *self._tpdos[k]):
+            pdo.at_sync()
+            if pdo.twice_run >= FOREIGN_CYCLES:
+                self._alarm(Alarm("ForeignProducer", axis.name))
+        target = target_pdo.get(TARGET) if target_pdo.fresh else None
+        seen = self._axis_input(k, axis, now_s, target)
+        for pdo in (target_pdo, *self._tpdos[k]):
+            pdo.fresh = False
+        return seen
+
+    def _axis_input(self, k: int, axis: AxisSettings, now_s: float, target: int | None) -> AxisInput:
+        tpdos, node = self._tpdos[k], self._nodes[k]
+        return AxisInput(
+            target,
+            _fresh(tpdos, POSITION),
+            _fresh(tpdos, READ_BACK),
+            _fresh(tpdos, FOLLOWING),
+            _last(tpdos, STATUSWORD),
+            _last(tpdos, MODE),
+            node.nmt,
+            _age(tpdos),
+            now_s - node.heartbeat_at_s,
+            max([pdo.short for pdo in tpdos], default=0),
+            max([pdo.long for pdo in tpdos], default=0),
+        )
+
+
+def _fresh(pdos: Sequence[_PdoState], index: int) -> int | None:
+    for pdo in pdos:
+        if pdo.fresh and index in pdo.where:
+            return pdo.get(index)
+    return None
+
+
+def _last(pdos: Sequence[_PdoState], index: int) -> int | None:
+    for pdo in pdos:
+        if index in pdo.where:
+            return pdo.get(index)
+    return None
+
+
+def _age(pdos: Sequence[_PdoState]) -> float:
+    """Age of the oldest TPDO that carries a signal of the guard, in units of its own rate, rounded up."""
+    ages = [-(-pdo.age // pdo.every_sync) for pdo in pdos if _NEEDED & pdo.where.keys()]
+    return max(ages, default=NEVER)
+
+
+_NEEDED = frozenset({STATUSWORD, POSITION, MODE})

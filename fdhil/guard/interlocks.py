@@ -1,0 +1,253 @@
+"""What must hold before and while an offset is sent: each interlock its own class, with cause, reaction and action.
+
+Every comparison is written ``not (it is good)``: what is unknown (None, NaN) is never good.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+
+from fdhil.cia402 import (
+    STATUS_FOLLOWING_ERROR,
+    STATUS_FOLLOWS_DEMAND,
+    STATUS_INTERNAL_LIMIT,
+    Mode,
+    Nmt,
+    State,
+    state_of,
+)
+
+
+class Reaction(IntEnum):
+    """What the guard does; a higher one wins."""
+
+    REFUSE = 0
+    HOLD = 1
+    RAMP_DOWN = 2
+    FREEZE = 3
+
+
+EFFECT: Mapping[Reaction, str] = {
+    Reaction.REFUSE: "nothing is sent",
+    Reaction.HOLD: "the offset is held for a few cycles, then ramped to zero",
+    Reaction.RAMP_DOWN: "the offset is ramped to zero and the correction is off until it is armed again",
+    Reaction.FREEZE: "nothing can be sent: the last offset may still be applied",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """Something that stops or refuses a correction: its class, the axis it is about, and a detail."""
+
+    code: str
+    axis: str = ""
+    detail: str = ""
+
+    @property
+    def reaction(self) -> Reaction:
+        """What the guard does about it while it sends."""
+        return CATALOGUE[self.code][0]
+
+    @property
+    def cause(self) -> str:
+        """The cause as a clause."""
+        where = f"axis {self.axis}: " if self.axis else ""
+        return f"{where}{CATALOGUE[self.code][1]}" + (f" ({self.detail})" if self.detail else "")
+
+    @property
+    def action(self) -> str:
+        """What the operator does next."""
+        return CATALOGUE[self.code][2]
+
+    @property
+    def text(self) -> str:
+        """One sentence: what happened, what it means for the machine, what to do next."""
+        return f"{self.cause}; {EFFECT[self.reaction]}; {self.action}"
+
+
+_R, _H, _F, _N = Reaction.RAMP_DOWN, Reaction.HOLD, Reaction.FREEZE, Reaction.REFUSE
+# class: (reaction while sending, cause, next action)
+CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
+    # the bus
+    "BusOff": (_F, "the CAN controller is bus-off", "hold the feed, check cable and termination, then adopt"),
+    "ErrorPassive": (_R, "the CAN controller is error-passive", "check cable, termination and bit rate"),
+    "BusRestarted": (_F, "the CAN controller restarted by itself", "hold the feed, then adopt"),
+    "BusDown": (_F, "the CAN bus is gone", "hold the feed, restore the interface, then restart the guard"),
+    "TxQueueFull": (_R, "frames do not leave the transmit queue", "check that another node acknowledges"),
+    "RxOverflow": (_R, "frames were lost before they were read", "give the guard a real-time priority"),
+    "LoopOverrun": (_R, "the guard's loop was late for more than ten cycles", "give the guard a real-time priority"),
+    "SyncLost": (_F, "no SYNC is heard", "hold the feed, restore the NC's SYNC, then adopt"),
+    "SyncJitter": (_H, "SYNC does not come at its period", "check sync_period_s and the NC's SYNC producer"),
+    "SyncCollision": (_R, "the SYNC counter jumps: there is a second producer", "remove the second SYNC producer"),
+    # the drive
+    "StaleData": (_R, "the drive's feedback is older than three SYNC", "check the drive and its TPDO mapping"),
+    "FeedbackGap": (_H, "a feedback frame was lost", "check the bus load and the cable"),
+    "TargetLost": (_H, "no new target (0x607A) came with this SYNC", "check that the NC streams its targets"),
+    "HeartbeatLost": (_R, "the drive's heartbeat is missing", "check the drive, or its 0x1017"),
+    "NmtStateWrong": (_F, "the drive is not Operational", "hold the feed, find the NMT master, then adopt"),
+    "NodeRebooted": (_F, "the drive has rebooted", "hold the feed, check the commissioning record, then adopt"),
+    "DriveNotEnabled": (_R, "the drive is not in Operation enabled", "clear its fault and enable it"),
+    "NotFollowing": (_R, "the drive does not follow its demand (statusword bit 12)", "check the drive's limits"),
+    "LimitActive": (_R, "an internal limit is active (statusword bit 11)", "leave the limit"),
+    "FollowingError": (_R, "the following error exceeds half its window", "check load, gains and 0x6065"),
+    "NotCsp": (_R, "the drive does not show cyclic synchronous position mode", "set 0x6060 to 8"),
+    "EchoMismatch": (_R, "the drive's offset is not the one that was sent", "check the PDO mapping and the scaling"),
+    "DriveEmergency": (_R, "the drive sent an emergency", "read its error code and clear it"),
+    "PdoLength": (_R, "a PDO is shorter than its mapping", "compare the drive's mapping with the profile"),
+    "PdoMapping": (_N, "a PDO is longer than its mapping", "compare the drive's mapping with the profile"),
+    "StaleOffset": (_N, "the drive already holds an offset", "adopt it, so that it is ramped to zero"),
+    # other nodes
+    "ForeignProducer": (_R, "two nodes send as this drive or NC", "find and remove the second node"),
+    "OffsetHijack": (_R, "another node sends our offset COB-ID", "hold the feed, find and remove that node"),
+    "BusLocked": (_R, "another guard's heartbeat is on the bus", "stop the other guard"),
+    # the path
+    "Misaligned": (_H, "the targets differ from the table's path", "plan the correction for the program that runs"),
+    "OverrideChanged": (_H, "the path is run at another rate than planned", "set the override of the plan"),
+    "FeedHold": (_H, "the path stands still", "start the feed, or arm again"),
+    "TableStarved": (_R, "less than one second of the streamed table is left", "check that the daemon keeps up"),
+    "OffsetLimit": (_R, "an offset is beyond the limit, braking included", "plan the correction inside the limits"),
+    "OffsetRate": (_R, "an offset changes too fast", "plan the correction inside the limits"),
+    "OffsetEnergy": (_R, "the offsets travel more than allowed in one second", "plan a smoother correction"),
+    "CorruptFile": (_N, "the correction table cannot be read", "plan it again"),
+    "TableBusy": (_N, "a whole table cannot be changed while a correction runs", "disarm first"),
+    "ProgramMismatch": (_N, "no table of this program is loaded", "plan and load the correction of this program"),
+    # what the daemon vouches for
+    "NotCommissioned": (_N, "there is no valid commissioning record", "run fdhil commission"),
+    "FeedforwardUnknown": (_N, "it is unknown whether the offset enters the feed-forward", "run fdhil commission"),
+    "ModelNotValidated": (_N, "the model was not validated", "record a rapid move of each axis"),
+    "ModelStale": (_R, "the model is too old or of another state of the machine", "record a rapid move of each axis"),
+    "PoorSkill": (_R, "predictions of the last moves were not good enough", "check load and gains, identify again"),
+    "HarmPredicted": (_N, "the correction is not predicted to help", "leave it off, or plan another method"),
+    "ReadOnlyStore": (_R, "the journal cannot be written", "make the store's disk writable"),
+    "WatchdogNotArmed": (_N, "the drive's watchdog on us is not proven", "run fdhil commission"),
+    "LimitBeyondWindow": (_N, "the largest offset exceeds a quarter of the window", "lower max_offset_um"),
+    "AuthRequired": (_N, "the operator's token is missing or wrong", "use the token of the run directory"),
+    # the guard itself
+    "NotOff": (_N, "a correction is already armed or ramping", "disarm it first"),
+    "NotSettled": (_N, "the interlocks were not all good for 100 SYNC", "wait a moment and arm again"),
+    "MainLost": (_R, "the daemon is gone or does not answer", "restart the daemon, then arm again"),
+    "Disarmed": (_R, "disarmed", "arm when it is wanted again"),
+    "Stopped": (_R, "the guard was told to stop", "start it again when it is wanted"),
+    "Finished": (_R, "the path is finished", "arm the next program"),
+    "InternalError": (_F, "the guard contradicts itself", "report it with the journal"),
+}
+
+# what the daemon must vouch for to arm, and the class of the refusal
+FACTS: Mapping[str, str] = {
+    "commissioned": "NotCommissioned",
+    "offset_in_feedforward_known": "FeedforwardUnknown",
+    "model_validated": "ModelNotValidated",
+    "model_fresh": "ModelStale",
+    "skill_enough": "PoorSkill",
+    "gain_positive": "HarmPredicted",
+    "journal_writable": "ReadOnlyStore",
+    "watchdog_proven": "WatchdogNotArmed",
+}
+# those that the daemon may withdraw while a correction runs
+WITHDRAWABLE = ("model_fresh", "skill_enough", "journal_writable")
+
+
+@dataclass(frozen=True, slots=True)
+class AxisView:
+    """What is known of one axis at a SYNC. Ages in SYNC cycles, infinite when never heard; NaN and None: unknown.
+
+    ``feedback_age`` is that of the older of statusword and position, in units of its own rate. ``holds_offset``: the
+    drive's offset was last read as another value than what we sent.
+    """
+
+    name: str
+    feedback_age: float = math.inf
+    heartbeat_age_s: float = math.inf
+    heartbeat_timeout_s: float = 0.0
+    nmt: int | None = None
+    statusword: int | None = None
+    mode: int | None = None
+    following_error: float = math.nan
+    window: int = 0
+    largest_offset: int = 0
+    echo_misses: int = 0
+    read_back: int | None = None
+    target_heard: bool = False
+    short_frames: int = 0
+    long_frames: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class BusView:
+    """What is known of the bus at a SYNC."""
+
+    state: str = "active"
+    sync_regular: bool = False
+    silent: bool = True
+    lost_frames: int = 0
+
+
+def _operational(axis: AxisView) -> bool:
+    return axis.nmt is None or axis.nmt == Nmt.OPERATIONAL
+
+
+def _heartbeat(axis: AxisView) -> bool:
+    return axis.heartbeat_timeout_s == 0 or axis.heartbeat_age_s <= axis.heartbeat_timeout_s
+
+
+def _status(bit: int, wanted: bool) -> Callable[[AxisView], bool]:
+    return lambda axis: axis.statusword is not None and bool(axis.statusword & bit) is wanted
+
+
+def _enabled(axis: AxisView) -> bool:
+    return axis.statusword is not None and state_of(axis.statusword) is State.OPERATION_ENABLED
+
+
+def _following(axis: AxisView) -> bool:
+    bit_clear = axis.statusword is None or not axis.statusword & STATUS_FOLLOWING_ERROR
+    return bit_clear and abs(axis.following_error) <= axis.window / 2
+
+
+# (class, what must be true): evaluated per axis and SYNC, in this order
+AXIS_INTERLOCKS: tuple[tuple[str, Callable[[AxisView], bool]], ...] = (
+    ("StaleData", lambda axis: axis.feedback_age <= 3),
+    ("HeartbeatLost", _heartbeat),
+    ("NmtStateWrong", _operational),
+    ("FollowingError", _following),
+    ("DriveNotEnabled", _enabled),
+    ("NotFollowing", _status(STATUS_FOLLOWS_DEMAND, True)),
+    ("LimitActive", _status(STATUS_INTERNAL_LIMIT, False)),
+    ("NotCsp", lambda axis: axis.mode == Mode.CYCLIC_SYNC_POSITION),
+    ("EchoMismatch", lambda axis: axis.echo_misses < 2),
+    ("PdoLength", lambda axis: axis.short_frames < 3),
+    ("TargetLost", lambda axis: axis.target_heard),
+    ("FeedbackGap", lambda axis: axis.feedback_age <= 1),
+)
+BUS_INTERLOCKS: tuple[tuple[str, Callable[[BusView], bool]], ...] = (
+    ("BusDown", lambda bus: bus.state != "down"),
+    ("BusOff", lambda bus: bus.state != "off"),
+    ("ErrorPassive", lambda bus: bus.state != "passive"),
+    ("SyncLost", lambda bus: not bus.silent),
+    ("SyncJitter", lambda bus: bus.sync_regular),
+    ("RxOverflow", lambda bus: bus.lost_frames == 0),
+)
+# needed to arm only: per axis
+ARMING_INTERLOCKS: tuple[tuple[str, Callable[[AxisView], bool]], ...] = (
+    ("StaleOffset", lambda axis: axis.read_back is None or axis.read_back == 0),
+    ("PdoMapping", lambda axis: axis.long_frames == 0),
+    ("LimitBeyondWindow", lambda axis: axis.largest_offset <= axis.window / 4),
+)
+
+
+def failing(bus: BusView, axes: tuple[AxisView, ...]) -> tuple[Alarm, ...]:
+    """Return an alarm for every interlock that is not good at this SYNC."""
+    of_bus = [Alarm(code) for code, good in BUS_INTERLOCKS if not good(bus)]
+    return (*of_bus, *[Alarm(code, axis.name) for axis in axes for code, good in AXIS_INTERLOCKS if not good(axis)])
+
+
+def not_ready(axes: tuple[AxisView, ...]) -> tuple[Alarm, ...]:
+    """Return an alarm for everything about the drives that forbids arming beyond ``failing``."""
+    return tuple(Alarm(code, a.name) for a in axes for code, good in ARMING_INTERLOCKS if not good(a))
+
+
+def withheld(facts: Mapping[str, object]) -> tuple[Alarm, ...]:
+    """Return an alarm for every fact that the daemon does not vouch for; only a true ``True`` counts."""
+    return tuple(Alarm(code) for fact, code in FACTS.items() if facts.get(fact) is not True)

@@ -1,0 +1,154 @@
+"""What an offset may do, in whole drive increments per SYNC cycle, and how to move it inside these limits.
+
+Everything here is integer arithmetic: there is no NaN, no rounding, and every start can be enumerated by a test.
+The check of a frame (``violation``) shares no formula with the motion (``follow``), so that one guards the other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import isqrt
+
+# a table is a rounded curve: its first difference may be 1, its second 2 increments beyond the curve's own
+ROUNDING_RATE = 1
+ROUNDING_ACCELERATION = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """``offset`` increments, ``rate`` per cycle, ``acceleration`` per cycle^2, ``variation`` total per ``window``.
+
+    ``window`` is one second in SYNC cycles: within it the offset may travel ``variation`` increments in all, which
+    bounds what an oscillating table can do.
+    """
+
+    offset: int
+    rate: int
+    acceleration: int
+    variation: int
+    window: int
+
+    @property
+    def hard_rate(self) -> int:
+        """Largest first difference of two frames."""
+        return self.rate + ROUNDING_RATE
+
+    @property
+    def hard_acceleration(self) -> int:
+        """Largest second difference of three frames."""
+        return self.acceleration + ROUNDING_ACCELERATION
+
+    def ramp_cycles(self, offset: int) -> int:
+        """Return the bound on the cycles from ``offset`` at any rate to rest at 0: 1 + |o|/S + 3 S/A."""
+        return 1 + -(-abs(offset) // self.rate) + 3 * -(-self.rate // self.acceleration)
+
+
+def stopping(rate: int, acceleration: int) -> int:
+    """Return how far an offset still travels that moves at ``rate`` >= 0 and brakes by ``acceleration`` each cycle."""
+    steps = rate // acceleration
+    return steps * rate - acceleration * steps * (steps + 1) // 2
+
+
+def approach(distance: int, acceleration: int) -> int:
+    """Return the largest rate u with u + stopping(u) <= ``distance`` >= 0: the fastest move that still stops there."""
+    steps = (isqrt(8 * distance // acceleration + 1) - 1) // 2
+    while acceleration * steps * (steps + 1) // 2 < distance:
+        steps += 1
+    return (distance + acceleration * steps * (steps - 1) // 2) // steps if steps else 0
+
+
+def clamp(value: int, low: int, high: int) -> int:
+    """Return ``value`` limited to [low, high]."""
+    return min(max(value, low), high)
+
+
+def follow(limits: Limits, offset: int, rate: int, wanted: int, wanted_rate: int) -> int:
+    """Return the next offset on the way to a moving goal: ``wanted`` next cycle, moving at ``wanted_rate``.
+
+    What is missing is made up without overshoot and inside the acceleration; on the goal the goal is met exactly. A
+    goal at rest at 0 is the ramp to zero.
+    """
+    missing = wanted - offset - wanted_rate
+    closing = approach(abs(missing), limits.acceleration)
+    speed = wanted_rate + (closing if missing > 0 else -closing)
+    if speed != wanted_rate or abs(speed - rate) > limits.hard_acceleration:
+        speed = clamp(speed, rate - limits.acceleration, rate + limits.acceleration)
+    speed = clamp(speed, -limits.hard_rate, limits.hard_rate)
+    return _inside(limits, offset, rate, speed)
+
+
+def brake(limits: Limits, offset: int, rate: int) -> int:
+    """Return the next offset when it is to come to rest wherever that is."""
+    speed = rate - clamp(rate, -limits.acceleration, limits.acceleration)
+    return _inside(limits, offset, rate, clamp(speed, -limits.hard_rate, limits.hard_rate))
+
+
+def _inside(limits: Limits, offset: int, rate: int, speed: int) -> int:
+    """Brake an outward speed in time for the largest offset, harder than usual where rounding leaves no other way."""
+    outward = 1 if speed > 0 else -1
+    room = max(0, limits.offset - outward * offset)
+    allowed = approach(room, limits.hard_acceleration)
+    if abs(speed) > allowed:
+        speed = outward * max(allowed, outward * rate - limits.hard_acceleration)
+    return offset + speed
+
+
+def violation(limits: Limits, before: int, rate: int, offset: int) -> str | None:
+    """Check one frame against the one before it and that one's rate; return the class of what it breaks, or None.
+
+    Braking-aware: an offset moving outward must still be able to stop at the limit.
+    """
+    speed = offset - before
+    if not abs(offset) <= max(limits.offset, abs(before)):  # an adopted offset may come from outside
+        return "OffsetLimit"
+    if not abs(speed) <= limits.hard_rate or not abs(speed - rate) <= limits.hard_acceleration:
+        return "OffsetRate"
+    if not (offset * speed <= 0 or abs(offset) + stopping(abs(speed), limits.hard_acceleration) <= limits.offset):
+        return "OffsetLimit"
+    return None
+
+
+def check_rows(limits: Limits, offsets: Sequence[int], start: int, stop: int) -> str | None:
+    """Check rows [start, stop) of a table's offsets, with what lies before ``start``; return the class or None.
+
+    The row before the first is taken to be at rest at the first row's value: the fade-in brings the offset there.
+    """
+    for row in range(start, stop):
+        before = offsets[max(row - 1, 0)]
+        broken = violation(limits, before, before - offsets[max(row - 2, 0)], offsets[row])
+        if broken is not None:
+            return broken
+    return "OffsetEnergy" if not _variation_fits(limits, offsets, start, stop) else None
+
+
+def _variation_fits(limits: Limits, offsets: Sequence[int], start: int, stop: int) -> bool:
+    first = max(1, start - limits.window + 1)
+    moves = [abs(offsets[row] - offsets[row - 1]) for row in range(first, stop)]
+    travelled = 0
+    for k, move in enumerate(moves):
+        travelled += move - (moves[k - limits.window] if k >= limits.window else 0)
+        if not travelled <= limits.variation:
+            return False
+    return True
+
+
+@dataclass(frozen=True, slots=True)
+class Travel:
+    """How far an offset travelled within the last second, in tenths of it, so that it costs nothing to carry."""
+
+    current: int = 0
+    filled: int = 0
+    past: tuple[int, ...] = ()
+
+    def add(self, move: int, window: int) -> Travel:
+        """Return the record with one more cycle; ``window`` is the second in cycles."""
+        share = max(1, window // 10)
+        if self.filled + 1 < share:
+            return Travel(self.current + abs(move), self.filled + 1, self.past)
+        return Travel(0, 0, (*self.past, self.current + abs(move))[-(window // share - 1) :])
+
+    @property
+    def total(self) -> int:
+        """Increments travelled within at least the last 0.9 and at most the last 1.0 second of them."""
+        return self.current + sum(self.past)

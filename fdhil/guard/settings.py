@@ -1,0 +1,169 @@
+"""What the guard is told at start: a frozen record that goes through one JSON file in the run directory.
+
+The file is written by ``fdhil-guard`` from the machine's config and profile; the guard reads nothing else.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from fdhil.cia402 import PdoEntry, lay_out
+from fdhil.errors import ConfigError, ConfigFault
+from fdhil.guard.limits import Limits
+
+SCHEMA = "fdhil-guard-settings-1"
+Layout = tuple[tuple[int, int, int, bool], ...]
+"""Entries (index, sub-index, bits, signed) of a PDO, one behind the other."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pdo:
+    """One PDO: its COB-ID, its layout and with every how many SYNC it comes."""
+
+    cob_id: int
+    layout: Layout
+    every_sync: int = 1
+
+    @property
+    def entries(self) -> tuple[PdoEntry, ...]:
+        """The placed entries."""
+        return lay_out(self.layout)
+
+
+@dataclass(frozen=True, slots=True)
+class AxisSettings:
+    """One axis: ``target`` is the NC's RPDO with 0x607A, ``offset`` our own RPDO with 0x60B0 alone.
+
+    ``window`` is the drive's following error window (0x6065) in increments; ``limits`` in increments per SYNC cycle.
+    ``heartbeat_timeout_s`` 0: the drive has no heartbeat, and its PDOs alone show that it is Operational.
+    """
+
+    name: str
+    node_id: int
+    target: Pdo
+    offset: Pdo
+    tpdos: tuple[Pdo, ...]
+    increments_per_mm: float
+    sign: int
+    limits: Limits
+    window: int
+    setpoint_delay_cycles: int
+    heartbeat_timeout_s: float = 0.0
+
+    @property
+    def reads_back(self) -> bool:
+        """Whether a TPDO shows the offset in force."""
+        return any(entry[0] == 0x60B0 for pdo in self.tpdos for entry in pdo.layout)
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """The machine as the guard sees it.
+
+    ``clock`` "sync": time is SYNC count x period (a simulated machine need not run in real time). ``token_sha256`` is
+    the hash of the operator's token, empty: nothing can be armed. ``offset_synchronous``: the drive applies our RPDO
+    at the next SYNC, so that without SYNC nothing can be ramped.
+    """
+
+    bus: str
+    transport: Literal["can_raw", "socketcand"]
+    sync_period_s: float
+    clock: Literal["monotonic", "sync"]
+    heartbeat_s: float
+    node_id: int
+    token_sha256: str
+    run_directory: str
+    axes: tuple[AxisSettings, ...]
+    offset_synchronous: bool = True
+
+    @property
+    def silence_s(self) -> float:
+        """How long the bus may be without SYNC: four periods, or 0.5 s of wall clock where time is the SYNC count."""
+        return 0.5 if self.clock == "sync" else 4 * self.sync_period_s
+
+    @property
+    def heartbeat_cycles(self) -> int:
+        """Our heartbeat comes with every so many SYNC."""
+        return max(1, round(self.heartbeat_s / self.sync_period_s))
+
+    def cycles(self, seconds: float) -> int:
+        """Return a duration in whole SYNC cycles, at least one."""
+        return max(1, round(seconds / self.sync_period_s))
+
+    @property
+    def sent_ids(self) -> frozenset[int]:
+        """The only COB-IDs that may ever leave: our heartbeat and the configured offset RPDOs."""
+        return frozenset([0x700 + self.node_id, *(axis.offset.cob_id for axis in self.axes)])
+
+
+def to_json(settings: Settings) -> str:
+    """Return the settings as the text of their file."""
+    return json.dumps({"schema": SCHEMA, **asdict(settings)}, indent=1)
+
+
+def from_json(text: str, source: str = "settings") -> Settings:
+    """Read settings back; ConfigError when the text is not what ``to_json`` writes."""
+    try:
+        document = json.loads(text)
+        if document.pop("schema") != SCHEMA:
+            raise ValueError(f"schema is not {SCHEMA}")
+        axes = tuple(_axis(axis) for axis in document.pop("axes"))
+        settings = Settings(axes=axes, **document)
+        _check(settings)
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        fault = ConfigFault("file", f"cannot be used: {error}", "let fdhil-guard write it")
+        raise ConfigError(source, [fault]) from None
+    return settings
+
+
+def load(path: Path) -> Settings:
+    """Read the settings file; ConfigError when it cannot be read or used."""
+    try:
+        text = path.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(str(path), [ConfigFault("file", f"cannot be read: {error}", "run fdhil-guard")]) from None
+    return from_json(text, str(path))
+
+
+def _pdo(document: Mapping[str, Any]) -> Pdo:
+    layout = tuple((int(i), int(s), int(b), bool(signed)) for i, s, b, signed in document["layout"])
+    return Pdo(int(document["cob_id"]), layout, int(document["every_sync"]))
+
+
+def _axis(document: dict[str, Any]) -> AxisSettings:
+    tpdos = tuple(_pdo(pdo) for pdo in document.pop("tpdos"))
+    target, offset = _pdo(document.pop("target")), _pdo(document.pop("offset"))
+    return AxisSettings(target=target, offset=offset, tpdos=tpdos, limits=Limits(**document.pop("limits")), **document)
+
+
+def _check(settings: Settings) -> None:
+    """Refuse what would make the guard's own arithmetic wrong; ValueError names it."""
+    if not settings.axes:
+        raise ValueError("no axis may be corrected (an [axis.NAME.correction] section switches writing on)")
+    if not 0 < settings.sync_period_s <= 1 or not 0 < settings.heartbeat_s <= 10:
+        raise ValueError("sync_period_s or heartbeat_s is out of range")
+    if settings.clock not in ("monotonic", "sync") or settings.transport not in ("can_raw", "socketcand"):
+        raise ValueError("unknown clock or transport")
+    if not _distinct([axis.offset.cob_id for axis in settings.axes]):
+        raise ValueError("two axes share one offset COB-ID")
+    for axis in settings.axes:
+        _check_axis(axis)
+
+
+def _check_axis(axis: AxisSettings) -> None:
+    if [(entry[0], entry[1]) for entry in axis.offset.layout] != [(0x60B0, 0)]:
+        raise ValueError(f"axis {axis.name}: the offset RPDO must map 0x60B0:00 and nothing else")
+    if not all(type(value) is int and value >= 1 for value in asdict(axis.limits).values()):
+        raise ValueError(f"axis {axis.name}: limits must be whole increments, at least 1")
+    if not 0x180 <= axis.offset.cob_id < 0x580 or type(axis.window) is not int:
+        raise ValueError(f"axis {axis.name}: {axis.offset.cob_id:#x} is no RPDO, or the window is no integer")
+    if not 0 <= axis.setpoint_delay_cycles <= 16:
+        raise ValueError(f"axis {axis.name}: setpoint_delay_cycles is out of range")
+
+
+def _distinct(values: Sequence[int]) -> bool:
+    return len(set(values)) == len(values)

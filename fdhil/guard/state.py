@@ -1,0 +1,150 @@
+"""The records that go in and out of the guard's core."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Literal
+
+from fdhil.guard.interlocks import Alarm, BusView
+from fdhil.guard.limits import Travel
+from fdhil.guard.path import Path, Place
+from fdhil.guard.settings import Settings
+
+AT_REST = Travel()
+
+
+class Mode(Enum):
+    """The guard's state; see the safety page."""
+
+    OFF = "OFF"
+    ADOPT = "ADOPT"
+    ARMED = "ARMED"
+    RAMPING = "RAMPING"
+    ACTIVE = "ACTIVE"
+    HOLD = "HOLD"
+    RAMP_DOWN = "RAMP_DOWN"
+    FROZEN = "FROZEN"
+
+
+ON_PATH = frozenset({Mode.RAMPING, Mode.ACTIVE, Mode.HOLD})
+IN_CHARGE = ON_PATH | {Mode.ARMED}
+LANDING = frozenset({Mode.ADOPT, Mode.RAMP_DOWN})
+SENDING = IN_CHARGE | LANDING
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What the operator or the daemon asks for; only an arm and an adopt need the operator's token."""
+
+    kind: Literal["arm", "disarm", "adopt", "stop"]
+    token_valid: bool = False
+    program_digest: str = ""
+    facts: Mapping[str, object] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class AxisInput:
+    """One axis at a SYNC: what its frames said since the SYNC before.
+
+    ``target`` is the 0x607A that this SYNC latched, ``position`` and ``read_back`` what was sampled at the SYNC before
+    (None when no frame came). Ages as in :class:`interlocks.AxisView`.
+    """
+
+    target: int | None = None
+    position: int | None = None
+    read_back: int | None = None
+    following_error: int | None = None
+    statusword: int | None = None
+    mode: int | None = None
+    nmt: int | None = None
+    feedback_age: float = float("inf")
+    heartbeat_age_s: float = float("inf")
+    short_frames: int = 0
+    long_frames: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """All that one step may know. ``sync`` False: the local timer, because no SYNC came.
+
+    ``late``: the next SYNC is already there, so that nothing sent now would be in time. ``transmitted`` says whether
+    the frames of the step before left. ``alarms`` are events since the last step (emergency, foreign frame).
+    """
+
+    sync: bool
+    axes: tuple[AxisInput, ...]
+    bus: BusView
+    late: bool = False
+    transmitted: bool = True
+    main_alive: bool = True
+    alarms: tuple[Alarm, ...] = ()
+    withdrawn: tuple[Alarm, ...] = ()
+    path: Path | None = None
+    request: Request | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class AxisState:
+    """One axis' offset: ``offset`` in force or about to be, moving at ``rate``; ``sent`` the last values, newest first.
+
+    ``read_back`` is what the drive last showed (None: never), ``zeros_shown`` whether it showed 0 since we send 0.
+    """
+
+    offset: int = 0
+    rate: int = 0
+    sent: tuple[int, ...] = (0,) * 4
+    travel: Travel = AT_REST
+    read_back: int | None = None
+    echo_misses: int = 0
+    late_echoes: int = 0
+    zero_shown: bool = False
+    following_error: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """The guard's whole memory.
+
+    ``places`` are the rows of the path that the machine may be at, best first; ``anchor`` the last row that the
+    targets agreed with. ``cause`` is why the correction went off, kept until the next arming.
+    """
+
+    mode: Mode
+    axes: tuple[AxisState, ...]
+    tick: int = 0
+    targets: tuple[tuple[int, ...] | None, ...] = ()
+    good_for: int = 0
+    program_digest: str = ""
+    start_row: int = 0
+    still_for: int = 0
+    places: tuple[Place, ...] = ()
+    anchor: int = 0
+    held_for: int = 0
+    resuming: bool = False
+    zeros_sent: int = 0
+    adopt_checked: bool = False
+    cause: Alarm | None = None
+    missed: int = 0
+    missed_run: int = 0
+    failed_run: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """What to do now: the offset of each axis in increments (None: send nothing), our heartbeat, what to journal.
+
+    ``refused`` answers a request: None when there was none, empty when it was granted.
+    """
+
+    offsets: tuple[int, ...] | None = None
+    heartbeat: bool = False
+    refused: tuple[Alarm, ...] | None = None
+    transition: tuple[Mode, Mode, Alarm | None] | None = None
+
+
+def initial(settings: Settings) -> State:
+    """Return the state at start: off, nothing known."""
+    axes = [AxisState(sent=(0,) * (axis.setpoint_delay_cycles + 4)) for axis in settings.axes]
+    return State(Mode.OFF, tuple(axes))

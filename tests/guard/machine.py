@@ -1,0 +1,274 @@
+"""A machine at the level of its frames: NC and drives as the guard sees them, one SYNC at a time, no physics."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from fdhil.guard import core
+from fdhil.guard.frames import Listener
+from fdhil.guard.interlocks import FACTS, Alarm
+from fdhil.guard.limits import Limits
+from fdhil.guard.path import Path
+from fdhil.guard.settings import AxisSettings, Pdo, Settings
+from fdhil.guard.state import Inputs, Mode, Output, Request, State, initial
+
+Frame = tuple[int, bytes]
+ENABLED = 0x1237
+FACTS_GIVEN: Mapping[str, bool] = dict.fromkeys(FACTS, True)
+DIGEST = "program-1"
+LIMITS = Limits(offset=819, rate=65, acceleration=6, variation=9830, window=1000)
+
+
+def axis_settings(name: str, node_id: int, limits: Limits = LIMITS) -> AxisSettings:
+    """The default mapping of the simulated drive."""
+    return AxisSettings(
+        name=name,
+        node_id=node_id,
+        target=Pdo(0x200 + node_id, ((0x6040, 0, 16, False), (0x607A, 0, 32, True))),
+        offset=Pdo(0x300 + node_id, ((0x60B0, 0, 32, True),)),
+        tpdos=(
+            Pdo(0x180 + node_id, ((0x6064, 0, 32, True), (0x606C, 0, 32, True))),
+            Pdo(0x280 + node_id, ((0x6041, 0, 16, False), (0x6078, 0, 16, True), (0x2101, 0, 16, True))),
+            Pdo(0x380 + node_id, ((0x6062, 0, 32, True), (0x60B0, 0, 32, True)), 10),
+            Pdo(0x480 + node_id, ((0x60FD, 0, 32, False), (0x6061, 0, 8, True), (0x6077, 0, 16, True)), 10),
+        ),
+        increments_per_mm=3276.8,
+        sign=1,
+        limits=limits,
+        window=32768,
+        setpoint_delay_cycles=2,
+    )
+
+
+def settings(axes: Sequence[str] = ("X", "Y"), limits: Limits = LIMITS, **changes: object) -> Settings:
+    """Settings of the bench in SYNC time."""
+    made = Settings(
+        bus="can0",
+        transport="socketcand",
+        sync_period_s=0.001,
+        clock="sync",
+        heartbeat_s=0.020,
+        node_id=100,
+        token_sha256="",
+        run_directory="",
+        axes=tuple(axis_settings(name, k + 1, limits) for k, name in enumerate(axes)),
+    )
+    return replace(made, **changes)  # type: ignore[arg-type] # any field of Settings
+
+
+@dataclass
+class Drive:
+    """What a drive holds and shows; ``answers`` False: it is silent; ``scale`` 0: it ignores its offset."""
+
+    node_id: int
+    statusword: int = ENABLED
+    mode: int = 8
+    offset: int = 0
+    position_error: int = 0
+    answers: bool = True
+    scale: float = 1.0
+    target: int = 0
+    received_target: int = 0
+    received_offset: int | None = None
+    queue: list[tuple[int, int]] = field(default_factory=list)
+
+    def at_sync(self, tick: int) -> list[Frame]:
+        """Latch what was received, then sample all TPDOs."""
+        self.target = self.received_target
+        if self.received_offset is not None:
+            self.offset = round(self.received_offset * self.scale)
+        self.queue = [*self.queue, (self.target, self.offset)][-3:]
+        if not self.answers:
+            return []
+        followed = sum(self.queue[0])
+        n = self.node_id
+        frames = [
+            (0x180 + n, struct.pack("<ii", followed - self.position_error, 0)),
+            (0x280 + n, struct.pack("<Hhh", self.statusword, 0, 0)),
+        ]
+        if tick % 10 == 0:
+            frames.append((0x380 + n, struct.pack("<ii", followed, self.offset)))
+            frames.append((0x480 + n, struct.pack("<Ibh", 0, self.mode, 0)))
+        return frames
+
+
+@dataclass
+class Bench:
+    """Drives, the NC's stream of targets, and the guard's core behind its listener; ``frames`` is the bus trace.
+
+    ``row`` of the demand that the NC sends next; before ``playing`` it stands at row 0.
+    """
+
+    settings: Settings
+    path: Path | None = None
+    demand: Sequence[Sequence[int]] = ()
+    drives: list[Drive] = field(default_factory=list)
+    state: State = field(init=False)
+    listener: Listener = field(init=False)
+    tick: int = 0
+    playing: bool = False
+    row: int = 0
+    main_alive: bool = True
+    frames: list[tuple[int, tuple[int, ...]]] = field(default_factory=list)
+    heartbeats: list[int] = field(default_factory=list)
+    alarms: list[Alarm] = field(default_factory=list)
+    outputs: list[Output] = field(default_factory=list)
+    counter: int = 0
+    rest: list[int] | None = None
+
+    def __post_init__(self) -> None:
+        self.state = initial(self.settings)
+        self.listener = Listener(self.settings)
+        if not self.drives:
+            self.drives = [Drive(axis.node_id) for axis in self.settings.axes]
+        if not self.demand:
+            self.demand = [[0] for _ in self.drives]
+        self.stream()
+
+    @property
+    def mode(self) -> Mode:
+        return self.state.mode
+
+    @property
+    def offsets(self) -> tuple[int, ...]:
+        return tuple(axis.offset for axis in self.state.axes)
+
+    def targets(self) -> list[int]:
+        """What the NC sends next."""
+        if self.rest is not None:
+            return self.rest
+        last = len(self.demand[0]) - 1
+        return [column[min(self.row, last)] for column in self.demand]
+
+    def stream(self) -> None:
+        """The NC's RPDOs for the next SYNC; the guard hears them, the drives receive them."""
+        for drive, target in zip(self.drives, self.targets(), strict=True):
+            drive.received_target = target
+            self.hear(0x200 + drive.node_id, struct.pack("<Hi", 0x0F, target))
+        if self.playing:
+            self.row += 1
+
+    def hear(self, cob_id: int, data: bytes) -> None:
+        self.listener.take(cob_id, data, self.tick * 1e-3)
+
+    def sync(
+        self,
+        request: Request | None = None,
+        *,
+        late: bool = False,
+        transmitted: bool = True,
+        nc: bool = True,
+        drop: Sequence[int] = (),
+    ) -> Output:
+        """One SYNC: drives latch and sample, the guard steps and sends, then the NC streams."""
+        self.tick += 1
+        self.counter = self.counter % 240 + 1
+        sampled = [frame for drive in self.drives for frame in drive.at_sync(self.tick)]
+        axes, bus = self.listener.at_sync(bytes([self.counter]), self.tick * 1e-3, self.tick * 1e-3)
+        inputs = Inputs(
+            True,
+            axes,
+            bus,
+            late,
+            transmitted,
+            self.main_alive,
+            self.listener.alarms(),
+            path=self.path,
+            request=request,
+        )
+        output = self.step(inputs)
+        for cob_id, data in sampled:
+            if cob_id not in drop:
+                self.hear(cob_id, data)
+        if nc:
+            self.stream()
+        return output
+
+    def step(self, inputs: Inputs) -> Output:
+        self.state, output = core.step(self.state, inputs, self.settings)
+        self.outputs.append(output)
+        if output.offsets is not None:
+            self.frames.append((self.tick, output.offsets))
+            for drive, offset in zip(self.drives, output.offsets, strict=True):
+                drive.received_offset = offset
+        if output.heartbeat:
+            self.heartbeats.append(self.tick)
+        if output.transition is not None and output.transition[2] is not None:
+            self.alarms.append(output.transition[2])
+        return output
+
+    def silence(self) -> Output:
+        """The local timer while no SYNC comes."""
+        axes, bus = self.listener.in_silence(self.tick * 1e-3, True)
+        return self.step(Inputs(False, axes, bus, main_alive=self.main_alive, path=self.path))
+
+    def settle(self, cycles: int = 130) -> None:
+        for _ in range(cycles):
+            self.sync()
+
+    def arm(self) -> tuple[Alarm, ...]:
+        refused = self.sync(arm_request()).refused
+        assert refused is not None
+        return refused
+
+    def run(self, cycles: int) -> None:
+        for _ in range(cycles):
+            self.sync()
+
+    def play(self) -> None:
+        self.playing = True
+
+    def until(self, mode: Mode, limit: int = 2000) -> int:
+        """Step until the guard is in ``mode``; the number of SYNC it took."""
+        for taken in range(limit):
+            if self.mode is mode:
+                return taken
+            self.sync()
+        raise AssertionError(f"still {self.mode} after {limit} SYNC")
+
+
+def arm_request(**changes: object) -> Request:
+    return replace(Request("arm", True, DIGEST, FACTS_GIVEN), **changes)  # type: ignore[arg-type] # fields of Request
+
+
+def smooth_path(
+    rows: int = 600, rest: int = 40, amplitude: int = 300, axes: int = 2
+) -> tuple[list[list[int]], list[list[int]]]:
+    """Demand and offset columns: a start from rest into steady speed and back, and a slow bump of the offset."""
+    demand: list[list[int]] = []
+    offset: list[list[int]] = []
+    for axis in range(axes):
+        positions, speed, at = [], 0.0, 1000.0 * axis
+        for k in range(rows):
+            positions.append(round(at))
+            moving = rest <= k < rows - rest
+            braking = k > rows - rest - 100
+            speed = max(0.0, min(500.0, speed + (-6.0 if braking else 6.0))) if moving else 0.0
+            at += speed * (1.0 if axis == 0 else 0.5)
+        demand.append(positions)
+        offset.append(
+            [_bump(k, rest + 20, rows - rest - 20, amplitude * (1 if axis == 0 else -1)) for k in range(rows)]
+        )
+    return demand, offset
+
+
+def _bump(k: int, begin: int, end: int, amplitude: int) -> int:
+    """A smooth rise and fall: the cosine of a full turn."""
+    import math
+
+    if not begin <= k < end:
+        return 0
+    return round(amplitude * 0.5 * (1 - math.cos(2 * math.pi * (k - begin) / (end - begin))))
+
+
+def bench(amplitude: int = 300, **changes: object) -> Bench:
+    """A bench with a table loaded, its drives at rest at the begin of the path."""
+    made = settings(**changes)  # type: ignore[arg-type] # fields of Settings
+    demand, offset = smooth_path(amplitude=amplitude, axes=len(made.axes))
+    path = Path(0, tuple(demand), tuple(offset), True, DIGEST, 1)
+    drives = [Drive(axis.node_id) for axis in made.axes]
+    for drive, column in zip(drives, demand, strict=True):
+        drive.queue = [(column[0], 0)] * 2
+    return Bench(made, path, demand, drives)
