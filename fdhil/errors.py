@@ -89,9 +89,11 @@ class RecordingError(FdhilError):
 
 
 class ProgramError(FdhilError):
-    """An NC program cannot be interpreted; ``line`` is the 1-based source line, ``word`` the word at fault."""
+    """An NC program cannot be interpreted; ``line`` is the 1-based source line (0: the
+    whole file), ``word`` the word at fault."""
 
     def __init__(self, line: int, word: str, message: str) -> None:
         self.line = line
         self.word = word
-        super().__init__(f"line {line}, {word!r}: {message}" if word else f"line {line}: {message}")
+        place = ", ".join(part for part in (f"line {line}" if line else "", repr(word) if word else "") if part)
+        super().__init__(f"{place}: {message}" if place else message)

@@ -1,0 +1,22 @@
+"""ISO 6983 programs and recorded demands: what the NC will order of the axes."""
+
+from fdhil.program.budget import Budget
+from fdhil.program.demand_csv import write_demand_csv
+from fdhil.program.interpreter import interpret
+from fdhil.program.loading import load_trajectory, program_digest
+from fdhil.program.motions import Arc, Dwell, Feed, Motion, Rapid
+from fdhil.program.planner import plan
+
+__all__ = [
+    "Arc",
+    "Budget",
+    "Dwell",
+    "Feed",
+    "Motion",
+    "Rapid",
+    "interpret",
+    "load_trajectory",
+    "plan",
+    "program_digest",
+    "write_demand_csv",
+]

@@ -1,0 +1,143 @@
+"""Arcs: from the words of G2 and G3 to a centre, with the tolerances of a control."""
+
+from __future__ import annotations
+
+import math
+
+from fdhil.errors import ProgramError
+from fdhil.program.modal import AXES, Modal
+from fdhil.program.motions import PLANE_AXES, Arc
+from fdhil.program.moves import Machine, axis_words, feed_mm_min, target
+from fdhil.program.words import Block
+
+_OFFSETS = "ijk"
+_MIN_RADIUS_MM = 1e-6
+# the ends of an arc may lie at radii that differ by the first, or by the second as long as that is 0.1 % of the radius
+_SPIRAL_ABSOLUTE_MM = 0.5
+_SPIRAL_SMALL_MM = 0.005
+_SPIRAL_RELATIVE = 0.001
+_CHORD_RELATIVE = 0.001  # by how much half the chord may exceed the radius of an R arc
+
+
+def arc(machine: Machine, block: Block) -> None:
+    """Order the arc of a G2 or G3 block; ProgramError when its words give none."""
+    modal = machine.modal
+    first, second, normal = PLANE_AXES[modal.plane_name]
+    if "r" in block.words and any(letter in block.words for letter in _OFFSETS):
+        raise block.fault("r", "contradicts I, J or K in the same block; give the radius or the centre")
+    words = axis_words(block)
+    end = target(modal, block)
+    clockwise = modal.motion == 20
+    if "r" in block.words:
+        if first not in words and second not in words:
+            raise block.fault("r", "an arc by radius wants an end in its plane; a circle wants its centre")
+        centre = _centre_of_radius(modal, block, (modal.position[first], modal.position[second]),
+                                   (end[first], end[second]), clockwise)  # fmt: skip
+    else:
+        centre = _centre_of_offsets(modal, block, first, second)
+        _check_radii(block, modal, centre, end, first, second)
+    turns = _turns(block)
+    order(machine, block, end, centre, -turns if clockwise else turns, normal)
+
+
+def order(
+    machine: Machine, block: Block, end: list[float], centre: tuple[float, float], turns: int, normal: int
+) -> None:
+    """Order an arc to ``end`` about ``centre`` (both in active co-ordinates, centre in the plane's order of axes)."""
+    modal = machine.modal
+    first, second, _ = PLANE_AXES[modal.plane_name]
+    start = modal.position
+    feed = feed_mm_min(modal, block, _length(start, end, centre, turns, (first, second, normal)))
+    if modal.rotation_deg and normal != 2:
+        raise ProgramError(block.line, f"G{modal.motion / 10:g}",
+                           "an arc outside the XY plane cannot follow a system that is turned about Z")  # fmt: skip
+    whole = list(start)
+    whole[first], whole[second] = centre
+    shown: list[float | None] = list(modal.machine(whole))
+    shown[normal] = None
+    modal.position = end
+    machine.out.append(
+        Arc(block.line, machine.checked(block), (shown[0], shown[1], shown[2]), turns, modal.plane_name, feed)
+    )
+
+
+def _turns(block: Block) -> int:
+    value = block.words.get("p", 1.0)
+    turns = round(value)
+    if abs(value - turns) > 1e-4 or not 1 <= turns <= 1_000_000:
+        raise block.fault("p", "is no number of turns; P must be a whole number from 1 to 1000000")
+    return turns
+
+
+def _centre_of_offsets(modal: Modal, block: Block, first: int, second: int) -> tuple[float, float]:
+    letters = _OFFSETS[first], _OFFSETS[second]
+    given = [letter for letter in letters if letter in block.words]
+    wrong = [letter for letter in _OFFSETS if letter in block.words and letter not in letters]
+    if wrong:
+        raise block.fault(wrong[0], f"gives no centre in the {modal.plane_name} plane; choose the plane or the letter")
+    if not given:
+        raise ProgramError(block.line, f"G{modal.motion / 10:g}", "an arc wants its centre (I J K) or its radius (R)")
+    if modal.arc_absolute and len(given) < 2:
+        raise block.fault(given[0], "an absolute centre (G90.1) wants both of its words")
+    values = [block.words.get(letter, 0.0) * modal.scale for letter in letters]
+    if modal.arc_absolute:
+        return values[0], values[1]
+    return modal.position[first] + values[0], modal.position[second] + values[1]
+
+
+def _check_radii(
+    block: Block, modal: Modal, centre: tuple[float, float], end: list[float], first: int, second: int
+) -> None:
+    begin = math.hypot(modal.position[first] - centre[0], modal.position[second] - centre[1])
+    finish = math.hypot(end[first] - centre[0], end[second] - centre[1])
+    word = next(letter for letter in _OFFSETS if letter in block.words)
+    if begin < _MIN_RADIUS_MM or finish < _MIN_RADIUS_MM:
+        raise block.fault(word, "the arc has no radius; move the centre away from start and end")
+    off = abs(begin - finish)
+    if off > _SPIRAL_ABSOLUTE_MM or (off > _SPIRAL_SMALL_MM and off > _SPIRAL_RELATIVE * begin):
+        raise block.fault(word, f"the radius is {begin:.4f} mm at the start and {finish:.4f} mm at the end of the arc; "
+                                f"correct centre or end ({AXES[first].upper()}, {AXES[second].upper()})")  # fmt: skip
+
+
+def _centre_of_radius(
+    modal: Modal, block: Block, start: tuple[float, float], end: tuple[float, float], clockwise: bool
+) -> tuple[float, float]:
+    """Centre of the arc of radius R between two points; a negative R takes the longer way round."""
+    radius = block.words["r"] * modal.scale
+    dx, dy = end[0] - start[0], end[1] - start[1]
+    half = math.hypot(dx, dy) / 2.0
+    if half < _MIN_RADIUS_MM:
+        raise block.fault("r", "an arc by radius ends where it starts; give the centre of a full circle")
+    if abs(radius) < half * (1.0 - _CHORD_RELATIVE):
+        raise block.fault("r", f"is too small a radius to reach the end, {2 * half:.4f} mm away")
+    height = math.sqrt(max(0.0, radius * radius - half * half))
+    side = -1.0 if clockwise == (radius > 0) else 1.0
+    return (
+        (start[0] + end[0]) / 2.0 - side * height * dy / (2.0 * half),
+        (start[1] + end[1]) / 2.0 + side * height * dx / (2.0 * half),
+    )
+
+
+def _length(
+    start: list[float], end: list[float], centre: tuple[float, float], turns: int, axes: tuple[int, int, int]
+) -> float:
+    first, second, normal = axes
+    begin = (start[first] - centre[0], start[second] - centre[1])
+    finish = (end[first] - centre[0], end[second] - centre[1])
+    angle = sweep(begin, finish, turns)
+    radius = (math.hypot(*begin) + math.hypot(*finish)) / 2.0
+    return math.hypot(radius * angle, end[normal] - start[normal])
+
+
+def sweep(begin: tuple[float, float], finish: tuple[float, float], turns: int) -> float:
+    """Return the signed angle (rad) from one radius to the other: coincident ones are a whole circle."""
+    angle = math.atan2(finish[1], finish[0]) - math.atan2(begin[1], begin[0])
+    circle = 2.0 * math.pi
+    angle = math.remainder(angle, circle)
+    if abs(angle) < 1e-12:
+        angle = 0.0
+    if turns > 0 and angle <= 0.0:
+        angle += circle
+    elif turns < 0 and angle >= 0.0:
+        angle -= circle
+    return angle + (turns - (1 if turns > 0 else -1)) * circle

@@ -1,0 +1,30 @@
+"""What a program may spend before it is refused: no input may hold the machine's computer for ever."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fdhil.config import Nc
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """Limits of one interpretation; whatever exceeds them ends in a ProgramError that names line and word.
+
+    ``max_blocks`` executed blocks, a block of a loop counted each time; ``max_call_depth`` nested calls;
+    ``max_nesting`` brackets within a value and loops or conditions within one another; ``max_line_chars`` characters
+    of one line; ``max_coordinate_mm`` largest co-ordinate; ``max_labels`` and ``max_parameters`` names in memory.
+    """
+
+    max_blocks: int = 10_000_000
+    max_call_depth: int = 50
+    max_nesting: int = 50
+    max_line_chars: int = 4096
+    max_coordinate_mm: float = 1e7
+    max_labels: int = 100_000
+    max_parameters: int = 100_000
+
+    @classmethod
+    def of(cls, nc: Nc) -> Budget:
+        """Return the budget that a machine's configuration sets."""
+        return cls(max_blocks=nc.max_blocks, max_call_depth=nc.max_call_depth)

@@ -1,0 +1,33 @@
+"""A file that orders motion, whatever it is: a demand CSV by its suffix, else an NC program."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from fdhil.config import MachineConfig
+from fdhil.errors import ProgramError
+from fdhil.program.budget import Budget
+from fdhil.program.demand_csv import read_demand_csv
+from fdhil.program.interpreter import interpret
+from fdhil.program.planner import plan
+from fdhil.records import Trajectory
+
+
+def load_trajectory(path: Path, config: MachineConfig) -> Trajectory:
+    """Return the reference that a file orders of the machine.
+
+    ``.csv`` is a demand CSV (RecordingError, ConfigError), anything else an NC program (ProgramError).
+    """
+    if path.suffix.lower() == ".csv":
+        return read_demand_csv(path, config)
+    return plan(interpret(path, Budget.of(config.nc)), config)
+
+
+def program_digest(path: Path) -> str:
+    """Return the SHA-256 of a program's or demand's bytes, 64 hexadecimal digits; ProgramError when it is not there."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise ProgramError(0, "", f"{path} cannot be read ({error.strerror}); check the path") from None

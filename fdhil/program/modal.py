@@ -1,0 +1,84 @@
+"""The modal state of the interpreter: where the tool is, in which co-ordinates, units, plane and modes.
+
+Lengths are millimetres and angles degrees throughout; ``scale`` is what one program unit of length is in mm. Positions
+have nine entries in the order X Y Z A B C U V W.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from fdhil.program.motions import PLANES, Point
+
+AXES = "xyzabcuvw"
+INDEX = {letter: place for place, letter in enumerate(AXES)}
+LINEAR = frozenset("xyzuvw")
+MM_PER_INCH = 25.4
+NO_MOTION = 800  # G80
+
+
+def _zeros() -> list[float]:
+    return [0.0] * 9
+
+
+@dataclass(slots=True)
+class Modal:
+    """Everything that one block leaves to the next; the defaults are those of a program's start.
+
+    ``position`` is the controlled point in the active co-ordinates. It becomes machine co-ordinates by adding ``g92``,
+    turning about Z by ``rotation_deg`` and adding ``g5x``; the tool's length ``tool`` stands between it and the axes.
+    """
+
+    position: list[float] = field(default_factory=_zeros)
+    g5x: list[float] = field(default_factory=_zeros)
+    g92: list[float] = field(default_factory=_zeros)
+    tool: list[float] = field(default_factory=_zeros)
+    rotation_deg: float = 0.0
+    system: int = 1
+    scale: float = 1.0
+    plane: int = 0
+    absolute: bool = True
+    arc_absolute: bool = False
+    diameter: bool = False
+    motion: int = NO_MOTION
+    feed_mode: int = 940
+    feed_word: float = 0.0
+    feed_mm_min: float = 0.0
+    spindle_rpm: float = 0.0
+    spindle_turns: int = 0
+    retract_to_r: bool = False
+    path_control: int = 640
+    path_tolerance_mm: float = 0.0
+
+    @property
+    def plane_name(self) -> str:
+        """XY, XZ or YZ."""
+        return PLANES[self.plane]
+
+    def machine(self, position: list[float] | None = None) -> Point:
+        """Return X, Y, Z of a position (default: the present one) in machine millimetres."""
+        p = self.position if position is None else position
+        x, y, z = p[0] + self.g92[0], p[1] + self.g92[1], p[2] + self.g92[2]
+        if self.rotation_deg:
+            x, y = rotate(x, y, self.rotation_deg)
+        return (x + self.g5x[0], y + self.g5x[1], z + self.g5x[2])
+
+    def machine_all(self) -> list[float]:
+        """Return all nine axes of the controlled point in machine co-ordinates."""
+        whole = [p + o + g for p, o, g in zip(self.position, self.g92, self.g5x, strict=True)]
+        whole[:3] = self.machine()
+        return whole
+
+    def from_machine(self, machine: list[float]) -> list[float]:
+        """Return the position in active co-ordinates of a controlled point in machine co-ordinates."""
+        moved = [m - g for m, g in zip(machine, self.g5x, strict=True)]
+        if self.rotation_deg:
+            moved[0], moved[1] = rotate(moved[0], moved[1], -self.rotation_deg)
+        return [m - o for m, o in zip(moved, self.g92, strict=True)]
+
+
+def rotate(x: float, y: float, degrees: float) -> tuple[float, float]:
+    """Turn a point about the origin, counter-clockwise."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return x * c - y * s, x * s + y * c

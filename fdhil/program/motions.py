@@ -1,0 +1,79 @@
+"""The motions that a program orders, in machine millimetres: what the interpreter yields and the planner takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+Point = tuple[float, float, float]
+PLANES = ("XY", "XZ", "YZ")
+# plane -> indices of its two axes in the order that makes a positive angle counter-clockwise seen from the positive
+# end of the normal axis, then the normal axis; XZ is turned about +Y from Z to X
+PLANE_AXES = {"XY": (0, 1, 2), "XZ": (2, 0, 1), "YZ": (1, 2, 0)}
+
+
+@dataclass(frozen=True, slots=True)
+class Rapid:
+    """G0: a straight line at rapid speed to ``end`` (mm); ``line`` is the 1-based source line."""
+
+    line: int
+    end: Point
+
+
+@dataclass(frozen=True, slots=True)
+class Feed:
+    """G1: a straight line to ``end`` (mm) at ``feed`` mm/min."""
+
+    line: int
+    end: Point
+    feed: float
+
+
+@dataclass(frozen=True, slots=True)
+class Arc:
+    """G2, G3: an arc, circle or helix to ``end`` (mm) at ``feed`` mm/min about ``centre``, None on the normal axis.
+
+    ``turns`` is 1 up to and including one circle, n for n - 1 whole circles more, negative clockwise seen from the
+    positive end of the normal axis; ``plane`` is one of ``PLANES``. Where the end is not as far from the centre as
+    the start the radius changes evenly with the angle.
+    """
+
+    line: int
+    end: Point
+    centre: tuple[float | None, float | None, float | None]
+    turns: int
+    plane: str
+    feed: float
+
+
+@dataclass(frozen=True, slots=True)
+class Dwell:
+    """G4: stand still for ``seconds``."""
+
+    line: int
+    seconds: float
+
+
+Motion = Rapid | Feed | Arc | Dwell
+
+
+def as_json(motion: Motion) -> dict[str, Any]:
+    """Return one motion as the object that ``interpret --json`` lists: mm, mm/min and s with 6 decimals."""
+    if isinstance(motion, Dwell):
+        return {"line": motion.line, "kind": "dwell", "seconds": round(motion.seconds, 6)}
+    shown: dict[str, Any] = {
+        "line": motion.line,
+        "kind": type(motion).__name__.lower(),
+        "end": [_shown(value) for value in motion.end],
+    }
+    if isinstance(motion, Arc):
+        shown["centre"] = [None if value is None else _shown(value) for value in motion.centre]
+        shown["turns"] = motion.turns
+        shown["plane"] = motion.plane
+    if not isinstance(motion, Rapid):
+        shown["feed"] = _shown(motion.feed)
+    return shown
+
+
+def _shown(value: float) -> float:
+    return round(value, 6) + 0.0  # + 0.0 makes the negative zero positive

@@ -1,0 +1,102 @@
+"""Straight moves and dwells: what G0, G1, G4 and G53 make of a block's axis words."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from fdhil.errors import ProgramError
+from fdhil.program.budget import Budget
+from fdhil.program.modal import AXES, INDEX, LINEAR, Modal
+from fdhil.program.motions import Dwell, Feed, Motion, Rapid
+from fdhil.program.words import Block
+
+_MIN_INVERSE_TIME_FEED = 0.1  # program units per minute; a move without length has no feed of its own
+
+
+@dataclass(slots=True)
+class Machine:
+    """The interpreter's machine: its modal state, and the motions that the block at hand has ordered so far."""
+
+    budget: Budget
+    modal: Modal = field(default_factory=Modal)
+    out: list[Motion] = field(default_factory=list)
+
+    def rapid_to(self, block: Block, target: list[float]) -> None:
+        """Order a rapid to a position in active co-ordinates."""
+        self.modal.position = target
+        self.out.append(Rapid(block.line, self.checked(block)))
+
+    def feed_to(self, block: Block, target: list[float]) -> None:
+        """Order a straight feed to a position in active co-ordinates, at the feed in force."""
+        feed = feed_mm_min(self.modal, block, _straight_length(self.modal.position, target))
+        self.modal.position = target
+        self.out.append(Feed(block.line, self.checked(block), feed))
+
+    def dwell(self, block: Block, seconds: float) -> None:
+        """Order a dwell."""
+        self.out.append(Dwell(block.line, seconds))
+
+    def checked(self, block: Block) -> tuple[float, float, float]:
+        """Return where the machine now stands; ProgramError when no machine reaches that."""
+        end = self.modal.machine()
+        limit = self.budget.max_coordinate_mm
+        for letter, value in zip("xyz", end, strict=True):
+            if not abs(value) <= limit:
+                raise block.fault(letter, f"leads to {value:g} mm; no machine reaches beyond {limit:g} mm")
+        return end
+
+
+def _straight_length(start: list[float], end: list[float]) -> float:
+    """Length that a feed refers to: of X Y Z, else of U V W, else of A B C."""
+    for first in (0, 6, 3):
+        length = math.dist(start[first : first + 3], end[first : first + 3])
+        if length > 0.0:
+            return length
+    return 0.0
+
+
+def feed_mm_min(modal: Modal, block: Block, length_mm: float) -> float:
+    """Return the feed of a move of this length; ProgramError when none is in force."""
+    if modal.feed_mode == 930:
+        if "f" not in block.words:
+            raise ProgramError(block.line, "G93", "a feed move in inverse-time mode wants an F word of its own")
+        return max(_MIN_INVERSE_TIME_FEED * modal.scale, length_mm * block.words["f"])
+    if modal.feed_mm_min <= 0.0:
+        raise ProgramError(block.line, f"G{modal.motion / 10:g}", "there is no feed rate; give F before a feed move")
+    if modal.feed_mode == 950:
+        if modal.spindle_rpm <= 0.0:
+            raise ProgramError(block.line, "G95", "feed per revolution wants a spindle speed; give S")
+        return modal.feed_mm_min * modal.spindle_rpm
+    return modal.feed_mm_min
+
+
+def axis_words(block: Block) -> dict[int, float]:
+    """Return the block's axis words by the axis' index, in program units."""
+    words = block.words
+    return {INDEX[letter]: words[letter] for letter in AXES if letter in words}
+
+
+def length_mm(modal: Modal, index: int, value: float) -> float:
+    """Return an axis word in mm or degrees; X is a diameter under G7."""
+    if AXES[index] not in LINEAR:
+        return value
+    if index == 0 and modal.diameter:
+        value /= 2.0
+    return value * modal.scale
+
+
+def target(modal: Modal, block: Block) -> list[float]:
+    """Return where the block's axis words lead, in active co-ordinates; G53 words are machine co-ordinates."""
+    position = modal.position
+    words = axis_words(block)
+    if "machine co-ordinates" in block.g:
+        whole = [c + t for c, t in zip(modal.machine_all(), modal.tool, strict=True)]
+        for index, value in words.items():
+            whole[index] = length_mm(modal, index, value)
+        return modal.from_machine([w - t for w, t in zip(whole, modal.tool, strict=True)])
+    end = list(position)
+    for index, value in words.items():
+        value = length_mm(modal, index, value)
+        end[index] = value if modal.absolute else end[index] + value
+    return end

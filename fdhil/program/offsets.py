@@ -1,0 +1,149 @@
+"""Co-ordinate systems: G54 to G59.3, G10 L2 and L20, G92, G52, tool length, and the homes of G28 and G30.
+
+Offsets live in numbered parameters in machine millimetres, as the language wants it: #5221 and on for G54, 20 numbers
+apart, with the rotation as the tenth; #5211 and on for G92, in force while #5210 is 1; #5161 and #5181 for the homes.
+"""
+
+from __future__ import annotations
+
+from fdhil.errors import ProgramError
+from fdhil.program.modal import AXES, Modal, rotate
+from fdhil.program.moves import Machine, axis_words, length_mm, target
+from fdhil.program.parameters import Variables
+from fdhil.program.words import Block
+
+G92_IN_FORCE, G92_FIRST = 5210, 5211
+HOME_FIRST = {280: 5161, 300: 5181}
+SYSTEMS = {540: 1, 550: 2, 560: 3, 570: 4, 580: 5, 590: 6, 591: 7, 592: 8, 593: 9}
+
+
+def first_of(system: int) -> int:
+    """Return the number of the parameter that holds a system's X offset."""
+    return 5221 + 20 * (system - 1)
+
+
+def select_system(modal: Modal, variables: Variables, system: int) -> None:
+    """Make G54 (1) to G59.3 (9) the active system: the tool stays where it is and gets new co-ordinates."""
+    if system == modal.system:
+        return
+    modal.system = system
+    variables.store(5220, float(system))
+    _activate(modal, variables)
+
+
+def _activate(modal: Modal, variables: Variables) -> None:
+    """Take the active system's offsets from its parameters."""
+    first = first_of(modal.system)
+    _change(modal, [variables.number(first + axis) for axis in range(9)], variables.number(first + 9))
+
+
+def _change(modal: Modal, g5x: list[float], rotation_deg: float) -> None:
+    """Put other offsets in force. Like the reference, this turns the co-ordinates without G92's share of them."""
+    position = list(modal.position)
+    position[0], position[1] = rotate(position[0], position[1], modal.rotation_deg)
+    position = [p + old - new for p, old, new in zip(position, modal.g5x, g5x, strict=True)]
+    position[0], position[1] = rotate(position[0], position[1], -rotation_deg)
+    modal.position, modal.g5x, modal.rotation_deg = position, g5x, rotation_deg
+
+
+def set_data(modal: Modal, variables: Variables, block: Block) -> None:
+    """G10: L2 sets a system's offsets, L20 sets them so that the tool stands at the words given.
+
+    ProgramError for L1, L10 and L11, which change the tool table: fdhil has none.
+    """
+    kind = block.words.get("l")
+    if kind is None or round(kind) not in (2, 20) or abs(kind - round(kind)) > 1e-4:
+        raise block.fault("l" if kind is not None else "G10", "sets no co-ordinate system; fdhil knows G10 L2 and L20")
+    number = int(block.words.get("p", -1.0))
+    if not 0 <= number <= 9:
+        raise block.fault("p", "is no co-ordinate system; P must be 1 (G54) to 9 (G59.3), or 0 for the active one")
+    system = number or modal.system
+    first = first_of(system)
+    g5x = [variables.number(first + axis) for axis in range(9)]
+    rotation_deg = variables.number(first + 9)
+    words = {axis: length_mm(modal, axis, value) for axis, value in axis_words(block).items()}
+    if round(kind) == 2:
+        if "r" in block.words:
+            rotation_deg = block.words["r"]
+        for axis, value in words.items():
+            g5x[axis] = value
+    else:
+        if "r" in block.words:
+            raise block.fault("r", "cannot be set with L20; use G10 L2")
+        g5x = _offsets_for(modal, g5x, rotation_deg, words)
+    for axis, value in enumerate([*g5x, rotation_deg]):
+        variables.store(first + axis, value)
+    if system == modal.system:
+        _change(modal, g5x, rotation_deg)
+
+
+def _offsets_for(modal: Modal, g5x: list[float], rotation_deg: float, words: dict[int, float]) -> list[float]:
+    """Return the offsets with which the present point has the co-ordinates ``words``; other axes keep theirs."""
+    machine = modal.machine_all()
+    here = [m - o for m, o in zip(machine, g5x, strict=True)]
+    here[0], here[1] = rotate(here[0], here[1], -rotation_deg)
+    wanted = [words[axis] + modal.g92[axis] if axis in words else here[axis] for axis in range(9)]
+    wanted[0], wanted[1] = rotate(wanted[0], wanted[1], rotation_deg)
+    return [m - w for m, w in zip(machine, wanted, strict=True)]
+
+
+def set_g92(modal: Modal, variables: Variables, block: Block) -> None:
+    """G92: the present point has the co-ordinates given; G52: the words are the offset itself."""
+    words = axis_words(block)
+    local = block.g["one-shot"] == 520
+    if not words:
+        raise ProgramError(block.line, "G52" if local else "G92", "wants axis words")
+    new = list(modal.g92)
+    for axis, value in words.items():
+        value = length_mm(modal, axis, value)
+        new[axis] = value if local else modal.position[axis] + modal.g92[axis] - value
+    _put_g92(modal, new)
+    for axis, value in enumerate(new):
+        variables.store(G92_FIRST + axis, value)
+    variables.store(G92_IN_FORCE, 1.0)
+
+
+def drop_g92(modal: Modal, variables: Variables, code: int) -> None:
+    """G92.1 clears the offset, G92.2 suspends it, G92.3 takes it from its parameters again."""
+    if code == 923:
+        _put_g92(modal, [variables.number(G92_FIRST + axis) for axis in range(9)])
+        variables.store(G92_IN_FORCE, 1.0)
+        return
+    _put_g92(modal, [0.0] * 9)
+    variables.store(G92_IN_FORCE, 0.0)
+    if code == 921:
+        for axis in range(9):
+            variables.store(G92_FIRST + axis, 0.0)
+
+
+def _put_g92(modal: Modal, g92: list[float]) -> None:
+    modal.position = [p + old - new for p, old, new in zip(modal.position, modal.g92, g92, strict=True)]
+    modal.g92 = g92
+
+
+def set_tool_length(modal: Modal, block: Block) -> None:
+    """G43.1 sets the tool's offsets; G43, G43.2 and G49 leave none, since fdhil knows no tool table."""
+    code = block.g["tool length"]
+    if code == 432:
+        return
+    words = {axis: length_mm(modal, axis, value) for axis, value in axis_words(block).items()}
+    tool = [words.get(axis, modal.tool[axis]) if code == 431 else 0.0 for axis in range(9)]
+    moved = [p + old - new for p, old, new in zip(modal.position, modal.tool, tool, strict=True)]
+    modal.position, modal.tool = moved, tool
+
+
+def go_home(machine: Machine, variables: Variables, block: Block) -> None:
+    """G28, G30: by way of the words given, then to the home of the axes named (of all when none is)."""
+    modal = machine.modal
+    words = axis_words(block)
+    machine.rapid_to(block, target(modal, block))
+    first = HOME_FIRST[block.g["one-shot"]]
+    home = [variables.number(first + axis) - modal.tool[axis] for axis in range(len(AXES))]
+    there = modal.from_machine(home)
+    machine.rapid_to(block, [there[a] if not words or a in words else modal.position[a] for a in range(len(AXES))])
+
+
+def store_home(modal: Modal, variables: Variables, code: int) -> None:
+    """G28.1, G30.1: the present machine position becomes the home."""
+    for axis, value in enumerate(modal.machine_all()):
+        variables.store(HOME_FIRST[code - 1] + axis, value + modal.tool[axis])

@@ -1,0 +1,80 @@
+"""Numbered and named parameters: the variables of a program, and what it may read of the machine's state."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from fdhil.errors import ProgramError
+
+LAST_NUMBER = 5602
+LOCAL_NUMBERS = 30
+_READ_ONLY = frozenset({*range(5400, 5410), *range(5420, 5429)})
+
+
+class Variables:
+    """The parameters #1 to #5602 and #<name>; #1 to #30 and names without leading underscore belong to the call.
+
+    ``state`` gives predefined numbers and names their values. KeyError for a parameter that is not there.
+    """
+
+    __slots__ = ("_globals", "_locals", "_max", "_numbers", "_stack", "_state_names", "_state_numbers")
+
+    def __init__(
+        self,
+        max_names: int,
+        state_numbers: Mapping[int, Callable[[], float]],
+        state_names: Mapping[str, Callable[[], float]],
+    ) -> None:
+        self._max = max_names
+        self._numbers: dict[int, float] = {}
+        self._globals: dict[str, float] = {}
+        self._locals: dict[str, float] = {}
+        self._stack: list[tuple[dict[int, float], dict[str, float]]] = []
+        self._state_numbers = state_numbers
+        self._state_names = state_names
+
+    def number(self, index: int) -> float:
+        """Return #index; 0 when it was never set."""
+        if index in self._state_numbers:
+            return self._state_numbers[index]()
+        if not 1 <= index <= LAST_NUMBER:
+            raise KeyError(index)
+        return self._numbers.get(index, 0.0)
+
+    def named(self, name: str) -> float:
+        """Return #<name>."""
+        if name in self._state_names:
+            return self._state_names[name]()
+        return (self._globals if name.startswith("_") else self._locals)[name]
+
+    def set(self, key: int | str, value: float, line: int) -> None:
+        """Set #key; ProgramError for a read-only one, one out of range, or too many."""
+        if isinstance(key, int):
+            if key in self._state_numbers or key in _READ_ONLY or not 1 <= key <= LAST_NUMBER:
+                raise ProgramError(line, f"#{key}", "cannot be set; use one of #1 to #5000")
+            self._numbers[key] = value
+            return
+        if key in self._state_names:
+            raise ProgramError(line, f"#<{key}>", "shows the machine's state and cannot be set; choose another name")
+        names = self._globals if key.startswith("_") else self._locals
+        if len(names) >= self._max and key not in names:
+            raise ProgramError(line, f"#<{key}>", f"is one parameter more than the {self._max} that are allowed")
+        names[key] = value
+
+    def store(self, index: int, value: float) -> None:
+        """Set a numbered parameter on behalf of the machine (offsets, homes)."""
+        self._numbers[index] = value
+
+    def enter(self, arguments: list[float]) -> None:
+        """Begin a call: its own #1 to #30, the arguments first, and its own local names."""
+        saved = {index: self._numbers.pop(index) for index in range(1, LOCAL_NUMBERS + 1) if index in self._numbers}
+        self._stack.append((saved, self._locals))
+        self._locals = {}
+        self._numbers.update(enumerate(arguments, start=1))
+
+    def leave(self) -> None:
+        """End a call: the caller's local parameters are back."""
+        for index in range(1, LOCAL_NUMBERS + 1):
+            self._numbers.pop(index, None)
+        saved, self._locals = self._stack.pop()
+        self._numbers.update(saved)

@@ -1,0 +1,95 @@
+"""The NC's planner: motions -> reference on the SYNC grid.
+
+The NC runs along the path at the programmed feed and smooths each axis' demand by causal moving averages, from rest
+at the start point. It stops exactly between rapid and feed, after each rapid and at a dwell, and between feeds only
+when the machine's configuration says so. All sampling is by whole blocks of numpy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from fdhil.config import MachineConfig
+from fdhil.program.motions import Motion
+from fdhil.program.segments import Segments, Timeline
+from fdhil.program.smoothing import Smoother
+from fdhil.records import Float, Int, Trajectory, frozen, frozen_ints
+
+MAX_ROWS = 10_000_000
+_BLOCK_ROWS = 1 << 16
+
+
+def plan(motions: Iterable[Motion], config: MachineConfig) -> Trajectory:
+    """Return the reference that the NC makes of ``motions``; row 0 is the rest at machine zero.
+
+    ProgramError for an axis that the machine does not have, a feed of nothing, and a duration of more than
+    ``MAX_ROWS`` SYNC periods.
+    """
+    blocks = list(stream(motions, config, _BLOCK_ROWS, MAX_ROWS))
+    rapid = np.concatenate([block.rapid for block in blocks])
+    rapid.setflags(write=False)
+    return Trajectory(
+        dt_s=config.machine.sync_period_s,
+        time_s=frozen(np.concatenate([block.time_s for block in blocks])),
+        position_mm={axis: frozen(np.concatenate([b.position_mm[axis] for b in blocks])) for axis in config.axis},
+        rapid=rapid,
+        line=frozen_ints(np.concatenate([block.line for block in blocks])),
+    )
+
+
+def stream(
+    motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float = math.inf
+) -> Iterator[Trajectory]:
+    """Yield the same reference in blocks of ``block_rows`` (the last one shorter), in flat memory.
+
+    A block is there as soon as the motions that reach into it were read; its times go on from the block before.
+    """
+    smoother = Smoother(config.nc.smoothing_s, config.machine.sync_period_s)
+    timeline = Timeline(config, smoother.settle_rows, max_rows)
+    row = 0
+    kept: list[tuple[Float, Int, Int]] = []
+    waiting = 0
+    for segments in timeline.batches(motions):
+        for raw, line, rapid in _sampled(segments, config.machine.sync_period_s, block_rows):
+            kept.append((smoother(raw), line, rapid))
+            waiting += line.size
+            while waiting >= block_rows:
+                block, kept = _cut(kept, block_rows)
+                yield _trajectory(block, row, config)
+                row += block_rows
+                waiting -= block_rows
+    if waiting:
+        block, _ = _cut(kept, waiting)
+        yield _trajectory(block, row, config)
+
+
+def _sampled(segments: Segments, dt_s: float, block_rows: int) -> Iterator[tuple[Float, Int, Int]]:
+    for first in range(segments.first_row, segments.end_row, block_rows):
+        last = min(first + block_rows, segments.end_row)
+        yield segments.sample(np.arange(first, last), dt_s)
+
+
+def _cut(kept: list[tuple[Float, Int, Int]], rows: int) -> tuple[tuple[Float, Int, Int], list[tuple[Float, Int, Int]]]:
+    position = np.concatenate([part[0] for part in kept])
+    line = np.concatenate([part[1] for part in kept])
+    rapid = np.concatenate([part[2] for part in kept])
+    rest = [(position[rows:], line[rows:], rapid[rows:])] if line.size > rows else []
+    return (position[:rows], line[:rows], rapid[:rows]), rest
+
+
+def _trajectory(block: tuple[Float, Int, Int], first_row: int, config: MachineConfig) -> Trajectory:
+    position, line, rapid_rows = block
+    n = line.size
+    rapid = rapid_rows.astype(np.bool_)
+    rapid.setflags(write=False)
+    columns = {axis: position[:, "XYZ".index(axis)] if axis in "XYZ" else np.zeros(n) for axis in config.axis}
+    return Trajectory(
+        dt_s=config.machine.sync_period_s,
+        time_s=frozen((first_row + np.arange(n)) * config.machine.sync_period_s),
+        position_mm={axis: frozen(column) for axis, column in columns.items()},
+        rapid=rapid,
+        line=frozen_ints(line),
+    )

@@ -1,0 +1,46 @@
+"""Causal moving averages in a row over each axis' demand: the usual FIR interpolation of an NC."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from fdhil.records import Float
+
+
+class Smoother:
+    """Smooths the rows it is handed, block after block; before the first row everything rested where it starts.
+
+    ``settle_rows`` is how many rows after its input has come to rest the output rests too.
+    """
+
+    def __init__(self, averages_s: Sequence[float], dt_s: float) -> None:
+        self._lengths = [max(1, math.floor(average / dt_s + 0.5)) for average in averages_s]
+        self._past: list[Float] = []
+        self.settle_rows = sum(length - 1 for length in self._lengths)
+
+    def __call__(self, rows: Float) -> Float:
+        """Return the smoothed rows, (n, d) -> (n, d)."""
+        if not rows.size:
+            return rows
+        if not self._past:
+            self._past = [np.repeat(rows[:1], length - 1, axis=0) for length in self._lengths]
+        for stage, length in enumerate(self._lengths):
+            if length == 1:
+                continue
+            whole = np.concatenate([self._past[stage], rows])
+            self._past[stage] = whole[whole.shape[0] - length + 1 :]
+            rows = np.column_stack([_mean(column, length) for column in whole.T])
+        return rows
+
+
+def _mean(column: Float, length: int) -> Float:
+    """Mean of each ``length`` values in a row; a column that does not move stays what it is, to the last bit."""
+    origin = column[0]
+    if column[-1] == origin and bool(np.all(column == origin)):
+        return column[length - 1 :]
+    smooth: Float = np.convolve(column - origin, np.full(length, 1.0 / length), mode="valid")
+    smooth += origin
+    return smooth

@@ -1,0 +1,97 @@
+"""Where the lines of a program come from: a file or any iterable of lines, read once, with marks to return to.
+
+Only what a loop or a call may come back to is kept: a place in the file. Memory stays flat however long the program.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import IO, NamedTuple, cast
+
+from fdhil.errors import ProgramError
+
+_SPOOL_BYTES = 4_000_000
+
+
+class Mark(NamedTuple):
+    """A place before a line: its byte offset and how many lines stand before it."""
+
+    offset: int
+    lines: int
+
+
+class Source:
+    """A program that is read line by line and can go back to a mark; ProgramError when it cannot be read.
+
+    ``line`` is the 1-based number of the line last read.
+    """
+
+    __slots__ = ("_feed", "_file", "_max_chars", "_open", "folder", "line", "name")
+
+    def __init__(self, program: Path | Iterable[str], max_line_chars: int) -> None:
+        self._max_chars = max_line_chars
+        self._feed: Iterator[str] | None = None
+        self._open = ExitStack()
+        self.line = 0
+        if isinstance(program, Path):
+            self.name, self.folder = program.name, program.parent
+            try:
+                self._file: IO[bytes] = self._open.enter_context(program.open("rb", buffering=1 << 18))
+            except OSError as error:
+                raise ProgramError(0, "", f"{program} cannot be read ({error.strerror}); check the path") from None
+        else:
+            self.name, self.folder = "", Path()
+            self._file = self._open.enter_context(_spool())
+            self._feed = iter(program)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._open.close()
+
+    def mark(self) -> Mark:
+        """Return the place before the next line."""
+        return Mark(self._file.tell(), self.line)
+
+    def go(self, mark: Mark) -> None:
+        """Return to a place."""
+        self._file.seek(mark.offset)
+        self.line = mark.lines
+
+    def next(self) -> str | None:
+        """Return the next line without its end, None after the last one."""
+        try:
+            raw = self._file.readline(self._max_chars + 2)
+        except OSError as error:
+            raise ProgramError(self.line + 1, "", f"cannot be read ({error.strerror}); check the disk") from None
+        if not raw and self._feed is not None:
+            raw = self._draw(self._feed)
+        if not raw:
+            return None
+        self.line += 1
+        if len(raw) > self._max_chars and len(raw.rstrip(b"\r\n")) > self._max_chars:
+            word = raw[:12].decode("latin-1")
+            raise ProgramError(self.line, word, f"the line is longer than {self._max_chars} characters; split it")
+        if b"\0" in raw:
+            raise ProgramError(self.line, "\\0", "holds a zero byte, so this is no text; give an NC program")
+        return raw.decode("latin-1").rstrip("\r\n")
+
+    def _draw(self, feed: Iterator[str]) -> bytes:
+        """Take one line from the iterable and keep it, so that a loop can come back to it."""
+        line = next(feed, None)
+        if line is None:
+            return b""
+        raw = (line.rstrip("\r\n").replace("\n", " ") + "\n").encode("latin-1", "replace")
+        at = self._file.tell()
+        self._file.write(raw)
+        self._file.seek(at + min(len(raw), self._max_chars + 2))
+        return raw[: self._max_chars + 2]
+
+
+@contextmanager
+def _spool() -> Iterator[IO[bytes]]:
+    """Keep lines in memory while they are few, else on the disk."""
+    with tempfile.SpooledTemporaryFile(_SPOOL_BYTES) as file:
+        yield cast(IO[bytes], file)

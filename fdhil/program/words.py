@@ -1,0 +1,183 @@
+"""From a line of text to a block: its words, codes by modal group, and parameter settings.
+
+Blanks, comments and case mean nothing outside names. A block has each letter once, except G, M and parameter settings.
+G codes are held times ten (G38.2 is 382).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from fdhil.errors import ProgramError
+from fdhil.program.expressions import Parameters, Reader
+
+_PLAIN = re.compile(r"(?:[a-z@^][+-]?(?:\d++\.?\d*+|\.\d++))*+")
+_WORD = re.compile(r"([a-z@^])([+-]?(?:\d++\.?\d*+|\.\d++))")
+_NUMBER = re.compile(r"n(\d++)(?:\.\d++)?+")
+_BLANKS = str.maketrans("", "", " \t\r\v\f")
+_LETTERS = frozenset("abcdefghijklmpqrstuvwxyz@^")
+
+
+def _groups(*members: tuple[str, tuple[int, ...]]) -> Mapping[int, str]:
+    return {code: name for name, codes in members for code in codes}
+
+
+MOTION = (0, 10, 20, 30, 50, 51, 52, 53, 330, 331, 382, 383, 384, 385, 730, 740, 760, 800, *range(810, 900, 10))
+G_GROUPS: Mapping[int, str] = _groups(
+    ("motion", MOTION),
+    ("one-shot", (40, 100, 280, 281, 300, 301, 520, 920, 921, 922, 923)),
+    ("machine co-ordinates", (530,)),
+    ("plane", (170, 180, 190)),
+    ("distance", (900, 910)),
+    ("arc distance", (901, 911)),
+    ("feed mode", (930, 940, 950)),
+    ("units", (200, 210)),
+    ("cutter compensation", (400, 410, 411, 420, 421)),
+    ("tool length", (430, 431, 432, 490)),
+    ("return", (980, 990)),
+    ("co-ordinate system", (540, 550, 560, 570, 580, 590, 591, 592, 593)),
+    ("path control", (610, 611, 640)),
+    ("spindle mode", (960, 970)),
+    ("lathe diameter", (70, 80)),
+)
+M_GROUPS: Mapping[int, str] = _groups(
+    ("stop", (0, 1, 2, 30, 60)),
+    ("call", (98, 99)),
+    ("signals", (62, 63, 64, 65, 66, 67, 68)),
+    ("tool", (6, 61)),
+    ("spindle", (3, 4, 5, 19)),
+    ("mist", (7,)),
+    ("flood", (8,)),
+    ("coolant off", (9,)),
+    ("overrides", (48, 49, 50, 51, 52, 53)),
+    ("modal state", (70, 71, 72, 73)),
+)
+
+
+@dataclass(slots=True)
+class Block:
+    """One line, read: ``words`` by letter (lower case, program units), G codes times ten and M codes by modal group,
+    and the parameter settings in their order, done after the whole line was read."""
+
+    line: int
+    words: dict[str, float] = field(default_factory=dict)
+    g: dict[str, int] = field(default_factory=dict)
+    m: dict[str, int] = field(default_factory=dict)
+    settings: list[tuple[int | str, float]] = field(default_factory=list)
+
+    def fault(self, word: str, message: str) -> ProgramError:
+        """Return the error for one of its words; a letter is shown with its value."""
+        if word in self.words:
+            word = f"{word.upper()}{self.words[word]:g}"
+        return ProgramError(self.line, word, message)
+
+
+def clean(raw: str, line: int) -> str:
+    """Return a line in lower case without comments and blanks; ProgramError for a comment that is not closed."""
+    if "(" in raw or ";" in raw:
+        raw = _without_comments(raw, line)
+    return raw.lower().translate(_BLANKS)
+
+
+def _without_comments(raw: str, line: int) -> str:
+    kept: list[str] = []
+    at = 0
+    while at < len(raw):
+        marks = [place for place in (raw.find("(", at), raw.find(";", at)) if place >= 0]
+        if not marks:
+            kept.append(raw[at:])
+            break
+        start = min(marks)
+        kept.append(raw[at:start])
+        if raw[start] == ";":
+            break
+        end = raw.find(")", start)
+        if end < 0:
+            raise ProgramError(line, raw[start : start + 12], "the comment is not closed; add ')'")
+        if "(" in raw[start + 1 : end]:
+            raise ProgramError(
+                line, raw[start : start + 12], "a comment stands within a comment; take the inner one out"
+            )
+        at = end + 1
+    return "".join(kept)
+
+
+def without_number(text: str) -> str:
+    """Return a cleaned line without its line number (N...)."""
+    if text.startswith("n"):
+        match = _NUMBER.match(text)
+        if match is not None:
+            return text[match.end() :]
+    return text
+
+
+def read(text: str, line: int, parameters: Parameters, max_nesting: int) -> Block:
+    """Read a cleaned line; ProgramError with line and word for what the language does not allow.
+
+    Values are evaluated with the parameters as they are before the line's own settings.
+    """
+    block = Block(line)
+    text = without_number(text)
+    if _PLAIN.fullmatch(text) is not None:
+        for letter, digits in _WORD.findall(text):
+            value = float(digits)
+            if value - value != 0.0:
+                raise ProgramError(line, letter.upper() + digits[:12], "is too large a number")
+            _add(block, letter, value)
+        return block
+    reader = Reader(text, line, parameters, max_nesting)
+    while not reader.done():
+        _next(block, reader)
+    return block
+
+
+def _next(block: Block, reader: Reader) -> None:
+    reader.word_at = reader.at
+    letter = reader.text[reader.at]
+    if letter == "#":
+        reader.at += 1
+        key: int | str = reader.name() if reader.text.startswith("<", reader.at) else reader.index()
+        if not reader.take("="):
+            raise reader.fault("a parameter's setting wants '=' and a value")
+        block.settings.append((key, reader.value()))
+        return
+    if letter not in _LETTERS:
+        raise reader.fault("is no word of the language; check the characters")
+    reader.at += 1
+    _add(block, letter, reader.value())
+
+
+def _add(block: Block, letter: str, value: float) -> None:
+    if letter == "g":
+        _add_g(block, value)
+    elif letter == "m":
+        _add_m(block, value)
+    elif letter in block.words:
+        raise ProgramError(block.line, f"{letter.upper()}{value:g}", "this letter stands twice in the block; keep one")
+    elif letter not in _LETTERS:
+        raise ProgramError(block.line, f"{letter.upper()}{value:g}", "stands where it may not; N and O begin a line")
+    else:
+        block.words[letter] = value
+
+
+def _add_g(block: Block, value: float) -> None:
+    code = round(value * 10.0)
+    group = G_GROUPS.get(code) if abs(value * 10.0 - code) < 1e-3 else None
+    if group is None:
+        raise ProgramError(block.line, f"G{value:g}", "is a G code that fdhil does not know; see the list of codes")
+    if group in block.g:
+        other = f"G{block.g[group] / 10:g}"
+        raise ProgramError(block.line, f"G{value:g}", f"contradicts {other} in the same block; keep one of them")
+    block.g[group] = code
+
+
+def _add_m(block: Block, value: float) -> None:
+    code = round(value)
+    group = M_GROUPS.get(code) if abs(value - code) < 1e-4 else None
+    if group is None:
+        raise ProgramError(block.line, f"M{value:g}", "is an M code that fdhil does not know; see the list of codes")
+    if group in block.m:
+        raise ProgramError(block.line, f"M{value:g}", f"contradicts M{block.m[group]} in the same block; keep one")
+    block.m[group] = code

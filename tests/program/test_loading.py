@@ -1,0 +1,71 @@
+"""Demand CSV in and out, and what a file is by its suffix."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil.errors import ConfigError, ProgramError, RecordingError
+from fdhil.program import load_trajectory, program_digest, write_demand_csv
+from tests.bench import bench_config
+
+PROGRAMS = Path(__file__).parents[2] / "configs" / "programs"
+
+
+def test_a_written_demand_reads_back(tmp_path: Path) -> None:
+    config = bench_config()
+    planned = load_trajectory(PROGRAMS / "bench_10m.ngc", config)
+    write_demand_csv(planned, tmp_path / "demand.csv")
+    read = load_trajectory(tmp_path / "demand.csv", config)
+    np.testing.assert_allclose(read.time_s, planned.time_s, atol=1e-9)
+    for axis in planned.axes:
+        np.testing.assert_allclose(read.position_mm[axis], planned.position_mm[axis], atol=1e-9)
+    assert (tmp_path / "demand.csv").read_text().splitlines()[0] == "time_s,X_mm,Y_mm"
+
+
+@pytest.mark.parametrize("name", ["bench_10m.ngc", "bench_20m.ngc", "bench_rounded_10m.ngc", "shuttle.ngc"])
+def test_the_programs_that_come_along_can_be_planned(name: str) -> None:
+    reference = load_trajectory(PROGRAMS / name, bench_config())
+    assert reference.position_mm["X"].max() >= 250.0
+    assert reference.rapid.any() == (name == "shuttle.ngc")
+
+
+ROWS = [f"{k / 1000:.3f},{k * 0.1:.4f},0.0" for k in range(20)]
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        [],
+        ["time_s,X_mm,Y_mm"],
+        ["time_s,X_mm", *[row.rpartition(",")[0] for row in ROWS]],
+        ["X_mm,Y_mm", *[row.partition(",")[2] for row in ROWS]],
+        ["time_s,X_mm,Y_mm", *ROWS[:5], "0.005,abc,0", *ROWS[6:]],
+        ["time_s,X_mm,Y_mm", *ROWS[:5], "0.005,nan,0", *ROWS[6:]],
+        ["time_s,X_mm,Y_mm", *ROWS[:5], "0.005,,0", *ROWS[6:]],
+        ["time_s,X_mm,Y_mm", *ROWS, "0.020,1."],
+        ["time_s,X_mm,Y_mm", *ROWS[:5], *ROWS[6:]],
+        ["time_s,X_mm,Y_mm,Z_mm", *[f"{row},{k}" for k, row in enumerate(ROWS)]],
+        ["time_s,X_mm,Y_mm", ROWS[0]],
+    ],
+)
+def test_a_broken_demand_is_a_recording_error(lines: list[str], tmp_path: Path) -> None:
+    (tmp_path / "d.csv").write_text("\n".join(lines))
+    with pytest.raises(RecordingError):
+        load_trajectory(tmp_path / "d.csv", bench_config())
+
+
+def test_another_step_than_the_sync_period_is_a_config_error(tmp_path: Path) -> None:
+    (tmp_path / "d.csv").write_text("time_s,X_mm,Y_mm\n" + "".join(f"{k * 0.002:.3f},0,0\n" for k in range(9)))
+    with pytest.raises(ConfigError, match="sync_period_s"):
+        load_trajectory(tmp_path / "d.csv", bench_config())
+
+
+def test_a_digest_tells_programs_apart(tmp_path: Path) -> None:
+    assert program_digest(PROGRAMS / "bench_10m.ngc") != program_digest(PROGRAMS / "bench_20m.ngc")
+    with pytest.raises(ProgramError):
+        program_digest(tmp_path / "none.ngc")
+    with pytest.raises(ProgramError):
+        load_trajectory(tmp_path / "none.ngc", bench_config())

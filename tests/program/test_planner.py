@@ -1,0 +1,135 @@
+"""The planner: times, speeds, stops and the smoothing of the NC."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from fdhil import config as configuration
+from fdhil.errors import ProgramError
+from fdhil.program import Arc, Dwell, Feed, Motion, Rapid, plan
+from fdhil.program.planner import stream
+from tests.bench import bench_config, bench_document
+
+MOVES: list[Motion] = [
+    Feed(1, (0.0, 55.0, 0.0), 10000.0),
+    Feed(2, (100.0, 55.0, 0.0), 10000.0),
+    Arc(3, (200.0, 55.0, 0.0), (150.0, 55.0, None), 1, "XY", 10000.0),
+    Feed(4, (250.0, 55.0, 0.0), 10000.0),
+    Rapid(5, (0.0, 0.0, 0.0)),
+]
+
+
+def test_a_feed_is_the_programmed_speed_through_two_moving_averages() -> None:
+    reference = plan([Feed(1, (100.0, 0.0, 0.0), 6000.0)], bench_config())
+    raw = np.minimum(np.arange(1000 + 88 + 2) * 0.1, 100.0)
+    expected = raw
+    for length in (60, 30):
+        expected = np.convolve(np.concatenate([np.zeros(length - 1), expected]), np.full(length, 1 / length), "valid")
+    np.testing.assert_allclose(reference.position_mm["X"], expected, atol=1e-9)
+    np.testing.assert_array_equal(reference.position_mm["Y"], 0.0)
+    assert reference.line[0] == 0
+    assert set(reference.line[1:]) == {1}
+    assert not reference.rapid.any()
+
+
+def test_the_path_is_run_at_the_programmed_feed_without_a_stop_between_feeds() -> None:
+    document = bench_document()
+    document["nc"] = {"smoothing_s": []}
+    reference = plan(MOVES[:4], configuration.parse(document))
+    x, y = reference.position_mm["X"], reference.position_mm["Y"]
+    speed = np.hypot(np.diff(x), np.diff(y)) / 1e-3
+    length = 55 + 100 + 50 * math.pi + 50
+    assert reference.time_s[-1] == pytest.approx(length / (10000 / 60), abs=2.1e-3)
+    assert np.quantile(speed, 0.01) == pytest.approx(10000 / 60, rel=1e-4)
+    assert y.min() >= 0.0
+    assert y[np.abs(x - 150) < 0.1] == pytest.approx(5.0, abs=0.01)  # the lower half of the circle
+
+
+def test_rapids_keep_each_axis_within_its_limits_and_run_straight() -> None:
+    document = bench_document()
+    document["nc"] = {"smoothing_s": []}
+    document["axis"]["Y"]["max_acceleration_mm_s2"] = 1000.0
+    reference = plan([Rapid(1, (300.0, 200.0, 0.0))], configuration.parse(document))
+    x, y = reference.position_mm["X"], reference.position_mm["Y"]
+    np.testing.assert_allclose(y, x * 2 / 3, atol=1e-9)
+    assert np.abs(np.diff(x)).max() <= 0.5 + 1e-9
+    assert np.abs(np.diff(y, 2)).max() <= 1000e-6 + 1e-9
+    assert np.abs(np.diff(y, 2)).max() >= 990e-6
+    assert (x[-1], y[-1]) == (300.0, 200.0)
+    assert reference.rapid[1:].all()
+
+
+def test_rapid_and_feed_are_parted_by_an_exact_stop() -> None:
+    reference = plan(MOVES, bench_config())
+    x, y = reference.position_mm["X"], reference.position_mm["Y"]
+    first_rapid = int(np.argmax(reference.rapid))
+    assert (x[first_rapid - 1], y[first_rapid - 1]) == pytest.approx((250.0, 55.0), abs=1e-9)
+    assert not reference.rapid[0]
+    assert (x[-1], y[-1]) == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+def test_exact_stop_between_feeds_is_an_option() -> None:
+    document = bench_document()
+    document["nc"] = {"corner": "exact_stop", "settle_s": 0.01}
+    reference = plan(MOVES[:2], configuration.parse(document))
+    corner = np.hypot(reference.position_mm["X"], reference.position_mm["Y"] - 55.0)
+    assert np.count_nonzero(corner < 1e-9) >= 10
+
+
+def test_a_dwell_holds_all_axes() -> None:
+    reference = plan(
+        [Feed(1, (10.0, 0.0, 0.0), 6000.0), Dwell(2, 0.5), Feed(3, (20.0, 0.0, 0.0), 6000.0)], bench_config()
+    )
+    assert np.count_nonzero(np.abs(reference.position_mm["X"] - 10.0) < 1e-9) >= 500
+    assert reference.time_s[-1] == pytest.approx(0.1 + 0.088 + 0.5 + 0.088 + 0.1 + 0.088, abs=0.003)
+
+
+def test_blocks_of_a_stream_make_the_same_reference() -> None:
+    config = bench_config()
+    whole = plan(MOVES, config)
+    blocks = list(stream(MOVES, config, 333))
+    assert {block.time_s.size for block in blocks[:-1]} == {333}
+    for axis in whole.axes:
+        joined = np.concatenate([block.position_mm[axis] for block in blocks])
+        np.testing.assert_allclose(joined, whole.position_mm[axis], atol=1e-9)
+    np.testing.assert_array_equal(np.concatenate([block.line for block in blocks]), whole.line)
+    np.testing.assert_array_equal(np.concatenate([block.rapid for block in blocks]), whole.rapid)
+
+
+def test_an_axis_that_the_machine_lacks_is_refused() -> None:
+    with pytest.raises(ProgramError, match="axis Z") as caught:
+        plan([Rapid(7, (0.0, 0.0, 1.0))], bench_config())
+    assert caught.value.line == 7
+
+
+def test_axes_that_the_program_does_not_move_stay() -> None:
+    reference = plan([Feed(1, (10.0, 0.0, 0.0), 6000.0)], bench_config("XYZ"))
+    assert reference.axes == ("X", "Y", "Z")
+    assert not reference.position_mm["Z"].any()
+
+
+def test_no_motion_is_a_rest() -> None:
+    reference = plan([], bench_config())
+    assert not reference.position_mm["X"].any()
+
+
+def test_an_endless_duration_is_refused() -> None:
+    with pytest.raises(ProgramError):
+        plan([Dwell(1, 1e300)], bench_config())
+    with pytest.raises(ProgramError):
+        plan([Feed(1, (1.0, 0.0, 0.0), 0.0)], bench_config())
+    with pytest.raises(ProgramError, match="h; split"):
+        plan([Feed(1, (1000.0, 0.0, 0.0), 1e-6)], bench_config())
+
+
+def test_helices_and_spirals_end_where_they_are_told() -> None:
+    config = bench_config("XYZ")
+    start = Feed(1, (10.0, 0.0, 0.0), 6000.0)
+    reference = plan([start, Arc(2, (10.001, 0.0, 5.0), (0.0, 0.0, None), -3, "XY", 6000.0)], config)
+    end = [reference.position_mm[axis][-1] for axis in "XYZ"]
+    assert end == pytest.approx([10.001, 0.0, 5.0], abs=1e-9)
+    angle = np.unwrap(np.arctan2(reference.position_mm["Y"], reference.position_mm["X"]))[300:]
+    assert angle[-1] == pytest.approx(-6 * math.pi, abs=1e-6)
