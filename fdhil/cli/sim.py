@@ -1,0 +1,115 @@
+"""``fdhil sim``: the simulated machine as a process of its own."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from fdhil.config import MachineConfig
+    from fdhil.records import Trajectory
+
+_FILE = click.Path(dir_okay=False, path_type=Path)
+
+
+@click.command()
+@click.argument("config", type=_FILE)
+@click.option("--json", "as_json", is_flag=True, help="Write events as JSON, one line each; the first is 'ready'.")
+@click.option("--faults", type=_FILE, help="A fault script: what breaks when (TOML).")
+@click.option("--demand", type=_FILE, help="A demand CSV that the NC plays at once.")
+@click.option("--program", type=_FILE, help="An NC program that the NC plays at once.")
+@click.option("--trace", type=_FILE, help="Record what is played first: reference, true table and offset (CSV).")
+def sim(
+    config: Path, as_json: bool, faults: Path | None, demand: Path | None, program: Path | None, trace: Path | None
+) -> None:
+    """Run the simulated machine of CONFIG: drives, sensors and NC on a bus that any python-can program joins.
+
+    The drives boot into pre-operational and only answer, until the NC is switched on ([sim] nc = true, --demand,
+    --program or the panel) or another master takes over SYNC, NMT and the set-points. Standard input is the operator's
+    panel, one JSON object per line:
+
+    \b
+      {"command": "nc", "on": true}              {"command": "play", "file": "path.csv"}
+      {"command": "feed_hold", "on": true}       {"command": "override", "percent": 50}
+      {"command": "set", "axis": "X", "parameters": {"Jt": 0.085}}
+      {"command": "temperature", "celsius": 22}  {"command": "fault", "axis": "X", "fault": "reboot"}
+      {"command": "trace", "file": "trace.csv"}  {"command": "stop"}  {"command": "quit"}
+
+    It ends on quit, Ctrl-C or SIGTERM; the end of standard input does not end it.
+    """
+    if demand is not None and program is not None:
+        raise click.UsageError("give --demand or --program, not both")
+    _serve(config, as_json, faults, demand or program, trace)
+
+
+def _serve(path: Path, as_json: bool, script: Path | None, play: Path | None, trace: Path | None) -> None:
+    import gc
+    import signal
+
+    from fdhil import config
+    from fdhil.sim import faults
+    from fdhil.sim.service import SimService, json_emitter
+
+    machine = config.load(path)
+    entries = [] if script is None else faults.load(script, tuple(machine.axis))
+    emit = json_emitter() if as_json else _tell
+    service = SimService(machine, emit, _load, panel_fd=_panel_descriptor(), faults=entries)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: service.stop())
+    sys.setswitchinterval(0.0005)  # the SYNC must not wait 5 ms for the thread that serves the sensors
+    gc.freeze()  # what is there now stays; the collector need not look at it between two SYNCs
+    service.run(play, trace)
+
+
+def _load(path: Path, machine: MachineConfig) -> Trajectory:
+    from fdhil.program import load_trajectory
+
+    return load_trajectory(path, machine)
+
+
+def _panel_descriptor() -> int | None:
+    """Return the descriptor of standard input, None when the process was started without one."""
+    try:
+        return sys.stdin.fileno()
+    except (AttributeError, OSError, ValueError):
+        return None
+
+
+def _tell(event: dict[str, Any]) -> None:
+    """Write an event for people."""
+    click.echo("\n".join(_lines(event)))
+
+
+def _lines(event: dict[str, Any]) -> list[str]:
+    match event["event"]:
+        case "ready":
+            return _ready_lines(event)
+        case "nc":
+            return [f"NC {'on: it sends SYNC and has enabled the drives' if event['on'] else 'off'}"]
+        case "playing":
+            return [f"playing {event['file']}, {event['rows']} rows"]
+        case "finished":
+            late = ", ".join(f"{axis} {n}" for axis, n in event["late_rpdo"].items())
+            how = "stopped after" if event["stopped"] else "finished"
+            trace = f", recorded to {event['trace']}" if event["trace"] else ""
+            return [f"{how} {event['rows']} rows of {event['file']}; late offset frames: {late}{trace}"]
+        case "error":
+            return [f"cannot: {event['text']}"]
+    rest = ", ".join(f"{key} {value}" for key, value in event.items() if key != "event")
+    return [f"{event['event']}: {rest}"]
+
+
+def _ready_lines(event: dict[str, Any]) -> list[str]:
+    lines = ["the simulated machine is ready"]
+    for name, bus in event["buses"].items():
+        arguments = ", ".join(f"{key}={value!r}" for key, value in bus.items())
+        load, worst = event["bus_load"][name], event["bus_load_worst"][name]
+        lines.append(f"  bus {name}: can.Bus({arguments})")
+        lines.append(f"  bus load of {name}: {load:.0%} at this SYNC period ({worst:.0%} with the most stuff bits)")
+    for axis, drive in event["drives"].items():
+        lines.append(f"  drive {axis}: node {drive['node_id']}, {drive['eds']}")
+    lines += [f"  voltage sensor {axis}: Modbus TCP {m['host']}:{m['port']}" for axis, m in event["modbus"].items()]
+    return lines

@@ -1,0 +1,247 @@
+"""A CAN bus on TCP: the hub speaks the socketcand text protocol, so that any python-can program joins the bus.
+
+    client -> hub   < open can0 >   < rawmode >   < echo >   < send 181 2 a ff >
+    hub -> client   < hi >          < ok >        < ok >     < frame 181 1700000000.000000 0AFF >
+
+What a client sends reaches every other client and the twin; nobody hears himself, as on SocketCAN. Every frame is
+padded with blanks inside its brackets to 64 bytes: python-can reads 1024 bytes at a time, so a whole number of frames
+fits and none is torn. Nothing is lost: each client has a queue, and while one queue is full the hub takes no frames
+from anyone and says so (:attr:`Hub.congested`); a client that reads nothing for ``STALL_S`` is then disconnected.
+"""
+
+from __future__ import annotations
+
+import errno
+import socket
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from fdhil.errors import ConnectError
+
+Frame = tuple[int, bytes]
+Handler = Callable[[Frame], None]
+
+EXTENDED = 1 << 31  # marks a 29 bit identifier, as SocketCAN does
+QUEUE_BYTES = 8 << 20
+STALL_S = 5.0
+# python-can takes each greeting with a recv of its own: frames must not follow the last one at once
+GREETING_S = 0.05
+_MAX_COMMAND = 4096
+_CHUNK = 1 << 16
+_ONE_MORE = frozenset({errno.EAGAIN, errno.EWOULDBLOCK, errno.EINTR})
+
+
+def encode(frames: Sequence[Frame], stamp_s: float) -> bytes:
+    """Return the frames as the hub sends them, 64 bytes each, all with the time stamp ``stamp_s`` (Unix time)."""
+    stamp = f"{stamp_s:.6f}"
+    text = []
+    for can_id, data in frames:
+        name = f"{can_id:03X}" if can_id < EXTENDED else f"{can_id & 0x1FFFFFFF:08X}"
+        text.append(f"< frame {name} {stamp} {data.hex().upper()}".ljust(62) + " >")
+    return "".join(text).encode("ascii")
+
+
+def decode_send(command: bytes) -> Frame | None:
+    """Return the frame of a ``send`` command (without its closing bracket), None when it is malformed.
+
+    >>> decode_send(b"< send 181 2 a ff ")
+    (385, b'\\n\\xff')
+    """
+    words = command.split()
+    try:
+        can_id, length = int(words[2], 16), int(words[3], 16)
+        data = bytes([int(word, 16) for word in words[4:]])
+    except (IndexError, ValueError):
+        return None
+    extended = len(words[2]) > 3
+    if length > 8 or len(data) != length or not 0 <= can_id <= (0x1FFFFFFF if extended else 0x7FF):
+        return None
+    return can_id | EXTENDED if extended else can_id, data
+
+
+@dataclass(slots=True, eq=False)
+class _Client:
+    """One connection; ``raw`` once it hears frames, ``hold_until_s`` while its last greeting may still be unread."""
+
+    socket: socket.socket
+    inbox: bytearray = field(default_factory=bytearray)
+    outbox: bytearray = field(default_factory=bytearray)
+    opened: bool = False
+    raw: bool = False
+    gone: bool = False
+    hold_until_s: float = 0.0
+    moved_s: float = 0.0
+
+
+class Hub:
+    """The bus ``channel`` on a TCP port of ``host``, port 0 for any free one; ConnectError when it cannot be had.
+
+    Not thread-safe: one loop selects on :meth:`readers` and :meth:`writers`, calls :meth:`pump`, then :meth:`flush`.
+    ``lost_clients`` counts those that were disconnected because they read nothing, ``malformed`` what was no command.
+    """
+
+    def __init__(self, channel: str, host: str = "127.0.0.1", port: int = 0, queue_bytes: int = QUEUE_BYTES) -> None:
+        self.channel = channel
+        self.lost_clients = 0
+        self.malformed = 0
+        self._queue_bytes = queue_bytes
+        self._clients: list[_Client] = []
+        self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        try:
+            self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self._listener.bind((host, port))
+            self._listener.listen(64)
+        except OSError as error:
+            self._listener.close()
+            raise ConnectError(
+                f"bus {channel}",
+                f"TCP port {port} of {host} cannot be had ({error.strerror or error}): end the program that holds it, "
+                "or set another port (0 lets the simulator choose one)",
+            ) from None
+        self._listener.setblocking(False)
+        self.host, self.port = self._listener.getsockname()[:2]
+
+    @property
+    def settings(self) -> dict[str, str | int | None]:
+        """The arguments with which ``can.Bus`` joins."""
+        return {"interface": "socketcand", "channel": self.channel, "host": self.host, "port": self.port}
+
+    @property
+    def congested(self) -> bool:
+        """Whether a client's queue is full: produce nothing more until it has been read."""
+        return any(len(client.outbox) > self._queue_bytes for client in self._clients)
+
+    @property
+    def clients(self) -> int:
+        """How many clients hear the bus."""
+        return sum(client.raw for client in self._clients)
+
+    def readers(self) -> list[socket.socket]:
+        """Sockets to select for reading."""
+        return [self._listener] if self.congested else [self._listener, *(c.socket for c in self._clients)]
+
+    def writers(self) -> list[socket.socket]:
+        """Sockets to select for writing: those whose queue could not be sent at once."""
+        return [c.socket for c in self._clients if c.outbox and not c.hold_until_s]
+
+    def deadline_s(self) -> float | None:
+        """Monotonic time at which :meth:`flush` is due although no socket is ready, None for never."""
+        waits = [c.hold_until_s for c in self._clients if c.hold_until_s]
+        return min(waits) if waits else None
+
+    def pump(self, ready: Sequence[object], handler: Handler) -> None:
+        """Read the sockets among ``ready``; each frame goes to the other clients, then to ``handler``, in turn."""
+        if self._listener in ready:
+            self._accept()
+        for client in tuple(self._clients):
+            if client.socket in ready:
+                self._read(client, handler)
+
+    def send(self, frames: Sequence[Frame], sender: _Client | None = None) -> None:
+        """Queue frames to every client but the sender."""
+        if not self._clients:
+            return
+        text = encode(frames, time.time())
+        for client in self._clients:
+            if client.raw and client is not sender:
+                client.outbox += text
+
+    def flush(self, now_s: float) -> None:
+        """Send what is queued as far as the sockets take it; ``now_s`` is monotonic."""
+        for client in self._clients:
+            if client.outbox and client.hold_until_s <= now_s:
+                client.hold_until_s = 0.0
+                self._write(client, now_s)
+        if any(client.gone for client in self._clients):
+            for client in self._clients:
+                if client.gone:
+                    client.socket.close()
+            self._clients = [client for client in self._clients if not client.gone]
+
+    def close(self) -> None:
+        """Close every connection and the port."""
+        for client in self._clients:
+            client.socket.close()
+        self._clients.clear()
+        self._listener.close()
+
+    def _accept(self) -> None:
+        try:
+            connection, _ = self._listener.accept()
+        except OSError as error:  # the client has already gone, or no descriptor is left
+            if error.errno not in _ONE_MORE and error.errno not in (errno.ECONNABORTED, errno.EMFILE):
+                raise
+            return
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        client = _Client(connection, moved_s=time.monotonic())
+        client.outbox += b"< hi >"
+        self._clients.append(client)
+
+    def _read(self, client: _Client, handler: Handler) -> None:
+        try:
+            chunk = client.socket.recv(_CHUNK)
+            # the stock client leaves Nagle on: without the acknowledgement its next frame waits for 40 ms
+            client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+        except OSError as error:
+            client.gone = error.errno not in _ONE_MORE
+            return
+        if not chunk:
+            client.gone = True
+            return
+        client.inbox += chunk
+        *commands, rest = bytes(client.inbox).split(b">")
+        client.inbox = bytearray(rest)
+        for command in commands:
+            self._command(client, command, handler)
+        if len(client.inbox) > _MAX_COMMAND:  # whatever this is, it does not speak the protocol
+            self.malformed += 1
+            client.gone = True
+
+    def _command(self, client: _Client, command: bytes, handler: Handler) -> None:
+        words = command.split(None, 2)
+        if client.raw and words[:2] == [b"<", b"send"]:
+            frame = decode_send(command)
+            if frame is None:
+                self.malformed += 1
+                return
+            client.hold_until_s = 0.0  # who sends has read his greetings
+            if len(self._clients) > 1:
+                self.send((frame,), client)
+            handler(frame)
+        else:
+            self._greet(client, [word.decode("ascii", "replace") for word in command.split()[1:]])
+
+    def _greet(self, client: _Client, words: list[str]) -> None:
+        """Answer what leads to raw mode; the answers stand before any frame in the queue."""
+        answer = b"< ok >"
+        if words == ["open", self.channel] and not client.opened:
+            client.opened = True
+        elif words == ["rawmode"] and client.opened and not client.raw:
+            client.raw = True
+            client.outbox += answer
+            self._write(client, time.monotonic())
+            client.hold_until_s = time.monotonic() + GREETING_S
+            return
+        elif words == ["echo"]:
+            answer = b"< echo >"
+        elif words[:1] == ["open"]:
+            answer = b"< error could not open bus >"
+        else:
+            self.malformed += 1
+            answer = b"< error unknown command >"
+        client.outbox += answer
+
+    def _write(self, client: _Client, now_s: float) -> None:
+        try:
+            sent = client.socket.send(client.outbox)
+        except OSError as error:
+            sent = 0
+            client.gone = error.errno not in _ONE_MORE
+        if sent:
+            del client.outbox[:sent]
+            client.moved_s = now_s
+        elif len(client.outbox) > self._queue_bytes and now_s - client.moved_s > STALL_S:
+            self.lost_clients += 1
+            client.gone = True

@@ -1,0 +1,394 @@
+"""The simulated machine, sans-I/O: drives, slide-ways, sensors and NC, moved by SYNC and by nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdhil.config import MachineConfig
+from fdhil.errors import ConfigError, ConfigFault, StoreError
+from fdhil.sim import description
+from fdhil.sim.drive import Drive
+from fdhil.sim.faults import FaultEntry, FaultSchedule
+from fdhil.sim.hub import Frame
+from fdhil.sim.modbus_sensor import SensorFaults, VoltageSensor
+from fdhil.sim.nc import BusFrame, Event, Nc, Row
+from fdhil.sim.recorder import Recorder
+from fdhil.sim.sensors import DriveFaults
+from fdhil.sim.thermal import SlideWay
+
+SYNC = 0x80
+OFFSET_RPDO = 2
+_THERMAL_CYCLES = 100  # the temperature moves slowly: the drive learns of it this often
+_GAP_CYCLES = 50  # a longer silence is the end of a stream, not a late frame
+_PATIENCE_CYCLES = 3  # a listed RPDO that was missing this often is not waited for any more
+
+
+@dataclass(slots=True)
+class _Stream:
+    """One RPDO, cycle by cycle; ``late`` counts the cycles in which it was missing in a stream that went on."""
+
+    active: bool = False
+    gap: int = 0
+    late: int = 0
+
+    def step(self, heard: bool) -> None:
+        if heard:
+            self.late += self.gap
+            self.active, self.gap = True, 0
+        elif self.active:
+            self.gap += 1
+            if self.gap > _GAP_CYCLES:
+                self.active, self.gap = False, 0
+
+    @property
+    def awaited(self) -> bool:
+        return self.active and self.gap <= _PATIENCE_CYCLES
+
+
+@dataclass(slots=True)
+class Unit:
+    """One axis of the machine: its drive and what is mounted around it. It is also what a fault acts on."""
+
+    axis: str
+    bus: str
+    drive: Drive
+    slide_way: SlideWay
+    sensor: VoltageSensor | None
+    outbox: list[BusFrame]
+    injected: dict[int, tuple[str, bytes]]
+    offsets: _Stream = field(default_factory=_Stream)
+    sync_on: bool = True
+
+    @property
+    def drive_faults(self) -> DriveFaults:
+        """The drive's fault state."""
+        return self.drive.faults
+
+    @property
+    def sensor_faults(self) -> SensorFaults | None:
+        """The sensor's fault state, None when the axis has no sensor."""
+        return None if self.sensor is None else self.sensor.faults
+
+    def trip(self, code: int) -> None:
+        """Let the drive fall into fault."""
+        self.drive.trip(code)
+
+    def reboot(self) -> None:
+        """Restart the drive."""
+        self.drive.power_off()
+        self.power(True)
+
+    def power(self, on: bool) -> None:
+        """Cut or restore the drive's supply."""
+        if on:
+            self.outbox.extend((self.bus, frame) for frame in self.drive.power_on())
+        else:
+            self.drive.power_off()
+
+    def input(self, bit: int, on: bool) -> None:
+        """Set or clear a bit of 0x60FD."""
+        mask = 1 << (bit & 31)
+        self.drive.digital_inputs = self.drive.digital_inputs | mask if on else self.drive.digital_inputs & ~mask
+
+    def inject(self, can_id: int, data: bytes, on: bool) -> None:
+        """Send a foreign frame at every SYNC while it is on."""
+        if on:
+            self.injected[can_id] = (self.bus, data)
+        else:
+            self.injected.pop(can_id, None)
+
+    def sync(self, on: bool) -> None:
+        """Let the NC's SYNC fail on this axis' bus, or come again."""
+        self.sync_on = on
+
+    def warm(self, celsius: float) -> None:
+        """Set the slide-way's temperature everywhere it is felt."""
+        self.slide_way.celsius = celsius
+        self.drive.set_temperature(celsius)
+        if self.sensor is not None:
+            self.sensor.celsius = celsius
+
+
+class Machine:
+    """The machine of one configuration. ``events`` collects what it has to tell; ``tick`` counts SYNCs."""
+
+    def __init__(self, config: MachineConfig) -> None:
+        self.config = config
+        self.period_s = config.machine.sync_period_s
+        self.nc = Nc(config)
+        self.events: list[Event] = []
+        self.tick = 0
+        self._outbox: list[BusFrame] = []
+        self._injected: dict[int, tuple[str, bytes]] = {}
+        seeds = np.random.SeedSequence(config.sim.seed).spawn(2 * len(config.axis))
+        self.units = {
+            axis: self._unit(axis, seeds[2 * place], seeds[2 * place + 1]) for place, axis in enumerate(config.axis)
+        }
+        self._of_bus: dict[str, list[Unit]] = {}
+        for unit in self.units.values():
+            self._of_bus.setdefault(unit.bus, []).append(unit)
+        self._first_bus = next(iter(self._of_bus))
+        self.schedule = FaultSchedule(self.units, self.period_s)
+        self._listed = [_listed_rpdo(text, self.units) for text in config.sim.lockstep_rpdo]
+        self._streams = {key: _Stream() for key in self._listed}
+        self._rapid_bit = 1 << config.g0.input_bit
+        self._rapid = False
+        self._row = 0
+        self._next_trace: Path | None = None
+        self._recorder: Recorder | None = None
+
+    def _unit(self, axis: str, drive_seed: np.random.SeedSequence, sensor_seed: np.random.SeedSequence) -> Unit:
+        section = self.config.axis[axis]
+        sim = self.config.sim
+        sensor = VoltageSensor(
+            1 / self.period_s,
+            section.regulators.voltage_limit_v,
+            sim.noise.voltage_v,
+            np.random.default_rng(sensor_seed),
+        )
+        sensor.celsius = sim.thermal.ambient_c
+        return Unit(
+            axis,
+            section.drive.bus,
+            Drive(axis, self.config, np.random.default_rng(drive_seed)),
+            SlideWay(sim.thermal, section.rapid_speed_rad_s, self.period_s),
+            sensor if sim.modbus else None,
+            self._outbox,
+            self._injected,
+        )
+
+    @property
+    def buses(self) -> tuple[str, ...]:
+        """The buses that have drives."""
+        return tuple(self._of_bus)
+
+    def describe(self, eds: Mapping[str, Path]) -> dict[str, Any]:
+        """Return what the ready event says of the drives and of the bus load (share of the bit rate)."""
+        drives = {}
+        for axis, unit in self.units.items():
+            drives[axis] = {**description.mapping(unit.drive), "eds": str(eds[axis])}
+        return {"drives": drives, "bus_load": self._load(stuffed=False), "bus_load_worst": self._load(stuffed=True)}
+
+    def _load(self, *, stuffed: bool) -> dict[str, float]:
+        rate = 1 / self.period_s
+        sync = description.frame_bits(1, stuffed=stuffed) * rate
+        loads = {}
+        for bus, units in self._of_bus.items():
+            bitrate = self.config.bus[bus].bitrate
+            drives = sum(description.bus_load(unit.drive, rate, bitrate, stuffed=stuffed) for unit in units)
+            loads[bus] = round(sync / bitrate + drives, 4)
+        return loads
+
+    # -- frames
+
+    def power_on(self) -> list[BusFrame]:
+        """Switch the drives on; they boot into pre-operational."""
+        for unit in self.units.values():
+            unit.power(True)
+        return self._take_outbox()
+
+    def receive(self, bus: str, frame: Frame) -> list[Frame]:
+        """Take a frame that another party sent and return what the drives of that bus send because of it."""
+        can_id, data = frame
+        if can_id == SYNC:
+            return self._sync(bus, data)
+        answers: list[Frame] = []
+        for unit in self._of_bus.get(bus, ()):
+            answers += unit.drive.receive(can_id, data)
+        if self.nc.on:
+            self.nc.hear(bus, frame)
+            for answer in answers:
+                self.nc.hear(bus, answer)
+        return answers
+
+    def cycle(self) -> list[BusFrame]:
+        """Run one period of the NC: its SYNC, the drives' answers, its set-points for the next one."""
+        frames: list[BusFrame] = []
+        syncs = self.nc.begin()
+        self._complete_events()
+        for bus, frame in syncs:
+            if all(unit.sync_on for unit in self._of_bus[bus]):
+                frames.append((bus, frame))
+                frames += [(bus, answer) for answer in self._sync(bus, frame[1])]
+        for bus, frame in self.nc.end():
+            frames.append((bus, frame))
+            for unit in self._of_bus[bus]:
+                for answer in unit.drive.receive(*frame):
+                    frames.append((bus, answer))
+                    self.nc.hear(bus, answer)
+        self._complete_events()
+        return frames + self._take_outbox() if self._outbox else frames
+
+    def wall_clock(self, now_s: float) -> list[BusFrame]:
+        """Run what depends on time and not on SYNC: heartbeats and their monitoring."""
+        frames: list[BusFrame] = []
+        for unit in self.units.values():
+            for frame in unit.drive.wall_clock(now_s):
+                frames.append((unit.bus, frame))
+                for other in self._of_bus[unit.bus]:
+                    if other is not unit and frame[0] > 0x700:
+                        frames += [(unit.bus, answer) for answer in other.drive.receive(*frame)]
+        return frames + self._take_outbox()
+
+    def _take_outbox(self) -> list[BusFrame]:
+        frames = list(self._outbox)
+        self._outbox.clear()
+        return frames
+
+    # -- the cycle
+
+    def _sync(self, bus: str, data: bytes) -> list[Frame]:
+        row = self.nc.in_force
+        playing = row is not None and row.playing
+        leading = bus == self._first_bus
+        if leading and not self.schedule.idle:
+            self._run_faults(self._row if playing else None)
+        if leading and self._rapid != (row is not None and row.rapid):
+            self._signal_rapid(not self._rapid)
+        frames: list[Frame] = []
+        for unit in self._of_bus[bus]:
+            frames += self._advance(unit, data)
+        if self._injected:
+            frames += self._foreign(bus)
+        if self.nc.on:
+            for frame in frames:
+                self.nc.hear(bus, frame)
+        if leading:
+            self.tick += 1
+        if bus == self.buses[-1]:
+            self._record(row if playing else None)
+        return frames
+
+    def _advance(self, unit: Unit, data: bytes) -> list[Frame]:
+        """One SYNC for one axis; its sensor and slide-way go with it when the drive accepted the SYNC."""
+        drive = unit.drive
+        before = drive.tick
+        frames = drive.receive(SYNC, data)
+        if drive.tick == before:
+            return frames
+        heard = drive.rpdos_heard_before
+        unit.offsets.step(OFFSET_RPDO in heard)
+        for key in self._listed:
+            if key[0] == unit.axis:
+                self._streams[key].step(key[1] in heard)
+        celsius = unit.slide_way.step(drive.physics.speed_rad_s)
+        if unit.sensor is not None:
+            unit.sensor.feed(drive.ratings.sign * drive.physics.voltage_mean_v)
+        if drive.tick % _THERMAL_CYCLES == 0:
+            unit.warm(celsius)
+        return frames
+
+    def _foreign(self, bus: str) -> list[Frame]:
+        frames: list[Frame] = []
+        for can_id, (where, data) in self._injected.items():
+            if where == bus:
+                frames.append((can_id, data))
+                for unit in self._of_bus[bus]:
+                    frames += unit.drive.receive(can_id, data)
+        return frames
+
+    def _signal_rapid(self, on: bool) -> None:
+        self._rapid = on
+        for unit in self.units.values():
+            inputs = unit.drive.digital_inputs
+            unit.drive.digital_inputs = inputs | self._rapid_bit if on else inputs & ~self._rapid_bit
+
+    def _run_faults(self, row: int | None) -> None:
+        for entry in self.schedule.step(self.tick, row):
+            self.events.append({"event": "fault", "sync": self.tick, **entry.model_dump(exclude_none=True)})
+
+    def waits(self) -> bool:
+        """Whether an RPDO that belongs into this cycle has not arrived yet (lockstep)."""
+        if self._listed:
+            return any(
+                stream.awaited and number not in self.units[axis].drive.rpdos_heard
+                for (axis, number), stream in self._streams.items()
+            )
+        return any(unit.drive.rpdos_heard_before - unit.drive.rpdos_heard for unit in self.units.values())
+
+    # -- what was played
+
+    def trace(self, path: Path) -> None:
+        """Record the next file that is played."""
+        self._next_trace = path
+
+    def _record(self, row: Row | None) -> None:
+        if row is None:
+            return
+        self._row += 1
+        if self._recorder is None:
+            return
+        values = [
+            (reference, unit.drive.table_mm, unit.drive.offset_mm * 1e3)
+            for reference, unit in zip(row.position_mm, self.units.values(), strict=True)
+        ]
+        try:
+            self._recorder.row(values)
+        except StoreError as error:
+            self._recorder.abandon()
+            self._recorder = None
+            self.events.append({"event": "error", "text": str(error)})
+
+    def take_events(self) -> list[Event]:
+        """Return what the machine and its NC have to tell since the last time."""
+        if self.nc.events:
+            self._complete_events()
+        events, self.events = self.events, []
+        return events
+
+    def _complete_events(self) -> None:
+        """Complete the NC's events; a file that comes into force starts the counters and the trace."""
+        for event in self.nc.events:
+            if event["event"] == "playing":
+                self._start_file()
+            elif event["event"] == "finished":
+                event["late_rpdo"] = {axis: unit.offsets.late for axis, unit in self.units.items()}
+                event["trace"] = self._close_trace()
+            self.events.append(event)
+        self.nc.events.clear()
+
+    def _start_file(self) -> None:
+        self._row = 0
+        for unit in self.units.values():
+            unit.offsets.late = 0
+        if self._next_trace is None:
+            return
+        try:
+            self._recorder = Recorder(self._next_trace, tuple(self.units), self.period_s)
+        except StoreError as error:
+            self.events.append({"event": "error", "text": str(error)})
+        self._next_trace = None
+
+    def _close_trace(self) -> str | None:
+        recorder, self._recorder = self._recorder, None
+        if recorder is None:
+            return None
+        try:
+            recorder.finish()
+        except StoreError as error:
+            self.events.append({"event": "error", "text": str(error)})
+            return None
+        return str(recorder.path)
+
+    def fault(self, entry: FaultEntry) -> None:
+        """Take a fault into the schedule."""
+        self.schedule.add(entry)
+
+    def close(self) -> None:
+        """Give up a trace that was not finished."""
+        if self._recorder is not None:
+            self._recorder.abandon()
+            self._recorder = None
+
+
+def _listed_rpdo(text: str, units: Mapping[str, Unit]) -> tuple[str, int]:
+    axis, _, number = text.partition(":")
+    if axis not in units or number not in ("1", "2", "3", "4"):
+        fault = ConfigFault("sim.lockstep_rpdo", f"{text!r} names no RPDO", "write axis and number, such as X:2")
+        raise ConfigError("config", [fault])
+    return axis, int(number)

@@ -1,0 +1,212 @@
+"""The separate voltage sensor of an axis: a Modbus TCP server with a small sample memory that can be latched.
+
+Registers, 16 bit, 32 bit values in two with the high word first, the same as input (fc 4) and holding registers (fc 3):
+
+    0-1     newest voltage, float32             10      trigger: 1 latches the newest samples, at most 100, that were
+    2-3     counter of the newest sample                not latched before (fc 6, 16)
+    4-5     sample rate in Hz, float32          11      0 idle, 1 latched, 2 latched and samples were lost
+    6-7     volts per count of the block        12-13   counter of the block's first sample
+    8-9     slide-way temperature in degC       14      number of samples in the block; 15 is 0
+                                                16-115  samples, int16
+
+Sample c is the mean over [c Ts, (c + 1) Ts) of the sensor's own time, which is the simulated one. Any unit identifier
+is answered, as TCP sensors do. The servers run in a thread of their own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import struct
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from pymodbus.constants import ExcCodes
+from pymodbus.server import ModbusTcpServer
+from pymodbus.simulator import DataType, SimData, SimDevice
+
+from fdhil.errors import ConnectError
+
+REGISTERS = 116
+BLOCK = 100
+TRIGGER, STATUS, FIRST_SAMPLE = 10, 11, 16
+_READS, _WRITES = (3, 4), (6, 16)
+_NOISE_BLOCK = 1024
+
+
+@dataclass(slots=True)
+class SensorFaults:
+    """What is wrong with a sensor: ``silent`` answers nothing, ``slow_s`` answers late, ``exception`` answers every
+    request with this code, ``stuck`` repeats its value, ``delay_samples`` lags, ``gain`` and ``offset_v`` distort."""
+
+    silent: bool = False
+    slow_s: float = 0.0
+    exception: int = 0
+    stuck: bool = False
+    delay_samples: int = 0
+    gain: float = 1.0
+    offset_v: float = 0.0
+
+
+class VoltageSensor:
+    """Registers and sample memory of one sensor; :meth:`feed` and the reading thread may run at the same time."""
+
+    def __init__(self, rate_hz: float, limit_v: float, noise_v: float, rng: np.random.Generator) -> None:
+        self.faults = SensorFaults()
+        self.celsius = 20.0
+        self.rate_hz = rate_hz
+        self.volts_per_count = max(0.01, round(1.05 * limit_v / 32767, 4))
+        self._noise_v, self._rng = noise_v, rng
+        self._noise: list[float] = []
+        self._lock = threading.Lock()
+        self._recent: deque[float] = deque(maxlen=BLOCK)
+        self._late: deque[float] = deque()
+        self._count = 0  # samples so far
+        self._latched = 0  # samples that were latched or lost
+        self._held: float | None = None
+        self._block = [0] * (REGISTERS - STATUS)
+
+    def feed(self, mean_v: float) -> None:
+        """Take the mean terminal voltage of one period: one sample."""
+        if not self._noise:
+            self._noise = (self._rng.standard_normal(_NOISE_BLOCK) * self._noise_v).tolist()
+        value = mean_v + self._noise.pop()
+        faults = self.faults
+        if faults.delay_samples or self._late:
+            self._late.append(value)
+            while len(self._late) > max(faults.delay_samples, 0) + 1:
+                self._late.popleft()
+            value = self._late[0]
+            if not faults.delay_samples:
+                self._late.clear()
+        value = value * faults.gain + faults.offset_v
+        if not faults.stuck:
+            self._held = None
+        elif self._held is None:
+            self._held = value
+        with self._lock:
+            self._recent.append(value if self._held is None else self._held)
+            self._count += 1
+
+    def latch(self) -> None:
+        """Put the newest samples that were not latched before into the block, at most 100."""
+        with self._lock:
+            fresh = self._count - self._latched
+            number = min(fresh, len(self._recent))
+            samples = list(self._recent)[len(self._recent) - number :]
+            self._latched = self._count
+            first = self._count - number
+        counts = [max(-32768, min(32767, round(v / self.volts_per_count))) & 0xFFFF for v in samples]
+        status = 2 if fresh > number else 1
+        header = [status, *_words(struct.pack(">I", first & 0xFFFFFFFF)), number, 0]
+        self._block = header + counts + [0] * (BLOCK - number)
+
+    def registers(self) -> list[int]:
+        """Return all registers as they read now."""
+        with self._lock:
+            newest, count = (self._recent[-1] if self._recent else 0.0), max(self._count - 1, 0)
+        head = struct.pack(">fIfff", newest, count & 0xFFFFFFFF, self.rate_hz, self.volts_per_count, self.celsius)
+        return [*_words(head), 0, *self._block]
+
+    async def access(
+        self,
+        function_code: int,
+        start_address: int,
+        address: int,
+        count: int,
+        current: list[int],
+        values: list[int] | list[bool] | None,
+    ) -> ExcCodes | None:
+        """Serve one request: pymodbus calls it before it reads ``current`` or writes ``values`` into it."""
+        if self.faults.slow_s:
+            await asyncio.sleep(self.faults.slow_s)
+        if self.faults.exception:
+            return ExcCodes(self.faults.exception)
+        if function_code not in (_WRITES if values else _READS + _WRITES):  # a write is read back for its answer
+            return ExcCodes.ILLEGAL_FUNCTION
+        if values:
+            if list(values) != [1]:
+                return ExcCodes.ILLEGAL_VALUE
+            self.latch()
+        current[:REGISTERS] = self.registers()
+        return None
+
+    def device(self) -> SimDevice:
+        """Return the device for pymodbus: only the trigger may be written, other addresses do not exist."""
+
+        def block(address: int, count: int, readonly: bool) -> SimData:
+            return SimData(address, values=[0] * count, datatype=DataType.REGISTERS, readonly=readonly)
+
+        parts = [block(0, TRIGGER, True), block(TRIGGER, 1, False), block(STATUS, REGISTERS - STATUS, True)]
+        return SimDevice(id=0, simdata=parts, action=self.access)
+
+
+def _words(data: bytes) -> list[int]:
+    return list(struct.unpack(f">{len(data) // 2}H", data))
+
+
+class SensorServers:
+    """The Modbus TCP servers of a machine, in one thread; ``ports`` by axis once :meth:`start` has returned."""
+
+    def __init__(self, sensors: Mapping[str, VoltageSensor], addresses: Mapping[str, tuple[str, int]]) -> None:
+        self._sensors, self._addresses = sensors, addresses
+        self._servers: list[ModbusTcpServer] = []
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._run, name="sim-modbus", daemon=True)
+        self.ports: dict[str, int] = {}
+
+    def start(self) -> None:
+        """Open every port; ConnectError when one cannot be had."""
+        # pymodbus logs every exception that it answers as an error with a dump of frames
+        logging.getLogger("pymodbus.logging").setLevel(logging.CRITICAL)
+        self._thread.start()
+        try:
+            asyncio.run_coroutine_threadsafe(self._open(), self._loop).result()
+        except ConnectError:
+            self.stop()
+            raise
+
+    def stop(self) -> None:
+        """Close every port and end the thread."""
+        asyncio.run_coroutine_threadsafe(self._close(), self._loop).result()
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    def _run(self) -> None:
+        asyncio.set_event_loop(self._loop)
+        self._loop.run_forever()
+
+    async def _open(self) -> None:
+        for axis, sensor in self._sensors.items():
+            host, port = self._addresses[axis]
+            server = ModbusTcpServer(sensor.device(), address=(host, port), trace_packet=_muffled(sensor))
+            try:
+                await server.serve_forever(background=True)
+            except RuntimeError:
+                raise ConnectError(
+                    f"voltage sensor {axis}",
+                    f"TCP port {port} of {host} cannot be had: end the program that holds it, or set "
+                    f"axis.{axis}.voltage.port to another one (0 lets the simulator choose one)",
+                ) from None
+            self._servers.append(server)
+            listener = server.transport
+            assert isinstance(listener, asyncio.Server)
+            self.ports[axis] = listener.sockets[0].getsockname()[1]
+
+    async def _close(self) -> None:
+        for server in self._servers:
+            server.serving.cancel()
+            server.close()
+        others = asyncio.all_tasks(self._loop) - {asyncio.current_task(self._loop)}
+        for task in others:
+            task.cancel()
+        await asyncio.gather(*others, return_exceptions=True)
+
+
+def _muffled(sensor: VoltageSensor) -> Callable[[bool, bytes], bytes]:
+    """Return the hook through which every packet goes: a silent sensor sends nothing."""
+    return lambda sending, packet: b"" if sending and sensor.faults.silent else packet

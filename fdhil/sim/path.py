@@ -1,0 +1,112 @@
+"""The NC's motion along a path on the SYNC grid: the rapid to its start, and its rows at a variable rate."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+
+from fdhil.records import Bool, Float
+
+
+def rapid_rows(
+    start_mm: Sequence[float],
+    end_mm: Sequence[float],
+    speed_mm_s: Sequence[float],
+    acceleration_mm_s2: Sequence[float],
+    smoothing_s: Sequence[float],
+    period_s: float,
+) -> Float:
+    """Return the rows (n, axes) of a straight rapid: a trapezoid in time, smoothed by causal moving averages.
+
+    The axis that needs longest sets the pace; the first row is the start, the last one the end. Empty (0, axes) when
+    there is no way to go.
+    """
+    start, end = np.asarray(start_mm, dtype=float), np.asarray(end_mm, dtype=float)
+    way = np.abs(end - start)
+    if not np.any(way > 0):
+        return np.empty((0, start.size))
+    moving = way > 0
+    speed = float(np.min(np.asarray(speed_mm_s)[moving] / way[moving]))  # parts of the way per second
+    acceleration = float(np.min(np.asarray(acceleration_mm_s2)[moving] / way[moving]))
+    speed = min(speed, math.sqrt(acceleration))  # a way too short for the rapid speed: a triangle
+    ramp_s, total_s = speed / acceleration, 1 / speed + speed / acceleration
+    t = np.arange(math.ceil(total_s / period_s) + 1) * period_s
+    t = np.minimum(t, total_s)
+    part = np.where(t < ramp_s, acceleration * t**2 / 2, speed * (t - ramp_s / 2))
+    part = np.where(t > total_s - ramp_s, 1 - acceleration * (total_s - t) ** 2 / 2, part)
+    for window_s in smoothing_s:
+        width = round(window_s / period_s)
+        if width > 1:
+            padded = np.concatenate([np.zeros(width - 1), part, np.ones(width - 1)])
+            part = np.convolve(padded, np.full(width, 1 / width), mode="valid")
+    rows = start + np.outer(part, end - start)
+    rows[-1] = end
+    return rows
+
+
+class Rate:
+    """The path's rate, 1 for 100 %: follows a target with limited slope and rounded ends, for override and feed hold.
+
+    ``slope_per_s`` bounds its change, so that a machine in rapid never brakes harder than its acceleration.
+    """
+
+    def __init__(self, slope_per_s: float, period_s: float) -> None:
+        self._step = slope_per_s * period_s
+        self._linear = 1.0
+        width = max(1, round(1 / (3 * self._step)))
+        self._window: deque[float] = deque([1.0] * width, maxlen=width)
+        self._settled = 0
+        self.value = 1.0
+
+    def jump(self, value: float) -> None:
+        """Take a value at once: the path stands still."""
+        self._linear = self.value = value
+        self._window.extend([value] * len(self._window))
+
+    def step(self, target: float) -> float:
+        """Go one cycle toward ``target`` and return the rate."""
+        if self._linear == target and self._settled > len(self._window):
+            return self.value
+        self._settled = self._settled + 1 if self._linear == target else 0
+        gap = target - self._linear
+        self._linear = target if abs(gap) <= self._step else self._linear + math.copysign(self._step, gap)
+        self._window.append(self._linear)
+        mean = math.fsum(self._window) / len(self._window)
+        self.value = target if self._settled >= len(self._window) else mean
+        return self.value
+
+
+class Player:
+    """Plays rows (n, axes) at a rate: whole rows exactly, between them a cubic through the neighbours."""
+
+    def __init__(self, rows: Float, rapid: Bool) -> None:
+        self._rows = np.ascontiguousarray(rows, dtype=float)
+        self._rapid = rapid
+        self._last = len(rows) - 1
+        self._at = 0.0
+
+    @property
+    def ended(self) -> bool:
+        """Whether every row has been played."""
+        return self._at > self._last
+
+    def step(self, rate: float) -> tuple[list[float], bool]:
+        """Return the position (mm per axis) and whether it is a rapid, then go on by ``rate`` rows."""
+        at = min(self._at, float(self._last))
+        row = int(at)
+        part = at - row
+        position = self._rows[row].tolist() if part == 0.0 else self._between(row, part)
+        # the last row is always played exactly, whatever the rate
+        self._at = self._last if at < self._last < at + rate else self._at + rate
+        return position, bool(self._rapid[row])
+
+    def _between(self, row: int, part: float) -> list[float]:
+        before, here = self._rows[max(row - 1, 0)].tolist(), self._rows[row].tolist()
+        after, beyond = self._rows[row + 1].tolist(), self._rows[min(row + 2, self._last)].tolist()
+        return [
+            p1 + 0.5 * part * (p2 - p0 + part * (2 * p0 - 5 * p1 + 4 * p2 - p3 + part * (3 * (p1 - p2) + p3 - p0)))
+            for p0, p1, p2, p3 in zip(before, here, after, beyond, strict=True)
+        ]

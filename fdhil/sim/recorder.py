@@ -1,0 +1,55 @@
+"""Writes what a played file really did: one CSV row per SYNC with the true table, as no sensor could give it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from fdhil.errors import StoreError
+
+
+class Recorder:
+    """A CSV of ``time_s`` and per axis reference and table (mm) and offset (um), written row by row.
+
+    The rows go to a temporary name next to ``path``; :meth:`finish` gives them the name. StoreError when the folder
+    cannot be written.
+    """
+
+    def __init__(self, path: Path, axes: Sequence[str], period_s: float) -> None:
+        self.path = path
+        self._period_s = period_s
+        self._rows = 0
+        self._part = path.with_name(f".{path.name}.{os.getpid()}.part")
+        try:
+            self._file = self._part.open("w", encoding="ascii", newline="\n")
+            columns = [f"{axis}_{what}" for axis in axes for what in ("reference_mm", "table_mm", "offset_um")]
+            self._file.write(",".join(["time_s", *columns]) + "\n")
+        except OSError as error:
+            raise _not_written(path, error) from None
+
+    def row(self, values: Sequence[tuple[float, float, float]]) -> None:
+        """Write one row: reference (mm), table (mm) and offset (um) of each axis. StoreError when it cannot be."""
+        cells = [f"{reference:.9f},{table:.9f},{offset:.6f}" for reference, table, offset in values]
+        try:
+            self._file.write(f"{self._rows * self._period_s:.9g},{','.join(cells)}\n")
+        except OSError as error:
+            raise _not_written(self.path, error) from None
+        self._rows += 1
+
+    def finish(self) -> None:
+        """Close the file and give it its name; StoreError when it cannot be."""
+        try:
+            self._file.close()
+            self._part.replace(self.path)
+        except OSError as error:
+            raise _not_written(self.path, error) from None
+
+    def abandon(self) -> None:
+        """Close and remove what was written so far."""
+        self._file.close()
+        self._part.unlink(missing_ok=True)
+
+
+def _not_written(path: Path, error: OSError) -> StoreError:
+    return StoreError(f"the trace {path} cannot be written ({error.strerror or error}): give a folder that can be")

@@ -1,0 +1,326 @@
+"""The process of the simulated machine: one loop that serves the buses, the panel and the clock.
+
+In ``realtime`` the NC's SYNC follows the host's monotonic clock, and a late host makes it slip instead of hurrying
+after. In ``lockstep`` the next SYNC goes out as soon as every RPDO that belongs into the cycle has arrived, and an idle
+machine does not run faster than its period.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from fdhil.config import MachineConfig
+from fdhil.errors import FdhilError
+from fdhil.records import Trajectory
+from fdhil.sim import eds
+from fdhil.sim.attach import Attachment, Selectable, attach
+from fdhil.sim.faults import FaultEntry
+from fdhil.sim.hub import Frame, Handler
+from fdhil.sim.machine import Machine
+from fdhil.sim.modbus_sensor import SensorServers
+from fdhil.sim.nc import BusFrame
+from fdhil.sim.panel import MAX_LINE, Panel, PanelError
+
+Loader = Callable[[Path, MachineConfig], Trajectory]
+Emit = Callable[[dict[str, Any]], None]
+
+WALL_CLOCK_S = 0.004  # how often heartbeats and their time-outs are looked at
+LOCKSTEP_WAIT_S = 0.5
+_MIN_SPACING = 0.75  # of a period, between two SYNCs after a late one
+_MAX_WAIT_S = 0.25
+
+
+class Pace:
+    """When the next SYNC may go out; all times are monotonic seconds."""
+
+    def __init__(self, period_s: float, *, lockstep: bool) -> None:
+        self._period_s, self._lockstep = period_s, lockstep
+        self._next_s = 0.0
+        self._last_s = 0.0
+
+    def due_s(self, *, waits: bool, idle: bool) -> float:
+        """Return the time of the next SYNC. ``waits``: an awaited RPDO has not come; ``idle``: nothing is played."""
+        if self._lockstep and waits:
+            return self._last_s + LOCKSTEP_WAIT_S
+        return self._next_s if idle or not self._lockstep else 0.0
+
+    def sent(self, now_s: float) -> None:
+        """A SYNC went out: the next one is a period later on the grid, unless the host is late."""
+        self._last_s = now_s
+        self._next_s = max(self._next_s + self._period_s, now_s + _MIN_SPACING * self._period_s)
+
+
+class SimService:
+    """The simulated machine with its ports open. :meth:`run` serves it until :meth:`stop`, then closes everything.
+
+    ``emit`` gets every event, the first one is ``ready``. ``load`` reads what is to be played (a demand CSV or a
+    program). ``panel_fd`` is where commands come from, None for nowhere. ConnectError when a port or bus cannot be had.
+    """
+
+    def __init__(
+        self,
+        config: MachineConfig,
+        emit: Emit,
+        load: Loader,
+        *,
+        panel_fd: int | None = None,
+        faults: Sequence[FaultEntry] = (),
+    ) -> None:
+        self.config = config
+        self.machine = Machine(config)
+        self._emit, self._load = emit, load
+        self._panel = Panel(self.machine, self._play, self.stop)
+        self._panel_fd = panel_fd
+        self._line = b""
+        self._ending = False
+        self._started_s = time.monotonic()
+        self._drive_time_s = 0.0
+        self._wall_s = 0.0
+        self._loads: list[tuple[Path, Future[Trajectory]]] = []
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="ThreadPoolExecutor-sim")
+        self._wake_read, self._wake_write = os.pipe()
+        os.set_blocking(self._wake_read, False)
+        os.set_blocking(self._wake_write, False)
+        self._pace = Pace(config.machine.sync_period_s, lockstep=config.sim.pace == "lockstep")
+        self._buses: dict[str, Attachment] = {}
+        self._handlers: dict[str, Handler] = {}
+        self._servers: SensorServers | None = None
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        for entry in faults:
+            self.machine.fault(entry)
+        try:
+            self._open()
+        except BaseException:
+            self.close()
+            raise
+
+    # -- opening and closing
+
+    def _open(self) -> None:
+        for name in self.machine.buses:
+            self._buses[name] = attach(name, self.config.bus[name])
+            self._handlers[name] = self._handler(name)
+        sensors = {axis: unit.sensor for axis, unit in self.machine.units.items() if unit.sensor is not None}
+        if sensors:
+            voltages = {axis: self.config.axis[axis].voltage for axis in sensors}
+            servers = SensorServers(sensors, {axis: (v.host, v.port) for axis, v in voltages.items()})
+            servers.start()
+            self._servers = servers
+
+    def _handler(self, bus: str) -> Handler:
+        machine, attachment = self.machine, self._buses[bus]
+
+        def handle(frame: Frame) -> None:
+            answers = machine.receive(bus, frame)
+            if answers:
+                attachment.send(answers)
+
+        return handle
+
+    def ready_event(self) -> dict[str, Any]:
+        """Return the ready event; the EDS files it names are written now."""
+        modbus = {}
+        if self._servers is not None:
+            for axis, port in self._servers.ports.items():
+                voltage = self.config.axis[axis].voltage
+                modbus[axis] = {"host": voltage.host, "port": port, "unit": voltage.unit}
+        return {
+            "event": "ready",
+            "buses": {name: bus.settings for name, bus in self._buses.items()},
+            "modbus": modbus,
+            **self.machine.describe(self._write_eds()),
+            "pace": self.config.sim.pace,
+            "sync_period_s": self.config.machine.sync_period_s,
+        }
+
+    def _write_eds(self) -> dict[str, Path]:
+        """Write them where the machine's run-time files are, if there is such a place, else to a temporary folder."""
+        run = self.config.store.run_directory
+        if run is not None and run.is_dir() and os.access(run, os.W_OK):
+            folder = run / "eds"
+        else:
+            self._folder = tempfile.TemporaryDirectory(prefix="fdhil-sim-")
+            folder = Path(self._folder.name)
+        return {
+            axis: eds.write_eds(unit.drive, folder / f"fdhil_twin_{axis}.eds").resolve()
+            for axis, unit in self.machine.units.items()
+        }
+
+    def close(self) -> None:
+        """Close every port and end every thread; what is being recorded is given up."""
+        self._pool.shutdown(wait=True, cancel_futures=True)
+        if self._servers is not None:
+            self._servers.stop()
+            self._servers = None
+        for bus in self._buses.values():
+            bus.close()
+        self._buses.clear()
+        self.machine.close()
+        if self._folder is not None:
+            self._folder.cleanup()
+        for fd in (self._wake_read, self._wake_write):
+            os.close(fd)
+
+    # -- the loop
+
+    def stop(self) -> None:
+        """Ask the loop to end; may be called from a signal handler or another thread."""
+        self._ending = True
+        self._wake()
+
+    def run(self, play: Path | None = None, trace: Path | None = None) -> None:
+        """Say that it is ready and serve until stopped. ``play`` is played at once, recorded to ``trace``."""
+        try:
+            trajectory = None if play is None else self._load(play, self.config)
+            self._send(self.machine.power_on())
+            self._emit(self.ready_event())
+            self._serve_panel()
+            if trace is not None:
+                self.machine.trace(trace)
+            if trajectory is not None or self.config.sim.nc:
+                self.machine.nc.switch(True)
+            if trajectory is not None:
+                self.machine.nc.play(str(play), trajectory)
+            while not self._ending:
+                self._turn()
+        finally:
+            self.close()
+
+    def _turn(self) -> None:
+        """One turn of the loop: wait, read, let time pass, send."""
+        buses = self._buses.values()
+        readers: list[int | Selectable] = [self._wake_read]
+        if self._panel_fd is not None:
+            readers.append(self._panel_fd)
+        writers: list[Selectable] = []
+        for bus in buses:
+            readers += bus.readers()
+            writers += bus.writers()
+        ready, _, _ = select.select(readers, writers, (), self._timeout_s())
+        if ready:
+            self._read(ready)
+        now_s = time.monotonic()
+        if now_s >= self._wall_s:
+            self._wall_clock(now_s)
+        if self._sync_due_s() <= now_s:
+            self._pace.sent(now_s)
+            self._send(self.machine.cycle())
+        for event in self.machine.take_events():
+            self._emit(event)
+        for bus in buses:
+            bus.flush(now_s)
+
+    def _read(self, ready: Sequence[object]) -> None:
+        if self._wake_read in ready:
+            self._drain_wake()
+            self._take_loads()
+        if self._panel_fd is not None and self._panel_fd in ready:
+            self._serve_panel()
+        for name, bus in self._buses.items():
+            bus.pump(ready, self._handlers[name])
+
+    def _timeout_s(self) -> float:
+        now_s = time.monotonic()
+        deadlines = [self._wall_s, self._sync_due_s(), now_s + _MAX_WAIT_S]
+        deadlines += [at for bus in self._buses.values() if (at := bus.deadline_s()) is not None]
+        return max(0.0, min(deadlines) - now_s)
+
+    def _sync_due_s(self) -> float:
+        """Return when the NC's next cycle may run: never without NC, and not while a bus takes nothing more."""
+        machine = self.machine
+        if not machine.nc.on or any(bus.congested for bus in self._buses.values()):
+            return float("inf")
+        return self._pace.due_s(waits=machine.waits(), idle=not machine.nc.busy)
+
+    def _wall_clock(self, now_s: float) -> None:
+        """Let the drives' own time pass. When the host was late it passes slower: a drive has no such pauses."""
+        late = now_s - self._wall_s if self._wall_s else 0.0
+        self._drive_time_s += min(WALL_CLOCK_S + late, 2 * WALL_CLOCK_S)
+        self._wall_s = now_s + WALL_CLOCK_S
+        frames = self.machine.wall_clock(self._drive_time_s)
+        if frames:
+            self._send(frames)
+
+    def _send(self, frames: Sequence[BusFrame]) -> None:
+        if len(self._buses) == 1:
+            (bus,) = self._buses.values()
+            bus.send([frame for _, frame in frames])
+            return
+        for name, bus in self._buses.items():
+            bus.send([frame for where, frame in frames if where == name])
+
+    # -- panel and files
+
+    def _serve_panel(self) -> None:
+        """Obey what has come on the panel's descriptor; its end is not the machine's end."""
+        if self._panel_fd is None or not select.select([self._panel_fd], (), (), 0)[0]:
+            return
+        try:
+            chunk = os.read(self._panel_fd, 1 << 16)
+        except BlockingIOError:
+            return
+        except OSError:  # a terminal that is gone
+            chunk = b""
+        *lines, self._line = (self._line + chunk).split(b"\n")
+        if not chunk:
+            self._panel_fd = None
+        if not chunk or len(self._line) > MAX_LINE:
+            lines, self._line = [*lines, self._line], b""
+        for line in lines:
+            self.command(line.decode("utf-8", "replace"))
+
+    def command(self, line: str) -> None:
+        """Obey one command of the panel; what is wrong with it becomes an event."""
+        try:
+            self._panel.obey(line)
+        except PanelError as error:
+            self._emit({"event": "error", "text": str(error)})
+
+    def _play(self, file: Path) -> None:
+        """Load a file aside, so that the SYNC goes on meanwhile, then play it."""
+        future = self._pool.submit(self._load, file, self.config)
+        self._loads.append((file, future))
+        future.add_done_callback(lambda _: self._wake())
+
+    def _take_loads(self) -> None:
+        while self._loads and self._loads[0][1].done():
+            file, future = self._loads.pop(0)
+            try:
+                self.machine.nc.play(str(file), future.result())
+            except FdhilError as error:
+                self._emit({"event": "error", "text": f"{file} cannot be played: {error}"})
+
+    def _wake(self) -> None:
+        try:
+            os.write(self._wake_write, b"\0")
+        except OSError:
+            return  # the pipe is full of calls already, or the service has just closed
+
+    def _drain_wake(self) -> None:
+        try:
+            os.read(self._wake_read, 4096)
+        except BlockingIOError:
+            return
+
+
+def json_emitter(write: Callable[[str], Any] | None = None) -> Emit:
+    """Return an ``emit`` that writes each event as one line of JSON to ``write``, standard output by default."""
+    import json
+
+    def emit(event: dict[str, Any]) -> None:
+        line = json.dumps(event)
+        if write is None:
+            sys.stdout.write(line + "\n")
+            sys.stdout.flush()
+        else:
+            write(line + "\n")
+
+    return emit
