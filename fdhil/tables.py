@@ -11,6 +11,7 @@ from typing import Any
 
 ESTIMATORS: Mapping[str, str] = {
     "least_squares": "fdhil.identification.estimators.least_squares:estimate",
+    "maximum_likelihood": "fdhil.identification.estimators.maximum_likelihood:estimate",
 }
 CORRECTIONS: Mapping[str, str] = {
     "mirror": "fdhil.correction.mirror:plan",

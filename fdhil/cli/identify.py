@@ -1,0 +1,181 @@
+"""``fdhil identify``: from recordings to parameters, each with its standard deviation, or the reason why not."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fdhil import tables
+
+if TYPE_CHECKING:
+    from fdhil.cli.batch import FileResult
+    from fdhil.config import Identification
+    from fdhil.records import Estimate, Verdict, WindowOutcome
+
+SCHEMA = "fdhil-identify-1"
+# what people read: unit and factor
+DISPLAY = {
+    "R": ("mohm", 1e3),
+    "L": ("mH", 1e3),
+    "K": ("N.m/A", 1.0),
+    "Jt": ("g.m2", 1e3),
+    "ft": ("mN.m.s", 1e3),
+    "Cd": ("N.m", 1.0),
+}
+
+
+@click.command()
+@click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RECORDING...")
+@click.option("--config", "config_path", type=click.Path(path_type=Path), help="Machine configuration (TOML).")
+@click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Estimator; left out: the best there is.")
+@click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+def identify(recordings: tuple[Path, ...], config_path: Path | None, method: str | None, as_json: bool) -> int:
+    """Identify a drive from the rapid moves in each RECORDING (CSV).
+
+    Each rapid is a window: it is checked, the six parameters are estimated from it, and the model is validated. The
+    accepted windows of a file together give its pooled parameters. Exit codes: 0 every file's pool is validated, 1 some
+    pool is not, 2 wrong option or configuration, 3 a recording cannot be read.
+    """
+    settings, rapid_speeds = _settings(config_path, method)
+    results = _analyse(recordings, settings, rapid_speeds)
+    if as_json:
+        document = {"schema": SCHEMA, "files": [_file_document(r) for r in results]}
+        click.echo(json.dumps(document, allow_nan=False))
+    else:
+        _show(results)
+    return 0 if all(r.verdict.accepted for r in results) else 1
+
+
+def _settings(path: Path | None, method: str | None) -> tuple[Identification, dict[str, float]]:
+    from fdhil import config
+
+    machine = config.load(path) if path is not None else None
+    settings = machine.identification if machine is not None else config.Identification()
+    speeds = {name: axis.rapid_speed_rad_s for name, axis in machine.axis.items()} if machine is not None else {}
+    return (settings.model_copy(update={"method": method}) if method else settings), speeds
+
+
+def _analyse(paths: Sequence[Path], settings: Identification, speeds: dict[str, float]) -> list[FileResult]:
+    """Analyse the files, with a progress bar on stderr when that is a terminal."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from fdhil.cli.batch import analyse_files
+
+    if not sys.stderr.isatty():
+        return list(analyse_files(paths, settings, speeds))
+    results = []
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("identifying", total=len(paths))
+        for result in analyse_files(paths, settings, speeds):
+            results.append(result)
+            progress.advance(task)
+    return results
+
+
+def _file_document(result: FileResult) -> dict[str, Any]:
+    return {
+        "file": result.file,
+        "axis": result.axis,
+        "windows": [_window_document(outcome) for outcome in result.outcomes],
+        "pooled": {
+            "parameters": _parameters(result.pooled, result.verdict),
+            "validated": result.verdict.accepted,
+            "windows_used": _used(result),
+            "reasons": [str(reason) for reason in result.verdict.reasons],
+        },
+    }
+
+
+def _used(result: FileResult) -> int:
+    if result.pooled is None:
+        return 0
+    return sum(outcome.verdict.accepted for outcome in result.outcomes)
+
+
+def _window_document(outcome: WindowOutcome) -> dict[str, Any]:
+    from fdhil.identification.windows import moving_range
+
+    window = outcome.window
+    first, last = moving_range(window)
+    return {
+        "start_s": round(window.start_s + first * window.dt_s, 6),
+        "end_s": round(window.start_s + last * window.dt_s, 6),
+        "direction": window.direction,
+        "parameters": _parameters(outcome.estimate, outcome.verdict),
+        "validated": outcome.verdict.accepted,
+        "fit_percent": outcome.verdict.fit_percent,
+        "reasons": [str(reason) for reason in outcome.verdict.reasons],
+    }
+
+
+def _parameters(estimate: Estimate | None, verdict: Verdict) -> dict[str, Any]:
+    """Return value, std and unit of each parameter, or null and the reason."""
+    from fdhil.records import PARAMETERS, UNITS
+
+    answer: dict[str, Any] = {}
+    for name in PARAMETERS:
+        if estimate is not None and math.isfinite(estimate.value(name)) and math.isfinite(estimate.std(name)):
+            answer[name] = {"value": estimate.value(name), "std": estimate.std(name), "unit": UNITS[name]}
+            continue
+        reason = estimate.missing.get(name) if estimate is not None else None
+        reason = reason or (verdict.reasons[0] if verdict.reasons else None)
+        answer[name] = {"value": None, "reason": str(reason) if reason is not None else "NotFinite: no estimate"}
+    return answer
+
+
+def _show(results: Sequence[FileResult]) -> None:
+    """Write a table per file for people: every window, then the pool."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    from fdhil.identification.windows import moving_range
+    from fdhil.records import PARAMETERS
+
+    console = Console()
+    for result in results:
+        table = Table(title=f"{result.file}: axis {result.axis}", title_justify="left", box=box.SIMPLE_HEAD)
+        table.add_column("rapid\ns", no_wrap=True)
+        for name in PARAMETERS:
+            table.add_column(f"{name}\n{DISPLAY[name][0]}", justify="right", no_wrap=True)
+        table.add_column("fit\n%", justify="right", no_wrap=True)
+        table.add_column("validated")
+        for outcome in result.outcomes:
+            window = outcome.window
+            first, last = moving_range(window)
+            span = f"{window.start_s + first * window.dt_s:.2f}-{window.start_s + last * window.dt_s:.2f}"
+            table.add_row(span, *_cells(outcome.estimate, outcome.verdict))
+        table.add_section()
+        table.add_row(f"all {_used(result)}", *_cells(result.pooled, result.verdict), style="bold")
+        console.print(table)
+        _show_reasons(console, result)
+
+
+def _cells(estimate: Estimate | None, verdict: Verdict) -> list[str]:
+    from fdhil.records import PARAMETERS
+
+    cells = []
+    for name in PARAMETERS:
+        if estimate is None or not math.isfinite(estimate.value(name)):
+            cells.append("-")
+            continue
+        value, std = estimate.value(name) * DISPLAY[name][1], estimate.std(name) * DISPLAY[name][1]
+        digits = min(6, max(0, -math.floor(math.log10(max(std, 1e-6)))))
+        cells.append(f"{value:.{digits}f}\n±{std:.{digits}f}")
+    fit = "-" if verdict.fit_percent is None else f"{verdict.fit_percent:.2f}"
+    return [*cells, fit, "yes" if verdict.accepted else "no"]
+
+
+def _show_reasons(console: Any, result: FileResult) -> None:
+    """Write each reason once, with what to do."""
+    told = [r for outcome in result.outcomes for r in outcome.verdict.reasons] + list(result.verdict.reasons)
+    for reason in dict.fromkeys(told):
+        advice = f"; {reason.advice}" if reason.advice else ""
+        console.print(f"  {reason}{advice}", highlight=False, markup=False)

@@ -1,0 +1,172 @@
+"""How the parameters move from rapid to rapid: slopes with intervals, jumps held back, a changed load, alarms.
+
+Pure: the same estimates in the same order give the same notices. Nothing here reads a clock.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from fdhil.config import Maintenance
+from fdhil.records import PARAMETERS, UNITS, Float, Notice, Parameters
+
+HISTORY = 32
+LEAST_HISTORY = 3
+BEYOND_CHANCE = 5.0
+HELD_EPISODES = 2
+AGREEING = 2
+RELEASE = 0.8  # an alarm is released when the change has fallen to this share of its limit
+# changes smaller than these are drift, not a jump, however sure the estimates are
+LEAST_JUMP: Mapping[str, float] = {"R": 0.05, "L": 0.08, "K": 0.03, "Jt": 0.03, "ft": 0.40, "Cd": 0.25}
+
+
+@dataclass(frozen=True, slots=True)
+class Slope:
+    """A straight line through a parameter's history: ``value`` per unit of what it was drawn against, with ``std``."""
+
+    value: float
+    std: float
+    at: float
+    level: float
+
+    def interval(self, sigmas: float = 1.96) -> tuple[float, float]:
+        """Return the slope's interval."""
+        return self.value - sigmas * self.std, self.value + sigmas * self.std
+
+
+def slope(points: Float, against: Float, stds: Float | None = None) -> Slope | None:
+    """Fit a line to ``points`` (n,) over ``against`` (n,), weighted by ``stds`` (n,); None when it has no slope.
+
+    The slope's standard deviation is the larger of what ``stds`` promise and what the scatter about the line shows.
+    """
+    known = np.isfinite(points) & np.isfinite(against)
+    y, x = points[known], against[known]
+    if y.size < 3 or np.ptp(x) == 0.0:
+        return None
+    weights = np.ones(y.size) if stds is None else 1.0 / np.maximum(stds[known], 1e-300) ** 2
+    at = float(np.average(x, weights=weights))
+    level = float(np.average(y, weights=weights))
+    spread = float((weights * (x - at) ** 2).sum())
+    value = float((weights * (x - at) * (y - level)).sum()) / spread
+    scatter = float((weights * (y - level - value * (x - at)) ** 2).sum()) / (y.size - 2)
+    inflation = scatter if stds is None else max(1.0, scatter)
+    return Slope(value, float(np.sqrt(inflation / spread)), at, level)
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One estimate in the history."""
+
+    values: Float
+    stds: Float
+    tick: int
+    temperature_c: float | None
+
+
+@dataclass(slots=True)
+class DriftTracker:
+    """The history of one axis' parameters: says what an operator should know after each validated window or pool."""
+
+    maintenance: Maintenance
+    axis: str = ""
+    points: deque[Point] = field(default_factory=lambda: deque(maxlen=HISTORY))
+    reference: Parameters | None = None
+    alarms: set[str] = field(default_factory=set)
+    _held: list[Point] = field(default_factory=list)
+
+    def update(
+        self, values: Parameters, covariance: Float, tick: int = 0, temperature_c: float | None = None
+    ) -> list[Notice]:
+        """Take a validated estimate with its covariance (6, 6); return what is to be said about it.
+
+        ``ParameterJump`` holds the estimate back for ``HELD_EPISODES`` further ones; a step of Jt alone is
+        ``LoadChanged``: the correction must be withdrawn at once, and the new Jt is used from the second agreeing one.
+        """
+        stds = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
+        point = Point(np.array(list(values.as_dict().values())), stds, tick, temperature_c)
+        if self.reference is None:
+            self.reference = values
+        moved = self._moved(point)
+        if not moved:
+            self._held.clear()
+            self.points.append(point)
+            return self._alarms(point)
+        return self._hold(point, moved)
+
+    @property
+    def holding(self) -> bool:
+        """Return whether the newest estimate is held back: it must not be used yet."""
+        return bool(self._held)
+
+    def trend(self, name: str, against: str = "temperature") -> Slope | None:
+        """Return the slope of a parameter against ``temperature`` (per degC) or ``tick``."""
+        k = PARAMETERS.index(name)
+        x = [
+            float(p.tick) if against == "tick" else (np.nan if p.temperature_c is None else p.temperature_c)
+            for p in self.points
+        ]
+        y = np.array([p.values[k] for p in self.points])
+        return slope(y, np.array(x, dtype=np.float64), np.array([p.stds[k] for p in self.points]))
+
+    def _moved(self, point: Point) -> list[str]:
+        """Return the parameters that lie beyond chance and drift from the recent history (median and MAD)."""
+        if len(self.points) < LEAST_HISTORY:
+            return []
+        recent = np.array([p.values for p in list(self.points)[-8:]])
+        spread = np.array([p.stds for p in list(self.points)[-8:]])
+        middle = np.median(recent, axis=0)
+        scatter = 1.4826 * np.median(np.abs(recent - middle), axis=0)
+        chance = BEYOND_CHANCE * np.sqrt(scatter**2 + point.stds**2 + np.median(spread, axis=0) ** 2)
+        least = np.array([LEAST_JUMP[name] for name in PARAMETERS]) * np.abs(middle)
+        apart = np.abs(point.values - middle)
+        return [name for k, name in enumerate(PARAMETERS) if apart[k] > max(chance[k], least[k])]
+
+    def _hold(self, point: Point, moved: Sequence[str]) -> list[Notice]:
+        before = np.median(np.array([p.values for p in list(self.points)[-8:]]), axis=0)
+        self._held = [p for p in self._held if self._agree(p, point)]
+        self._held.append(point)
+        load = list(moved) == ["Jt"]
+        needed = AGREEING if load else HELD_EPISODES + 1
+        settled = len(self._held) >= needed
+        code = "LoadChanged" if load else "ParameterJump"
+        what = ", ".join(
+            f"{n} {before[k]:.4g} -> {point.values[k]:.4g} {UNITS[n]}" for k, n in enumerate(PARAMETERS) if n in moved
+        )
+        if settled:
+            held, self._held = self._held, []
+            self.points.clear()
+            self.points.extend(held)
+            text = f"{what}: {needed} estimates agree, so the new value is used"
+            return [Notice(code, "minor", text, self.axis, point.tick), *self._alarms(point)]
+        left = needed - len(self._held)
+        text = f"{what}: held back until {left} further estimate{'s agree' if left > 1 else ' agrees'}"
+        return [Notice(code, "MAJOR" if load else "minor", text, self.axis, point.tick)]
+
+    @staticmethod
+    def _agree(one: Point, other: Point) -> bool:
+        chance = BEYOND_CHANCE * np.sqrt(one.stds**2 + other.stds**2)
+        least = np.array([LEAST_JUMP[name] for name in PARAMETERS]) * np.abs(one.values)
+        return bool((np.abs(one.values - other.values) <= np.maximum(chance, least)).all())
+
+    def _alarms(self, point: Point) -> list[Notice]:
+        """Return maintenance alarms that begin or end: relative change from the first value, with hysteresis."""
+        assert self.reference is not None
+        notices = []
+        for k, (name, first) in enumerate(self.reference.as_dict().items()):
+            limit = float(getattr(self.maintenance, name))
+            change = abs(point.values[k] - first) / abs(first) if first else 0.0
+            sure = change - 2 * point.stds[k] / abs(first) if first else 0.0
+            if name not in self.alarms and sure > limit:
+                self.alarms.add(name)
+                moved = f"{name} has moved by {100 * change:.0f} % to {point.values[k]:.4g} {UNITS[name]}"
+                text = f"{moved}, limit {100 * limit:.0f} %"
+                notices.append(Notice("MaintenanceDue", "minor", text, self.axis, point.tick))
+            elif name in self.alarms and change < RELEASE * limit:
+                self.alarms.discard(name)
+                text = f"{name} is back at {point.values[k]:.4g} {UNITS[name]}"
+                notices.append(Notice("MaintenanceDue", "info", text, self.axis, point.tick))
+        return notices

@@ -1,0 +1,23 @@
+"""One file per estimator, each with ``estimate(windows, settings) -> Estimate``; ``fdhil.tables`` lists them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from fdhil import tables
+from fdhil.config import Identification
+from fdhil.records import Estimate, Window
+
+
+class Estimator(Protocol):
+    """What an estimator is: one window, or a pool of windows of one drive taken together."""
+
+    def __call__(self, windows: Sequence[Window], settings: Identification) -> Estimate: ...
+
+
+def chosen(settings: Identification) -> tuple[str, Estimator]:
+    """Return the name and the function of the estimator that the settings ask for (the best when they do not say)."""
+    name = settings.method or list(tables.ESTIMATORS)[-1]
+    estimator: Estimator = tables.load(tables.ESTIMATORS, name)
+    return name, estimator

@@ -1,0 +1,147 @@
+"""The paper's method: one low-pass on every signal, operator [4], least squares on [5] and [6] of [DES].
+
+Each interval mean of voltage belongs to the middle of its interval; current and speed are brought to the same interval
+means, so that all three are treated alike. [6] is fitted as K i = Jt Dw + ft w + Cd sign(w) with K from [5]. Standard
+deviations come from one sandwich over both equations, because filtered residuals are coloured and share their noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import binary_erosion
+
+from fdhil.config import Identification
+from fdhil.identification.covariance import sandwich
+from fdhil.identification.derivatives import OPERATORS, ZERO_FORCING_1, Operator, derivative
+from fdhil.identification.filtering import reach, zero_phase
+from fdhil.identification.identifiability import empty_estimate, judge
+from fdhil.identification.motion import surely_moving
+from fdhil.identification.windows import carried
+from fdhil.records import PARAMETERS, Bool, Estimate, Float, Reason, Result, Window
+
+NAME = "least_squares"
+
+
+@dataclass(frozen=True, slots=True)
+class Signals:
+    """A window's signals, filtered alike and at one instant per row, (n,) each; ``usable`` marks the rows to fit."""
+
+    voltage: Float
+    current: Float
+    speed: Float
+    side: Float
+    usable: Bool
+    broken: Bool
+
+
+def interval_means(values: Float) -> Float:
+    """Return the mean of a sampled signal over [t_k, t_k + dt) (n,), exact for cubics; the ends by a line."""
+    means = np.empty_like(values)
+    means[1:-2] = (-values[:-3] + 13 * values[1:-2] + 13 * values[2:-1] - values[3:]) / 24
+    means[0] = (values[0] + values[1]) / 2
+    means[-2] = (values[-2] + values[-1]) / 2
+    means[-1] = values[-1]
+    return means
+
+
+def align(window: Window, settings: Identification) -> Signals:
+    """Return the three signals at one instant per row, through the same zero-phase low-pass."""
+    assert window.voltage_v is not None
+    dt = window.dt_s
+    raw = [carried(s) for s in (window.voltage_v, window.current_a, window.speed_rad_s)]
+    voltage, current, speed = raw
+    if window.voltage_sampling == "interval_mean":
+        current, speed = interval_means(current), interval_means(speed)
+    moving = surely_moving(window.speed_rad_s, window.rapid_speed_rad_s)
+    side = np.where(moving, np.sign(zero_phase(raw[2], settings.lowpass_hz, dt)), 0.0)
+    filtered = [zero_phase(s, settings.lowpass_hz, dt) for s in (voltage, current, speed)]
+    broken = ~(np.isfinite(window.voltage_v) & np.isfinite(window.current_a) & np.isfinite(window.speed_rad_s))
+    width = 2 * reach(settings.lowpass_hz, dt) + 1
+    usable = binary_erosion(moving & ~broken, np.ones(width, dtype=bool), border_value=False)
+    return Signals(filtered[0], filtered[1], filtered[2], side, usable, broken)
+
+
+def regressors(signals: Signals, dt_s: float, operator: Operator = ZERO_FORCING_1) -> tuple[Float, Float]:
+    """Return the usable rows (m, 4) of [u, Di, i, w] and (m, 4) of [i, Dw, w, sign w]."""
+    di, dw = derivative(signals.current, dt_s, operator), derivative(signals.speed, dt_s, operator)
+    rows = signals.usable & np.isfinite(di) & np.isfinite(dw)
+    electrical = np.column_stack([signals.voltage, di, signals.current, signals.speed])[rows]
+    mechanical = np.column_stack([signals.current, dw, signals.speed, signals.side])[rows]
+    return electrical, mechanical
+
+
+def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
+    """Fit [5] and [6] to the windows together; see :func:`estimate_with` for another operator."""
+    return estimate_with(windows, settings, ZERO_FORCING_1.name)
+
+
+def estimate_with(windows: Sequence[Window], settings: Identification, operator: str) -> Estimate:
+    """Fit [5] and [6] with a named derivative operator."""
+    parts = [regressors(align(w, settings), w.dt_s, OPERATORS[operator]) for w in windows if w.voltage_v is not None]
+    parts = [p for p in parts if p[0].shape[0] > 0]
+    rows = sum(p[0].shape[0] for p in parts)
+    if rows < 8:
+        reason = Reason(
+            "MissingStage(cruise)",
+            f"only {rows} rows lie beyond the low-pass's reach from standstill",
+            "record a longer rapid or raise lowpass_hz",
+        )
+        return empty_estimate(NAME, Result.UNDER_EXCITED, reason)
+    electrical = np.vstack([p[0] for p in parts])
+    mechanical = np.vstack([p[1] for p in parts])
+    if not (np.isfinite(electrical).all() and np.isfinite(mechanical).all()):
+        return empty_estimate(
+            NAME, Result.NOT_FINITE, Reason("NotFinite", "a filtered signal is not finite", "record again")
+        )
+    return _fit(parts, electrical, mechanical, settings, windows[0].dt_s)
+
+
+def _fit(
+    parts: Sequence[tuple[Float, Float]], electrical: Float, mechanical: Float, settings: Identification, dt: float
+) -> Estimate:
+    first, conditions_1 = solve(electrical[:, 1:], electrical[:, 0])
+    inductance, resistance, constant = first
+    torque = mechanical[:, 0] * constant
+    second, conditions_2 = solve(mechanical[:, 1:], torque)
+    values = np.array([resistance, inductance, constant, *second])
+    residual_u = electrical[:, 0] - electrical[:, 1:] @ first
+    residual_t = torque - mechanical[:, 1:] @ second
+    lengths = [p[0].shape[0] for p in parts]
+    covariance = sandwich(electrical, mechanical, residual_u, residual_t, lengths, round(2 / settings.lowpass_hz / dt))
+    order = [1, 0, 2, 3, 4, 5]  # from L, R, K to R, L, K
+    return judge(
+        Estimate(
+            method=NAME,
+            names=PARAMETERS,
+            values=values,
+            covariance=covariance[np.ix_(order, order)],
+            residuals={"electrical": residual_u, "mechanical": residual_t / constant if constant else residual_t},
+            result=Result.OK,
+        ),
+        max(conditions_1, conditions_2),
+    )
+
+
+def raw_values(windows: Sequence[Window], settings: Identification) -> Float | None:
+    """Return [R, L, K, Jt, ft, Cd] (6,) unjudged, as a start for other estimators; None when there are too few rows."""
+    parts = [regressors(align(w, settings), w.dt_s) for w in windows]
+    if sum(p[0].shape[0] for p in parts) < 8:
+        return None
+    electrical, mechanical = (np.vstack([p[k] for p in parts]) for k in (0, 1))
+    if not (np.isfinite(electrical).all() and np.isfinite(mechanical).all()):
+        return None
+    (inductance, resistance, constant), _ = solve(electrical[:, 1:], electrical[:, 0])
+    second, _ = solve(mechanical[:, 1:], mechanical[:, 0] * constant)
+    return np.array([resistance, inductance, constant, *second])
+
+
+def solve(phi: Float, y: Float) -> tuple[Float, float]:
+    """Return the least-squares solution (k,) of phi theta = y ([DES] eq. 3) and the condition number of scaled phi."""
+    scale = np.sqrt((phi * phi).mean(axis=0))
+    scale[scale == 0] = 1.0
+    theta, _, _, singular = np.linalg.lstsq(phi / scale, y, rcond=None)
+    condition = float(singular[0] / singular[-1]) if singular[-1] > 0 else np.inf
+    return theta / scale, condition

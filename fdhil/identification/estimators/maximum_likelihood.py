@@ -1,0 +1,206 @@
+"""All six parameters together from noisy voltage, current and speed: maximum likelihood by Kalman innovations.
+
+The voltage is noisy too, so the model driven by it is off by noise that the drive has filtered. The innovations of
+:mod:`fdhil.identification.innovations` undo that filter: they are white, and the sum of their squares is the exponent
+of the likelihood. Gauss-Newton steps with the filter held fixed solve an unbiased estimating equation; noise levels and
+filter are renewed between them. The information matrix is what remains of the steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdhil.config import Identification
+from fdhil.identification.delay import coarse_delay
+from fdhil.identification.estimators import least_squares
+from fdhil.identification.identifiability import empty_estimate, judge
+from fdhil.identification.innovations import Gains, gains_of, innovations
+from fdhil.identification.motion import Motion, Noise, prepare
+from fdhil.identification.noise import fit_noise
+from fdhil.records import PARAMETERS, Estimate, Float, Reason, Result, Window
+
+NAME = "maximum_likelihood"
+RENEWALS = 3
+STEPS = 8
+CONVERGED = 1e-3  # of a standard deviation
+DIFFERENCE = 1e-5
+DELAY_DIFFERENCE_S = 1e-5
+SURE = 5.0  # standard deviations beyond which a delay is believed
+LEAST_DELAY = 0.02  # of a sample; smaller ones are the voltage's course within a sample
+SETTLED = 0.01  # squared standard deviations moved by a renewal of the filter
+FLOORS = np.array([1e-4, 0.0, 1e-4, 1e-9])
+LEAST_TIME_CONSTANT_S = 1e-4  # of the winding: noise may drive the starting L below 0
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Windows ready to be fitted: each with its noise levels and, for the parameters they were made for, its filter."""
+
+    motions: tuple[Motion, ...]
+    noises: tuple[Noise, ...]
+    filters: tuple[Gains, ...]
+
+    def residuals(self, theta: Float) -> Float:
+        """Return the whitened innovations of all windows (m,); ``theta`` (7,) is [R, L, K, Jt, ft, Cd, delay]."""
+        parts = [innovations(m, theta, f, theta[6]) for m, f in zip(self.motions, self.filters, strict=True)]
+        return np.concatenate([p.ravel() for p in parts])
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """The end of a fit: ``theta`` (7,), information (k, k) of the ``free`` entries, innovations (m,), noises."""
+
+    theta: Float
+    information: Float
+    free: tuple[int, ...]
+    residuals: Float
+    jacobian: Float
+    problem: Problem
+    converged: bool
+
+
+def pose(motions: Sequence[Motion], theta: Float, noises: Sequence[Noise]) -> Problem:
+    """Return the problem with the filters made for ``theta``."""
+    filters = tuple(gains_of(m, theta, s) for m, s in zip(motions, noises, strict=True))
+    return Problem(tuple(motions), tuple(noises), filters)
+
+
+def jacobian(problem: Problem, theta: Float, base: Float, free: Sequence[int], scales: Float) -> Float:
+    """Return minus the derivative (m, k) of the innovations by the ``free`` entries of theta, the filter held."""
+    columns = []
+    for j in free:
+        step = DELAY_DIFFERENCE_S if j == 6 else DIFFERENCE * scales[j]
+        moved = theta.copy()
+        moved[j] += step
+        columns.append((base - problem.residuals(moved)) / step)
+    return np.column_stack(columns)
+
+
+def typical(theta: Float, motions: Sequence[Motion]) -> Float:
+    """Return the typical size (7,) of each entry: friction is measured against the torque and speed there are."""
+    torque = abs(theta[2]) * max(float(np.abs(m.current).max()) for m in motions)
+    speed = max(float(np.abs(m.speed).max()) for m in motions)
+    sizes = np.abs(theta)
+    sizes[4] = max(sizes[4], 1e-3 * torque / speed)
+    sizes[5] = max(sizes[5], 1e-3 * torque)
+    return sizes
+
+
+def admissible(theta: Float) -> bool:
+    """Return whether R, L, K and Jt are above 0 and all is finite."""
+    return bool(np.isfinite(theta).all() and (theta[:4] > 0).all())
+
+
+def descend(problem: Problem, theta: Float, free: Sequence[int]) -> tuple[Float, Float, Float, bool]:
+    """Take Gauss-Newton steps with the filter held; return theta, innovations (m,), jacobian (m, k), and success."""
+    residuals = problem.residuals(theta)
+    for _ in range(STEPS):
+        j = jacobian(problem, theta, residuals, free, typical(theta, problem.motions))
+        norms = np.sqrt((j * j).sum(axis=0))
+        if not np.isfinite(norms).all() or (norms == 0).any():
+            return theta, residuals, j, False
+        step = np.linalg.lstsq(j / norms, residuals, rcond=None)[0] / norms
+        share, cost = 1.0, float(residuals @ residuals)
+        while share > 1e-3:
+            trial = theta.copy()
+            trial[list(free)] += share * step
+            if admissible(trial):
+                moved = problem.residuals(trial)
+                if np.isfinite(moved).all() and float(moved @ moved) <= cost * (1 + 1e-12):
+                    theta, residuals = trial, moved
+                    break
+            share *= 0.5
+        else:
+            return theta, residuals, j, True  # nothing lower along the step: this is the bottom, to rounding
+        if float(np.abs(step * norms).max()) < CONVERGED:
+            return theta, residuals, j, True
+    return theta, residuals, j, False
+
+
+def fit(motions: Sequence[Motion], start: Float, free: Sequence[int]) -> Fit:
+    """Alternate between the parameters and the noise levels, from ``start`` (7,)."""
+    theta, noises = start.copy(), [m.noise for m in motions]
+    for turn in range(RENEWALS):
+        problem = pose(motions, theta, noises)
+        before = theta
+        theta, residuals, j, converged = descend(problem, theta, free)
+        information = j.T @ j
+        moved = theta[list(free)] - before[list(free)]
+        if turn and float(moved @ information @ moved) < SETTLED:
+            break
+        noises = [fit_noise(m, theta, theta[6]) for m in motions]
+    return Fit(theta, information, tuple(free), residuals, j, problem, converged)
+
+
+def starting_point(windows: Sequence[Window], settings: Identification) -> Float | None:
+    """Return the least-squares estimate as theta (7,) without delay; None without one, or when no drive can be so."""
+    first = least_squares.raw_values(windows, settings)
+    if first is None or not np.isfinite(first).all() or (first[[0, 2, 3]] <= FLOORS[[0, 2, 3]]).any():
+        return None
+    first[1] = max(first[1], LEAST_TIME_CONSTANT_S * first[0])
+    return np.append(first, 0.0)
+
+
+def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | None:
+    """Fit windows of one drive together; None when they hold nothing to start from.
+
+    A delay between voltage and the other signals is fitted too when the data surely show one.
+    """
+    usable = [w for w in windows if w.voltage_v is not None]
+    start = starting_point(usable, settings) if usable else None
+    if start is None:
+        return None
+    motions = [prepare(w) for w in usable]
+    delays = [coarse_delay(w, settings) for w in usable]
+    start[6] = float(np.median(delays))
+    if start[6] != 0.0:
+        return fit(motions, start, range(7))
+    plain = fit(motions, start, range(6))
+    delay, std = delay_score(plain)
+    if abs(delay) < SURE * std or abs(delay) < LEAST_DELAY * min(m.dt_s for m in motions):
+        return plain
+    return fit(motions, np.append(plain.theta[:6], delay), range(7))
+
+
+def delay_score(plain: Fit) -> tuple[float, float]:
+    """Return the delay (s) that one Newton step from a fit without delay would add, and its standard deviation."""
+    d = jacobian(plain.problem, plain.theta, plain.residuals, [6], typical(plain.theta, plain.problem.motions))[:, 0]
+    basis = np.linalg.qr(plain.jacobian)[0]
+    rest = d - basis @ (basis.T @ d)
+    weight = float(rest @ rest)
+    return (float(rest @ plain.residuals) / weight, weight**-0.5) if weight > 0 else (0.0, np.inf)
+
+
+def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
+    """Fit one window, or several of one drive together; a delay is fitted with them when the data surely show one.
+
+    Where least squares finds nothing that could be a drive, that answer is returned: it says what is wrong.
+    """
+    result = fit_windows(windows, settings)
+    if result is None:
+        return least_squares.estimate(windows, settings)
+    return finish(result)
+
+
+def finish(result: Fit) -> Estimate:
+    """Return the fit as an estimate with its covariance."""
+    scale = np.sqrt(np.diag(result.information))
+    scale[scale == 0] = 1.0
+    scaled = result.information / np.outer(scale, scale)
+    singular = np.linalg.svd(scaled, compute_uv=False)
+    condition = float(np.sqrt(singular[0] / singular[-1])) if singular[-1] > 0 else np.inf
+    inverse = np.linalg.pinv(scaled) / np.outer(scale, scale)
+    k = len(PARAMETERS)
+    answer = Estimate(
+        method=NAME,
+        names=PARAMETERS,
+        values=result.theta[:k],
+        covariance=inverse[:k, :k],
+        residuals={"electrical": result.residuals[0::2], "mechanical": result.residuals[1::2]},
+        result=Result.OK if result.converged else Result.DIVERGED,
+        delay_s=float(result.theta[6]) if 6 in result.free else None,
+    )
+    return judge(answer, condition)

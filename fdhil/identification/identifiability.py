@@ -1,0 +1,80 @@
+"""What the data can tell: a parameter without an interval is not published, it has a reason instead."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from fdhil.records import PARAMETERS, Estimate, Reason, Result
+
+CONDITION_LIMIT = 1e6
+RELATIVE_STD_LIMIT: Mapping[str, float] = {"R": 0.10, "L": 0.10, "K": 0.05, "Jt": 0.10, "ft": 0.5, "Cd": 0.5}
+# ft and Cd may be small in truth: their interval is measured against the friction torque there is
+PHYSICAL: Mapping[str, tuple[float, float]] = {
+    "R": (1e-3, 1e3),
+    "L": (1e-6, 10.0),
+    "K": (1e-3, 100.0),
+    "Jt": (1e-7, 100.0),
+    "ft": (-np.inf, 10.0),
+    "Cd": (-np.inf, 1e3),
+}
+
+
+def empty_estimate(method: str, result: Result, reason: Reason) -> Estimate:
+    """Return an estimate without values, each missing for ``reason``."""
+    k = len(PARAMETERS)
+    return Estimate(
+        method=method,
+        names=PARAMETERS,
+        values=np.full(k, np.nan),
+        covariance=np.full((k, k), np.nan),
+        residuals={},
+        result=result,
+        missing=dict.fromkeys(PARAMETERS, reason),
+    )
+
+
+def judge(estimate: Estimate, condition: float) -> Estimate:
+    """Return the estimate with its result set, and NaN with a reason where the data cannot tell a parameter."""
+    if not np.isfinite(condition) or condition > CONDITION_LIMIT:
+        text = f"the regressor is rank deficient (condition number {condition:.1e})"
+        reason = Reason("RankDeficient", text, "record a rapid with acceleration and cruise")
+        return empty_estimate(estimate.method, Result.ILL_CONDITIONED, reason)
+    if not (np.isfinite(estimate.values).all() and np.isfinite(estimate.covariance).all()):
+        return empty_estimate(
+            estimate.method, Result.NOT_FINITE, Reason("NotFinite", "the fit is not finite", "record again")
+        )
+    missing = _unknown(estimate)
+    values, covariance = estimate.values.copy(), estimate.covariance.copy()
+    for name in missing:
+        k = estimate.names.index(name)
+        values[k] = covariance[k, :] = covariance[:, k] = np.nan
+    result = Result.UNDER_EXCITED if missing else estimate.result
+    return replace(estimate, values=values, covariance=covariance, missing=missing, result=result)
+
+
+def _unknown(estimate: Estimate) -> dict[str, Reason]:
+    """Return the parameters whose standard deviation is too large to publish them."""
+    missing = {}
+    for name, limit in RELATIVE_STD_LIMIT.items():
+        value, std = estimate.value(name), estimate.std(name)
+        share = std / abs(value) if value else np.inf
+        if share > limit:
+            text = f"the standard deviation of {name} is {100 * share:.0f} % of its value, limit {100 * limit:.0f} %"
+            missing[name] = Reason("LowExcitation", text, "record rapids at other speeds and in both directions")
+    return missing
+
+
+def unphysical(estimate: Estimate) -> list[Reason]:
+    """Return a reason for each parameter outside the box of what a feed drive can be; a NaN has its own reason."""
+    reasons = []
+    for name, (low, high) in PHYSICAL.items():
+        value = estimate.value(name)
+        # friction may be nil, so only a significantly negative one is unphysical
+        floor = -3 * estimate.std(name) if name in ("ft", "Cd") else low
+        if np.isfinite(value) and not floor <= value <= high:
+            text = f"{name} = {value:.4g} lies outside {max(low, 0):.3g} to {high:.3g}"
+            reasons.append(Reason("Unphysical", text, "check the scale, sign and order of the signals"))
+    return reasons

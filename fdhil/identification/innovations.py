@@ -1,0 +1,176 @@
+"""Kalman innovations of a window: what current and speed do that the model, driven by the measured voltage, does not.
+
+With G the model's response from voltage to z = [i; w], the residual z - G u has covariance S_iw + G S_u G'. A Kalman
+filter whose process noise is the voltage's noise through the drive whitens exactly that residual, sample by sample.
+Where friction is not known (standstill, reversal) the speed is a random walk and only the electrical equation speaks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from fdhil.identification.motion import BROKEN, UNKNOWN, Motion, Noise
+from fdhil.model.feed_drive import transition
+from fdhil.records import Float, Parameters
+
+DIFFUSE = 1e6  # variance, in units of the measurement's, of a state about which nothing is known
+
+
+def _gains_plain(
+    a: Float, lever: Float, dt: float, mode: Float, observed: Float, noise: Float, walk: float
+) -> tuple[Float, Float, float]:
+    """Return the gains (n, 4) and whiteners (n, 3) of the filter, and the log determinant of the innovations.
+
+    ``lever`` = [1/L, 1/Jt]; ``noise`` = variances of voltage, current, speed; a whitener is [w11, w21, w22].
+    """
+    n = mode.size
+    gains = np.zeros((n, 4))
+    white = np.zeros((n, 3))
+    logdet = 0.0
+    free = a.copy()
+    free[1, :] = 0.0
+    phi_m, mean_m, _ = transition(a, dt)
+    phi_u, mean_u, _ = transition(free, dt)
+    p11, p12, p22 = DIFFUSE * noise[1], 0.0, DIFFUSE * noise[2]
+    for k in range(n):
+        if observed[k]:
+            s11, s12, s22 = p11 + noise[1], p12, p22 + noise[2]
+            det = s11 * s22 - s12 * s12
+            g11, g12 = (p11 * s22 - p12 * s12) / det, (p12 * s11 - p11 * s12) / det
+            g21, g22 = (p12 * s22 - p22 * s12) / det, (p22 * s11 - p12 * s12) / det
+            gains[k, 0], gains[k, 1], gains[k, 2], gains[k, 3] = g11, g12, g21, g22
+            c11 = np.sqrt(s11)
+            c21 = s12 / c11
+            c22 = np.sqrt(s22 - c21 * c21)
+            white[k, 0], white[k, 1], white[k, 2] = 1.0 / c11, -c21 / (c11 * c22), 1.0 / c22
+            logdet += np.log(det)
+            p11, p12, p22 = g11 * noise[1], g12 * noise[2], g22 * noise[2]
+        if mode[k] == BROKEN:
+            p11, p12, p22 = DIFFUSE * noise[1], 0.0, DIFFUSE * noise[2]
+            continue
+        unknown = mode[k] == UNKNOWN
+        phi = phi_u if unknown else phi_m
+        b = mean_u if unknown else mean_m
+        b1, b2 = b[0, 0] * lever[0], b[1, 0] * lever[0]
+        q11 = phi[0, 0] * p11 + phi[0, 1] * p12
+        q12 = phi[0, 0] * p12 + phi[0, 1] * p22
+        q21 = phi[1, 0] * p11 + phi[1, 1] * p12
+        q22 = phi[1, 0] * p12 + phi[1, 1] * p22
+        p11 = q11 * phi[0, 0] + q12 * phi[0, 1] + b1 * b1 * noise[0]
+        p12 = q11 * phi[1, 0] + q12 * phi[1, 1] + b1 * b2 * noise[0]
+        p22 = q21 * phi[1, 0] + q22 * phi[1, 1] + b2 * b2 * noise[0]
+        if unknown:
+            # the walk of the speed over the interval reaches the current through the back-EMF
+            v1, v2 = mean_u[0, 1] / dt * walk, walk
+            p11 += v1 * v1
+            p12 += v1 * v2
+            p22 += v2 * v2
+    return gains, white, logdet
+
+
+_gains: Callable[..., tuple[Float, Float, float]] = njit(cache=True, nogil=True)(_gains_plain)
+
+
+def _residuals_plain(
+    a: Float,
+    lever: Float,
+    friction: float,
+    dt: float,
+    mode: Float,
+    observed: Float,
+    mean_v: Float,
+    rise_v: Float,
+    load: Float,
+    current: Float,
+    speed: Float,
+    gains: Float,
+    white: Float,
+) -> Float:
+    """Return the whitened innovations (n, 2); 0 where nothing was measured."""
+    n = mode.size
+    out = np.zeros((n, 2))
+    free = a.copy()
+    free[1, :] = 0.0
+    phi_m, mean_m, ramp_m = transition(a, dt)
+    phi_u, mean_u, ramp_u = transition(free, dt)
+    i, w = current[0], speed[0]
+    for k in range(n):
+        if observed[k]:
+            e1, e2 = current[k] - i, speed[k] - w
+            out[k, 0] = white[k, 0] * e1
+            out[k, 1] = white[k, 1] * e1 + white[k, 2] * e2
+            i += gains[k, 0] * e1 + gains[k, 1] * e2
+            w += gains[k, 2] * e1 + gains[k, 3] * e2
+        if mode[k] == BROKEN:
+            continue
+        u = lever[0] * mean_v[k]
+        r = lever[0] * rise_v[k]
+        if mode[k] == UNKNOWN:
+            i = phi_u[0, 0] * i + phi_u[0, 1] * w + mean_u[0, 0] * u + ramp_u[0, 0] * r
+            continue
+        f = -lever[1] * (friction * mode[k] + load[k])
+        i_next = phi_m[0, 0] * i + phi_m[0, 1] * w + mean_m[0, 0] * u + mean_m[0, 1] * f + ramp_m[0, 0] * r
+        w = phi_m[1, 0] * i + phi_m[1, 1] * w + mean_m[1, 0] * u + mean_m[1, 1] * f + ramp_m[1, 0] * r
+        i = i_next
+    return out
+
+
+_residuals: Callable[..., Float] = njit(cache=True, nogil=True)(_residuals_plain)
+
+
+@dataclass(frozen=True, slots=True)
+class Gains:
+    """The filter's gains (n, 4), whiteners (n, 3), and log determinant, for fixed parameters and noise."""
+
+    gains: Float
+    whiteners: Float
+    logdet: float
+
+
+def matrix_of(theta: Float) -> Float:
+    """Return A (2, 2) for ``theta`` = [R, L, K, Jt, ft, Cd, ...]."""
+    return np.array([[-theta[0] / theta[1], -theta[2] / theta[1]], [theta[2] / theta[3], -theta[4] / theta[3]]])
+
+
+def gains_of(motion: Motion, theta: Float, noise: Noise) -> Gains:
+    """Return the filter's gains for ``theta`` (6,) = [R, L, K, Jt, ft, Cd]."""
+    lever = np.array([1 / theta[1], 1 / theta[3]])
+    return Gains(
+        *_gains(
+            matrix_of(theta), lever, motion.dt_s, motion.mode, motion.observed, noise.vector() ** 2, motion.speed_walk
+        )
+    )
+
+
+def innovations(
+    motion: Motion, theta: Float, gains: Gains, delay_s: float = 0.0, load_nm: Float | None = None
+) -> Float:
+    """Return the whitened innovations (n, 2) of [current, speed]: white and of unit variance when the model is right.
+
+    ``load_nm`` (n,) is a torque against the positive direction over each interval (none when left out).
+    """
+    lever = np.array([1 / theta[1], 1 / theta[3]])
+    return _residuals(
+        matrix_of(theta),
+        lever,
+        theta[5],
+        motion.dt_s,
+        motion.mode,
+        motion.observed,
+        motion.delayed(delay_s),
+        motion.voltage_rise,
+        np.zeros(motion.n) if load_nm is None else load_nm,
+        motion.current,
+        motion.speed,
+        gains.gains,
+        gains.whiteners,
+    )
+
+
+def vector_of(parameters: Parameters) -> Float:
+    """Return [R, L, K, Jt, ft, Cd] (6,)."""
+    return np.array(list(parameters.as_dict().values()))

@@ -1,0 +1,150 @@
+"""A window made ready for the estimators: where the drive surely moves, and the voltage over each interval."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import binary_erosion, uniform_filter1d
+
+from fdhil.identification.windows import RUN_SHARE, carried, noise_of
+from fdhil.model.feed_drive import interval_shape
+from fdhil.records import Bool, Float, Window
+
+UNKNOWN = 0  # stuck, reversing or about to move: the friction torque is not known
+# what the model can explain at best, as a share of a signal's peak: the voltage's course within a sample is not known
+SHAPE_SHARE = (3e-4, 1e-4, 1e-4)
+BROKEN = 9  # a sample is lost: nothing is known over this interval
+
+Modes = npt.NDArray[np.int8]
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Standard deviations of the white noise on voltage (V), current (A) and speed (rad/s)."""
+
+    voltage_v: float
+    current_a: float
+    speed_rad_s: float
+
+    def vector(self) -> Float:
+        """Return (3,) in the order voltage, current, speed."""
+        return np.array([self.voltage_v, self.current_a, self.speed_rad_s])
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """One window on its grid: ``mode`` (n,) says what is known of the interval that begins at each row.
+
+    +1 or -1: the drive surely moves that way; ``UNKNOWN``: friction is not known; ``BROKEN``: samples are lost.
+    ``voltage_mean`` and ``voltage_rise`` (n,) describe the voltage over each interval; ``current`` and ``speed`` (n,)
+    are instants, ``observed`` (n,) marks the rows that were measured. ``speed_walk`` is the standard deviation of the
+    speed's change over an interval of unknown friction.
+    """
+
+    dt_s: float
+    current: Float
+    speed: Float
+    voltage_mean: Float
+    voltage_rise: Float
+    observed: Bool
+    mode: Modes
+    noise: Noise
+    speed_walk: float
+
+    @property
+    def n(self) -> int:
+        """Number of rows."""
+        return int(self.speed.size)
+
+    def delayed(self, delay_s: float) -> Float:
+        """Return the mean voltage (n,) of each interval when the measured voltage is late by ``delay_s``."""
+        if delay_s == 0.0:
+            return self.voltage_mean
+        rows = delay_s / self.dt_s
+        whole = round(rows)
+        shifted = np.roll(self.voltage_mean, -whole)
+        rise = np.roll(self.voltage_rise, -whole)
+        if whole > 0:
+            shifted[-whole:], rise[-whole:] = self.voltage_mean[-1], 0.0
+        elif whole < 0:
+            shifted[:-whole], rise[:-whole] = self.voltage_mean[0], 0.0
+        moved: Float = shifted + (rows - whole) * rise
+        return moved
+
+
+def surely_moving(speed: Float, rapid_rad_s: float) -> Bool:
+    """Return where (n,) the shaft surely turns, over the whole reach of the smoothing that decides it."""
+    limit = RUN_SHARE * rapid_rad_s
+    width = 2 * int(np.clip((5 * noise_of(speed) / limit) ** 2, 0, 15)) + 1
+    smoothed = uniform_filter1d(carried(speed), width, mode="nearest")
+    moving = np.abs(smoothed) >= limit
+    moving[1:] &= np.sign(smoothed[1:]) == np.sign(smoothed[:-1])
+    sure: Bool = binary_erosion(moving, np.ones(width + 2, dtype=bool), border_value=True)
+    return sure
+
+
+def prepare(window: Window) -> Motion:
+    """Return the window as the estimators need it; its voltage must be there and it must have rows."""
+    if window.voltage_v is None:
+        raise ValueError("a window without voltage has no electrical equation")
+    observed = np.isfinite(window.speed_rad_s) & np.isfinite(window.current_a)
+    powered = np.isfinite(window.voltage_v)
+    sure = surely_moving(window.speed_rad_s, window.rapid_speed_rad_s)
+    side = np.sign(carried(window.speed_rad_s)).astype(np.int8)
+    mode = np.where(sure, np.sign(_majority(side, sure)), UNKNOWN).astype(np.int8)
+    mode[:-1][mode[:-1] != mode[1:]] = UNKNOWN  # an interval belongs to a motion when both its ends do
+    mode[~powered] = BROKEN
+    mean, rise = interval_shape(carried(window.voltage_v), window.voltage_sampling)
+    speed, current = carried(window.speed_rad_s), carried(window.current_a)
+    return Motion(
+        dt_s=window.dt_s,
+        current=current,
+        speed=speed,
+        voltage_mean=mean,
+        voltage_rise=rise,
+        observed=observed,
+        mode=mode,
+        noise=noise_levels(window),
+        speed_walk=_largest_step(speed, window.dt_s),
+    )
+
+
+def _majority(side: Modes, sure: Bool) -> Modes:
+    """Return for every row the direction that most rows of its moving stretch have (noise may flip single rows)."""
+    result = np.zeros_like(side)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], sure.astype(np.int8), [0]])))
+    for a, b in zip(edges[::2], edges[1::2], strict=True):
+        result[a:b] = 1 if side[a:b].sum(dtype=np.int64) >= 0 else -1
+    return result
+
+
+def noise_levels(window: Window) -> Noise:
+    """Return the noise of the three signals as their third differences show it, never below their resolution."""
+    signals = (window.voltage_v, window.current_a, window.speed_rad_s)
+    levels = [_level(s, share) for s, share in zip(signals, SHAPE_SHARE, strict=True)]
+    return Noise(*levels)
+
+
+def _level(values: Float | None, share: float) -> float:
+    finite = values[np.isfinite(values)] if values is not None else np.zeros(0)
+    if finite.size < 8:
+        return 1e-9
+    floor = resolution(finite) / math.sqrt(12.0)
+    return max(noise_of(finite), floor, share * float(np.abs(finite).max()), 1e-9)
+
+
+def resolution(values: Float) -> float:
+    """Return the smallest step between different values, 0 when there is only one."""
+    steps = np.diff(np.unique(values))
+    steps = steps[steps > 1e-9 * max(1.0, float(np.abs(values).max(initial=0.0)))]
+    return float(steps.min()) if steps.size else 0.0
+
+
+def _largest_step(speed: Float, dt: float) -> float:
+    width = 2 * round(0.005 / dt / 2) + 1
+    step = np.diff(uniform_filter1d(speed, width, mode="nearest"))
+    largest: float = np.abs(step).max(initial=1e-9)
+    return largest

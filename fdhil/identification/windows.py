@@ -1,0 +1,158 @@
+"""Rapid moves in a recording: where each begins and ends, and its stages.
+
+A window is a maximal run in which the smoothed speed is at least 2 % of the rapid speed, extended to rest. A run whose
+peak stays below 60 % of the rapid speed is a feed move and is not listed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from fdhil.records import Bool, Float, Recording, Stages, Window, frozen
+
+RUN_SHARE = 0.02
+RAPID_SHARE = 0.60
+PLATEAU_S = 0.100
+PLATEAU_BAND = 0.025
+SMOOTHING_S = 0.015
+EXTENSION_S = 0.040
+MARGIN_S = 0.100
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Half-open rows of one move: where the smoothed speed passes 2 %, and that extended to rest."""
+
+    start: int
+    end: int
+    rest_start: int
+    rest_end: int
+    direction: int
+
+
+def smooth(values: Float, dt_s: float, seconds: float = SMOOTHING_S) -> Float:
+    """Return ``values`` (n,) averaged over ``seconds`` about each row; lost rows (NaN) take the last one before."""
+    width = 2 * round(seconds / dt_s / 2) + 1
+    smoothed: Float = uniform_filter1d(carried(values), width, mode="nearest")
+    return smoothed
+
+
+def carried(values: Float) -> Float:
+    """Return ``values`` with each non-finite row replaced by the last finite one before it (0 where there is none)."""
+    finite = np.isfinite(values)
+    if finite.all():
+        return values
+    last = np.maximum.accumulate(np.where(finite, np.arange(values.size), -1))
+    return np.where(last < 0, 0.0, values[np.maximum(last, 0)])
+
+
+def noise_of(values: Float) -> float:
+    """Return the standard deviation of white noise on a smooth signal, from its third differences (robust)."""
+    d = np.diff(values, 3)
+    d = d[np.isfinite(d)]
+    return float(1.4826 * np.median(np.abs(d)) / np.sqrt(20.0)) if d.size else 0.0
+
+
+def find_windows(recording: Recording, rapid_speed_rad_s: float | None = None) -> list[Window]:
+    """Return the rapids of a recording, in time order.
+
+    The rapid speed is the recording's own, else ``rapid_speed_rad_s`` (the machine's), else the file's largest.
+    """
+    speed = smooth(recording.speed_rad_s, recording.dt_s)
+    rapid = recording.rapid_speed_rad_s or rapid_speed_rad_s or float(np.max(np.abs(speed), initial=0.0))
+    if rapid <= 0 or not np.isfinite(rapid):
+        return []
+    runs = _runs(speed, rapid, recording.dt_s, noise_of(recording.speed_rad_s))
+    windows = []
+    for k, run in enumerate(runs):
+        if np.abs(speed[run.start : run.end]).max() < RAPID_SHARE * rapid:
+            continue
+        floor = runs[k - 1].rest_end if k else 0
+        ceiling = runs[k + 1].rest_start if k + 1 < len(runs) else speed.size
+        windows.append(_cut(recording, speed, run, floor, ceiling, rapid))
+    return windows
+
+
+def _runs(speed: Float, rapid: float, dt: float, noise: float) -> list[Run]:
+    """Return the moves of either direction; ``speed`` is smoothed."""
+    side = np.sign(speed) * (np.abs(speed) >= RUN_SHARE * rapid)
+    edges = np.flatnonzero(np.diff(side)) + 1
+    bounds = np.concatenate([[0], edges, [side.size]])
+    spans = [(int(a), int(b)) for a, b in pairwise(bounds) if b > a and side[a] != 0]
+    # what the smoothed noise may reach at rest
+    still = np.abs(speed) <= max(0.002 * rapid, 3 * noise / np.sqrt(max(1.0, SMOOTHING_S / dt)))
+    reach = round(EXTENSION_S / dt)
+    runs = []
+    for k, (a, b) in enumerate(spans):
+        low = max(spans[k - 1][1] if k else 0, a - reach)
+        high = min(spans[k + 1][0] if k + 1 < len(spans) else side.size, b + reach)
+        before, after = np.flatnonzero(still[low:a]), np.flatnonzero(still[b:high])
+        start = low + int(before[-1]) + 1 if before.size else low
+        end = b + int(after[0]) if after.size else high
+        runs.append(Run(a, b, start, end, int(side[a])))
+    return runs
+
+
+def _cut(recording: Recording, speed: Float, run: Run, floor: int, ceiling: int, rapid: float) -> Window:
+    """Cut one window with its margins of standstill."""
+    margin = round(MARGIN_S / recording.dt_s)
+    a, b = max(floor, run.rest_start - margin), min(ceiling, run.rest_end + margin)
+    part = slice(a, b)
+    gaps = tuple((max(g, a) - a, min(h, b) - a) for g, h in recording.gaps if g < b and h > a)
+    return Window(
+        axis=recording.axis,
+        start_tick=a,
+        start_s=float(recording.time_s[a]),
+        dt_s=recording.dt_s,
+        demand_mm=frozen(recording.demand_mm[part]),
+        position_mm=frozen(recording.position_mm[part]),
+        speed_rad_s=frozen(recording.speed_rad_s[part]),
+        current_a=frozen(recording.current_a[part]),
+        voltage_v=frozen(recording.voltage_v[part]),
+        voltage_sampling=recording.voltage_sampling,
+        stages=_stages(speed, run, a, recording.dt_s),
+        direction=run.direction,
+        rapid_speed_rad_s=rapid,
+        pitch_mm=recording.pitch_mm,
+        gaps=gaps,
+        temperature_c=recording.temperature_c,
+    )
+
+
+def _stages(speed: Float, run: Run, offset: int, dt: float) -> Stages:
+    """Return the stages in rows of the window; a recording that begins or ends in the move lacks that stage."""
+    moving = np.abs(speed[run.rest_start : run.rest_end])
+    top = float(np.median(moving[moving >= 0.9 * moving.max()]))
+    first, last = longest(np.abs(moving - top) <= PLATEAU_BAND * top)
+    begin, end = run.rest_start - offset, run.rest_end - offset
+    whole_start = run.start > 0 and abs(speed[run.start - 1]) < abs(speed[run.start]) and run.rest_start > 0
+    whole_end = run.rest_end < speed.size or moving[-1] < RUN_SHARE * top
+    long_enough = (last - first) * dt >= PLATEAU_S
+    return Stages(
+        accelerate=(begin, begin + first) if whole_start and first > 0 else None,
+        cruise=(begin + first, begin + last) if long_enough else None,
+        brake=(begin + last, end) if whole_end and run.rest_start + last < run.rest_end else None,
+    )
+
+
+def longest(flags: Bool) -> tuple[int, int]:
+    """Return the half-open range of the longest run of True; (0, 0) when there is none."""
+    padded = np.concatenate([[False], flags, [False]])
+    edges = np.flatnonzero(np.diff(padded.astype(np.int8)))
+    if edges.size == 0:
+        return 0, 0
+    starts, ends = edges[::2], edges[1::2]
+    k = int(np.argmax(ends - starts))
+    return int(starts[k]), int(ends[k])
+
+
+def moving_range(window: Window) -> tuple[int, int]:
+    """Return the half-open rows of the move itself, without the margins of standstill."""
+    stages = [s for s in (window.stages.accelerate, window.stages.cruise, window.stages.brake) if s is not None]
+    if not stages:
+        return 0, window.n
+    return stages[0][0], stages[-1][1]

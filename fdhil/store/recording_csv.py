@@ -1,0 +1,185 @@
+"""Recordings as CSV: header lines ``# key: value``, then columns; a step of time off by more than 1 % is a gap."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from fdhil.errors import RecordingError
+from fdhil.records import Float, Recording, VoltageSampling, frozen
+
+FORMAT = "fdhil-recording-1"
+COLUMNS = ("time_s", "voltage_V", "current_A", "speed_rad_per_s", "position_m", "demand_m")
+REQUIRED = ("format", "sample_rate_hz", "voltage_sampling", "axis", "pitch_m_per_rev")
+STEP_TOLERANCE = 0.01
+MIN_ROWS = 16
+MAX_ROWS = 20_000_000
+
+
+def read_recording(path: Path) -> Recording:
+    """Read one CSV recording; RecordingError names what is wrong with the file and what to do about it."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read ({error.strerror}): check the path") from None
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path} is no text file: export the recording as CSV in UTF-8") from None
+    return parse_recording(text, str(path))
+
+
+def parse_recording(text: str, source: str = "recording") -> Recording:
+    """Parse the text of a CSV recording; ``source`` names it in errors. RecordingError as :func:`read_recording`."""
+    if not text.strip():
+        raise RecordingError(f"{source} is empty: record it again")
+    headers, first_row, lines = _split(text, source)
+    dt = 1.0 / _positive(headers, "sample_rate_hz", source)
+    if not text.endswith("\n"):
+        raise RecordingError(
+            f"{source} is truncated: line {len(lines)} has no end of line, so its last number may be cut; copy it again"
+        )
+    table = _numbers(lines, first_row, source)
+    rows, gaps = _place(table[:, 0], dt, source)
+    columns = _spread(table, rows)
+    sampling = _sampling(headers, source)
+    pitch_m = _positive(headers, "pitch_m_per_rev", source)
+    rapid_m_s = _positive(headers, "rapid_speed_m_per_s", source) if "rapid_speed_m_per_s" in headers else None
+    return Recording(
+        axis=headers["axis"],
+        dt_s=dt,
+        time_s=frozen(table[0, 0] + dt * np.arange(columns.shape[0])),
+        voltage_v=frozen(columns[:, 1]),
+        current_a=frozen(columns[:, 2]),
+        speed_rad_s=frozen(columns[:, 3]),
+        position_mm=frozen(columns[:, 4] * 1e3),
+        demand_mm=frozen(columns[:, 5] * 1e3),
+        voltage_sampling=sampling,
+        pitch_mm=pitch_m * 1e3,
+        rapid_speed_rad_s=None if rapid_m_s is None else rapid_m_s / pitch_m * 2 * math.pi,
+        temperature_c=_optional(headers, "temperature_C", source),
+        gaps=gaps,
+        headers=headers,
+    )
+
+
+def _split(text: str, source: str) -> tuple[dict[str, str], int, list[str]]:
+    """Return the headers, the index of the first row of numbers, and all lines."""
+    lines = text.splitlines()
+    headers: dict[str, str] = {}
+    k = next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))
+    for line in lines[:k]:
+        key, colon, value = line[1:].partition(":")
+        if colon:
+            headers[key.strip()] = value.strip()
+    if k == len(lines):
+        raise RecordingError(f"{source} is truncated: it has headers but no columns; record it again")
+    missing = [key for key in REQUIRED if not headers.get(key)]
+    if missing:
+        raise RecordingError(f"{source} has no header {', '.join(missing)}: add a line such as '# {missing[0]}: ...'")
+    if headers["format"] != FORMAT:
+        raise RecordingError(f"{source} has format {headers['format']!r}, which is not {FORMAT!r}: convert it first")
+    names = tuple(name.strip() for name in lines[k].split(","))
+    absent = [name for name in COLUMNS if name not in names]
+    if absent:
+        raise RecordingError(f"{source} has no column {', '.join(absent)}: it needs {','.join(COLUMNS)}")
+    return headers, k + 1, lines
+
+
+def _numbers(lines: list[str], first_row: int, source: str) -> Float:
+    """Return the rows as (n, 6) in the order of ``COLUMNS``; all of them finite."""
+    names = [name.strip() for name in lines[first_row - 1].split(",")]
+    rows = [line for line in lines[first_row:] if line.strip()]
+    if len(rows) < MIN_ROWS:
+        raise RecordingError(f"{source} is truncated: {len(rows)} rows are no recording; record it again")
+    if len(rows) > MAX_ROWS:
+        raise RecordingError(f"{source} has {len(rows)} rows, more than {MAX_ROWS}: cut it into parts")
+    try:
+        table = np.array([row.split(",") for row in rows], dtype=np.float64)
+    except ValueError:
+        raise _bad_row(lines, first_row, len(names), source) from None
+    if table.shape[1] != len(names) or not np.isfinite(table).all():
+        raise _bad_row(lines, first_row, len(names), source)
+    return table[:, [names.index(name) for name in COLUMNS]]
+
+
+def _bad_row(lines: list[str], first_row: int, width: int, source: str) -> RecordingError:
+    """Return the error that names the first row at fault."""
+    last = max(k for k, line in enumerate(lines) if line.strip())
+    for k, line in enumerate(lines[first_row:], start=first_row):
+        if not line.strip():
+            continue
+        cells = line.split(",")
+        if len(cells) != width:
+            what = "is truncated" if k == last else "is damaged"
+            return RecordingError(f"{source} {what}: line {k + 1} has {len(cells)} of {width} values; copy it again")
+        for cell in cells:
+            try:
+                value = float(cell)
+            except ValueError:
+                return RecordingError(f"{source} line {k + 1} has {cell.strip()!r} where a number belongs: correct it")
+            if not math.isfinite(value):
+                return RecordingError(
+                    f"{source} line {k + 1} has the non-finite value {cell.strip()!r}: leave a lost sample's row out"
+                )
+    return RecordingError(f"{source} cannot be read as numbers: export it again")
+
+
+def _place(
+    time_s: Float, dt: float, source: str
+) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], tuple[tuple[int, int], ...]]:
+    """Return the grid row (n,) of each sample and the half-open gaps between them."""
+    steps = np.diff(time_s)
+    if (steps <= 0).any():
+        k = int(np.argmax(steps <= 0))
+        raise RecordingError(
+            f"{source}: time stands still or runs back at {time_s[k + 1]:g} s: sort or record it again"
+        )
+    off = np.abs(steps - dt) > STEP_TOLERANCE * dt
+    if off.mean() > 0.5:
+        raise RecordingError(
+            f"{source}: rows are {np.median(steps):g} s apart, but sample_rate_hz says {dt:g} s: correct the header"
+        )
+    # a step that is off is a gap even where it rounds to one sample: at least one row is then missing or misplaced
+    counts = np.where(off, np.maximum(np.rint(steps / dt), 2), 1).astype(np.int64)
+    rows = np.concatenate([[0], np.cumsum(counts)])
+    if rows[-1] > MAX_ROWS:
+        raise RecordingError(f"{source}: a gap of {steps.max():g} s is no recording of one run: cut the file there")
+    gaps = tuple((int(rows[k]) + 1, int(rows[k + 1])) for k in np.flatnonzero(off))
+    return rows, gaps
+
+
+def _spread(table: Float, rows: np.ndarray[tuple[int], np.dtype[np.int64]]) -> Float:
+    columns = np.full((int(rows[-1]) + 1, table.shape[1]), np.nan)
+    columns[rows] = table
+    return columns
+
+
+def _sampling(headers: dict[str, str], source: str) -> VoltageSampling:
+    value = headers["voltage_sampling"]
+    if value == "interval_mean":
+        return "interval_mean"
+    if value == "instant":
+        return "instant"
+    raise RecordingError(f"{source} has voltage_sampling {value!r}: it must be interval_mean or instant")
+
+
+def _positive(headers: dict[str, str], key: str, source: str) -> float:
+    value = _optional(headers, key, source)
+    if value is None or not value > 0:
+        raise RecordingError(f"{source} has header {key} = {headers.get(key)!r}: it must be a number above 0")
+    return value
+
+
+def _optional(headers: dict[str, str], key: str, source: str) -> float | None:
+    if key not in headers:
+        return None
+    try:
+        value = float(headers[key])
+    except ValueError:
+        raise RecordingError(
+            f"{source} has header {key} = {headers[key]!r} where a number belongs: correct it"
+        ) from None
+    if not math.isfinite(value):
+        raise RecordingError(f"{source} has the non-finite header {key} = {headers[key]!r}: correct it")
+    return value

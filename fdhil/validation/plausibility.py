@@ -1,0 +1,198 @@
+"""What must hold of the signals before any fit is believed: finite, not stuck, not clipped, no hidden gap."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from fdhil.identification.motion import noise_levels, resolution
+from fdhil.identification.windows import carried, longest, moving_range, smooth
+from fdhil.records import Bool, Float, Reason, Window
+
+CHANCE = 1e-7  # of a false alarm of one check on one good window
+TOLERATED_GAP = 3  # rows: a longer gap hides what the drive did
+TOLERATED_LOSS = 0.02
+STUCK_S = 0.003
+RAIL_SAMPLES = 3
+QUANTISATION = 1 / 50
+SURE = 6.0
+SCALE_TOLERANCE = 0.005  # of the travel: pitch and speed scale are known to that
+BACKLASH_UM = 60.0
+
+
+def implausibilities(window: Window) -> list[Reason]:
+    """Return every reason why this window must not be identified from, before any fit; empty when it is plausible."""
+    reasons = list(_not_finite(window)) + list(_stages(window))
+    if window.n < 32 or any(reason.code == "NotFinite" for reason in reasons):
+        return reasons
+    reasons += list(_gaps(window))
+    reasons += list(_stuck(window))
+    reasons += list(_clipped(window))
+    reasons += list(_position(window))
+    return reasons
+
+
+def warnings_of(window: Window) -> list[Reason]:
+    """Return what does not refuse the window but widens its intervals: coarse quantisation."""
+    found = []
+    for name, unit, values in _signals(window):
+        finite = values[np.isfinite(values)]
+        span = float(np.ptp(finite)) if finite.size else 0.0
+        step = resolution(finite)
+        if span > 0 and step > QUANTISATION * span:
+            text = f"{name} comes in steps of {step:.3g} {unit}, {100 * step / span:.1f} % of the range used"
+            found.append(Reason("Quantised", text, "use a finer scale in the drive's mapping"))
+    return found
+
+
+def _signals(window: Window) -> Iterator[tuple[str, str, Float]]:
+    if window.voltage_v is not None:
+        yield "voltage", "V", window.voltage_v
+    yield "current", "A", window.current_a
+    yield "speed", "rad/s", window.speed_rad_s
+
+
+def _lost(window: Window) -> Bool:
+    """Return the rows (n,) that the window itself declares as lost."""
+    lost = np.zeros(window.n, dtype=bool)
+    for a, b in window.gaps:
+        lost[a:b] = True
+    return lost
+
+
+def _not_finite(window: Window) -> Iterator[Reason]:
+    lost = _lost(window)
+    for name, _, values in _signals(window):
+        bad = ~np.isfinite(values) & ~lost
+        if bad.any():
+            text = f"{name} is not finite in {int(bad.sum())} rows, first at {_time(window, int(np.argmax(bad))):.3f} s"
+            yield Reason("NotFinite", text, "check the sensor and its scaling")
+    largest = max((float(np.abs(v[np.isfinite(v)]).max(initial=0.0)) for _, _, v in _signals(window)), default=0.0)
+    if largest > 1e9:
+        yield Reason("NotFinite", f"a signal reaches {largest:.3g}, which no drive does", "check the scaling")
+
+
+def _stages(window: Window) -> Iterator[Reason]:
+    stages = window.stages
+    for name, stage in (("accel", stages.accelerate), ("cruise", stages.cruise), ("brake", stages.brake)):
+        if stage is None:
+            what = {"accel": "acceleration", "cruise": "100 ms of constant speed", "brake": "braking to rest"}[name]
+            yield Reason(f"MissingStage({name})", f"the move has no {what}", "record the whole of a longer rapid")
+
+
+def _gaps(window: Window) -> Iterator[Reason]:
+    a, b = moving_range(window)
+    inside = [(max(g, a), min(h, b)) for g, h in window.gaps if g < b and h > a]
+    rows = sum(h - g for g, h in inside)
+    if rows and (max(h - g for g, h in inside) > TOLERATED_GAP or rows > TOLERATED_LOSS * (b - a)):
+        text = f"{rows} of {b - a} samples of the move are lost, the first at {_time(window, inside[0][0]):.3f} s"
+        yield Reason("StaleData", text, "find where frames are lost: bus load, receive buffer")
+
+
+def _stuck(window: Window) -> Iterator[Reason]:
+    a, b = moving_range(window)
+    for name, unit, values in _signals(window):
+        part = values[a:b]
+        same = np.diff(part) == 0.0
+        start, end = longest(same)
+        least = max(2, round(STUCK_S / window.dt_s))
+        at_rail = end > start and part[start] in (np.nanmax(values), np.nanmin(values))
+        if end - start >= least and not at_rail and _beyond_chance(same, start, end):
+            text = (
+                f"{name} repeats {part[start]:.6g} {unit} for {(end - start + 1) * window.dt_s * 1e3:.0f} ms "
+                f"from {_time(window, a + start):.3f} s while the axis moves"
+            )
+            yield Reason("StuckValue", text, "check the sensor or the object's mapping")
+
+
+def _beyond_chance(same: Bool, start: int, end: int) -> bool:
+    """Return whether a run of repeats is longer than the repeats outside it make likely."""
+    outside = np.concatenate([same[:start], same[end:]])
+    share = (float(outside.sum()) + 1.0) / (outside.size + 2.0)
+    return same.size * share ** (end - start) < CHANCE
+
+
+def _clipped(window: Window) -> Iterator[Reason]:
+    for name, unit, values in _signals(window):
+        for rail, side in ((np.nanmax(values), "upper"), (np.nanmin(values), "lower")):
+            at_rail = values == rail
+            start, end = longest(at_rail)
+            if rail == 0.0 or end - start < RAIL_SAMPLES or not _rail_is_hard(values, start, end):
+                continue
+            text = (
+                f"{name} stays at its {side} extreme {rail:.6g} {unit} for {end - start} samples "
+                f"from {_time(window, start):.3f} s"
+            )
+            yield Reason("Saturated", text, "use a larger measuring range")
+
+
+def _rail_is_hard(values: Float, start: int, end: int) -> bool:
+    return _beyond_chance(np.diff(values) == 0.0, start, end - 1)
+
+
+def _position(window: Window) -> Iterator[Reason]:
+    """Compare the position with the integral of speed: a hidden gap, a stuck signal or a wrong scale shows up."""
+    if not np.isfinite(window.position_mm).any() or np.ptp(carried(window.position_mm)) == 0.0:
+        return
+    to_mm = window.pitch_mm / (2 * math.pi)
+    # lost rows are bridged for this comparison alone
+    speed, position = _bridged(window.speed_rad_s), _bridged(window.position_mm)
+    travel = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2)]) * window.dt_s * to_mm
+    noise = noise_levels(window).speed_rad_s * window.dt_s * to_mm
+    quantum = max(resolution(position), 1e-6)
+    error = position - position[0] - travel
+    yield from _jump(window, error, noise, quantum)
+    yield from _scale(travel, error, noise, quantum)
+
+
+def _bridged(values: Float) -> Float:
+    known = np.isfinite(values)
+    if known.all():
+        return values
+    bridged: Float = np.interp(np.arange(values.size), np.flatnonzero(known), values[known])
+    return bridged
+
+
+def _jump(window: Window, error: Float, noise: float, quantum: float) -> Iterator[Reason]:
+    """Find the stretch over which position and integral part most beyond noise, at any length up to 100 ms."""
+    worst, where, amount = 0.0, 0, 0.0
+    for seconds in (0.0, 0.005, 0.02, 0.05, 0.1):
+        length = max(1, round(seconds / window.dt_s))
+        if length >= error.size:
+            continue
+        change = np.abs(error[length:] - error[:-length])
+        # backlash and the screw's elasticity move the table against the motor by some um
+        allowed = SURE * np.hypot(noise * np.sqrt(length + 1), quantum) + BACKLASH_UM * 1e-3
+        k = int(np.argmax(change))
+        if change[k] / allowed > worst:
+            worst, where, amount = float(change[k] / allowed), k, float(change[k])
+    if worst > 1.0:
+        text = f"position and the integral of speed part by {1e3 * amount:.0f} um at {_time(window, where):.3f} s"
+        yield Reason("Implausible", text, "samples are lost or repeated there: check counters and time stamps")
+
+
+def _scale(travel: Float, error: Float, noise: float, quantum: float) -> Iterator[Reason]:
+    whole = abs(float(travel[-1]))
+    allowed = SURE * np.hypot(noise * np.sqrt(error.size), quantum) + SCALE_TOLERANCE * whole + BACKLASH_UM * 1e-3
+    if whole > 0 and abs(float(error[-1])) > allowed:
+        share = 100 * float(error[-1]) / whole
+        text = f"the position travels {share:+.2f} % more than the integral of speed"
+        yield Reason("CalibrationSuspect", text, "check the screw's pitch, the speed scale and lost samples")
+
+
+def at_rest(window: Window) -> Bool:
+    """Return the rows (n,) in which the table surely stands still, from position and smoothed speed."""
+    position = carried(window.position_mm)
+    reach = max(1, round(0.010 / window.dt_s))
+    ahead, behind = np.roll(position, -reach), np.roll(position, reach)
+    still = (np.abs(ahead - position) < 0.004) & (np.abs(behind - position) < 0.004)
+    still[:reach] &= np.abs(position[:reach] - position[0]) < 0.004
+    still[-reach:] &= np.abs(position[-reach:] - position[-1]) < 0.004
+    slow = np.abs(smooth(window.speed_rad_s, window.dt_s)) < 0.02 * window.rapid_speed_rad_s
+    return still & slow & np.isfinite(window.speed_rad_s)
+
+
+def _time(window: Window, row: int) -> float:
+    return window.start_s + row * window.dt_s

@@ -1,0 +1,106 @@
+"""The verdict on one window: plausible, estimated, physical, of the model's structure, and simulated as measured."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from fdhil.config import Identification
+from fdhil.identification.estimators import chosen, maximum_likelihood
+from fdhil.identification.estimators.maximum_likelihood import Fit
+from fdhil.identification.identifiability import empty_estimate, unphysical
+from fdhil.identification.windows import carried
+from fdhil.model.feed_drive import simulate_plant
+from fdhil.records import Estimate, Reason, Result, Verdict, Window, WindowOutcome
+from fdhil.validation.plausibility import implausibilities
+from fdhil.validation.rest import rest_faults
+from fdhil.validation.structure import excess_noise, findings, whiteness
+
+LEAST_FIT_PERCENT = 80.0
+UNFIT = ("NotFinite",)
+
+
+def analyse(window: Window, settings: Identification) -> WindowOutcome:
+    """Return what one window says of the drive, and whether it is believed; never raises, whatever the data."""
+    reasons = implausibilities(window)
+    if window.voltage_v is None:
+        reasons.append(Reason("SampleTiming", "the window has no voltage", "connect the voltage sensor"))
+    if window.n < 32 or window.voltage_v is None or any(r.code in UNFIT for r in reasons):
+        if not reasons:
+            reasons.append(Reason("LowExcitation", f"{window.n} rows are no rapid move", "record a whole rapid"))
+        missing = empty_estimate(chosen(settings)[0], Result.NOT_FINITE, reasons[0])
+        return WindowOutcome(window, missing, Verdict(False, None, tuple(reasons)))
+    try:
+        estimate, fit = _estimate(window, settings)
+    except (np.linalg.LinAlgError, FloatingPointError, ZeroDivisionError, OverflowError) as error:
+        reasons.append(Reason("SolverFailed", f"the solver gave up ({error})", "look at the window's signals"))
+        missing = empty_estimate(chosen(settings)[0], Result.DIVERGED, reasons[-1])
+        return WindowOutcome(window, missing, Verdict(False, None, tuple(reasons)))
+    fit_percent = simulated_fit_percent(window, estimate)
+    reasons += _doubts(window, estimate, fit, fit_percent)
+    return WindowOutcome(window, estimate, Verdict(not reasons, fit_percent, tuple(reasons)))
+
+
+def _estimate(window: Window, settings: Identification) -> tuple[Estimate, Fit | None]:
+    """Return the estimate by the chosen method, and the maximum-likelihood fit that the checks of structure need."""
+    name, estimator = chosen(settings)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        fit = maximum_likelihood.fit_windows([window], settings)
+        if name == maximum_likelihood.NAME and fit is not None:
+            return maximum_likelihood.finish(fit), fit
+        return estimator([window], settings), fit
+
+
+def _doubts(window: Window, estimate: Estimate, fit: Fit | None, fit_percent: float | None) -> list[Reason]:
+    reasons = list({r.text: r for r in estimate.missing.values()}.values())
+    if estimate.result is Result.DIVERGED:
+        reasons.append(Reason("SolverFailed", "the fit does not converge", "look at the window's signals"))
+    reasons += unphysical(estimate)
+    if fit is None:
+        return reasons or [Reason("RankDeficient", "there is no fit to check", "record a whole rapid")]
+    late = _late(window, fit)
+    if late is not None:
+        return [*reasons, late]
+    if np.isfinite(fit.residuals).all():
+        reasons += _structure(fit)
+        reasons += rest_faults(window, fit)
+    if fit_percent is not None and not fit_percent >= LEAST_FIT_PERCENT:
+        text = f"the model simulated from the measured voltage follows the speed by {fit_percent:.1f} % only"
+        reasons.append(Reason("ValidationFailed", text, "look at the residuals"))
+    return reasons
+
+
+def _late(window: Window, fit: Fit) -> Reason | None:
+    delay = float(fit.theta[6])
+    if abs(delay) <= window.dt_s:
+        return None
+    text = (
+        f"voltage is {1e3 * abs(delay):.2f} ms {'late' if delay > 0 else 'early'} against current and speed, "
+        f"more than a sample of {1e3 * window.dt_s:g} ms"
+    )
+    return Reason("SampleTiming", text, "take voltage, current and speed from one SYNC, or enter the sensor's delay")
+
+
+def _structure(fit: Fit) -> list[Reason]:
+    """Return the named finding that explains most, else what has no name."""
+    found = [f for f in findings(fit) if f.matters]
+    if found:
+        return [found[0].reason()]
+    return [*whiteness(fit), *excess_noise(fit)]
+
+
+def simulated_fit_percent(window: Window, estimate: Estimate) -> float | None:
+    """Return 100 (1 - |w - what| / |w - mean w|) of the speed simulated from voltage; None without a model."""
+    p = estimate.parameters()
+    values = np.array(list(p.as_dict().values()))
+    if window.voltage_v is None or not np.isfinite(values).all() or not (values[:4] > 0).all():
+        return None
+    p = replace(p, ft=max(p.ft, 0.0), Cd=max(p.Cd, 0.0))
+    known = np.isfinite(window.speed_rad_s)
+    _, speed = simulate_plant(p, carried(window.voltage_v), window.dt_s, window.voltage_sampling)
+    measured = window.speed_rad_s[known]
+    spread = float(np.linalg.norm(measured - measured.mean()))
+    if spread == 0.0 or not np.isfinite(speed).all():
+        return None
+    return 100.0 * (1.0 - float(np.linalg.norm(measured - speed[known])) / spread)

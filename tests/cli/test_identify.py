@@ -1,0 +1,129 @@
+"""``fdhil identify`` as users and programs call it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+
+from fdhil.cli.identify import identify
+from fdhil.cli.main import cli, run_safely
+from studies import bench
+from tests.identification.recorded import signals
+
+
+@pytest.fixture
+def shuttle(tmp_path: Path) -> Path:
+    """A recording of two rapids."""
+    path = tmp_path / "shuttle.csv"
+    path.write_text(bench.as_csv(signals(moves=2), 0.003))
+    return path
+
+
+def _invoke(*arguments: object) -> Result:
+    return CliRunner().invoke(cli, ["identify", *map(str, arguments)], standalone_mode=False)
+
+
+def _document(result: Result) -> dict[str, Any]:
+    document: dict[str, Any] = json.loads(result.stdout)
+    return document
+
+
+def test_json_holds_every_window_and_the_pool(shuttle: Path) -> None:
+    result = _invoke(shuttle, "--json")
+    assert result.return_value == 0
+    document = _document(result)
+    assert document["schema"] == "fdhil-identify-1"
+    (told,) = document["files"]
+    assert (told["file"], told["axis"]) == (str(shuttle), "X")
+    assert [w["direction"] for w in told["windows"]] == [1, -1]
+    for window in told["windows"]:
+        assert window["validated"] is True
+        assert window["reasons"] == []
+        assert 98 < window["fit_percent"] < 100
+        assert set(window) == {
+            "start_s", "end_s", "direction", "parameters", "validated", "fit_percent", "reasons",
+        }  # fmt: skip
+    pooled = told["pooled"]
+    assert pooled["windows_used"] == 2
+    assert pooled["validated"] is True
+    truth = bench.Plant().truth()
+    for name, entry in pooled["parameters"].items():
+        assert entry["value"] == pytest.approx(truth[name], rel=0.02)
+        assert 0 < entry["std"] < 0.05 * truth[name]
+    assert pooled["parameters"]["L"]["unit"] == "H"
+
+
+@pytest.mark.parametrize("method", ["least_squares", "maximum_likelihood"])
+def test_method_is_obeyed(shuttle: Path, method: str) -> None:
+    assert _invoke(shuttle, "--json", "--method", method).return_value == 0
+
+
+def test_people_get_a_table(shuttle: Path) -> None:
+    result = _invoke(shuttle)
+    assert result.return_value == 0
+    assert "all 2" in result.stdout
+    assert "g.m2" in result.stdout
+
+
+def test_refused_is_exit_1_with_null_values(tmp_path: Path) -> None:
+    path = tmp_path / "still.csv"
+    path.write_text(bench.as_csv(bench.run(bench.Plant(), bench.shuttle(distance=0.02, speed=0.1)), 0.003))
+    result = _invoke(path, "--json")
+    assert result.return_value == 1
+    (told,) = _document(result)["files"]
+    assert told["windows"] == []
+    assert told["pooled"]["windows_used"] == 0
+    assert told["pooled"]["reasons"][0].startswith("NoWindow")
+    assert told["pooled"]["parameters"]["R"]["value"] is None
+    assert "reason" in told["pooled"]["parameters"]["R"]
+    assert "NoWindow" in _invoke(path).stdout
+
+
+def test_config_gives_the_rapid_speed(shuttle: Path, tmp_path: Path) -> None:
+    text = "".join(x for x in shuttle.read_text().splitlines(keepends=True) if "rapid_speed" not in x)
+    shuttle.write_text(text)
+    config = tmp_path / "machine.toml"
+    fast = tmp_path / "fast.toml"
+    config.write_text(_config(500.0))
+    fast.write_text(_config(2000.0))
+    assert len(_document(_invoke(shuttle, "--json", "--config", config))["files"][0]["windows"]) == 2
+    assert _document(_invoke(shuttle, "--json", "--config", fast))["files"][0]["windows"] == []
+
+
+def _config(rapid: float) -> str:
+    return f"""
+[machine]
+name = "bench"
+[axis.X]
+screw_pitch_mm = 20.0
+rapid_speed_mm_s = {rapid}
+max_acceleration_mm_s2 = 4000.0
+nominal = {{ R = 0.5, L = 0.005, K = 0.8, Jt = 0.075, ft = 0.05, Cd = 5.0 }}
+[axis.X.regulators]
+position_gain_per_s = 50.0
+speed_kp = 23.562
+speed_ki = 1184.35
+current_limit_a = 200.0
+current_kp = 12.566
+current_ki = 1256.64
+voltage_limit_v = 300.0
+"""
+
+
+def test_unreadable_recording_is_exit_3_in_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.argv", ["fdhil-identify", str(tmp_path / "absent.csv")])
+    assert run_safely(identify) == 3
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "cannot be read" in error
+
+
+def test_unknown_method_is_exit_2(shuttle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["fdhil-identify", str(shuttle), "--method", "guess"])
+    assert run_safely(identify) == 2

@@ -1,0 +1,116 @@
+"""Every listed estimator on the bench: accurate, with honest intervals, equivariant, and silent where it must be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil import tables
+from fdhil.config import Identification
+from fdhil.identification.estimators import Estimator, chosen
+from fdhil.records import PARAMETERS, Estimate, Float, Result, Window, frozen
+from studies import bench
+from tests.identification.recorded import windows
+
+SETTINGS = Identification()
+TRUTH = np.array([bench.Plant().truth()[name] for name in PARAMETERS])
+# per cent of the truth that one rapid at 0.1 % noise must reach, in the order of PARAMETERS
+REACH: dict[str, tuple[float, ...]] = {
+    "least_squares": (0.3, 0.6, 0.1, 0.5, 8.0, 12.0),
+    "maximum_likelihood": (0.1, 0.2, 0.05, 0.1, 1.5, 2.0),
+}
+
+
+@pytest.fixture(params=list(tables.ESTIMATORS))
+def name(request: pytest.FixtureRequest) -> str:
+    """The name of a listed estimator."""
+    return str(request.param)
+
+
+def _estimator(name: str) -> Estimator:
+    return chosen(SETTINGS.model_copy(update={"method": name}))[1]
+
+
+def _errors_percent(estimate: Estimate) -> Float:
+    errors: Float = 100 * np.abs(estimate.values / TRUTH - 1)
+    return errors
+
+
+def test_the_last_listed_is_the_default() -> None:
+    assert chosen(SETTINGS)[0] == list(tables.ESTIMATORS)[-1] == "maximum_likelihood"
+
+
+def test_one_rapid(name: str) -> None:
+    estimate = _estimator(name)(windows(0.001), SETTINGS)
+    assert estimate.result is Result.OK
+    assert estimate.method == name
+    assert (_errors_percent(estimate) < REACH[name]).all()
+
+
+def test_windows_together_beat_one(name: str) -> None:
+    estimate = _estimator(name)(windows(0.005, moves=4), SETTINGS)
+    assert (_errors_percent(estimate) < (1.0, 1.0, 1.0, 1.0, 5.0, 5.0)).all()
+    one = _estimator(name)(windows(0.005, moves=4)[:1], SETTINGS)
+    assert (np.diag(estimate.covariance)[:4] < np.diag(one.covariance)[:4]).all()
+
+
+def test_deviations_are_honest(name: str) -> None:
+    scores = []
+    for seed in range(12):
+        estimate = _estimator(name)(windows(0.005, seed), SETTINGS)
+        scores.append((estimate.values - TRUTH) / np.sqrt(np.diag(estimate.covariance)))
+    rms = np.sqrt(np.mean(np.square(scores), axis=0))
+    assert (rms > 0.4).all()
+    assert (rms < 1.8).all()
+
+
+def test_either_direction_gives_the_same(name: str) -> None:
+    window = windows(0.002)[0]
+    assert window.voltage_v is not None
+    mirrored = replace(
+        window,
+        voltage_v=frozen(-window.voltage_v),
+        current_a=frozen(-window.current_a),
+        speed_rad_s=frozen(-window.speed_rad_s),
+        direction=-1,
+    )
+    there, back = (_estimator(name)([w], SETTINGS) for w in (window, mirrored))
+    np.testing.assert_allclose(back.values, there.values, rtol=1e-6)
+
+
+def test_order_of_windows_does_not_matter(name: str) -> None:
+    three = windows(0.005, moves=3)
+    there, back = (_estimator(name)(order, SETTINGS) for order in (three, three[::-1]))
+    np.testing.assert_allclose(back.values, there.values, rtol=1e-5)
+
+
+def test_scaled_units_scale_the_parameters(name: str) -> None:
+    window = windows(0.002)[0]
+    assert window.voltage_v is not None
+    in_kilovolt = replace(window, voltage_v=frozen(window.voltage_v * 1e-3))
+    plain, scaled = (_estimator(name)([w], SETTINGS) for w in (window, in_kilovolt))
+    # torque = K i is in kilo-units too, so every parameter shrinks alike
+    np.testing.assert_allclose(scaled.values, plain.values * 1e-3, rtol=1e-4)
+
+
+def test_lost_rows_are_left_out(name: str) -> None:
+    window = windows(0.001)[0]
+    assert window.voltage_v is not None
+    lost = {}
+    for field in ("voltage_v", "current_a", "speed_rad_s"):
+        values = np.array(getattr(window, field))
+        values[400:403] = np.nan
+        lost[field] = frozen(values)
+    holed = Window(**{f: getattr(window, f) for f in window.__slots__} | lost | {"gaps": ((400, 403),)})
+    assert (_errors_percent(_estimator(name)([holed], SETTINGS)) < REACH[name]).all()
+
+
+def test_nothing_to_fit_is_told(name: str) -> None:
+    window = windows(0.001)[0]
+    still = replace(window, speed_rad_s=frozen(np.zeros(window.n)))
+    estimate = _estimator(name)([still], SETTINGS)
+    assert estimate.result is not Result.OK
+    assert set(estimate.missing) == set(PARAMETERS)
+    assert np.isnan(estimate.values).all()

@@ -1,0 +1,106 @@
+"""CSV recordings: what is read, and how each fault is told."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil.errors import RecordingError
+from fdhil.store.recording_csv import parse_recording, read_recording
+from studies import bench
+
+COLUMNS = ("voltage_V", "current_A", "speed_rad_per_s", "position_m", "demand_m")
+
+
+def _text(rows: int = 40, dt: float = 0.001, **headers: str) -> str:
+    return bench.table_text(
+        dt, {name: np.linspace(0.0, rows * 0.5, rows, endpoint=False) for name in COLUMNS}, **headers
+    )
+
+
+def _without(text: str, start: str) -> str:
+    return "".join(line for line in text.splitlines(keepends=True) if not line.startswith(start))
+
+
+def test_reads_units_and_headers(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    path.write_text(_text(temperature_C="21.5", machine="mill 3"))
+    recording = read_recording(path)
+    assert recording.axis == "X"
+    assert recording.dt_s == pytest.approx(0.001)
+    assert recording.pitch_mm == pytest.approx(20.0)
+    assert recording.rapid_speed_rad_s == pytest.approx(0.5 / 0.02 * 2 * math.pi)
+    assert recording.temperature_c == 21.5
+    assert recording.headers["machine"] == "mill 3"
+    assert recording.position_mm[2] == pytest.approx(1000.0)
+    assert recording.gaps == ()
+    assert not recording.speed_rad_s.flags.writeable
+
+
+def test_columns_may_come_in_any_order_with_more() -> None:
+    columns: dict[str, bench.Array] = {name: np.linspace(0.0, 29.0, 30) for name in ("extra", *reversed(COLUMNS))}
+    columns["current_A"] = np.linspace(0.0, 87.0, 30)
+    recording = parse_recording(bench.table_text(0.001, columns))
+    assert recording.current_a[2] == 6.0
+
+
+def test_a_missing_row_is_a_gap_of_nan() -> None:
+    lines = _text().splitlines(keepends=True)
+    first = next(k for k, line in enumerate(lines) if line.startswith("time_s")) + 1
+    del lines[first + 10 : first + 13]
+    recording = parse_recording("".join(lines))
+    assert recording.gaps == ((10, 13),)
+    assert recording.time_s.size == 40
+    assert np.isnan(recording.speed_rad_s[10:13]).all()
+    assert recording.speed_rad_s[13] == 6.5
+
+
+def test_a_step_off_by_two_percent_is_a_gap() -> None:
+    text = _text().replace("0.020000,", "0.020020,")
+    assert len(parse_recording(text).gaps) == 2
+    assert parse_recording(_text().replace("0.020000,", "0.020005,")).gaps == ()
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "empty"),
+        ("\n  \n", "empty"),
+        (_text()[:-4], "truncated"),
+        ("\n".join(_text().splitlines()[:6]) + "\n", "truncated"),
+        ("\n".join(_text().splitlines()[:12]) + "\n", "truncated"),
+        (_text() + "0.040000,1.0\n", "truncated"),
+        (_text().replace("current_A", "amps"), "no column current_A"),
+        (_without(_text(), "# sample_rate_hz"), "no header sample_rate_hz"),
+        (_without(_text(), "# pitch"), "no header pitch_m_per_rev"),
+        (_text(format="other-1"), "format 'other-1'"),
+        (_text(voltage_sampling="sometimes"), "voltage_sampling"),
+        (_text(sample_rate_hz="fast"), "sample_rate_hz"),
+        (_text(pitch_m_per_rev="-1"), "pitch_m_per_rev"),
+        (_text(rapid_speed_m_per_s="nan"), "rapid_speed_m_per_s"),
+        (_text().replace(",2.50000,", ",2.5x,"), "2.5x"),
+        (_text().replace(",2.50000,", ",nan,"), "non-finite"),
+        (_text().replace(",2.50000,", ",inf,"), "non-finite"),
+        (_text().replace("0.020000,", "0.019000,"), "time stands still"),
+        (_text(sample_rate_hz="2000"), "correct the header"),
+    ],
+    ids=lambda value: value if len(value) < 40 else "text",
+)
+def test_each_fault_is_one_sentence(text: str, words: str) -> None:
+    with pytest.raises(RecordingError, match=words) as caught:
+        parse_recording(text, "r.csv")
+    message = str(caught.value)
+    assert message.startswith("r.csv")
+    assert "\n" not in message
+
+
+def test_a_file_that_is_no_text_or_not_there(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="cannot be read"):
+        read_recording(tmp_path / "absent.csv")
+    binary = tmp_path / "b.csv"
+    binary.write_bytes(b"\xff\xfe\x00\x80" * 40)
+    with pytest.raises(RecordingError, match="no text file"):
+        read_recording(binary)

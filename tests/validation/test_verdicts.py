@@ -1,0 +1,160 @@
+"""Verdicts: good windows are accepted, each kind of fault is refused under its own name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil import tables
+from fdhil.config import Identification
+from fdhil.identification.windows import find_windows
+from fdhil.records import Float, Window, WindowOutcome, frozen
+from fdhil.store.recording_csv import parse_recording
+from fdhil.validation import analyse, pool
+from studies import bench
+from tests.identification.recorded import windows
+
+SETTINGS = Identification()
+
+
+def _codes(outcome: WindowOutcome) -> set[str]:
+    return {reason.code for reason in outcome.verdict.reasons}
+
+
+def _changed(window: Window, **signals: Callable[[Float], Float]) -> Window:
+    assert window.voltage_v is not None
+    arrays = {name: frozen(change(np.array(getattr(window, name)))) for name, change in signals.items()}
+    return replace(window, **arrays)  # type: ignore[arg-type]  # the names are arrays of the record
+
+
+@pytest.mark.parametrize("method", [None, *tables.ESTIMATORS])
+@pytest.mark.parametrize("noise", [0.001, 0.005])
+def test_good_windows_are_accepted(method: str | None, noise: float) -> None:
+    settings = SETTINGS.model_copy(update={"method": method})
+    outcomes = [analyse(window, settings) for window in windows(noise, moves=2)]
+    for outcome in outcomes:
+        assert outcome.verdict.accepted, outcome.verdict.reasons
+        assert outcome.verdict.fit_percent is not None
+        assert outcome.verdict.fit_percent > 98.0
+    estimate, verdict = pool(outcomes, settings)
+    assert verdict.accepted
+    assert estimate is not None
+
+
+def _stuck(values: Float) -> Float:
+    values[500:560] = values[500]
+    return values
+
+
+def _clipped(values: Float) -> Float:
+    return np.clip(values, -60.0, 60.0)
+
+
+def _late(values: Float) -> Float:
+    return np.concatenate([np.full(8, values[0]), values[:-8]])
+
+
+def _gain_step(values: Float) -> Float:
+    values[550:] *= 1.15
+    return values
+
+
+@pytest.mark.parametrize(
+    ("field", "change", "code"),
+    [
+        ("speed_rad_s", _stuck, "StuckValue"),
+        ("current_a", _stuck, "StuckValue"),
+        ("current_a", _clipped, "Saturated"),
+        ("voltage_v", _late, "SampleTiming"),
+        ("current_a", _gain_step, "CalibrationSuspect"),
+    ],
+)
+def test_sensor_faults_are_named(field: str, change: Callable[[Float], Float], code: str) -> None:
+    outcome = analyse(_changed(windows(0.003)[0], **{field: change}), SETTINGS)
+    assert not outcome.verdict.accepted
+    assert code in _codes(outcome)
+
+
+def test_a_load_torque_is_named_with_its_amount() -> None:
+    demand = bench.shuttle()
+    load = np.zeros(demand.size)
+    load[400:600] = 8.0
+    signals = bench.run(bench.Plant(), demand, load=load)
+    outcome = analyse(find_windows(parse_recording(bench.as_csv(signals, 0.003)))[0], SETTINGS)
+    (reason,) = outcome.verdict.reasons
+    assert reason.code == "LoadDetected"
+    assert "+7." in reason.text or "+8." in reason.text
+
+
+def test_stribeck_friction_is_named() -> None:
+    signals = bench.run(bench.Plant(stribeck=12.0), bench.shuttle())
+    outcome = analyse(find_windows(parse_recording(bench.as_csv(signals, 0.003)))[0], SETTINGS)
+    assert any("Stribeck" in reason.text for reason in outcome.verdict.reasons)
+
+
+def test_frames_lost_without_a_trace_in_the_time_column() -> None:
+    whole = bench.run(bench.Plant(), bench.shuttle())
+    keep = np.r_[0:300, 360 : whole.speed.size]
+    names = ("voltage", "voltage_instant", "current", "speed", "position", "demand")
+    holed = replace(whole, **{name: getattr(whole, name)[keep] for name in names})
+    outcome = analyse(find_windows(parse_recording(bench.as_csv(holed, 0.003)))[0], SETTINGS)
+    assert "Implausible" in _codes(outcome)
+
+
+def test_a_counted_gap_is_refused_when_long_and_left_out_when_short() -> None:
+    text = bench.as_csv(bench.run(bench.Plant(), bench.shuttle()), 0.003).splitlines(keepends=True)
+    head = next(k for k, line in enumerate(text) if line.startswith("time_s")) + 1
+    for rows, accepted in ((2, True), (30, False)):
+        cut = "".join(text[: head + 500] + text[head + 500 + rows :])
+        outcome = analyse(find_windows(parse_recording(cut))[0], SETTINGS)
+        assert outcome.verdict.accepted is accepted
+        assert accepted or "StaleData" in _codes(outcome)
+
+
+def test_a_short_rapid_lacks_its_cruise() -> None:
+    signals = bench.run(bench.Plant(), bench.shuttle(distance=0.05))
+    outcome = analyse(find_windows(parse_recording(bench.as_csv(signals, 0.003)))[0], SETTINGS)
+    assert not outcome.verdict.accepted
+    assert "MissingStage(cruise)" in _codes(outcome)
+    assert outcome.estimate is not None
+
+
+def test_swapped_columns_are_unphysical() -> None:
+    window = windows(0.003)[0]
+    assert window.voltage_v is not None
+    swapped = replace(window, voltage_v=frozen(-window.voltage_v))
+    assert "Unphysical" in _codes(analyse(swapped, SETTINGS))
+
+
+def test_not_finite_values_never_enter_a_fit() -> None:
+    outcome = analyse(_changed(windows()[0], current_a=lambda v: np.where(v > 50, np.inf, v)), SETTINGS)
+    assert _codes(outcome) == {"NotFinite"}
+    assert outcome.estimate is not None
+    assert np.isnan(outcome.estimate.values).all()
+
+
+def test_a_window_without_voltage_is_told() -> None:
+    outcome = analyse(replace(windows()[0], voltage_v=None), SETTINGS)
+    assert not outcome.verdict.accepted
+
+
+def test_nothing_pooled_from_nothing() -> None:
+    estimate, verdict = pool([], SETTINGS)
+    assert estimate is None
+    assert [reason.code for reason in verdict.reasons] == ["NoWindow"]
+    refused = analyse(_changed(windows()[0], voltage_v=_late), SETTINGS)
+    estimate, verdict = pool([refused], SETTINGS)
+    assert estimate is None
+    assert not verdict.accepted
+    assert verdict.reasons
+
+
+def test_a_load_that_changed_between_the_windows_is_seen() -> None:
+    light = windows(0.003)[0]
+    heavy = windows(0.003, plant=bench.Plant(Jt=0.085))[0]
+    estimate, verdict = pool([analyse(light, SETTINGS), analyse(heavy, SETTINGS)], SETTINGS)
+    assert not verdict.accepted
+    assert [reason.code for reason in verdict.reasons] == ["LoadChanged"]
