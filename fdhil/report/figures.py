@@ -41,7 +41,7 @@ _STYLE = {
     "legend.frameon": False,
     "legend.fontsize": 8.5,
     "lines.linewidth": 1.3,
-    "svg.fonttype": "path",
+    "svg.fonttype": "none",
     "svg.hashsalt": "fdhil",
 }
 
@@ -63,8 +63,9 @@ def _drawing(width: float = 6.4, height: float = 3.6) -> Iterator[tuple[Figure, 
 
     svg: list[str] = []
     with rc_context(_STYLE):
-        figure = Figure(figsize=(width, height), layout="constrained")
-        yield figure, figure.subplots(), svg
+        figure = Figure(figsize=(width, height))
+        # fixed margins: matplotlib's own layout would draw every figure twice
+        yield figure, figure.add_axes((0.8 / width, 0.55 / height, 1 - 1.0 / width, 1 - 0.9 / height)), svg
         text = io.StringIO()
         figure.savefig(text, format="svg", metadata={"Date": None})
     body = text.getvalue()
@@ -85,7 +86,7 @@ def signals(window: Window) -> str:
         axes.plot(time_s, window.current_a, label="current (A)", color=COLOURS[2])
         axes.plot(time_s, window.speed_rad_s, label="speed (rad/s)", color=COLOURS[0])
         axes.set_xlabel("time (s)")
-        axes.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+        axes.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 0.98))
     return svg[0]
 
 
@@ -156,20 +157,34 @@ def path(reference_mm: Float, points: Mapping[str, tuple[float, float]]) -> str:
     return svg[0]
 
 
-def corner(curves: Sequence[Curve], centre_mm: tuple[float, float], half_width_mm: float) -> str:
-    """A place of the path enlarged (Figures 11-15, 17, 18, 20): reference grey, the others in colour."""
+def corner(curves: Sequence[Curve], place_mm: tuple[float, float], half_width_mm: float) -> str:
+    """A place of the path enlarged (Figures 11-15, 17, 18, 20): reference grey, the others in colour.
+
+    The NC rounds its corners by far more than the drives err, so the view is centred on the point of the reference (the
+    first curve) that is nearest to ``place_mm``.
+    """
+    reference = curves[0].path_mm
+    centre = reference[np.argmin(np.hypot(*(reference - np.asarray(place_mm)).T))]
     with _drawing(4.8, 3.6) as (_, axes, svg):
-        for k, curve in enumerate(curves):
+        for k, curve in enumerate(_near(curves, centre, 3 * half_width_mm)):
             colour, width = (REFERENCE, 2.2) if k == 0 else (COLOURS[(k - 1) % len(COLOURS)], 1.3)
             axes.plot(*curve.path_mm.T, color=colour, lw=width, ls="--" if curve.dashed else "-", label=curve.label)
-        x, y = centre_mm
+        x, y = centre
         axes.set_xlim(x - half_width_mm, x + half_width_mm)
         axes.set_ylim(y - 0.75 * half_width_mm, y + 0.75 * half_width_mm)
         axes.ticklabel_format(useOffset=False)
+        axes.locator_params(nbins=6)
         axes.set_xlabel("X (mm)")
         axes.set_ylabel("Y (mm)")
-        axes.legend(loc="best")
+        axes.legend(loc="upper left", bbox_to_anchor=(0.0, 1.1), ncols=3, columnspacing=1.2)
     return svg[0]
+
+
+def _near(curves: Sequence[Curve], centre_mm: Float, distance_mm: float) -> Iterator[Curve]:
+    """Blank what lies outside the view: a page with twenty whole paths would be large and slow."""
+    for curve in curves:
+        inside = np.all(np.abs(curve.path_mm - centre_mm) < distance_mm, axis=1, keepdims=True)
+        yield Curve(curve.label, np.where(inside, curve.path_mm, np.nan), curve.dashed)
 
 
 def contour_errors(time_s: Float, cases: Mapping[str, Float]) -> str:

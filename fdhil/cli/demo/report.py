@@ -204,7 +204,7 @@ def _predicted(loop: Loop) -> Section:
         curves = [Curve("desired", _xy(slow.position_mm))]
         curves += [Curve(feed, _xy(answer.predicted_mm)) for feed, answer in feeds.items()]
         caption = f"Predicted path at {place} for two feeds (Figure {number})"
-        pictures.append((caption, figures.corner(curves, POINTS[place], 0.5)))
+        pictures.append((caption, figures.corner(curves, POINTS[place], 1.0)))
     for (label, change), number in zip(DRIFTS, (14, 15), strict=True):
         drifted = predict(slow, models | {"X": _drift(models["X"], change)}, loop.config)
         curves = [
