@@ -126,6 +126,7 @@ class Drive:
         self.set_temperature(self._celsius)
         self._feedback.sample(self.tick)
         self._feedback.show_state()
+        self._trace.clear()
         return self._boot_up()
 
     def power_off(self) -> None:

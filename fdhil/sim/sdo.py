@@ -9,7 +9,7 @@ from __future__ import annotations
 import binascii
 from dataclasses import dataclass, field
 
-from fdhil.sim.dictionary import AbortCode, Dictionary, Entry, TransferAbort
+from fdhil.sim.dictionary import AbortCode, Dictionary, TransferAbort
 
 MAX_DOWNLOAD_BYTES = 1024  # no object that can be written is longer
 
@@ -25,7 +25,8 @@ class _Upload:
 
 @dataclass(slots=True)
 class _Download:
-    entry: Entry
+    index: int
+    sub: int
     size: int | None
     toggle: int = 0
     data: bytearray = field(default_factory=bytearray)
@@ -60,13 +61,9 @@ class SdoServer:
         if len(data) != 8:
             return []
         index, sub = int.from_bytes(data[1:3], "little"), data[3]
-        transfer = self._transfer
-        if transfer is not None and data[0] >> 5 in (0, 3, 5) and data[0] & 0xE3 != 0xA0:
-            index, sub = (
-                (transfer.entry.index, transfer.entry.sub)
-                if isinstance(transfer, _Download)
-                else (transfer.index, transfer.sub)
-            )
+        goes_on = data[0] >> 5 in (0, 3, 5) and data[0] & 0xE3 != 0xA0
+        if goes_on and self._transfer is not None:  # such a request does not repeat what it is about
+            index, sub = self._transfer.index, self._transfer.sub
         try:
             return self._dispatch(data, index, sub)
         except TransferAbort as abort:
@@ -125,7 +122,7 @@ class SdoServer:
             size = int.from_bytes(data[4:8], "little") if sized else None
             if size is not None and (size > MAX_DOWNLOAD_BYTES or (entry.size is not None and size != entry.size)):
                 raise TransferAbort(AbortCode.LENGTH)
-            self._transfer = _Download(entry, size)
+            self._transfer = _Download(index, sub, size)
         return [_head(0x60, index, sub) + bytes(4)]
 
     def _download_segment(self, data: bytes) -> list[bytes]:
@@ -143,7 +140,7 @@ class SdoServer:
             raise TransferAbort(AbortCode.LENGTH)
         if last:
             self._transfer = None
-            self._dictionary.write(transfer.entry.index, transfer.entry.sub, bytes(transfer.data))
+            self._dictionary.write(transfer.index, transfer.sub, bytes(transfer.data))
         return [bytes([0x20 | toggle << 4]) + bytes(7)]
 
     def _block_upload(self, data: bytes, index: int, sub: int) -> list[bytes]:
@@ -170,8 +167,10 @@ class SdoServer:
             raise TransferAbort(AbortCode.BLOCK_SIZE)
         if 0 < len(value) <= data[5]:  # the protocol switch threshold: shorter objects go by the plain transfer
             return self._initiate_upload(index, sub)
-        self._transfer = _BlockUpload(index, sub, value, data[4], with_crc=bool(data[0] & 4))
-        return [_head(0xC6, index, sub) + len(value).to_bytes(4, "little")]
+        # a client that asks for no CRC may still check one that is offered: offer it on request alone
+        with_crc = bool(data[0] & 4)
+        self._transfer = _BlockUpload(index, sub, value, data[4], with_crc)
+        return [_head(0xC2 | with_crc << 2, index, sub) + len(value).to_bytes(4, "little")]
 
     def _block(self, transfer: _BlockUpload) -> list[bytes]:
         """Return the segments of the next block, each with its sequence number, the very last one marked."""

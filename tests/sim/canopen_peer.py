@@ -1,0 +1,76 @@
+"""The `canopen` library as the drive's peer: in one thread for speed, or over python-can's virtual bus."""
+
+from __future__ import annotations
+
+import io
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import can
+import canopen
+
+from fdhil.sim.drive import Drive, Frame
+from fdhil.sim.eds import eds_text
+
+
+class DirectBus(can.BusABC):
+    """A python-can bus without a wire: what is sent is answered before `send` returns."""
+
+    def __init__(self, drive: Drive) -> None:
+        super().__init__("direct")
+        self._is_shutdown = True  # there is nothing to shut down, and no need to be told so
+        self.drive = drive
+        self.network: canopen.Network | None = None
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        self.deliver(self.drive.receive(msg.arbitration_id, bytes(msg.data)))
+
+    def deliver(self, frames: list[Frame]) -> None:
+        assert self.network is not None
+        for can_id, data in frames:
+            self.network.notify(can_id, bytearray(data), 0.0)
+
+
+def dictionary(drive: Drive) -> canopen.ObjectDictionary:
+    """The object dictionary that `canopen` reads from the drive's own EDS."""
+    source = io.StringIO(eds_text(drive))
+    source.name = "drive.eds"
+    return canopen.import_od(source, drive.node_id)
+
+
+def direct(drive: Drive) -> tuple[canopen.RemoteNode, DirectBus]:
+    """A remote node wired to a drive in the same thread."""
+    bus = DirectBus(drive)
+    network = canopen.Network(bus=bus)
+    bus.network = network
+    return network.add_node(drive.node_id, dictionary(drive)), bus
+
+
+@contextmanager
+def over_virtual_bus(drive: Drive) -> Iterator[canopen.RemoteNode]:
+    """A remote node on a virtual CAN bus; a thread plays the drive's side of it."""
+    channel = f"drive-{id(drive)}"
+    wire = can.Bus(interface="virtual", channel=channel)
+    running = threading.Event()
+    running.set()
+
+    def serve() -> None:
+        while running.is_set():
+            message = wire.recv(timeout=0.05)
+            if message is None:
+                continue
+            for can_id, data in drive.receive(message.arbitration_id, bytes(message.data)):
+                wire.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+
+    thread = threading.Thread(target=serve, name="drive")
+    thread.start()
+    network = canopen.Network()
+    network.connect(interface="virtual", channel=channel)
+    try:
+        yield network.add_node(drive.node_id, dictionary(drive))
+    finally:
+        network.disconnect()
+        running.clear()
+        thread.join()
+        wire.shutdown()

@@ -1,0 +1,97 @@
+"""A drive on the test's bench: raw frames in and out, no thread, no clock."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from fdhil import config
+from fdhil.sim.drive import Drive, Frame
+from tests.bench import bench_document
+
+NO_NOISE = {"voltage_v": 0.0, "current_a": 0.0, "speed_rad_s": 0.0}
+
+
+class Abort(Exception):
+    """The server aborted with this code."""
+
+    def __init__(self, code: int) -> None:
+        self.code = code
+        super().__init__(f"{code:08X}")
+
+
+def machine(axes: str = "X", noise: bool = False, **sim_axis: Any) -> config.MachineConfig:
+    """The bench with its twin's peculiarities; silent sensors unless ``noise``."""
+    document = bench_document(axes)
+    document["sim"] = {"axis": {axes[0]: sim_axis}} | ({} if noise else {"noise": NO_NOISE})
+    return config.parse(document)
+
+
+class Rig:
+    """One drive and the frames it sent; ``drive`` is powered on."""
+
+    def __init__(self, machine_config: config.MachineConfig | None = None, axis: str = "X", seed: int = 1) -> None:
+        self.drive = Drive(axis, machine_config or machine(), np.random.default_rng(seed))
+        self.node = self.drive.node_id
+        self.boot = self.drive.power_on()
+
+    def send(self, can_id: int, data: bytes) -> list[Frame]:
+        return self.drive.receive(can_id, data)
+
+    def nmt(self, command: int) -> list[Frame]:
+        return self.send(0x000, bytes([command, self.node]))
+
+    def write(self, index: int, sub: int, value: int, size: int) -> None:
+        """Expedited download."""
+        data = value.to_bytes(size, "little", signed=value < 0).ljust(4, b"\0")
+        self.sdo(bytes([0x23 | (4 - size) << 2]) + struct.pack("<HB", index, sub) + data)
+
+    def read(self, index: int, sub: int = 0, *, signed: bool = False) -> int:
+        """Expedited upload."""
+        answer = self.sdo(bytes([0x40]) + struct.pack("<HB", index, sub) + bytes(4))
+        return int.from_bytes(answer[4 : 8 - (answer[0] >> 2 & 3)], "little", signed=signed)
+
+    def sdo(self, request: bytes) -> bytes:
+        (answer,) = [data for can_id, data in self.send(0x600 + self.node, request) if can_id == 0x580 + self.node]
+        if answer[0] == 0x80:
+            raise Abort(int.from_bytes(answer[4:8], "little"))
+        return answer
+
+    def sync(self, data: bytes = b"") -> list[Frame]:
+        return self.send(0x080, data)
+
+    def cycle(self, target: int, offset: int | None = None, word: int = 0x0F) -> list[Frame]:
+        """One SYNC with its RPDOs in time."""
+        self.send(0x200 + self.node, struct.pack("<Hi", word, target))
+        if offset is not None:
+            self.send(0x300 + self.node, struct.pack("<i", offset))
+        return self.sync()
+
+    def enable(self, target: int = 0, mode: int = 8) -> None:
+        """NMT start, mode, 06 07 0F, and enough cycles for the delay to be over."""
+        self.nmt(0x01)
+        self.write(0x6060, 0, mode, 1)
+        for word in (0x06, 0x07, 0x0F, 0x0F, 0x0F, 0x0F):
+            self.cycle(target, word=word)
+
+    def follow(
+        self, targets: Iterable[int], offsets: Iterable[int] | None = None
+    ) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """Give one target per SYNC; return the true table position (n,) in mm at those SYNCs."""
+        positions = []
+        for target, offset in zip(targets, offsets if offsets is not None else _nothing(), strict=False):
+            self.cycle(target, offset)
+            positions.append(self.drive.table_mm)
+        return np.array(positions)
+
+    @property
+    def status(self) -> int:
+        return self.drive.dictionary.number(0x6041)
+
+
+def _nothing() -> Iterable[None]:
+    while True:
+        yield None
