@@ -62,10 +62,10 @@ class Alarm:
         """What the operator does next."""
         return CATALOGUE[self.code][2]
 
-    @property
-    def text(self) -> str:
-        """One sentence: what happened, what it means for the machine, what to do next."""
-        return f"{self.cause}; {EFFECT[self.reaction]}; {self.action}"
+    def sentence(self, off: bool = False) -> str:
+        """What happened, what it means for the machine (``off``: nothing is applied any more), what to do next."""
+        effect = "the correction is off and nothing is applied" if off else EFFECT[self.reaction]
+        return f"{self.cause}; {effect}; {self.action}"
 
 
 _R, _H, _F, _N = Reaction.RAMP_DOWN, Reaction.HOLD, Reaction.FREEZE, Reaction.REFUSE

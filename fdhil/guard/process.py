@@ -150,7 +150,7 @@ class Guard:
     def _local_timer(self) -> None:
         """Without SYNC for too long the core steps on the wall clock: it freezes, or ramps an event-driven RPDO."""
         now_s = time.monotonic()
-        if now_s - self._last_sync_s <= self.settings.silence_s:
+        if now_s - self._last_sync_s <= self.settings.silence_s or self._frames_wait():
             return
         if not self._silent:
             self._silent = True
@@ -158,6 +158,14 @@ class Guard:
         busy = self.state.mode in SENDING or self._requests
         if busy and now_s - self._stepped_s >= self.settings.sync_period_s:
             self._step(sync=False, late=False, now_s=now_s, silent=True)
+
+    def _frames_wait(self) -> bool:
+        """Whether it was this process that slept, and not the bus: then its frames are waiting."""
+        if self._listener.bus_state == "down":
+            return False
+        poll = select.poll()
+        poll.register(self._can, select.POLLIN)
+        return bool(poll.poll(0))
 
     def _step(self, sync: bool, late: bool, now_s: float, silent: bool) -> None:
         axes, bus = self._listener.in_silence(now_s, silent)
@@ -205,7 +213,9 @@ class Guard:
         return sent
 
     def _tell(self, before: Mode, mode: Mode, cause: Alarm | None) -> None:
-        told = {} if cause is None else {"code": cause.code, "axis": cause.axis, "text": cause.text}
+        told = (
+            {} if cause is None else {"code": cause.code, "axis": cause.axis, "text": cause.sentence(mode is Mode.OFF)}
+        )
         self._journal.write(
             "state",
             before=before.value,
@@ -215,7 +225,7 @@ class Guard:
             missed=self.state.missed,
             **told,
         )
-        self._notifier.tell(f"STATUS={mode.value}" + (f": {cause.text}" if cause else ""))
+        self._notifier.tell(f"STATUS={mode.value}" + (f": {cause.cause}" if cause else ""))
 
     def _offsets_um(self) -> dict[str, float]:
         """What is applied per axis as far as is known, in the axis' direction."""

@@ -1,0 +1,191 @@
+"""A socketcand hub with the machine behind it, in a thread: it paces SYNC and waits for nobody unless told to."""
+
+from __future__ import annotations
+
+import select
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from tests.guard.machine import Drive, Frame
+
+
+def encode(frames: list[Frame]) -> bytes:
+    """Frames as a socketcand server sends them."""
+    return b"".join(f"< frame {i:03X} {time.time():.6f} {d.hex()} >".encode() for i, d in frames)
+
+
+class Peer(threading.Thread):
+    """One client is the guard; ``sent`` lists (SYNC count, COB-ID, data) of everything it put on the bus.
+
+    Each cycle: SYNC, the drives' TPDOs, then the NC's targets; when ``lockstep`` the next SYNC waits for the offset
+    frames of the guard. ``row`` runs over ``demand`` while ``playing``.
+    """
+
+    def __init__(self, demand: list[list[int]], period_s: float = 0.001) -> None:
+        super().__init__(daemon=True)
+        self.demand, self.period_s = demand, period_s
+        self.drives = [Drive(k + 1) for k in range(len(demand))]
+        self.sent: list[tuple[int, int, bytes]] = []
+        self.latched: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
+        self.tick = self.row = 0
+        self.playing = self.lockstep = False
+        self.syncing = True
+        self.ended = threading.Event()
+        self._inbox = b""
+        self._offset_frames = 0
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.port: int = self._server.getsockname()[1]
+        self._client: socket.socket | None = None
+        self._lock = threading.Lock()
+
+    def run(self) -> None:
+        self._server.settimeout(0.05)
+        while not self.ended.is_set():
+            if self._client is None:
+                self._accept()
+            elif self.syncing:
+                self._cycle()
+            else:
+                self._listen(self.period_s)
+        for each in (self._client, self._server):
+            if each is not None:
+                each.close()
+
+    def _accept(self) -> None:
+        try:
+            client, _ = self._server.accept()
+        except TimeoutError:
+            return
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        client.sendall(b"< hi >")
+        for command in (b"< open can0 >", b"< rawmode >"):
+            got = b""
+            while not got.endswith(b">"):
+                got += client.recv(1)
+            assert got == command
+            client.sendall(b"< ok >")
+        self._client = client
+
+    def inject(self, *frames: Frame) -> None:
+        """Put frames of another node on the bus."""
+        with self._lock:
+            assert self._client is not None
+            self._client.sendall(encode(list(frames)))
+
+    def _cycle(self) -> None:
+        self.tick += 1
+        sampled = [frame for drive in self.drives for frame in drive.at_sync(self.tick)]
+        self.latched.append((self.tick, tuple(d.target for d in self.drives), tuple(d.offset for d in self.drives)))
+        last = len(self.demand[0]) - 1
+        targets = [column[min(self.row, last)] for column in self.demand]
+        streamed = []
+        for drive, target in zip(self.drives, targets, strict=True):
+            drive.received_target = target
+            streamed.append((0x200 + drive.node_id, b"\x0f\x00" + target.to_bytes(4, "little", signed=True)))
+        self.row += self.playing
+        sync = (0x080, bytes([(self.tick - 1) % 240 + 1]))
+        self._transmit(encode([sync, *sampled, *streamed]))
+        before = self._offset_frames
+        lockstep = self.lockstep
+        deadline_s = time.monotonic() + (1.0 if lockstep else self.period_s)
+        while time.monotonic() < deadline_s and not self.ended.is_set():
+            if lockstep and self._offset_frames - before >= len(self.drives):
+                return
+            self._listen(max(0.0, deadline_s - time.monotonic()))
+
+    def _transmit(self, text: bytes) -> None:
+        assert self._client is not None
+        try:
+            with self._lock:
+                self._client.sendall(text)
+        except OSError:
+            self._client.close()
+            self._client = None
+
+    def _listen(self, wait_s: float) -> None:
+        if self._client is None or not select.select([self._client], [], [], wait_s)[0]:
+            return
+        try:
+            chunk = self._client.recv(4096)
+        except OSError:
+            chunk = b""
+        if not chunk:
+            self._client.close()
+            self._client = None
+            return
+        *commands, self._inbox = (self._inbox + chunk).split(b">")
+        for command in commands:
+            words = command.split()
+            assert words[:2] == [b"<", b"send"], command
+            cob_id, data = int(words[2], 16), bytes(int(word, 16) for word in words[4:])
+            assert len(data) == int(words[3], 16)
+            self.sent.append((self.tick, cob_id, data))
+            for drive in self.drives:
+                if cob_id == 0x300 + drive.node_id:
+                    self._offset_frames += 1
+                    drive.received_offset = int.from_bytes(data, "little", signed=True)
+
+    def offsets_sent(self, node: int = 1) -> list[tuple[int, int]]:
+        """(SYNC count, increments) of the offset frames to one node."""
+        return [(k, int.from_bytes(d, "little", signed=True)) for k, i, d in list(self.sent) if i == 0x300 + node]
+
+    def wait(self, condition: Callable[[], bool], what: str, limit_s: float = 20.0) -> None:
+        """Wait until something has come about."""
+        deadline_s = time.monotonic() + limit_s
+        while not condition():
+            assert time.monotonic() < deadline_s, f"{what} did not come about"
+            time.sleep(0.002)
+
+
+MACHINE = """
+[machine]
+name = "bench"
+sync_period_s = 0.001
+{axes}
+[bus.can0]
+interface = "socketcand"
+host = "127.0.0.1"
+port = {port}
+[guard]
+clock = "{clock}"
+"""
+AXIS = """
+[axis.{name}]
+screw_pitch_mm = 20.0
+rapid_speed_mm_s = 500.0
+max_acceleration_mm_s2 = 4000.0
+[axis.{name}.nominal]
+R = 0.5
+L = 0.005
+K = 0.8
+Jt = 0.075
+ft = 0.05
+Cd = 5.0
+[axis.{name}.regulators]
+position_gain_per_s = 50.0
+speed_kp = 23.562
+speed_ki = 1184.35
+current_limit_a = 200.0
+current_kp = 12.566
+current_ki = 1256.64
+voltage_limit_v = 300.0
+{correction}
+"""
+CORRECTION = """[axis.{name}.correction]
+max_offset_um = 250.0
+max_speed_mm_s = 20.0
+max_acceleration_mm_s2 = 2000.0
+"""
+
+
+def write_config(folder: Path, port: int, clock: str = "sync", axes: str = "XY", corrected: bool = True) -> Path:
+    """A machine config of the bench whose bus is on ``port``."""
+    text = "".join(
+        AXIS.format(name=name, correction=CORRECTION.format(name=name) if corrected else "") for name in axes
+    )
+    file = folder / "machine.toml"
+    file.write_text(MACHINE.format(axes=text, port=port, clock=clock), "utf-8")
+    return file

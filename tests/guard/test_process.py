@@ -1,0 +1,244 @@
+"""The guard as a process, on a hub of the socketcand protocol with a machine behind it."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fdhil import config as machine_config
+from fdhil.cli.guard import open_bus, settings_of
+from fdhil.guard.client import GuardClient, GuardLost
+from fdhil.guard.settings import to_json
+from tests.guard.machine import DIGEST, FACTS_GIVEN, LIMITS, smooth_path
+from tests.guard.peer import Peer, write_config
+
+DEMAND, OFFSET = smooth_path(rows=800)
+TOKEN = "the operator's"
+
+
+class Rig:
+    """Peer, guard process and a daemon's client that says it is alive."""
+
+    def __init__(self, folder: Path, clock: str = "sync") -> None:
+        self.peer = Peer(DEMAND)
+        self.peer.start()
+        self.config = machine_config.load(write_config(folder, self.peer.port, clock))
+        self.run_directory = folder
+        self.settings = folder / "guard.json"
+        token = hashlib.sha256(TOKEN.encode()).hexdigest()
+        self.settings.write_text(to_json(settings_of(self.config, "can0", folder, token)))
+        self.journal = (folder / "journal").open("w+")
+        self.process = self.start()
+        self.client: GuardClient | None = None
+        self.alive = threading.Event()
+        self._ended = threading.Event()
+        self._keeper = threading.Thread(target=self._keep_alive, daemon=True)
+
+    def start(self) -> subprocess.Popen[bytes]:
+        """Start a guard on a descriptor of its own, as fdhil-guard does by exec."""
+        with open_bus("can0", self.config.bus["can0"]) as bus:
+            arguments = ["--settings", str(self.settings), "--descriptor", str(bus.fileno())]
+            return subprocess.Popen(
+                [sys.executable, "-m", "fdhil.guard", *arguments],
+                stdout=self.journal,
+                stderr=subprocess.PIPE,
+                pass_fds=[bus.fileno()],
+            )
+
+    def connect(self) -> GuardClient:
+        self.peer.wait(lambda: any(e["event"] == "ready" for e in self.events()), "the guard")
+        self.client = GuardClient(self.run_directory, timeout_s=20.0)
+        self.alive.set()
+        self._keeper.start()
+        return self.client
+
+    def _keep_alive(self) -> None:
+        assert self.client is not None
+        while not self._ended.wait(0.05):
+            if self.alive.is_set():
+                try:
+                    self.client.alive()
+                except GuardLost:
+                    return
+
+    def arm(self, amplitude: float = 1.0) -> None:
+        client = self.client or self.connect()
+        demand = dict(zip("XY", DEMAND, strict=True))
+        offset = {axis: [round(amplitude * v) for v in column] for axis, column in zip("XY", OFFSET, strict=True)}
+        answer = client.load("XY", demand, offset, DIGEST)
+        assert answer["ok"], answer
+        self.peer.wait(lambda: client.status()["good_for"] > 100, "good interlocks")
+        answer = client.arm(TOKEN, DIGEST, FACTS_GIVEN)
+        assert answer["ok"], answer
+        self.peer.wait(lambda: len(self.peer.offsets_sent()) > 30, "zeros")
+
+    def state(self) -> str:
+        assert self.client is not None
+        return str(self.client.status()["state"])
+
+    def into_the_cut(self) -> None:
+        """Armed, playing in lockstep, well into the bump of the offset."""
+        self.arm()
+        self.peer.playing = self.peer.lockstep = True
+        self.peer.wait(lambda: self.peer.row > 330, "the path")
+
+    def events(self) -> list[dict[str, object]]:
+        self.journal.seek(0)
+        return [json.loads(line) for line in self.journal.read().splitlines()]
+
+    def close(self) -> None:
+        self._ended.set()
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGCONT)
+            self.process.kill()
+        self.process.communicate()
+        self.peer.ended.set()
+        self.peer.join()
+        if self.client is not None:
+            self._keeper.join()
+            self.client.close()
+        self.journal.close()
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    made = Rig(tmp_path)
+    yield made
+    made.close()
+
+
+def check_limits(rig: Rig) -> None:
+    """No frame breaks a limit against the one before it; a cycle that the guard missed stops the offset at once."""
+    missed = max([int(str(event["missed"])) for event in rig.events() if event["event"] == "state"], default=0)
+    for node in (1, 2):
+        values = [0, 0, *[offset for _, offset in rig.peer.offsets_sent(node)]]
+        rates = [b - a for a, b in itertools.pairwise(values)]
+        assert max(map(abs, values)) <= LIMITS.offset
+        assert max(map(abs, rates)) <= LIMITS.hard_rate
+        assert sum(abs(b - a) > LIMITS.hard_acceleration for a, b in itertools.pairwise(rates)) <= missed
+
+
+def test_mute_by_default_then_aligned_to_the_cycle_then_off(rig: Rig) -> None:
+    client = rig.connect()
+    rig.peer.wait(lambda: client.status()["good_for"] > 200, "SYNC")
+    assert rig.peer.sent == []
+    rig.arm()
+    rig.peer.playing = rig.peer.lockstep = True
+    rig.peer.wait(lambda: rig.peer.row > 780, "the path")
+    rig.peer.lockstep = False
+    rig.peer.wait(lambda: rig.state() == "OFF", "the end")
+    rows = {target: k for k, target in enumerate(DEMAND[0])}
+    moving = [(t, o) for _, t, o in rig.peer.latched if DEMAND[0][50] < t[0] < DEMAND[0][-50]]
+    assert len(moving) > 600
+    assert [o for _, o in moving] == [(OFFSET[0][rows[t[0]]], OFFSET[1][rows[t[0]]]) for t, _ in moving]
+    check_limits(rig)
+    assert client.status()["cause"]["code"] == "Finished", "\n".join(map(str, rig.events()))
+    count = len(rig.peer.sent)
+    ticks = rig.peer.tick
+    rig.peer.wait(lambda: rig.peer.tick > ticks + 50, "SYNC")
+    assert len(rig.peer.sent) == count
+    assert {i for _, i, _ in rig.peer.sent} == {0x301, 0x302, 0x764}
+
+
+def test_disarm_ramps_down(rig: Rig) -> None:
+    rig.into_the_cut()
+    assert rig.client is not None
+    assert abs(rig.peer.offsets_sent()[-1][1]) > 100
+    assert rig.client.disarm()["ok"]
+    rig.peer.lockstep = False
+    rig.peer.wait(lambda: rig.state() == "OFF", "off")
+    assert rig.peer.offsets_sent()[-1][1] == 0
+    check_limits(rig)
+
+
+def test_sigterm_ramps_down_and_exits_0(rig: Rig) -> None:
+    rig.into_the_cut()
+    rig.process.send_signal(signal.SIGTERM)
+    rig.peer.lockstep = False
+    assert rig.process.wait(20) == 0
+    assert rig.peer.offsets_sent()[-1][1] == 0
+    check_limits(rig)
+    last = rig.events()[-1]
+    assert (last["event"], last["state"], last["offset_um"]) == ("stopped", "OFF", {"X": 0.0, "Y": 0.0})
+
+
+@pytest.mark.parametrize("how", ["closes", "falls silent"])
+def test_lost_daemon_ramps_down(rig: Rig, how: str) -> None:
+    rig.into_the_cut()
+    assert rig.client is not None
+    rig.alive.clear()
+    rig.peer.lockstep = False
+    rig.peer.period_s = 0.01
+    if how == "closes":
+        rig.client.close()
+    rig.peer.wait(lambda: any(e.get("code") == "MainLost" for e in rig.events()), "MainLost")
+    rig.peer.period_s = 0.001
+    rig.peer.wait(lambda: any(e.get("state") == "OFF" for e in rig.events()), "off")
+    assert rig.peer.offsets_sent()[-1][1] == 0
+    check_limits(rig)
+
+
+def test_lost_sync_freezes_and_adopting_brings_it_to_zero(rig: Rig) -> None:
+    rig.into_the_cut()
+    assert rig.client is not None
+    rig.peer.lockstep = rig.peer.playing = rig.peer.syncing = False
+    rig.peer.wait(lambda: rig.state() == "FROZEN", "frozen")
+    count = len(rig.peer.sent)
+    held = rig.peer.offsets_sent()[-1][1]
+    time.sleep(0.1)
+    assert len(rig.peer.sent) == count
+    assert rig.client.status()["cause"]["code"] == "SyncLost"
+    assert rig.client.adopt(TOKEN)["code"] == "SyncLost"
+    rig.peer.syncing = True
+    rig.peer.wait(lambda: rig.client is not None and rig.client.adopt(TOKEN)["ok"], "adoption")
+    rig.peer.wait(lambda: rig.state() == "OFF", "off")
+    assert rig.peer.offsets_sent()[-1][1] == 0
+    assert held != 0
+    check_limits(rig)
+
+
+def test_stopped_process_sends_nothing(rig: Rig) -> None:
+    rig.into_the_cut()
+    rig.peer.lockstep = False
+    rig.process.send_signal(signal.SIGSTOP)
+    os.waitid(os.P_PID, rig.process.pid, os.WSTOPPED | os.WNOWAIT)
+    time.sleep(0.02)
+    count, tick = len(rig.peer.sent), rig.peer.tick
+    rig.peer.wait(lambda: rig.peer.tick > tick + 200, "SYNC")
+    assert len(rig.peer.sent) == count
+    rig.process.send_signal(signal.SIGCONT)
+    rig.peer.wait(lambda: rig.state() == "OFF", "off")
+    assert rig.client is not None
+    assert rig.client.status()["cause"]["code"] in ("LoopOverrun", "MainLost")
+    check_limits(rig)
+
+
+def test_killed_guard_leaves_a_value_that_the_next_one_adopts(rig: Rig) -> None:
+    rig.into_the_cut()
+    rig.process.kill()
+    rig.process.wait()
+    rig.peer.lockstep = rig.peer.playing = False
+    held = rig.peer.drives[0].offset
+    assert held != 0
+    count = len(rig.peer.offsets_sent())
+    again = rig.start()
+    try:
+        rig.peer.wait(lambda: len(rig.peer.offsets_sent()) > count and rig.peer.drives[0].offset == 0, "adoption")
+        values = [offset for _, offset in rig.peer.offsets_sent()[count:]]
+        assert abs(values[0] - held) <= LIMITS.rate
+        check_limits(rig)
+    finally:
+        again.terminate()
+        assert again.wait(20) == 0
+        again.communicate()
