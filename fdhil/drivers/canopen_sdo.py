@@ -8,6 +8,7 @@ is read twice: two equal answers, or an error.
 from __future__ import annotations
 
 import logging
+import operator
 import queue
 import time
 from typing import Any
@@ -81,14 +82,12 @@ class SdoLink:
     def write_int(self, index: int, sub: int, value: int, length: int) -> None:
         """Write an integer of ``length`` bytes; after a time-out the object tells whether it arrived.
 
-        ValueError when ``value`` is no integer or does not fit.
+        TypeError when ``value`` is no integer, ValueError when it does not fit.
         """
-        if not isinstance(value, int) or isinstance(value, bool):  # the library would cut 1.7 to 1 without a word
-            raise ValueError(f"{value!r} is no integer")
-        fits = -(1 << 8 * length - 1) <= value < 1 << 8 * length
-        if not fits:
-            raise ValueError(f"{value} does not fit {length} bytes")
-        data = (value & (1 << 8 * length) - 1).to_bytes(length, "little")
+        number = operator.index(value)  # the library would cut 1.7 to 1 without a word
+        if not -(1 << 8 * length - 1) <= number < 1 << 8 * length:
+            raise ValueError(f"{number} does not fit {length} bytes")
+        data = (number & (1 << 8 * length) - 1).to_bytes(length, "little")
         try:
             self._guarded(index, sub, lambda: self._client.download(index, sub, data))
         except DeviceTimeout:

@@ -42,9 +42,9 @@ def read_optional(master: Master, index: int, sub: int = 0, *, signed: bool = Fa
         raise
 
 
-def listen(master: Master, seconds: float = LISTEN_S) -> None:
-    """Listen without sending: a silent bus is no bus to send on, and with an NC on it we are not its master."""
-    end = master.now() + seconds
+def listen(master: Master) -> None:
+    """Listen for ``LISTEN_S`` without sending: on a silent bus nothing is sent, and beside an NC we are not the master."""
+    end = master.now() + LISTEN_S
     while master.now() < end and master.heard.sync == 0:
         master.check()
         master.pause(0.01)

@@ -1,0 +1,247 @@
+"""Commissioning against a simulated drive: a good one is signed off, every wrong set-up is refused with its reason."""
+
+from __future__ import annotations
+
+import json
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from fdhil.cia402 import Object, State
+from fdhil.config import MachineConfig
+from fdhil.drivers import canopen_sdo, commissioning, commissioning_checks
+from fdhil.drivers.commissioning import (
+    CommissioningRecord,
+    check_axis,
+    commission,
+    enable,
+    feedforward_test,
+    load_record,
+    prepare,
+    record_path,
+    rolled_back,
+    save_record,
+    sign_test,
+    watchdog_test,
+)
+from fdhil.drivers.commissioning_master import Master
+from fdhil.errors import ConnectError, DeviceError, DriveFault, ProtocolError, StoreError
+from tests.drivers.peer import DrivePeer
+from tests.drivers.wire import machine
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorter waits than on a real machine; the simulated drive settles sooner."""
+    monkeypatch.setattr(commissioning_checks, "LISTEN_S", 0.25)
+    monkeypatch.setattr(canopen_sdo, "QUIET_S", 0.1)
+    monkeypatch.setattr(canopen_sdo, "RESPONSE_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(commissioning, "SETTLE_CYCLES", 120)
+    monkeypatch.setattr(commissioning, "AVERAGE_CYCLES", 60)
+
+
+def config(**sections: Any) -> MachineConfig:
+    return machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex}, **sections)
+
+
+@pytest.fixture
+def peer() -> Iterator[tuple[DrivePeer, MachineConfig]]:
+    settings = config()
+    with DrivePeer(settings) as running:
+        yield running, settings
+
+
+def test_a_good_drive_is_signed_off_and_left_as_it_was(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    consumers = [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)]
+    steps: list[str] = []
+    record = commission(settings, "X", steps.append)
+    assert record.offset_in_feedforward is True
+    assert record.watchdog == "proven"
+    assert record.sign_test_um == pytest.approx(10.0, abs=3.0)
+    assert record.options == {"6007": 1, "605A": 2, "605E": 2, "6065": 32768, "6085": 26214400}
+    assert record.serial == 1001
+    assert record.following_error_window_um == 10_000.0
+    assert steps[0] == "listen"
+    assert steps[-1] == "restore"
+    assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
+    assert drive.drive.nmt == 0x7F
+    assert drive.drive.dictionary.number(0x60B0) == 0
+    assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == consumers
+
+
+def test_an_offset_kept_out_of_the_feedforward_is_noticed() -> None:
+    settings = config(sim={"axis": {"X": {"offset_in_feedforward": False}}})
+    with DrivePeer(settings), Master(settings, "X") as master, rolled_back(master):
+        prepare(master)
+        enable(master)
+        assert feedforward_test(master) is False
+
+
+def test_a_drive_that_counts_against_the_axis_passes() -> None:
+    settings = config(drive={"sign": -1})
+    with DrivePeer(settings), Master(settings, "X") as master, rolled_back(master):
+        check_axis(master)
+        prepare(master)
+        enable(master)
+        assert sign_test(master) == pytest.approx(10.0, abs=3.0)
+
+
+def run_steps(master: Master, last: Callable[[Master], object]) -> None:
+    with rolled_back(master):
+        prepare(master)
+        enable(master)
+        last(master)
+
+
+WRONG: dict[str, tuple[Callable[[DrivePeer], None], str]] = {
+    "goes on without communication": (lambda p: p.drive.set_object(0x6007, 0, 0), "0x6007 is 0"),
+    "disables voltage instead": (lambda p: p.drive.set_object(0x6007, 0, 2), "0x6007 is 2"),
+    "coasts": (lambda p: p.drive.set_object(0x605E, 0, 0), "coasts"),
+    "quick stop coasts": (lambda p: p.drive.set_object(0x605A, 0, 0), "coasts"),
+    "window off": (lambda p: p.drive.set_object(0x6065, 0, 0xFFFFFFFF), "0x6065 is off"),
+    "window zero": (lambda p: p.drive.set_object(0x6065, 0, 0), "0x6065 is off"),
+    "window too small": (lambda p: p.drive.set_object(0x6065, 0, 300), "too small"),
+    "gear x 10": (lambda p: p.drive.set_object(0x6091, 1, 10), "counts 6553.6 per motor revolution"),
+    "feed x 10": (lambda p: p.drive.set_object(0x6092, 1, 655360), "counts 655360 per motor revolution"),
+    "mapping": (
+        lambda p: p.drive.remap(0x1A01, [(0x6041, 0, 16), (0x2101, 0, 16), (0x6078, 0, 16)]),
+        "TPDO2 maps 60410010, 21010010, 60780010",
+    ),
+    "transmission type": (lambda p: p.drive.set_object(0x1800, 2, 255), "TPDO1 has transmission type 255"),
+    "COB-ID": (lambda p: p.drive.set_object(0x1401, 1, 0x305), "RPDO2 has the COB-ID 00000305"),
+    "PDO switched off": (lambda p: p.drive.set_object(0x1401, 1, 0x80000301), "RPDO2 has the COB-ID 80000301"),
+    "rated current": (lambda p: p.drive.set_object(0x6075, 0, 10_000), "rated current is 10 A"),
+    "no CSP": (lambda p: p.drive.set_object(0x6502, 0, 1), "no cyclic synchronous position"),
+    "other period": (lambda p: p.drive.set_object(0x60C2, 1, 2), "interpolates over 2 ms"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_a_wrong_set_up_is_refused_before_anything_moves(what: str, peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    spoil, says = WRONG[what]
+    spoil(drive)
+    with Master(settings, "X") as master, pytest.raises(DeviceError) as caught:
+        check_axis(master)
+    assert says in str(caught.value)
+    assert not {0x000, 0x080, 0x201, 0x301} & set(drive.heard)
+
+
+def offset_doubled(peer: DrivePeer) -> None:
+    peer.drive.faults.offset_scale = 2.0
+
+
+def offset_negated(peer: DrivePeer) -> None:
+    peer.drive.faults.offset_scale = -1.0
+
+
+def offset_lost(peer: DrivePeer) -> None:
+    peer.drive.faults.ignore_offset = True
+
+
+def not_csp(peer: DrivePeer) -> None:
+    peer.drive.faults.not_csp = True
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (offset_doubled, "does not add 0x60B0"),
+        (offset_negated, "does not add 0x60B0"),
+        (offset_lost, "0x60B0 holds 0"),
+        (not_csp, "does not take the mode"),
+    ],
+)
+def test_a_drive_that_takes_offsets_otherwise_is_refused_and_disabled(
+    spoil: Callable[[DrivePeer], None], says: str, peer: tuple[DrivePeer, MachineConfig]
+) -> None:
+    drive, settings = peer
+    spoil(drive)
+    with Master(settings, "X") as master, pytest.raises(DeviceError) as caught:
+        run_steps(master, sign_test)
+    assert says in str(caught.value)
+    assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
+    assert drive.drive.dictionary.number(0x60B0) == 0
+
+
+def test_a_watchdog_that_does_nothing_is_refused(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    drive.drive.faults.no_heartbeat_consumer = True
+    with Master(settings, "X") as master, pytest.raises(DriveFault, match="watchdog does not work"):
+        run_steps(master, watchdog_test)
+    assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
+
+
+def test_full_heartbeat_consumers_are_refused(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    for sub in (1, 2, 3, 4):
+        drive.drive.set_object(0x1016, sub, (10 + sub) << 16 | 500)
+    with Master(settings, "X") as master, pytest.raises(DriveFault, match="all entries of 0x1016 are taken"):
+        watchdog_test(master)
+
+
+def test_an_nc_on_the_bus_is_left_alone(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as nc, Master(settings, "X") as master:
+        nc.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+        with pytest.raises(ProtocolError, match="an NC is sending"):
+            commissioning_checks.listen(master)
+    assert drive.heard == [0x80]  # the NC's own
+
+
+def test_a_silent_bus_gets_no_frame() -> None:
+    settings = config()
+    with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as other:
+        with pytest.raises(ConnectError, match="there is no drive on the bus"):
+            commission(settings, "X")
+        assert other.recv(0) is None
+
+
+def test_a_drive_that_does_not_answer_is_named() -> None:
+    settings = config(drive={"node_id": 9})
+    with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as other:
+        other.send(can.Message(arbitration_id=0x701, data=[5], is_extended_id=False))
+        with Master(settings, "X") as master, pytest.raises(DeviceError, match=r"drive X: .* was not answered"):
+            master.sdo.read_int(Object.IDENTITY, 1)
+
+
+def test_states_are_shown(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    _, settings = peer
+    with Master(settings, "X") as master, rolled_back(master):
+        prepare(master)
+        assert master.state() is State.SWITCH_ON_DISABLED
+        enable(master)
+        assert master.state() is State.OPERATION_ENABLED
+
+
+RECORD = CommissioningRecord(
+    "X", 1, 2, 3, 4, "c0ffee", "f1f2", {"6007": 1}, 10_000.0, True, 9.8, True, "proven", "2026-01-01T00:00:00+00:00"
+)
+
+
+def test_a_record_comes_back_as_it_was(tmp_path: Path) -> None:
+    save_record(RECORD, tmp_path / "store")
+    assert load_record(tmp_path / "store", "X") == RECORD
+    assert load_record(tmp_path / "store", "Y") is None
+
+
+@pytest.mark.parametrize("key", ["offset_in_feedforward", "watchdog", "options", "serial", "digest", "schema", "axis"])
+def test_a_changed_record_is_refused(key: str, tmp_path: Path) -> None:
+    path = save_record(RECORD, tmp_path)
+    document = json.loads(path.read_text())
+    document[key] = {"6007": 0} if key == "options" else "other" if key != "serial" else 5
+    path.write_text(json.dumps(document))
+    with pytest.raises(StoreError, match="changed after it was signed off"):
+        load_record(tmp_path, "X")
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[]", '{"schema": 1', "\x00", '{"options": 3}'])
+def test_what_is_no_record_is_refused(text: str, tmp_path: Path) -> None:
+    record_path(tmp_path, "X").write_text(text)
+    with pytest.raises(StoreError, match="commission the axis again"):
+        load_record(tmp_path, "X")

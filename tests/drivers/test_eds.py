@@ -1,0 +1,122 @@
+"""EDS files with every quirk seen in the field are read; what cannot be read is one error class with the line."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fdhil.drivers.eds import MAX_BYTES, MAX_OBJECTS, load_eds, objects_of, parse_eds
+from fdhil.errors import EdsError
+
+GOOD = """\
+[FileInfo]
+FileName=a.eds
+[DeviceInfo]
+VendorName=Some Vendor
+VendorNumber=0x12
+ProductNumber=0x34
+BaudRate_1000=1
+NrOfRXPDO=4
+[DummyUsage]
+Dummy0001=0
+Dummy0002=0
+Dummy0003=0
+Dummy0004=0
+Dummy0005=1
+Dummy0006=0
+Dummy0007=0
+[1000]
+ParameterName=Device type
+ObjectType=0x7
+DataType=0x0007
+AccessType=ro
+DefaultValue=0x20192
+PDOMapping=0
+[1800]
+ParameterName=TPDO 1
+ObjectType=0x9
+SubNumber=2
+[1800sub0]
+ParameterName=Highest sub-index
+DataType=0x0005
+AccessType=ro
+DefaultValue=1
+[1800sub1]
+ParameterName=COB-ID
+DataType=0x0007
+AccessType=rw
+DefaultValue=$NODEID+0x40000180
+"""
+
+QUIRKS = {
+    "windows text": (GOOD.replace("Some Vendor", "\u201cVendor\u201d \u2013 f\u00fcr alle")).encode("cp1252"),
+    "byte order mark": b"\xef\xbb\xbf" + GOOD.encode(),
+    "incomplete dummies": GOOD.replace("Dummy0001=0\n", "").replace("Dummy0007=0\n", "").encode(),
+    "comments miscounted": (GOOD + "[Comments]\nLines=9\nLine1=a\n").encode(),
+    "blank numbers": GOOD.replace("VendorNumber=0x12", "VendorNumber=").replace("NrOfRXPDO=4", "NrOfRXPDO=").encode(),
+    "leading zeros": GOOD.replace("NrOfRXPDO=4", "NrOfRXPDO=004").replace("PDOMapping=0", "PDOMapping=000").encode(),
+    "section twice": (GOOD + "[1000]\nParameterName=Device type\nDataType=7\nAccessType=ro\n").encode(),
+    "key twice": GOOD.replace("AccessType=ro\n", "AccessType=ro\nAccessType=ro\n").encode(),
+    "comment behind a value": GOOD.replace("ObjectType=0x7", "ObjectType=0x07 # VAR").encode(),
+    "semicolon behind a value": GOOD.replace("DataType=0x0007", "DataType=0x0007 ; U32").encode(),
+    "keys in other case": GOOD.replace("ParameterName", "parametername").replace("DataType", "DATATYPE").encode(),
+    "blank mapping": GOOD.replace("PDOMapping=0", "PDOMapping=").encode(),
+    "carriage returns": GOOD.replace("\n", "\r\n").encode(),
+    "lines that say nothing": (GOOD + "\n\nrubbish without a sign\n;comment\n#comment\n\0\n").encode(),
+    "blank node id": (GOOD + "[DeviceComissioning]\nNodeID=\nBaudrate=\n").encode(),
+    "no access type": GOOD.replace("AccessType=rw\n", "").encode(),
+}
+
+
+@pytest.mark.parametrize("quirk", QUIRKS)
+def test_quirk_is_mended(quirk: str) -> None:
+    dictionary = parse_eds(QUIRKS[quirk], "drive.eds", 5)
+    objects = objects_of(dictionary)
+    assert objects[0x1800, 1].default == 0x40000185
+    assert objects[0x1000, 0].default == 0x20192
+
+
+def test_a_file_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.eds"
+    path.write_text(GOOD)
+    assert objects_of(load_eds(path, 3))[0x1800, 1].default == 0x40000183
+
+
+@pytest.mark.parametrize(
+    ("raw", "says"),
+    [
+        (b"", "line 1: it has no object"),
+        (b"hello", "line 1: it has no object"),
+        (GOOD.replace("ObjectType=0x7", "ObjectType=banana").encode(), "line 19: ObjectType is 'banana'"),
+        (GOOD.replace("DataType=0x0007\n", "", 1).encode(), "line 17: [1000] is wrong"),
+        (GOOD.replace("[1800]", "[1801]").encode(), "is wrong"),
+        (b"[1000]\nParameterName=a\nObjectType=8\nCompactSubObj=999999999\n", "line 4: CompactSubObj is 999999999"),
+        (b"[1000]\n" + b"x" * 5000, "line 2 is longer"),
+        (b" " * (MAX_BYTES + 1), "larger than 2 MiB"),
+        ("".join(f"[{i:04X}]\nDataType=7\n" for i in range(MAX_OBJECTS + 1)).encode(), "more than"),
+    ],
+)
+def test_what_cannot_be_read_is_one_error(raw: bytes, says: str) -> None:
+    with pytest.raises(EdsError, match=r"bad\.eds") as caught:
+        parse_eds(raw, "bad.eds")
+    assert says in str(caught.value)
+
+
+def test_a_missing_file_is_the_same_error(tmp_path: Path) -> None:
+    with pytest.raises(EdsError, match="cannot be read"):
+        load_eds(tmp_path / "none.eds")
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.data())
+def test_damage_never_escapes_as_another_error(data: st.DataObject) -> None:
+    raw = bytearray(GOOD.encode())
+    for _ in range(data.draw(st.integers(1, 6))):
+        at = data.draw(st.integers(0, len(raw) - 1))
+        raw[at : at + data.draw(st.integers(0, 20))] = data.draw(st.binary(max_size=6))
+    with contextlib.suppress(EdsError):
+        parse_eds(bytes(raw), "bad.eds", 5)
