@@ -1,0 +1,227 @@
+"""``fdhil predict`` and ``fdhil correct``: the path error of a program before it is cut, and its correction."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from fdhil import tables
+
+if TYPE_CHECKING:
+    from fdhil.config import MachineConfig
+    from fdhil.records import Correction, Float, Parameters, Prediction, Reason, Trajectory
+
+FILE = click.Path(path_type=Path)
+Command = TypeVar("Command", bound=Callable[..., Any])
+MANY_ZONES = 12
+
+
+def _shared(command: Command) -> Command:
+    """Add the argument and options that both commands have."""
+    for option in reversed(
+        (
+            click.argument("program", type=FILE, metavar="PROGRAM|DEMAND.csv"),
+            click.option(
+                "--config", "config_path", type=FILE, required=True, help="The machine's configuration (TOML)."
+            ),
+            click.option("--model", "model_path", type=FILE, help="Parameters of each axis (JSON)."),
+            click.option("--from-history", is_flag=True, help="Use the newest validated parameters of the store."),
+            click.option("--out", type=FILE, help="Write a CSV with a row per SYNC period."),
+            click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else."),
+        )
+    ):
+        command = option(command)
+    return command
+
+
+@click.command()
+@_shared
+def predict(
+    program: Path, config_path: Path, model_path: Path | None, from_history: bool, out: Path | None, as_json: bool
+) -> int:
+    """Predict the path error that the drives will leave of a PROGRAM (NC program or demand CSV).
+
+    The parameters are the configuration's nominal ones unless --model or --from-history says otherwise. Exit codes: 0
+    done, 2 wrong option, model or configuration, 3 a file cannot be read or written.
+    """
+    reference, models, config = _inputs(program, config_path, model_path, from_history)
+    from fdhil import prediction
+
+    predicted = prediction.predict(reference, models, config)
+    if out is not None:
+        _write(out, _prediction_columns(predicted))
+    if as_json:
+        document = {"schema": "fdhil-predict-1", "program": str(program), **_prediction_document(predicted)}
+        click.echo(json.dumps(document, allow_nan=False))
+    else:
+        _show_prediction(predicted)
+    return 0
+
+
+@click.command()
+@_shared
+@click.option("--method", type=click.Choice(list(tables.CORRECTIONS)), help="Left out: the best there is.")
+def correct(
+    program: Path,
+    config_path: Path,
+    model_path: Path | None,
+    from_history: bool,
+    out: Path | None,
+    as_json: bool,
+    method: str | None,
+) -> int:
+    """Plan the offsets that correct the predicted path error of a PROGRAM (NC program or demand CSV).
+
+    Nothing is sent. A correction that is not predicted to help is refused, with advice: its offsets are 0. Exit codes:
+    0 planned, 1 refused, 2 wrong option, model or configuration, 3 a file cannot be read or written.
+    """
+    reference, models, config = _inputs(program, config_path, model_path, from_history)
+    from fdhil import correction
+
+    planned = correction.plan(reference, models, config, method)
+    if out is not None:
+        _write(out, _correction_columns(planned))
+    if as_json:
+        click.echo(json.dumps(_correction_document(str(program), planned), allow_nan=False))
+    else:
+        _show_correction(planned)
+    return 1 if planned.refused else 0
+
+
+def _inputs(
+    program: Path, config_path: Path, model_path: Path | None, from_history: bool
+) -> tuple[Trajectory, dict[str, Parameters], MachineConfig]:
+    """Read configuration, model and reference, in this order."""
+    if model_path is not None and from_history:
+        raise click.UsageError("--model and --from-history exclude each other: give one of them")
+    from fdhil import config as configuration
+    from fdhil.prediction import models as model_files
+    from fdhil.program import load_trajectory
+
+    config = configuration.load(config_path)
+    given, source = model_files.nominal_models(config), str(config_path)
+    if model_path is not None:
+        given, source = model_files.load_models(model_path), str(model_path)
+    elif from_history:
+        from fdhil.store.history import latest_parameters
+
+        given, source = latest_parameters(config.store.directory), str(config.store.directory)
+    reference = load_trajectory(program, config)
+    return reference, model_files.models_for(reference, given, config, source), config
+
+
+def _prediction_columns(predicted: Prediction) -> dict[str, tuple[Float, int]]:
+    """Return the columns of the CSV: header -> values (n,) and decimals."""
+    reference = predicted.reference
+    columns: dict[str, tuple[Float, int]] = {"time_s": (reference.time_s, 6 if reference.dt_s >= 1e-5 else 9)}
+    for axis in reference.axes:
+        columns[f"{axis}_reference_mm"] = (reference.position_mm[axis], 6)
+        columns[f"{axis}_predicted_mm"] = (predicted.predicted_mm[axis], 6)
+        columns[f"{axis}_error_um"] = (predicted.error_um[axis], 4)
+    columns["contour_error_um"] = (predicted.contour_um, 4)
+    return columns
+
+
+def _correction_columns(planned: Correction) -> dict[str, tuple[Float, int]]:
+    columns = _prediction_columns(planned.before)
+    for axis in planned.before.reference.axes:
+        columns[f"{axis}_offset_um"] = (planned.offset_um[axis], 4)
+        columns[f"{axis}_corrected_error_um"] = (planned.after.error_um[axis], 4)
+    columns["corrected_contour_error_um"] = (planned.after.contour_um, 4)
+    return columns
+
+
+def _write(path: Path, columns: Mapping[str, tuple[Float, int]]) -> None:
+    """Write columns as CSV whose first line is the header; RecordingError when the file cannot be written."""
+    import numpy as np
+
+    from fdhil.errors import RecordingError
+
+    # adding 0 after rounding turns -0.0000 into 0.0000
+    values = np.column_stack([np.round(values, decimals) + 0.0 for values, decimals in columns.values()])
+    formats = [f"%.{decimals}f" for _, decimals in columns.values()]
+    try:
+        np.savetxt(path, values, fmt=formats, delimiter=",", header=",".join(columns), comments="")
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be written ({error.strerror}); check the folder") from None
+
+
+def _contour(predicted: Prediction) -> dict[str, float]:
+    return {"rms_um": _rms(predicted.contour_um), "max_um": float(predicted.contour_um.max())}
+
+
+def _rms(values: Float) -> float:
+    return float((values @ values / values.size) ** 0.5)
+
+
+def _prediction_document(predicted: Prediction) -> dict[str, Any]:
+    return {
+        "duration_s": round(float(predicted.reference.time_s[-1] - predicted.reference.time_s[0]), 6),
+        "axes": {
+            axis: {"rms_error_um": _rms(error), "max_error_um": float(abs(error).max())}
+            for axis, error in predicted.error_um.items()
+        },
+        "contour": _contour(predicted),
+        "zones": _zones(predicted),
+    }
+
+
+def _zones(predicted: Prediction) -> list[dict[str, Any]]:
+    return [
+        {"start_s": z.start_s, "end_s": z.end_s, "where": z.where, "max_um": z.max_um, "cause": z.cause}
+        for z in predicted.zones
+    ]
+
+
+def _reasons(reasons: Sequence[Reason]) -> list[dict[str, str]]:
+    return [{"code": r.code, "text": r.text, "advice": r.advice} for r in reasons]
+
+
+def _correction_document(program: str, planned: Correction) -> dict[str, Any]:
+    before, after = _contour(planned.before), _contour(planned.after)
+    return {
+        "schema": "fdhil-correct-1",
+        "program": program,
+        "method": planned.method,
+        **_prediction_document(planned.before),
+        "before": before,
+        "after": after,
+        "gain": before["rms_um"] / after["rms_um"] if after["rms_um"] > 0 else 1.0,
+        "max_offset_um": {axis: float(abs(offset).max()) for axis, offset in planned.offset_um.items()},
+        "refused": _reasons(planned.refused),
+        "warnings": _reasons(planned.warnings),
+    }
+
+
+def _show_prediction(predicted: Prediction) -> None:
+    contour = _contour(predicted)
+    click.echo(
+        f"{predicted.reference.time_s[-1]:.2f} s of path: contour error {contour['rms_um']:.1f} um RMS,"
+        f" {contour['max_um']:.1f} um at most"
+    )
+    zones = sorted(predicted.zones, key=lambda zone: -zone.max_um)[:MANY_ZONES]
+    for zone in sorted(zones, key=lambda zone: zone.start_s):
+        click.echo(
+            f"  {zone.start_s:8.3f} s .. {zone.end_s:8.3f} s  {zone.max_um:8.1f} um  {zone.cause:12}  at {zone.where}"
+        )
+    if len(predicted.zones) > len(zones):
+        click.echo(f"  and {len(predicted.zones) - len(zones)} smaller zones (--json lists them all)")
+
+
+def _show_correction(planned: Correction) -> None:
+    _show_prediction(planned.before)
+    for reason in planned.warnings:
+        click.echo(f"warning, {reason}; {reason.advice}", err=True)
+    for reason in planned.refused:
+        click.echo(f"refused, {reason}; {reason.advice}")
+    if not planned.refused:
+        after = _contour(planned.after)
+        gain = _contour(planned.before)["rms_um"] / max(after["rms_um"], 1e-12)
+        click.echo(
+            f"with the {planned.method} correction: {after['rms_um']:.2f} um RMS, {after['max_um']:.1f} um at most,"
+            f" {gain:.0f} times better"
+        )

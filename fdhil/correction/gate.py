@@ -1,0 +1,120 @@
+"""The gate: what is not predicted to help is not sent, and every refusal says what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d
+
+from fdhil.config import MachineConfig
+from fdhil.correction import feed
+from fdhil.records import Bool, Float, Parameters, Prediction, Reason, Trajectory
+
+NEAR_SHARE = 0.95  # of a current or voltage limit: worth a warning
+LEAST_GAIN = 1.05  # before / after RMS
+NOTHING_UM = 0.05  # an RMS below this is nothing to correct
+WORSE_UM = 1.0  # by how much a zone's largest error may grow
+ZONE_S = 0.1  # errors this near to each other are one zone
+MASK_S, FADE_S = 0.04, 0.06  # what is left alone around a row that gets worse, and how far the fade reaches
+
+
+def writing_off(reference: Trajectory, config: MachineConfig) -> tuple[Reason, ...]:
+    """Refuse axes without limits: writing is off by default."""
+    return tuple(
+        Reason(
+            "WritingOff",
+            f"axis {axis} has no section [axis.{axis}.correction]: writing to its drive is off",
+            f"add [axis.{axis}.correction] with max_offset_um, max_speed_mm_s and max_acceleration_mm_s2",
+        )
+        for axis in reference.axes
+        if axis not in config.axis or config.axis[axis].correction is None
+    )
+
+
+def demand(
+    reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, before: Prediction
+) -> tuple[tuple[Reason, ...], tuple[Reason, ...]]:
+    """Return (refused, warnings): no offset helps a drive whose current or voltage is at its limit."""
+    refused, warnings = [], []
+    limited = feed.steadily_limited(before.limited_s)
+    for axis in reference.axes:
+        load = feed.required(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s)
+        share, what = max((load.current_share, "current"), (load.voltage_share, "voltage"))
+        place = " ".join(f"{a} {reference.position_mm[a][load.row]:.1f}" for a in reference.axes)
+        if share > 1.0 or axis in limited:
+            refused.append((axis, share, what, place))
+        elif share > NEAR_SHARE or before.limited_s[axis] > 0.0 or _peak_share(before, axis, config) > NEAR_SHARE:
+            text = f"axis {axis} comes near its {what} limit at {place}: little is left for a disturbance"
+            warnings.append(Reason("NearLimit", text, "lower the feed if the path error matters there"))
+    if not refused:
+        return (), tuple(warnings)
+    advice = _held(reference, models, config)
+    return tuple(
+        Reason(
+            "DemandTooHigh",
+            f"axis {axis} is asked for {share * 100:.0f} % of its {what} limit at {place} and has a limit acting for"
+            f" {before.limited_s[axis] * 1e3:.0f} ms: no offset can help",
+            advice,
+        )
+        for axis, share, what, place in refused
+    ), tuple(warnings)
+
+
+def _peak_share(before: Prediction, axis: str, config: MachineConfig) -> float:
+    return float(np.abs(before.current_a[axis]).max()) / config.axis[axis].regulators.current_limit_a
+
+
+def _held(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> str:
+    share = feed.held_share(reference, models, config)
+    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    fastest = float(np.linalg.norm(np.diff(path, axis=0), axis=1).max()) / reference.dt_s * 0.06
+    return f"a feed of {share * fastest:.1f} m/min ({share * 100:.0f} % of {fastest:.1f}) can be held, or smooth more"
+
+
+def worse_rows(before_um: Float, after_um: Float, dt_s: float) -> Bool:
+    """Return (n,) the rows of zones whose largest contour error the correction would raise by more than 1 um."""
+    size = 2 * round(ZONE_S / dt_s) + 1
+    then, now = maximum_filter1d(before_um, size), maximum_filter1d(after_um, size)
+    return np.asarray((now > then + WORSE_UM) & (after_um > then + WORSE_UM))
+
+
+def fade(worse: Bool, dt_s: float) -> Float:
+    """Return a factor (n,): 0 in and around the rows that get worse, 1 far from them, smooth in between."""
+    rows = np.flatnonzero(worse)
+    if rows.size == 0:
+        return np.ones(worse.size)
+    here = np.arange(worse.size)
+    after = np.searchsorted(rows, here)
+    distance = np.minimum(
+        np.abs(here - rows[np.minimum(after, rows.size - 1)]), np.abs(here - rows[np.maximum(after - 1, 0)])
+    )
+    ratio = np.clip((distance * dt_s - MASK_S) / FADE_S, 0.0, 1.0)
+    return np.asarray(ratio**3 * (10 - 15 * ratio + 6 * ratio**2))
+
+
+def gain(before: Prediction, after: Prediction) -> float:
+    """Return the RMS of the contour error without the correction over that with it."""
+    then, now = rms(before.contour_um), rms(after.contour_um)
+    return then / now if now > 0 else 1.0
+
+
+def rms(values: Float) -> float:
+    """Return the root mean square of (n,)."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def result(before: Prediction, after: Prediction) -> tuple[Reason, ...]:
+    """Refuse a correction that is not predicted to help as a whole, or that makes a zone worse."""
+    then, now = rms(before.contour_um), rms(after.contour_um)
+    if then < NOTHING_UM:
+        return (Reason("NoGain", f"the path error is {then:.3f} um RMS already", "nothing needs a correction"),)
+    if not now * LEAST_GAIN <= then:
+        text = f"the path error would be {now:.1f} um RMS with the correction, {then:.1f} um without"
+        return (Reason("NoGain", text, "try the method inverse, or lower the feed"),)
+    worse = np.flatnonzero(worse_rows(before.contour_um, after.contour_um, before.reference.dt_s))
+    if worse.size:
+        row = int(worse[np.argmax(after.contour_um[worse])])
+        text = f"at {before.reference.time_s[row]:.3f} s the error would grow to {after.contour_um[row]:.1f} um"
+        return (Reason("HarmPredicted", text, "try the method inverse, or lower the feed"),)
+    return ()

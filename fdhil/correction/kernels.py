@@ -1,0 +1,189 @@
+"""The compiled projection onto what an offset may do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numba import njit
+
+from fdhil.records import Float
+
+ITERATIONS = 60
+
+
+def _differences_plain(o: Float, start: Float, which: int) -> Float:
+    """Return o (0), its first (1) or its second (2) difference, each (n,); ``start`` = [o before, o before that]."""
+    n = o.size
+    out = np.empty(n)
+    for k in range(n):
+        one = o[k - 1] if k >= 1 else start[0]
+        two = o[k - 2] if k >= 2 else (start[0] if k == 1 else start[1])
+        if which == 0:
+            out[k] = o[k]
+        elif which == 1:
+            out[k] = o[k] - one
+        else:
+            out[k] = o[k] - 2.0 * one + two
+    return out
+
+
+_differences: Callable[[Float, Float, int], Float] = njit(cache=True, nogil=True)(_differences_plain)
+
+
+def _scatter_plain(force: Float, which: int, into: Float) -> None:
+    """Add the transposed difference of ``force`` (n,) to ``into`` (n,)."""
+    n = force.size
+    for k in range(n):
+        if which == 0:
+            into[k] += force[k]
+        elif which == 1:
+            into[k] += force[k] - (force[k + 1] if k + 1 < n else 0.0)
+        else:
+            one = force[k + 1] if k + 1 < n else 0.0
+            two = force[k + 2] if k + 2 < n else 0.0
+            into[k] += force[k] - 2.0 * one + two
+
+
+_scatter: Callable[[Float, int, Float], None] = njit(cache=True, nogil=True)(_scatter_plain)
+
+
+def _solve_plain(d0: Float, d1: Float, d2: Float, b: Float) -> Float:
+    """Solve a symmetric positive pentadiagonal system in place; d1[k], d2[k] couple row k to k + 1 and k + 2."""
+    n = b.size
+    for k in range(n):
+        pivot = d0[k]
+        if k + 1 < n:
+            low = d1[k] / pivot
+            d0[k + 1] -= low * d1[k]
+            b[k + 1] -= low * b[k]
+            if k + 2 < n:
+                d1[k + 1] -= low * d2[k]
+        if k + 2 < n:
+            low = d2[k] / pivot
+            d0[k + 2] -= low * d2[k]
+            b[k + 2] -= low * b[k]
+    x = np.empty(n)
+    for k in range(n - 1, -1, -1):
+        rest = b[k]
+        if k + 1 < n:
+            rest -= d1[k] * x[k + 1]
+        if k + 2 < n:
+            rest -= d2[k] * x[k + 2]
+        x[k] = rest / d0[k]
+    return x
+
+
+_solve: Callable[[Float, Float, Float, Float], Float] = njit(cache=True, nogil=True)(_solve_plain)
+
+
+def _weigh_plain(weight: Float, which: int, d0: Float, d1: Float, d2: Float) -> None:
+    """Add C' diag(weight) C of a difference to the three diagonals."""
+    n = weight.size
+    for k in range(n):
+        g = weight[k]
+        if which == 0:
+            d0[k] += g
+        elif which == 1:
+            d0[k] += g
+            if k >= 1:
+                d0[k - 1] += g
+                d1[k - 1] -= g
+        else:
+            d0[k] += g
+            if k >= 1:
+                d0[k - 1] += 4.0 * g
+                d1[k - 1] -= 2.0 * g
+            if k >= 2:
+                d0[k - 2] += g
+                d1[k - 2] -= 2.0 * g
+                d2[k - 2] += g
+
+
+_weigh: Callable[[Float, int, Float, Float, Float], None] = njit(cache=True, nogil=True)(_weigh_plain)
+
+
+def _project_plain(wanted: Float, limits: Float, start: Float) -> Float:
+    """Return the nearest (n,) to ``wanted`` (least squares) whose value, first and second difference stay in +-limits.
+
+    A primal-dual interior-point method; each of its steps is one pentadiagonal system. ``limits`` (3,) > 0.
+    """
+    n = wanted.size
+    o = np.zeros(n)
+    slack = np.empty((6, n))
+    force = np.empty((6, n))
+    value = np.empty((3, n))
+    step = np.empty((3, n))
+    scale = max(1.0, np.abs(wanted).max())
+    mu = 0.1 * scale
+    for c in range(3):
+        value[c] = _differences(o, start, c)
+        for side in range(2):
+            sign = 1.0 - 2.0 * side
+            for k in range(n):
+                slack[2 * c + side, k] = max(limits[c] - sign * value[c, k], 0.1 * limits[c])
+                force[2 * c + side, k] = mu / slack[2 * c + side, k]
+    for _ in range(ITERATIONS):
+        gap = 0.0
+        miss = 0.0
+        b = wanted - o
+        d0 = np.ones(n)
+        d1 = np.zeros(n)
+        d2 = np.zeros(n)
+        for c in range(3):
+            weight = np.empty(n)
+            push = np.empty(n)
+            for k in range(n):
+                s1, s2 = slack[2 * c, k], slack[2 * c + 1, k]
+                l1, l2 = force[2 * c, k], force[2 * c + 1, k]
+                r1 = s1 + value[c, k] - limits[c]
+                r2 = s2 - value[c, k] - limits[c]
+                gap += l1 * s1 + l2 * s2
+                miss = max(miss, abs(r1) / limits[c], abs(r2) / limits[c])
+                weight[k] = l1 / s1 + l2 / s2
+                # with the forces of this iterate the two -l cancel those in the gradient
+                push[k] = -(mu + l1 * r1) / s1 + (mu + l2 * r2) / s2
+            _scatter(push, c, b)
+            _weigh(weight, c, d0, d1, d2)
+        gap /= 6 * n
+        if gap < 1e-7 * scale and miss < 1e-9:
+            break
+        move = _solve(d0, d1, d2, b)
+        zero = np.zeros(2)
+        primal = 1.0
+        dual = 1.0
+        for c in range(3):
+            step[c] = _differences(move, zero, c)
+            for side in range(2):
+                sign = 1.0 - 2.0 * side
+                for k in range(n):
+                    s = slack[2 * c + side, k]
+                    f = force[2 * c + side, k]
+                    r = s + sign * value[c, k] - limits[c]
+                    ds = -r - sign * step[c, k]
+                    df = (mu - f * ds) / s - f
+                    if ds < 0.0:
+                        primal = min(primal, -0.99 * s / ds)
+                    if df < 0.0:
+                        dual = min(dual, -0.99 * f / df)
+        total = 0.0
+        for c in range(3):
+            for side in range(2):
+                sign = 1.0 - 2.0 * side
+                for k in range(n):
+                    s = slack[2 * c + side, k]
+                    f = force[2 * c + side, k]
+                    r = s + sign * value[c, k] - limits[c]
+                    ds = -r - sign * step[c, k]
+                    df = (mu - f * ds) / s - f
+                    slack[2 * c + side, k] = s + primal * ds
+                    force[2 * c + side, k] = f + dual * df
+                    total += slack[2 * c + side, k] * force[2 * c + side, k]
+        o += primal * move
+        for c in range(3):
+            value[c] = _differences(o, start, c)
+        mu = (0.1 if min(primal, dual) > 0.9 else 0.3) * total / (6 * n)
+    return o
+
+
+project: Callable[[Float, Float, Float], Float] = njit(cache=True, nogil=True)(_project_plain)

@@ -1,0 +1,181 @@
+"""What an offset may do, and how a wanted offset is planned inside it, so that the guard never has to clip it.
+
+In drive increments per SYNC cycle: amplitude L, rate S, acceleration A, total variation E within one second. L is
+braking-aware: |o| + v^2 / (2 A) <= L while the offset moves outward at v.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fdhil.config import Axis
+from fdhil.correction import kernels
+from fdhil.records import Float, Int, Reason
+
+AXIS_SPEED_SHARE = 0.10  # an offset never takes more than this of the axis' own speed
+AXIS_ACCELERATION_SHARE = 0.50
+VARIATION_MM = 3.0
+VARIATION_S = 1.0
+# rounding a curve to whole increments moves its first difference by up to 1, its second by up to 2
+ROUNDING_RATE, ROUNDING_ACCELERATION = 1.0, 2.0
+_PASSES = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """``offset`` increments, ``rate`` per cycle, ``acceleration`` per cycle^2, ``variation`` per ``window`` cycles."""
+
+    offset: float
+    rate: float
+    acceleration: float
+    variation: float
+    window: int
+    um_per_increment: float
+
+    @staticmethod
+    def of(axis: Axis, sync_period_s: float) -> Limits:
+        """Return the limits of an axis; ValueError when writing is off (no ``[axis.X.correction]``)."""
+        if axis.correction is None:
+            raise ValueError("writing is off for this axis")
+        scale = axis.scaling.increments_per_mm
+        top_speed = axis.drive.speed_limit_mm_s or axis.rapid_speed_mm_s
+        speed = min(axis.correction.max_speed_mm_s, AXIS_SPEED_SHARE * top_speed)
+        acceleration = min(
+            axis.correction.max_acceleration_mm_s2, AXIS_ACCELERATION_SHARE * axis.max_acceleration_mm_s2
+        )
+        return Limits(
+            offset=axis.correction.max_offset_um * 1e-3 * scale,
+            rate=speed * scale * sync_period_s,
+            acceleration=acceleration * scale * sync_period_s**2,
+            variation=VARIATION_MM * scale,
+            window=round(VARIATION_S / sync_period_s),
+            um_per_increment=1e3 / scale,
+        )
+
+    @property
+    def curve(self) -> Limits:
+        """The limits of a curve that is rounded afterwards: less by the rounding, where that leaves enough."""
+        return replace(
+            self,
+            offset=self.offset - 0.5,
+            rate=max(self.rate - ROUNDING_RATE, 0.5 * self.rate),
+            acceleration=self.acceleration - ROUNDING_ACCELERATION
+            if self.acceleration >= 2 * ROUNDING_ACCELERATION
+            else self.acceleration,
+        )
+
+
+def check(offset_increments: Int, limits: Limits, before: tuple[float, float] = (0.0, 0.0)) -> list[Reason]:
+    """Return what a table (n,) breaks: empty, or ``OffsetLimit``, ``OffsetRate``, ``OffsetEnergy`` with its figure.
+
+    ``before``: the two offsets ahead of the first row, the nearer one first. Rounding to increments is allowed for.
+    """
+    o = offset_increments.astype(np.float64)
+    rate = np.diff(o, prepend=before[0])
+    acceleration = np.diff(rate, prepend=before[0] - before[1])
+    um = limits.um_per_increment
+    reasons = []
+    reach = braking_reach(o, rate, limits.acceleration + ROUNDING_ACCELERATION)
+    if not reach.max(initial=0.0) <= limits.offset + 0.5:
+        text = f"the offset reaches {reach.max() * um:.0f} um, braking included; {limits.offset * um:.0f} are allowed"
+        reasons.append(Reason("OffsetLimit", text, "plan the correction inside the limits"))
+    fast, hard = np.abs(rate).max(initial=0.0), np.abs(acceleration).max(initial=0.0)
+    if not fast <= limits.rate + ROUNDING_RATE or not hard <= limits.acceleration + ROUNDING_ACCELERATION:
+        text = f"the offset moves {fast * um:.1f} um and changes that by {hard * um:.1f} um in a cycle"
+        reasons.append(Reason("OffsetRate", text, "plan the correction inside the limits"))
+    travel = variation(rate, limits.window).max(initial=0.0)
+    if not travel <= limits.variation:
+        text = f"the offset travels {travel * um * 1e-3:.1f} mm in one second; {VARIATION_MM:.0f} are allowed"
+        reasons.append(Reason("OffsetEnergy", text, "plan a smoother correction"))
+    return reasons
+
+
+def braking_reach(offset: Float, rate: Float, acceleration: float) -> Float:
+    """Return (n,) how far each row's offset gets if it brakes from there: |o| + v^2 / (2 A) while moving outward."""
+    outward = np.maximum(rate * np.sign(offset), 0.0)
+    return np.asarray(np.abs(offset) + outward**2 / (2 * acceleration))
+
+
+def variation(rate: Float, window: int) -> Float:
+    """Return (n,) the travel within the ``window`` cycles that end at each row."""
+    total = np.concatenate([[0.0], np.cumsum(np.abs(rate))])
+    rows = np.arange(1, total.size)
+    return np.asarray(total[rows] - total[np.maximum(rows - window, 0)])
+
+
+def fit(wanted: Float, limits: Limits, before: tuple[float, float] = (0.0, 0.0)) -> Float:
+    """Return the curve (n,) nearest to ``wanted`` (increments, n) that keeps the limits, ready to be rounded."""
+    curve = limits.curve
+    goal = np.ascontiguousarray(np.clip(wanted, -4 * curve.offset, 4 * curve.offset))
+    amplitude = curve.offset
+    planned = goal
+    for _ in range(_PASSES):
+        planned = _projected(goal, replace(curve, offset=amplitude), before)
+        rate = np.diff(planned, prepend=before[0])
+        excess = float(braking_reach(planned, rate, curve.acceleration).max(initial=0.0)) - curve.offset
+        travel = variation(rate, curve.window)
+        if excess <= 1e-6 * curve.offset and travel.max(initial=0.0) <= 0.98 * curve.variation:
+            return planned
+        if excess > 1e-6 * curve.offset:
+            amplitude = max(amplitude - 1.05 * excess, 0.2 * amplitude)
+        goal = goal * _calm(travel, 0.95 * curve.variation, curve.window)
+    if before != (0.0, 0.0):
+        return _projected(np.zeros_like(goal), curve, before)
+    # a curve that starts from rest and is scaled down keeps every limit that it kept before
+    rate = np.diff(planned, prepend=0.0)
+    too_far = float(variation(rate, curve.window).max(initial=0.0)) / (0.98 * curve.variation)
+    too_high = float(braking_reach(planned, rate, curve.acceleration).max(initial=0.0)) / curve.offset
+    return np.asarray(planned / max(too_far, too_high, 1.0))
+
+
+def _projected(goal: Float, limits: Limits, before: tuple[float, float]) -> Float:
+    if _inside(goal, limits, before):
+        return goal
+    return kernels.project(goal, np.array([limits.offset, limits.rate, limits.acceleration]), np.array(before))
+
+
+def _inside(offset: Float, limits: Limits, before: tuple[float, float]) -> bool:
+    rate = np.diff(offset, prepend=before[0])
+    acceleration = np.diff(rate, prepend=before[0] - before[1])
+    return bool(
+        np.abs(offset).max(initial=0.0) <= limits.offset
+        and np.abs(rate).max(initial=0.0) <= limits.rate
+        and np.abs(acceleration).max(initial=0.0) <= limits.acceleration
+    )
+
+
+def _calm(travel: Float, allowed: float, window: int) -> Float:
+    """A factor (n,) <= 1 that shrinks the offset wherever the second around it travels too far."""
+    if travel.max(initial=0.0) <= allowed:
+        return np.ones(travel.size)
+    factor = np.minimum(1.0, allowed / np.maximum(travel, 1e-12))
+    # a row belongs to all windows that end within the next second; smoothed, so that the factor adds no jerk
+    lowest = np.minimum.accumulate(np.concatenate([factor, np.full(window, factor[-1])])[::-1])[::-1]
+    shrunk = lowest[: travel.size] if travel.size <= window else _sliding_minimum(factor, window)
+    smooth = max(1, window // 20)
+    padded = np.pad(shrunk, smooth, mode="edge")
+    kernel = np.hanning(2 * smooth + 1)
+    return np.asarray(np.minimum(np.convolve(padded, kernel / kernel.sum(), mode="valid"), 1.0))
+
+
+def _sliding_minimum(values: Float, window: int) -> Float:
+    padded = np.concatenate([values, np.full(window, values[-1])])
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, window + 1).min(axis=1))
+
+
+def to_increments(offset: Float) -> Int:
+    """Round a planned curve (n,) to whole increments."""
+    return np.rint(offset).astype(np.int64)
+
+
+def fit_all(wanted_um: Mapping[str, Float], axes: Mapping[str, Axis], sync_period_s: float) -> dict[str, Float]:
+    """Plan the wanted offsets of all axes inside their limits; return them in um, in whole increments."""
+    planned: dict[str, Float] = {}
+    for name, wanted in wanted_um.items():
+        limits = Limits.of(axes[name], sync_period_s)
+        whole = to_increments(fit(wanted / limits.um_per_increment, limits))
+        planned[name] = whole.astype(np.float64) * limits.um_per_increment
+    return planned

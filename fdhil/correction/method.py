@@ -1,0 +1,23 @@
+"""What every correction method returns."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from fdhil.records import Float, Reason
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A method's answer: ``offset_um`` (n,) per axis, inside the limits and in whole increments.
+
+    ``delay_s`` is the common delay tau that the method aims at, r(t - tau). ``refused`` is what the method itself found
+    to be impossible. The speed and torque offsets (0x60B1, 0x60B2) are empty but for an on-line feed-forward.
+    """
+
+    offset_um: Mapping[str, Float]
+    delay_s: float = 0.0
+    refused: tuple[Reason, ...] = ()
+    speed_offset_rad_s: Mapping[str, Float] = field(default_factory=dict)
+    torque_offset_nm: Mapping[str, Float] = field(default_factory=dict)

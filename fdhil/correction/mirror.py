@@ -1,0 +1,51 @@
+"""Mirror correction ([DES] eq. 11 with H ~ 1, figure 16): the predicted error with its sign changed, unfiltered."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from fdhil.config import MachineConfig
+from fdhil.correction.limits import fit_all
+from fdhil.correction.method import Plan
+from fdhil.records import Float, Parameters, Prediction, Reason, Trajectory
+
+
+def plan(
+    reference: Trajectory,
+    _models: Mapping[str, Parameters],
+    config: MachineConfig,
+    before: Prediction,
+) -> Plan:
+    """Return offset = -error of the prediction ``before``, inside the limits.
+
+    Refused with ``LagTooLarge`` where the error exceeds what an offset may be: a clipped mirror is no mirror.
+    """
+    wanted = {axis: -error for axis, error in before.error_um.items()}
+    return Plan(fit_all(wanted, config.axis, reference.dt_s), refused=too_large(wanted, config))
+
+
+def too_large(wanted_um: Mapping[str, Float], config: MachineConfig) -> tuple[Reason, ...]:
+    """Return ``LagTooLarge`` for each axis whose wanted offset is beyond its ceiling."""
+    reasons = []
+    for axis, wanted in wanted_um.items():
+        limits = config.axis[axis].correction
+        largest = float(np.abs(wanted).max(initial=0.0))
+        if limits is not None and not largest <= limits.max_offset_um:
+            reasons.append(
+                lag_reason(axis, largest, limits.max_offset_um, config.axis[axis].regulators.speed_feedforward)
+            )
+    return tuple(reasons)
+
+
+def lag_reason(axis: str, needed_um: float, allowed_um: float, feedforward: float) -> Reason:
+    """Say that an axis lags by more than an offset may make up for."""
+    advice = (
+        f"enable the drive's speed feed-forward (it is {feedforward:g}), then identify and plan again"
+        if feedforward < 0.95
+        else f"lower the feed, or raise max_offset_um of axis {axis} if the machine allows it"
+    )
+    return Reason(
+        "LagTooLarge", f"axis {axis} needs offsets of {needed_um:.0f} um, {allowed_um:.0f} um are allowed", advice
+    )

@@ -1,0 +1,125 @@
+"""From a reference to a correction: method, limits, gate; and from a correction to the guard's table."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from fdhil import tables
+from fdhil.config import MachineConfig
+from fdhil.correction import gate
+from fdhil.correction.limits import fit_all
+from fdhil.correction.method import Plan
+from fdhil.prediction.predict import predict, predict_corrected
+from fdhil.records import (
+    Correction,
+    CorrectionTable,
+    Float,
+    Int,
+    Parameters,
+    Prediction,
+    Reason,
+    Trajectory,
+    frozen,
+    frozen_ints,
+)
+
+MASK_PASSES = 3
+
+
+def default_method() -> str:
+    """The best method there is: the last of the table."""
+    return list(tables.CORRECTIONS)[-1]
+
+
+def plan(
+    reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, method: str | None = None
+) -> Correction:
+    """Plan the correction of ``reference``; refusals are values, with all offsets 0 and ``after`` = ``before``.
+
+    ConfigError when an axis has no model; KeyError for an unknown method.
+    """
+    name = method or default_method()
+    factory = tables.load(tables.CORRECTIONS, name)
+    before = predict(reference, models, config)
+    refused = gate.writing_off(reference, config)
+    if refused:
+        return _refuse(name, before, refused, ())
+    refused, warnings = gate.demand(reference, models, config, before)
+    if refused:
+        return _refuse(name, before, refused, warnings)
+    wanted: Plan = factory(reference, models, config, before)
+    if wanted.refused:
+        return _refuse(name, before, wanted.refused, warnings)
+    offset, after, masked = _mask_harm(reference, models, config, before, wanted)
+    refused = gate.result(before, after)
+    if refused:
+        return _refuse(name, before, refused, warnings)
+    return Correction(
+        method=name,
+        before=before,
+        after=after,
+        offset_um={axis: frozen(values) for axis, values in offset.items()},
+        warnings=warnings + masked,
+    )
+
+
+def _mask_harm(
+    reference: Trajectory,
+    models: Mapping[str, Parameters],
+    config: MachineConfig,
+    before: Prediction,
+    wanted: Plan,
+) -> tuple[Mapping[str, Float], Prediction, tuple[Reason, ...]]:
+    """Leave alone the zones that would get worse; return the offsets, what they leave, and a warning per pass."""
+    offset = wanted.offset_um
+    after = predict_corrected(reference, models, config, offset)
+    worse = np.zeros(before.contour_um.size, dtype=np.bool_)
+    for _ in range(MASK_PASSES):
+        now = gate.worse_rows(before.contour_um, after.contour_um, reference.dt_s)
+        if not now.any():
+            break
+        worse |= now
+        factor = gate.fade(worse, reference.dt_s)
+        offset = fit_all(
+            {axis: values * factor for axis, values in wanted.offset_um.items()}, config.axis, reference.dt_s
+        )
+        after = predict_corrected(reference, models, config, offset)
+    if not worse.any():
+        return offset, after, ()
+    first, last = reference.time_s[np.flatnonzero(worse)[[0, -1]]]
+    text = (
+        f"{worse.sum() * reference.dt_s:.2f} s between {first:.2f} s and {last:.2f} s"
+        " would get worse and are left as they are"
+    )
+    return offset, after, (Reason("HarmPredicted", text, "try the method inverse, or lower the feed there"),)
+
+
+def _refuse(method: str, before: Prediction, refused: tuple[Reason, ...], warnings: tuple[Reason, ...]) -> Correction:
+    zero = frozen(np.zeros(before.contour_um.size))
+    offsets = dict.fromkeys(before.reference.axes, zero)
+    return Correction(method, before, before, offsets, refused, warnings)
+
+
+def table(correction: Correction, config: MachineConfig, program_digest: str) -> CorrectionTable:
+    """Return the guard's table: demand and offset in drive increments, in the drive's own sign.
+
+    ValueError for a refused correction, and for a value that is not finite.
+    """
+    if correction.refused:
+        raise ValueError(f"a refused correction ({correction.refused[0].code}) has no table")
+    reference = correction.before.reference
+    demand: dict[str, Int] = {}
+    offset: dict[str, Int] = {}
+    digest = hashlib.sha256(program_digest.encode())
+    for axis in reference.axes:
+        scaling = config.axis[axis].scaling
+        for into, values in ((demand, reference.position_mm[axis]), (offset, correction.offset_um[axis] * 1e-3)):
+            if not math.isfinite(float(np.abs(values).max(initial=0.0))):
+                raise ValueError(f"axis {axis} has a value that is not finite")
+            into[axis] = frozen_ints(np.rint(values * scaling.sign * scaling.increments_per_mm))
+            digest.update(into[axis].tobytes())
+    return CorrectionTable(reference.axes, demand, offset, program_digest, digest.hexdigest())

@@ -1,0 +1,10 @@
+"""What the closed loops will leave of a path: axis errors, contour error, the zones where it stands out, and the skill
+of such a prediction on recorded moves."""
+
+from __future__ import annotations
+
+from fdhil.prediction.contour import contour_error_um
+from fdhil.prediction.predict import predict, predict_corrected
+from fdhil.prediction.skill import skill
+
+__all__ = ["contour_error_um", "predict", "predict_corrected", "skill"]

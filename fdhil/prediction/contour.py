@@ -1,0 +1,22 @@
+"""The contour error: how far the table is from the path, wherever along the path it should be."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fdhil.prediction import kernels
+from fdhil.records import Float
+
+WINDOW_S = 0.4
+
+
+def contour_error_um(reference_mm: Float, actual_mm: Float, dt_s: float) -> Float:
+    """Return (n,) >= 0, the distance of each actual point (n, d) to the polyline of the reference (n, d) within 0.4 s.
+
+    ValueError when the two differ in shape.
+    """
+    reference = np.ascontiguousarray(reference_mm, dtype=np.float64)
+    actual = np.ascontiguousarray(actual_mm, dtype=np.float64)
+    if reference.shape != actual.shape or reference.ndim != 2:
+        raise ValueError(f"reference {reference.shape} and actual path {actual.shape} must both be (n, d)")
+    return kernels.contour(reference, actual, round(WINDOW_S / dt_s)) * 1e3

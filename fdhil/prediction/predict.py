@@ -1,0 +1,66 @@
+"""Prediction of a reference trajectory from the identified closed loops ([DES] section 5, figure 9)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from fdhil.config import MachineConfig
+from fdhil.errors import ConfigError, ConfigFault
+from fdhil.model import closed_loop
+from fdhil.prediction.contour import contour_error_um
+from fdhil.prediction.zones import find_zones
+from fdhil.records import Float, Parameters, Prediction, Trajectory, frozen
+
+
+def check_axes(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> None:
+    """Raise ConfigError where an axis of the reference has no configuration or no model."""
+    faults = [
+        ConfigFault(f"axis.{axis}", "the demand moves this axis, the configuration does not have it", "add its section")
+        for axis in reference.axes
+        if axis not in config.axis
+    ]
+    faults += [
+        ConfigFault(f"model.{axis}", "there is no model of this axis", "identify it from a recorded rapid move")
+        for axis in reference.axes
+        if axis not in models
+    ]
+    if faults:
+        raise ConfigError("prediction", faults)
+
+
+def predict(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> Prediction:
+    """Predict what the drives leave of ``reference``; ConfigError when an axis has no model or configuration."""
+    return predict_corrected(reference, models, config, None)
+
+
+def predict_corrected(
+    reference: Trajectory,
+    models: Mapping[str, Parameters],
+    config: MachineConfig,
+    offset_um: Mapping[str, Float] | None,
+) -> Prediction:
+    """Predict the path with ``offset_um`` (n,) per axis added to the reference; errors stay relative to the path."""
+    check_axes(reference, models, config)
+    offsets = None if offset_um is None else {axis: values * 1e-3 for axis, values in offset_um.items()}
+    responses = closed_loop.simulate_axes(models, config.axis, reference.dt_s, reference.position_mm, offsets)
+    return assemble(reference, responses)
+
+
+def assemble(reference: Trajectory, responses: Mapping[str, closed_loop.Response]) -> Prediction:
+    """Put the axes' responses together: errors per axis, contour error, zones."""
+    axes = reference.axes
+    path = np.column_stack([reference.position_mm[axis] for axis in axes])
+    actual = np.column_stack([responses[axis].position_mm for axis in axes])
+    contour = frozen(contour_error_um(path, actual, reference.dt_s))
+    limited = np.max([responses[axis].limited for axis in axes], axis=0)
+    return Prediction(
+        reference=reference,
+        predicted_mm={axis: frozen(responses[axis].position_mm) for axis in axes},
+        error_um={axis: frozen((responses[axis].position_mm - reference.position_mm[axis]) * 1e3) for axis in axes},
+        contour_um=contour,
+        current_a={axis: frozen(responses[axis].current_a) for axis in axes},
+        limited_s={axis: responses[axis].limited_s for axis in axes},
+        zones=find_zones(reference, contour, limited),
+    )

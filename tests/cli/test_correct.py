@@ -1,0 +1,60 @@
+"""``fdhil correct`` as another program calls it."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil.program import write_demand_csv
+from tests.cli.test_predict import _bench as _bench
+from tests.cli.test_predict import invoke
+from tests.paths import bench_trajectory
+
+
+def test_writes_json_and_csv(bench: Path) -> None:
+    """Offsets, what is left with them, and the gain."""
+    out = bench / "out.csv"
+    arguments = ["--config", bench / "bench.toml", "--method", "mirror", "--json", "--out", out]
+    result = invoke("correct", bench / "demand.csv", *arguments)
+    assert result.exit_code == 0
+    document = json.loads(result.stdout)
+    assert document["refused"] == []
+    assert document["gain"] == pytest.approx(document["before"]["rms_um"] / document["after"]["rms_um"])
+    with out.open() as file:
+        rows = list(csv.DictReader(file))
+    corrected = np.array([float(row["corrected_contour_error_um"]) for row in rows])
+    assert np.sqrt(np.mean(corrected**2)) == pytest.approx(document["after"]["rms_um"], rel=1e-3)
+    increments = np.array([float(row["X_offset_um"]) for row in rows]) * 65536 / 20e3
+    assert np.allclose(increments, np.rint(increments), atol=1e-3)
+    assert {"Y_offset_um", "X_corrected_error_um", "Y_corrected_error_um", "contour_error_um"} <= set(rows[0])
+
+
+def test_a_refusal_writes_zeros_and_exits_1(bench: Path) -> None:
+    """The file is there, its offsets are 0, and the document says why."""
+    write_demand_csv(bench_trajectory(20, (0.030, 0.015)), bench / "fast.csv")
+    out = bench / "out.csv"
+    result = invoke("correct", bench / "fast.csv", "--config", bench / "bench.toml", "--json", "--out", out)
+    assert result.exit_code == 1
+    refused = json.loads(result.stdout)["refused"]
+    assert {entry["code"] for entry in refused} == {"DemandTooHigh"}
+    assert all(entry["text"] and entry["advice"] for entry in refused)
+    with out.open() as file:
+        assert all(float(row["X_offset_um"]) == float(row["Y_offset_um"]) == 0.0 for row in csv.DictReader(file))
+
+
+def test_text_for_people(bench: Path) -> None:
+    """The gain in words."""
+    result = invoke("correct", bench / "demand.csv", "--config", bench / "bench.toml", "--method", "mirror")
+    assert result.exit_code == 0
+    assert "times better" in result.stdout
+
+
+def test_an_unknown_method_is_refused(bench: Path) -> None:
+    """The methods are those of the table."""
+    result = invoke("correct", bench / "demand.csv", "--config", bench / "bench.toml", "--method", "magic")
+    assert result.exit_code == 2
+    assert "mirror" in result.stderr

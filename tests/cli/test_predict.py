@@ -1,0 +1,95 @@
+"""``fdhil predict`` as another program calls it."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+
+from fdhil.cli.main import cli, run_safely
+from fdhil.program import write_demand_csv
+from tests.bench import _AXIS
+from tests.paths import bench_trajectory
+
+
+@pytest.fixture(name="bench")
+def _bench(tmp_path: Path) -> Path:
+    """A folder with the bench's configuration and a demand."""
+    axes = "".join(f"[axis.{a}]\n{_AXIS.replace('[regulators]', f'[axis.{a}.regulators]')}" for a in "XY")
+    (tmp_path / "bench.toml").write_text(f'[machine]\nname = "bench"\nsync_period_s = 0.001\n{axes}')
+    write_demand_csv(bench_trajectory(10), tmp_path / "demand.csv")
+    return tmp_path
+
+
+def invoke(*arguments: object) -> Result:
+    """Run a command in this process; errors become exit codes as on the command line."""
+    codes: list[int] = []
+    runner = CliRunner()
+    with runner.isolation() as streams:
+        import sys
+
+        sys.argv = ["fdhil", *map(str, arguments)]
+        codes.append(run_safely(cli))
+        out, err = streams[0].getvalue(), streams[1].getvalue()
+    return Result(runner, out, err, out + err, None, codes[0], None)
+
+
+def test_writes_json_and_csv(bench: Path) -> None:
+    """The document and the columns of the contract."""
+    out = bench / "out.csv"
+    result = invoke("predict", bench / "demand.csv", "--config", bench / "bench.toml", "--json", "--out", out)
+    assert result.exit_code == 0
+    document = json.loads(result.stdout)
+    assert document["contour"]["rms_um"] == pytest.approx(24.2, rel=0.02)
+    assert set(document["axes"]["X"]) == {"rms_error_um", "max_error_um"}
+    assert set(document["zones"][0]) == {"start_s", "end_s", "where", "max_um", "cause"}
+    assert document["duration_s"] == pytest.approx(3.09, abs=0.01)
+    with out.open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == [
+        "time_s",
+        *(f"{axis}_{name}" for axis in "XY" for name in ("reference_mm", "predicted_mm", "error_um")),
+        "contour_error_um",
+    ]
+    assert len(rows) == len(bench_trajectory(10).time_s)
+    largest = max(float(row["contour_error_um"]) for row in rows)
+    assert largest == pytest.approx(document["contour"]["max_um"], abs=1e-3)
+    assert len(rows[0]["X_reference_mm"].split(".")[1]) >= 6
+
+
+def test_text_for_people(bench: Path) -> None:
+    """One line for the path, one per zone."""
+    result = invoke("predict", bench / "demand.csv", "--config", bench / "bench.toml")
+    assert "24.2 um RMS" in result.stdout
+    assert "corner" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["demand.csv", "--config", "missing.toml"], 2, "cannot be read"),
+        (["missing.csv", "--config", "bench.toml"], 3, "cannot be read"),
+        (["demand.csv", "--config", "bench.toml", "--model", "missing.json"], 2, "cannot be read"),
+        (["demand.csv", "--config", "bench.toml", "--model", "x.json"], 2, "Y: moves and has no model"),
+        (["demand.csv", "--config", "bench.toml", "--model", "bad.json"], 2, "must be above 0"),
+        (["demand.csv", "--config", "bench.toml", "--from-history"], 2, "moves and has no model"),
+        (["demand.csv", "--config", "bench.toml", "--from-history", "--model", "x.json"], 2, "exclude each other"),
+        (["demand.csv", "--config", "bench.toml", "--out", "no/such/folder.csv"], 3, "cannot be written"),
+        (["demand.csv"], 2, "--config"),
+    ],
+)
+def test_trouble_is_one_sentence(
+    bench: Path, arguments: list[str], code: int, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Exit code and a sentence, never a traceback."""
+    monkeypatch.chdir(bench)
+    good = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
+    (bench / "x.json").write_text(json.dumps({"X": good}))
+    (bench / "bad.json").write_text(json.dumps({"X": good, "Y": good | {"R": 0}}))
+    result = invoke("predict", *arguments)
+    assert result.exit_code == code
+    assert message in result.stderr
+    assert "Traceback" not in result.stderr

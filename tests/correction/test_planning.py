@@ -1,0 +1,117 @@
+"""Corrections of the bench path: what each method leaves, what the gate refuses, and the guard's table."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil import config as configuration
+from fdhil.correction import Limits, check, plan, table
+from fdhil.model import closed_loop
+from fdhil.prediction import contour_error_um, predict
+from fdhil.prediction.models import nominal_models
+from tests.bench import bench_config, bench_document
+from tests.paths import bench_trajectory, rms, trajectory
+
+CONFIG = bench_config()
+MODELS = nominal_models(CONFIG)
+
+
+def changed(**regulators: Any) -> configuration.MachineConfig:
+    """The bench with other regulators on both axes."""
+    document = copy.deepcopy(bench_document())
+    for axis in document["axis"].values():
+        axis["regulators"] |= regulators
+    return configuration.parse(document)
+
+
+@pytest.mark.parametrize(("feed", "rms_um", "max_um"), [(10, 3.5, 20.3), (20, 7.0, 32.0)])
+def test_mirror_leaves_what_the_bench_says(feed: float, rms_um: float, max_um: float) -> None:
+    """Seven to nine times better on the bench, within the limits, and no zone worse."""
+    correction = plan(bench_trajectory(feed), MODELS, CONFIG, "mirror")
+    assert correction.refused == ()
+    assert rms(correction.after.contour_um) == pytest.approx(rms_um, rel=0.06)
+    assert correction.after.contour_um.max() == pytest.approx(max_um, rel=0.02)
+    for axis, offset in correction.offset_um.items():
+        limits = Limits.of(CONFIG.axis[axis], 0.001)
+        increments = offset / limits.um_per_increment
+        assert np.allclose(increments, np.rint(increments), atol=1e-6)
+        assert check(np.rint(increments).astype(np.int64), limits) == []
+
+
+@pytest.mark.parametrize(("feedforward", "before_um", "after_um"), [(0.5, 85, 67), (0.0, 110, 233)])
+def test_mirror_on_a_lagging_drive(feedforward: float, before_um: float, after_um: float) -> None:
+    """The largest error at D without limits: with H far from 1 the mirror barely helps, or harms."""
+    reference, config = bench_trajectory(10), changed(speed_feedforward=feedforward)
+    x, y = reference.position_mm["X"], reference.position_mm["Y"]
+    at_d = np.hypot(x - 150, y - 5) < 20
+    before = predict(reference, MODELS, config)
+    assert before.contour_um[at_d].max() == pytest.approx(before_um, rel=0.08)
+    mirrored = {axis: -error * 1e-3 for axis, error in before.error_um.items()}
+    after = closed_loop.simulate_axes(MODELS, config.axis, 0.001, reference.position_mm, mirrored)
+    actual = np.column_stack([after[axis].position_mm for axis in "XY"])
+    assert contour_error_um(np.column_stack([x, y]), actual, 0.001)[at_d].max() == pytest.approx(after_um, rel=0.08)
+
+
+def test_a_lagging_drive_is_refused_a_mirror() -> None:
+    """The offsets would be far beyond the ceiling; the advice is the drive's own feed-forward."""
+    correction = plan(bench_trajectory(10), MODELS, changed(speed_feedforward=0.5), "mirror")
+    assert {reason.code for reason in correction.refused} == {"LagTooLarge"}
+    assert "feed-forward" in correction.refused[0].advice
+    assert all(not offset.any() for offset in correction.offset_um.values())
+
+
+@pytest.mark.parametrize("method", [None, "mirror"])
+def test_too_high_a_demand_is_refused_with_the_feed_that_can_be_held(method: str | None) -> None:
+    """20 m/min with 30 + 15 ms asks for 1.7 times the current limit; 9 to 11 m/min can be held."""
+    correction = plan(bench_trajectory(20, (0.030, 0.015)), MODELS, CONFIG, method)
+    assert {reason.code for reason in correction.refused} == {"DemandTooHigh"}
+    feed = float(correction.refused[0].advice.split()[3])
+    assert 9 < feed < 11
+    assert correction.after is correction.before
+
+
+def test_nearness_to_a_limit_warns_and_does_not_refuse() -> None:
+    """20 m/min with 60 + 30 ms reaches 99 % of the current limit."""
+    correction = plan(bench_trajectory(20), MODELS, CONFIG, "mirror")
+    assert "NearLimit" in {warning.code for warning in correction.warnings}
+
+
+def test_writing_is_off_without_limits() -> None:
+    """No [axis.X.correction], no offsets."""
+    document = bench_document()
+    del document["axis"]["Y"]["correction"]
+    correction = plan(bench_trajectory(10), MODELS, configuration.parse(document), "mirror")
+    assert [reason.code for reason in correction.refused] == ["WritingOff"]
+    assert "[axis.Y.correction]" in correction.refused[0].advice
+
+
+def test_nothing_to_correct_is_no_gain() -> None:
+    """A path at rest needs no offsets."""
+    correction = plan(trajectory(np.zeros((200, 2))), MODELS, CONFIG, "mirror")
+    assert [reason.code for reason in correction.refused] == ["NoGain"]
+
+
+def test_the_table_is_in_the_drives_increments_and_sign() -> None:
+    """Demand and offset are rounded, and turned where the drive counts against the axis."""
+    document = bench_document()
+    document["axis"]["Y"]["drive"] = {"sign": -1}
+    config = configuration.parse(document)
+    correction = plan(bench_trajectory(10), MODELS, config, "mirror")
+    result = table(correction, config, "abc")
+    per_mm = 65536 / 20
+    reference = correction.before.reference
+    assert np.array_equal(result.demand_increments["X"], np.rint(reference.position_mm["X"] * per_mm))
+    assert np.array_equal(result.offset_increments["Y"], np.rint(-correction.offset_um["Y"] * 1e-3 * per_mm))
+    assert result.program_digest == "abc"
+    assert table(correction, config, "abd").digest != result.digest
+
+
+def test_a_refused_correction_has_no_table() -> None:
+    """What was refused cannot be sent."""
+    correction = plan(trajectory(np.zeros((200, 2))), MODELS, CONFIG, "mirror")
+    with pytest.raises(ValueError, match="NoGain"):
+        table(correction, CONFIG, "abc")

@@ -1,0 +1,97 @@
+"""The closed-loop kernel against slow independent physics, and its own laws."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fdhil.model import closed_loop
+from fdhil.records import Float, Parameters
+from tests.bench import bench_config
+from tests.model.slow_drive import SlowDrive
+from tests.paths import smooth
+
+AXIS = bench_config("X").axis["X"]
+NOMINAL = Parameters(**AXIS.nominal.model_dump())
+PERIOD = 0.001
+
+
+def random_demand(seed: int, n: int = 450) -> Float:
+    """Moves, reversals and rests, smoothed as an NC does; away from the limits."""
+    random = np.random.default_rng(seed)
+    speeds = np.repeat(random.choice([0.0, 1.0, -1.0], 10) * random.uniform(0, 90, 10), n // 10 + 1)[:n]
+    speeds[-110:] = 0.0
+    path = random.uniform(-5, 5) + np.cumsum(speeds) * PERIOD
+    return smooth(path[:, None], (0.060, 0.030), PERIOD)[:, 0]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_agrees_with_independent_physics(seed: int) -> None:
+    """Within 0.6 um of a drive that quantises (dry friction keeps what rounding left), 0.02 um of one that does not."""
+    random = np.random.default_rng(100 + seed)
+    scaled = [v * random.uniform(0.85, 1.15) for v in NOMINAL.as_dict().values()]
+    parameters = Parameters(*scaled)
+    demand = random_demand(seed)
+    response = closed_loop.simulate(parameters, AXIS, PERIOD, demand)
+    assert response.limited_s == 0.0
+    fine = SlowDrive(parameters, AXIS, PERIOD, increments=65536 << 20).run(demand.tolist())
+    assert np.abs(response.position_mm - fine).max() < 0.02e-3
+    coarse = SlowDrive(parameters, AXIS, PERIOD).run(demand.tolist())
+    assert np.abs(response.position_mm - coarse).max() < 0.6e-3
+    assert np.sqrt(np.mean((response.position_mm - coarse) ** 2)) < 0.2e-3
+
+
+def test_agrees_while_a_limit_acts() -> None:
+    """A step of the demand drives current and voltage into their limits."""
+    demand = np.concatenate([np.zeros(5), np.full(250, 12.0)])
+    response = closed_loop.simulate(NOMINAL, AXIS, PERIOD, demand)
+    assert response.limited_s > 0.005
+    slow = SlowDrive(NOMINAL, AXIS, PERIOD, increments=65536 << 20).run(demand.tolist())
+    assert np.abs(response.position_mm - slow).max() < 5e-3
+
+
+def test_starts_at_rest_and_follows_to_rest() -> None:
+    """Row 0 is the start; after the hold the table is at the reference within what dry friction keeps."""
+    demand = random_demand(3)
+    response = closed_loop.simulate(NOMINAL, AXIS, PERIOD, demand)
+    assert response.position_mm[0] == demand[0]
+    assert response.speed_rad_s[0] == response.current_a[0] == 0.0
+    assert abs(response.position_mm[-1] - demand[-1]) < 0.05
+
+
+def test_runs_in_pieces_give_the_same_bits() -> None:
+    """A run that continues from a state is the run that was not interrupted."""
+    demand = random_demand(4)
+    whole = closed_loop.simulate(NOMINAL, AXIS, PERIOD, demand)
+    head = closed_loop.simulate(NOMINAL, AXIS, PERIOD, demand, rows=200)
+    tail = closed_loop.simulate(NOMINAL, AXIS, PERIOD, demand, state=head.end, first=200)
+    assert np.array_equal(np.concatenate([head.position_mm, tail.position_mm]), whole.position_mm)
+    assert np.array_equal(tail.end, whole.end)
+
+
+def test_offset_enters_the_feed_forward() -> None:
+    """Corrected means simulating r + o."""
+    demand = random_demand(5)
+    offset = smooth(np.random.default_rng(5).normal(0, 0.2, (demand.size, 1)), (0.05, 0.03), PERIOD)[:, 0]
+    offset -= offset[0]
+    together = closed_loop.simulate(NOMINAL, AXIS, PERIOD, demand, offset)
+    summed = closed_loop.simulate(NOMINAL, AXIS, PERIOD, demand + offset)
+    assert np.allclose(together.position_mm, summed.position_mm, atol=1e-9)
+
+
+def test_axes_in_threads_give_the_same_bits() -> None:
+    """Two axes at once are two axes one after the other."""
+    config = bench_config("XY")
+    demands = {"X": random_demand(6), "Y": random_demand(7)}
+    models = {"X": NOMINAL, "Y": Parameters(0.5, 0.005, 0.8, 0.085, 0.01, 1.0)}
+    both = closed_loop.simulate_axes(models, config.axis, PERIOD, demands)
+    for axis, demand in demands.items():
+        alone = closed_loop.simulate(models[axis], config.axis[axis], PERIOD, demand)
+        assert np.array_equal(both[axis].position_mm, alone.position_mm)
+
+
+@pytest.mark.parametrize("demand", [[], [0.0, np.nan], [[0.0, 1.0]], [0.0, np.inf]])
+def test_refuses_what_is_no_reference(demand: list[float]) -> None:
+    """An empty, two-dimensional or non-finite reference is an error, not a result."""
+    with pytest.raises(ValueError, match="finite positions"):
+        closed_loop.simulate(NOMINAL, AXIS, PERIOD, np.array(demand))

@@ -1,0 +1,143 @@
+"""The path errors of the bench, predicted: the published figures, zones, drifts, and the contour error's own laws."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fdhil.errors import ConfigError
+from fdhil.prediction import contour_error_um, predict, skill
+from fdhil.prediction.models import nominal_models
+from fdhil.records import Float
+from tests.bench import bench_config
+from tests.paths import bench_trajectory, rms, trajectory
+
+CONFIG = bench_config()
+MODELS = nominal_models(CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("feed", "smoothing", "rms_um", "max_um"),
+    [(10, (0.060, 0.030), 24.2, 98.6), (20, (0.060, 0.030), 64.1, 218.0), (10, (0.030, 0.015), 39.4, 211.0)],
+)
+def test_bench_figures(feed: float, smoothing: tuple[float, float], rms_um: float, max_um: float) -> None:
+    """The contour errors of the bench path, reference held for 0.5 s at its end."""
+    prediction = predict(bench_trajectory(feed, smoothing), MODELS, CONFIG)
+    assert rms(prediction.contour_um) == pytest.approx(rms_um, rel=0.02)
+    assert prediction.contour_um.max() == pytest.approx(max_um, rel=0.01)
+
+
+def test_zones_name_place_and_cause() -> None:
+    """The corners A, C, E and G of the path, and the reversal at the bottom of the arc D."""
+    zones = predict(bench_trajectory(10), MODELS, CONFIG).zones
+    corners = [zone.where for zone in zones if zone.cause == "corner"]
+    expected = [(0, 55), (100, 55), (200, 55), (250, 55)]
+    assert len(corners) == 4
+    for where, (x, y) in zip(corners, expected, strict=True):
+        _, x_mm, _, y_mm = where.split()
+        assert abs(float(x_mm) - x) < 2.5
+        assert abs(float(y_mm) - y) < 2.5
+    assert any(zone.cause == "reversal" and zone.where.startswith("X 150") for zone in zones)
+    assert all(zone.end_s > zone.start_s and zone.max_um >= 1.0 for zone in zones)
+
+
+def test_saturation_is_named() -> None:
+    """20 m/min with short smoothing asks for more than the current limit."""
+    prediction = predict(bench_trajectory(20, (0.030, 0.015)), MODELS, CONFIG)
+    assert prediction.limited_s["X"] > 0.1
+    assert {zone.cause for zone in prediction.zones} == {"saturation"}
+
+
+@pytest.mark.parametrize(
+    ("drift", "at_e_um", "largest_um"),
+    [({"ft": 0.01, "Cd": 1.0}, (0.0, 2.0), (10.0, 16.0)), ({"Jt": 0.085}, (5.0, 20.0), (5.0, 25.0))],
+)
+def test_drifts_change_the_path(
+    drift: dict[str, float], at_e_um: tuple[float, float], largest_um: tuple[float, float]
+) -> None:
+    """Figures 14 and 15: a drift on one axis alone moves the path, near E by little (friction) or much (inertia)."""
+    reference = bench_trajectory(10)
+    healthy = predict(reference, MODELS, CONFIG)
+    drifted = predict(reference, MODELS | {"X": replace(MODELS["X"], **drift)}, CONFIG)
+    moved = np.abs(healthy.predicted_mm["X"] - drifted.predicted_mm["X"]) * 1e3
+    x, y = reference.position_mm["X"], reference.position_mm["Y"]
+    near_e = np.hypot(x - 200, y - 55) < 5
+    assert at_e_um[0] <= moved[near_e].max() <= at_e_um[1]
+    assert largest_um[0] <= moved.max() <= largest_um[1]
+
+
+def test_an_axis_without_model_is_a_config_error() -> None:
+    """Both what has no model and what has no configuration are named."""
+    with pytest.raises(ConfigError, match=r"model\.Y"):
+        predict(bench_trajectory(10), {"X": MODELS["X"]}, CONFIG)
+    with pytest.raises(ConfigError, match=r"axis\.Y"):
+        predict(bench_trajectory(10), MODELS, bench_config("X"))
+
+
+def brute_force(reference: Float, actual: Float, half: int) -> Float:
+    """The full search over all segments within the window."""
+    out = np.empty(len(actual))
+    for k, point in enumerate(actual):
+        low, high = max(0, k - half), min(len(reference) - 1, k + half)
+        a, b = reference[low:high], reference[low + 1 : high + 1]
+        edge = b - a
+        length = np.maximum((edge**2).sum(axis=1), 1e-300)
+        t = np.clip(((point - a) * edge).sum(axis=1) / length, 0, 1)
+        out[k] = np.sqrt(((point - a - t[:, None] * edge) ** 2).sum(axis=1)).min()
+    return out * 1e3
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.floats(0, 50))
+def test_contour_error_is_that_of_the_full_search(seed: int, d: int, noise: float) -> None:
+    """Nothing that the search passes over could have been nearer."""
+    random = np.random.default_rng(seed)
+    steps = random.normal(0, 1, (120, d)) * (random.random((120, 1)) > 0.3)
+    reference = np.cumsum(steps, axis=0)
+    actual = reference + random.normal(0, 1, (120, d)) * noise * random.random()
+    assert np.allclose(
+        contour_error_um(reference, actual, 0.02), brute_force(reference, actual, 20), rtol=1e-9, atol=1e-9
+    )
+
+
+def test_contour_error_wants_equal_shapes() -> None:
+    """Different numbers of rows cannot be compared."""
+    with pytest.raises(ValueError, match="must both be"):
+        contour_error_um(np.zeros((3, 2)), np.zeros((4, 2)), 0.001)
+
+
+def test_skill_of_a_perfect_model_is_perfect_and_finds_a_delay() -> None:
+    """The model's own response has no error; the same response two cycles late shows 2 ms."""
+    reference = bench_trajectory(10)
+    response = predict(reference, MODELS, CONFIG)
+    demand, position = reference.position_mm["Y"][:900], response.predicted_mm["Y"][:900]
+    same = skill("Y", 7, demand, position, MODELS["Y"], CONFIG.axis["Y"], 0.001)
+    assert same.rms_um < 1e-6
+    assert same.tick == 7
+    assert same.measured_rms_um > 20
+    late = np.concatenate([np.repeat(position[:1], 2), position[:-2]])
+    delayed = skill("Y", 7, demand, late, MODELS["Y"], CONFIG.axis["Y"], 0.001)
+    assert delayed.delay_ms == pytest.approx(2.0, abs=0.1)
+    assert delayed.rms_um > 100
+
+
+def test_skill_leaves_out_lost_rows() -> None:
+    """A lost row is not compared and does no harm."""
+    reference = bench_trajectory(10)
+    response = predict(reference, MODELS, CONFIG)
+    demand, position = reference.position_mm["Y"][:900].copy(), response.predicted_mm["Y"][:900].copy()
+    demand[300:303] = position[300:303] = np.nan
+    assert skill("Y", 0, demand, position, MODELS["Y"], CONFIG.axis["Y"], 0.001).rms_um < 0.5
+    with pytest.raises(ValueError, match="no position"):
+        skill("Y", 0, demand, np.full(900, np.nan), MODELS["Y"], CONFIG.axis["Y"], 0.001)
+
+
+def test_one_axis_alone() -> None:
+    """With a single axis the contour error is what overshoots the ends of the path."""
+    demand = bench_trajectory(10).position_mm["Y"][:, None]
+    prediction = predict(trajectory(np.asarray(demand), "Y"), MODELS, CONFIG)
+    assert prediction.contour_um.max() < np.abs(prediction.error_um["Y"]).max()
