@@ -57,6 +57,7 @@ class Motion:
         self._target: float | None = None
         self._pending: float | None = None
         self._acknowledged = False
+        self._position = float(position)
         self._last_word = 0
 
     @property
@@ -98,13 +99,20 @@ class Motion:
     def _take_target(self, word: int) -> None:
         target = float(self._dictionary.number(0x607A))
         if word & _RELATIVE:
-            target += self._profile.now if self._target is None else self._target
+            target += self._base
         low, high = self._dictionary.number(0x607D, 1), self._dictionary.number(0x607D, 2)
         target = min(max(target, low), high)
         if word & _AT_ONCE or self._target is None or (self._profile.at_rest and self._profile.now == self._target):
             self._target, self._pending = target, None
         else:
             self._pending = target
+
+    @property
+    def _base(self) -> float:
+        """What a relative target is relative to: the target before it, else where the axis stands."""
+        if self._target is not None:
+            return self._target
+        return self._profile.now if self.source in (Source.PROFILE, Source.STOP) else self._position
 
     def at_sync(self, position: float) -> Command:
         """A SYNC came: take the latched set-points and return the command of the cycle that begins.
@@ -113,10 +121,10 @@ class Motion:
         """
         self._push()
         source = self._choose()
-        if source is Source.CYCLIC:
-            self.command = self.cyclic.command()
-        elif source is Source.OFF:
-            self.command = _REST
+        self._position = position
+        if source is Source.CYCLIC or source is Source.OFF:
+            self._target = self._pending = None
+            self.command = self.cyclic.command() if source is Source.CYCLIC else _REST
         else:
             self._own_motion(source, position)
         self.source = source
@@ -153,8 +161,6 @@ class Motion:
             # the demand that was in force, not where the new cycle's set-point would take it
             start, speed = self.command[1], self.command[3]
             self._profile.start(start, speed)
-        if self.source is not Source.PROFILE and source is Source.PROFILE and self._target is None:
-            self._acknowledged = False
         number = self._dictionary.number
         ramp = self._power.ramp
         deceleration = number(Ramp.QUICK_STOP.value if ramp is Ramp.QUICK_STOP else Ramp.SLOW_DOWN.value)

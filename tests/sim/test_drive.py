@@ -1,0 +1,440 @@
+"""The drive as a node: NMT, heartbeats, emergencies, sensors, storage, EDS."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import canopen
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fdhil.sim.drive import Drive
+from fdhil.sim.eds import write_eds
+from tests.sim.canopen_peer import dictionary, over_virtual_bus
+from tests.sim.rig import Abort, Rig, machine
+
+HEARTBEAT_LOST = 0x8130
+
+
+def emergencies(frames: list[tuple[int, bytes]], node: int = 1) -> list[int]:
+    assert all(len(data) == 8 for can_id, data in frames if can_id == 0x080 + node)
+    return [int.from_bytes(data[:2], "little") for can_id, data in frames if can_id == 0x080 + node]
+
+
+# -- NMT
+
+
+def test_boot_up_states_and_heartbeat() -> None:
+    rig = Rig()
+    assert rig.boot == [(0x701, b"\0")]
+    assert rig.drive.wall_clock(10.0) == [(0x701, b"\x7f")]
+    assert rig.drive.wall_clock(10.05) == []
+    rig.nmt(0x01)
+    assert rig.drive.wall_clock(10.1) == [(0x701, b"\x05")]
+    rig.nmt(0x02)
+    assert rig.drive.wall_clock(10.2) == [(0x701, b"\x04")]
+    assert rig.send(0x601, bytes([0x40, 0, 0x10, 0]) + bytes(4)) == []  # no SDO while stopped
+    rig.nmt(0x80)
+    assert rig.read(0x1017) == 100
+    rig.write(0x1017, 0, 0, 2)
+    assert rig.drive.wall_clock(99.0) == []
+
+
+def test_nmt_is_for_all_or_for_its_node() -> None:
+    rig = Rig()
+    rig.send(0, bytes([1, 5]))
+    assert rig.drive.nmt == 0x7F
+    rig.send(0, bytes([1]))
+    assert rig.drive.nmt == 0x7F
+    rig.send(0, bytes([1, 0]))
+    assert rig.drive.nmt == 0x05
+
+
+def test_reset_node_boots_with_the_power_on_values() -> None:
+    rig = Rig()
+    rig.enable()
+    rig.cycle(0, 77)
+    rig.write(0x6081, 0, 5, 4)
+    assert rig.nmt(0x81) == [(0x701, b"\0")]
+    assert rig.drive.nmt == 0x7F
+    assert rig.read(0x60B0) == 0 == rig.read(0x6060) == rig.read(0x6040)
+    assert rig.read(0x6081) == 500 * 65536 // 20
+    assert rig.status & 0x6F == 0x40
+
+
+def test_reset_communication_keeps_the_application() -> None:
+    rig = Rig()
+    rig.write(0x6081, 0, 5, 4)
+    rig.write(0x1017, 0, 50, 2)
+    rig.write(0x1802, 2, 3, 1)
+    assert rig.nmt(0x82) == [(0x701, b"\0")]
+    assert (rig.read(0x6081), rig.read(0x1017), rig.read(0x1802, 2)) == (5, 100, 10)
+
+
+def test_parameters_survive_a_reset_when_they_were_saved() -> None:
+    rig = Rig()
+    rig.write(0x1016, 1, 100 << 16 | 60, 4)
+    rig.write(0x607A, 0, 5, 4)
+    rig.write(0x1010, 1, 0x65766173, 4)
+    rig.nmt(0x81)
+    assert rig.read(0x1016, 1) == 100 << 16 | 60
+    assert rig.read(0x607A) == 0
+    rig.write(0x1011, 1, 0x64616F6C, 4)
+    rig.nmt(0x81)
+    assert rig.read(0x1016, 1) == 0
+    assert rig.read(0x1010, 1) == 1
+
+
+def test_without_supply_nothing_answers_and_the_axis_coasts() -> None:
+    rig = Rig()
+    rig.enable()
+    rig.follow(range(0, 3000, 300))
+    before = rig.drive.physics.speed_rad_s
+    rig.drive.power_off()
+    assert rig.sync() == [] == rig.drive.wall_clock(5.0) == rig.nmt(0x81)
+    assert 0 < rig.drive.physics.speed_rad_s < before
+    assert rig.drive.physics.current_a == 0
+    assert rig.drive.power_on() == [(0x701, b"\0")]
+    assert rig.read(0x6064) == rig.read(0x607A) > 500  # an absolute encoder
+
+
+def test_sync_with_and_without_counter() -> None:
+    rig = Rig()
+    rig.nmt(0x01)
+    assert len(rig.sync()) == 2 == len(rig.sync(b"\x05"))
+    rig.nmt(0x80)
+    rig.write(0x1019, 0, 240, 1)
+    rig.nmt(0x01)
+    assert len(rig.sync(b"\x01")) == 2
+    assert emergencies(rig.sync()) == [0x8240]
+    rig.nmt(0x80)
+    rig.write(0x1005, 0, 0x81, 4)
+    rig.nmt(0x01)
+    assert rig.sync(b"\x01") == []
+    assert len(rig.send(0x81, b"\x01")) == 2
+
+
+def test_the_counter_is_on_where_the_twin_s_nc_is() -> None:
+    config = machine().model_copy(update={"sim": machine().sim.model_copy(update={"nc": True})})
+    assert Rig(config).read(0x1019) == 240
+
+
+# -- heartbeats of others
+
+
+def watch(reaction: int) -> Rig:
+    rig = Rig()
+    rig.write(0x6007, 0, reaction, 2)
+    rig.write(0x1016, 1, 100 << 16 | 60, 4)
+    rig.enable()
+    return rig
+
+
+@pytest.mark.parametrize(("reaction", "pattern"), [(0, 0x27), (1, 0x0F), (2, 0x40), (3, 0x07)])
+def test_a_lost_heartbeat_is_told_and_reacted_to(reaction: int, pattern: int) -> None:
+    rig = watch(reaction)
+    rig.drive.wall_clock(1.0)
+    assert emergencies(rig.drive.wall_clock(9.0)) == []  # monitoring starts with the first one
+    rig.send(0x764, b"\x05")
+    assert emergencies(rig.drive.wall_clock(9.0599)) == []
+    assert emergencies(rig.drive.wall_clock(9.061)) == [HEARTBEAT_LOST]
+    assert rig.status & (0x4F if reaction == 2 else 0x6F) == pattern
+    assert rig.read(0x1001) == 0x11
+    assert rig.read(0x603F) == (HEARTBEAT_LOST if reaction == 1 else 0)
+    assert emergencies(rig.drive.wall_clock(9.5)) == []  # once
+    assert emergencies(rig.send(0x764, b"\x05")) == [0]  # it is back
+    assert rig.read(0x1001) == 0
+
+
+def test_after_the_reaction_the_axis_is_at_rest_and_without_power() -> None:
+    rig = watch(1)
+    rig.send(0x764, b"\x05")
+    rig.follow(range(0, 30000, 300))
+    rig.drive.wall_clock(1.0)
+    for _ in range(200):
+        rig.cycle(29700)
+    assert rig.status & 0x4F == 0x08
+    assert rig.drive.physics.speed_rad_s == 0
+    assert rig.drive.physics.current_a == 0
+    rig.cycle(29700, word=0x80)
+    assert rig.status & 0x6F == 0x40
+    assert rig.read(0x603F) == 0
+
+
+def test_the_consumer_can_be_made_deaf() -> None:
+    rig = watch(1)
+    rig.drive.faults.no_heartbeat_consumer = True
+    rig.send(0x764, b"\x05")
+    assert emergencies(rig.drive.wall_clock(50.0)) == []
+
+
+def test_one_node_is_watched_once() -> None:
+    rig = watch(1)
+    with pytest.raises(Abort) as abort:
+        rig.write(0x1016, 2, 100 << 16 | 50, 4)
+    assert abort.value.code == 0x06040043
+    rig.write(0x1016, 2, 100 << 16, 4)
+
+
+def test_nmt_stop_under_power_is_an_aborted_connection() -> None:
+    rig = watch(2)
+    rig.nmt(0x02)
+    assert rig.status & 0x4F == 0x40
+
+
+def test_rpdo_time_out() -> None:
+    rig = Rig()
+    rig.write(0x1401, 5, 5, 2)
+    rig.write(0x6007, 0, 3, 2)
+    rig.enable()
+    rig.drive.wall_clock(1.0)
+    assert emergencies(rig.drive.wall_clock(1.1)) == []
+    rig.cycle(0, 0)
+    assert emergencies(rig.drive.wall_clock(1.104)) == []
+    assert emergencies(rig.drive.wall_clock(1.106)) == [0x8250]
+    assert rig.status & 0x6F == 0x07
+
+
+# -- faults
+
+
+def test_a_trip_is_told_once_and_kept_in_the_history() -> None:
+    rig = Rig()
+    rig.enable()
+    rig.drive.trip(0x2310, b"\x01\x02\x03\x04\x05")
+    ((_, data),) = [frame for frame in rig.sync() if frame[0] == 0x081]
+    assert data == bytes([0x10, 0x23, 0x03, 1, 2, 3, 4, 5])
+    assert rig.read(0x603F) == 0x2310
+    rig.drive.trip(0x4310)
+    assert rig.read(0x1003) == 2
+    assert (rig.read(0x1003, 1), rig.read(0x1003, 2)) == (0x4310, 0x02012310)
+    for _ in range(12):
+        rig.drive.trip(0x3210)
+    assert rig.read(0x1003) == 8
+    rig.write(0x1014, 0, 0x80000081, 4)
+    rig.sync()
+    rig.drive.trip(0xFF01)
+    assert emergencies(rig.sync()) == []  # the EMCY object is not valid
+
+
+def test_following_error_window_and_time_out() -> None:
+    rig = Rig()
+    rig.write(0x6065, 0, 1000, 4)
+    rig.enable()
+    rig.drive.faults.load_torque_nm = 400.0  # a jam: more than 200 A can hold
+    codes, statuses = [], []
+    for _ in range(60):
+        codes += emergencies(rig.cycle(0))
+        statuses.append(rig.status)
+    assert codes == [0x8611]
+    assert statuses[-1] & 1 << 13
+    assert statuses[-1] & 0x4F == 0x08
+    assert rig.read(0x1001) & 0x21 == 0x21
+    off = Rig()
+    off.write(0x6065, 0, 0xFFFFFFFF, 4)
+    off.enable()
+    off.drive.faults.load_torque_nm = 400.0
+    for _ in range(60):
+        assert emergencies(off.cycle(0)) == []
+    assert off.status & 1 << 11  # the current limit acts
+
+
+def test_limit_switches_show_in_bit_11() -> None:
+    rig = Rig()
+    rig.drive.digital_inputs = 1 << 16 | 2
+    rig.sync()
+    assert rig.status & 1 << 11
+    assert rig.read(0x60FD) == 0x10002 == rig.drive.digital_inputs
+
+
+def test_the_offset_can_be_ignored_or_scaled() -> None:
+    rig = Rig()
+    rig.enable()
+    rig.cycle(0, 100)
+    rig.drive.faults.ignore_offset = True
+    for _ in range(4):
+        rig.cycle(0, 300)
+    assert rig.read(0x60B0) == 100 == rig.read(0x6062)
+    rig.drive.faults.ignore_offset = False
+    rig.drive.faults.offset_scale = 10.0
+    for _ in range(4):
+        rig.cycle(0, 30)
+    assert (rig.read(0x60B0), rig.read(0x6062)) == (30, 300)
+
+
+def test_a_drive_that_is_not_in_csp_says_so_and_stands() -> None:
+    rig = Rig()
+    rig.enable()
+    rig.drive.faults.not_csp = True
+    rig.follow(range(0, 3000, 100))
+    assert rig.read(0x6061) == 1
+    assert not rig.status & 1 << 12
+    assert abs(rig.drive.table_mm) < 0.01
+
+
+# -- sensors
+
+
+def test_noise_has_its_standard_deviation_and_is_on_the_reported_values_alone() -> None:
+    rig = Rig(machine(noise=True))
+    rig.nmt(0x01)
+    rows = []
+    for _ in range(2000):
+        frames = dict(rig.sync())
+        speed = struct.unpack("<ii", frames[0x181])[1]
+        rows.append((speed, *struct.unpack("<Hhh", frames[0x281])[1:]))
+    std = np.std(np.array(rows) * [2 * np.pi / 65536, 0.05, 0.02], axis=0)
+    np.testing.assert_allclose(std, [0.15, np.hypot(0.05, 0.05 / 12**0.5), 0.06], rtol=0.08)
+    assert rig.drive.table_mm == 0.0
+
+
+def test_sensor_faults() -> None:
+    rig = Rig()
+    rig.nmt(0x01)
+    read = {"position": 0x6064, "speed": 0x606C, "current": 0x6078, "voltage": 0x2101}
+    for name, index in read.items():
+        fault = rig.drive.faults.signal(name)
+        fault.offset = 4.0
+        rig.sync()
+        value = rig.read(index, signed=True)
+        assert value > 0
+        fault.gain, fault.clip = -1.0, 2.0
+        rig.sync()
+        assert 0 < rig.read(index, signed=True) <= value
+        fault.clip, fault.stuck = None, True
+        rig.sync()
+        fault.offset = -4.0
+        rig.sync()
+        assert rig.read(index, signed=True) == value
+        fault.stuck, fault.resolution = False, 100.0
+        rig.sync()
+        assert rig.read(index, signed=True) == 0
+        fault.garbage = 1e9
+        seen = set()
+        for _ in range(5):
+            rig.sync()
+            seen.add(rig.read(index, signed=True))
+        assert len(seen) > 1
+    with pytest.raises(KeyError):
+        rig.drive.faults.signal("humidity")
+
+
+def test_a_slow_sensor_is_late() -> None:
+    rig = Rig()
+    rig.enable()
+    rig.drive.faults.signal("position").delay_cycles = 3
+    true, shown = [], []
+    for target in range(0, 4000, 100):
+        rig.cycle(target)
+        true.append(round(rig.drive.table_mm * 3276.8))
+        shown.append(rig.read(0x6064, signed=True))
+    assert shown[3:] == true[:-3]
+
+
+def test_temperature_moves_the_friction() -> None:
+    rig = Rig(machine(ft_per_kelvin=-0.4, Cd_per_kelvin=-0.1))
+    rig.drive.set_temperature(22.0)
+    assert rig.read(0x2110, 1) == 2200
+    assert rig.drive.physics.parameters.ft == pytest.approx(0.05 * 0.2)
+    assert rig.drive.physics.parameters.Cd == pytest.approx(4.0)
+    rig.drive.set_parameters(Jt=0.085, Cd=1.0)
+    assert rig.drive.physics.parameters.Jt == 0.085
+    assert rig.drive.physics.parameters.Cd == pytest.approx(0.8)
+    rig.drive.set_temperature(30.0)
+    assert rig.drive.physics.parameters.ft == 0.0
+    for wrong in ({"Jt": 0.0}, {"R": float("nan")}, {"ft": -1.0}):
+        with pytest.raises(ValueError, match="no value of a feed drive"):
+            rig.drive.set_parameters(**wrong)
+    with pytest.raises(TypeError):
+        rig.drive.set_parameters(mass=1.0)
+
+
+def test_the_true_plant_may_differ_from_the_nominal_one() -> None:
+    rig = Rig(machine(Jt=0.09, start_mm=12.0))
+    assert rig.drive.physics.parameters.Jt == 0.09
+    assert rig.read(0x6076) == 40000  # the drive's data sheet does not know
+    assert rig.drive.table_mm == pytest.approx(12.0)
+    assert rig.read(0x6064) == round(12 * 3276.8) == rig.read(0x607A)
+
+
+# -- EDS
+
+
+def test_the_eds_says_what_the_drive_is(tmp_path: Path) -> None:
+    config = machine("XY")
+    rig = Rig(config, "Y")
+    od: Any = canopen.import_od(str(write_eds(rig.drive, tmp_path / "sub" / "y.eds")), 2)
+    for item in rig.drive.dictionary:
+        for entry in item.entries:
+            described = od.get_variable(item.index, entry.sub)
+            assert described is not None, hex(item.index)
+            assert described.data_type == entry.type
+            assert described.access_type == entry.access
+            assert described.pdo_mappable == entry.mappable
+            if entry.size is not None:
+                assert described.default == entry.default
+                assert (described.min, described.max) == (entry.low, entry.high)
+    assert isinstance(od[0x1600], canopen.objectdictionary.ODRecord)
+    assert od[0x1018][4].default == 1002
+    elsewhere: Any = canopen.import_od(str(tmp_path / "sub" / "y.eds"), 9)
+    assert elsewhere[0x1800][1].default == 0x40000189
+    assert elsewhere[0x1402][1].default == 0x80000409
+
+
+def test_every_object_that_may_be_read_can_be_read_by_the_library() -> None:
+    rig = Rig()
+    rig.sync()
+    od: Any = dictionary(rig.drive)
+    for item in rig.drive.dictionary:
+        for entry in item.entries:
+            if entry.access == "wo" or item.index == 0x1003:
+                continue
+            data = rig.drive.dictionary.read(item.index, entry.sub)
+            assert od.get_variable(item.index, entry.sub).decode_raw(data) is not None
+            assert entry.size in (None, len(data))
+
+
+def test_a_master_brings_it_up_over_a_virtual_bus() -> None:
+    rig = Rig()
+    with over_virtual_bus(rig.drive) as node:
+        node.nmt.state = "OPERATIONAL"
+        node.sdo["Modes of operation"].raw = 8
+        for word in (0x06, 0x07, 0x0F):
+            node.sdo["Controlword"].raw = word
+        assert node.sdo["Statusword"].raw & 0x6F == 0x27
+        assert node.sdo["Modes of operation display"].raw == 8
+        assert node.emcy.log == []
+
+
+def test_two_runs_are_the_same_bit_by_bit() -> None:
+    def run() -> list[list[tuple[int, bytes]]]:
+        rig = Rig(machine(noise=True, backlash_um=5.0), seed=7)
+        rig.enable()
+        return [rig.cycle(n * n, n) for n in range(200)]
+
+    assert run() == run()
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    st.lists(
+        st.tuples(st.sampled_from([0, 0x80, 0x201, 0x301, 0x401, 0x601, 0x701, 0x764, 0x123]), st.binary(max_size=8)),
+        max_size=60,
+    )
+)
+def test_no_frame_breaks_the_drive(frames: list[tuple[int, bytes]]) -> None:
+    drive = Drive("X", CONFIG, np.random.default_rng(0))
+    drive.power_on()
+    drive.receive(0, b"\x01\x00")
+    for n, (can_id, data) in enumerate(frames):
+        for sent_id, sent in (*drive.receive(can_id, data), *drive.wall_clock(n * 0.02)):
+            assert 0 < sent_id <= 0x7FF
+            assert len(sent) <= 8
+    assert np.isfinite(drive.table_mm)
+
+
+CONFIG = machine()
