@@ -55,6 +55,11 @@ class Curve:
     dashed: bool = False
 
 
+def magnified(reference_mm: Float, actual_mm: Float, factor: float) -> Float:
+    """Return the actual path (n, 2) with its deviation from the reference ``factor`` times as large."""
+    return reference_mm + factor * (actual_mm - reference_mm)
+
+
 @contextmanager
 def _drawing(width: float = 6.4, height: float = 3.6) -> Iterator[tuple[Figure, Axes, list[str]]]:
     """A figure with one pair of axes; on leaving, the list holds its SVG."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import shutil
 import time
@@ -20,7 +19,9 @@ from fdhil.cli.demo.processes import Process, Twin
 from fdhil.cli.demo.report import Cut, Loop, Published
 from fdhil.config import MachineConfig
 from fdhil.daemon.control import SOCKET_NAME, ask
+from fdhil.daemon.token import TOKEN_NAME
 from fdhil.drivers.commissioning import commission
+from fdhil.drivers.commissioning_record import save_record
 from fdhil.errors import DeviceTimeout, FdhilError, RecordingError
 from fdhil.prediction import contour_error_um, predict
 from fdhil.program import load_trajectory
@@ -88,7 +89,7 @@ def _start_twin(out: Path, realtime: bool, say: Say, stack: ExitStack) -> Stage:
         "can0": {"interface": "socketcand", "channel": bus["channel"], "host": bus["host"], "port": bus["port"]}
     }
     (out / "machine.toml").write_text(_toml(document), "utf-8")
-    folder = source.parent / "programs"
+    folder = source.parent
     programs = {label: folder / name for label, name in PROGRAMS.items()}
     return Stage(out, machine_config.load(out / "machine.toml"), twin, say, programs)
 
@@ -127,7 +128,8 @@ def _await(done: Callable[[], bool], timeout_s: float, failure: str, stage: Stag
 def _commission(stage: Stage) -> None:
     for axis in stage.config.axis:
         stage.say(f"commissioning {axis}: identity, read-back, +10 um, feed-forward, watchdog")
-        record = asyncio.run(commission(stage.config, axis))
+        record = commission(stage.config, axis)
+        save_record(record, stage.config.store.directory)
         where = "sees" if record.offset_in_feedforward else "does not see"
         stage.say(f"  the offset moved the axis {record.sign_test_um:+.1f} um; the feed-forward {where} it")
 

@@ -19,6 +19,7 @@ POINTS: Mapping[str, tuple[float, float]] = {
     "A": (0.0, 55.0), "B": (50.0, 55.0), "C": (100.0, 55.0), "D": (150.0, 5.0), "E": (200.0, 55.0), "F": (225.0, 55.0),
     "G": (250.0, 55.0),
 }  # fmt: skip
+MAGNIFIED = 10  # a hundred micrometres beside corners that the NC rounds by millimetres
 # [DES] 5.3: the drifts whose effect at E is shown, on X only
 DRIFTS: Sequence[tuple[str, Mapping[str, float]]] = (
     ("ft 0.01, Cd 1 on X", {"ft": 0.01, "Cd": 1.0}),
@@ -202,9 +203,12 @@ def _predicted(loop: Loop) -> Section:
     pictures = []
     for place, number in (("A", 11), ("C", 12), ("E", 13)):
         curves = [Curve("desired", _xy(slow.position_mm))]
-        curves += [Curve(feed, _xy(answer.predicted_mm)) for feed, answer in feeds.items()]
-        caption = f"Predicted path at {place} for two feeds (Figure {number})"
-        pictures.append((caption, figures.corner(curves, POINTS[place], 1.0)))
+        for feed, answer in feeds.items():
+            desired = _xy(answer.reference.position_mm)
+            curves.append(Curve(feed, figures.magnified(desired, _xy(answer.predicted_mm), MAGNIFIED)))
+        curves.append(Curve("desired, 20 m/min", _xy(loop.programs["20 m/min"].position_mm), dashed=True))
+        caption = f"Predicted path at {place} for two feeds, errors {MAGNIFIED} times as large (Figure {number})"
+        pictures.append((caption, figures.corner(curves, POINTS[place], 8.0)))
     for (label, change), number in zip(DRIFTS, (14, 15), strict=True):
         drifted = predict(slow, models | {"X": _drift(models["X"], change)}, loop.config)
         curves = [
