@@ -181,7 +181,7 @@ def corner(curves: Sequence[Curve], place_mm: tuple[float, float], half_width_mm
         axes.locator_params(nbins=6)
         axes.set_xlabel("X (mm)")
         axes.set_ylabel("Y (mm)")
-        axes.legend(loc="upper left", bbox_to_anchor=(0.0, 1.1), ncols=3, columnspacing=1.2)
+        axes.legend(loc="upper left", bbox_to_anchor=(0.0, 1.1), ncols=len(curves) if len(curves) < 4 else 2, columnspacing=1.2)
     return svg[0]
 
 

@@ -19,7 +19,6 @@ from fdhil.cli.demo.processes import Process, Twin
 from fdhil.cli.demo.report import Cut, Loop, Published
 from fdhil.config import MachineConfig
 from fdhil.daemon.control import SOCKET_NAME, ask
-from fdhil.daemon.token import TOKEN_NAME
 from fdhil.drivers.commissioning import commission
 from fdhil.drivers.commissioning_record import save_record
 from fdhil.errors import DeviceTimeout, FdhilError, RecordingError

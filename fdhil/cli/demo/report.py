@@ -202,7 +202,7 @@ def _predicted(loop: Loop) -> Section:
     slow = loop.programs["10 m/min"]
     pictures = []
     for place, number in (("A", 11), ("C", 12), ("E", 13)):
-        curves = [Curve("desired", _xy(slow.position_mm))]
+        curves = [Curve("desired, 10 m/min", _xy(slow.position_mm))]
         for feed, answer in feeds.items():
             desired = _xy(answer.reference.position_mm)
             curves.append(Curve(feed, figures.magnified(desired, _xy(answer.predicted_mm), MAGNIFIED)))
