@@ -380,6 +380,7 @@ class Nc:
             for axis, here in zip(self.axes, self._position, strict=True)
         ]
         rows = np.column_stack(columns)
+        self._rate.jump(0.0 if self._hold else self.override)
         rapid = rapid_rows(
             self._position, rows[0], self._speeds, self._accelerations, self._smoothing_s, self._period_s
         )

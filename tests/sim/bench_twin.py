@@ -1,0 +1,104 @@
+"""The bench machine as a twin in this process, and references to play on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from fdhil import config
+from fdhil.config import MachineConfig
+from fdhil.records import Float, Trajectory, frozen
+from fdhil.sim.hub import Frame
+from fdhil.sim.machine import Machine
+from tests.bench import bench_document
+
+PERIOD_S = 0.001
+
+
+def twin_config(axes: str = "XY", *, sim: Mapping[str, Any] | None = None, **axis_keys: Any) -> MachineConfig:
+    """Return the bench's configuration with a [sim] section and keys for every axis."""
+    document = bench_document(axes)
+    for axis in document["axis"].values():
+        axis.update(axis_keys)
+    document["sim"] = {"noise": {"voltage_v": 0.0, "current_a": 0.0, "speed_rad_s": 0.0}, **(sim or {})}
+    return config.parse(document)
+
+
+def smooth(points_mm: Float, widths: tuple[int, ...] = (60, 30)) -> Float:
+    """Return (n, axes) rows that run through the moving averages, as an NC does."""
+    for width in widths:
+        padded = np.vstack([np.repeat(points_mm[:1], width - 1, 0), points_mm, np.repeat(points_mm[-1:], width - 1, 0)])
+        kernel = np.ones(width) / width
+        points_mm = np.column_stack([np.convolve(column, kernel, mode="valid") for column in padded.T])
+    return points_mm
+
+
+def corner(speed_mm_s: float = 150.0, side_mm: float = 20.0) -> Float:
+    """Return the rows (n, 2) of an L: up along Y, then along X."""
+    steps = round(side_mm / (speed_mm_s * PERIOD_S))
+    way = np.linspace(0.0, side_mm, steps + 1)
+    up = np.column_stack([np.zeros_like(way), way])
+    along = np.column_stack([way[1:], np.full(steps, side_mm)])
+    return smooth(np.vstack([up, along]))
+
+
+def trajectory(rows_mm: Float, axes: str = "XY", rapid: bool = False) -> Trajectory:
+    """Return rows (n, axes) as a trajectory."""
+    n = len(rows_mm)
+    return Trajectory(
+        PERIOD_S,
+        frozen(np.arange(n) * PERIOD_S),
+        {axis: frozen(rows_mm[:, place]) for place, axis in enumerate(axes)},
+        np.full(n, rapid),
+        np.zeros(n, dtype=np.int64),
+    )
+
+
+class TwinInHand:
+    """A machine that is moved cycle by cycle; ``wire`` keeps every frame in order, ``events`` what it told."""
+
+    def __init__(self, machine_config: MachineConfig) -> None:
+        self.machine = Machine(machine_config)
+        self.wire: list[Frame] = [frame for _, frame in self.machine.power_on()]
+        self.events: list[dict[str, Any]] = []
+        self.table: list[list[float]] = []
+        self.each_cycle: Callable[[], None] = lambda: None
+
+    def run(self, cycles: int) -> None:
+        """Run some cycles of the NC."""
+        for _ in range(cycles):
+            self.wire += [frame for _, frame in self.machine.cycle()]
+            self.events += self.machine.take_events()
+            self.table.append([unit.drive.table_mm for unit in self.machine.units.values()])
+            self.each_cycle()
+
+    def run_until(self, event: str, limit: int = 20000) -> dict[str, Any]:
+        """Run until an event of this name comes and return it."""
+        for _ in range(limit):
+            known = len(self.events)
+            self.run(1)
+            for item in self.events[known:]:
+                if item["event"] == event:
+                    return item
+        raise AssertionError(f"no {event} within {limit} cycles: {self.events}")
+
+    def send(self, can_id: int, data: bytes) -> list[Frame]:
+        """Send a frame as another party and return the answers."""
+        return self.machine.receive("can0", (can_id, data))
+
+    def switch_on(self) -> None:
+        """Let the NC take over."""
+        self.machine.nc.switch(True)
+        self.run_until("nc")
+
+    def play(self, rows_mm: Float, **keys: Any) -> None:
+        """Let the NC play rows."""
+        self.machine.nc.play("rows", trajectory(rows_mm, **keys))
+
+
+def targets(wire: list[Frame], node_id: int) -> list[tuple[int, int]]:
+    """Return (controlword, target) of every RPDO1 of a node on the wire."""
+    found = [data for can_id, data in wire if can_id == 0x200 + node_id]
+    return [(int.from_bytes(d[:2], "little"), int.from_bytes(d[2:], "little", signed=True)) for d in found]

@@ -1,0 +1,73 @@
+"""A hub in a thread, as the twin's loop runs it, and the stock client that joins it."""
+
+from __future__ import annotations
+
+import select
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import can
+
+from fdhil.sim.hub import Frame, Hub
+
+
+class HubThread(threading.Thread):
+    """Serves a hub until stopped; ``twin`` is called in the hub's thread with every frame that comes."""
+
+    def __init__(self, hub: Hub, twin: Callable[[Hub, Frame], None] = lambda hub, frame: None) -> None:
+        super().__init__(name="hub")
+        self.hub = hub
+        self.each_turn: Callable[[Hub], None] = lambda hub: None
+        self._twin = twin
+        self._ending = False
+
+    def run(self) -> None:
+        """The loop."""
+        while not self._ending:
+            ready, _, _ = select.select(self.hub.readers(), self.hub.writers(), (), 0.002)
+            self.hub.pump(ready, lambda frame: self._twin(self.hub, frame))
+            self.each_turn(self.hub)
+            self.hub.flush(time.monotonic())
+
+    def stop(self) -> None:
+        """End the loop and close the hub."""
+        self._ending = True
+        self.join()
+        self.hub.close()
+
+
+@contextmanager
+def serving(hub: Hub, twin: Callable[[Hub, Frame], None] = lambda hub, frame: None) -> Iterator[HubThread]:
+    """Serve a hub for the time of a with block."""
+    thread = HubThread(hub, twin)
+    thread.start()
+    try:
+        yield thread
+    finally:
+        thread.stop()
+
+
+@contextmanager
+def joined(hub: Hub, count: int = 1) -> Iterator[list[can.BusABC]]:
+    """Join stock python-can clients for the time of a with block."""
+    buses: list[can.BusABC] = []
+    try:
+        for _ in range(count):
+            buses.append(can.Bus(interface="socketcand", channel="can0", host=hub.host, port=hub.port))
+        yield buses
+    finally:
+        for bus in buses:
+            bus.shutdown()
+
+
+def frames_of(bus: can.BusABC, count: int, timeout_s: float = 10.0) -> list[Frame]:
+    """Receive ``count`` frames, fewer when they do not come in time."""
+    frames: list[Frame] = []
+    deadline = time.monotonic() + timeout_s
+    while len(frames) < count and time.monotonic() < deadline:
+        message = bus.recv(0.2)
+        if message is not None:
+            frames.append((message.arbitration_id, bytes(message.data)))
+    return frames

@@ -1,0 +1,189 @@
+"""The hub against the stock socketcand client of python-can."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import socket
+import struct
+import time
+
+import can
+import pytest
+from can.interfaces.socketcand.socketcand import (
+    convert_ascii_message_to_can_message,
+    convert_can_message_to_ascii_message,
+)
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fdhil.errors import ConnectError
+from fdhil.sim import hub as hub_module
+from fdhil.sim.hub import EXTENDED, Hub, decode_send, encode
+from tests.sim.hub_thread import frames_of, joined, serving
+
+_DATA = st.binary(max_size=8)
+_STANDARD, _EXTENDED = st.integers(0, 0x7FF), st.integers(0, 0x1FFFFFFF)
+
+
+@given(_STANDARD, _DATA)
+def test_the_client_understands_what_the_hub_sends(can_id: int, data: bytes) -> None:
+    text = encode([(can_id, data)], 1700000000.25)
+    message = convert_ascii_message_to_can_message(text.decode())
+    assert (message.arbitration_id, message.data, message.is_extended_id) == (can_id, data, False)
+    assert message.timestamp == 1700000000.25
+    assert len(text) == 64
+
+
+@given(_EXTENDED, _DATA)
+def test_29_bit_identifiers_stay_apart_from_11_bit_ones(can_id: int, data: bytes) -> None:
+    message = can.Message(arbitration_id=can_id, data=data, is_extended_id=True)
+    frame = decode_send(convert_can_message_to_ascii_message(message)[:-1].encode())
+    assert frame == (can_id | EXTENDED, data)
+    back = convert_ascii_message_to_can_message(encode([frame], 0.0).decode())
+    assert (back.arbitration_id, back.data, back.is_extended_id) == (can_id, data, True)
+
+
+@given(_STANDARD, _DATA)
+def test_the_hub_understands_what_the_client_sends(can_id: int, data: bytes) -> None:
+    message = can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+    assert decode_send(convert_can_message_to_ascii_message(message)[:-1].encode()) == (can_id, data)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "< send",
+        "< send 181",
+        "< send 181 2 0a",
+        "< send 181 1 0a 0b",
+        "< send 181 9 0 0 0 0 0 0 0 0 0",
+        "< send 800 0",
+        "< send 181 1 1ff",
+        "< send 181 -1",
+        "< send xyz 0",
+    ],
+)
+def test_malformed_frames_are_refused(text: str) -> None:
+    assert decode_send(text.encode()) is None
+
+
+def test_every_client_hears_the_others_and_not_himself() -> None:
+    heard = []
+    hub = Hub("can0")
+    with serving(hub, lambda hub, frame: heard.append(frame)), joined(hub, 3) as (a, b, c):
+        a.send(can.Message(arbitration_id=0x181, data=b"\x0a\xff", is_extended_id=False))
+        b.send(can.Message(arbitration_id=0x000, data=b"\x01\x00", is_extended_id=False))
+        assert frames_of(c, 2) == [(0x181, b"\x0a\xff"), (0x000, b"\x01\x00")]
+        assert frames_of(a, 1) == [(0x000, b"\x01\x00")]
+        assert frames_of(b, 1) == [(0x181, b"\x0a\xff")]
+        assert a.recv(0.05) is None
+    assert heard == [(0x181, b"\x0a\xff"), (0x000, b"\x01\x00")]
+
+
+def test_the_twin_answers_in_the_order_of_the_frames() -> None:
+    """A burst of SYNC, frame, SYNC in one packet must not show both answers after both questions."""
+    hub = Hub("can0")
+    with (
+        serving(hub, lambda hub, frame: hub.send([(0x181, frame[1])]) if frame[0] == 0x80 else None),
+        joined(hub, 1) as (listener,),
+        socket.create_connection((hub.host, hub.port)) as plain,
+    ):
+        for command, answer in ((b"", b"< hi >"), (b"< open can0 >", b"< ok >"), (b"< rawmode >", b"< ok >")):
+            plain.sendall(command)
+            assert plain.recv(64) == answer
+        plain.sendall(b"< send 80 1 1 >< send 201 1 7 >< send 80 1 2 >")
+        assert frames_of(listener, 5) == [
+            (0x080, b"\1"),
+            (0x181, b"\1"),
+            (0x201, b"\7"),
+            (0x080, b"\2"),
+            (0x181, b"\2"),
+        ]
+
+
+def test_clients_join_while_the_bus_is_busy(caplog: pytest.LogCaptureFixture) -> None:
+    """The client reads each greeting with one recv: frames behind the last one would be taken for a wrong answer."""
+    hub = Hub("can0")
+    caplog.set_level(logging.WARNING)
+    with serving(hub) as thread:
+        thread.each_turn = lambda hub: hub.send([(0x80, b"\1"), (0x181, bytes(8))])
+        for _ in range(10):
+            with joined(hub, 1) as (bus,):
+                assert len(frames_of(bus, 4)) == 4
+    assert not [record for record in caplog.records if "ncomplete" in record.message]
+
+
+def test_nothing_is_lost_to_a_slow_reader() -> None:
+    """20000 frames against a queue of 4 kB: the hub stops taking frames until the slow reader has read."""
+    count = 20000
+    hub = Hub("can0", queue_bytes=4096)
+    with serving(hub), joined(hub, 2) as (slow, fast), socket.create_connection((hub.host, hub.port)) as sender:
+        for command in (b"", b"< open can0 >", b"< rawmode >"):
+            sender.sendall(command)
+            sender.recv(64)
+        sender.setblocking(False)
+        text = b"".join(b"< send 201 4 %x %x %x %x >" % tuple(struct.pack("<I", k)) for k in range(count))
+        received: dict[int, list[int]] = {0: [], 1: []}
+        saw_congestion = False
+        deadline = time.monotonic() + 30
+        while min(map(len, received.values())) < count and time.monotonic() < deadline:
+            with contextlib.suppress(BlockingIOError):
+                text = text[sender.send(text[: 1 << 18]) :]
+            saw_congestion |= hub.congested
+            for place, bus in enumerate((slow, fast)):
+                for _ in range(100 if place else 50):
+                    message = bus.recv(0)
+                    if message is not None:
+                        received[place].append(int.from_bytes(message.data, "little"))
+    assert received[0] == received[1] == list(range(count))
+    assert saw_congestion
+    assert hub.lost_clients == 0
+
+
+def test_a_client_that_never_reads_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hub_module, "STALL_S", 0.05)
+    hub = Hub("can0", queue_bytes=1 << 16)
+    with serving(hub) as thread, joined(hub, 1):
+        thread.each_turn = lambda hub: None if hub.congested else hub.send([(0x181, bytes(8))] * 2000)
+        deadline = time.monotonic() + 20
+        while not hub.lost_clients and time.monotonic() < deadline:
+            time.sleep(0.01)
+        thread.each_turn = lambda hub: None
+        assert hub.lost_clients == 1
+        time.sleep(0.01)
+        assert hub.clients == 0
+
+
+def test_what_is_no_socketcand_client_does_not_disturb() -> None:
+    hub = Hub("can0")
+    with serving(hub), joined(hub, 2) as (a, b):
+        with socket.create_connection((hub.host, hub.port)) as stranger:
+            stranger.recv(64)
+            stranger.sendall(b"GET / HTTP/1.1\r\n" + b"x" * 5000)
+            assert _until_closed(stranger) == b""
+        with socket.create_connection((hub.host, hub.port)) as stranger:
+            assert stranger.recv(64) == b"< hi >"
+            stranger.sendall(b"< open can7 >")
+            assert stranger.recv(64) == b"< error could not open bus >"
+            stranger.sendall(b"< echo >")
+            assert stranger.recv(64) == b"< echo >"
+        a.send(can.Message(arbitration_id=0x701, data=b"\0", is_extended_id=False))
+        assert frames_of(b, 1) == [(0x701, b"\0")]
+    assert hub.malformed == 1
+
+
+def _until_closed(connection: socket.socket) -> bytes:
+    try:
+        return connection.recv(64)
+    except ConnectionResetError:
+        return b""
+
+
+def test_a_port_in_use_is_one_sentence() -> None:
+    hub = Hub("can0")
+    try:
+        with pytest.raises(ConnectError, match=rf"bus can0: TCP port {hub.port} .* cannot be had"):
+            Hub("can0", port=hub.port)
+    finally:
+        hub.close()
