@@ -95,3 +95,9 @@ class Rig:
 def _nothing() -> Iterable[None]:
     while True:
         yield None
+
+
+def emergencies(frames: list[Frame], node: int = 1) -> list[int]:
+    """The error codes of the EMCY frames among these, all of 8 bytes."""
+    assert all(len(data) == 8 for can_id, data in frames if can_id == 0x080 + node)
+    return [int.from_bytes(data[:2], "little") for can_id, data in frames if can_id == 0x080 + node]
