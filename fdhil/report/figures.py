@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,28 +23,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-INK, SOFT, REFERENCE = "#1d2733", "#5b6876", "#9aa5b1"
+INK, REFERENCE = "#1d2733", "#9aa5b1"
 # colours that stay apart in print and for colour-blind readers (Okabe and Ito)
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-
-_STYLE = {
-    "font.size": 9.5,
-    "font.family": "sans-serif",
-    "axes.edgecolor": SOFT,
-    "axes.labelcolor": INK,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#e6eaee",
-    "grid.linewidth": 0.7,
-    "xtick.color": SOFT,
-    "ytick.color": SOFT,
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-    "lines.linewidth": 1.3,
-    "svg.fonttype": "none",
-    "svg.hashsalt": "fdhil",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +45,11 @@ def magnified(reference_mm: Float, actual_mm: Float, factor: float) -> Float:
 @contextmanager
 def _drawing(width: float = 6.4, height: float = 3.6) -> Iterator[tuple[Figure, Axes, list[str]]]:
     """A figure with one pair of axes; on leaving, the list holds its SVG."""
-    from matplotlib import rc_context
+    from matplotlib import style
     from matplotlib.figure import Figure
 
     svg: list[str] = []
-    with rc_context(_STYLE):
+    with style.context(Path(__file__).with_name("fdhil.mplstyle")):
         figure = Figure(figsize=(width, height))
         # fixed margins: matplotlib's own layout would draw every figure twice
         yield figure, figure.add_axes((0.8 / width, 0.55 / height, 1 - 1.0 / width, 1 - 0.9 / height)), svg
@@ -181,7 +163,8 @@ def corner(curves: Sequence[Curve], place_mm: tuple[float, float], half_width_mm
         axes.locator_params(nbins=6)
         axes.set_xlabel("X (mm)")
         axes.set_ylabel("Y (mm)")
-        axes.legend(loc="upper left", bbox_to_anchor=(0.0, 1.1), ncols=len(curves) if len(curves) < 4 else 2, columnspacing=1.2)
+        columns = len(curves) if len(curves) < 4 else 2
+        axes.legend(loc="upper left", bbox_to_anchor=(0.0, 1.1), ncols=columns, columnspacing=1.2)
     return svg[0]
 
 

@@ -1,0 +1,95 @@
+"""The report: one self-contained page, and figures that show the data."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil.errors import FdhilError
+from fdhil.records import Parameters, Stages, Window, frozen
+from fdhil.report import Page, Section, Table, figures, write
+
+PARAMETERS = Parameters(R=0.5, L=0.005, K=0.8, Jt=0.075, ft=0.05, Cd=5.0)
+
+
+def window() -> Window:
+    """A window whose voltage drives the model, so that model and measurement agree."""
+    from fdhil.model.feed_drive import simulate_plant
+
+    voltage = np.concatenate([np.zeros(50), np.linspace(0, 60, 200), np.full(300, 60.0)])
+    current, speed = simulate_plant(PARAMETERS, voltage, 0.001, "interval_mean")
+    nothing = frozen(np.zeros(voltage.size))
+    return Window(
+        axis="X", start_tick=0, start_s=0.0, dt_s=0.001, demand_mm=nothing, position_mm=nothing,
+        speed_rad_s=frozen(speed), current_a=frozen(current), voltage_v=frozen(voltage),
+        voltage_sampling="interval_mean", stages=Stages((50, 250), (250, 550), None), direction=1,
+        rapid_speed_rad_s=75.0, pitch_mm=20.0,
+    )  # fmt: skip
+
+
+def curves() -> list[figures.Curve]:
+    t = np.linspace(0, 10, 200)
+    path = np.column_stack([t, np.minimum(t, 5.0)])
+    return [figures.Curve("desired", path), figures.Curve("cut", path + 0.05)]
+
+
+FIGURES = {
+    "signals": lambda: figures.signals(window()),
+    "torque": lambda: figures.torque([("20 degC", window(), PARAMETERS), ("22 degC", window(), PARAMETERS)]),
+    "model_against_drive": lambda: figures.model_against_drive(window(), PARAMETERS, 99.5),
+    "drift": lambda: figures.drift("ft", "N.m.s", {"X": (np.arange(20.0, 23), np.arange(3.0), np.ones(3))}),
+    "path": lambda: figures.path(curves()[0].path_mm, {"A": (5.0, 5.0)}),
+    "corner": lambda: figures.corner(curves(), (5.0, 5.0), 1.0),
+    "contour_errors": lambda: figures.contour_errors(np.arange(9.0), {"before": np.arange(9.0)}),
+    "error_map": lambda: figures.error_map(curves()[0].path_mm, np.linspace(0, 9, 200), 9.0),
+    "history": lambda: figures.history("R", "ohm", [1.0, 2.0], np.array([0.5, 0.6]), np.array([0.1, 0.1]), "days"),
+}
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_every_figure_is_svg_that_repeats(name: str) -> None:
+    svg = FIGURES[name]()
+    root = ET.fromstring(svg)
+    assert root.tag.endswith("svg")
+    assert len(svg) > 2000
+    assert svg == FIGURES[name]()
+
+
+def test_the_model_curve_lies_on_the_measured_one() -> None:
+    rapid = window()
+    assert np.allclose(figures.simulated_speed(rapid, PARAMETERS), rapid.speed_rad_s, atol=1e-9)
+
+
+def test_magnified_errors() -> None:
+    reference, actual = np.zeros((2, 2)), np.full((2, 2), 0.1)
+    assert np.allclose(figures.magnified(reference, actual, 10), 1.0)
+
+
+def test_the_page_needs_nothing_from_elsewhere(tmp_path: Path) -> None:
+    page = Page(
+        "A <machine>",
+        "subtitle",
+        headline=[("after", "3.5 um")],
+        sections=[
+            Section("One", "text", [Table(["a", "b"], [["1", "2"]], "caption")], [("figure", FIGURES["corner"]())])
+        ],
+    )
+    write(page, tmp_path / "deep" / "report.html")
+    text = (tmp_path / "deep" / "report.html").read_text("utf-8")
+    assert "A &lt;machine&gt;" in text
+    assert "3.5 um" in text
+    assert "<td>2</td>" in text
+    loaded = re.findall(r"""(?:src|href)=["']([^"'#][^"']*)""", text)
+    assert loaded == []
+    assert "<script" not in text
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_a_page_that_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FdhilError, match="cannot be written"):
+        write(Page("t", "s"), tmp_path / "file" / "report.html")
