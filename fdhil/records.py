@@ -142,7 +142,8 @@ class Window:
     Arrays are (n,); a lost sample is NaN in every signal, and ``gaps`` lists the half-open ranges that were lost.
     ``voltage_v`` of row k is the mean over [t_k, t_k + dt) when ``voltage_sampling`` is ``interval_mean``, else the
     value at t_k; ``voltage_delay_s`` (what is left after alignment by counters, None when not known) has not been
-    taken out. ``start_s`` is the time of row 0 in its recording or since the first tick.
+    taken out. ``start_s`` is the time of row 0 in its recording or since the first tick. ``offset_mm`` is the position
+    offset in force, None where it was 0 throughout or is not known.
     """
 
     axis: str
@@ -163,6 +164,7 @@ class Window:
     temperature_c: float | None = None
     voltage_delay_s: float | None = None
     source: str = ""
+    offset_mm: Float | None = None
 
     @property
     def n(self) -> int:

@@ -33,7 +33,7 @@ def replay(recordings: tuple[Path, ...], config: Path | None, method: str | None
     validated, or there is none.
     """
     machine = machine_config.load(config) if config else None
-    from fdhil.cli.outcomes import as_document
+    from fdhil.daemon.documents import as_document
     from fdhil.daemon.journal import line_of
 
     files = []
@@ -67,7 +67,7 @@ def _replayed(
                 settings = machine or _config_of(window)
                 if window.axis not in settings.axis:
                     raise RecordingError(f"{path} is of axis {window.axis}, which --config does not have; use its own")
-                pipelines[window.axis] = AxisPipeline(window.axis, settings, method)
+                pipelines[window.axis] = AxisPipeline(window.axis, settings, method, with_skill=machine is not None)
             outcomes += pipelines[window.axis].feed(window)
         replayed.append((path, outcomes))
     return replayed
@@ -133,7 +133,7 @@ def _revision_rows(machine: machine_config.MachineConfig, axis: str | None) -> l
 
 
 def _row(revision: Revision) -> dict[str, Any]:
-    from fdhil.daemon.status import parameters_status
+    from fdhil.daemon.documents import parameters_status
 
     published = revision.set
     return {

@@ -12,9 +12,15 @@ from rich.table import Table
 BARS = "▁▂▃▄▅▆▇█"
 
 
+def _console() -> Console:
+    """Return a console for stdout: as wide as the terminal, or wide enough for the tables where there is none."""
+    console = Console()
+    return console if console.is_terminal else Console(width=150)
+
+
 def show(status: Mapping[str, Any], console: Console | None = None) -> None:
     """Print the status document."""
-    out = console or Console()
+    out = console or _console()
     source, sync, guard = status["source"], status["sync"], status.get("guard") or {}
     rate = "no SYNC yet" if sync["rate_hz"] is None else f"SYNC {sync['rate_hz']:.1f} Hz of {sync['expected_hz']:.0f}"
     out.print(f"[bold]{escape(status['machine'])}[/bold]: {source['state']}, {rate}, up {status['uptime_s']:.0f} s")
@@ -69,7 +75,7 @@ def sparkline(values: Sequence[float]) -> str:
 
 def show_history(rows: Sequence[Mapping[str, Any]], console: Console | None = None, newest: int = 15) -> None:
     """Print the newest revisions of every axis, and each parameter's course over all of them."""
-    out = console or Console()
+    out = console or _console()
     for axis in dict.fromkeys(row["axis"] for row in rows):
         of_axis = [row for row in rows if row["axis"] == axis]
         names = list(of_axis[0]["parameters"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections import deque
@@ -11,12 +12,14 @@ from pathlib import Path
 from fdhil.config import MachineConfig
 from fdhil.drivers.profile import load_profile
 from fdhil.errors import StoreError
-from fdhil.pipeline import POOL_WINDOWS
-from fdhil.records import Notice, Outcome, ParameterSet, WindowOutcome
-from fdhil.store.history import FILE_NAME, History, Revision, Stamp
+from fdhil.identification.drift import Point
+from fdhil.pipeline import POOL_WINDOWS, Known
+from fdhil.records import PARAMETERS, Notice, Outcome, ParameterSet, Skill, WindowOutcome, frozen
+from fdhil.store.history import FILE_NAME, History, Revision, Stamp, StoredWindow
 from fdhil.store.windows import RawScale, Scales, WindowStore
 
 WINDOWS_FOLDER = "windows"
+SKILLS = 3
 
 
 def boot_id() -> str:
@@ -40,6 +43,16 @@ def raw_scales(config: MachineConfig, axis: str) -> Scales:
         "current_a": (RawScale(profile.current_a_per_count(settings)),),
         "voltage_v": (RawScale(voltage), RawScale(-voltage)) if voltage else (),
     }
+
+
+def _point(window: StoredWindow) -> Point:
+    """Return a stored window's estimate as the drift tracker has it."""
+    told = window.parameters or {}
+    values, stds = (
+        frozen([math.nan if (number := told.get(name, {}).get(key)) is None else number for name in PARAMETERS])
+        for key in ("value", "std")
+    )
+    return Point(values, stds, window.start_tick, window.temperature_c)
 
 
 class Keeper:
@@ -110,11 +123,23 @@ class Keeper:
         """Return the newest revision of each axis that the history has."""
         if self._history is None:
             return {}
-        found = {}
-        for axis in self._config.axis:
-            for revision in self._history.revisions(axis, limit=1):
-                found[axis] = revision
-        return found
+        found = {axis: self._history.revisions(axis, limit=1) for axis in self._config.axis}
+        return {axis: revisions[0] for axis, revisions in found.items() if revisions}
+
+    def skills(self) -> list[Skill]:
+        """Return the newest skills of all axes, oldest first."""
+        if self._history is None:
+            return []
+        return [skill for axis in self._config.axis for skill in self._history.skills(axis, limit=SKILLS)]
+
+    def known(self, axis: str) -> Known:
+        """Return where an earlier run left off: first and newest set, and the newest accepted windows' estimates."""
+        if self._history is None:
+            return Known()
+        newest = self._history.revisions(axis, limit=1)
+        first = self._history.first_revision(axis)
+        windows = [window for window in self._history.windows(axis, limit=4 * POOL_WINDOWS) if window.accepted]
+        return Known(first.set if first else None, newest[0].set if newest else None, tuple(map(_point, windows)))
 
     def counts(self, axis: str) -> tuple[int, int]:
         """Return how many windows of an axis were ever accepted and refused."""

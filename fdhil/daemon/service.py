@@ -17,6 +17,7 @@ from typing import Any, Protocol
 
 from fdhil.config import MachineConfig
 from fdhil.daemon import journal
+from fdhil.daemon.armory import Armory
 from fdhil.daemon.control import SOCKET_NAME, Answer, ControlServer, refusal
 from fdhil.daemon.keeping import Keeper
 from fdhil.daemon.lock import sole_owner
@@ -25,7 +26,7 @@ from fdhil.daemon.status import Watch
 from fdhil.daemon.warm import warm
 from fdhil.errors import DeviceError, FdhilError
 from fdhil.pipeline import AxisPipeline, Record
-from fdhil.records import Notice, Outcome, TickTimes
+from fdhil.records import Notice, Outcome, Temperature, TickTimes
 
 QUEUE_RECORDS = 4000  # per axis: more than half a minute of blocks; beyond it the newest are dropped and counted
 NOTICE_QUEUE = 200
@@ -61,6 +62,7 @@ class Service:
         self._method = method
         self._run_directory = config.store.run_directory or config.store.directory / "run"
         self._keeper = Keeper(config)
+        self._armory = Armory(config, self._keeper, self._run_directory)
         self._watch = Watch(config, time.monotonic())
         self._pipelines: dict[str, AxisPipeline] = {}
         self._queues = {axis: asyncio.Queue[Record](QUEUE_RECORDS) for axis in config.axis}
@@ -79,14 +81,16 @@ class Service:
         with sole_owner(self._run_directory):
             for number in (signal.SIGTERM, signal.SIGINT):
                 loop.add_signal_handler(number, self._stop.set)
+            state = "absent"
             try:
                 await self._serve()
             finally:
                 notify("STOPPING=1")
+                state = await self._armory.stand_down()
                 await asyncio.to_thread(self._keeper.close)
                 for number in (signal.SIGTERM, signal.SIGINT):
                     loop.remove_signal_handler(number)
-        self._log("stopped, offset 0")
+        self._log("stopped, " + ("offset 0" if state in {"OFF", "absent"} else f"the guard is in state {state}"))
 
     async def _serve(self) -> None:
         self._say(await asyncio.to_thread(self._keeper.open))
@@ -96,10 +100,12 @@ class Service:
             acquiring = tasks.create_task(self._acquire(), name="acquire")
             others = [tasks.create_task(self._work(axis), name=f"axis {axis}") for axis in self._config.axis]
             others.append(tasks.create_task(self._keep_notices(), name="notices"))
+            others.append(tasks.create_task(self._armory.attend(self._tell), name="guard"))
             others.append(tasks.create_task(self._feed_watchdog(), name="watchdog"))
             others.append(tasks.create_task(self._say_ready(), name="ready"))
             await self._stop.wait()
             notify("STOPPING=1")
+            await self._armory.stand_down()
             acquiring.cancel()
             await asyncio.wait([acquiring])
             await asyncio.gather(*(queue.join() for queue in self._queues.values()), self._notices.join())
@@ -108,11 +114,11 @@ class Service:
 
     def _prepare(self) -> None:
         """Begin each axis with what the history knows, and compile the kernels."""
-        newest = self._keeper.newest()
+        self._armory.begin(self._keeper.newest(), self._keeper.skills())
         for axis in self._config.axis:
-            published = newest[axis].set if axis in newest else None
-            self._pipelines[axis] = AxisPipeline(axis, self._config, self._method, published)
-            self._watch.begin(axis, published, self._keeper.counts(axis))
+            known = self._keeper.known(axis)
+            self._pipelines[axis] = AxisPipeline(axis, self._config, self._method, known)
+            self._watch.begin(axis, known.newest, self._keeper.counts(axis))
         warm(self._config, self._method)
 
     async def _say_ready(self) -> None:
@@ -159,6 +165,8 @@ class Service:
         if isinstance(record, Notice):
             self._tell([record])
             return
+        if isinstance(record, Temperature):
+            self._armory.note_temperature(record)
         for axis in self._config.axis if isinstance(record, TickTimes) else (record.axis,):
             if axis in self._queues:
                 if self._queues[axis].full():
@@ -176,6 +184,7 @@ class Service:
             self._busy_since_s[axis] = time.monotonic()
             outcomes, notices = await asyncio.to_thread(self._digest, axis, batch)
             del self._busy_since_s[axis]
+            self._armory.note(outcomes)
             self._say([*outcomes, *notices])
             for _ in batch:
                 queue.task_done()
@@ -232,6 +241,10 @@ class Service:
     async def _handle(self, request: Mapping[str, Any]) -> Answer:
         if request["request"] == "status":
             return self._status()
+        if request["request"] == "arm":
+            return await self._armory.arm(request)
+        if request["request"] == "disarm":
+            return await self._armory.disarm()
         if request["request"] == "stop":
             self._stop.set()
             return {"ok": True, "text": "stopping"}
@@ -245,7 +258,20 @@ class Service:
             "strays": list(self._keeper.strays),
         }
         status = self._watch.status(time.monotonic())
-        return {"ok": True, **status, "counters": counters, "store": store, "dropped": self._dropped}
+        guard = self._armory.guard
+        for axis, celsius in self._armory.temperatures.items():
+            status["axes"][axis]["slideway_c"] = celsius
+        return {
+            "ok": True,
+            "state": guard.state if guard.connected else "OFF(SHADOW)",
+            **status,
+            "frames": {"received": counters.get("frames", 0), "lost": counters.get("lost", 0)},
+            "counters": counters,
+            "dropped": self._dropped,
+            "guard": dict(guard.status),
+            "armed": self._armory.armed,
+            "store": store,
+        }
 
 
 def run(config: MachineConfig, open_source: OpenSource, method: str | None = None) -> None:

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import numpy as np
-
 from fdhil.config import MachineConfig
+from fdhil.daemon.documents import parameters_status
 from fdhil.pipeline import Record
-from fdhil.records import PARAMETERS, UNITS, Notice, Outcome, ParameterSet, Skill, TickTimes, WindowOutcome
+from fdhil.records import Notice, Outcome, ParameterSet, Skill, TickTimes, WindowOutcome
 
 SCHEMA = "fdhil-status-1"
 NOTICES = 20
 SYNC_INTERVALS = 500
 SILENCES = {"BusSilent", "BusDown", "SyncLost"}
-INTERVAL_95 = 1.959963984540054
 
 
 @dataclass(slots=True)
@@ -139,24 +135,6 @@ def _axis_status(watch: _AxisWatch) -> dict[str, Any]:
         "last_window": _window_status(last) if last else None,
         "skill": asdict(skill) if skill else None,
     }
-
-
-def parameters_status(published: ParameterSet) -> Mapping[str, Mapping[str, Any]]:
-    """Return each parameter with its standard deviation and 95 % interval; nothing is told without its interval."""
-    told = {}
-    deviations = np.sqrt(np.diag(published.covariance))
-    for k, name in enumerate(PARAMETERS):
-        value, std = float(getattr(published.parameters, name)), float(deviations[k])
-        half = INTERVAL_95 * std
-        known = math.isfinite(half)
-        told[name] = {
-            "value": value,
-            "std": std if known else None,
-            "low": value - half if known else None,
-            "high": value + half if known else None,
-            "unit": UNITS[name],
-        }
-    return told
 
 
 def _window_status(outcome: WindowOutcome) -> dict[str, Any]:

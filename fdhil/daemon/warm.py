@@ -19,7 +19,7 @@ def warm(config: MachineConfig, method: str | None = None) -> None:
             pipeline.feed(nominal_rapid(name, axis, config.machine.sync_period_s, direction))
 
 
-def nominal_rapid(name: str, axis: Axis, dt_s: float, direction: int = 1) -> Window:
+def nominal_rapid(name: str, axis: Axis, dt_s: float, direction: int = 1, seed: int = 1) -> Window:
     """Return a rapid that the nominal drive would make (equations [1] and [2] solved for the voltage), with noise."""
     nominal, top = axis.nominal, axis.rapid_speed_rad_s
     ramp_s = axis.rapid_speed_mm_s / axis.max_acceleration_mm_s2
@@ -32,7 +32,7 @@ def nominal_rapid(name: str, axis: Axis, dt_s: float, direction: int = 1) -> Win
         voltage = (voltage + np.append(voltage[1:], voltage[-1])) / 2
     turned = np.cumsum(speed) - 0.5 * (speed + speed[0])  # trapezoids
     position = turned * dt_s * axis.screw_pitch_mm / (2 * math.pi)
-    rng = np.random.default_rng(1)
+    rng = np.random.default_rng(seed)
     noisy = [frozen(s + rng.normal(0, 1e-3 * np.abs(s).max(), s.size)) for s in (speed, current, voltage)]
     begin, end = margin, speed.size - margin
     return Window(

@@ -1,8 +1,8 @@
 """The sequence of one axis: samples in, outcomes out. No I/O, no clock: the same input gives the same bits.
 
 :class:`AxisPipeline` keeps a bounded ring of recent samples, cuts a window when a rapid move is over, has it analysed,
-pools the accepted windows, and publishes a parameter set when the pool is validated. A replayed window takes the very
-same way (``feed(window)``).
+holds back what jumped, pools the accepted windows, publishes a parameter set when the pool is validated, and judges the
+closed-loop model by every recorded move. A replayed window takes the very same way (``feed(window)``).
 """
 
 from __future__ import annotations
@@ -14,18 +14,23 @@ import numpy as np
 
 from fdhil import validation
 from fdhil.config import Identification, MachineConfig
+from fdhil.identification.drift import DriftTracker, Point
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline.ring import Ring, Stretch
+from fdhil.prediction import skill
 from fdhil.records import (
     AxisSamples,
+    Float,
     MoveEvent,
     MoveKind,
     Notice,
     Outcome,
     ParameterSet,
     Recording,
+    Skill,
     Temperature,
     TickTimes,
+    Verdict,
     VoltageSamples,
     Window,
     WindowOutcome,
@@ -40,6 +45,8 @@ POOL_WINDOWS = (
     6  # both directions, several speeds: enough to tell viscous from dry friction, few enough to follow drift
 )
 
+JUMPS = {"LoadChanged", "ParameterJump"}
+
 Record = AxisSamples | VoltageSamples | TickTimes | MoveEvent | Temperature | Window
 
 
@@ -52,13 +59,30 @@ class _Rapid:
     source: str
 
 
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What the history knows of an axis: its first and its newest published set, the newest windows' estimates."""
+
+    first: ParameterSet | None = None
+    newest: ParameterSet | None = None
+    points: tuple[Point, ...] = ()
+
+
 class AxisPipeline:
     """Everything that is known of one axis, and what follows from the next record of it."""
 
     def __init__(
-        self, axis: str, config: MachineConfig, method: str | None = None, published: ParameterSet | None = None
+        self,
+        axis: str,
+        config: MachineConfig,
+        method: str | None = None,
+        known: Known | None = None,
+        with_skill: bool = True,
     ) -> None:
-        """``method`` names an estimator (None: the config's choice); ``published`` is the newest set of the history."""
+        """``method`` names an estimator (None: the config's choice); ``known`` is where an earlier run left off.
+
+        ``with_skill`` False leaves the closed loop out, for a recording whose regulators are not known.
+        """
         self.axis = axis
         self._config = config
         self._settings = _settings(config, method)
@@ -69,7 +93,13 @@ class AxisPipeline:
         self._first_tick: int | None = None
         self._temperature: Temperature | None = None
         self._pool: deque[WindowOutcome] = deque(maxlen=POOL_WINDOWS)
-        self._published = published
+        self._held: list[WindowOutcome] = []
+        known = known or Known()
+        self._published = known.newest
+        self._tracker = DriftTracker(config.maintenance, axis)
+        self._tracker.points.extend(known.points)
+        self._tracker.reference = known.first.parameters if known.first else None
+        self._with_skill = with_skill
 
     @property
     def published(self) -> ParameterSet | None:
@@ -175,6 +205,7 @@ class AxisPipeline:
             start_tick=tick,
             start_s=(tick - first_tick) * self._period_s,
             voltage_v=None if stretch.voltage_v is None else window.voltage_v,
+            offset_mm=_offset(stretch, window),
             voltage_delay_s=stretch.voltage_delay_s,
             temperature_c=None if self._temperature is None else self._temperature.celsius,
             source=source,
@@ -182,31 +213,79 @@ class AxisPipeline:
 
     def _analyse(self, window: Window) -> list[Outcome]:
         outcome = validation.analyse(window, self._settings)
+        before = self._published
         outcomes: list[Outcome] = [outcome]
-        if outcome.verdict.accepted:
-            self._pool.append(outcome)
-            outcomes += self._publish(outcome)
-        return outcomes
+        if outcome.verdict.accepted and outcome.estimate is not None:
+            notices = self._track(outcome)
+            outcomes += notices
+            if not self._tracker.holding:
+                outcomes += self._publish(window)
+        judged = self._judge(window, before or self._published)
+        return [*outcomes, judged] if judged else outcomes
 
-    def _publish(self, newest: WindowOutcome) -> list[Outcome]:
+    def _track(self, outcome: WindowOutcome) -> list[Notice]:
+        """Hold a window back that jumped; once further ones agree with it they are the new pool."""
+        estimate, window = outcome.estimate, outcome.window
+        assert estimate is not None
+        tick = window.start_tick
+        notices = self._tracker.update(estimate.parameters(), estimate.covariance, tick, window.temperature_c)
+        if self._tracker.holding:
+            self._held.append(outcome)
+            return notices
+        if any(notice.code in JUMPS for notice in notices):
+            agreeing = {point.tick for point in self._tracker.points}
+            self._pool.clear()
+            self._pool.extend(held for held in self._held if held.window.start_tick in agreeing)
+        self._held.clear()
+        self._pool.append(outcome)
+        return notices
+
+    def _publish(self, newest: Window) -> list[Outcome]:
+        """Publish what the pool says; windows that no longer agree with the newest leave it, the oldest first."""
         estimate, verdict = validation.pool(tuple(self._pool), self._settings)
+        while not verdict.accepted and len(self._pool) > 1:
+            self._pool.popleft()
+            estimate, verdict = validation.pool(tuple(self._pool), self._settings)
         if estimate is None or not verdict.accepted:
-            text = "The accepted windows do not agree as a pool, the parameters before stay; " + "; ".join(
-                str(reason) for reason in verdict.reasons
+            text = (
+                "the newest window is not believed as a pool of its own (" + _listed(verdict) + "), the older set stays"
             )
-            return [Notice("ValidationFailed", "minor", text, self.axis, newest.window.start_tick)]
+            return [Notice("ValidationFailed", "minor", text, self.axis, newest.start_tick)]
         self._published = ParameterSet(
             axis=self.axis,
             revision=1 if self._published is None else self._published.revision + 1,
             parameters=estimate.parameters(),
             covariance=estimate.covariance,
             windows=len(self._pool),
-            tick=newest.window.start_tick + newest.window.n,
-            temperature_c=newest.window.temperature_c,
+            tick=newest.start_tick + newest.n,
+            temperature_c=newest.temperature_c,
             config_digest=self._config.digest,
         )
         return [self._published]
 
+    def _judge(self, window: Window, published: ParameterSet | None) -> Skill | None:
+        """Compare the move with what the set that was valid before it predicts; None where that cannot be done."""
+        if published is None or not self._with_skill:
+            return None
+        axis = self._config.axis[self.axis]
+        signals = (window.demand_mm, window.position_mm)
+        try:
+            return skill(
+                self.axis, window.start_tick, *signals, published.parameters, axis, self._period_s, window.offset_mm
+            )
+        except ValueError:  # too few whole rows to compare
+            return None
+
+
+def _listed(verdict: Verdict) -> str:
+    return "; ".join(str(reason) for reason in verdict.reasons)
+
 
 def _settings(config: MachineConfig, method: str | None) -> Identification:
     return config.identification if method is None else config.identification.model_copy(update={"method": method})
+
+
+def _offset(stretch: Stretch, window: Window) -> Float | None:
+    """Return the offset in force in a window's rows, None where it was 0 throughout."""
+    rows = stretch.offset_mm[window.start_tick : window.start_tick + window.n]
+    return frozen(rows) if np.any(np.abs(rows) > 0) else None

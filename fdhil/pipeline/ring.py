@@ -22,6 +22,8 @@ RATE_TOLERANCE = 0.01  # a sensor's rate may be off a multiple of the SYNC rate 
 class Stretch:
     """Signals of the ticks ``start_tick`` + 0..n-1, arrays (n,), NaN where lost; ``gaps`` half-open.
 
+    ``offset_mm`` is the position offset in force.
+
     Row k of ``voltage_v`` is the mean over the period that begins at tick k (or the instant, as the source samples);
     None without a source. ``voltage_delay_s`` is what the placing on whole ticks left over.
     """
@@ -33,6 +35,7 @@ class Stretch:
     current_a: Float
     voltage_v: Float | None
     voltage_delay_s: float | None
+    offset_mm: Float
     gaps: tuple[tuple[int, int], ...]
 
 
@@ -107,6 +110,7 @@ class Ring:
             placed(b.current_a for b in blocks),
             voltage,
             delay,
+            placed(b.offset_mm for b in blocks),
             runs(~np.isfinite(speed)),
         )
 

@@ -204,6 +204,11 @@ class History:
         """Return the published parameter sets, oldest first; with ``limit`` the newest so many."""
         return [_revision(row) for row in self._newest("revisions", axis, limit)]
 
+    def first_revision(self, axis: str) -> Revision | None:
+        """Return the first parameter set that was ever published of an axis."""
+        rows = self._select("SELECT * FROM revisions WHERE axis = ? ORDER BY id LIMIT 1", (axis,))
+        return _revision(rows[0]) if rows else None
+
     def windows(self, axis: str | None = None, limit: int | None = None) -> list[StoredWindow]:
         """Return the analysed windows, oldest first; with ``limit`` the newest so many."""
         return [_stored_window(row) for row in self._newest("windows", axis, limit)]

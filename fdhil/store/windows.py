@@ -34,7 +34,9 @@ COLUMNS: Mapping[str, str] = {
     "speed_rad_s": "rad/s",
     "current_a": "A",
     "voltage_v": "V",
+    "offset_mm": "mm",
 }
+OPTIONAL = {"voltage_v", "offset_mm"}
 _NAME = re.compile(r"w(\d{8,12})-([A-Z])\.parquet")
 _META = b"fdhil"
 _NEXT = "make a new recording or use an older one"
@@ -161,8 +163,7 @@ def _decode(content: bytes) -> tuple[Window, str]:
     for name in COLUMNS:
         described = head["columns"].get(name)
         arrays[name] = None if described is None else _values(table.column(name), described)
-    present = [array for array in arrays.values() if array is not None]
-    if len(present) < len(COLUMNS) - 1 or arrays["speed_rad_s"] is None or len({a.size for a in present}) != 1:
+    if any(arrays[name] is None for name in COLUMNS.keys() - OPTIONAL):
         raise ValueError("a column is missing")
     return _window(head, arrays), str(head["digest"])
 

@@ -24,6 +24,12 @@ from fdhil.store.windows import list_windows
 from tests.daemon.machine import NOMINAL, Machine, config_of, rapids
 
 
+@pytest.fixture(autouse=True)
+def _quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the compiling to the first rapid: most of these tests never see one."""
+    monkeypatch.setattr("fdhil.daemon.service.warm", lambda config, method: None)
+
+
 async def _exists(path: Path) -> None:
     for _ in range(6000):
         if path.exists():

@@ -1,13 +1,36 @@
-"""Outcomes as JSON documents, values to full precision."""
+"""Outcomes and parameters as JSON documents, values to full precision. Imports nothing heavy."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
-from fdhil.daemon.status import parameters_status
-from fdhil.records import UNITS, Notice, Outcome, ParameterSet, Skill, WindowOutcome
+import numpy as np
+
+from fdhil.records import PARAMETERS, UNITS, Notice, Outcome, ParameterSet, Skill, WindowOutcome
 from fdhil.store.history import described
+
+INTERVAL_95 = 1.959963984540054
+
+
+def parameters_status(published: ParameterSet) -> Mapping[str, Mapping[str, Any]]:
+    """Return each parameter with its standard deviation and 95 % interval; nothing is told without its interval."""
+    told = {}
+    deviations = np.sqrt(np.diag(published.covariance))
+    for k, name in enumerate(PARAMETERS):
+        value, std = float(getattr(published.parameters, name)), float(deviations[k])
+        half = INTERVAL_95 * std
+        known = math.isfinite(half)
+        told[name] = {
+            "value": value,
+            "std": std if known else None,
+            "low": value - half if known else None,
+            "high": value + half if known else None,
+            "unit": UNITS[name],
+        }
+    return told
 
 
 def as_document(outcome: Outcome) -> dict[str, Any]:

@@ -1,0 +1,166 @@
+"""From a program to what the guard is asked to send: plan, gate, table, and the facts that the daemon vouches for.
+
+Pure but for reading the program and the commissioning records; what says no is a value (:class:`Refused`).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdhil import correction
+from fdhil.config import MachineConfig
+from fdhil.drivers.commissioning_record import CommissioningRecord, axis_digest, load_record
+from fdhil.program import load_trajectory, program_digest
+from fdhil.records import Correction, CorrectionTable, Float, ParameterSet, Reason, Skill
+
+MODEL_AGE_S = 8 * 3600.0  # a shift: older parameters are of another state of the machine
+MODEL_KELVIN = 3.0
+SKILL_MOVES = 3  # FAULTS E19: the last three recorded moves ...
+SKILL_SHARE = 0.5  # ... must be predicted within half of the gain that is promised
+UNGUARDED_UM = 20.0  # the largest offset that may stay in a drive whose watchdog on us is not proven
+
+
+@dataclass(frozen=True, slots=True)
+class AxisKnowledge:
+    """What the daemon knows of an axis when it arms: newest published set with its age, last moves' skills."""
+
+    published: ParameterSet | None
+    age_s: float
+    temperature_c: float | None
+    skills: tuple[Skill, ...]
+    load_changed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Armament:
+    """A correction ready for the guard: its table, what is promised, and the facts (see the guard's interlocks)."""
+
+    program: str
+    correction: Correction
+    table: CorrectionTable
+    facts: dict[str, bool]
+
+    def summary(self) -> dict[str, Any]:
+        """Return what the operator is told."""
+        before, after = self.correction.before, self.correction.after
+        return {
+            "program": self.program,
+            "program_digest": self.table.program_digest,
+            "method": self.correction.method,
+            "rows": int(before.contour_um.size),
+            "before": {"rms_um": rms(before.contour_um), "max_um": float(before.contour_um.max())},
+            "after": {"rms_um": rms(after.contour_um), "max_um": float(after.contour_um.max())},
+            "warnings": [str(reason) for reason in self.correction.warnings],
+            "facts": dict(self.facts),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """Why nothing is armed, the weightiest reason first."""
+
+    reasons: tuple[Reason, ...]
+
+
+def rms(values: Float) -> float:
+    """Return the root mean square of (n,)."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def prepare(
+    program: Path, method: str | None, config: MachineConfig, known: Mapping[str, AxisKnowledge]
+) -> Armament | Refused:
+    """Plan the correction of a program with the newest validated parameters.
+
+    ProgramError, RecordingError or ConfigError when the program cannot be used; StoreError for a damaged record.
+    """
+    reference = load_trajectory(program, config)
+    models = {}
+    for axis in reference.axes:
+        published = known[axis].published if axis in known else None
+        if published is None:
+            text = f"axis {axis} has no validated parameters yet"
+            return Refused((Reason("ModelNotValidated", text, "let the machine make a few rapids of this axis"),))
+        models[axis] = published.parameters
+    planned = correction.plan(reference, models, config, method)
+    if planned.refused:
+        return Refused(planned.refused)
+    if not any(np.any(offset) for offset in planned.offset_um.values()):
+        text = f"the method {planned.method} plans no position offset"
+        return Refused((Reason("HarmPredicted", text, "use the method inverse or mirror"),))
+    digest = program_digest(program)
+    table = correction.table(planned, config, digest)
+    facts = standing_facts(reference.axes, config, known, promised_um(planned)) | _commissioned(planned, config)
+    return Armament(str(program), planned, table, facts)
+
+
+def promised_um(planned: Correction) -> float:
+    """Return by how much the contour error's RMS is predicted to shrink."""
+    return rms(planned.before.contour_um) - rms(planned.after.contour_um)
+
+
+def standing_facts(
+    axes: Sequence[str], config: MachineConfig, known: Mapping[str, AxisKnowledge], gain_um: float
+) -> dict[str, bool]:
+    """Return the facts about the models, which also may be withdrawn while a correction runs."""
+    return {
+        "model_validated": all(known[axis].published is not None for axis in axes),
+        "model_fresh": all(_fresh(known[axis], config) for axis in axes),
+        "skill_enough": all(_skilled(known[axis].skills, gain_um) for axis in axes),
+        "gain_positive": gain_um > 0.0,
+    }
+
+
+def _fresh(axis: AxisKnowledge, config: MachineConfig) -> bool:
+    """A model is of this machine as it is now: same configuration, same load, not old, not of another temperature."""
+    published = axis.published
+    if published is None or published.config_digest != config.digest or axis.load_changed:
+        return False
+    if not 0.0 <= axis.age_s <= MODEL_AGE_S:
+        return False
+    if published.temperature_c is None or axis.temperature_c is None:
+        return True
+    return abs(axis.temperature_c - published.temperature_c) <= MODEL_KELVIN
+
+
+def _skilled(skills: Sequence[Skill], gain_um: float) -> bool:
+    """The last recorded moves were predicted within half of what is promised; without any, nothing is known."""
+    last = list(skills)[-SKILL_MOVES:]
+    return bool(last) and all(skill.rms_um <= SKILL_SHARE * gain_um for skill in last)
+
+
+def _commissioned(planned: Correction, config: MachineConfig) -> dict[str, bool]:
+    records = {axis: load_record(config.store.directory, axis) for axis in planned.offset_um}
+    largest_um = max(float(np.abs(offset).max()) for offset in planned.offset_um.values())
+    return {
+        "commissioned": all(_valid(record, config, axis) for axis, record in records.items()),
+        # the plans assume an offset that the feed-forward sees; another drive would be made worse
+        "offset_in_feedforward_known": all(r is not None and r.offset_in_feedforward is True for r in records.values()),
+        "watchdog_proven": largest_um <= UNGUARDED_UM
+        or all(r is not None and r.watchdog == "proven" for r in records.values()),
+    }
+
+
+def _valid(record: CommissioningRecord | None, config: MachineConfig, axis: str) -> bool:
+    return record is not None and record.readback_ok and record.config_digest == axis_digest(config, axis)
+
+
+class Skills:
+    """The last skills of each axis."""
+
+    def __init__(self, axes: Sequence[str]) -> None:
+        self._last = {axis: deque[Skill](maxlen=SKILL_MOVES) for axis in axes}
+
+    def add(self, skill: Skill) -> None:
+        """Take the newest."""
+        self._last[skill.axis].append(skill)
+
+    def of(self, axis: str) -> tuple[Skill, ...]:
+        """Return the last of an axis, oldest first."""
+        return tuple(self._last[axis])

@@ -1,0 +1,171 @@
+"""The operator's side of the daemon: what it knows of the models, arming and disarming, and vouching while armed."""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from fdhil import tables
+from fdhil.config import MachineConfig
+from fdhil.daemon.arming import AxisKnowledge, Refused, Skills, prepare, promised_um, standing_facts
+from fdhil.daemon.control import Answer, refusal
+from fdhil.daemon.guard_link import REST, GuardLink
+from fdhil.daemon.keeping import Keeper, boot_id
+from fdhil.daemon.token import ensure_token
+from fdhil.errors import DeviceError
+from fdhil.records import Correction, Notice, Outcome, ParameterSet, Skill, Temperature
+from fdhil.store.history import Revision
+
+ALIVE_S = 0.1  # the guard calls us lost after 0.5 s
+REFRESH_S = 0.5
+STAND_DOWN_S = 3.0  # the longest ramp to zero takes 0.12 s
+NO_GUARD = "start fdhil-guard with this machine's config"
+
+Tell = Callable[[Sequence[Notice]], None]
+
+
+class Armory:
+    """Knows when a correction may be armed, and withdraws what it no longer vouches for."""
+
+    def __init__(self, config: MachineConfig, keeper: Keeper, run_directory: Path) -> None:
+        self._config = config
+        self._keeper = keeper
+        self._run_directory = run_directory
+        self._token = ""
+        self._published: dict[str, tuple[ParameterSet, float]] = {}
+        self._temperature: dict[str, float] = {}
+        self._load_changed: set[str] = set()
+        self._skills = Skills(list(config.axis))
+        self._arming = asyncio.Lock()
+        self._armed: tuple[Correction, Mapping[str, Any]] | None = None
+        self.guard = GuardLink(run_directory)
+
+    def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
+        """Start from what the history knows; the token is made where there is none. DeviceError when it cannot be."""
+        self._token = ensure_token(self._run_directory)
+        boot, now_s = boot_id(), time.monotonic()
+        for axis, revision in newest.items():
+            stamp = revision.stamp
+            same_boot = bool(boot) and stamp.boot == boot
+            age_s = now_s - stamp.monotonic_ns * 1e-9 if same_boot else time.time() - stamp.wall_s
+            # an age below 0 (a wall clock that was set back) stays one: it is not believed
+            self._published[axis] = (revision.set, now_s - age_s)
+        for skill in skills:
+            self._skills.add(skill)
+
+    def note(self, outcomes: Sequence[Outcome]) -> None:
+        """Take what the pipelines say."""
+        for outcome in outcomes:
+            if isinstance(outcome, ParameterSet):
+                self._published[outcome.axis] = (outcome, time.monotonic())
+                self._load_changed.discard(outcome.axis)
+            elif isinstance(outcome, Skill):
+                self._skills.add(outcome)
+            elif isinstance(outcome, Notice) and outcome.code == "LoadChanged" and outcome.severity == "MAJOR":
+                self._load_changed.add(outcome.axis)
+
+    def note_temperature(self, reading: Temperature) -> None:
+        """Take a temperature."""
+        self._temperature[reading.axis] = reading.celsius
+
+    @property
+    def temperatures(self) -> Mapping[str, float]:
+        """The newest temperature of each axis that has one."""
+        return self._temperature
+
+    @property
+    def armed(self) -> Mapping[str, Any] | None:
+        """What was armed last and still is, None otherwise."""
+        return self._armed[1] if self._armed else None
+
+    def _known(self) -> dict[str, AxisKnowledge]:
+        now_s = time.monotonic()
+        known = {}
+        for axis in self._config.axis:
+            published, since_s = self._published.get(axis, (None, now_s))
+            known[axis] = AxisKnowledge(
+                published,
+                now_s - since_s,
+                self._temperature.get(axis),
+                self._skills.of(axis),
+                axis in self._load_changed,
+            )
+        return known
+
+    async def arm(self, request: Mapping[str, Any]) -> Answer:
+        """Plan, load and arm one program; every no has its class, cause and next action."""
+        token, program, method = (request.get(key) for key in ("token", "program", "method"))
+        if not isinstance(token, str) or not hmac.compare_digest(token.encode(), self._token.encode()):
+            return refusal("AuthRequired", "the operator's token is missing or wrong", "use the run directory's token")
+        if not isinstance(program, str) or not (method is None or method in tables.CORRECTIONS):
+            return refusal("BadRequest", "program or method is no name", f"methods: {', '.join(tables.CORRECTIONS)}")
+        if self._arming.locked():
+            return refusal("NotOff", "another program is being armed", "wait for its answer")
+        async with self._arming:
+            return await self._arm(Path(program), method, token)
+
+    async def _arm(self, program: Path, method: str | None, token: str) -> Answer:
+        prepared = await asyncio.to_thread(prepare, program, method, self._config, self._known())
+        if isinstance(prepared, Refused):
+            first, *_ = prepared.reasons
+            return dict(refusal(first.code, first.text, first.advice)) | {"refused": list(map(str, prepared.reasons))}
+        prepared.facts["journal_writable"] = self._keeper.fault is None
+        try:
+            answer = await asyncio.to_thread(self.guard.arm, prepared, token)
+        except DeviceError as error:
+            return refusal("GuardAbsent", str(error), NO_GUARD)
+        summary = prepared.summary()
+        if not answer["ok"]:
+            return dict(answer) | {"planned": summary}
+        self._armed = (prepared.correction, summary)
+        text = (
+            f"armed {program.name} by {summary['method']}: contour error {summary['before']['rms_um']:.1f} um RMS is"
+            f" predicted to become {summary['after']['rms_um']:.1f}; start the program"
+        )
+        return {"ok": True, "state": answer.get("state", "ARMED"), "text": text, **summary}
+
+    async def disarm(self) -> Answer:
+        """Have the guard ramp to zero."""
+        try:
+            answer = await asyncio.to_thread(self.guard.disarm)
+        except DeviceError as error:
+            return refusal("GuardAbsent", str(error), NO_GUARD)
+        return dict(answer) | ({"text": f"guard: {self.guard.state}"} if answer["ok"] else {})
+
+    async def attend(self, tell: Tell) -> None:
+        """Tell the guard that this loop turns and what is still vouched for, and the log what the guard does."""
+        turn = 0
+        while True:
+            self.guard.say_alive(self._facts())
+            if turn % round(REFRESH_S / ALIVE_S) == 0 and not self._arming.locked():
+                tell(await asyncio.to_thread(self.guard.refresh))
+                if self._armed and self.guard.state in REST:
+                    self._armed = None
+            turn += 1
+            await asyncio.sleep(ALIVE_S)
+
+    def _facts(self) -> Mapping[str, bool] | None:
+        """What is still vouched for while a correction runs; None while none does."""
+        if self._armed is None:
+            return None
+        planned = self._armed[0]
+        facts = standing_facts(tuple(planned.offset_um), self._config, self._known(), promised_um(planned))
+        return facts | {"journal_writable": self._keeper.fault is None}
+
+    async def stand_down(self) -> str:
+        """Have a running correction ramped to zero and wait for it; return the state that was reached."""
+        if self.guard.connected and self.guard.state not in REST:
+            await self.disarm()
+            for _ in range(round(STAND_DOWN_S / ALIVE_S)):
+                if self.guard.state in REST:
+                    break
+                self.guard.say_alive(None)
+                await asyncio.sleep(ALIVE_S)
+                await asyncio.to_thread(self.guard.refresh)
+        state = self.guard.state
+        await asyncio.to_thread(self.guard.close)
+        return state

@@ -1,0 +1,121 @@
+"""The daemon's link to the guard process: found again when it was gone, told that the daemon lives, asked to arm."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from fdhil.daemon.arming import Armament
+from fdhil.errors import DeviceError
+from fdhil.guard.client import GuardClient
+from fdhil.records import Notice
+
+ABSENT: Mapping[str, Any] = {"state": "absent", "text": "no guard runs: nothing can be armed, nothing is sent"}
+REST = {"OFF", "FROZEN", "absent"}
+
+
+class GuardLink:
+    """At most one connection; ``state`` is the guard's, ``absent`` while there is none. Safe from several threads."""
+
+    def __init__(self, run_directory: Path) -> None:
+        self._run_directory = run_directory
+        self._lock = threading.Lock()
+        self._client: GuardClient | None = None
+        self._status: Mapping[str, Any] = ABSENT
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a connection."""
+        return self._client is not None
+
+    @property
+    def status(self) -> Mapping[str, Any]:
+        """What the guard said last."""
+        return self._status
+
+    @property
+    def state(self) -> str:
+        """The guard's state when it was asked last."""
+        return str(self._status["state"])
+
+    def refresh(self) -> list[Notice]:
+        """Connect where needed and ask for the status (blocking); return what changed."""
+        with self._lock:
+            before = self._status
+            try:
+                if self._client is None:
+                    self._client = GuardClient(self._run_directory)
+                status: Mapping[str, Any] = self._client.status()
+            except DeviceError as error:
+                self._drop()
+                return self._gone(before, error)
+            self._status = status
+        return _changes(before, status)
+
+    def _drop(self) -> None:
+        if self._client is not None:
+            self._client.close()
+        self._client, self._status = None, ABSENT
+
+    @staticmethod
+    def _gone(before: Mapping[str, Any], error: DeviceError) -> list[Notice]:
+        if before["state"] == "absent":
+            return []
+        severity: Any = "minor" if before["state"] == "OFF" else "MAJOR"
+        return [Notice("GuardLost", severity, f"{error}; it was in state {before['state']}")]
+
+    def say_alive(self, facts: Mapping[str, bool] | None) -> None:
+        """Tell the guard that the daemon is well (never blocks); a guard that is gone is found out by ``refresh``."""
+        client = self._client
+        if client is not None:
+            try:
+                client.alive(facts)
+            except DeviceError:
+                self._status = {**self._status, "text": "the connection is lost"}
+
+    def arm(self, armament: Armament, token: str) -> Mapping[str, Any]:
+        """Load the table and arm (blocking); return the guard's answer. DeviceError when there is no guard."""
+        with self._lock:
+            if self._client is None:
+                self._client = GuardClient(self._run_directory)
+            table = armament.table
+            answer: Mapping[str, Any] = self._client.load(
+                table.axes, _rows(table.demand_increments), _rows(table.offset_increments), table.program_digest
+            )
+            if answer["ok"]:
+                self._client.alive(None)  # planning took its time: the guard must know us as alive when it is asked
+                answer = self._client.arm(token, table.program_digest, armament.facts)
+            self._status = self._client.status()
+        return answer
+
+    def disarm(self) -> Mapping[str, Any]:
+        """Ask for the ramp to zero (blocking); DeviceError when there is no guard."""
+        with self._lock:
+            if self._client is None:
+                self._client = GuardClient(self._run_directory)
+            answer = self._client.disarm()
+            self._status = self._client.status()
+        return answer
+
+    def close(self) -> None:
+        """End the connection; a correction that still runs is ramped down by the guard."""
+        with self._lock:
+            self._drop()
+
+
+def _rows(columns: Mapping[str, Any]) -> dict[str, Any]:
+    return {axis: column.tolist() for axis, column in columns.items()}
+
+
+def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
+    """Say when the guard came, or changed its state, and why."""
+    if before["state"] == now["state"]:
+        return []
+    cause = now.get("cause") or {}
+    why = f": {cause.get('code', '')}: {cause['text']}" if cause.get("text") else ""
+    if before["state"] == "absent":
+        return [Notice("GuardFound", "info", f"the guard runs, in state {now['state']}{why}")]
+    severity: Any = "MAJOR" if now["state"] == "FROZEN" else "info"
+    return [Notice("GuardState", severity, f"{before['state']} -> {now['state']}{why}", cause.get("axis", ""))]

@@ -1,0 +1,259 @@
+"""One axis' sequence: the right stretch is cut, what was lost stays lost, what jumped is held back, bits repeat."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fdhil.config import MachineConfig
+from fdhil.daemon.warm import nominal_rapid
+from fdhil.pipeline import AxisPipeline, Record
+from fdhil.pipeline.ring import Ring
+from fdhil.records import (
+    AxisSamples,
+    Notice,
+    Outcome,
+    ParameterSet,
+    Skill,
+    Temperature,
+    TickTimes,
+    VoltageSamples,
+    Window,
+    WindowOutcome,
+    frozen,
+    frozen_ints,
+)
+from fdhil.store.windows import decode_window, encode_window
+from tests.daemon.machine import config_of, rapids
+from tests.store.made import bits, same
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> MachineConfig:
+    """The bench, one axis; least squares, because what is tested here is the sequence, not the estimator."""
+    return config_of(tmp_path, identification={"method": "least_squares"})
+
+
+def fed(pipeline: AxisPipeline, records: Sequence[Record]) -> list[Outcome]:
+    """Feed records one by one and return all outcomes."""
+    return [outcome for record in records for outcome in pipeline.feed(record)]
+
+
+def windows_of(outcomes: Sequence[Outcome]) -> list[Window]:
+    """Return the windows among outcomes."""
+    return [outcome.window for outcome in outcomes if isinstance(outcome, WindowOutcome)]
+
+
+def numbers(outcomes: Sequence[Outcome]) -> list[object]:
+    """Return everything that outcomes say as comparable values, arrays as bytes."""
+    told: list[object] = []
+    for outcome in outcomes:
+        if isinstance(outcome, WindowOutcome):
+            estimate = outcome.estimate
+            assert estimate is not None
+            told += [bits(estimate.values), bits(estimate.covariance), repr(outcome.verdict)]
+        elif isinstance(outcome, ParameterSet):
+            told += [repr(outcome.parameters), bits(outcome.covariance), outcome.revision, outcome.windows]
+        else:
+            told.append(repr(outcome))
+    return told
+
+
+def test_each_rapid_becomes_one_window_from_rest_to_rest(config: MachineConfig) -> None:
+    outcomes = fed(AxisPipeline("X", config), rapids(config, count=2, first_tick=5000))
+    first, second = windows_of(outcomes)
+    assert (first.direction, second.direction) == (1, -1)
+    for window, start in ((first, 5400), (second, 5400 + 850 + 400)):
+        assert abs(window.start_tick - start) <= 60  # the margin of rest begins where the made one does
+        assert window.start_s == pytest.approx((window.start_tick - 5000) * 0.001)
+        stages = window.stages
+        assert None not in (stages.accelerate, stages.cruise, stages.brake)
+        assert np.abs(window.speed_rad_s[:20]).max() < 1.0
+        assert np.abs(window.speed_rad_s[-20:]).max() < 1.0
+        assert window.source == "test"
+        assert window.offset_mm is None
+    sets = [outcome for outcome in outcomes if isinstance(outcome, ParameterSet)]
+    assert [(s.revision, s.windows, s.config_digest) for s in sets] == [(1, 1, config.digest), (2, 2, config.digest)]
+    skills = [outcome for outcome in outcomes if isinstance(outcome, Skill)]
+    assert len(skills) == 2
+
+
+@settings(deadline=None, max_examples=8)
+@given(cut=st.lists(st.integers(1, 160), min_size=1, max_size=12), seed=st.integers(0, 9))
+def test_the_sizes_of_blocks_change_nothing(cut: list[int], seed: int) -> None:
+    config = config_of(Path(), identification={"method": "least_squares"})
+    records = rapids(config, count=1)
+    assert numbers(fed(AxisPipeline("X", config), reblocked(records, cut))) == numbers(
+        fed(AxisPipeline("X", config), records)
+    )
+
+
+def reblocked(records: Sequence[Record], cut: Sequence[int]) -> list[Record]:
+    """Return the records with their samples in blocks of other sizes; events as early as they can come."""
+    blocks = [record for record in records if isinstance(record, AxisSamples)]
+    names = ("tick", "demand_mm", "position_mm", "speed_rad_s", "current_a", "voltage_v", "offset_mm", "statusword")
+    whole = {name: np.concatenate([getattr(block, name) for block in blocks]) for name in names}
+    out: list[Record] = [record for record in records if not isinstance(record, AxisSamples | TickTimes)]
+    start, k = 0, 0
+    while start < whole["tick"].size:
+        stop = start + cut[k % len(cut)]
+        part: dict[str, Any] = {name: values[start:stop] for name, values in whole.items()}
+        out.append(AxisSamples(axis="X", **part))
+        start, k = stop, k + 1
+    return out
+
+
+def test_a_replayed_window_gives_the_same_bits_through_a_file(config: MachineConfig) -> None:
+    live = fed(AxisPipeline("X", config), rapids(config, count=1))
+    (window,) = windows_of(live)
+    stored = decode_window(encode_window(window, config.digest))
+    assert same(stored, window)
+    assert numbers(AxisPipeline("X", config).feed(stored)) == numbers(live)
+
+
+def test_lost_samples_are_nan_and_listed_and_refused(config: MachineConfig) -> None:
+    records = rapids(config, count=1)
+    lost = range(800, 812)
+    records = [without(record, lost) if isinstance(record, AxisSamples) else record for record in records]
+    outcomes = fed(AxisPipeline("X", config), records)
+    (window,) = windows_of(outcomes)
+    start = 800 - window.start_tick
+    assert window.gaps == ((start, start + 12),)
+    assert np.isnan(window.speed_rad_s[start : start + 12]).all()
+    assert window.voltage_v is not None
+    assert np.isnan(window.voltage_v[start : start + 12]).all()
+
+
+def without(block: AxisSamples, ticks: range) -> AxisSamples:
+    """Return a block without the samples of some ticks."""
+    keep = ~np.isin(block.tick, list(ticks))
+    names = ("tick", "demand_mm", "position_mm", "speed_rad_s", "current_a", "voltage_v", "offset_mm", "statusword")
+    return replace(block, **{name: getattr(block, name)[keep] for name in names})
+
+
+def test_the_newest_temperature_goes_with_the_window_and_other_axes_are_ignored(config: MachineConfig) -> None:
+    pipeline = AxisPipeline("X", config)
+    pipeline.feed(Temperature("X", 0, 21.5, "slideway"))
+    pipeline.feed(Temperature("Y", 0, 99.0, "slideway"))
+    stranger = [replace(r, axis="Y") for r in rapids(config, count=1) if isinstance(r, AxisSamples)]
+    assert fed(pipeline, stranger) == []
+    (window,) = windows_of(fed(pipeline, rapids(config, count=1)))
+    assert window.temperature_c == 21.5
+
+
+def test_a_sync_count_that_begins_anew_forgets_the_old_one(config: MachineConfig) -> None:
+    pipeline = AxisPipeline("X", config)
+    records = rapids(config, count=1, first_tick=70_000)
+    assert windows_of(fed(pipeline, records[: len(records) // 2])) == []
+    (window,) = windows_of(fed(pipeline, rapids(config, count=1)))
+    assert window.start_tick < 500
+
+
+def test_a_changed_load_is_told_at_once_and_used_from_the_second_window(config: MachineConfig) -> None:
+    pipeline = AxisPipeline("X", config)
+    axis = config.axis["X"]
+    heavy = axis.model_copy(update={"nominal": axis.nominal.model_copy(update={"Jt": 0.085})})
+
+    def rapid(settings: object, k: int) -> Window:
+        made = nominal_rapid("X", heavy if settings == "heavy" else axis, 0.001, 1 if k % 2 else -1, seed=k)
+        return replace(made, start_tick=2000 * k)
+
+    for k in range(1, 5):
+        assert any(isinstance(o, ParameterSet) for o in pipeline.feed(rapid("light", k)))
+    third = pipeline.feed(rapid("heavy", 5))
+    assert [o.code for o in third if isinstance(o, Notice)] == ["LoadChanged"]
+    assert not any(isinstance(o, ParameterSet) for o in third)
+    assert pipeline.published is not None
+    assert pipeline.published.parameters.Jt == pytest.approx(0.075, rel=0.01)
+    fourth = pipeline.feed(rapid("heavy", 6))
+    (published,) = [o for o in fourth if isinstance(o, ParameterSet)]
+    assert published.parameters.Jt == pytest.approx(0.085, rel=0.01)
+    assert published.windows == 2  # the windows with the old load are no part of it
+
+
+def test_one_window_that_is_off_leaves_no_trace(config: MachineConfig) -> None:
+    pipeline = AxisPipeline("X", config)
+    axis = config.axis["X"]
+    odd = axis.model_copy(update={"nominal": axis.nominal.model_copy(update={"R": 0.7, "K": 0.9})})
+    sets = []
+    for k, real in enumerate((axis, axis, axis, odd, axis), start=1):
+        window = replace(nominal_rapid("X", real, 0.001, seed=k), start_tick=2000 * k)
+        outcomes = pipeline.feed(window)
+        sets.append([o for o in outcomes if isinstance(o, ParameterSet)])
+        assert [o.code for o in outcomes if isinstance(o, Notice)] == (["ParameterJump"] if k == 4 else [])
+    assert [len(s) for s in sets] == [1, 1, 1, 0, 1]
+    assert sets[4][0].windows == 4
+    last = sets[4][0].parameters
+    assert abs(last.K - 0.8) < 0.008
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.0003, -0.0004])
+@pytest.mark.parametrize("ratio", [1, 4])
+def test_a_sensors_voltage_is_placed_by_its_count_however_late_the_host_is(ratio: int, late_s: float) -> None:
+    period_ns, n = 1_000_000, 4000
+    rng = np.random.default_rng(5)
+    ring = Ring(20_000, 1e-3)
+    tick = np.arange(100, 100 + n)
+    # a host that is late by up to 5 ms, in bursts: arrivals are true only as a whole
+    arrival = np.maximum.accumulate(tick * period_ns + rng.exponential(3e5, n).astype(np.int64))
+    ring.add(TickTimes(frozen_ints(tick), frozen_ints(arrival)))
+    signal = np.sin(np.arange(n + 200) / 50)
+    counter = np.arange(7 * ratio, (7 + n) * ratio)  # its sample 7 * ratio begins with tick 107, but for late_s
+    begins = 107 + (counter - 7 * ratio) / ratio - late_s / 1e-3
+    t_ns = np.interp(begins, tick, arrival)
+    volts = signal[np.minimum((begins - 100).round().astype(int).clip(0), n + 199)]
+    for part in np.array_split(np.arange(counter.size), 80):
+        block = (frozen_ints(counter[part]), frozen_ints(t_ns[part]), frozen_ints(np.full(part.size, 9)))
+        ring.add(VoltageSamples("s", "X", *block, frozen(volts[part]), 1000.0 * ratio))
+    ring.add(samples(np.arange(100, 100 + n)))
+    stretch = ring.cut(1000, 2000, separate_voltage=True)
+    assert stretch.voltage_v is not None
+    left_over = late_s - round(late_s * 1e3 * ratio) / (1e3 * ratio)  # whole samples are placed
+    assert stretch.voltage_delay_s == pytest.approx(left_over, abs=1.2e-4 / ratio)
+    assert ring.voltage_reaches(3000)
+    assert not ring.voltage_reaches(5000)
+    if ratio == 1 and late_s == 0.0:
+        assert np.array_equal(stretch.voltage_v, signal[900:1900])
+
+
+def test_lost_sensor_samples_and_an_unfit_rate_stay_unknown() -> None:
+    ring = Ring(20_000, 1e-3)
+    tick = np.arange(2000)
+    ring.add(TickTimes(frozen_ints(tick), frozen_ints(tick * 1_000_000)))
+    ring.add(samples(tick))
+    counter = np.delete(np.arange(2000), np.arange(500, 510))
+    block = (frozen_ints(counter), frozen_ints(counter * 1_000_000), frozen_ints(np.ones(counter.size)))
+    ring.add(VoltageSamples("s", "X", *block, frozen(np.ones(counter.size)), 1000.0))
+    stretch = ring.cut(400, 600, separate_voltage=True)
+    assert stretch.voltage_v is not None
+    assert np.flatnonzero(np.isnan(stretch.voltage_v)).tolist() == list(range(100, 110))
+    unfit = Ring(20_000, 1e-3)
+    unfit.add(TickTimes(frozen_ints(tick), frozen_ints(tick * 1_000_000)))
+    unfit.add(VoltageSamples("s", "X", *block, frozen(np.ones(counter.size)), 730.0))
+    assert unfit.cut(400, 600, separate_voltage=True).voltage_v is None
+
+
+def samples(tick: np.ndarray) -> AxisSamples:
+    """Return samples that stand still."""
+    zeros = frozen(np.zeros(tick.size))
+    ticks = frozen_ints(tick)
+    return AxisSamples("X", ticks, zeros, zeros, zeros, zeros, None, zeros, frozen_ints(zeros))
+
+
+def test_memory_is_bounded(config: MachineConfig) -> None:
+    ring = Ring(1000, 1e-3)
+    for start in range(0, 100_000, 50):
+        tick = np.arange(start, start + 50)
+        ring.add(samples(tick))
+        ring.add(TickTimes(frozen_ints(tick), frozen_ints(tick * 1_000_000)))
+    assert len(ring._samples) <= 22
+    assert len(ring._times) <= 22
+    assert math.isnan(ring.cut(0, 10, separate_voltage=False).speed_rad_s[0])
