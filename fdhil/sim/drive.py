@@ -91,6 +91,7 @@ class Drive:
         self.tick = 0
         self.table_mm = self.physics.table_rad * self._mm_per_rad
         self._sync_id = 0x80
+        self._sync_refused = False
         self._now_s = 0.0
         self._over_window = 0
         self._last_offset = 0
@@ -174,7 +175,7 @@ class Drive:
             return self._nmt(data)
         if can_id > 0x700:
             back = len(data) == 1 and self._consumer.receive(can_id - 0x700, self._now_s)
-            return self._emergencies.clear_communication() if back else []
+            return self._emergencies.clear(in_fault=self.power.faulty) if back else []
         return self._rpdo(can_id, data) if self.nmt == OPERATIONAL else []
 
     def _sdo_request(self, data: bytes) -> list[Frame]:
@@ -229,7 +230,9 @@ class Drive:
             return []
         counter = data[0] if data else None
         if counter is None and self.dictionary.numbers[0x101900]:
-            return self._emergencies.report(monitor.SYNC_LENGTH)
+            told, self._sync_refused = self._sync_refused, True
+            return [] if told else self._emergencies.report(monitor.SYNC_LENGTH)
+        self._sync_refused = False
         operational = self.nmt == OPERATIONAL
         if operational:
             self.pdo.latch(count_late=self.motion.source is Source.CYCLIC)

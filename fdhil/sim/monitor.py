@@ -49,18 +49,15 @@ class Emergencies:
         values[0x1003 << 8] = count
         return self._frame(code, register, detail)
 
-    def clear(self, bits: int = 0xFE) -> list[Frame]:
-        """Take ``bits`` out of the error register; when it becomes 0, return the frame "error reset" (code 0)."""
+    def clear(self, *, in_fault: bool = False) -> list[Frame]:
+        """Errors were reset, or with ``in_fault`` only the communication works again.
+
+        When the error register becomes 0, return the frame "error reset" (code 0).
+        """
         before = self._dictionary.number(0x1001)
-        after = before & ~bits
-        if after == _GENERIC:
-            after = 0
+        after = before & ~_COMMUNICATION if in_fault else 0
         self._dictionary.numbers[0x1001 << 8] = after
         return self._frame(NO_ERROR, 0, b"") if before and not after else []
-
-    def clear_communication(self) -> list[Frame]:
-        """The communication works again."""
-        return self.clear(_COMMUNICATION)
 
     def _frame(self, code: int, register: int, detail: bytes) -> list[Frame]:
         cob_id = self._dictionary.number(0x1014)

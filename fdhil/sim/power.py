@@ -87,6 +87,11 @@ class PowerStage:
         self._last_word = None
 
     @property
+    def faulty(self) -> bool:
+        """Whether a fault waits for its reset."""
+        return self.state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
+
+    @property
     def follows(self) -> bool:
         """Whether the drive follows the set-points it is given."""
         return self.state is State.OPERATION_ENABLED and self.ramp is None
@@ -151,12 +156,12 @@ class PowerStage:
 
     def disable_voltage(self) -> None:
         """Transitions 7, 9, 10 and 12 by the drive itself."""
-        if self.state not in (State.FAULT, State.FAULT_REACTION_ACTIVE, State.NOT_READY):
+        if not self.faulty and self.state is not State.NOT_READY:
             self._enter(State.SWITCH_ON_DISABLED)
 
     def fault(self) -> None:
         """Transitions 13 and 14: react by 0x605E, at once when no current flows."""
-        if self.state in (State.FAULT, State.FAULT_REACTION_ACTIVE):
+        if self.faulty:
             return
         code = self._option(0x605E)
         if not self.powered or code == 0:
