@@ -115,7 +115,7 @@ class Unit:
 
 
 class Machine:
-    """The machine of one configuration. ``events`` collects what it has to tell; ``tick`` counts SYNCs."""
+    """The machine of one configuration. ``events`` collects what it has to tell; ``tick`` counts SYNC periods."""
 
     def __init__(self, config: MachineConfig) -> None:
         self.config = config
@@ -215,6 +215,9 @@ class Machine:
             if all(unit.sync_on for unit in self._of_bus[bus]):
                 frames.append((bus, frame))
                 frames += [(bus, answer) for answer in self._sync(bus, frame[1])]
+            elif bus == self._first_bus:  # the SYNC is lost by a fault, whose end must come all the same
+                self._run_faults(None)
+                self.tick += 1
         for bus, frame in self.nc.end():
             frames.append((bus, frame))
             for unit in self._of_bus[bus]:

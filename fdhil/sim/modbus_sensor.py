@@ -125,7 +125,9 @@ class VoltageSensor:
             await asyncio.sleep(self.faults.slow_s)
         if self.faults.exception:
             return ExcCodes(self.faults.exception)
-        if function_code not in (_WRITES if values else _READS + _WRITES):  # a write is read back for its answer
+        if not values and function_code in _WRITES:
+            return None  # a write is read back for its answer
+        if function_code not in (_WRITES if values else _READS):
             return ExcCodes.ILLEGAL_FUNCTION
         if values:
             if list(values) != [1]:

@@ -1,0 +1,352 @@
+"""The machine around the drives: offsets and trace on the SYNC grid, repeatability, slide-ways, fault script."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil.errors import ConfigError
+from fdhil.sim import faults
+from fdhil.sim.faults import FAULTS
+from fdhil.sim.machine import Machine
+from fdhil.sim.modbus_sensor import SensorFaults
+from fdhil.sim.panel import Panel, PanelError
+from fdhil.sim.sensors import DriveFaults
+from fdhil.sim.service import Pace
+from tests.sim.bench_twin import PERIOD_S, TwinInHand, corner, trajectory, twin_config
+
+PER_MM = 65536 / 20
+
+
+def read_trace(path: Path) -> dict[str, np.ndarray]:
+    table = np.genfromtxt(path, delimiter=",", names=True)
+    return {name: table[name] for name in table.dtype.names}
+
+
+def test_the_trace_has_a_row_per_demand_row_and_300_ms(tmp_path: Path) -> None:
+    twin = TwinInHand(twin_config())
+    twin.switch_on()
+    rows = corner()
+    file = tmp_path / "trace.csv"
+    twin.machine.trace(file)
+    twin.play(rows)
+    assert not file.exists()
+    event = twin.run_until("finished")
+    assert event["trace"] == str(file)
+    assert list(tmp_path.iterdir()) == [file]
+    trace = read_trace(file)
+    assert list(trace) == [
+        "time_s", "X_reference_mm", "X_table_mm", "X_offset_um", "Y_reference_mm", "Y_table_mm", "Y_offset_um",
+    ]  # fmt: skip
+    assert len(trace["time_s"]) == len(rows) + 300
+    assert trace["time_s"] == pytest.approx(np.arange(len(rows) + 300) * PERIOD_S)
+    assert trace["X_reference_mm"][: len(rows)] == pytest.approx(rows[:, 0], abs=1e-9)
+    assert trace["Y_table_mm"][0] == 0.0
+    error_um = (trace["Y_table_mm"] - trace["Y_reference_mm"]) * 1e3
+    assert 5 < np.abs(error_um).max() < 300
+    assert np.abs(error_um[-50:]).max() < 1.0
+    twin.play(rows)
+    assert twin.run_until("finished")["trace"] is None, "a trace is of the next file only"
+
+
+def test_an_offset_reaches_the_row_it_was_sent_with(tmp_path: Path) -> None:
+    """A guard that answers SYNC k - 1 with o[k + 2] corrects row k + 2, no earlier and no later."""
+    twin = TwinInHand(twin_config())
+    twin.switch_on()
+    rows = corner()
+    offset = np.round(0.02 * np.sin(np.arange(len(rows) + 400) / 37) * PER_MM).astype(int)
+    file = tmp_path / "trace.csv"
+    twin.machine.trace(file)
+    twin.play(rows)
+    twin.run_until("playing")  # row 0 is in force now: SYNC 0 has been
+    row = 0
+
+    def guard() -> None:
+        nonlocal row
+        twin.send(0x301, struct.pack("<i", offset[row + 3]))
+        row += 1
+
+    guard()
+    twin.each_cycle = guard
+    finished = twin.run_until("finished")
+    assert finished["late_rpdo"] == {"X": 0, "Y": 0}
+    applied = read_trace(file)["X_offset_um"]
+    assert np.all(applied[:3] == 0)
+    assert applied[3:] == pytest.approx(offset[3 : len(applied)] / PER_MM * 1e3, abs=1e-6)
+    assert np.all(read_trace(file)["Y_offset_um"] == 0)
+
+
+def test_offset_frames_that_are_missing_are_counted() -> None:
+    twin = TwinInHand(twin_config())
+    twin.switch_on()
+    twin.play(corner())
+    twin.run_until("playing")
+    cycle = 0
+
+    def guard() -> None:
+        nonlocal cycle
+        cycle += 1
+        if cycle not in (50, 90, 91, 92) and cycle < 200:
+            twin.send(0x301, struct.pack("<i", 0))
+
+    twin.each_cycle = guard
+    assert twin.run_until("finished")["late_rpdo"] == {"X": 4, "Y": 0}, "the end of the stream is not a late frame"
+
+
+def test_lockstep_waits_for_the_stream_of_the_cycle_before() -> None:
+    twin = TwinInHand(twin_config())
+    twin.switch_on()
+    assert not twin.machine.waits()
+    twin.send(0x301, struct.pack("<i", 0))
+    twin.run(1)
+    assert twin.machine.waits()
+    twin.send(0x301, struct.pack("<i", 0))
+    assert not twin.machine.waits()
+    twin.run(1)
+    assert twin.machine.waits()
+    twin.run(1)
+    assert not twin.machine.waits(), "it was missing in the cycle before"
+
+
+def test_lockstep_waits_for_listed_rpdos_only_once_they_are_there() -> None:
+    twin = TwinInHand(twin_config(sim={"lockstep_rpdo": ["X:2"]}))
+    twin.switch_on()
+    assert not twin.machine.waits()
+    for can_id in (0x301, 0x302):
+        twin.send(can_id, struct.pack("<i", 0))
+    twin.run(1)
+    assert twin.machine.waits()
+    twin.run(1)
+    assert twin.machine.waits(), "a listed stream is waited for a little longer"
+    twin.send(0x301, struct.pack("<i", 0))
+    assert not twin.machine.waits(), "Y is not listed"
+    for _ in range(5):
+        twin.run(1)
+    assert not twin.machine.waits()
+
+
+@pytest.mark.parametrize("listed", ["Q:2", "X", "X:5", "X:two"])
+def test_a_listed_rpdo_that_does_not_exist_is_refused(listed: str) -> None:
+    with pytest.raises(ConfigError, match="lockstep_rpdo"):
+        Machine(twin_config(sim={"lockstep_rpdo": [listed]}))
+
+
+def test_two_runs_are_equal_bit_by_bit() -> None:
+    """Noise, stick-slip, sensors: nothing but the seed and the SYNCs decides."""
+
+    def run(seed: int) -> tuple[list[tuple[int, bytes]], list[int]]:
+        noise = {"voltage_v": 0.06, "current_a": 0.05, "speed_rad_s": 0.15}
+        twin = TwinInHand(twin_config(sim={"seed": seed, "noise": noise}))
+        twin.switch_on()
+        twin.play(corner() + 3.0)
+        twin.run_until("finished")
+        sensor = twin.machine.units["Y"].sensor
+        assert sensor is not None
+        return twin.wire, sensor.registers()
+
+    assert run(1) == run(1)
+    assert run(1)[0] != run(2)[0]
+
+
+def test_another_master_may_take_over_sync_nmt_and_set_points() -> None:
+    twin = TwinInHand(twin_config("X"))
+    twin.send(0x000, b"\1\1")
+    twin.send(0x601, bytes.fromhex("2f60600008000000"))
+    for word in (0x06, 0x07, 0x0F):
+        twin.send(0x201, struct.pack("<Hi", word, 0))
+        answers = twin.send(0x80, b"")
+        assert [can_id for can_id, _ in answers[:2]] == [0x181, 0x281]
+    way = 0
+    for k in range(400):
+        way = min(k * 200, 50000)
+        twin.send(0x201, struct.pack("<Hi", 0x0F, way))
+        twin.send(0x80, b"")
+    assert twin.machine.units["X"].drive.table_mm == pytest.approx(way / PER_MM, abs=0.005)
+    assert twin.machine.tick == 403
+    sensor = twin.machine.units["X"].sensor
+    assert sensor is not None
+    assert sensor.registers()[3] == 402
+
+
+def test_slide_ways_warm_with_speed_and_friction_falls() -> None:
+    sim = {
+        "thermal": {"ambient_c": 20.0, "rise_c": 50.0, "time_constant_s": 1.0},
+        "axis": {"X": {"ft_per_kelvin": -0.1, "Cd_per_kelvin": -0.1}},
+    }
+    twin = TwinInHand(twin_config(sim=sim))
+    twin.switch_on()
+    sweep = 100 * (1 - np.cos(np.linspace(0, 2 * np.pi, 1500))) / 2
+    twin.play(np.column_stack([sweep, np.zeros_like(sweep)]))
+    twin.run_until("finished")
+    x, y = twin.machine.units["X"], twin.machine.units["Y"]
+    assert 22.0 < x.slide_way.celsius < 40.0
+    assert y.slide_way.celsius == pytest.approx(20.0, abs=0.1)
+    shown = x.drive.dictionary.number(0x2110, 1) / 100
+    assert shown == pytest.approx(x.slide_way.celsius, abs=0.5)
+    assert x.drive.physics.parameters.Cd == pytest.approx(max(5.0 * (1 - 0.1 * (shown - 20)), 0), abs=0.05)
+    assert y.drive.physics.parameters.Cd == 5.0
+
+
+# -- the panel
+
+
+def a_panel(machine: Machine) -> Panel:
+    return Panel(machine, lambda path: None, lambda: None)
+
+
+def test_the_panel_sets_parameters_and_temperature() -> None:
+    machine = Machine(twin_config(sim={"axis": {"X": {"Cd_per_kelvin": -0.1}}}))
+    machine.power_on()
+    panel = a_panel(machine)
+    panel.obey('{"command": "set", "axis": "X", "parameters": {"Jt": 0.085, "ft": 0.01}}')
+    panel.obey('{"command": "temperature", "celsius": 22.0}')
+    x = machine.units["X"].drive.physics.parameters
+    assert (x.Jt, x.ft, x.Cd) == (0.085, 0.01, pytest.approx(4.0))
+    assert machine.units["Y"].drive.physics.parameters.Jt == 0.075
+    assert machine.units["Y"].drive.dictionary.number(0x2110, 1) == 2200
+    panel.obey("")
+
+
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        ("nonsense", "no JSON"),
+        ("[1]", "no command None"),
+        ('{"command": ["nc"]}', "no command"),
+        ('{"command": "dance"}', "'dance'; it has nc, play"),
+        ('{"command": "nc"}', '"on" must be true or false'),
+        ('{"command": "nc", "on": 1}', '"on" must be true or false'),
+        ('{"command": "play"}', '"file" must be a path'),
+        ('{"command": "override", "percent": NaN}', '"percent" must be a number'),
+        ('{"command": "override", "percent": -1}', "0 to 150"),
+        ('{"command": "set", "parameters": {"Jt": 1}}', "no axis None"),
+        ('{"command": "set", "axis": "X"}', "must be an object"),
+        ('{"command": "set", "axis": "X", "parameters": {"J": 1}}', "J is no parameter"),
+        ('{"command": "set", "axis": "X", "parameters": {"Jt": -1}}', "Jt = -1"),
+        ('{"command": "temperature", "celsius": 900}', "no temperature"),
+        ('{"command": "temperature", "celsius": 20, "axis": "Q"}', "no axis 'Q'"),
+        ('{"command": "fault", "fault": "meteor"}', "'meteor' is none of"),
+        ('{"command": "fault", "fault": "reboot"}', "needs an axis"),
+        ('{"command": "fault", "fault": "reboot", "axis": "Q"}', "no axis 'Q'"),
+        ('{"command": "' + "x" * 70000 + '"}', "longer than 64 KiB"),
+    ],
+)
+def test_the_panel_says_what_is_wrong(line: str, complaint: str) -> None:
+    with pytest.raises(PanelError, match=complaint.replace("?", r"\?")):
+        a_panel(Machine(twin_config())).obey(line)
+
+
+# -- the fault script
+
+
+def test_a_fault_script_acts_at_its_time_and_ends(tmp_path: Path) -> None:
+    script = tmp_path / "faults.toml"
+    script.write_text(
+        '[[fault]]\nat_sync = 100\naxis = "X"\nfault = "position_stuck"\nduration_s = 0.05\n'
+        '[[fault]]\nat_row = 200\naxis = "Y"\nfault = "trip"\nvalue = 0x3210\n'
+        "[[fault]]\nat_s = 0.05\nfault = 'frame'\ncan_id = 0x123\ndata = '0a0b'\nduration_s = 0.01\n"
+    )
+    twin = TwinInHand(twin_config())
+    for entry in faults.load(script, ("X", "Y")):
+        twin.machine.fault(entry)
+    twin.switch_on()
+    twin.play(corner())
+    signal = []
+    twin.each_cycle = lambda: signal.append("position" in twin.machine.units["X"].drive_faults.signals)
+    twin.run_until("error")
+    assert [event["fault"] for event in twin.events if event["event"] == "fault"] == ["frame", "position_stuck", "trip"]
+    assert any(can_id == 0x82 and data[:2] == b"\x10\x32" for can_id, data in twin.wire)
+    assert [data for can_id, data in twin.wire if can_id == 0x123] == [b"\x0a\x0b"] * 10
+    twin.run(100)
+    assert not twin.machine.units["X"].drive_faults.signals["position"].stuck
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_every_fault_ends_without_a_trace(name: str) -> None:
+    """Being listed is being tested: started, run, ended, and the machine is as it was."""
+    twin = TwinInHand(twin_config("X"))
+    twin.switch_on()
+    value = {"drop_tpdo": 1.0, "trip": 0x1000, "sensor_exception": 4.0, "offset_scale": 2.0}.get(name, 1.0)
+    item = {"axis": "X", "fault": name, "value": value, "duration_s": 0.003, "can_id": 0x555, "data": "01"}
+    twin.machine.fault(faults.parse(item, ("X",)))
+    twin.run(20)
+    assert twin.machine.schedule.idle
+    unit = twin.machine.units["X"]
+    ended = {signal: fault for signal, fault in unit.drive_faults.signals.items() if fault.stuck or fault.gain != 1.0}
+    assert not ended
+    unit.drive_faults.signals.clear()
+    assert unit.drive_faults == DriveFaults()
+    assert unit.sensor_faults == SensorFaults()
+    assert unit.drive.digital_inputs == 0
+    assert unit.sync_on
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("fault = 3", "entry"),
+        ("[[fault]]\naxis='X'", r"fault\[0\]\.fault: Field required"),
+        ("[[fault]]\naxis='X'\nfault='load_torqe'\nvalue=1", "did you mean 'load_torque'"),
+        ("[[fault]]\naxis='X'\nfault='load_torque'", "needs a value: N.m"),
+        ("[[fault]]\nfault='reboot'", "needs an axis"),
+        ("[[fault]]\nfault='reboot'\naxis='Q'", "there is no axis 'Q'"),
+        ("[[fault]]\nfault='reboot'\naxis='X'\nat_s=1\nat_sync=2", "one of at_s"),
+        ("[[fault]]\nfault='reboot'\naxis='X'\nat_s=-1", "greater than or equal"),
+        ("[[fault]]\nfault='reboot'\naxis='X'\nwhen=1", "when"),
+        ("[[fault]]\nfault='load_torque'\naxis='X'\nvalue=nan", "finite"),
+        ("[[fault]]\nfault='frame'", "needs can_id"),
+        ("[[fault]]\nfault='frame'\ncan_id=1\ndata='zz'", "hex"),
+        ("[[fault]]\nfault='frame'\ncan_id=1\ndata='000102030405060708'", "at most 8"),
+        ("faults = []", "faults: is no key"),
+        ("[[fault]\n", "is no TOML"),
+    ],
+)
+def test_a_wrong_fault_script_is_refused(text: str, complaint: str, tmp_path: Path) -> None:
+    script = tmp_path / "faults.toml"
+    script.write_text(text)
+    with pytest.raises(ConfigError, match=complaint):
+        faults.load(script, ("X", "Y"))
+
+
+def test_all_wrong_entries_are_named_at_once(tmp_path: Path) -> None:
+    script = tmp_path / "faults.toml"
+    script.write_text("[[fault]]\nfault='reboot'\n[[fault]]\nfault='meteor'\n")
+    with pytest.raises(ConfigError) as caught:
+        faults.load(script, ("X",))
+    assert [fault.path for fault in caught.value.faults] == ["fault[0].entry", "fault[1].fault"]
+
+
+# -- the pace
+
+
+def test_a_late_host_slips_and_does_not_hurry_after() -> None:
+    pace = Pace(0.001, lockstep=False)
+    pace.sent(10.0)
+    now, sent = 10.0, []
+    for k in range(100):
+        now = max(now, pace.due_s(waits=False, idle=False)) + (0.0201 if k == 50 else 0.00005)
+        pace.sent(now)
+        sent.append(now)
+    gaps = np.diff(sent)
+    assert gaps.min() >= 0.00075
+    assert gaps[:49].mean() == pytest.approx(0.001, abs=2e-5)
+    assert sent[-1] - sent[0] > 0.0201 + 97 * 0.001
+
+
+def test_lockstep_runs_when_everything_is_there_and_waits_half_a_second() -> None:
+    pace = Pace(0.001, lockstep=True)
+    pace.sent(10.0)
+    assert pace.due_s(waits=False, idle=False) <= 10.0
+    assert pace.due_s(waits=True, idle=False) == 10.5
+    assert pace.due_s(waits=False, idle=True) == pytest.approx(10.001, abs=3e-4)
+
+
+def test_a_played_file_leaves_axes_alone_that_it_does_not_name() -> None:
+    twin = TwinInHand(twin_config(sim={"axis": {"Y": {"start_mm": 5.0}}}))
+    twin.switch_on()
+    twin.machine.nc.play("x only", trajectory(corner()[:, :1], "X"))
+    twin.run_until("finished")
+    assert twin.machine.units["Y"].drive.table_mm == pytest.approx(5.0, abs=1e-3)
