@@ -15,6 +15,7 @@ import select
 import socket
 import struct
 import time
+from collections.abc import Sequence
 from typing import Protocol
 
 import can
@@ -40,6 +41,10 @@ class Port(Protocol):
     """What the receive thread and the commissioning master need of a bus."""
 
     @property
+    def holds_back(self) -> bool:
+        """Whether what is not read waits at the sender, so that nothing is lost by reading late."""
+
+    @property
     def kernel_drops(self) -> int:
         """Frames the kernel dropped because they were not read in time."""
 
@@ -55,6 +60,8 @@ class Port(Protocol):
 
 class SocketCanPort:
     """A raw CAN socket on a network interface: kernel stamps, error frames, drop count."""
+
+    holds_back = False
 
     def __init__(self, name: str, channel: str) -> None:
         self._name = name
@@ -119,14 +126,41 @@ class SocketCanPort:
         self._socket.close()
 
 
+class HubClock:
+    """The hub's clock against ours, from the quickest reading so far: no reading comes before it was sent.
+
+    A hub whose clock was set, or which sends no clock at all, starts anew.
+    """
+
+    _DRIFT_S = 1e-7  # per reading: two clocks drift apart, and the quickest reading may be long ago
+    _JUMP_S = 1.0
+
+    def __init__(self) -> None:
+        self._ahead_s: float | None = None
+
+    def ahead_s(self, lines: Sequence[str], now_ns: int) -> float | None:
+        """Return by how many seconds the hub's stamps are ahead of the host's monotonic clock, None without stamps."""
+        try:
+            ahead = float(lines[-1].split(None, 4)[3]) - now_ns * 1e-9
+        except (IndexError, ValueError):
+            return self._ahead_s
+        if self._ahead_s is None or ahead > self._ahead_s or ahead < self._ahead_s - self._JUMP_S:
+            self._ahead_s = ahead
+        else:
+            self._ahead_s -= self._DRIFT_S
+        return self._ahead_s
+
+
 class SocketcandPort:
     """A TCP connection to a socketcand hub in raw mode."""
 
+    holds_back = True
     kernel_drops = 0  # TCP loses nothing; what the hub dropped it must say itself
 
     def __init__(self, name: str, host: str, port: int, channel: str) -> None:
         self._name = name
         self._rest = b""
+        self._clock = HubClock()
         self.malformed = 0
         where = f"{host}:{port}"
         try:
@@ -159,7 +193,7 @@ class SocketcandPort:
             raise ConnectError(self._name, f"{otherwise}; check host, port and channel")
 
     def receive(self, ring: Ring, timeout_s: float) -> None:
-        """Read what has come in one piece and split it; the stamp is the moment of reading."""
+        """Read what has come in one piece and split it; the hub's stamps become host-monotonic ones."""
         self._socket.settimeout(timeout_s)
         try:
             chunk = self._socket.recv(1 << 18)
@@ -177,16 +211,17 @@ class SocketcandPort:
         if len(self._rest) > MAX_LINE_BYTES:
             self.malformed += 1
             self._rest = b""
-        append = ring.append
+        append, ahead_s = ring.append, self._clock.ahead_s(lines, now_ns)
         for line in lines:
             words = line.split(None, 4)
             try:
                 name = words[2]
+                stamp_ns = min(now_ns, int((float(words[3]) - ahead_s) * 1e9)) if ahead_s else now_ns
                 data = bytes.fromhex(words[4])[:8] if len(words) > 4 else b""
                 if words[1] == "frame":
-                    append(now_ns, int(name, 16) if len(name) == 3 else int(name, 16) | EXTENDED_FLAG, data)
+                    append(stamp_ns, int(name, 16) if len(name) == 3 else int(name, 16) | EXTENDED_FLAG, data)
                 elif words[1] == "error":
-                    append(now_ns, int(name, 16) & 0x1FFFFFFF | ERROR_FLAG, data)
+                    append(stamp_ns, int(name, 16) & 0x1FFFFFFF | ERROR_FLAG, data)
             except (IndexError, ValueError, struct.error):
                 self.malformed += 1
 
@@ -207,6 +242,7 @@ class SocketcandPort:
 class VirtualPort:
     """python-can's bus inside one process."""
 
+    holds_back = False
     kernel_drops = 0
 
     def __init__(self, name: str, channel: str) -> None:

@@ -16,7 +16,11 @@ from fdhil.drivers.can_ports import BusEnded, Port, SocketcandPort, SocketCanPor
 from fdhil.drivers.frames import DEFAULT_RING_FRAMES, Frames, Latch, Ring
 from fdhil.errors import DeviceError
 
-POLL_S = 0.2
+POLL_S = 0.05
+# frames are read a few milliseconds at a time: a thread that wakes for every one costs more than all the decoding, and
+# the stamps come from the kernel or the hub
+BATCH_S = 0.004
+HOLD_BACK_S = 0.001
 
 
 def open_port(name: str, settings: config.CanBus) -> Port:
@@ -53,7 +57,12 @@ class CanBus:
         """The receive thread: nothing but appending; its end is reported, never swallowed."""
         try:
             while not self._stopping.is_set():
+                if self._port.holds_back and self._ring.waiting > 0.5:
+                    time.sleep(HOLD_BACK_S)  # what is not read waits in the hub
+                    continue
                 self._port.receive(self._ring, POLL_S)
+                if not self._transmit:
+                    time.sleep(BATCH_S)
         except BusEnded as end:
             self._end.set(str(end))
 
@@ -90,7 +99,7 @@ class CanBus:
     def close(self) -> None:
         """Stop the receive thread and release the bus."""
         self._stopping.set()
-        self._thread.join(timeout=5 * POLL_S)
+        self._thread.join(timeout=20 * POLL_S)
         self._port.close()
 
     def __enter__(self) -> CanBus:

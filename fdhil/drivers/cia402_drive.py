@@ -96,8 +96,11 @@ class Cia402Decoder:
             return []
         self._next_row = stop
         self._length_notices()
-        self._read_back(first, stop)
-        out: list[AxisSamples | InputSamples | Notice] = [*self._samples(first, stop), *self._inputs(first, stop)]
+        offset = self._read_back_offset(first, stop)
+        demand = self._read_back_demand(first, stop, offset)
+        out: list[AxisSamples | InputSamples | Notice] = []
+        out += self._samples(first, stop, demand, offset)
+        out += self._inputs(first, stop)
         self._forget(stop)
         told, self._notices = self._notices, []
         return [*out, *told]
@@ -109,12 +112,20 @@ class Cia402Decoder:
             setpoint.forget(row)
         self._syncs = self._syncs[np.searchsorted(self._syncs, row) :]
 
-    def _samples(self, first: int, stop: int) -> list[AxisSamples]:
+    def _heard(self, first: int, stop: int) -> Bool:
+        """Which SYNCs of ticks [first, stop) were received."""
+        mine = self._syncs[self._syncs.searchsorted(first) : self._syncs.searchsorted(stop)]
+        heard = np.zeros(stop - first, np.bool_)
+        heard[mine - first] = True
+        return heard
+
+    def _samples(
+        self, first: int, stop: int, demand: SetpointRows | None, offset: SetpointRows | None
+    ) -> list[AxisSamples]:
         """Rows [first, stop); nothing while the demand is not known."""
-        heard = np.isin(np.arange(first, stop), self._syncs)
+        heard = self._heard(first, stop)
         grids = {name: dense(self._queues[name], first, stop + 1) for name in self._required}
         lost = self._count(grids, heard)
-        demand, offset = self._target.rows(first, stop), self._offset.rows(first, stop)
         if demand is None:
             return []
         lost += demand.lost + int(np.count_nonzero(~heard))
@@ -186,35 +197,38 @@ class Cia402Decoder:
         tick, words = self._queues[found[0].name].between(first, stop)
         return [InputSamples(self.axis, frozen_ints(tick), frozen_ints(decode(found[1], words)))] if tick.size else []
 
-    def _read_back(self, first: int, stop: int) -> None:
-        """Learn set-points that nobody streams from the drive's read-back, and check those that are sniffed.
+    def _shown(self, key: ObjectKey, first: int, stop: int) -> tuple[Int, Int]:
+        """Ticks and values of a slower TPDO's object; empty when the profile maps it nowhere."""
+        found = self.profile.find_tpdo(key)
+        if found is None:
+            return np.empty(0, np.int64), np.empty(0, np.int64)
+        tick, words = self._queues[found[0].name].between(first, stop)
+        return tick, decode(found[1], words)
 
-        0x6062 at SYNC k is r[k] + o[k]; 0x60B0 at SYNC k is what was latched there, so it is in force at k + delay.
+    def _read_back_offset(self, first: int, stop: int) -> SetpointRows | None:
+        """The offset in force on rows [first, stop): sniffed, else what the drive shows.
+
+        0x60B0 at SYNC k is what was latched there, so it is in force at k + delay.
         """
-        demand_at, offset_at = (
-            self.profile.find_tpdo(self.profile.position_demand),
-            self.profile.find_tpdo(self.profile.offset),
-        )
-        if demand_at is None or offset_at is None:
-            return
-        tick, words = self._queues[offset_at[0].name].between(first, stop)
-        if tick.size == 0:
-            return
-        if self._offset.queue.tick.size == 0:
-            self._offset.held = int(decode(offset_at[1], words[-1:])[0])
-        tick, words = self._queues[demand_at[0].name].between(first, stop)
-        if tick.size == 0:
-            return
-        shown = decode(demand_at[1], words)
-        offset = self._offset.rows(first, stop)
-        now = offset.value[tick - first] if offset is not None else np.zeros(tick.size, np.int64)
-        if self._target.queue.tick.size == 0:
-            self._target.held = int(shown[-1] - now[-1])
-            return
+        _, shown = self._shown(self.profile.offset, first, stop)
+        if shown.size and self._offset.queue.tick.size == 0:
+            self._offset.held = int(shown[-1])
+        return self._offset.rows(first, stop)
+
+    def _read_back_demand(self, first: int, stop: int, offset: SetpointRows | None) -> SetpointRows | None:
+        """The demand on rows [first, stop): sniffed and checked against what the drive shows, else what it shows.
+
+        0x6062 at SYNC k is r[k] + o[k].
+        """
+        tick, shown = self._shown(self.profile.position_demand, first, stop)
+        base = shown - (offset.value[tick - first] if offset is not None else 0)
+        if self._target.queue.tick.size == 0 and shown.size:
+            self._target.held = int(base[-1])
         demand = self._target.rows(first, stop)
-        if demand is not None:
+        if demand is not None and self._target.queue.tick.size and shown.size:
             sure = demand.certain[tick - first]
-            self._compare((shown - now - demand.value[tick - first])[sure])
+            self._compare((base - demand.value[tick - first])[sure])
+        return demand
 
     def _compare(self, difference: Int) -> None:
         for wrong in np.abs(difference) > _READ_BACK_TOLERANCE:

@@ -43,7 +43,7 @@ def read_optional(master: Master, index: int, sub: int = 0, *, signed: bool = Fa
 
 
 def listen(master: Master) -> None:
-    """Listen for ``LISTEN_S`` without sending: on a silent bus nothing is sent, and beside an NC we are not the master."""
+    """Listen without sending: on a silent bus nothing is sent, and beside an NC we are not the master."""
     end = master.now() + LISTEN_S
     while master.now() < end and master.heard.sync == 0:
         master.check()

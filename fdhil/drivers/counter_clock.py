@@ -1,9 +1,9 @@
 """Where on a timeline the samples of a free-running counter lie, from bounds. Pure.
 
-Each query tells that sample ``counter`` had just been completed at some instant between asking and answer. Both ends
-are hard bounds, so all queries together leave a narrow band of lines counter -> time, and its middle is the estimate;
-slow queries bound little and do no harm (the same idea as Klipper's clock synchronisation, with bounds instead of a
-regression, because delays are one-sided and not normal). The timeline may be the host's clock in ns or the SYNC count:
+Each query tells that sample ``counter`` had just been completed at some instant between asking and answer. So all
+queries together leave a narrow band of lines counter -> time, and its middle is the estimate; slow queries bound little
+and do no harm (the idea of Klipper's clock synchronisation, with intervals instead of a regression, because delays are
+one-sided and not normal). The timeline may be the host's clock in ns or the SYNC count:
 a simulated machine that is held up stops both its SYNC and its sensor, and only the SYNC count stays true.
 """
 
@@ -13,6 +13,8 @@ from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
+
+from fdhil.records import Float
 
 KEPT_QUERIES = 256
 RATE_TOLERANCE = 200e-6  # two quartz clocks
@@ -50,10 +52,7 @@ class CounterClock:
         self._queries.append((counter, asked, answered))
 
     def line(self) -> Line | None:
-        """Return the middle of the band, None before the first query.
-
-        Bounds that contradict each other (a counter that stalled, a clock that is off) give an ``error`` that says so.
-        """
+        """Return the middle of the band that most queries agree on, None before the first query."""
         if not self._queries:
             return None
         counter, asked, answered = (np.array(column) for column in zip(*self._queries, strict=True))
@@ -61,9 +60,8 @@ class CounterClock:
         step = self._rate(counter, asked, answered)
         begun = step * (counter - origin)
         # sample c is complete at start + step (c - origin + 1), and c + 1 is not yet
-        latest = np.min(answered - begun - step)
-        earliest = np.max(asked - begun - 2 * step)
-        return Line(origin, float(latest + earliest) / 2, step, max(abs(float(latest - earliest)) / 2, step * 1e-3))
+        low, high = _agreed(asked - begun - 2 * step, answered - begun - step)
+        return Line(origin, (low + high) / 2, step, max((high - low) / 2, step * 1e-3))
 
     def _rate(self, counter: np.ndarray, asked: np.ndarray, answered: np.ndarray) -> float:
         """Slope through the quickest half of the queries, kept within quartz tolerance of the nominal step."""
@@ -76,3 +74,16 @@ class CounterClock:
             return self._step
         slope = float(spread @ (y - y.mean()) / (spread @ spread))
         return float(np.clip(slope, self._step * (1 - RATE_TOLERANCE), self._step * (1 + RATE_TOLERANCE)))
+
+
+def _agreed(low: Float, high: Float) -> tuple[float, float]:
+    """Return the smallest span that lies in the most of the intervals [low, high] (n,): Marzullo's algorithm.
+
+    A few queries that lie (a stamp that was late because the computer was) are outvoted instead of believed.
+    """
+    edges = np.concatenate([low, high])
+    change = np.concatenate([np.ones(low.size), -np.ones(high.size)])
+    order = np.lexsort((-change, edges))
+    depth = np.cumsum(change[order])
+    best = int(np.argmax(depth))
+    return float(edges[order][best]), float(edges[order][best + 1])

@@ -60,6 +60,11 @@ class Ring:
         """Frames that came in since the start, those that found no room included."""
         return self._written + self.overflowed
 
+    @property
+    def waiting(self) -> float:
+        """Share of the ring that waits to be drained, 0..1."""
+        return (self._written - self._read) / self._capacity
+
     def append(self, t_ns: int, can_id: int, data: bytes) -> None:
         """Store one frame (writer's side only); ``data`` has at most 8 bytes."""
         written = self._written

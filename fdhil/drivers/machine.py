@@ -25,7 +25,7 @@ from fdhil.records import AxisSamples, MoveEvent, Notice, Temperature, TickTimes
 
 Record = AxisSamples | VoltageSamples | TickTimes | MoveEvent | Temperature | Notice
 
-DRAIN_S = 0.04
+DRAIN_S = 0.05
 POLL_S = 0.05
 SILENCE_S = 2.0
 LISTEN_S = 2.0

@@ -30,6 +30,7 @@ BLOCK_SAMPLES = 100
 ALL_REGISTERS = FIRST_SAMPLE + BLOCK_SAMPLES
 STATUS_LOST = 2
 STUCK_POLLS = 20
+SYNC_LATENESS_NS = 200_000  # how late the stamp of a SYNC may be on a busy computer
 _SETTLE_STEPS = 8
 _SETTLE_STEP_S = 0.01
 
@@ -152,7 +153,7 @@ class ModbusVoltage:
         line = self._tick_clock.line() if self._tick_clock else None
         if line is not None and ticks.running:
             fraction = line.start + line.step * (counter - line.origin)
-            return ticks.time_ns(fraction), line.error * ticks.period_ns
+            return ticks.time_ns(fraction), line.error * ticks.period_ns + SYNC_LATENESS_NS
         host = self._host_clock.line() if self._host_clock else None
         assert host is not None  # accept() has just added a query
         return host.start + host.step * (counter - host.origin), host.error

@@ -45,16 +45,17 @@ class PdoQueue:
 
     def add(self, ticked: Ticked, counters: DecoderCounters) -> None:
         """Take this PDO's frames from a block; a short one is discarded, of a long one the mapped bytes are used."""
-        mine = np.flatnonzero(ticked.frames["id"] == self.cob_id)
+        mine = (ticked.can_id == self.cob_id).nonzero()[0]
         if mine.size == 0:
             return
-        frames = ticked.frames[mine]
-        length = frames["dlc"]
-        whole = length >= self.spec.length
-        counters.short += int(mine.size - np.count_nonzero(whole))
-        counters.long += int(np.count_nonzero(length > self.spec.length))
-        self.tick = np.concatenate([self.tick, ticked.tick[mine[whole]]])
-        self.data = np.concatenate([self.data, frames["data"][whole]])
+        length = ticked.length[mine]
+        if (length != self.spec.length).any():
+            whole = length >= self.spec.length
+            counters.short += int(mine.size - np.count_nonzero(whole))
+            counters.long += int(np.count_nonzero(length > self.spec.length))
+            mine = mine[whole]
+        self.tick = np.concatenate([self.tick, ticked.tick[mine]])
+        self.data = np.concatenate([self.data, ticked.data[mine]])
 
     def forget(self, before_tick: int) -> None:
         """Drop what is older than ``before_tick``."""
@@ -64,8 +65,14 @@ class PdoQueue:
 
     def between(self, first: int, stop: int) -> tuple[Int, Words]:
         """Return tick and data of the frames of ticks [first, stop)."""
-        low, high = np.searchsorted(self.tick, [first, stop])
+        low, high = self.tick.searchsorted((first, stop))
         return self.tick[low:high], self.data[low:high]
+
+    def gapless(self, first: int, stop: int) -> Words | None:
+        """Return the data of ticks [first, stop) when exactly one frame came in each of them, else None."""
+        tick, data = self.between(first, stop)
+        regular = tick.size == stop - first and bool((tick == np.arange(first, stop)).all())
+        return data if regular else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,12 +96,16 @@ class Dense:
 
 def dense(queue: PdoQueue, first: int, stop: int) -> Dense:
     """Lay the queue's frames of ticks [first, stop) out on the grid."""
+    n = stop - first
+    regular = queue.gapless(first, stop)
+    if regular is not None:
+        return Dense(regular, np.ones(n, np.bool_), np.zeros(n, np.bool_), np.zeros(n, np.int64))
     tick, data = queue.between(first, stop)
     place = tick - first
-    words = np.zeros(stop - first, np.uint64)
+    words = np.zeros(n, np.uint64)
     words[place[::-1]] = data[::-1]
-    count = np.bincount(place, minlength=stop - first)
-    ambiguous = np.zeros(stop - first, np.bool_)
+    count = np.bincount(place, minlength=n)
+    ambiguous = np.zeros(n, np.bool_)
     if tick.size > np.count_nonzero(count):
         ambiguous[place[data != words[place]]] = True
     duplicates = np.where(ambiguous, 0, np.maximum(count - 1, 0))
@@ -126,6 +137,9 @@ class Setpoint:
 
     def rows(self, first: int, stop: int) -> SetpointRows | None:
         """Return the set-point in force on rows [first, stop); None while nothing is known of it."""
+        regular = self.queue.gapless(first - self.shift, stop - self.shift)
+        if regular is not None:
+            return SetpointRows(decode(self._entry, regular), np.ones(stop - first, np.bool_), 0)
         ticks, words, doubtful = self._latched()
         values = decode(self._entry, words)
         wanted = np.arange(first - self.shift, stop - self.shift)

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from fdhil.cia402 import COB_SYNC
 from fdhil.drivers.frames import Frames
@@ -21,12 +22,14 @@ _HISTORY = 32
 
 @dataclass(frozen=True, slots=True)
 class Ticked:
-    """Frames (n,) with ``tick`` (n,) int64, and the SYNCs among them: ``syncs.tick`` (m,), ``syncs.t_ns`` (m,).
+    """Frames as columns (n,): ``can_id``, ``length``, ``data`` and ``tick``, and the SYNCs among them: ``syncs``.
 
     ``last_tick`` is the newest SYNC's, -1 before the first one.
     """
 
-    frames: Frames
+    can_id: npt.NDArray[np.uint32]
+    length: npt.NDArray[np.uint8]
+    data: npt.NDArray[np.uint64]
     tick: Int
     syncs: TickTimes
     last_tick: int
@@ -52,11 +55,13 @@ class SyncGrid:
 
     def feed(self, frames: Frames) -> Ticked:
         """Give every frame its tick; a SYNC itself has the tick it starts."""
-        where = np.flatnonzero(frames["id"] == COB_SYNC)
+        # contiguous columns: they are compared and shifted once per PDO
+        can_id, length, data = (np.ascontiguousarray(frames[name]) for name in ("id", "dlc", "data"))
+        where = np.flatnonzero(can_id == COB_SYNC)
         before = self._last_tick
         if where.size == 0:
             empty = TickTimes(np.empty(0, np.int64), np.empty(0, np.int64))
-            return Ticked(frames, np.full(frames.size, before, np.int64), empty, before)
+            return Ticked(can_id, length, data, np.full(frames.size, before, np.int64), empty, before)
         syncs = frames[where]
         ticks = self._ticks(syncs)
         kept = ticks >= 0
@@ -64,7 +69,7 @@ class SyncGrid:
         starts = np.concatenate([[before], ticks])
         tick = starts[np.searchsorted(where, np.arange(frames.size), side="right")]
         notices = self._collisions(stamps)
-        return Ticked(frames, tick, TickTimes(ticks, stamps), self._last_tick, notices)
+        return Ticked(can_id, length, data, tick, TickTimes(ticks, stamps), self._last_tick, notices)
 
     def _ticks(self, syncs: Frames) -> Int:
         """Tick of every SYNC; -1 for one that is a duplicate or out of order."""

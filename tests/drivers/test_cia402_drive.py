@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdhil.drivers.bus_decoder import BusDecoder
-from fdhil.drivers.frames import Frames
+from fdhil.drivers.frames import Frames, frames_of
 from fdhil.records import AxisSamples, Notice
-from tests.drivers.wire import Wire, machine
+from tests.drivers.wire import Row, Wire, machine
 
 PER_MM = 65536 / 20
 
@@ -66,3 +66,127 @@ def test_blocks_do_not_matter(cuts: list[int], counter: bool) -> None:
     check_rows(wire, got)
     assert got["tick"].tolist() == list(range(2, 118))
     assert notices == []
+
+
+def without(frames: Frames, dropped: Sequence[int]) -> Frames:
+    return np.delete(frames, list(dropped))
+
+
+@settings(deadline=None, max_examples=40)
+@given(data=st.data(), cut=st.integers(0, 900))
+def test_every_lost_frame_is_counted_and_leaves_a_hole(data: st.DataObject, cut: int) -> None:
+    wire = Wire(n=120)
+    frames = wire.frames()
+    ids, ticks = frames["id"], np.cumsum(frames["id"] == 0x80) - 1
+    # every-SYNC PDOs and SYNCs, not next to each other, so that each loss can be told from its neighbour's
+    candidates = np.flatnonzero(np.isin(ids, [0x80, 0x181, 0x281]) & (ticks > 10) & (ticks < 100))
+    chosen = data.draw(st.lists(st.sampled_from(candidates.tolist()), unique=True, max_size=8))
+    chosen = [c for c in chosen if not any(o != c and abs(int(ticks[o]) - int(ticks[c])) < 8 for o in chosen)]
+    left = without(frames, chosen)
+    got, _, decoder = decode_all([left[:cut], left[cut:]])
+    check_rows(wire, got)
+    counted = decoder.counters()
+    lost_syncs = sum(int(ids[c]) == 0x80 for c in chosen)
+    assert counted["sync_missed"] == lost_syncs
+    assert counted["pdo_lost"] == len(chosen) - lost_syncs
+    assert got["lost"].sum() == len(chosen)
+    holes = {int(k) for k in set(range(2, 118)) - set(got["tick"].tolist())}
+    expected: set[int] = set()
+    for c in chosen:
+        k = int(ticks[c])
+        expected |= {
+            0x80: {k - 1, k, k - 2, k + 2, k + 3},  # both neighbours are ambiguous, TPDOs and targets alike
+            0x181: {k},
+            0x281: {k - 1, k},  # the voltage of row k-1 came with it
+        }[int(ids[c])]
+    assert holes <= expected
+    for c in chosen:
+        assert int(ticks[c]) in holes
+
+
+def test_a_lost_target_is_a_hole_where_it_mattered() -> None:
+    wire = Wire(n=60)
+    frames = wire.frames()
+    ticks = np.cumsum(frames["id"] == 0x80) - 1
+    lost = np.flatnonzero((frames["id"] == 0x201) & (ticks == 30))
+    got, _, decoder = decode_all([without(frames, lost.tolist())])
+    check_rows(wire, got)
+    assert set(range(2, 58)) - set(got["tick"].tolist()) == {33}  # sent after SYNC 30, in force at 30 + 1 + 2
+    assert decoder.counters()["pdo_lost"] == 1
+
+
+def test_a_duplicate_is_no_second_sample() -> None:
+    wire = Wire(n=60)
+    frames = wire.frames()
+    twice = np.insert(frames, 100, frames[100])
+    got, _, decoder = decode_all([np.insert(twice, 40, twice[40])])
+    check_rows(wire, got)
+    counted = decoder.counters()
+    assert counted["pdo_duplicates"] + counted["sync_duplicates"] <= 2
+    assert got["tick"].tolist() == list(range(2, 58))
+
+
+def test_a_short_pdo_is_discarded_and_a_long_one_cut() -> None:
+    wire = Wire(n=80)
+    rows = wire.rows()
+    short = [i for i, row in enumerate(rows) if row[1] == 0x281][20:24]
+    for i in short:
+        rows[i] = (*rows[i][:2], rows[i][2][:4])
+    long = [i for i, row in enumerate(rows) if row[1] == 0x281][40]
+    rows[long] = (*rows[long][:2], rows[long][2] + b"\xff\xff")
+    got, notices, decoder = decode_all([frames_of(rows)])
+    check_rows(wire, got)
+    assert decoder.counters()["pdo_short"] == 4
+    assert decoder.counters()["pdo_long"] == 1
+    assert {n.code for n in notices} == {"PdoLength", "PdoMapping"}
+
+
+def test_another_node_with_the_drives_id_is_noticed() -> None:
+    wire = Wire(n=80)
+    rows: list[Row] = []
+    for row in wire.rows():
+        rows.append(row)
+        if row[1] == 0x181:
+            rows.append((row[0], 0x181, bytes(8)))
+    got, notices, _ = decode_all([frames_of(rows)])
+    assert got["tick"].size == 0
+    assert [n.code for n in notices] == ["ForeignProducer"]
+
+
+def test_a_wrong_delay_in_the_config_is_noticed() -> None:
+    _, notices, _ = decode_all([Wire(n=200).frames()], drive={"setpoint_delay_cycles": 3})
+    assert "DemandMismatch" in {n.code for n in notices}
+
+
+def test_an_axis_that_counts_backwards_is_turned() -> None:
+    wire = Wire(n=40)
+    forward, _, _ = decode_all([wire.frames()])
+    backward, _, _ = decode_all([wire.frames()], drive={"sign": -1})
+    for name in ("demand_mm", "position_mm", "speed_rad_s", "current_a", "voltage_v", "offset_mm"):
+        np.testing.assert_array_equal(forward[name], -backward[name])
+
+
+def test_an_instant_voltage_stays_on_its_row() -> None:
+    wire = Wire(n=40)
+    got, _, _ = decode_all([wire.frames()], voltage={"sampling": "instant"})
+    second = np.array([wire.tpdo2(int(k))[2] for k in got["tick"]])
+    np.testing.assert_allclose(got["voltage_v"], second * 0.02)
+
+
+def test_a_drive_that_nobody_commands_shows_its_own_demand() -> None:
+    wire = Wire(n=80)
+    wire.reference = dict.fromkeys(wire.reference, 4711)
+    wire.offset = dict.fromkeys(wire.offset, 13)
+    rows = [row for row in wire.rows() if row[1] not in (0x201, 0x301)]
+    got, notices, _ = decode_all([frames_of(rows)])
+    check_rows(wire, got)
+    assert got["tick"].size == 78
+    assert notices == []
+
+
+def test_two_drives_of_one_bus_are_told_apart() -> None:
+    both = sorted([*Wire(n=40).rows(), *(r for r in Wire(n=40, node_id=2).rows() if r[1] != 0x80)], key=lambda r: r[0])
+    decoder = BusDecoder("can0", machine(axes="XY"))
+    samples = [r for r in decoder.feed(frames_of(both), 0) if isinstance(r, AxisSamples)]
+    assert [s.axis for s in samples] == ["X", "Y"]
+    np.testing.assert_array_equal(samples[0].position_mm, samples[1].position_mm)
