@@ -10,6 +10,7 @@ from fdhil.program.motions import PLANE_AXES, Arc
 from fdhil.program.moves import Machine, axis_words, feed_mm_min, target
 from fdhil.program.words import Block
 
+CODES = (20, 30)
 _OFFSETS = "ijk"
 _MIN_RADIUS_MM = 1e-6
 # the ends of an arc may lie at radii that differ by the first, or by the second as long as that is 0.1 % of the radius
@@ -56,8 +57,8 @@ def order(
     shown: list[float | None] = list(modal.machine(whole))
     shown[normal] = None
     modal.position = end
-    machine.out.append(
-        Arc(block.line, machine.checked(block), (shown[0], shown[1], shown[2]), turns, modal.plane_name, feed)
+    machine.order(
+        block, Arc(block.line, machine.checked(block), (shown[0], shown[1], shown[2]), turns, modal.plane_name, feed)
     )
 
 

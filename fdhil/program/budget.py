@@ -11,12 +11,15 @@ from fdhil.config import Nc
 class Budget:
     """Limits of one interpretation; whatever exceeds them ends in a ProgramError that names line and word.
 
-    ``max_blocks`` executed blocks, a block of a loop counted each time; ``max_call_depth`` nested calls;
+    ``max_blocks`` lines read, those of a loop counted each time; ``max_jumps`` calls and turns of loops;
+    ``max_motions_per_block`` what one block may order; ``max_call_depth`` nested calls;
     ``max_nesting`` brackets within a value and loops or conditions within one another; ``max_line_chars`` characters
     of one line; ``max_coordinate_mm`` largest co-ordinate; ``max_labels`` and ``max_parameters`` names in memory.
     """
 
     max_blocks: int = 10_000_000
+    max_jumps: int = 400_000
+    max_motions_per_block: int = 100_000
     max_call_depth: int = 50
     max_nesting: int = 50
     max_line_chars: int = 4096

@@ -1,23 +1,28 @@
 """The interpreter: blocks in the order of execution that RS-274 wants, motions out.
 
-A block is executed feed mode, F, S, tool, spindle, dwell, plane, units, compensation, offsets, path control, distance,
-and its motion last. Simple blocks (G0 or G1 with X Y Z F) take a short way with the same meaning.
+A block is executed feed mode, F, S, kept modes, spindle, dwell, plane, units, compensation, tool length, co-ordinate
+system, path control, distance, and its motion last. Simple blocks (G0 or G1 with X Y Z F) take a short way with the
+same meaning.
 """
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from fdhil.errors import ProgramError
-from fdhil.program import arcs, moves, offsets
+from fdhil.program import arcs, canned, lathe, moves, offsets
 from fdhil.program.budget import Budget
+from fdhil.program.checks import CYCLES, check_readers, one_reader_of_axes
+from fdhil.program.flow import Flow
 from fdhil.program.modal import INDEX, MM_PER_INCH, NO_MOTION, Modal
 from fdhil.program.motions import Feed, Motion, Rapid
 from fdhil.program.parameters import Variables
 from fdhil.program.source import Source
-from fdhil.program.words import Block, clean, read
+from fdhil.program.state import KeptModes, names_of, numbers_of
+from fdhil.program.words import Block, clean, read, without_number
 
 _VALUE = r"([+-]?(?:\d++\.?\d*+|\.\d++))[ \t]*+"
 _SIMPLE = re.compile(
@@ -26,56 +31,74 @@ _SIMPLE = re.compile(
     re.IGNORECASE,
 )
 _STOPS = (2, 30)
-ARC_MOTIONS = (20, 30)
+_PROBES = (382, 383, 384, 385)
+_PROBED_FIRST, _PROBE_HIT = 5061, 5070
 
 
-def interpret(source: Path | Iterable[str], budget: Budget | None = None) -> Iterator[Motion]:
+def interpret(
+    source: Path | Iterable[str], budget: Budget | None = None, *, block_delete: bool = False
+) -> Iterator[Motion]:
     """Yield the motions of an NC program in machine mm, line by line in flat memory.
 
-    ``source`` is a file or any iterable of lines. ProgramError with line and word for what is wrong, for what fdhil
-    does not know, and for what exceeds ``budget``. Start: offsets 0, position 0, G21 G17 G90 G94 G91.1 G54.
+    ``source`` is a file or any iterable of lines; subroutines in files of their own are sought beside the file. With
+    ``block_delete`` lines that begin with "/" are left out. ProgramError with line and word for what is wrong, for what
+    fdhil does not know, and for what exceeds ``budget``. Start: offsets 0, position 0, G21 G17 G90 G94 G91.1 G54.
     """
-    return Interpreter(source, budget or Budget()).run()
+    return Interpreter(source, budget or Budget(), block_delete).run()
 
 
 class Interpreter:
     """One run of one program."""
 
-    def __init__(self, source: Path | Iterable[str], budget: Budget) -> None:
+    def __init__(self, source: Path | Iterable[str], budget: Budget, block_delete: bool) -> None:
         self._budget = budget
-        self._source = Source(source, budget.max_line_chars)
+        self._block_delete = block_delete
         self._machine = moves.Machine(budget)
         modal = self._machine.modal
-        self._variables = Variables(budget.max_parameters, _state_numbers(modal), _state_names(modal))
+        first = Source(source, budget.max_line_chars)
+        names = names_of(
+            modal, lambda: self._flow.source.line, lambda: self._flow.depth, lambda: self._variables.returned
+        )
+        self._variables = Variables(budget.max_parameters, numbers_of(modal), names)
+        self._variables.store(5220, 1.0)
+        self._kept = KeptModes(modal, self._variables)
+        self._flow = Flow(first, self._variables, budget, self._kept.returned)
+        self._cycle_words: dict[str, float] = {}
         self._blocks = 0
+        self._empty_so_far = True
+        self._percent = False
         self._ended = False
 
     def run(self) -> Iterator[Motion]:
         """Yield the motions until the program ends."""
-        source, machine = self._source, self._machine
+        flow, machine = self._flow, self._machine
         try:
             while not self._ended:
-                raw = source.next()
+                raw = flow.source.next()
                 if raw is None:
+                    flow.at_end()
                     return
-                self._count(source.line)
-                motion = self._simple(raw, source.line)
+                line = flow.source.line
+                self._count(line)
+                if flow.skipping:
+                    flow.skip_over(raw, line)
+                    continue
+                motion = self._simple(raw, line)
                 if motion is not None:
                     yield motion
                     continue
-                self._line(raw, source.line)
+                self._line(raw, line)
                 if machine.out:
                     ordered, machine.out = machine.out, []
                     yield from ordered
         finally:
-            source.close()
+            flow.close()
 
     def _count(self, line: int) -> None:
         self._blocks += 1
         if self._blocks > self._budget.max_blocks:
-            raise ProgramError(
-                line, "", f"more than {self._budget.max_blocks} blocks were executed; is a loop endless?"
-            )
+            what = f"more than {self._budget.max_blocks} blocks were executed; is a loop endless?"
+            raise ProgramError(line, "", what)
 
     def _simple(self, raw: str, line: int) -> Motion | None:
         """Execute a block of G0, G1, X, Y, Z, F alone; None leaves it to the long way."""
@@ -85,7 +108,7 @@ class Interpreter:
         g, x, y, z, f = match.groups()
         modal = self._machine.modal
         motion = modal.motion if g is None else 10 * int(g)
-        if motion not in (0, 10) or modal.feed_mode != 940 or modal.diameter or (x is None and y is None and z is None):
+        if motion not in (0, 10) or not modal.plain or (x is None and y is None and z is None):
             return None
         position = list(modal.position)
         for index, word in ((0, x), (1, y), (2, z)):
@@ -99,7 +122,7 @@ class Interpreter:
         if f is not None:
             modal.feed_word = float(f)
             modal.feed_mm_min = modal.feed_word * modal.scale
-        if motion == 10 and not 0.0 < modal.feed_mm_min < 1e300:
+        if motion == 10 and not 0.0 < modal.feed_mm_min < math.inf:
             return None
         modal.motion = motion
         modal.position = position
@@ -108,94 +131,137 @@ class Interpreter:
     def _line(self, raw: str, line: int) -> None:
         text = clean(raw, line)
         if text.startswith("/"):
-            text = text[1:]
+            text = "" if self._block_delete else text[1:]
         if not text:
             return
         if text.startswith("%"):
-            self._ended = self._ended or line > 1
+            self._at_percent(line)
+            return
+        self._empty_so_far = False
+        text = without_number(text)
+        if text.startswith("o"):
+            self._flow.execute(text, line)
             return
         block = read(text, line, self._variables, self._budget.max_nesting)
         self._execute(block)
         for key, value in block.settings:
             self._variables.set(key, value, line)
+        self._call(block)
+
+    def _at_percent(self, line: int) -> None:
+        if self._empty_so_far:
+            self._percent, self._empty_so_far = True, False
+        elif self._percent or self._flow.depth:
+            self._ended = True
+        else:
+            raise ProgramError(line, "%", "encloses a program, so it must stand before it too")
 
     def _execute(self, block: Block) -> None:
-        modal = self._machine.modal
-        _feed_mode(modal, block)
+        machine, modal = self._machine, self._machine.modal
+        one_reader_of_axes(block)
+        check_readers(block, block.g.get("motion", modal.motion))
+        _feed(modal, block)
         _spindle(modal, block)
-        _modes(modal, block)
+        if "modal state" in block.m and not self._kept.do(block.m["modal state"], self._flow.depth):
+            raise ProgramError(block.line, "M72", "has no modes to restore; keep them by M70 first")
+        if block.g.get("one-shot") == 40:
+            _dwell(machine, block)
+        _units(modal, block)
         self._coordinates(block)
-        self._motion(block)
+        _distance(modal, block)
+        self._motion(block, self._set(block))
         self._ended = self._ended or block.m.get("stop") in _STOPS
 
-    def _motion(self, block: Block) -> None:
-        machine, modal = self._machine, self._machine.modal
-        axes = any(letter in INDEX for letter in block.words)
-        one_shot = block.g.get("one-shot")
-        if one_shot == 40:
-            self._dwell(block)
-        elif one_shot is not None:
-            axes = axes and not self._set(block, one_shot)
-        if block.g.get("tool length") == 431:
-            axes = False
-        if "motion" in block.g:
-            modal.motion = block.g["motion"]
-        elif not axes:
-            return
-        if modal.motion == 0:
-            if axes:
-                machine.rapid_to(block, moves.target(modal, block))
-        elif modal.motion == 10:
-            if axes:
-                machine.feed_to(block, moves.target(modal, block))
-        elif modal.motion in ARC_MOTIONS:
-            arcs.arc(machine, block)
-        elif modal.motion == NO_MOTION:
-            if axes:
-                letter = next(letter for letter in block.words if letter in INDEX)
-                raise block.fault(letter, "has no motion to go with; give G0, G1, G2 or G3")
-        else:
-            raise _unknown(block, modal.motion)
+    def _call(self, block: Block) -> None:
+        code = block.m.get("call")
+        if code == 98:
+            name, times = block.words.get("p", -1.0), block.words.get("l", 1.0)
+            if name < 0.0 or abs(name - round(name)) > 1e-4 or not 0 <= times < 1e9:
+                raise ProgramError(
+                    block.line, "M98", "wants the subroutine's number as P and may have its repeats as L"
+                )
+            self._flow.call_fanuc(str(round(name)), round(times), block.line)
+        elif code == 99 and not self._flow.end_fanuc():
+            self._ended = True
 
     def _coordinates(self, block: Block) -> None:
-        modal = self._machine.modal
-        if "tool length" in block.g:
+        modal, g = self._machine.modal, block.g
+        if g.get("cutter compensation", 400) != 400:
+            raise unknown(block, g["cutter compensation"])
+        if "tool length" in g:
             offsets.set_tool_length(modal, block)
-        if "co-ordinate system" in block.g:
-            offsets.select_system(modal, self._variables, offsets.SYSTEMS[block.g["co-ordinate system"]])
+        if "co-ordinate system" in g:
+            offsets.select_system(modal, self._variables, offsets.SYSTEMS[g["co-ordinate system"]])
 
-    def _set(self, block: Block, code: int) -> bool:
-        """Do a one-shot code; True when it is the one that uses the axis words."""
+    def _set(self, block: Block) -> bool:
+        """Do a one-shot code; True when one was done that uses the axis words."""
         modal, variables = self._machine.modal, self._variables
+        code = block.g.get("one-shot", 40)
         if code in (281, 301):
             offsets.store_home(modal, variables, code)
-            return False
-        if code in (921, 922, 923):
+        elif code in (921, 922, 923):
             offsets.drop_g92(modal, variables, code)
-            return False
-        if code == 100:
+        elif code == 100:
             offsets.set_data(modal, variables, block)
         elif code in (920, 520):
             offsets.set_g92(modal, variables, block)
-        else:
+        elif code in (280, 300):
             offsets.go_home(self._machine, variables, block)
-        return True
+        return code in (100, 920, 520, 280, 300) or block.g.get("tool length") == 431
 
-    def _dwell(self, block: Block) -> None:
-        seconds = block.words.get("p")
-        if seconds is None or seconds < 0.0:
-            raise ProgramError(block.line, "G4", "a dwell wants its seconds as P, not negative")
-        self._machine.dwell(block, seconds)
+    def _motion(self, block: Block, axes_used: bool) -> None:
+        machine, modal = self._machine, self._machine.modal
+        axis = next((letter for letter in block.words if letter in INDEX or letter in "@^"), None)
+        if "motion" in block.g:
+            modal.motion = block.g["motion"]
+        elif axes_used or (axis is None and not (modal.motion in arcs.CODES and _has_centre(block))):
+            return
+        code = modal.motion
+        if code == 0:
+            machine.rapid_to(block, moves.target(modal, block))
+        elif code == 10:
+            machine.feed_to(block, moves.target(modal, block))
+        elif code in arcs.CODES:
+            arcs.arc(machine, block)
+        elif code in CYCLES:
+            canned.cycle(machine, block, self._cycle_words)
+        elif code in _PROBES:
+            self._probe(block)
+        elif code in (330, 331):
+            lathe.synchronised(machine, block)
+        elif code != NO_MOTION:
+            raise unknown(block, code)
+        elif axis is not None and not axes_used:
+            raise block.fault(axis, "has no motion to go with; give G0, G1, G2 or G3")
+
+    def _probe(self, block: Block) -> None:
+        """G38.2 to G38.5: not listed; the probe is taken to trip at the target."""
+        modal = self._machine.modal
+        code = f"G{modal.motion / 10:g}"
+        if modal.feed_mode == 930 or modal.feed_mm_min <= 0.0:
+            raise ProgramError(block.line, code, "wants a feed rate per minute; give F")
+        end = moves.target(modal, block)
+        if not moves.axis_words(block):
+            raise ProgramError(block.line, code, "wants the axis words of its target")
+        modal.position = end
+        self._machine.checked(block)
+        for axis, value in enumerate(end):
+            self._variables.store(_PROBED_FIRST + axis, value / (modal.scale if axis not in (3, 4, 5) else 1.0))
+        self._variables.store(_PROBE_HIT, 1.0)
 
 
-def _unknown(block: Block, code: int) -> ProgramError:
+def unknown(block: Block, code: int) -> ProgramError:
+    """Return the error for a G code (times ten) that fdhil does not know."""
     return ProgramError(block.line, f"G{code / 10:g}", "is a G code that fdhil does not know; see the list of codes")
 
 
-def _feed_mode(modal: Modal, block: Block) -> None:
-    mode = block.g.get("feed mode")
-    if mode is not None and mode != modal.feed_mode:
-        modal.feed_mode = mode
+def _has_centre(block: Block) -> bool:
+    return any(letter in block.words for letter in "ijkr")
+
+
+def _feed(modal: Modal, block: Block) -> None:
+    if "feed mode" in block.g:
+        modal.feed_mode = block.g["feed mode"]
         modal.feed_mm_min = modal.feed_word = 0.0
     if "f" in block.words:
         feed = block.words["f"]
@@ -214,19 +280,24 @@ def _spindle(modal: Modal, block: Block) -> None:
         modal.spindle_turns = {3: 1, 4: -1}.get(block.m["spindle"], 0)
 
 
-def _modes(modal: Modal, block: Block) -> None:
+def _dwell(machine: moves.Machine, block: Block) -> None:
+    seconds = block.words.get("p")
+    if seconds is None or seconds < 0.0:
+        raise ProgramError(block.line, "G4", "a dwell wants its seconds as P, not negative")
+    machine.dwell(block, seconds)
+
+
+def _units(modal: Modal, block: Block) -> None:
+    if "lathe diameter" in block.g:
+        modal.diameter = block.g["lathe diameter"] == 70
+    if "plane" in block.g:
+        modal.plane = {170: 0, 180: 1, 190: 2}[block.g["plane"]]
+    if "units" in block.g:
+        modal.scale = MM_PER_INCH if block.g["units"] == 200 else 1.0
+
+
+def _distance(modal: Modal, block: Block) -> None:
     g = block.g
-    if "plane" in g:
-        modal.plane = {170: 0, 180: 1, 190: 2}[g["plane"]]
-    if "units" in g:
-        modal.scale = MM_PER_INCH if g["units"] == 200 else 1.0
-    if (
-        g.get("lathe diameter", 80) != 80
-        or g.get("cutter compensation", 400) != 400
-        or g.get("tool length", 490) != 490
-    ):
-        code = next(g[group] for group in ("lathe diameter", "cutter compensation", "tool length") if group in g)
-        raise _unknown(block, code)
     if "path control" in g:
         modal.path_control = g["path control"]
         modal.path_tolerance_mm = block.words.get("p", 0.0) * modal.scale
@@ -234,14 +305,5 @@ def _modes(modal: Modal, block: Block) -> None:
         modal.absolute = g["distance"] == 900
     if "arc distance" in g:
         modal.arc_absolute = g["arc distance"] == 901
-
-
-def _state_numbers(modal: Modal) -> Mapping[int, Callable[[], float]]:
-    def place(index: int) -> Callable[[], float]:
-        return lambda: modal.position[index] / (modal.scale if index not in (3, 4, 5) else 1.0)
-
-    return {5420 + index: place(index) for index in range(9)}
-
-
-def _state_names(modal: Modal) -> Mapping[str, Callable[[], float]]:
-    return {"_feed": lambda: modal.feed_word, "_x": lambda: modal.position[0] / modal.scale}
+    if "return" in g:
+        modal.retract_to_r = g["return"] == 990

@@ -47,9 +47,15 @@ class Modal:
     feed_mm_min: float = 0.0
     spindle_rpm: float = 0.0
     spindle_turns: int = 0
-    retract_to_r: bool = False
+    retract_to_r: bool = True
+    compensation: int = 400
     path_control: int = 640
     path_tolerance_mm: float = 0.0
+
+    @property
+    def plain(self) -> bool:
+        """Whether a straight move needs no more than adding offsets: G94, radius, no cutter compensation."""
+        return self.feed_mode == 940 and self.compensation == 400 and not self.diameter
 
     @property
     def plane_name(self) -> str:

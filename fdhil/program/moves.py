@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from fdhil.errors import ProgramError
 from fdhil.program.budget import Budget
 from fdhil.program.modal import AXES, INDEX, LINEAR, Modal
-from fdhil.program.motions import Dwell, Feed, Motion, Rapid
+from fdhil.program.motions import Dwell, Feed, Motion, Point, Rapid
 from fdhil.program.words import Block
 
 _MIN_INVERSE_TIME_FEED = 0.1  # program units per minute; a move without length has no feed of its own
@@ -25,19 +25,29 @@ class Machine:
     def rapid_to(self, block: Block, target: list[float]) -> None:
         """Order a rapid to a position in active co-ordinates."""
         self.modal.position = target
-        self.out.append(Rapid(block.line, self.checked(block)))
+        self.order(block, Rapid(block.line, self.checked(block)))
 
     def feed_to(self, block: Block, target: list[float]) -> None:
         """Order a straight feed to a position in active co-ordinates, at the feed in force."""
-        feed = feed_mm_min(self.modal, block, _straight_length(self.modal.position, target))
+        self.feed_at(block, target, feed_mm_min(self.modal, block, straight_length(self.modal.position, target)))
+
+    def feed_at(self, block: Block, target: list[float], feed: float) -> None:
+        """Order a straight feed at ``feed`` mm/min."""
         self.modal.position = target
-        self.out.append(Feed(block.line, self.checked(block), feed))
+        self.order(block, Feed(block.line, self.checked(block), feed))
 
     def dwell(self, block: Block, seconds: float) -> None:
         """Order a dwell."""
-        self.out.append(Dwell(block.line, seconds))
+        self.order(block, Dwell(block.line, seconds))
 
-    def checked(self, block: Block) -> tuple[float, float, float]:
+    def order(self, block: Block, motion: Motion) -> None:
+        """Order a motion; ProgramError when one block orders too many."""
+        if len(self.out) >= self.budget.max_motions_per_block:
+            most = self.budget.max_motions_per_block
+            raise ProgramError(block.line, "", f"orders more than {most} motions; split it")
+        self.out.append(motion)
+
+    def checked(self, block: Block) -> Point:
         """Return where the machine now stands; ProgramError when no machine reaches that."""
         end = self.modal.machine()
         limit = self.budget.max_coordinate_mm
@@ -47,7 +57,7 @@ class Machine:
         return end
 
 
-def _straight_length(start: list[float], end: list[float]) -> float:
+def straight_length(start: list[float], end: list[float]) -> float:
     """Length that a feed refers to: of X Y Z, else of U V W, else of A B C."""
     for first in (0, 6, 3):
         length = math.dist(start[first : first + 3], end[first : first + 3])
@@ -88,15 +98,35 @@ def length_mm(modal: Modal, index: int, value: float) -> float:
 
 def target(modal: Modal, block: Block) -> list[float]:
     """Return where the block's axis words lead, in active co-ordinates; G53 words are machine co-ordinates."""
-    position = modal.position
     words = axis_words(block)
+    polar = "@" in block.words or "^" in block.words
     if "machine co-ordinates" in block.g:
+        if polar or not modal.absolute or modal.motion not in (0, 10):
+            raise ProgramError(block.line, "G53", "wants absolute X Y Z words (G90) and G0 or G1")
         whole = [c + t for c, t in zip(modal.machine_all(), modal.tool, strict=True)]
         for index, value in words.items():
             whole[index] = length_mm(modal, index, value)
         return modal.from_machine([w - t for w, t in zip(whole, modal.tool, strict=True)])
-    end = list(position)
+    end = list(modal.position)
+    if polar:
+        end[0], end[1] = _polar(modal, block)
     for index, value in words.items():
         value = length_mm(modal, index, value)
         end[index] = value if modal.absolute else end[index] + value
     return end
+
+
+def _polar(modal: Modal, block: Block) -> tuple[float, float]:
+    """Return X and Y of polar words: @ the distance from the origin, ^ the angle, from the present ones when missing."""
+    for letter in "xy":
+        if letter in block.words:
+            raise block.fault(letter, "contradicts the polar words @ and ^ in the same block")
+    x, y = modal.position[0], modal.position[1]
+    distance, angle = math.hypot(x, y), math.degrees(math.atan2(y, x))
+    if not modal.absolute:
+        distance += block.words.get("@", 0.0) * modal.scale
+        angle += block.words.get("^", 0.0)
+    else:
+        distance = block.words["@"] * modal.scale if "@" in block.words else distance
+        angle = block.words.get("^", angle)
+    return distance * math.cos(math.radians(angle)), distance * math.sin(math.radians(angle))

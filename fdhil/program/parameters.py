@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 
 from fdhil.errors import ProgramError
 
-LAST_NUMBER = 5602
+LAST_NUMBER = 5601
 LOCAL_NUMBERS = 30
 _READ_ONLY = frozenset({*range(5400, 5410), *range(5420, 5429)})
 
@@ -17,7 +17,7 @@ class Variables:
     ``state`` gives predefined numbers and names their values. KeyError for a parameter that is not there.
     """
 
-    __slots__ = ("_globals", "_locals", "_max", "_numbers", "_stack", "_state_names", "_state_numbers")
+    __slots__ = ("_globals", "_locals", "_max", "_numbers", "_stack", "_state_names", "_state_numbers", "returned")
 
     def __init__(
         self,
@@ -26,6 +26,7 @@ class Variables:
         state_names: Mapping[str, Callable[[], float]],
     ) -> None:
         self._max = max_names
+        self.returned: float | None = None
         self._numbers: dict[int, float] = {}
         self._globals: dict[str, float] = {}
         self._locals: dict[str, float] = {}
@@ -64,6 +65,10 @@ class Variables:
     def store(self, index: int, value: float) -> None:
         """Set a numbered parameter on behalf of the machine (offsets, homes)."""
         self._numbers[index] = value
+
+    def set_returned(self, value: float | None) -> None:
+        """Keep what a subroutine returned, as #<_value> and #<_value_returned>."""
+        self.returned = value
 
     def enter(self, arguments: list[float]) -> None:
         """Begin a call: its own #1 to #30, the arguments first, and its own local names."""

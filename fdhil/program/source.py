@@ -14,6 +14,7 @@ from typing import IO, NamedTuple, cast
 from fdhil.errors import ProgramError
 
 _SPOOL_BYTES = 4_000_000
+_READ_AHEAD_BYTES = 1 << 18
 
 
 class Mark(NamedTuple):
@@ -26,24 +27,27 @@ class Mark(NamedTuple):
 class Source:
     """A program that is read line by line and can go back to a mark; ProgramError when it cannot be read.
 
-    ``line`` is the 1-based number of the line last read.
+    ``line`` is the 1-based number of the line last read; ``folder`` is where its subroutines lie, None for an iterable.
     """
 
-    __slots__ = ("_feed", "_file", "_max_chars", "_open", "folder", "line", "name")
+    __slots__ = ("_begin", "_end", "_feed", "_file", "_max_chars", "_open", "folder", "line", "name")
 
     def __init__(self, program: Path | Iterable[str], max_line_chars: int) -> None:
         self._max_chars = max_line_chars
         self._feed: Iterator[str] | None = None
         self._open = ExitStack()
+        self._begin = self._end = 0
         self.line = 0
+        self.name = ""
+        self.folder: Path | None = None
         if isinstance(program, Path):
             self.name, self.folder = program.name, program.parent
             try:
-                self._file: IO[bytes] = self._open.enter_context(program.open("rb", buffering=1 << 18))
+                file = self._open.enter_context(program.open("rb", buffering=_READ_AHEAD_BYTES))
             except OSError as error:
                 raise ProgramError(0, "", f"{program} cannot be read ({error.strerror}); check the path") from None
+            self._file: IO[bytes] = file
         else:
-            self.name, self.folder = "", Path()
             self._file = self._open.enter_context(_spool())
             self._feed = iter(program)
 
@@ -51,13 +55,18 @@ class Source:
         """Close the file."""
         self._open.close()
 
-    def mark(self) -> Mark:
-        """Return the place before the next line."""
-        return Mark(self._file.tell(), self.line)
+    def here(self) -> Mark:
+        """Return the place before the line last read."""
+        return Mark(self._begin, self.line - 1)
+
+    def after(self) -> Mark:
+        """Return the place after the line last read."""
+        return Mark(self._end, self.line)
 
     def go(self, mark: Mark) -> None:
         """Return to a place."""
         self._file.seek(mark.offset)
+        self._begin = self._end = mark.offset
         self.line = mark.lines
 
     def next(self) -> str | None:
@@ -70,6 +79,8 @@ class Source:
             raw = self._draw(self._feed)
         if not raw:
             return None
+        self._begin = self._end
+        self._end += len(raw)
         self.line += 1
         if len(raw) > self._max_chars and len(raw.rstrip(b"\r\n")) > self._max_chars:
             word = raw[:12].decode("latin-1")
@@ -84,10 +95,9 @@ class Source:
         if line is None:
             return b""
         raw = (line.rstrip("\r\n").replace("\n", " ") + "\n").encode("latin-1", "replace")
-        at = self._file.tell()
+        raw = raw[: self._max_chars + 2]
         self._file.write(raw)
-        self._file.seek(at + min(len(raw), self._max_chars + 2))
-        return raw[: self._max_chars + 2]
+        return raw
 
 
 @contextmanager

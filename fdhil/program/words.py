@@ -48,9 +48,7 @@ M_GROUPS: Mapping[int, str] = _groups(
     ("signals", (62, 63, 64, 65, 66, 67, 68)),
     ("tool", (6, 61)),
     ("spindle", (3, 4, 5, 19)),
-    ("mist", (7,)),
-    ("flood", (8,)),
-    ("coolant off", (9,)),
+    ("coolant", (7, 8, 9)),
     ("overrides", (48, 49, 50, 51, 52, 53)),
     ("modal state", (70, 71, 72, 73)),
 )

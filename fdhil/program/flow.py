@@ -1,0 +1,354 @@
+"""Flow of a program: O-words (sub, call, return, while, do, repeat, if) and Fanuc calls (M98, M99).
+
+Nothing is compiled: a jump is a seek to a mark in the source, and what must not be executed is read over. A label
+belongs to the subroutine it stands in; each call has labels, #1 to #30 and local names of its own.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+from fdhil.errors import ProgramError
+from fdhil.program.budget import Budget
+from fdhil.program.expressions import Reader
+from fdhil.program.parameters import LOCAL_NUMBERS, Variables
+from fdhil.program.source import Mark, Source
+from fdhil.program.words import clean, without_number
+
+_KEYWORD = re.compile(r"endsub|sub|call|return|while|endwhile|do|repeat|endrepeat|if|elseif|else|endif|break|continue")
+_MAYBE_O_WORD = re.compile(r"[\s/]*(?:n[\d.\s]*)?o", re.IGNORECASE)
+_FILE_NAME = re.compile(r"[\w+-][\w .+-]*")
+FANUC = "fanuc"  # the keyword of a bare O-number
+
+
+class Place(NamedTuple):
+    """A mark in one source."""
+
+    source: Source
+    mark: Mark
+
+
+@dataclass(slots=True)
+class Label:
+    """What is known of a label in this call: what opened it where, and how far it is."""
+
+    kind: str
+    line: int
+    mark: Mark
+    done: bool = False
+    left: float = 0.0
+
+
+@dataclass(slots=True)
+class Frame:
+    """One call: where to go back to, and the labels of the subroutine."""
+
+    name: str
+    back: Place | None = None
+    fanuc: bool = False
+    again: int = 0
+    entry: Place | None = None
+    labels: dict[str, Label] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class Skip:
+    """Reading over lines until ``label`` comes with one of ``keywords``; then that line is executed or not."""
+
+    label: str
+    keywords: tuple[str, ...]
+    line: int
+    execute: bool = False
+
+
+class Flow:
+    """Where execution goes; ``on_return`` is told when a call ends."""
+
+    def __init__(self, source: Source, variables: Variables, budget: Budget, on_return: Callable[[int], None]) -> None:
+        self.source = source
+        self._variables = variables
+        self._budget = budget
+        self._on_return = on_return
+        self._frames = [Frame("")]
+        self._subs: dict[str, tuple[Place, bool]] = {}
+        self._skip: Skip | None = None
+        self._jumps = 0
+        self._entering = False
+        self._folder = source.folder
+        self._files: list[Source] = [source]
+
+    @property
+    def depth(self) -> int:
+        """Number of calls under way."""
+        return len(self._frames) - 1
+
+    @property
+    def skipping(self) -> bool:
+        """Whether lines are read over."""
+        return self._skip is not None
+
+    def close(self) -> None:
+        """Close every source that is open."""
+        for source in self._files:
+            source.close()
+
+    def at_end(self) -> None:
+        """Check that the program may end here; ProgramError when a label is sought or a call is under way."""
+        if self._skip is not None:
+            wanted = " or ".join(self._skip.keywords)
+            raise ProgramError(self._skip.line, f"O<{self._skip.label}>", f"the program ends before its {wanted}")
+        if self.depth:
+            name = self._frames[-1].name
+            raise ProgramError(self.source.line, f"O<{name}>", "the file ends within the subroutine; add its endsub")
+
+    def skip_over(self, raw: str, line: int) -> None:
+        """Look at a line that is read over: it may be the one that is sought."""
+        if _MAYBE_O_WORD.match(raw) is None:
+            return
+        text = without_number(clean(raw, line).lstrip("/"))
+        if not text.startswith("o"):
+            return
+        reader = self._reader(text, line)
+        label, keyword = self._head(reader)
+        skip = self._skip
+        if skip is None or label != skip.label or keyword not in skip.keywords:
+            return
+        self._skip = None
+        if self._entering:
+            self._begin_sub(label, keyword, line)
+        elif skip.execute:
+            self._do(label, keyword, reader, line)
+
+    def execute(self, text: str, line: int) -> None:
+        """Execute a cleaned line that begins with O (after its line number)."""
+        reader = self._reader(text, line)
+        label, keyword = self._head(reader)
+        self._do(label, keyword, reader, line)
+        if not reader.done():
+            raise reader.fault("stands after the O-word's end; put it on a line of its own", text[reader.at :][:12])
+
+    def _reader(self, text: str, line: int) -> Reader:
+        return Reader(text, line, self._variables, self._budget.max_nesting)
+
+    def _head(self, reader: Reader) -> tuple[str, str]:
+        reader.take("o")
+        label = reader.name() if reader.text.startswith("<", reader.at) else str(reader.index())
+        if reader.done():
+            return label, FANUC
+        match = _KEYWORD.match(reader.text, reader.at)
+        if match is None:
+            raise reader.fault("is no O-word; they are sub, call, while, do, repeat, if and their ends")
+        reader.at = match.end()
+        return label, match.group()
+
+    def _do(self, label: str, keyword: str, reader: Reader, line: int) -> None:
+        match keyword:
+            case "sub":
+                self._define(label, line)
+            case "call":
+                self._call(label, self._arguments(reader), line)
+            case "return" | "endsub":
+                self._return(label, keyword, reader, line)
+            case "if":
+                self._if(self._open(label, "if", line), label, reader, line)
+            case "elseif":
+                self._elseif(label, reader, line)
+            case "else":
+                self._otherwise(label, reader, line)
+            case "endif":
+                self._label(label, ("if",), reader)
+            case "while":
+                self._while(label, reader, line)
+            case "endwhile":
+                self._jump(self._label(label, ("while",), reader).mark, line)
+            case "do":
+                self._open(label, "do", line)
+            case "repeat":
+                self._repeat(label, reader, line)
+            case "endrepeat":
+                self._next_repeat(label, reader, line)
+            case "break" | "continue":
+                self._leave_loop(label, keyword, reader, line)
+            case _:
+                self._subs.setdefault(label, (Place(self.source, self.source.here()), True))
+
+    # --- conditions and loops -------------------------------------------------------------------------------------
+
+    def _open(self, label: str, kind: str, line: int) -> Label:
+        labels = self._frames[-1].labels
+        known = labels.get(label)
+        if known is not None and (known.line != line or known.kind != kind):
+            raise ProgramError(line, f"O<{label}>", f"is the label of line {known.line} already; choose another one")
+        if known is None and len(labels) >= self._budget.max_labels:
+            raise ProgramError(line, f"O<{label}>", f"is one label more than the {self._budget.max_labels} allowed")
+        mark = self.source.after() if kind in ("do", "repeat") else self.source.here()
+        opened = labels[label] = Label(kind, line, mark)
+        return opened
+
+    def _label(self, label: str, kinds: tuple[str, ...], reader: Reader) -> Label:
+        known = self._frames[-1].labels.get(label)
+        if known is None or known.kind not in kinds:
+            raise reader.fault(f"has no {' or '.join(kinds)} of the same label before it")
+        return known
+
+    def _condition(self, reader: Reader) -> float:
+        if not reader.take("["):
+            raise reader.fault("wants its condition in brackets")
+        return reader.bracketed()
+
+    def _jump(self, mark: Mark, line: int) -> None:
+        self._count_jump(line)
+        self.source.go(mark)
+
+    def _count_jump(self, line: int) -> None:
+        self._jumps += 1
+        if self._jumps > self._budget.max_jumps:
+            raise ProgramError(line, "O", f"more than {self._budget.max_jumps} jumps were made; is a loop endless?")
+
+    def _if(self, state: Label, label: str, reader: Reader, line: int) -> None:
+        state.done = self._condition(reader) != 0.0
+        if not state.done:
+            self._skip = Skip(label, ("elseif", "else", "endif"), line, execute=True)
+
+    def _elseif(self, label: str, reader: Reader, line: int) -> None:
+        state = self._label(label, ("if",), reader)
+        holds = self._condition(reader) != 0.0
+        if state.done or not holds:
+            keywords = ("elseif", "endif") if state.done else ("elseif", "else", "endif")
+            self._skip = Skip(label, keywords, line, execute=True)
+        state.done = state.done or holds
+
+    def _otherwise(self, label: str, reader: Reader, line: int) -> None:
+        if self._label(label, ("if",), reader).done:
+            self._skip = Skip(label, ("endif",), line)
+
+    def _while(self, label: str, reader: Reader, line: int) -> None:
+        known = self._frames[-1].labels.get(label)
+        if known is not None and known.kind == "do":
+            if self._condition(reader) != 0.0:
+                self._jump(known.mark, line)
+            return
+        self._open(label, "while", line)
+        if self._condition(reader) == 0.0:
+            self._skip = Skip(label, ("endwhile",), line)
+
+    def _repeat(self, label: str, reader: Reader, line: int) -> None:
+        state = self._open(label, "repeat", line)
+        state.left = self._condition(reader)
+        if state.left <= 0.0:
+            self._skip = Skip(label, ("endrepeat",), line)
+
+    def _next_repeat(self, label: str, reader: Reader, line: int) -> None:
+        state = self._label(label, ("repeat",), reader)
+        state.left -= 1.0
+        if state.left > 0.0:
+            self._jump(state.mark, line)
+
+    def _leave_loop(self, label: str, keyword: str, reader: Reader, line: int) -> None:
+        state = self._label(label, ("while", "do"), reader)
+        if keyword == "break":
+            self._skip = Skip(label, ("endwhile",) if state.kind == "while" else ("while",), line)
+        elif state.kind == "while":
+            self._jump(state.mark, line)
+        else:
+            self._skip = Skip(label, ("while",), line, execute=True)
+
+    # --- subroutines ----------------------------------------------------------------------------------------------
+
+    def _define(self, label: str, line: int) -> None:
+        """Meet a subroutine on the way: remember where it is and read over it."""
+        if label in self._subs:
+            raise ProgramError(line, f"O<{label}>", "is a subroutine that is defined already; choose another name")
+        if self.depth:
+            raise ProgramError(line, f"O<{label}>", "is defined within a subroutine; move it out")
+        self._subs[label] = (Place(self.source, self.source.here()), False)
+        self._skip = Skip(label, ("endsub",), line)
+
+    def _arguments(self, reader: Reader) -> list[float]:
+        arguments: list[float] = []
+        while reader.take("["):
+            arguments.append(reader.bracketed())
+        if len(arguments) > LOCAL_NUMBERS:
+            raise reader.fault(f"has {len(arguments)} arguments; {LOCAL_NUMBERS} are allowed")
+        return arguments
+
+    def _call(self, name: str, arguments: list[float], line: int) -> None:
+        self._enter(Frame(name, Place(self.source, self.source.after())), line)
+        self._variables.enter(arguments)
+
+    def call_fanuc(self, name: str, times: int, line: int) -> None:
+        """M98 P<name> L<times>."""
+        if times > 0:
+            frame = Frame(name, Place(self.source, self.source.after()), fanuc=True, again=times - 1)
+            self._enter(frame, line)
+
+    def _enter(self, frame: Frame, line: int) -> None:
+        self._count_jump(line)
+        if self.depth >= self._budget.max_call_depth:
+            raise ProgramError(line, f"O<{frame.name}>", f"calls nest deeper than {self._budget.max_call_depth} levels")
+        known = self._subs.get(frame.name)
+        self._frames.append(frame)
+        self._entering = True
+        self._skip = Skip(frame.name, (FANUC,) if frame.fanuc else ("sub",), line)
+        if known is not None:
+            place, fanuc = known
+            if fanuc != frame.fanuc:
+                how = "M98" if fanuc else "call"
+                raise ProgramError(line, f"O<{frame.name}>", f"is a subroutine that wants to be called by {how}")
+            self.source = place.source
+            self.source.go(place.mark)
+            return
+        path = self._file_of(frame.name)
+        if path is not None:
+            self.source = Source(path, self._budget.max_line_chars)
+            self._files.append(self.source)
+
+    def _file_of(self, name: str) -> Path | None:
+        if self._folder is None or _FILE_NAME.fullmatch(name) is None:
+            return None
+        path = self._folder / f"{name}.ngc"
+        return path if path.is_file() else None
+
+    def _begin_sub(self, label: str, keyword: str, line: int) -> None:
+        self._entering = False
+        here = Place(self.source, self.source.here())
+        self._subs.setdefault(label, (here, keyword == FANUC))
+        self._frames[-1].entry = Place(self.source, self.source.after())
+
+    def _return(self, label: str, keyword: str, reader: Reader, line: int) -> None:
+        frame = self._frames[-1]
+        if not self.depth or frame.fanuc:
+            raise reader.fault(f"has no subroutine to end; {keyword} belongs between sub and endsub")
+        if keyword == "endsub" and frame.name != label:
+            raise reader.fault(f"names another subroutine than O<{frame.name}>, which is under way")
+        returned = self._condition(reader) if not reader.done() else None
+        self._variables.leave()
+        self._variables.set_returned(returned)
+        self._go_back()
+
+    def end_fanuc(self) -> bool:
+        """M99: return True when it ends a subroutine, False in the main program."""
+        if not self.depth:
+            return False
+        frame = self._frames[-1]
+        if not frame.fanuc:
+            raise ProgramError(
+                self.source.line, "M99", "cannot end a subroutine that was called by an O-word; use endsub"
+            )
+        if frame.again > 0 and frame.entry is not None:
+            frame.again -= 1
+            self._jump(frame.entry.mark, self.source.line)
+            return True
+        self._go_back()
+        return True
+
+    def _go_back(self) -> None:
+        frame = self._frames.pop()
+        self._on_return(self.depth + 1)
+        if frame.back is not None:
+            self.source = frame.back.source
+            self.source.go(frame.back.mark)

@@ -1,0 +1,138 @@
+"""What a program may read of the machine (#5420, #<_feed> and the like), and M70 to M73."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from fdhil.program.modal import AXES, INDEX, LINEAR, Modal
+from fdhil.program.offsets import select_system
+from fdhil.program.parameters import Variables
+
+Reading = Callable[[], float]
+# what M70 keeps: the modes, not the position and not the motion in force
+_KEPT = (
+    "scale", "plane", "absolute", "arc_absolute", "diameter", "feed_mode", "feed_word", "feed_mm_min", "spindle_rpm",
+    "spindle_turns", "retract_to_r", "path_control", "path_tolerance_mm", "system",
+)  # fmt: skip
+
+
+def numbers_of(modal: Modal) -> Mapping[int, Reading]:
+    """Return the numbered parameters that show the machine's state: #5420 to #5428, the controlled point."""
+
+    def place(index: int) -> Reading:
+        return lambda: modal.position[index] / (modal.scale if AXES[index] in LINEAR else 1.0)
+
+    fixed = {5400 + index: (lambda: 0.0) for index in range(14)}
+    return {**fixed, **{5420 + index: place(index) for index in range(9)}}
+
+
+def names_of(
+    modal: Modal, line: Callable[[], int], depth: Callable[[], int], value: Callable[[], float | None]
+) -> Mapping[str, Reading]:
+    """Return the named parameters that show the machine's state."""
+    flags: dict[str, Callable[[], bool]] = {
+        "_metric": lambda: modal.scale == 1.0,
+        "_imperial": lambda: modal.scale != 1.0,
+        "_absolute": lambda: modal.absolute,
+        "_incremental": lambda: not modal.absolute,
+        "_inverse_time": lambda: modal.feed_mode == 930,
+        "_units_per_minute": lambda: modal.feed_mode == 940,
+        "_units_per_rev": lambda: modal.feed_mode == 950,
+        "_retract_r_plane": lambda: modal.retract_to_r,
+        "_retract_old_z": lambda: not modal.retract_to_r,
+        "_spindle_rpm_mode": lambda: True,
+        "_spindle_css_mode": lambda: False,
+        "_ijk_absolute_mode": lambda: modal.arc_absolute,
+        "_lathe_diameter_mode": lambda: modal.diameter,
+        "_lathe_radius_mode": lambda: not modal.diameter,
+        "_spindle_on": lambda: modal.spindle_turns != 0,
+        "_spindle_cw": lambda: modal.spindle_turns > 0,
+        "_tool_offset": lambda: any(modal.tool),
+        "_value_returned": lambda: value() is not None,
+    }
+    readings: dict[str, Reading] = {name: _as_number(flag) for name, flag in flags.items()}
+    readings |= {
+        "_line": lambda: float(line()),
+        "_call_level": lambda: float(depth()),
+        "_motion_mode": lambda: float(modal.motion),
+        "_plane": lambda: 170.0 + 10.0 * modal.plane,
+        "_ccomp": lambda: float(modal.compensation),
+        "_coord_system": lambda: (540, 550, 560, 570, 580, 590, 591, 592, 593)[modal.system - 1] * 1.0,
+        "_feed": lambda: modal.feed_word,
+        "_rpm": lambda: modal.spindle_rpm,
+        "_value": lambda: value() or 0.0,
+        "_vmajor": lambda: 2.9,
+        "_current_pocket": lambda: 1.0,
+        "_selected_pocket": lambda: -1.0,
+    }
+    for name in (
+        "_vminor",
+        "_task",
+        "_remap_level",
+        "_mist",
+        "_flood",
+        "_adaptive_feed",
+        "_current_tool",
+        "_selected_tool",
+    ):
+        readings[name] = lambda: 0.0
+    for name in ("_speed_override", "_feed_override", "_feed_hold"):
+        readings[name] = lambda: 1.0
+    for letter in AXES:
+        readings[f"_{letter}"] = _own(modal, INDEX[letter])
+        readings[f"_abs_{letter}"] = _machine(modal, INDEX[letter])
+    return readings
+
+
+def _as_number(flag: Callable[[], bool]) -> Reading:
+    return lambda: float(flag())
+
+
+def _own(modal: Modal, index: int) -> Reading:
+    return lambda: modal.position[index] / (modal.scale if AXES[index] in LINEAR else 1.0)
+
+
+def _machine(modal: Modal, index: int) -> Reading:
+    return lambda: (modal.machine_all()[index] + modal.tool[index]) / (modal.scale if AXES[index] in LINEAR else 1.0)
+
+
+@dataclass(frozen=True)
+class _Kept:
+    values: Mapping[str, Any]
+    restore_on_return: bool
+
+
+class KeptModes:
+    """M70 keeps the modes of this call level, M71 forgets them, M72 restores them, M73 does so when the call ends."""
+
+    def __init__(self, modal: Modal, variables: Variables) -> None:
+        self._modal = modal
+        self._variables = variables
+        self._kept: dict[int, _Kept] = {}
+
+    def do(self, code: int, level: int) -> bool:
+        """Do one of the four codes; False when M72 finds nothing to restore."""
+        if code in (70, 73):
+            self._kept[level] = _Kept({name: getattr(self._modal, name) for name in _KEPT}, code == 73)
+        elif code == 71:
+            self._kept.pop(level, None)
+        elif level not in self._kept:
+            return False
+        else:
+            self._restore(self._kept[level])
+        return True
+
+    def returned(self, level: int) -> None:
+        """Tell that the call of this level has ended."""
+        kept = self._kept.pop(level, None)
+        if kept is not None and kept.restore_on_return:
+            self._restore(kept)
+
+    def _restore(self, kept: _Kept) -> None:
+        for name, value in kept.values.items():
+            if name == "system":
+                select_system(self._modal, self._variables, value)
+            else:
+                setattr(self._modal, name, value)
