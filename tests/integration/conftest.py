@@ -1,0 +1,105 @@
+"""One suite, three transports: python-can's ``virtual``, the TCP hub, and a real SocketCAN interface (vcan0)."""
+
+from __future__ import annotations
+
+import itertools
+import queue
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from fdhil import config as machine_config
+from fdhil.config import MachineConfig
+from fdhil.program import load_trajectory
+from fdhil.sim.service import SimService
+from tests.bench import bench_document
+
+PATIENCE_S = 60.0
+_channel = itertools.count()
+
+
+@dataclass
+class Bench:
+    """The twin in a thread on one transport, and the configuration with which anyone joins it."""
+
+    config: MachineConfig
+    service: SimService
+    events: queue.Queue[dict[str, Any]]
+    ready: Mapping[str, Any] = field(default_factory=dict)
+
+    def event(self, kind: str) -> dict[str, Any]:
+        """Return the next event of this kind."""
+        while True:
+            event = self.events.get(timeout=PATIENCE_S)
+            assert event["event"] != "error", event
+            if event["event"] == kind:
+                return event
+
+    def command(self, line: str) -> None:
+        """Give one command of the operator's panel (JSON)."""
+        self.service.command(line)
+
+    def join(self) -> can.BusABC:
+        """Join the bus with the arguments that the ready event gives to any python-can program."""
+        place = {k: v for k, v in self.ready["buses"]["can0"].items() if v is not None}
+        return can.Bus(**place)
+
+
+def _virtual(document: dict[str, Any]) -> None:
+    document["bus"] = {"can0": {"interface": "virtual", "channel": f"bench-{next(_channel)}"}}
+
+
+def _hub(document: dict[str, Any]) -> None:
+    document["bus"] = {"can0": {"interface": "socketcand"}}
+
+
+def _socketcan(document: dict[str, Any]) -> None:
+    document["bus"] = {"can0": {"interface": "socketcan", "channel": "vcan0"}}
+
+
+TRANSPORTS: Mapping[str, Callable[[dict[str, Any]], None]] = {
+    "virtual": _virtual,
+    "hub": _hub,
+    "socketcan": _socketcan,
+}
+
+
+@pytest.fixture(params=["virtual", "hub", pytest.param("socketcan", marks=pytest.mark.socketcan)])
+def transport(request: pytest.FixtureRequest) -> str:
+    """The transport of this run of the suite."""
+    return str(request.param)
+
+
+@pytest.fixture
+def sections() -> dict[str, Any]:
+    """Sections that a test module adds to the bench's configuration."""
+    return {"sim": {"pace": "lockstep", "modbus": False}}
+
+
+@pytest.fixture
+def bench(transport: str, sections: dict[str, Any], tmp_path: Path) -> Iterator[Bench]:
+    """Serve the bench's twin on the transport."""
+    document = bench_document() | sections
+    TRANSPORTS[transport](document)
+    events: queue.Queue[dict[str, Any]] = queue.Queue()
+    config = machine_config.parse(document, folder=tmp_path)
+    service = SimService(config, events.put, load_trajectory)
+    thread = threading.Thread(target=service.run, name="twin")
+    thread.start()
+    bench = Bench(config, service, events)
+    try:
+        bench.ready = bench.event("ready")
+        for name, place in bench.ready["buses"].items():
+            document["bus"][name] |= {k: v for k, v in place.items() if v is not None}
+        for axis, place in bench.ready["modbus"].items():
+            document["axis"][axis].setdefault("voltage", {}).update(place)
+        bench.config = machine_config.parse(document, folder=tmp_path)
+        yield bench
+    finally:
+        service.stop()
+        thread.join()

@@ -1,0 +1,93 @@
+"""What any CANopen master sees of the drives, on every transport."""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Iterator
+
+import can
+import canopen
+import pytest
+
+from tests.integration.conftest import Bench
+
+PATIENCE_S = 10.0
+
+
+@pytest.fixture
+def bus(bench: Bench) -> Iterator[can.BusABC]:
+    """A stock python-can bus that has joined."""
+    joined = bench.join()
+    yield joined
+    joined.shutdown()
+
+
+def received(bus: can.BusABC, can_id: int) -> bytes:
+    """Return the data of the next frame with this identifier."""
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        message = bus.recv(0.1)
+        if message is not None and message.arbitration_id == can_id:
+            return bytes(message.data)
+    raise AssertionError(f"no frame {can_id:03X} came")
+
+
+def send(bus: can.BusABC, can_id: int, data: bytes = b"") -> None:
+    bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+
+
+def test_sdo_by_a_stock_client_expedited_segmented_and_block(bench: Bench) -> None:
+    bus = bench.join()
+    network = canopen.Network(bus=bus)
+    network.connect()
+    try:
+        node = network.add_node(1, bench.ready["drives"]["X"]["eds"])
+        node.sdo.RESPONSE_TIMEOUT = PATIENCE_S
+        assert node.sdo[0x1018][1].raw > 0
+        assert len(str(node.sdo[0x1008].raw)) > 4
+        network.nmt.state = "OPERATIONAL"
+        for _ in range(200):
+            bus.send(can.Message(arbitration_id=0x080, is_extended_id=False))
+        with node.sdo[0x2120].open("rb", block_transfer=True) as stream:
+            assert len(stream.read()) > 1000  # the trace of those cycles
+        with pytest.raises(canopen.SdoAbortedError) as aborted:
+            node.sdo.download(0x6041, 0, b"\0\0")
+        assert aborted.value.code == 0x06010002
+        node.sdo[0x60B0].raw = -1234
+        assert node.sdo[0x60B0].raw == -1234
+    finally:
+        network.disconnect()
+        bus.shutdown()
+
+
+def test_a_reset_node_boots_and_can_be_started(bus: can.BusABC) -> None:
+    send(bus, 0x000, bytes([0x81, 1]))
+    assert received(bus, 0x701) == b"\x00"
+    send(bus, 0x000, bytes([0x01, 1]))
+    send(bus, 0x080)
+    assert len(received(bus, 0x181)) == 8
+    assert len(received(bus, 0x281)) >= 6
+
+
+def test_another_master_enables_a_drive_and_its_set_point_acts_two_cycles_late(bus: can.BusABC) -> None:
+    send(bus, 0x000, bytes([0x01, 1]))
+    send(bus, 0x601, struct.pack("<BHBI", 0x2F, 0x6060, 0, 8))
+    received(bus, 0x581)
+    status = 0
+    for word in (0x06, 0x06, 0x07, 0x07, 0x0F, 0x0F, 0x0F):
+        send(bus, 0x201, struct.pack("<Hi", word, 0))
+        send(bus, 0x080)
+        status = struct.unpack_from("<H", received(bus, 0x281))[0]
+    assert status & 0x6F == 0x27
+    demands = []
+    for k in range(60):  # TPDO3 comes every tenth SYNC
+        send(bus, 0x201, struct.pack("<Hi", 0x0F, 10 * k))
+        send(bus, 0x080)
+        received(bus, 0x281)
+        message = bus.recv(0.005)
+        if message is not None and message.arbitration_id == 0x381:
+            demands.append((k, struct.unpack("<ii", bytes(message.data))[0]))
+    assert len(demands) >= 3
+    # the target latched at SYNC k is in force at SYNC k + 2
+    assert {demand - 10 * (k - 2) for k, demand in demands} == {0}

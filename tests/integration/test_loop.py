@@ -1,0 +1,110 @@
+"""From the bus to a corrected path, on every transport: acquisition, identification, commissioning."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil.drivers import open_machine
+from fdhil.drivers.commissioning import commission
+from fdhil.pipeline import AxisPipeline
+from fdhil.records import AxisSamples, ParameterSet, WindowOutcome
+from tests.integration.conftest import PATIENCE_S, Bench
+
+pytestmark = pytest.mark.timeout(240)
+
+SHUTTLE = "G21 G90 G94\n" + "G0 X300 Y300\nG4 P0.3\nG0 X0 Y0\nG4 P0.3\n" * 2 + "M2\n"
+TRUE = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
+
+
+async def recorded(bench: Bench, program: Path) -> tuple[list[Any], dict[str, int]]:
+    """Let the NC play a program, and return all records that the drivers made of it with their counters."""
+    records: list[Any] = []
+    async with open_machine(bench.config) as source:
+        bench.command('{"command": "nc", "on": true}')
+        await asyncio.to_thread(bench.event, "nc")
+        bench.command(json.dumps({"command": "play", "file": str(program)}))
+        finished = asyncio.create_task(asyncio.to_thread(bench.event, "finished"))
+        stream = aiter(source.records())
+        async with asyncio.timeout(4 * PATIENCE_S):
+            while not finished.done():
+                records.append(await anext(stream))
+            end = asyncio.get_running_loop().time() + 0.5
+            while asyncio.get_running_loop().time() < end:
+                records.append(await anext(stream))
+        return records, source.counters()
+
+
+def shuttle(folder: Path) -> Path:
+    path = folder / "shuttle.ngc"
+    path.write_text(SHUTTLE)
+    return path
+
+
+def test_nothing_is_lost_and_the_drives_are_identified(bench: Bench, tmp_path: Path) -> None:
+    records, counters = asyncio.run(recorded(bench, shuttle(tmp_path)))
+    assert counters["lost"] == 0
+    for axis in bench.config.axis:
+        blocks = [r for r in records if isinstance(r, AxisSamples) and r.axis == axis]
+        tick = np.concatenate([block.tick for block in blocks])
+        assert tick.size > 4000
+        assert np.all(np.diff(tick) == 1)
+        pipeline = AxisPipeline(axis, bench.config)
+        outcomes = [outcome for r in records if getattr(r, "axis", axis) == axis for outcome in pipeline.feed(r)]
+        windows = [o for o in outcomes if isinstance(o, WindowOutcome)]
+        assert [o.verdict.accepted for o in windows] == [True] * 4, [o.verdict for o in windows]
+        newest = [o for o in outcomes if isinstance(o, ParameterSet)][-1].parameters.as_dict()
+        for name, true in TRUE.items():
+            assert newest[name] == pytest.approx(true, rel=0.01 if name not in ("ft", "Cd") else 0.05), name
+
+
+def test_demand_and_position_lie_on_the_same_tick(bench: Bench, tmp_path: Path) -> None:
+    """One cycle of misalignment would show as 0.5 mm at rapid speed."""
+    records, _ = asyncio.run(recorded(bench, shuttle(tmp_path)))
+    blocks = [r for r in records if isinstance(r, AxisSamples) and r.axis == "X"]
+    demand, position, speed = (
+        np.concatenate([getattr(b, name) for b in blocks]) for name in ("demand_mm", "position_mm", "speed_rad_s")
+    )
+    cruise = np.abs(speed) > 150
+    late_mm = np.abs(demand - position)[cruise]
+    assert np.median(late_mm) < 0.1
+    # the integral of speed is the position, tick by tick
+    travel = np.cumsum((speed[1:] + speed[:-1]) / 2) * 0.001 * 20 / (2 * np.pi)
+    assert np.max(np.abs(travel - (position[1:] - position[0]))) < 0.2
+
+
+def test_an_axis_is_commissioned(bench: Bench) -> None:
+    record = commission(bench.config, "X")
+    assert record.watchdog == "proven"
+    assert record.offset_in_feedforward is True
+    assert record.sign_test_um == pytest.approx(10, abs=1)
+
+
+def test_an_emergency_is_told(bench: Bench) -> None:
+    async def notices() -> set[str]:
+        codes = set()
+        async with open_machine(bench.config) as source:
+            bench.command('{"command": "nc", "on": true}')
+            await asyncio.to_thread(bench.event, "nc")
+            other = bench.join()
+            try:
+                import can
+
+                data = struct.pack("<HB5x", 0x8611, 0x21)
+                other.send(can.Message(arbitration_id=0x081, data=data, is_extended_id=False))
+                async with asyncio.timeout(PATIENCE_S):
+                    async for record in source.records():
+                        codes.add(getattr(record, "code", ""))
+                        if "DriveEmergency" in codes:
+                            return codes
+            finally:
+                other.shutdown()
+        return codes
+
+    assert "DriveEmergency" in asyncio.run(notices())
