@@ -247,7 +247,7 @@ class Drive:
         return frames + self._take_outgoing() if self._outgoing else frames
 
     def _integrate(self) -> None:
-        self.physics.load_torque_nm = self.faults.load_torque_nm
+        self.physics.load_torque_nm = float(self.faults.load_torque_nm)
         self.physics.cycle(self.power.powered, self.motion.command)
         self.tick += 1
 

@@ -79,6 +79,7 @@ class Profile:
 
     def start(self, position: float, speed: float) -> None:
         """Go on from a demand and its speed."""
+        position = float(position)  # the compiled cycle knows floats; an int would have it compiled once more
         before = position - speed * self._period_s
         self._points = (before, position, position + speed * self._period_s)
         self._speed = speed

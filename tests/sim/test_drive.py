@@ -12,10 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fdhil import config
 from fdhil.sim.drive import Drive
 from fdhil.sim.eds import write_eds
+from tests.bench import bench_document
 from tests.sim.canopen_peer import dictionary, over_virtual_bus
-from tests.sim.rig import Rig, emergencies, machine
+from tests.sim.rig import Abort, Rig, emergencies, machine
 
 # -- NMT
 
@@ -111,9 +113,32 @@ def test_sync_with_and_without_counter() -> None:
     assert len(rig.send(0x81, b"\x01")) == 2
 
 
+def test_sync_parameters_change_in_pre_operational_only() -> None:
+    rig = Rig()
+    rig.nmt(0x01)
+    for index, value, size in ((0x1005, 0x81, 4), (0x1019, 240, 1)):
+        with pytest.raises(Abort) as abort:
+            rig.write(index, 0, value, size)
+        assert abort.value.code == 0x08000022
+
+
+@pytest.mark.parametrize(("period_s", "value", "exponent"), [(0.001, 1, -3), (0.002, 2, -3), (0.0005, 5, -4)])
+def test_other_sync_periods(period_s: float, value: int, exponent: int) -> None:
+    document = bench_document("X")
+    document["machine"]["sync_period_s"] = period_s
+    rig = Rig(config.parse(document))
+    assert (rig.read(0x60C2, 1), rig.read(0x60C2, 2, signed=True)) == (value, exponent)
+    assert rig.read(0x1006) == round(period_s * 1e6)
+    assert rig.drive.physics.voltage_v.size == round(period_s / 3.125e-5)
+    rig.enable()
+    rig.follow(range(0, 20000, 100))
+    assert rig.drive.reference_mm == pytest.approx(19700 / 3276.8)
+    assert rig.drive.table_mm == pytest.approx(rig.drive.reference_mm, abs=0.05)
+
+
 def test_the_counter_is_on_where_the_twin_s_nc_is() -> None:
-    config = machine().model_copy(update={"sim": machine().sim.model_copy(update={"nc": True})})
-    assert Rig(config).read(0x1019) == 240
+    with_nc = machine().model_copy(update={"sim": machine().sim.model_copy(update={"nc": True})})
+    assert Rig(with_nc).read(0x1019) == 240
 
 
 # -- sensors
@@ -205,8 +230,7 @@ def test_the_true_plant_may_differ_from_the_nominal_one() -> None:
 
 
 def test_the_eds_says_what_the_drive_is(tmp_path: Path) -> None:
-    config = machine("XY")
-    rig = Rig(config, "Y")
+    rig = Rig(machine("XY"), "Y")
     od: Any = canopen.import_od(str(write_eds(rig.drive, tmp_path / "sub" / "y.eds")), 2)
     for item in rig.drive.dictionary:
         for entry in item.entries:

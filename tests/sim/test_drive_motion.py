@@ -10,6 +10,7 @@ import pytest
 from fdhil import config
 from fdhil.records import Float
 from fdhil.sim.drive import Drive
+from fdhil.sim.physics import run_cycle
 from fdhil.sim.setpoints import CyclicSetpoints, Profile, Target
 from tests.bench import bench_config, bench_document
 from tests.sim.rig import Rig, machine
@@ -238,6 +239,20 @@ def test_profile_position_relative_buffered_at_once_and_halted() -> None:
     assert 0 < held < 45
     run_to(rig, 0, 0x0F, 900)
     assert rig.drive.table_mm == pytest.approx(0.0, abs=2e-3)
+
+
+def test_no_mode_and_no_fault_has_the_cycle_compiled_again() -> None:
+    rig = profile_rig()
+    rig.drive.faults.load_torque_nm = 1
+    rig.drive.faults.offset_scale = 2
+    run_to(rig, 1, 0x1F, 5)
+    for word in (0x10F, 0x02, 0x00):
+        rig.cycle(0, word=word)
+    rig.write(0x6060, 0, 8, 1)
+    rig.cycle(0, 5, word=0x06)
+    for _ in range(5):
+        rig.cycle(0, 5)
+    assert len(run_cycle.signatures) == 1
 
 
 def test_switching_to_csp_follows_the_cyclic_set_points_again() -> None:

@@ -119,6 +119,9 @@ def test_fault_reaction_and_reset_on_the_rising_edge_alone() -> None:
         other.fault()
         assert state(other) is wanted
     idle = stage()
+    idle.quick_stop()
+    assert state(idle) is S.SWITCH_ON_DISABLED
+    idle.at_rest()
     idle.fault()
     assert state(idle) is S.FAULT
     idle.disable_voltage()

@@ -214,6 +214,11 @@ def test_protocol_errors_end_the_transfer() -> None:
     sdo.request(head(0xA4, 0x2000) + bytes([5, 0, 0, 0]))
     sdo.request(bytes([0xA3]) + bytes(7))
     assert abort_code(sdo.request(bytes([0xA2, 9, 5]) + bytes(5))) == AbortCode.COMMAND
+    sdo.request(head(0xA4, 0x2000) + bytes([5, 0, 0, 0]))
+    sdo.request(bytes([0xA3]) + bytes(7))
+    assert abort_code(sdo.request(bytes([0xA2, 1, 0]) + bytes(5))) == AbortCode.BLOCK_SIZE
+    sdo.request(head(0xA4, 0x2000) + bytes([5, 0, 0, 0]))
+    assert abort_code(sdo.request(bytes([0xA2, 1, 5]) + bytes(5))) == AbortCode.COMMAND  # not started
     sdo.request(head(0x40, 0x2000) + bytes(4))
     assert sdo.request(head(0x80, 0x2000) + bytes(4)) == []  # the client gives up
     assert abort_code(sdo.request(bytes([0x60]) + bytes(7))) == AbortCode.COMMAND
