@@ -56,8 +56,8 @@ class GuardClient:
     def load(
         self,
         axes: Sequence[str],
-        demand: Mapping[str, Sequence[int]],
-        offset: Mapping[str, Sequence[int]],
+        demand: Mapping[str, table.Column],
+        offset: Mapping[str, table.Column],
         program_digest: str,
         first: int = 0,
         final: bool = True,

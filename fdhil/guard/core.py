@@ -7,8 +7,6 @@ path, the motion of the offset, and a check of the frame by other formulas than 
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from fdhil.guard.interlocks import Alarm, AxisView, Reaction, failing, not_ready, withheld
 from fdhil.guard.limits import brake, follow, violation
 from fdhil.guard.path import EPS, Path, Place, advance, around
@@ -46,7 +44,7 @@ def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outpu
     state = _observe(state, inputs, settings)
     views = tuple(map(_view, settings.axes, inputs.axes, state.axes))
     alarms = _alarms(state, inputs, views)
-    state = replace(state, good_for=0 if alarms else state.good_for + inputs.sync)
+    state = state._replace(good_for=0 if alarms else state.good_for + inputs.sync)
     state, refused = _request(state, inputs, alarms, views, settings)
     state = _react(state, inputs, alarms, settings)
     state = _adopt_at_start(state, inputs, alarms)
@@ -54,7 +52,7 @@ def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outpu
         state = _follow_path(state, inputs, alarms, settings)
     state, output = _move(state, inputs, settings)
     moved = None if state.mode is before else (before, state.mode, state.cause)
-    return state, replace(output, refused=refused, transition=moved)
+    return state, output._replace(refused=refused, transition=moved)
 
 
 # --- what the drives and the bus say ---
@@ -62,10 +60,12 @@ def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outpu
 
 def _observe(state: State, inputs: Inputs, settings: Settings) -> State:
     """Take in what was sampled: failed frames, read-backs, following errors, the targets just latched."""
-    axes = state.axes if inputs.transmitted else tuple(map(_not_sent, state.axes))
-    failed = 0 if inputs.transmitted else state.failed_run + 1
+    axes, failed = state.axes, 0
+    if not inputs.transmitted:
+        axes, failed = tuple(map(_not_sent, state.axes)), state.failed_run + 1
+        state = _behind(state)
     if not inputs.sync:
-        return replace(state, axes=axes, failed_run=failed, tick=state.tick + (not settings.offset_synchronous))
+        return state._replace(axes=axes, failed_run=failed, tick=state.tick + (not settings.offset_synchronous))
     heard = [axis.target for axis in inputs.axes]
     targets = None if None in heard else tuple([target for target in heard if target is not None])
     depth = max([axis.setpoint_delay_cycles for axis in settings.axes]) + 2
@@ -74,8 +74,7 @@ def _observe(state: State, inputs: Inputs, settings: Settings) -> State:
         _sampled(axis, seen, setting, k, history)
         for k, (axis, seen, setting) in enumerate(zip(axes, inputs.axes, settings.axes, strict=True))
     ]
-    return replace(
-        state,
+    return state._replace(
         axes=tuple(sampled),
         tick=state.tick + 1,
         targets=history,
@@ -87,7 +86,7 @@ def _observe(state: State, inputs: Inputs, settings: Settings) -> State:
 
 def _not_sent(axis: AxisState) -> AxisState:
     """The last frame did not leave: the value before it is still in force, at rest."""
-    return replace(axis, offset=axis.sent[1], rate=0, sent=(axis.sent[1], *axis.sent[1:]))
+    return axis._replace(offset=axis.sent[1], rate=0, sent=(axis.sent[1], *axis.sent[1:]))
 
 
 def _sampled(
@@ -102,15 +101,13 @@ def _sampled(
     latched = history[1 + setting.setpoint_delay_cycles] if len(history) > 1 + setting.setpoint_delay_cycles else None
     if seen.following_error is not None:
         error = seen.following_error
-    elif seen.position is not None:
-        offset = axis.sent[1 + setting.setpoint_delay_cycles]
-        error = float("nan") if latched is None else latched[k] + offset - seen.position
+    elif seen.position is not None and latched is not None:
+        error = latched[k] + axis.sent[1 + setting.setpoint_delay_cycles] - seen.position
     if seen.read_back is None:
-        return axis if error == axis.following_error else replace(axis, following_error=error)
+        return axis if error == axis.following_error else axis._replace(following_error=error)
     late = seen.read_back != axis.sent[1] and seen.read_back in axis.sent[2:4]
     wrong = seen.read_back != axis.sent[1] and not late
-    return replace(
-        axis,
+    return axis._replace(
         following_error=error,
         read_back=seen.read_back,
         echo_misses=axis.echo_misses + 1 if wrong else 0,
@@ -196,8 +193,7 @@ def _refusals(state: State, inputs: Inputs, request: Request, alarms: Alarms, vi
 
 def _armed(state: State, inputs: Inputs) -> State:
     assert inputs.path is not None
-    return replace(
-        state,
+    return state._replace(
         mode=Mode.ARMED,
         program_digest=inputs.path.program_digest,
         start_row=inputs.path.standing_rows(),
@@ -224,7 +220,7 @@ def _adopt_refusals(state: State, request: Request, alarms: Alarms, settings: Se
 def _adopting(state: State) -> State:
     """Take over what the drives hold: the first value sent is the value read."""
     axes = tuple([_at_rest(axis, axis.sent[0] if axis.read_back is None else axis.read_back) for axis in state.axes])
-    return replace(state, mode=Mode.ADOPT, axes=axes, zeros_sent=0, adopt_checked=True, cause=Alarm("StaleOffset"))
+    return state._replace(mode=Mode.ADOPT, axes=axes, zeros_sent=0, adopt_checked=True, cause=Alarm("StaleOffset"))
 
 
 def _at_rest(axis: AxisState, offset: int) -> AxisState:
@@ -235,15 +231,15 @@ def _at_rest(axis: AxisState, offset: int) -> AxisState:
 
 
 def _ramp_down(state: State, cause: Alarm) -> State:
-    return replace(state, mode=Mode.RAMP_DOWN, cause=cause, places=(), zeros_sent=0)
+    return state._replace(mode=Mode.RAMP_DOWN, cause=cause, places=(), zeros_sent=0)
 
 
 def _frozen(state: State, cause: Alarm) -> State:
     """Stop sending: what the drive holds is unknown, unless only zeros were sent."""
     if not any(any(axis.sent) for axis in state.axes):
-        return replace(state, mode=Mode.OFF, cause=cause, places=())
-    unread = tuple([replace(axis, read_back=None) for axis in state.axes])
-    return replace(state, mode=Mode.FROZEN, cause=cause, places=(), axes=unread)
+        return state._replace(mode=Mode.OFF, cause=cause, places=())
+    unread = tuple([axis._replace(read_back=None) for axis in state.axes])
+    return state._replace(mode=Mode.FROZEN, cause=cause, places=(), axes=unread)
 
 
 def _react(state: State, inputs: Inputs, alarms: Alarms, settings: Settings) -> State:
@@ -282,7 +278,7 @@ def _adopt_at_start(state: State, inputs: Inputs, alarms: Alarms) -> State:
         return state
     if any(axis.read_back for axis in state.axes):
         return _adopting(state)
-    return replace(state, adopt_checked=True)
+    return state._replace(adopt_checked=True)
 
 
 # --- the place on the path ---
@@ -297,7 +293,7 @@ def _follow_path(state: State, inputs: Inputs, alarms: Alarms, settings: Setting
         return _ramp_down(state, Alarm("ProgramMismatch"))
     hold = next((alarm for alarm in alarms if alarm.reaction is Reaction.HOLD), None)
     if state.mode is Mode.ARMED:
-        return _held(state, hold, settings) if hold else _await_start(replace(state, held_for=0), path)
+        return _held(state, hold, settings) if hold else _await_start(state._replace(held_for=0), path)
     state, lost = _track(state, path)
     hold = hold or lost
     if path.final and state.places[0].row >= path.end - 1:
@@ -307,8 +303,8 @@ def _follow_path(state: State, inputs: Inputs, alarms: Alarms, settings: Setting
     if hold is not None:
         return _held(state, hold, settings)
     if state.mode is Mode.HOLD:
-        return replace(state, mode=Mode.RAMPING, held_for=0, cause=None)
-    return replace(state, held_for=0)
+        return state._replace(mode=Mode.RAMPING, held_for=0, cause=None)
+    return state._replace(held_for=0)
 
 
 def _held(state: State, alarm: Alarm, settings: Settings) -> State:
@@ -317,7 +313,7 @@ def _held(state: State, alarm: Alarm, settings: Settings) -> State:
     if state.held_for >= allowed:
         return _ramp_down(state, alarm)
     mode = Mode.ARMED if state.mode is Mode.ARMED else Mode.HOLD
-    return replace(state, mode=mode, held_for=state.held_for + 1, cause=alarm)
+    return state._replace(mode=mode, held_for=state.held_for + 1, cause=alarm)
 
 
 def _await_start(state: State, path: Path) -> State:
@@ -328,13 +324,13 @@ def _await_start(state: State, path: Path) -> State:
     if now == last:
         distance = path.mismatch(path.first, now)
         at_start = distance is not None and distance <= EPS
-        return replace(state, still_for=state.still_for + 1 if at_start else 0)
+        return state._replace(still_for=state.still_for + 1 if at_start else 0)
     if state.still_for < STILL_CYCLES:
-        return replace(state, still_for=0)
+        return state._replace(still_for=0)
     places = around(path, state.start_row + 1, now)
     if not places:
         return _ramp_down(state, Alarm("Misaligned", detail="the first move leaves the path"))
-    return replace(state, mode=Mode.RAMPING, places=places, anchor=places[0].row, cause=None)
+    return state._replace(mode=Mode.RAMPING, places=places, anchor=places[0].row, cause=None)
 
 
 def _track(state: State, path: Path) -> tuple[State, Alarm | None]:
@@ -342,15 +338,15 @@ def _track(state: State, path: Path) -> tuple[State, Alarm | None]:
     targets = state.targets[0]
     places = advance(path, state.places, targets)
     if places:
-        return replace(state, places=places, anchor=places[0].row if targets else state.anchor, resuming=False), None
+        return state._replace(places=places, anchor=places[0].row if targets else state.anchor, resuming=False), None
     assert targets is not None
     distance = path.mismatch(state.anchor, targets)
     if targets == state.targets[1] and distance is not None and distance <= EPS:
-        return replace(state, places=(Place(state.anchor),), resuming=True), Alarm("FeedHold")
+        return state._replace(places=(Place(state.anchor),), resuming=True), Alarm("FeedHold")
     places = around(path, state.anchor + 1, targets) if state.resuming else ()
     if places:
-        return replace(state, places=places, anchor=places[0].row, resuming=False), None
-    return replace(state, places=advance(path, state.places, None), resuming=False), Alarm("Misaligned")
+        return state._replace(places=places, anchor=places[0].row, resuming=False), None
+    return state._replace(places=advance(path, state.places, None), resuming=False), Alarm("Misaligned")
 
 
 # --- the motion of the offset ---
@@ -363,8 +359,7 @@ def _move(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outp
     if not inputs.sync and (settings.offset_synchronous or not inputs.bus.silent):
         return state, Output()
     if inputs.late:
-        mode = Mode.RAMPING if state.mode is Mode.ACTIVE else state.mode
-        return replace(state, mode=mode, axes=tuple(map(_stands, state.axes))), Output()
+        return _behind(state)._replace(axes=tuple(map(_stands, state.axes))), Output()
     offsets, broken = _next_offsets(state, inputs.path, settings)
     if broken is not None:
         state = _ramp_down(state, broken)
@@ -373,7 +368,7 @@ def _move(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outp
     if wrong is not None:
         return _frozen(state, wrong), Output()
     axes = tuple([_sent(axis, o, s) for axis, o, s in zip(state.axes, offsets, settings.axes, strict=True)])
-    state = _arrived(replace(state, axes=axes), inputs.path, settings)
+    state = _arrived(state._replace(axes=axes), inputs.path, settings)
     heartbeat = state.tick % settings.heartbeat_cycles == 0
     return state, Output(offsets, heartbeat)
 
@@ -411,8 +406,7 @@ def _wrong_frame(state: State, offsets: tuple[int, ...], settings: Settings) -> 
 
 def _sent(axis: AxisState, offset: int, setting: AxisSettings) -> AxisState:
     move = offset - axis.offset
-    return replace(
-        axis,
+    return axis._replace(
         offset=offset,
         rate=move,
         sent=(offset, *axis.sent[:-1]),
@@ -421,24 +415,29 @@ def _sent(axis: AxisState, offset: int, setting: AxisSettings) -> AxisState:
     )
 
 
+def _behind(state: State) -> State:
+    """A frame did not leave in time: the offset is no longer on the table and has to catch up."""
+    return state._replace(mode=Mode.RAMPING) if state.mode is Mode.ACTIVE else state
+
+
 def _stands(axis: AxisState) -> AxisState:
     """Nothing was sent in this cycle: the drive keeps the value."""
-    return replace(axis, rate=0, sent=(axis.sent[0], *axis.sent[:-1]))
+    return axis._replace(rate=0, sent=(axis.sent[0], *axis.sent[:-1]))
 
 
 def _arrived(state: State, path: Path | None, settings: Settings) -> State:
     """Leave RAMPING when on the table, and a landing when the drives show 0."""
     if state.mode is Mode.RAMPING and path is not None and len(state.places) == 1:
         on_table = tuple([axis.offset for axis in state.axes]) == path.offsets_at(state.places[0].row + 1)
-        return replace(state, mode=Mode.ACTIVE) if on_table else state
+        return state._replace(mode=Mode.ACTIVE) if on_table else state
     if state.mode not in LANDING:
         return state
     if any(axis.offset or axis.rate for axis in state.axes):
-        return replace(state, zeros_sent=0)
+        return state._replace(zeros_sent=0)
     sent = state.zeros_sent + 1
     shown = all(a.zero_shown or not s.reads_back for s, a in zip(settings.axes, state.axes, strict=True))
     if sent > ZEROS and shown:
-        return replace(state, mode=Mode.OFF, axes=tuple([_at_rest(axis, 0) for axis in state.axes]), zeros_sent=sent)
+        return state._replace(mode=Mode.OFF, axes=tuple([_at_rest(axis, 0) for axis in state.axes]), zeros_sent=sent)
     if sent > ZEROS_UNCONFIRMED:
-        return replace(state, mode=Mode.FROZEN, cause=Alarm("EchoMismatch", detail="no zero was read back"))
-    return replace(state, zeros_sent=sent)
+        return state._replace(mode=Mode.FROZEN, cause=Alarm("EchoMismatch", detail="no zero was read back"))
+    return state._replace(zeros_sent=sent)

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 from fdhil.cia402 import (
     STATUS_FOLLOWING_ERROR,
@@ -150,8 +151,7 @@ FACTS: Mapping[str, str] = {
 WITHDRAWABLE = ("model_fresh", "skill_enough", "journal_writable")
 
 
-@dataclass(frozen=True, slots=True)
-class AxisView:
+class AxisView(NamedTuple):
     """What is known of one axis at a SYNC. Ages in SYNC cycles, infinite when never heard; NaN and None: unknown.
 
     ``feedback_age`` is that of the older of statusword and position, in units of its own rate. ``holds_offset``: the
@@ -175,8 +175,7 @@ class AxisView:
     long_frames: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class BusView:
+class BusView(NamedTuple):
     """What is known of the bus at a SYNC."""
 
     state: str = "active"

@@ -116,6 +116,8 @@ def check_rows(limits: Limits, offsets: Sequence[int], start: int, stop: int) ->
     """
     for row in range(start, stop):
         before = offsets[max(row - 1, 0)]
+        if not abs(offsets[row]) <= limits.offset:
+            return "OffsetLimit"
         broken = violation(limits, before, before - offsets[max(row - 2, 0)], offsets[row])
         if broken is not None:
             return broken

@@ -194,7 +194,7 @@ class Guard:
             self._owner, self._withdrawn = client, ()
         if output.refused is not None and client is not None:
             self._answer(client, document, output.refused)
-        if output.transition is not None:
+        if output.transition is not None and not {*output.transition[:2]} <= {Mode.RAMPING, Mode.ACTIVE}:
             self._tell(*output.transition)
 
     def _send(self, output: Output) -> bool:
@@ -213,9 +213,8 @@ class Guard:
         return sent
 
     def _tell(self, before: Mode, mode: Mode, cause: Alarm | None) -> None:
-        told = (
-            {} if cause is None else {"code": cause.code, "axis": cause.axis, "text": cause.sentence(mode is Mode.OFF)}
-        )
+        off = mode is Mode.OFF
+        told = {"code": cause.code, "axis": cause.axis, "text": cause.sentence(off)} if cause else {}
         self._journal.write(
             "state",
             before=before.value,

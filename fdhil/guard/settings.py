@@ -159,9 +159,11 @@ def _check_axis(axis: AxisSettings) -> None:
         raise ValueError(f"axis {axis.name}: the offset RPDO must map 0x60B0:00 and nothing else")
     if not all(type(value) is int and value >= 1 for value in asdict(axis.limits).values()):
         raise ValueError(f"axis {axis.name}: limits must be whole increments, at least 1")
-    if not 0x180 <= axis.offset.cob_id < 0x580 or type(axis.window) is not int:
-        raise ValueError(f"axis {axis.name}: {axis.offset.cob_id:#x} is no RPDO, or the window is no integer")
-    if not 0 <= axis.setpoint_delay_cycles <= 16:
+    if not 0x180 <= axis.offset.cob_id < 0x580 or type(axis.window) is not int or axis.window < 1:
+        raise ValueError(
+            f"axis {axis.name}: {axis.offset.cob_id:#x} is no RPDO, or the window is no number of increments"
+        )
+    if type(axis.setpoint_delay_cycles) is not int or not 0 <= axis.setpoint_delay_cycles <= 16:
         raise ValueError(f"axis {axis.name}: setpoint_delay_cycles is out of range")
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from fdhil.guard.interlocks import Alarm, BusView
 from fdhil.guard.limits import Travel
@@ -44,8 +44,7 @@ class Request:
     facts: Mapping[str, object] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
-class AxisInput:
+class AxisInput(NamedTuple):
     """One axis at a SYNC: what its frames said since the SYNC before.
 
     ``target`` is the 0x607A that this SYNC latched, ``position`` and ``read_back`` what was sampled at the SYNC before
@@ -65,8 +64,7 @@ class AxisInput:
     long_frames: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Inputs:
+class Inputs(NamedTuple):
     """All that one step may know. ``sync`` False: the local timer, because no SYNC came.
 
     ``late``: the next SYNC is already there, so that nothing sent now would be in time. ``transmitted`` says whether
@@ -85,8 +83,7 @@ class Inputs:
     request: Request | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class AxisState:
+class AxisState(NamedTuple):
     """One axis' offset: ``offset`` in force or about to be, moving at ``rate``; ``sent`` the last values, newest first.
 
     ``read_back`` is what the drive last showed (None: never), ``zeros_shown`` whether it showed 0 since we send 0.
@@ -103,8 +100,7 @@ class AxisState:
     following_error: float = float("nan")
 
 
-@dataclass(frozen=True, slots=True)
-class State:
+class State(NamedTuple):
     """The guard's whole memory.
 
     ``places`` are the rows of the path that the machine may be at, best first; ``anchor`` the last row that the
@@ -131,8 +127,7 @@ class State:
     failed_run: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Output:
+class Output(NamedTuple):
     """What to do now: the offset of each axis in increments (None: send nothing), our heartbeat, what to journal.
 
     ``refused`` answers a request: None when there was none, empty when it was granted.

@@ -16,6 +16,7 @@ from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
+from typing import Any, Protocol
 
 from fdhil.errors import StoreError
 from fdhil.guard.limits import Limits, check_rows
@@ -25,6 +26,19 @@ MAGIC = b"FDHT"
 SLOT_BYTES = 32 << 20
 _HEADER = struct.Struct("<4sIQI")  # magic, length of the body, sequence, CRC-32 of length, sequence and body
 _LENGTH = struct.Struct("<I")
+
+
+class Array(Protocol):
+    """An integer array of numpy, which this room does not import."""
+
+    def tolist(self) -> Any:
+        """Return the values as a list of int."""
+
+    def __len__(self) -> int:
+        """Number of rows."""
+
+
+Column = Sequence[int] | Array
 
 
 class TableRefused(Exception):
@@ -37,8 +51,8 @@ class TableRefused(Exception):
 
 def encode(
     axes: Sequence[str],
-    demand: Mapping[str, Sequence[int]],
-    offset: Mapping[str, Sequence[int]],
+    demand: Mapping[str, Column],
+    offset: Mapping[str, Column],
     program_digest: str,
     first: int = 0,
     final: bool = True,
@@ -60,8 +74,8 @@ def encode(
     return b"".join(parts)
 
 
-def _to_int32(values: Sequence[int]) -> bytes:
-    whole = values.tolist() if hasattr(values, "tolist") else values
+def _to_int32(values: Column) -> bytes:
+    whole = values if isinstance(values, Sequence) else values.tolist()
     try:
         column = array("i", whole)
     except (TypeError, OverflowError) as error:

@@ -162,7 +162,14 @@ class Bench:
         nc: bool = True,
         drop: Sequence[int] = (),
     ) -> Output:
-        """One SYNC: drives latch and sample, the guard steps and sends, then the NC streams."""
+        """One SYNC: drives latch and sample, the guard steps and sends, then the NC streams.
+
+        ``transmitted`` False: what the guard sent in the step before did not leave.
+        """
+        if not transmitted and self.outputs and self.outputs[-1].offsets is not None:
+            self.frames.pop()
+            for drive in self.drives:
+                drive.received_offset = None
         self.tick += 1
         self.counter = self.counter % 240 + 1
         sampled = [frame for drive in self.drives for frame in drive.at_sync(self.tick)]

@@ -11,6 +11,8 @@ from pathlib import Path
 
 from tests.guard.machine import Drive, Frame
 
+ANSWER_S = 0.3
+
 
 def encode(frames: list[Frame]) -> bytes:
     """Frames as a socketcand server sends them."""
@@ -20,8 +22,8 @@ def encode(frames: list[Frame]) -> bytes:
 class Peer(threading.Thread):
     """One client is the guard; ``sent`` lists (SYNC count, COB-ID, data) of everything it put on the bus.
 
-    Each cycle: SYNC, the drives' TPDOs, then the NC's targets; when ``lockstep`` the next SYNC waits for the offset
-    frames of the guard. ``row`` runs over ``demand`` while ``playing``.
+    Each cycle: SYNC, the drives' TPDOs, then the NC's targets; while ``lockstep`` the next SYNC waits for the offset
+    frames of a guard that sent some in the cycle before. ``row`` runs over ``demand`` while ``playing``.
     """
 
     def __init__(self, demand: list[list[int]], period_s: float = 0.001) -> None:
@@ -31,11 +33,12 @@ class Peer(threading.Thread):
         self.sent: list[tuple[int, int, bytes]] = []
         self.latched: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
         self.tick = self.row = 0
-        self.playing = self.lockstep = False
-        self.syncing = True
+        self.playing = False
+        self.lockstep = self.syncing = True
         self.ended = threading.Event()
         self._inbox = b""
         self._offset_frames = 0
+        self._answered = False
         self._server = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._server.getsockname()[1]
         self._client: socket.socket | None = None
@@ -89,12 +92,13 @@ class Peer(threading.Thread):
         sync = (0x080, bytes([(self.tick - 1) % 240 + 1]))
         self._transmit(encode([sync, *sampled, *streamed]))
         before = self._offset_frames
-        lockstep = self.lockstep
-        deadline_s = time.monotonic() + (1.0 if lockstep else self.period_s)
+        waits = self.lockstep and self._answered
+        deadline_s = time.monotonic() + (ANSWER_S if waits else self.period_s)
         while time.monotonic() < deadline_s and not self.ended.is_set():
-            if lockstep and self._offset_frames - before >= len(self.drives):
-                return
+            if waits and self._offset_frames - before >= len(self.drives):
+                break
             self._listen(max(0.0, deadline_s - time.monotonic()))
+        self._answered = self._offset_frames > before
 
     def _transmit(self, text: bytes) -> None:
         assert self._client is not None

@@ -1,0 +1,185 @@
+"""OFF to ARMED: impossible unless every interlock, every fact, the token, the table and the time agree."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from fdhil.guard import core
+from fdhil.guard.interlocks import CATALOGUE, FACTS, Alarm, AxisView, BusView, Reaction, failing, not_ready
+from fdhil.guard.state import AxisInput, Inputs, Mode
+from tests.guard.machine import DIGEST, FACTS_GIVEN, Bench, arm_request, bench
+
+Change = Callable[[AxisInput], AxisInput]
+# one change per interlock, that breaks it and no other
+AXIS_CHANGES: dict[str, Change] = {
+    "StaleData": lambda axis: axis._replace(feedback_age=4.0),
+    "NmtStateWrong": lambda axis: axis._replace(nmt=4),
+    "HeartbeatLost": lambda axis: axis._replace(heartbeat_age_s=0.6),
+    "NotFollowing": lambda axis: axis._replace(statusword=(axis.statusword or 0) & ~0x1000),
+    "LimitActive": lambda axis: axis._replace(statusword=(axis.statusword or 0) | 0x0800),
+    "FollowingError": lambda axis: axis._replace(statusword=(axis.statusword or 0) | 0x2000),
+    "DriveNotEnabled": lambda axis: axis._replace(statusword=(axis.statusword or 0) & ~0x0004),
+    "NotCsp": lambda axis: axis._replace(mode=1),
+    "PdoLength": lambda axis: axis._replace(short_frames=3),
+    "TargetLost": lambda axis: axis._replace(target=None),
+}
+BUS_CHANGES: dict[str, dict[str, Any]] = {
+    "BusDown": {"state": "down"},
+    "SyncJitter": {"sync_regular": False},
+    "RxOverflow": {"lost_frames": 1},
+}
+
+
+@pytest.fixture(scope="module")
+def settled() -> tuple[Bench, Inputs]:
+    """A machine with everything good, and the inputs of its next SYNC."""
+    machine = bench(axes=("X",))
+    axes = tuple(replace(axis, heartbeat_timeout_s=0.5) for axis in machine.settings.axes)
+    machine.settings = replace(machine.settings, axes=axes)
+    machine.listener.settings = machine.settings
+    for _ in range(150):
+        machine.hear(0x701, b"\x05")
+        machine.sync()
+    machine.hear(0x701, b"\x05")
+    seen, bus = machine.listener.at_sync(bytes([machine.counter + 1]), 0.151, 0.151)
+    return machine, Inputs(True, seen, bus, path=machine.path)
+
+
+def refusals(machine: Bench, inputs: Inputs) -> set[str]:
+    """The classes of the refusal; empty when it was armed."""
+    state, output = core.step(machine.state, inputs, machine.settings)
+    assert output.refused is not None
+    assert (state.mode is Mode.ARMED) is (output.refused == ())
+    assert (output.offsets is None) is (state.mode is not Mode.ARMED)
+    return {alarm.code for alarm in output.refused}
+
+
+def test_everything_good_arms(settled: tuple[Bench, Inputs]) -> None:
+    machine, inputs = settled
+    assert refusals(machine, inputs._replace(request=arm_request())) == set()
+
+
+def test_every_vector_of_what_is_vouched_for(settled: tuple[Bench, Inputs]) -> None:
+    machine, inputs = settled
+    others = ("AuthRequired", "MainLost", "ProgramMismatch")
+    for vector in itertools.product((True, False), repeat=len(FACTS) + len(others)):
+        facts = dict(zip(FACTS, vector, strict=False))
+        token, daemon, table = vector[len(FACTS) :]
+        request = arm_request(facts=facts, token_valid=token)
+        changed = inputs._replace(request=request, main_alive=daemon, path=machine.path if table else None)
+        expected = {FACTS[fact] for fact, good in facts.items() if not good}
+        expected |= {code for code, good in zip(others, (token, daemon, table), strict=True) if not good}
+        assert refusals(machine, changed) == expected
+
+
+def test_every_vector_of_the_interlocks(settled: tuple[Bench, Inputs]) -> None:
+    machine, inputs = settled
+    codes = [*AXIS_CHANGES, *BUS_CHANGES]
+    for vector in itertools.product((True, False), repeat=len(codes)):
+        axis, bus = inputs.axes[0], inputs.bus
+        broken = {code for code, good in zip(codes, vector, strict=True) if not good}
+        for code in broken & AXIS_CHANGES.keys():
+            axis = AXIS_CHANGES[code](axis)
+        for code in broken & BUS_CHANGES.keys():
+            bus = bus._replace(**BUS_CHANGES[code])
+        told = refusals(machine, inputs._replace(axes=(axis,), bus=bus, request=arm_request()))
+        assert broken <= told
+        assert bool(told) is bool(broken)
+
+
+@pytest.mark.parametrize("value", [None, 1, "true", 0, [], {"commissioned": True}])
+def test_only_a_true_true_is_a_fact(settled: tuple[Bench, Inputs], value: object) -> None:
+    machine, inputs = settled
+    facts = {**FACTS_GIVEN, "commissioned": value}
+    assert refusals(machine, inputs._replace(request=arm_request(facts=facts))) == {"NotCommissioned"}
+
+
+@pytest.mark.parametrize("digest", ["", "another"])
+def test_another_program(settled: tuple[Bench, Inputs], digest: str) -> None:
+    machine, inputs = settled
+    assert digest != DIGEST
+    assert refusals(machine, inputs._replace(request=arm_request(program_digest=digest))) == {"ProgramMismatch"}
+
+
+def test_not_before_a_hundred_good_cycles() -> None:
+    machine = bench()
+    machine.settle(30)
+    machine.drives[0].mode = 1
+    machine.settle(11)
+    machine.drives[0].mode = 8
+    machine.until(Mode.OFF)
+    while machine.state.good_for == 0:
+        machine.sync()
+    for _ in range(98):
+        assert {alarm.code for alarm in machine.arm()} == {"NotSettled"}
+    assert machine.arm() == ()
+
+
+def test_not_twice_and_not_by_itself() -> None:
+    machine = bench()
+    machine.settle()
+    assert machine.arm() == ()
+    assert {alarm.code for alarm in machine.arm()} == {"NotOff"}
+    machine.drives[0].statusword = 0x0008
+    machine.until(Mode.OFF)
+    machine.drives[0].statusword = 0x1237
+    machine.settle(400)
+    assert machine.mode is Mode.OFF
+    assert machine.arm() == ()
+
+
+GOOD = AxisView("X", 1, 0.0, 0.0, 5, 0x1237, 8, 0.0, 32768, 819, 0, 0, True)
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        ({"feedback_age": float("nan")}, "StaleData"),
+        ({"feedback_age": float("inf")}, "StaleData"),
+        ({"feedback_age": 2}, "FeedbackGap"),
+        ({"following_error": float("nan")}, "FollowingError"),
+        ({"following_error": float("inf")}, "FollowingError"),
+        ({"following_error": -16385.0}, "FollowingError"),
+        ({"heartbeat_timeout_s": 0.5, "heartbeat_age_s": float("nan")}, "HeartbeatLost"),
+        ({"statusword": None}, "DriveNotEnabled"),
+        ({"mode": None}, "NotCsp"),
+        ({"nmt": 0}, "NmtStateWrong"),
+        ({"echo_misses": 2}, "EchoMismatch"),
+        ({"target_heard": False}, "TargetLost"),
+        ({"short_frames": 3}, "PdoLength"),
+    ],
+)
+def test_unknown_is_never_good(change: dict[str, Any], code: str) -> None:
+    bus = BusView(sync_regular=True, silent=False)
+    assert failing(bus, (GOOD,)) == ()
+    bad = failing(bus, (GOOD._replace(**change),))
+    assert code in {alarm.code for alarm in bad}
+
+
+@pytest.mark.parametrize(
+    ("change", "code"),
+    [
+        ({"read_back": 5}, "StaleOffset"),
+        ({"long_frames": 1}, "PdoMapping"),
+        ({"window": 4 * 819 - 1}, "LimitBeyondWindow"),
+    ],
+)
+def test_what_forbids_arming_alone(change: dict[str, Any], code: str) -> None:
+    assert not_ready((GOOD,)) == ()
+    assert [a.code for a in not_ready((GOOD._replace(**change),))] == [code]
+
+
+@pytest.mark.parametrize("code", CATALOGUE)
+def test_each_class_has_cause_effect_and_action(code: str) -> None:
+    alarm = Alarm(code, "X", "detail")
+    sentence = alarm.sentence()
+    assert sentence.startswith("axis X: ")
+    assert sentence.count("; ") >= 2
+    assert alarm.action.strip()
+    assert "\n" not in sentence
+    assert isinstance(alarm.reaction, Reaction)

@@ -1,0 +1,363 @@
+"""Each fault in the cut: its class once, the reaction that the matrix asks for, zero within the time to safe."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from fdhil.guard.limits import Limits
+from fdhil.guard.path import Path
+from fdhil.guard.state import ON_PATH, Mode, Request
+from tests.guard.machine import DIGEST, Bench, Drive, bench
+
+Fault = Callable[[Bench], None]
+
+
+def _drive(**changes: object) -> Fault:
+    def apply(machine: Bench) -> None:
+        for name, value in changes.items():
+            setattr(machine.drives[0], name, value)
+
+    return apply
+
+
+def _hear(cob_id: int, data: bytes) -> Fault:
+    return lambda machine: machine.hear(cob_id, data)
+
+
+def _set(**changes: object) -> Fault:
+    def apply(machine: Bench) -> None:
+        for name, value in changes.items():
+            setattr(machine, name, value)
+
+    return apply
+
+
+def _shift(machine: Bench) -> None:
+    machine.row += 3
+
+
+def _hold(machine: Bench) -> None:
+    machine.playing = False
+
+
+def _bus(state: str) -> Fault:
+    return lambda machine: machine.listener.error(state)
+
+
+def _lose(machine: Bench) -> None:
+    machine.listener.lost_frames += 1
+
+
+def _short(machine: Bench) -> None:
+    for _ in range(3):
+        machine.hear(0x181, b"\0")
+
+
+def _counter(step: int) -> Fault:
+    def apply(machine: Bench) -> None:
+        machine.counter += step
+
+    return apply
+
+
+RAMPED: dict[str, tuple[Fault, str, int]] = {
+    # row of the fault matrix: what happens, class, SYNC until it is detected
+    "A2": (_bus("passive"), "ErrorPassive", 1),
+    "A6": (_lose, "RxOverflow", 1),
+    "A9": (_counter(100), "SyncCollision", 1),
+    "A10": (_drive(answers=False), "StaleData", 5),
+    "A15": (_short, "PdoLength", 1),
+    "A19": (_hear(0x301, b"\x01\0\0\0"), "OffsetHijack", 1),
+    "A20": (_hear(0x081, b"\x30\x81"), "DriveEmergency", 1),
+    "A20 short": (_hear(0x081, b"\x30"), "DriveEmergency", 1),
+    "E6": (_shift, "Misaligned", 12),
+    "E9": (_drive(mode=1), "NotCsp", 12),
+    "E10": (_drive(statusword=0x0250), "DriveNotEnabled", 2),
+    "E11": (_drive(statusword=0x1A37), "LimitActive", 2),
+    "E12 bit": (_drive(statusword=0x3237), "FollowingError", 2),
+    "E12 error": (_drive(position_error=16500), "FollowingError", 2),
+    "E12 negative": (_drive(position_error=-16500), "FollowingError", 2),
+    "E15 ignored": (_drive(scale=0.0), "EchoMismatch", 22),
+    "E15 scaled": (_drive(scale=0.5), "EchoMismatch", 22),
+    "F8": (_hear(0x764, b"\x05"), "BusLocked", 1),
+    "F15": (_set(main_alive=False), "MainLost", 1),
+}
+FROZEN: dict[str, tuple[Fault, str]] = {
+    "A1": (_bus("off"), "BusOff"),
+    "A3": (_bus("restarted"), "BusRestarted"),
+    "A4": (_bus("down"), "BusDown"),
+    "A23": (_hear(0x701, b"\x00"), "NodeRebooted"),
+    "A24 NMT": (_hear(0x000, b"\x80\x00"), "NmtStateWrong"),
+    "A24 heartbeat": (_hear(0x701, b"\x04"), "NmtStateWrong"),
+}
+
+
+@pytest.fixture(scope="module")
+def prepared() -> Bench:
+    """Active, the offset of X near its largest and rising."""
+    machine = bench(amplitude=800)
+    machine.settle()
+    assert machine.arm() == ()
+    machine.run(30)
+    machine.play()
+    while machine.offsets[0] < 600:
+        machine.sync()
+    assert machine.mode is Mode.ACTIVE
+    machine.alarms.clear()
+    return machine
+
+
+@pytest.fixture
+def cutting(prepared: Bench) -> Bench:
+    """A machine of one's own in that state."""
+    return copy.deepcopy(prepared)
+
+
+@pytest.mark.parametrize("row", RAMPED)
+def test_fault_ramps_down_in_time(cutting: Bench, row: str) -> None:
+    fault, code, detected = RAMPED[row]
+    limits = cutting.settings.axes[0].limits
+    fault(cutting)
+    for _ in range(detected):
+        assert cutting.mode in ON_PATH
+        cutting.sync()
+        if cutting.mode is Mode.RAMP_DOWN:
+            break
+    assert cutting.mode is Mode.RAMP_DOWN
+    peak = max(map(abs, cutting.offsets))
+    taken, rising = 1, -(-limits.hard_rate // limits.acceleration)
+    while cutting.offsets != (0, 0):
+        before = max(map(abs, cutting.offsets))
+        cutting.sync()
+        taken += 1
+        assert taken <= rising or max(map(abs, cutting.offsets)) <= before
+    assert taken <= limits.ramp_cycles(peak)
+    cutting.drives = [Drive(d.node_id, queue=d.queue, offset=d.offset) for d in cutting.drives]
+    cutting.until(Mode.OFF)
+    assert cutting.state.cause is not None
+    assert cutting.state.cause.code == code
+    assert [alarm.code for alarm in cutting.alarms if alarm.reaction > 1].count(code) <= 2
+    assert {alarm.code for alarm in cutting.alarms} <= {code, "FeedbackGap"}
+
+
+@pytest.mark.parametrize("row", FROZEN)
+def test_fault_freezes_at_once_and_only_the_operator_leads_out(cutting: Bench, row: str) -> None:
+    fault, code = FROZEN[row]
+    count, held = len(cutting.frames), cutting.offsets
+    fault(cutting)
+    cutting.run(30)
+    assert cutting.mode is Mode.FROZEN
+    assert [alarm.code for alarm in cutting.alarms] == [code]
+    assert len(cutting.frames) == count
+    cutting.listener.error("active")
+    cutting.hear(0x701, b"\x05")
+    cutting.run(30)
+    assert cutting.mode is Mode.FROZEN
+    assert cutting.sync(Request("adopt")).refused != ()
+    assert cutting.sync(Request("adopt", token_valid=True)).refused == ()
+    assert abs(cutting.frames[count][1][0] - held[0]) <= cutting.settings.axes[0].limits.rate
+    cutting.until(Mode.OFF)
+    assert cutting.drives[0].offset == 0
+
+
+def test_silence_freezes_a_synchronous_offset(cutting: Bench) -> None:
+    cutting.silence()
+    assert cutting.mode is Mode.FROZEN
+    assert [alarm.code for alarm in cutting.alarms] == ["SyncLost"]
+
+
+def test_silence_ramps_an_event_driven_offset() -> None:
+    machine = bench(offset_synchronous=False)
+    machine.settle()
+    assert machine.arm() == ()
+    machine.run(30)
+    machine.play()
+    while machine.offsets[0] < 200:
+        machine.sync()
+    count = len(machine.frames)
+    for _ in range(60):
+        machine.silence()
+    assert machine.state.cause is not None
+    assert machine.state.cause.code == "SyncLost"
+    assert machine.offsets == (0, 0)
+    assert len(machine.frames) > count + 5
+    assert machine.heartbeats[-1] == machine.tick
+
+
+def test_silence_while_nothing_is_applied_is_off() -> None:
+    machine = bench()
+    machine.settle()
+    machine.arm()
+    machine.silence()
+    assert machine.mode is Mode.OFF
+    assert [alarm.code for alarm in machine.alarms] == ["SyncLost"]
+
+
+@pytest.mark.parametrize("lost", [1, 2, 9])
+def test_lost_targets_are_held_and_then_found_again(cutting: Bench, lost: int) -> None:
+    for _ in range(lost):
+        cutting.sync(nc=False)
+        cutting.row += 1  # the NC went on, its frames did not come through
+    cutting.sync()
+    assert cutting.mode is Mode.HOLD
+    cutting.run(20 + lost)
+    assert cutting.state.mode is Mode.ACTIVE
+
+
+def test_lost_feedback_is_held_and_then_forgiven(cutting: Bench) -> None:
+    cutting.sync(drop=(0x281,))
+    cutting.sync()
+    assert cutting.mode is Mode.HOLD
+    cutting.run(10)
+    assert cutting.state.mode is Mode.ACTIVE
+
+
+def test_feed_hold_keeps_the_offset_and_goes_on(cutting: Bench) -> None:
+    _hold(cutting)
+    cutting.run(12)
+    assert cutting.mode is Mode.HOLD
+    assert cutting.state.cause is not None
+    assert cutting.state.cause.code == "FeedHold"
+    held = cutting.offsets
+    cutting.run(500)
+    assert cutting.offsets == held
+    cutting.play()
+    cutting.until(Mode.ACTIVE, 40)
+
+
+def test_feed_hold_does_not_last_for_ever() -> None:
+    cutting = bench(sync_period_s=0.02)
+    cutting.settle()
+    cutting.arm()
+    cutting.run(30)
+    cutting.play()
+    cutting.run(250)
+    _hold(cutting)
+    cutting.run(490)
+    assert cutting.mode is Mode.HOLD
+    cutting.run(30)
+    cutting.until(Mode.OFF)
+    assert cutting.alarms[-1].code == "FeedHold"
+
+
+@pytest.mark.parametrize("late", [1, 3, 10])
+def test_missed_cycles_are_counted_and_made_up(cutting: Bench, late: int) -> None:
+    for _ in range(late):
+        assert cutting.sync(late=True).offsets is None
+    cutting.run(25)
+    assert cutting.mode is Mode.ACTIVE
+    assert cutting.state.missed == late
+
+
+def test_many_missed_cycles_ramp_down(cutting: Bench) -> None:
+    for _ in range(11):
+        cutting.sync(late=True)
+    cutting.until(Mode.OFF)
+    assert cutting.alarms[-1].code == "LoopOverrun"
+
+
+@pytest.mark.parametrize(("failures", "mode"), [(1, Mode.ACTIVE), (3, Mode.OFF), (6, Mode.FROZEN)])
+def test_full_transmit_queue(cutting: Bench, failures: int, mode: Mode) -> None:
+    for _ in range(failures):
+        cutting.sync(transmitted=False)
+    cutting.run(80)
+    assert cutting.mode is mode
+
+
+def test_late_frame_is_counted_not_feared(cutting: Bench) -> None:
+    for _ in range(60):
+        for drive in cutting.drives:  # the drive latches what was sent a cycle earlier
+            drive.received_offset = cutting.frames[-2][1][drive.node_id - 1]
+        cutting.sync()
+    assert cutting.mode is Mode.ACTIVE
+    assert cutting.state.axes[0].late_echoes >= 5
+
+
+def test_adopts_what_the_drive_holds_at_start() -> None:
+    machine = bench()
+    machine.drives[1].offset = machine.drives[1].received_offset = -500
+    machine.until(Mode.ADOPT)
+    assert abs(machine.frames[0][1][1] + 500) <= machine.settings.axes[1].limits.acceleration
+    machine.until(Mode.OFF)
+    assert machine.drives[1].offset == 0
+    machine.drives[1].received_offset = 77
+    machine.run(200)
+    assert machine.mode is Mode.OFF  # only at the start: later it is another's, and nothing is armed over it
+    assert "StaleOffset" in {alarm.code for alarm in machine.arm()}
+
+
+def test_drive_that_keeps_its_offset_freezes_instead_of_off(cutting: Bench) -> None:
+    cutting.sync(Request("disarm"))
+    cutting.run(5)
+    cutting.drives[0].answers = False
+    cutting.run(200)
+    assert cutting.mode is Mode.FROZEN
+    assert cutting.state.cause is not None
+    assert cutting.state.cause.code == "EchoMismatch"
+
+
+def test_wrong_start_of_the_path_is_off() -> None:
+    machine = bench()
+    machine.settle()
+    machine.arm()
+    machine.run(30)
+    machine.rest = [7, 900]
+    machine.run(3)
+    assert machine.mode in (Mode.RAMP_DOWN, Mode.OFF)
+    machine.until(Mode.OFF)
+    assert machine.alarms[-1].code == "Misaligned"
+
+
+@pytest.mark.parametrize(("row", "value", "code"), [(300, 240, "OffsetRate"), (300, 5000, "OffsetLimit")])
+def test_table_that_breaks_a_limit_at_run_time_is_left(row: int, value: int, code: str) -> None:
+    machine = bench()
+    assert machine.path is not None
+    columns = [list(column) for column in machine.path.offset]
+    columns[0][row] = value
+    machine.path = Path(0, machine.path.demand, tuple(columns), True, DIGEST, 1)
+    machine.settle()
+    machine.arm()
+    machine.run(30)
+    machine.play()
+    machine.until(Mode.ACTIVE)
+    machine.until(Mode.OFF)
+    assert machine.alarms[-1].code == code
+    sent = [offsets[0] for _, offsets in machine.frames]
+    limits = machine.settings.axes[0].limits
+    assert max(abs(b - a) for a, b in itertools.pairwise(sent)) <= limits.hard_rate
+
+
+def test_table_that_is_swapped_for_another_program_is_left(cutting: Bench) -> None:
+    assert cutting.path is not None
+    cutting.path = Path(0, cutting.path.demand, cutting.path.offset, True, "other", 2)
+    cutting.sync()
+    assert cutting.mode is Mode.RAMP_DOWN
+    assert cutting.alarms[-1].code == "ProgramMismatch"
+
+
+def test_streamed_table_that_runs_dry_is_left_in_time(cutting: Bench) -> None:
+    assert cutting.path is not None
+    path = cutting.path
+    cutting.path = Path(0, path.demand, path.offset, False, DIGEST, 2)
+    cutting.sync()
+    assert cutting.alarms[-1].code == "TableStarved"
+
+
+def test_vibrating_table_is_left_by_its_total_variation() -> None:
+    machine = bench()
+    assert machine.path is not None
+    wave = [(k // 8 % 2 * 2 - 1) * (k % 8 if k % 8 < 4 else 8 - k % 8) * 6 for k in range(600)]
+    machine.path = Path(0, machine.path.demand, (wave, machine.path.offset[1]), True, DIGEST, 1)
+    tight = Limits(819, 65, 12, 500, 1000)
+    machine.settings = replace(machine.settings, axes=tuple(replace(a, limits=tight) for a in machine.settings.axes))
+    machine.settle()
+    machine.arm()
+    machine.run(30)
+    machine.play()
+    machine.until(Mode.RAMP_DOWN)
+    assert machine.alarms[-1].code == "OffsetEnergy"

@@ -1,0 +1,176 @@
+"""What the guard hears: order, age, length and origin of frames, and the regularity of SYNC."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fdhil.guard.frames import Listener
+from tests.guard.machine import settings
+
+
+def listener(**changes: object) -> Listener:
+    return Listener(settings(("X",), **changes))  # type: ignore[arg-type] # fields of Settings
+
+
+def target(value: int) -> bytes:
+    return struct.pack("<Hi", 0x0F, value)
+
+
+def test_the_target_latched_is_the_last_before_the_sync() -> None:
+    heard = listener()
+    heard.take(0x201, target(5), 0.0)
+    heard.take(0x201, target(6), 0.0)
+    axes, _ = heard.at_sync(b"\x01", 0.0, 0.0)
+    assert axes[0].target == 6
+    axes, _ = heard.at_sync(b"\x02", 0.001, 0.001)
+    assert axes[0].target is None
+
+
+def test_ages_count_in_units_of_each_pdo() -> None:
+    heard = listener()
+    ages = []
+    for k in range(1, 40):
+        axes, _ = heard.at_sync(bytes([k]), k * 1e-3, k * 1e-3)
+        ages.append(axes[0].feedback_age)
+        if k < 20:
+            heard.take(0x181, bytes(8), 0.0)
+            heard.take(0x281, bytes(6), 0.0)
+        if k % 10 == 0 and k < 35:
+            heard.take(0x481, bytes(7), 0.0)
+    assert ages[9] > 1e6
+    assert set(ages[10:20]) == {1}
+    assert ages[20:24] == [2, 3, 4, 5]
+
+
+def test_read_back_is_told_once() -> None:
+    heard = listener()
+    heard.take(0x381, struct.pack("<ii", 0, -77), 0.0)
+    assert heard.at_sync(b"\x01", 0.0, 0.0)[0][0].read_back == -77
+    assert heard.at_sync(b"\x02", 0.0, 0.0)[0][0].read_back is None
+
+
+def test_wrong_lengths() -> None:
+    heard = listener()
+    heard.take(0x281, struct.pack("<Hi", 0x1237, 0), 0.0)
+    for _ in range(3):
+        heard.take(0x281, b"\0", 0.0)
+    axes, _ = heard.at_sync(b"\x01", 0.0, 0.0)
+    assert (axes[0].statusword, axes[0].short_frames, axes[0].long_frames) == (0x1237, 3, 0)
+    heard.take(0x281, struct.pack("<Hi", 0x0237, 0) + b"\0", 0.0)
+    axes, _ = heard.at_sync(b"\x02", 0.0, 0.0)
+    assert (axes[0].statusword, axes[0].short_frames, axes[0].long_frames) == (0x0237, 0, 1)
+
+
+@pytest.mark.parametrize(
+    ("cob_id", "data", "code"),
+    [
+        (0x301, b"\0\0\0\0", "OffsetHijack"),
+        (0x764, b"\x05", "BusLocked"),
+        (0x701, b"\x00", "NodeRebooted"),
+        (0x000, b"\x02\x01", "NmtStateWrong"),
+        (0x000, b"\x81\x00", "NmtStateWrong"),
+        (0x081, b"\x10\x23\x01\0\0\0\0\0", "DriveEmergency"),
+        (0x081, b"", "DriveEmergency"),
+        (0x000, b"\x01\x01", None),
+        (0x000, b"\x02\x05", None),
+        (0x000, b"", None),
+        (0x701, b"\x05", None),
+        (0x701, b"", None),
+        (0x705, b"\x00", None),
+        (0x081, b"\0\0\0\0\0\0\0\0", None),
+        (0x085, b"\x10\x23\0\0\0\0\0\0", None),
+    ],
+)
+def test_events(cob_id: int, data: bytes, code: str | None) -> None:
+    heard = listener()
+    heard.take(cob_id, data, 0.0)
+    assert [alarm.code for alarm in heard.alarms()] == ([code] if code else [])
+    assert heard.alarms() == ()
+
+
+def test_a_flood_stays_small() -> None:
+    heard = listener()
+    for _ in range(10_000):
+        heard.take(0x081, b"\x10\x23", 0.0)
+    assert heard.emergencies == 10_000
+    assert len(heard.alarms()) == 16
+
+
+@pytest.mark.parametrize(
+    ("counters", "codes"),
+    [
+        ([1, 2, 3], []),
+        ([239, 240, 1, 2], []),
+        ([5, 6, 1, 2], []),
+        ([1, 2, 4], ["RxOverflow"]),
+        ([1, 2, 2], ["SyncCollision"]),
+        ([10, 11, 100], ["SyncCollision"]),
+        ([10, 11, 9], ["SyncCollision"]),
+    ],
+)
+def test_sync_counter(counters: list[int], codes: list[str]) -> None:
+    heard = listener()
+    for counter in counters:
+        heard.at_sync(bytes([counter]), 0.0, 0.0)
+    assert [alarm.code for alarm in heard.alarms()] == codes
+
+
+def test_sync_without_counter_is_not_judged() -> None:
+    heard = listener()
+    for data in (b"", b"\x05", b"", b"\x09", b"\x00\x01"):
+        heard.at_sync(data, 0.0, 0.0)
+    assert heard.alarms() == ()
+
+
+def regular(intervals: list[tuple[float, float]], period_s: float = 0.001) -> list[bool]:
+    """Whether each SYNC was regular, for (stamp, arrival) intervals in monotonic time."""
+    heard = listener(clock="monotonic", sync_period_s=period_s)
+    stamp = arrival = 100.0
+    told = [heard.at_sync(b"", stamp, arrival)[1].sync_regular]
+    for by_stamp, by_arrival in intervals:
+        stamp, arrival = stamp + by_stamp, arrival + by_arrival
+        told.append(heard.at_sync(b"", stamp, arrival)[1].sync_regular)
+    return told
+
+
+def test_regular_sync() -> None:
+    assert regular([(0.001, 0.001)] * 40) == [False] + [True] * 40
+
+
+def test_a_late_reader_is_not_the_bus_fault_and_a_set_clock_neither() -> None:
+    assert all(regular([(0.001, 0.001)] * 20 + [(0.001, 0.02)] + [(0.001, 1e-5)] * 18)[1:])
+    assert all(regular([(0.001, 0.001)] * 20 + [(-3600.0, 0.001)] + [(0.001, 0.001)] * 18)[1:])
+
+
+def test_jitter_and_a_wrong_period_are_told() -> None:
+    told = regular([(0.001, 0.001)] * 10 + [(0.0031, 0.0031)] + [(0.001, 0.001)] * 3)
+    assert told[11] is False
+    assert told[12] is True
+    assert not any(regular([(0.00103, 0.00103)] * 40))
+
+
+def test_two_senders_of_one_id_are_told_after_three_cycles() -> None:
+    heard = listener()
+    for k in range(1, 5):
+        heard.take(0x281, struct.pack("<Hi", 0x1237, 0), 0.0)
+        heard.take(0x281, struct.pack("<Hi", 0x1237, 0), 0.0)  # a duplicate says nothing new
+        heard.at_sync(bytes([k]), 0.0, 0.0)
+    assert heard.alarms() == ()
+    for k in range(5, 8):
+        heard.take(0x281, struct.pack("<Hi", 0x1237, 0), 0.0)
+        heard.take(0x281, struct.pack("<Hi", 0x1237, 1), 0.0)
+        heard.at_sync(bytes([k]), 0.0, 0.0)
+    assert [alarm.code for alarm in heard.alarms()] == ["ForeignProducer"]
+
+
+@given(st.lists(st.tuples(st.integers(0, 0x7FF), st.binary(max_size=8))))
+def test_any_traffic_is_taken(frames: list[tuple[int, bytes]]) -> None:
+    heard = listener()
+    for cob_id, data in frames:
+        heard.take(cob_id, data, 0.0)
+        heard.at_sync(data[:1], 0.0, 0.0)
+    heard.in_silence(0.0, True)

@@ -1,0 +1,163 @@
+"""Limits and motion: enumerated where they are small, drawn where they are large."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fdhil.guard.limits import Limits, Travel, approach, brake, check_rows, follow, stopping, violation
+
+SMALL = Limits(offset=40, rate=9, acceleration=2, variation=400, window=100)
+
+
+def braking_way(rate: int, acceleration: int) -> int:
+    way = 0
+    while rate > acceleration:
+        rate -= acceleration
+        way += rate
+    return way
+
+
+@given(st.integers(0, 500), st.integers(1, 60))
+def test_stopping_is_the_sum_of_what_is_left(rate: int, acceleration: int) -> None:
+    assert stopping(rate, acceleration) == braking_way(rate, acceleration)
+
+
+@given(st.integers(0, 5000), st.integers(1, 60))
+def test_approach_is_the_fastest_rate_that_still_stops(distance: int, acceleration: int) -> None:
+    rate = approach(distance, acceleration)
+    assert rate + stopping(rate, acceleration) <= distance
+    assert rate + 1 + stopping(rate + 1, acceleration) > distance
+
+
+def starts(limits: Limits) -> list[tuple[int, int]]:
+    """All (offset, rate) that a frame within the limits may leave behind."""
+    return [
+        (offset, rate)
+        for offset in range(-limits.offset, limits.offset + 1)
+        for rate in range(-limits.hard_rate, limits.hard_rate + 1)
+        if abs(offset - rate) <= limits.offset and violation(limits, offset - rate, rate, offset) is None
+    ]
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        SMALL,
+        Limits(30, 1, 1, 400, 100),
+        Limits(25, 7, 1, 400, 100),
+        Limits(60, 20, 20, 400, 100),
+        Limits(164, 6, 1, 9830, 1000),
+    ],
+)
+def test_ramp_to_zero_from_every_start_keeps_every_limit_and_its_time(limits: Limits) -> None:
+    for start in starts(limits):
+        offset, rate = start
+        for _ in range(limits.ramp_cycles(offset)):
+            after = follow(limits, offset, rate, 0, 0)
+            assert violation(limits, offset, rate, after) is None, (start, offset, rate, after)
+            offset, rate = after, after - offset
+        assert (offset, rate) == (0, 0), start
+
+
+@pytest.mark.parametrize("limits", [SMALL, Limits(25, 7, 1, 400, 100)])
+def test_outward_ends_within_the_braking_time(limits: Limits) -> None:
+    rising = -(-limits.hard_rate // limits.acceleration)
+    for start in starts(limits):
+        offset, rate = start
+        for cycle in range(limits.ramp_cycles(offset)):
+            after = follow(limits, offset, rate, 0, 0)
+            crossed = start[0] * start[1] < 0  # one that runs through zero turns once behind it
+            assert crossed or cycle < rising or abs(after) <= abs(offset), (start, cycle)
+            offset, rate = after, after - offset
+
+
+def test_brake_comes_to_rest_inside_the_limits() -> None:
+    for start in starts(SMALL):
+        offset, rate = start
+        for _ in range(-(-SMALL.hard_rate // SMALL.acceleration) + 1):
+            after = brake(SMALL, offset, rate)
+            assert violation(SMALL, offset, rate, after) is None, start
+            offset, rate = after, after - offset
+        assert rate == 0, start
+
+
+@given(st.lists(st.integers(-60, 60), min_size=1, max_size=60), st.data())
+def test_following_anything_keeps_every_limit(goals: list[int], data: st.DataObject) -> None:
+    offset, rate = data.draw(st.sampled_from(starts(SMALL)))
+    before = 0
+    for goal in goals:
+        after = follow(SMALL, offset, rate, goal, goal - before)
+        assert violation(SMALL, offset, rate, after) is None
+        offset, rate, before = after, after - offset, goal
+
+
+@given(st.integers(-30, 30), st.integers(-3, 3))
+def test_a_moving_goal_is_met_and_then_kept_exactly(start: int, speed: int) -> None:
+    offset, rate, goal = start, 0, -speed * 4
+    for _ in range(60):
+        goal += speed if abs(goal + speed) < 20 else 0
+        moving = speed if abs(goal + speed) < 20 else 0
+        offset, rate = (after := follow(SMALL, offset, rate, goal, moving)), after - offset
+    assert offset == goal
+
+
+def test_an_adopted_offset_beyond_the_limit_only_shrinks() -> None:
+    offset, rate = 500, 0
+    for _ in range(200):
+        after = follow(SMALL, offset, rate, 0, 0)
+        assert violation(SMALL, offset, rate, after) is None
+        assert after <= offset
+        offset, rate = after, after - offset
+    assert offset == 0
+
+
+@pytest.mark.parametrize(
+    ("before", "rate", "offset", "expected"),
+    [
+        (40, 0, 41, "OffsetLimit"),
+        (40, 0, 40, None),
+        (0, 9, 10, None),
+        (0, 9, 11, "OffsetRate"),
+        (0, 0, 4, None),
+        (0, 0, 5, "OffsetRate"),
+        (0, -1, 4, "OffsetRate"),
+        (30, 6, 38, "OffsetLimit"),  # it could not stop before 40 any more
+        (38, -6, 30, None),
+        (-30, -6, -38, "OffsetLimit"),
+    ],
+)
+def test_each_limit_at_its_edge(before: int, rate: int, offset: int, expected: str | None) -> None:
+    assert violation(SMALL, before, rate, offset) == expected
+
+
+def test_rows_are_checked_at_every_place() -> None:
+    rows = [0] * 50
+    assert check_rows(SMALL, rows, 0, 50) is None
+    for k in range(1, 50):
+        broken = list(rows)
+        broken[k] = 5
+        assert check_rows(SMALL, broken, 0, 50) == "OffsetRate"
+        assert check_rows(SMALL, broken, 0, k) is None
+        assert check_rows(SMALL, broken, k, 50) == "OffsetRate"
+    assert check_rows(SMALL, [41, *rows], 0, 51) == "OffsetLimit"
+
+
+def test_total_variation_is_that_of_any_second() -> None:
+    swing = [(k % 4 > 1) * 2 for k in range(400)]  # 1 increment per cycle on average
+    quiet = Limits(40, 9, 2, 100, 100)
+    assert check_rows(quiet, swing, 0, 400) is None
+    assert check_rows(Limits(40, 9, 2, 97, 100), swing, 0, 400) == "OffsetEnergy"
+    pieces = [check_rows(Limits(40, 9, 2, 97, 100), swing, k, k + 10) for k in range(0, 400, 10)]
+    assert pieces[5] is None
+    assert set(pieces[11:]) == {"OffsetEnergy"}
+
+
+@given(st.lists(st.integers(-9, 9), min_size=1, max_size=350))
+def test_travel_lies_between_nine_tenths_of_a_second_and_a_whole_one(moves: list[int]) -> None:
+    travel = Travel()
+    for k, move in enumerate(moves):
+        travel = travel.add(move, 100)
+        assert sum(map(abs, moves[max(0, k - 89) : k + 1])) <= travel.total
+        assert travel.total <= sum(map(abs, moves[max(0, k - 99) : k + 1]))

@@ -1,0 +1,243 @@
+"""Sockets and settings: what may leave, what is understood, and that the settings survive their file."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import socket
+import struct
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fdhil.errors import ConfigError
+from fdhil.guard.can_socket import ERROR, BusDown, ForbiddenFrame, RawCan, SocketcandText, controller_states
+from fdhil.guard.settings import Settings, from_json, to_json
+from tests.guard.machine import settings
+
+
+@pytest.fixture
+def wire() -> Iterator[tuple[SocketcandText, socket.socket]]:
+    server = socket.create_server(("127.0.0.1", 0))
+    far = socket.create_connection(server.getsockname())
+    near, _ = server.accept()
+    server.close()
+    can = SocketcandText(near, allowed={0x301, 0x764}, wanted={0x080, 0x181, 0x301})
+    yield can, far
+    can.close()
+    far.close()
+
+
+def frames_of(can: SocketcandText, far: socket.socket, text: bytes) -> list[tuple[int, bytes]]:
+    far.sendall(text)
+    far.shutdown(socket.SHUT_WR)
+    got = []
+    try:
+        while True:
+            got += [(cob_id, data) for cob_id, data, _ in can.receive()]
+    except BusDown:
+        return got
+
+
+def test_only_our_own_frames_leave(wire: tuple[SocketcandText, socket.socket]) -> None:
+    can, far = wire
+    assert can.send(0x301, b"\x02\x0a\xff\x00")
+    assert far.recv(100) == b"< send 301 4 02 0a ff 00 >"
+    for cob_id in range(0x800):
+        if cob_id not in (0x301, 0x764):
+            with pytest.raises(ForbiddenFrame):
+                can.send(cob_id, b"\0")
+    assert can.send(0x764, b"\x05")
+    assert far.recv(100) == b"< send 764 1 05 >"
+
+
+def test_frames_of_any_spelling(wire: tuple[SocketcandText, socket.socket]) -> None:
+    text = b"< frame 181 23.424242 11 22 >< frame 080 1.5 >< frame 181 1.0 0AFF                 >"
+    text += b"< frame 7FF 1.0 00 >< frame 00000181 1.0 00 >< ok >< frame 181 x 00 >< frame 181 1.0 0 >garbage>"
+    text += b"< error 00000040 1.0 >< error zz 1.0 >< frame 301 1.0 01 >"
+    assert frames_of(*wire, text) == [
+        (0x181, b"\x11\x22"),
+        (0x080, b""),
+        (0x181, b"\x0a\xff"),
+        (ERROR, b"off"),
+        (0x301, b"\x01"),
+    ]
+
+
+def test_torn_frames_are_joined(wire: tuple[SocketcandText, socket.socket]) -> None:
+    can, far = wire
+    far.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    got = []
+    for byte in b"< frame 181 1.0 1122 >< frame 080 2.0 01 >":
+        far.sendall(bytes([byte]))
+        got += can.receive()
+    while len(got) < 2:
+        got += can.receive()
+    assert got == [(0x181, b"\x11\x22", 1.0), (0x080, b"\x01", 2.0)]
+
+
+def babble(can: SocketcandText, far: socket.socket) -> None:
+    """The hub sends what has no frame in it, for ever."""
+    far.setblocking(False)
+    while True:
+        with contextlib.suppress(BlockingIOError):
+            far.send(b"x" * 4096)
+        can.receive()
+
+
+def pour(can: SocketcandText, frames: int) -> None:
+    """Send frames that nobody reads, until the queue is full or torn."""
+    for _ in range(frames):
+        if not can.send(0x301, b"\0\0\0\0"):
+            raise BusDown("full")
+
+
+def test_a_hub_that_talks_nonsense_is_down(wire: tuple[SocketcandText, socket.socket]) -> None:
+    with pytest.raises(BusDown, match="protocol"):
+        babble(*wire)
+
+
+def test_a_closed_hub_is_down(wire: tuple[SocketcandText, socket.socket]) -> None:
+    can, far = wire
+    far.close()
+    with pytest.raises(BusDown, match="closed"):
+        can.receive()
+    with pytest.raises(BusDown):
+        pour(can, 100)
+
+
+def test_a_full_queue_is_told(wire: tuple[SocketcandText, socket.socket]) -> None:
+    with pytest.raises(BusDown, match="part of a frame|full"):
+        pour(wire[0], 1_000_000)
+
+
+class Raw:
+    """A CAN_RAW socket as far as RawCan uses it."""
+
+    def __init__(self) -> None:
+        self.options: list[tuple[int, int]] = []
+        self.waiting: list[tuple[bytes, list[tuple[int, int, bytes]]]] = []
+        self.sent: list[bytes] = []
+        self.error: OSError | None = None
+
+    def setblocking(self, flag: bool) -> None:
+        assert not flag
+
+    def setsockopt(self, level: int, option: int, value: object) -> None:
+        self.options.append((level, option))
+
+    def recvmsg(self, size: int, ancillary: int) -> tuple[bytes, list[tuple[int, int, bytes]], int, None]:
+        if not self.waiting:
+            raise self.error or BlockingIOError(11, "again")
+        data, control = self.waiting.pop(0)
+        return data, control, 0, None
+
+    def send(self, data: bytes) -> int:
+        if self.error is not None:
+            raise self.error
+        self.sent.append(data)
+        return len(data)
+
+
+def test_raw_frames_stamps_drops_and_controller_states() -> None:
+    raw = Raw()
+    can = RawCan(raw, {0x301}, {0x080})  # type: ignore[arg-type] # this host has no CAN
+    stamp = [(socket.SOL_SOCKET, 29, struct.pack("@ll", 12, 500_000))]
+    drops = [(socket.SOL_SOCKET, 40, struct.pack("<I", 7))]
+    raw.waiting = [
+        (struct.pack("=IB3x8s", 0x080, 1, b"\x05"), stamp),
+        (struct.pack("=IB3x8s", 0x80000080, 1, b"\x05"), stamp),
+        (struct.pack("=IB3x8s", 0x20000004, 8, b"\0\x20"), drops),
+        (struct.pack("=IB3x8s", 0x20000140, 8, b""), drops),
+    ]
+    assert can.receive() == [
+        (0x080, b"\x05", 12.5),
+        (ERROR, b"passive", 0.0),
+        (ERROR, b"off", 0.0),
+        (ERROR, b"restarted", 0.0),
+    ]
+    assert can.lost_frames == 7
+    assert can.send(0x301, b"\x01\0\0\0")
+    assert raw.sent == [struct.pack("=IB3x8s", 0x301, 4, b"\x01")]
+    with pytest.raises(ForbiddenFrame):
+        can.send(0x300, b"")
+    raw.error = OSError(105, "No buffer space available")
+    assert not can.send(0x301, b"")
+    raw.error = OSError(100, "Network is down")
+    with pytest.raises(BusDown, match="Network is down"):
+        can.send(0x301, b"")
+    with pytest.raises(BusDown):
+        can.receive()
+
+
+@pytest.mark.parametrize(
+    ("can_id", "detail", "states"),
+    [
+        (0x20000004, 0x04, ["warning"]),
+        (0x20000004, 0x08, ["warning"]),
+        (0x20000004, 0x10, ["passive"]),
+        (0x20000004, 0x40, ["active"]),
+        (0x20000004, 0x00, []),
+        (0x20000100, 0x00, ["restarted"]),
+        (0x20000008, 0x00, []),
+    ],
+)
+def test_controller_states(can_id: int, detail: int, states: list[str]) -> None:
+    assert controller_states(can_id, bytes([0, detail, 0, 0, 0, 0, 0, 0])) == states
+
+
+def test_settings_survive_their_file() -> None:
+    made = settings(token_sha256="ab", offset_synchronous=False)
+    assert from_json(to_json(made)) == made
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        ("schema",),
+        ("sync_period_s",),
+        ("clock",),
+        ("axes",),
+        ("axes", 0, "limits", "offset"),
+        ("axes", 0, "offset", "layout"),
+        ("axes", 0, "offset", "cob_id"),
+        ("axes", 0, "window"),
+        ("axes", 0, "setpoint_delay_cycles"),
+        ("heartbeat_s",),
+        ("transport",),
+    ],
+)
+@pytest.mark.parametrize("value", [None, -1, "x", [], 0.5, float("nan")])
+def test_wrong_settings_are_one_error(path: tuple[str | int, ...], value: object) -> None:
+    document = json.loads(to_json(settings()))
+    inner = document
+    for key in path[:-1]:
+        inner = inner[key]
+    if value == 0.5 and path[-1] in ("sync_period_s", "heartbeat_s"):
+        return
+    inner[path[-1]] = value
+    with pytest.raises(ConfigError, match="fdhil-guard"):
+        from_json(json.dumps(document))
+
+
+@given(st.text(max_size=50))
+def test_text_that_is_no_settings_file(text: str) -> None:
+    with pytest.raises(ConfigError):
+        from_json(text)
+
+
+def test_two_axes_on_one_offset_are_refused() -> None:
+    document = json.loads(to_json(settings()))
+    document["axes"][1]["offset"]["cob_id"] = document["axes"][0]["offset"]["cob_id"]
+    with pytest.raises(ConfigError, match="share"):
+        from_json(json.dumps(document))
+
+
+def test_what_may_be_sent_and_how_long_silence_is() -> None:
+    made: Settings = settings()
+    assert made.sent_ids == {0x301, 0x302, 0x764}
+    assert made.silence_s == 0.5
+    assert settings(clock="monotonic").silence_s == pytest.approx(0.004)
+    assert made.heartbeat_cycles == 20
