@@ -101,7 +101,7 @@ class Motion:
         if word & _RELATIVE:
             target += self._base
         low, high = self._dictionary.number(0x607D, 1), self._dictionary.number(0x607D, 2)
-        target = min(max(target, low), high)
+        target = float(min(max(target, low), high))
         if word & _AT_ONCE or self._target is None or (self._profile.at_rest and self._profile.now == self._target):
             self._target, self._pending = target, None
         else:
@@ -141,7 +141,7 @@ class Motion:
     def _push(self) -> None:
         values = self._dictionary.numbers
         position, offset, speed, torque, low, high = _cyclic(values)
-        acting = offset * self._faults.offset_scale
+        acting = offset * float(self._faults.offset_scale)
         self.limited = not low <= position + acting <= high
         target = min(max(position + acting, low), high) - acting if self.limited else position
         self.cyclic.push(Target(target, acting, speed * self._rad_per_increment, torque * 1e-3 * self._rated_current_a))
