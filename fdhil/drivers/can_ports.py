@@ -26,6 +26,8 @@ from fdhil.errors import ConnectError, DeviceError
 RECEIVE_BUFFER_BYTES = 8 << 20
 CONNECT_TIMEOUT_S = 3.0
 MAX_LINE_BYTES = 200
+MIN_LINE_BYTES = 18  # a frame without data: a chunk never holds more frames than the ring has room for
+MAX_CHUNK_BYTES = 1 << 18
 SO_RCVBUFFORCE = 33
 SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
@@ -66,7 +68,12 @@ class SocketCanPort:
     def __init__(self, name: str, channel: str) -> None:
         self._name = name
         self.kernel_drops = 0
-        self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        try:
+            self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        except OSError as error:
+            raise ConnectError(
+                name, f"this kernel has no CAN ({error.strerror}); use the socketcand interface or another kernel"
+            ) from None
         try:
             self._configure()
             self._socket.bind((channel,))
@@ -196,7 +203,7 @@ class SocketcandPort:
         """Read what has come in one piece and split it; the hub's stamps become host-monotonic ones."""
         self._socket.settimeout(timeout_s)
         try:
-            chunk = self._socket.recv(1 << 18)
+            chunk = self._socket.recv(min(MAX_CHUNK_BYTES, ring.room * MIN_LINE_BYTES))
         except TimeoutError:
             return
         except OSError as error:

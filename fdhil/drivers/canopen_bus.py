@@ -43,6 +43,7 @@ class CanBus:
     ) -> None:
         self.name = name
         self._port = open_port(name, settings)
+        self._ring_frames = ring_frames
         self._ring = Ring(ring_frames)
         self._transmit = transmit
         self._stopping = threading.Event()
@@ -57,7 +58,7 @@ class CanBus:
         """The receive thread: nothing but appending; its end is reported, never swallowed."""
         try:
             while not self._stopping.is_set():
-                if self._port.holds_back and self._ring.waiting > 0.5:
+                if self._port.holds_back and 2 * self._ring.room < self._ring_frames:
                     time.sleep(HOLD_BACK_S)  # what is not read waits in the hub
                     continue
                 self._port.receive(self._ring, POLL_S)

@@ -61,9 +61,9 @@ class Ring:
         return self._written + self.overflowed
 
     @property
-    def waiting(self) -> float:
-        """Share of the ring that waits to be drained, 0..1."""
-        return (self._written - self._read) / self._capacity
+    def room(self) -> int:
+        """Frames that still find room."""
+        return self._capacity - (self._written - self._read)
 
     def append(self, t_ns: int, can_id: int, data: bytes) -> None:
         """Store one frame (writer's side only); ``data`` has at most 8 bytes."""

@@ -49,6 +49,7 @@ class SyncGrid:
         self._recent_odd: list[bool] = []
         self._collision = False
         self._intervals_ns: list[int] = []
+        self._stamped_ns: int | None = None
         self.missed = 0
         self.duplicates = 0
         self.out_of_order = 0
@@ -83,7 +84,7 @@ class SyncGrid:
             return regular
         if self._last_counter is not None and counted.all():
             expected = (self._last_counter + np.arange(syncs.size)) % COUNTER_RANGE + 1
-            if np.array_equal(expected, counters):
+            if np.array_equal(expected, counters) and not self._long_pause(syncs):
                 self._finish(regular, int(counters[-1]), syncs, clean=True)
                 return regular
         ticks = [
@@ -91,6 +92,11 @@ class SyncGrid:
             for c, has, t in zip(counters, counted, syncs["t_ns"], strict=True)
         ]
         return np.array(ticks, np.int64)
+
+    def _long_pause(self, syncs: Frames) -> bool:
+        """Whether a whole turn of the counter may have gone by between two of these SYNCs."""
+        stamps = np.concatenate([[self._last_ns or syncs["t_ns"][0]], syncs["t_ns"]])
+        return self._realtime and bool(np.diff(stamps).max() > _BACKWARD * self._period_ns)
 
     def _finish(self, ticks: Int, counter: int | None, syncs: Frames, clean: bool) -> None:
         self._last_tick = int(ticks[-1])
@@ -150,8 +156,11 @@ class SyncGrid:
 
     def _collisions(self, stamps: Int) -> tuple[Notice, ...]:
         """Say once when two producers seem to send SYNC."""
-        self._intervals_ns = (self._intervals_ns + np.diff(stamps).tolist())[-_HISTORY:]
-        twice = len(self._recent_odd) == _HISTORY and sum(self._recent_odd) > _HISTORY // 2
+        if stamps.size:
+            before = [] if self._stamped_ns is None else [self._stamped_ns]
+            self._intervals_ns = (self._intervals_ns + np.diff([*before, *stamps]).tolist())[-_HISTORY:]
+            self._stamped_ns = int(stamps[-1])
+        twice = len(self._recent_odd) == _HISTORY and sum(self._recent_odd) > _HISTORY // 3
         fast = (
             self._realtime
             and self._last_counter is None

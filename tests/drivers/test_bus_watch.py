@@ -1,0 +1,161 @@
+"""The SYNC grid and what nodes say about themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fdhil.drivers.bus_decoder import BusDecoder
+from fdhil.drivers.frames import frames_of
+from fdhil.drivers.node_watch import NodeWatch, emcy_text
+from fdhil.drivers.sync_grid import SyncGrid
+from fdhil.drivers.tick_clock import TickClock
+from fdhil.records import Notice, TickTimes
+from tests.drivers.wire import Row, machine
+
+MS = 1_000_000
+
+
+def syncs(ticks: list[int], counter: bool = True, step_ns: int = MS) -> list[Row]:
+    return [(k * step_ns, 0x80, bytes([k % 240 + 1]) if counter else b"") for k in ticks]
+
+
+@given(st.lists(st.integers(1, 100), min_size=1, max_size=60), st.integers(0, 239))
+def test_missed_syncs_are_counted_by_their_counter(steps: list[int], start: int) -> None:
+    grid = SyncGrid(0.001)
+    ticks = (start + np.concatenate([[0], np.cumsum(steps)])).tolist()
+    got = np.concatenate([grid.feed(frames_of(syncs([k]))).syncs.tick for k in ticks])
+    assert got.tolist() == [k - start for k in ticks]
+    assert grid.missed == sum(steps) - len(steps)
+
+
+def test_whole_turns_of_the_counter_are_told_by_time() -> None:
+    grid = SyncGrid(0.001)
+    got = grid.feed(frames_of(syncs([0, 1, 242, 243 + 480])))
+    assert got.syncs.tick.tolist() == [0, 1, 242, 723]
+
+
+def test_a_simulated_machine_that_was_held_up_misses_nothing() -> None:
+    grid = SyncGrid(0.001)
+    rows = syncs([0, 1, 2])
+    rows += [(t + 180 * MS, i, d) for t, i, d in syncs([3, 4, 5])]
+    assert grid.feed(frames_of(rows)).syncs.tick.tolist() == [0, 1, 2, 3, 4, 5]
+    assert grid.missed == 0
+
+
+def test_duplicates_and_reordered_syncs_are_put_aside() -> None:
+    grid = SyncGrid(0.001)
+    rows = syncs([0, 1, 1, 2, 1, 3, 4])
+    assert grid.feed(frames_of(rows)).syncs.tick.tolist() == [0, 1, 2, 3, 4]
+    assert (grid.duplicates, grid.out_of_order) == (1, 1)
+
+
+def test_a_producer_that_starts_again_is_followed() -> None:
+    grid = SyncGrid(0.001)
+    rows = [*syncs(list(range(200, 205))), *[(t + 300 * MS, i, d) for t, i, d in syncs([0, 1, 2])]]
+    got = grid.feed(frames_of(rows)).syncs.tick
+    assert np.all(np.diff(got) > 0)
+    assert got.size >= 7
+
+
+def test_frames_belong_to_the_sync_before_them() -> None:
+    grid = SyncGrid(0.001)
+    frames = frames_of(
+        [(0, 0x181, b""), *syncs([5]), (2, 0x181, b""), (3, 0x181, b""), *syncs([6, 7]), (9, 0x181, b"")]
+    )
+    assert grid.feed(frames).tick.tolist() == [-1, 0, 0, 0, 1, 2, 2]
+    assert grid.feed(frames_of([(10, 0x181, b"")])).tick.tolist() == [2]
+
+
+def test_two_producers_are_noticed_once() -> None:
+    grid = SyncGrid(0.001)
+    notices: list[Notice] = []
+    for k in range(100):
+        rows = [*syncs([k]), (k * MS + 400_000, 0x80, bytes([(k + 77) % 240 + 1]))]
+        notices += grid.feed(frames_of(rows)).notices
+    assert [n.code for n in notices] == ["SyncCollision"]
+
+
+def test_two_producers_without_counters_are_noticed_by_their_rate() -> None:
+    grid = SyncGrid(0.001)
+    notices = [n for k in range(200) for n in grid.feed(frames_of(syncs([k], False, MS // 2))).notices]
+    assert [n.code for n in notices] == ["SyncCollision"]
+    simulated = SyncGrid(0.001, realtime=False)
+    assert not [n for k in range(200) for n in simulated.feed(frames_of(syncs([k], False, MS // 2))).notices]
+
+
+@pytest.mark.parametrize("data", [b"\x11\x86\x01\0\0\0\0\0", b"\x11\x86\x01", b"\x11\x86"])
+def test_an_emergency_is_told_whatever_its_length(data: bytes) -> None:
+    watch = NodeWatch("X", 1)
+    (notice,) = watch.feed(frames_of([(0, 0x81, data)]), 0)
+    assert notice.code == "DriveEmergency"
+    assert "8611 (following error" in notice.text
+    assert watch.feed(frames_of([(0, 0x81, data)] * 1000), 0) == []
+    assert watch.emcy_count == 1001
+
+
+def test_an_emergency_that_is_over_is_told() -> None:
+    watch = NodeWatch("X", 1)
+    watch.feed(frames_of([(0, 0x81, b"\x11\x86\x01")]), 0)
+    assert [n.severity for n in watch.feed(frames_of([(0, 0x81, bytes(8))]), 0)] == ["info"]
+    assert len(watch.feed(frames_of([(0, 0x81, b"\x11\x86\x01")]), 0)) == 1
+
+
+def test_a_flood_of_codes_is_bounded() -> None:
+    watch = NodeWatch("X", 1)
+    rows = [(0, 0x81, bytes([k % 256, 0x10 + k // 256])) for k in range(2000)]
+    assert len(watch.feed(frames_of(rows), 0)) <= 32
+
+
+def test_an_emergency_without_a_code_is_told_too() -> None:
+    assert len(NodeWatch("X", 1).feed(frames_of([(0, 0x81, b"")]), 0)) == 1
+
+
+def beats(times_ms: list[int], state: int = 5) -> list[Row]:
+    return [(t * MS, 0x701, bytes([state])) for t in times_ms]
+
+
+def test_a_heartbeat_that_stops_is_noticed_and_its_return_too() -> None:
+    watch = NodeWatch("X", 1)
+    assert watch.feed(frames_of(beats([0, 100, 200, 300])), 300 * MS) == []
+    assert watch.feed(frames_of([]), 650 * MS) == []
+    assert [n.code for n in watch.feed(frames_of([]), 750 * MS)] == ["HeartbeatLost"]
+    assert watch.feed(frames_of([]), 2000 * MS) == []
+    assert [n.severity for n in watch.feed(frames_of(beats([2100])), 2100 * MS)] == ["info"]
+
+
+def test_a_boot_and_a_lost_state_are_noticed() -> None:
+    watch = NodeWatch("X", 1)
+    watch.feed(frames_of(beats([0, 100])), 0)
+    assert [n.code for n in watch.feed(frames_of(beats([200], 0x7F)), 0)] == ["NmtStateWrong"]
+    assert [n.code for n in watch.feed(frames_of(beats([300], 0)), 0)] == ["NodeRebooted"]
+    assert watch.boots == 1
+
+
+@pytest.mark.parametrize(
+    ("code", "text"), [(0x8130, "heartbeat or life guarding lost"), (0x3210, "voltage"), (0x0100, "unknown")]
+)
+def test_emergency_texts(code: int, text: str) -> None:
+    assert emcy_text(code) == text
+
+
+def test_a_sync_that_stops_is_noticed_once() -> None:
+    decoder = BusDecoder("can0", machine())
+    decoder.feed(frames_of(syncs([0, 1, 2])), 2 * MS)
+    codes = [r.code for t in (500, 1100, 1200) for r in decoder.feed(frames_of([]), t * MS) if isinstance(r, Notice)]
+    assert codes == ["SyncLost"]
+    back = decoder.feed(frames_of(syncs([1300])), 1300 * MS)
+    assert [r.severity for r in back if isinstance(r, Notice)] == ["info"]
+
+
+def test_tick_clock_follows_a_producer_that_is_held_up() -> None:
+    clock = TickClock(0.001)
+    clock.add(TickTimes(np.array([0, 1, 2, 3]), np.array([0, 1, 2, 53]) * MS))
+    assert clock.bounds(2 * MS, 27 * MS + MS // 2) == pytest.approx((2.0, 2.5))
+    np.testing.assert_allclose(clock.time_ns(np.array([-1.0, 2.5, 5.0])), np.array([-1.0, 27.5, 55.0]) * MS)
+    assert clock.bounds(-MS, MS) is None
+    assert clock.bounds(60 * MS, 600 * MS) is None
+    clock.add(TickTimes(np.array([0, 1]), np.array([100, 101]) * MS))
+    assert clock.newest_tick == 1

@@ -1,0 +1,90 @@
+"""Every listed source of G0 events keeps the contract; each finds the rapids that it can know of."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fdhil import tables
+from fdhil.drivers.cia402_drive import InputSamples
+from fdhil.drivers.g0_digital_input import DigitalInputG0
+from fdhil.drivers.g0_inferred import InferredG0
+from fdhil.records import AxisSamples, Float, MoveEvent, MoveKind, frozen, frozen_ints
+from tests.drivers.wire import machine
+
+
+def samples(demand_mm: Float, first: int = 0, axis: str = "X") -> AxisSamples:
+    n = demand_mm.size
+    zeros = frozen(np.zeros(n))
+    ticks = frozen_ints(np.arange(first, first + n))
+    return AxisSamples(axis, ticks, frozen(demand_mm), zeros, zeros, zeros, None, zeros, frozen_ints(np.zeros(n)))
+
+
+def move(distance_mm: float, speed_mm_s: float, acceleration: float = 4000.0) -> Float:
+    """Trapezoid in 1 ms steps, with 200 ms of rest on both sides."""
+    ramp_s = speed_mm_s / acceleration
+    t = np.arange(0, distance_mm / speed_mm_s + ramp_s, 1e-3)
+    speed = np.clip(np.minimum(t, t[-1] - t) * acceleration, 0, speed_mm_s)
+    return np.concatenate([np.zeros(200), np.cumsum(speed) * 1e-3, np.full(200, np.sum(speed) * 1e-3)])
+
+
+def run(demand: Float, block: int = 50) -> list[tuple[MoveKind, int]]:
+    source = InferredG0("X", machine())
+    events: list[MoveEvent] = []
+    for first in range(0, demand.size, block):
+        events += source.feed(samples(demand[first : first + block], first))
+    assert {e.source for e in events} <= {"inferred"}
+    return [(e.kind, e.tick) for e in events]
+
+
+def test_a_rapid_is_known_from_where_it_began() -> None:
+    demand = move(400, 500)
+    (kind, start), (rest, end) = run(demand)
+    assert (kind, rest) == (MoveKind.RAPID, MoveKind.REST)
+    assert start == pytest.approx(200, abs=3)
+    assert end == pytest.approx(demand.size - 200, abs=3)
+
+
+def test_a_feed_is_a_feed() -> None:
+    assert [kind for kind, _ in run(move(50, 166))] == [MoveKind.FEED, MoveKind.REST]
+    assert [kind for kind, _ in run(move(500, 166))] == [MoveKind.FEED, MoveKind.REST]
+
+
+def test_a_rapid_backwards_is_one_too() -> None:
+    assert [kind for kind, _ in run(-move(400, 500))] == [MoveKind.RAPID, MoveKind.REST]
+
+
+def test_rest_is_silent_and_jitter_is_no_move() -> None:
+    rounding = 20 / 65536
+    assert run(np.tile([0.0, rounding], 300)) == []
+
+
+@settings(deadline=None, max_examples=25)
+@given(block=st.integers(1, 300))
+def test_blocks_do_not_matter(block: int) -> None:
+    demand = np.concatenate([move(300, 500), 300 - move(20, 100), 280 + move(300, 500)])
+    whole, cut = run(demand, demand.size), run(demand, block)
+    assert [kind for kind, _ in cut] == [kind for kind, _ in whole]
+    assert [tick for _, tick in cut] == [tick for _, tick in whole]
+
+
+def test_the_ncs_signal_is_taken_edge_by_edge() -> None:
+    source = DigitalInputG0("X", machine())
+    record = InputSamples("X", frozen_ints(np.arange(0, 60, 10)), frozen_ints([0, 0, 1 << 16, 1 << 16 | 1, 1, 0]))
+    assert [(e.kind, e.tick) for e in source.feed(record)] == [(MoveKind.RAPID, 10), (MoveKind.REST, 40)]
+    assert source.feed(InputSamples("Y", record.tick, record.inputs)) == []
+
+
+@pytest.mark.parametrize("name", tables.EVENT_SOURCES)
+def test_contract(name: str) -> None:
+    source = tables.load(tables.EVENT_SOURCES, name)("X", machine())
+    for record in (
+        samples(np.zeros(0)),
+        samples(np.zeros(10)),
+        samples(np.zeros(10), axis="Y"),
+        InputSamples("X", frozen_ints([]), frozen_ints([])),
+        InputSamples("Y", frozen_ints([0, 10]), frozen_ints([0, 1 << 16])),
+    ):
+        assert source.feed(record) == []

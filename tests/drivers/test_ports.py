@@ -1,0 +1,190 @@
+"""Ways onto a bus: the socketcand reader against a hub of plain sockets, its clock, and what happens at the end."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+import uuid
+from collections.abc import Callable, Iterator
+
+import can
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fdhil.config import CanBus as BusSettings
+from fdhil.drivers.can_ports import HubClock, SocketcandPort
+from fdhil.drivers.canopen_bus import CanBus
+from fdhil.drivers.frames import ERROR_FLAG, EXTENDED_FLAG, Ring
+from fdhil.errors import ConnectError, DeviceError
+
+
+class MiniHub:
+    """One bus, one client: greets, then sends what it is told; ``commands`` is what the client sent."""
+
+    def __init__(self, greetings: tuple[bytes, ...] = (b"< hi >", b"< ok >", b"< ok >")) -> None:
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.port = int(self._server.getsockname()[1])
+        self._greetings = greetings
+        self.client: socket.socket | None = None
+        self.commands = b""
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        self.client, _ = self._server.accept()
+        for number, greeting in enumerate(self._greetings):
+            if number:
+                self.commands += self.client.recv(256)
+            self.client.sendall(greeting)
+
+    def say(self, text: bytes) -> None:
+        self._thread.join()
+        assert self.client is not None
+        self.client.sendall(text)
+
+    def heard(self) -> bytes:
+        assert self.client is not None
+        self.client.settimeout(2)
+        return self.client.recv(4096)
+
+    def hang_up(self) -> None:
+        self._thread.join()
+        if self.client is not None:
+            self.client.close()
+
+    def close(self) -> None:
+        self.hang_up()
+        self._server.close()
+
+
+@pytest.fixture
+def hub() -> Iterator[MiniHub]:
+    running = MiniHub()
+    yield running
+    running.close()
+
+
+def settings_of(port: int) -> BusSettings:
+    return BusSettings(interface="socketcand", port=port)
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 10
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_frames_come_in_order_however_the_stream_is_cut(hub: MiniHub) -> None:
+    text = (
+        b"< frame 181 1700000000.000100 1122334455667788 >\n< frame 080 1700000000.000200  >"
+        b"< frame 00000123 1700000000.000300 AA BB ><error junk>< frame xyz 1 00 >< error 20000040 1700000000.0004 >"
+        b"< frame 281 1700000000.000500 01                     >"
+    )
+    with CanBus("can0", settings_of(hub.port)) as bus:
+        for k in range(0, len(text), 7):
+            hub.say(text[k : k + 7])
+        wait_for(lambda: bus.counters()["frames"] >= 5)
+        frames = bus.drain()
+    assert [hex(i) for i in frames["id"]] == [
+        "0x181", "0x80", hex(EXTENDED_FLAG | 0x123), hex(ERROR_FLAG | 0x40), "0x281",
+    ]  # fmt: skip
+    assert frames["dlc"].tolist() == [8, 0, 2, 0, 1]
+    assert int(frames["data"][0]) == 0x8877665544332211
+    assert int(frames["t_ns"][4] - frames["t_ns"][0]) <= 500_000
+
+
+def test_nothing_is_sent_unless_the_bus_was_opened_for_it(hub: MiniHub) -> None:
+    with CanBus("can0", settings_of(hub.port)) as bus, pytest.raises(DeviceError, match="listen only"):
+        bus.send(0x301, b"\x01")
+
+
+def test_what_is_sent_is_socketcand(hub: MiniHub) -> None:
+    with CanBus("can0", settings_of(hub.port), transmit=True) as bus:
+        bus.send(0x301, b"\x01\xff")
+        bus.send(0x80, b"")
+        wait_for(lambda: hub.commands.count(b">") >= 2)
+        said = hub.heard()
+    assert hub.commands == b"< open can0 >< rawmode >"
+    assert said.startswith(b"< send 301 2 1 ff >")
+
+
+def test_a_hub_that_hangs_up_is_an_end_not_silence(hub: MiniHub) -> None:
+    with CanBus("can0", settings_of(hub.port)) as bus:
+        hub.hang_up()
+        wait_for(lambda: bus.ended is not None)
+        assert bus.ended == "the CAN hub ended the connection"
+
+
+@pytest.mark.parametrize("greetings", [(b"HTTP/1.1 400 Bad Request>",), (b"< hi >", b"< error no such bus >")])
+def test_what_is_no_hub_is_said(greetings: tuple[bytes, ...]) -> None:
+    hub = MiniHub(greetings)
+    with pytest.raises(ConnectError, match="check host, port and channel"):
+        CanBus("can0", settings_of(hub.port))
+    hub.close()
+
+
+def test_nobody_there_is_said() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = int(server.getsockname()[1])
+    with pytest.raises(ConnectError, match="cannot be reached"):
+        CanBus("can0", settings_of(port))
+
+
+def test_an_interface_that_is_not_there_is_said() -> None:
+    with pytest.raises(ConnectError, match=r"ip link|no CAN"):
+        CanBus("can9", BusSettings(interface="socketcan", channel="nocan9"))
+
+
+def test_a_full_ring_holds_the_hub_back(hub: MiniHub) -> None:
+    line = b"< frame 181 1700000000.000100 1122334455667788 >"
+    with CanBus("can0", settings_of(hub.port), ring_frames=64) as bus:
+        sender = threading.Thread(target=hub.say, args=(line * 20_000,))
+        sender.start()
+        got = 0
+        while got < 20_000:
+            got += bus.drain().size
+            time.sleep(0.0005)
+        sender.join()
+        assert bus.counters()["lost"] == 0
+
+
+def test_virtual_bus_gives_what_it_got() -> None:
+    channel = uuid.uuid4().hex
+    with can.Bus(interface="virtual", channel=channel) as other:
+        with CanBus("can0", BusSettings(interface="virtual", channel=channel), transmit=True) as bus:
+            other.send(can.Message(arbitration_id=0x181, data=[1, 2], is_extended_id=False))
+            wait_for(lambda: bus.counters()["frames"] == 1)
+            (frame,) = bus.drain()
+            bus.send(0x601, b"\x40")
+        message = other.recv(2)
+    assert (int(frame["id"]), int(frame["data"])) == (0x181, 0x0201)
+    assert message is not None
+    assert message.arbitration_id == 0x601
+
+
+def test_hub_clock_takes_the_quickest_reading() -> None:
+    clock = HubClock()
+
+    def ahead(stamp_s: float, now_s: float) -> float | None:
+        return clock.ahead_s([f"< frame 181 {stamp_s:.6f} 00"], int(now_s * 1e9))
+
+    assert ahead(1000.0, 10.005) == pytest.approx(989.995)
+    assert ahead(1000.1, 10.101) == pytest.approx(989.999)
+    assert ahead(1000.2, 10.250) == pytest.approx(989.999, abs=1e-6)
+    assert ahead(500.0, 10.3) == pytest.approx(489.7)  # the hub's clock was set
+    assert clock.ahead_s(["rubbish"], 0) == pytest.approx(489.7)
+
+
+@settings(max_examples=60)
+@given(st.lists(st.binary(max_size=40), max_size=6))
+def test_rubbish_is_counted_not_raised(pieces: list[bytes]) -> None:
+    port = SocketcandPort.__new__(SocketcandPort)
+    port._rest, port._clock, port.malformed = b"", HubClock(), 0
+    ring = Ring(64)
+    for piece in pieces:
+        port._split(piece + b" >", ring, 1)
+    port._split(b"< frame 181 1.0 01 >", ring, 1)
+    assert int(ring.drain()["id"][-1]) == 0x181
