@@ -159,9 +159,20 @@ def shuttle(
     return np.concatenate([[0.0], np.cumsum(rates) * dt])
 
 
-def run(plant: Plant, demand: Array, pitch: float = 0.02, load: Array | None = None, dt_s: float = 1e-3) -> Signals:
-    """Simulate the closed loop; rows every ``dt_s`` (a multiple of 31.25 us); ``load`` (n,) N.m per cycle."""
-    demand = np.round(demand / pitch / INCREMENT) * INCREMENT * pitch
+def run(
+    plant: Plant,
+    demand: Array,
+    pitch: float = 0.02,
+    load: Array | None = None,
+    dt_s: float = 1e-3,
+    quantised: bool = False,
+) -> Signals:
+    """Simulate the closed loop; rows every ``dt_s`` (a multiple of 31.25 us); ``load`` (n,) N.m per cycle.
+
+    ``quantised`` set-points, as a bus carries them, make the speed feed-forward and so the voltage rough.
+    """
+    if quantised:
+        demand = np.round(demand / pitch / INCREMENT) * INCREMENT * pitch
     load = np.zeros(demand.size) if load is None else load
     every = round(dt_s / STEP_S)
     mean_u, now_u, current, speed, position = _run(plant.vector(), pitch, demand, load, every)

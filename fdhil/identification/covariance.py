@@ -1,48 +1,101 @@
-"""Covariances that stay honest when residuals are coloured."""
+"""Covariances that stay honest when residuals are coloured and regressors are noisy."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.signal import fftconvolve
 
 from fdhil.records import Float
 
 
-def long_run(scores: Float, lengths: Sequence[int], lags: int) -> Float:
-    """Return the long-run covariance sum (k, k) of ``scores`` (m, k), windows of ``lengths`` stacked (Parzen)."""
-    total = np.zeros((scores.shape[1], scores.shape[1]))
-    start = 0
-    for length in lengths:
-        s = scores[start : start + length]
-        start += length
-        total += s.T @ s
-        for lag in range(1, min(lags, length - 1) + 1):
-            x = lag / (lags + 1)
-            weight = 1 - 6 * x * x + 6 * x**3 if x <= 0.5 else 2 * (1 - x) ** 3
-            cross = s[lag:].T @ s[:-lag]
-            total += weight * (cross + cross.T)
-    return total
+def coloured_meat(blocks: Sequence[Float], gammas: Sequence[Sequence[Float]], lengths: Sequence[int]) -> Float:
+    """Return the covariance (k, k) of the stacked scores sum_t phi_t e_t of regressions over the same rows.
+
+    ``blocks`` are regressors (m, k_j) in windows of ``lengths``; ``gammas[a][b]`` (2 H + 1,) is the covariance of
+    residual a at t with residual b at t + lag, for lags -H to H. The residuals are sensor noise through known filters,
+    so their covariance is known; estimating it from the residuals leaks power that a derivative does not have.
+    """
+    sizes = np.cumsum([0, *(b.shape[1] for b in blocks)])
+    meat = np.zeros((sizes[-1], sizes[-1]))
+    for start, stop in _spans(lengths):
+        for a, left in enumerate(blocks):
+            for b, right in enumerate(blocks):
+                pulled = fftconvolve(right[start:stop], gammas[a][b][::-1, None], mode="full", axes=0)
+                half = gammas[a][b].size // 2
+                meat[sizes[a] : sizes[a + 1], sizes[b] : sizes[b + 1]] += (
+                    left[start:stop].T @ pulled[half : half + stop - start]
+                )
+    return meat
 
 
-def sandwich(
-    electrical: Float, mechanical: Float, residual_u: Float, residual_t: Float, lengths: Sequence[int], lags: int
+def residual_gammas(theta: Float, impulse: Float, slope: Float, noise: Float) -> list[list[Float]]:
+    """Return the covariances of the residuals of [5] (V) and of K times [6] (N.m) that sensor noise causes.
+
+    ``theta`` is [L, R, K, Jt, ft, Cd]; ``impulse`` and ``slope`` are what the low-pass, and the operator after it, make
+    of one noisy sample; ``noise`` (3,) are the variances of voltage, current and speed.
+    """
+    none = np.zeros_like(impulse)
+    electrical = (impulse, -(theta[0] * slope + theta[1] * impulse), -theta[2] * impulse)
+    mechanical = (none, theta[2] * impulse, -(theta[3] * slope + theta[4] * impulse))
+    answers = (electrical, mechanical)
+    return [
+        [
+            np.sum([v * np.correlate(q, p, "full") for v, p, q in zip(noise, one, other, strict=True)], axis=0)
+            for other in answers
+        ]
+        for one in answers
+    ]
+
+
+def _spans(lengths: Sequence[int]) -> list[tuple[int, int]]:
+    stops = np.cumsum(lengths).tolist()
+    return list(zip([0, *stops[:-1]], stops, strict=True))
+
+
+def two_step(
+    electrical: Float, mechanical: Float, residuals: Sequence[Float], gammas: list[list[Float]], lengths: Sequence[int]
 ) -> Float:
     """Return the covariance (6, 6) of [L, R, K, Jt, ft, Cd] fitted in two steps.
 
     ``electrical`` (m, 4) is [u, Di, i, w], ``mechanical`` (m, 4) is [i, Dw, w, sign w]; the second step uses K of the
-    first, so the scores of both are stacked, and their coloured residuals summed over ``lags``.
+    first, so the scores of both are stacked. Where residuals are larger than noise explains, the covariance grows.
     """
     phi_1, phi_2 = electrical[:, 1:], mechanical[:, 1:]
-    scores = np.column_stack([phi_1 * residual_u[:, None], phi_2 * residual_t[:, None]])
+    expected = [gammas[k][k][gammas[k][k].size // 2] for k in (0, 1)]
+    excess = [max(1.0, float(np.mean(e * e) / g)) for e, g in zip(residuals, expected, strict=True)]
+    scaled = [[gammas[a][b] * np.sqrt(excess[a] * excess[b]) for b in (0, 1)] for a in (0, 1)]
+    bread = _bread(phi_1, phi_2, mechanical[:, 0])
+    covariance: Float = bread @ coloured_meat([phi_1, phi_2], scaled, lengths) @ bread.T
+    return covariance
+
+
+def _bread(phi_1: Float, phi_2: Float, current: Float) -> Float:
+    """Return the inverse (6, 6) of the stacked normal equations."""
     slope = np.zeros((6, 6))
     slope[:3, :3] = phi_1.T @ phi_1
     slope[3:, 3:] = phi_2.T @ phi_2
-    slope[3:, 2] = -phi_2.T @ mechanical[:, 0]
+    slope[3:, 2] = -phi_2.T @ current
     scale = np.sqrt(np.abs(np.diag(slope)))
     scale[scale == 0] = 1.0
-    bread = np.linalg.pinv(slope / np.outer(scale, scale))
-    freedom = phi_1.shape[0] / max(1.0, phi_1.shape[0] - 3.0 * lags)
-    meat = long_run(scores / scale, lengths, lags) * freedom
-    covariance: Float = bread @ meat @ bread.T / np.outer(scale, scale)
-    return covariance
+    inverse: Float = np.linalg.pinv(slope / np.outer(scale, scale)) / np.outer(scale, scale)
+    return inverse
+
+
+def attenuation(
+    electrical: Float, mechanical: Float, theta: Float, impulse: Float, slope: Float, noise: Float
+) -> Float:
+    """Return the bias (6,) of [L, R, K, Jt, ft, Cd] that noise on the regressors causes, to first order.
+
+    ``impulse``, ``slope`` and ``noise`` (3,) as in :func:`residual_gammas`. The paper's method does not correct it, so
+    its interval must hold it.
+    """
+    rows = electrical.shape[0]
+    ff, dd, df = (float(a @ b) * rows for a, b in ((impulse, impulse), (slope, slope), (slope, impulse)))
+    pull = np.zeros((6, 6))
+    pull[:2, :2] = noise[1] * np.array([[dd, df], [df, ff]])
+    pull[2, 2] = noise[2] * ff
+    pull[3:5, 3:5] = noise[2] * np.array([[dd, df], [df, ff]])
+    bias: Float = -_bread(electrical[:, 1:], mechanical[:, 1:], mechanical[:, 0]) @ pull @ theta
+    return bias

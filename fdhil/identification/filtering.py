@@ -29,11 +29,19 @@ def zero_phase(values: Float, lowpass_hz: float, dt_s: float) -> Float:
 
 
 @lru_cache(maxsize=32)
-def reach(lowpass_hz: float, dt_s: float) -> int:
-    """Return how many rows to either side the filter mixes into one: beyond it lies 1 % of its impulse response."""
+def impulse_response(lowpass_hz: float, dt_s: float) -> Float:
+    """Return what the low-pass makes of one sample, centred (odd length)."""
     half = max(8, round(6 / lowpass_hz / dt_s))
     impulse = np.zeros(2 * half + 1)
     impulse[half] = 1.0
-    answer = np.abs(sosfiltfilt(_sections(lowpass_hz, dt_s), impulse, padlen=0))
+    answer: Float = sosfiltfilt(_sections(lowpass_hz, dt_s), impulse, padlen=0)
+    return answer
+
+
+@lru_cache(maxsize=32)
+def reach(lowpass_hz: float, dt_s: float) -> int:
+    """Return how many rows to either side the filter mixes into one: beyond it lies 1 % of its impulse response."""
+    answer = np.abs(impulse_response(lowpass_hz, dt_s))
+    half = answer.size // 2
     beyond = answer[half:][::-1].cumsum()[::-1] * 2 - answer[half]
     return int(np.argmax(beyond <= REACH_SHARE * answer.sum()))

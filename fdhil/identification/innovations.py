@@ -84,13 +84,17 @@ def _residuals_plain(
     observed: Float,
     mean_v: Float,
     rise_v: Float,
+    emf: float,
     load: Float,
     current: Float,
     speed: Float,
     gains: Float,
     white: Float,
 ) -> Float:
-    """Return the whitened innovations (n, 2); 0 where nothing was measured."""
+    """Return the whitened innovations (n, 2); 0 where nothing was measured.
+
+    ``emf`` (V.s) times the speed's rise over an interval is added to ``rise_v``.
+    """
     n = mode.size
     out = np.zeros((n, 2))
     free = a.copy()
@@ -113,9 +117,10 @@ def _residuals_plain(
             i = phi_u[0, 0] * i + phi_u[0, 1] * w + mean_u[0, 0] * u + ramp_u[0, 0] * r
             continue
         f = -lever[1] * (friction * mode[k] + load[k])
-        i_next = phi_m[0, 0] * i + phi_m[0, 1] * w + mean_m[0, 0] * u + mean_m[0, 1] * f + ramp_m[0, 0] * r
-        w = phi_m[1, 0] * i + phi_m[1, 1] * w + mean_m[1, 0] * u + mean_m[1, 1] * f + ramp_m[1, 0] * r
-        i = i_next
+        w_next = phi_m[1, 0] * i + phi_m[1, 1] * w + mean_m[1, 0] * u + mean_m[1, 1] * f
+        r += lever[0] * emf * (w_next - w)
+        i = phi_m[0, 0] * i + phi_m[0, 1] * w + mean_m[0, 0] * u + mean_m[0, 1] * f + ramp_m[0, 0] * r
+        w = w_next + ramp_m[1, 0] * r
     return out
 
 
@@ -151,9 +156,12 @@ def innovations(
 ) -> Float:
     """Return the whitened innovations (n, 2) of [current, speed]: white and of unit variance when the model is right.
 
-    ``load_nm`` (n,) is a torque against the positive direction over each interval (none when left out).
+    ``load_nm`` (n,) is a torque against the positive direction over each interval (none when left out). Of the course
+    of an interval mean within its sample only the back-EMF's ramp is certain: what the current regulator adds depends
+    on the drive, and to take it from neighbouring means biases L.
     """
     lever = np.array([1 / theta[1], 1 / theta[3]])
+    means = motion.voltage_sampling == "interval_mean"
     return _residuals(
         matrix_of(theta),
         lever,
@@ -162,7 +170,8 @@ def innovations(
         motion.mode,
         motion.observed,
         motion.delayed(delay_s),
-        motion.voltage_rise,
+        np.zeros(motion.n) if means else motion.voltage_rise,
+        float(theta[2]) if means else 0.0,
         np.zeros(motion.n) if load_nm is None else load_nm,
         motion.current,
         motion.speed,

@@ -11,7 +11,7 @@ from scipy.ndimage import binary_erosion, uniform_filter1d
 
 from fdhil.identification.windows import RUN_SHARE, carried, noise_of
 from fdhil.model.feed_drive import interval_shape
-from fdhil.records import Bool, Float, Window
+from fdhil.records import Bool, Float, VoltageSampling, Window
 
 UNKNOWN = 0  # stuck, reversing or about to move: the friction torque is not known
 # what the model can explain at best, as a share of a signal's peak: the voltage's course within a sample is not known
@@ -53,6 +53,7 @@ class Motion:
     mode: Modes
     noise: Noise
     speed_walk: float
+    voltage_sampling: VoltageSampling = "interval_mean"
 
     @property
     def n(self) -> int:
@@ -109,6 +110,7 @@ def prepare(window: Window) -> Motion:
         mode=mode,
         noise=noise_levels(window),
         speed_walk=_largest_step(speed, window.dt_s),
+        voltage_sampling=window.voltage_sampling,
     )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from fdhil.identification.estimators.maximum_likelihood import Fit
-from fdhil.identification.motion import noise_levels
+from fdhil.identification.motion import UNKNOWN, Motion, noise_levels
 from fdhil.identification.windows import carried, smooth
 from fdhil.records import Reason, Window
 from fdhil.validation.plausibility import at_rest
@@ -18,6 +18,9 @@ LEAST_SPEED = 0.004  # of the rapid speed
 LEAST_VOLTAGE = 0.01  # of the peak voltage
 HOLDING_SHARE = 1.15  # a drive at rest may hold as much as dry friction drags, and no more
 LEAST_TORQUE = 0.01
+LEAST_BREAKAWAY = 0.02  # of the peak torque
+AFTER_S = 0.015
+LONGEST_BREAKAWAY_S = 0.060
 
 
 def rest_faults(window: Window, fit: Fit) -> Iterator[Reason]:
@@ -32,6 +35,52 @@ def rest_faults(window: Window, fit: Fit) -> Iterator[Reason]:
         text = f"speed reads {speed:+.3g} rad/s at standstill, limit {limit:.2g}"
         yield Reason("CalibrationSuspect", text, "set the zero of the speed sensor at standstill")
     yield from _holding(window, fit, rows)
+    yield from breakaway(window, fit)
+
+
+def breakaway(window: Window, fit: Fit) -> Iterator[Reason]:
+    """Yield a reason where the move takes more impulse to begin than [2] says: friction is higher at low speed.
+
+    From rest, Jt w(t) is the integral of what K i exceeds dry friction by, less viscous friction. The current's noise
+    averages out in that integral, so the speed it predicts for the first surely moving rows is sharp.
+    """
+    motion, theta = fit.problem.motions[0], fit.theta
+    sure = np.flatnonzero(np.abs(motion.mode) == 1)
+    if sure.size < 2 * AFTER_S / window.dt_s:
+        return
+    begin, side = int(sure[0]), int(motion.mode[sure[0]])
+    end = begin + round(AFTER_S / window.dt_s)
+    still = _rest_before(motion, begin, fit.problem.noises[0].speed_rad_s)
+    if still is None:
+        return
+    torque = side * theta[2] * motion.current[still:end]
+    speed = side * motion.speed[still:end]
+    net = np.where(np.arange(still, end) < begin, np.maximum(torque - theta[5], 0.0), torque - theta[5])
+    net = net - theta[4] * np.maximum(speed, 0.0)
+    predicted = np.concatenate([[0.0], np.cumsum((net[1:] + net[:-1]) / 2)]) * window.dt_s / theta[3]
+    late = predicted[begin - still :] - speed[begin - still :]
+    spread = fit.problem.noises[0].speed_rad_s / np.sqrt(late.size)
+    lasted = (begin - still) * window.dt_s
+    excess = float(np.mean(late)) * theta[3] / lasted
+    sure_by = SURE * spread * theta[3] / lasted
+    peak = theta[2] * float(np.abs(motion.current).max())
+    if abs(excess) > sure_by + LEAST_BREAKAWAY * peak:
+        text = (
+            f"beginning to move takes {excess:+.3g} N.m more over {1e3 * lasted:.0f} ms than friction drags (Stribeck)"
+        )
+        yield Reason("ValidationFailed", text, "lubricate the slide-way, or check for a clamp or backlash")
+
+
+def _rest_before(motion: Motion, begin: int, noise: float) -> int | None:
+    """Return the last row surely at rest before the move begins; None where there is no such rest."""
+    rows = max(8, round(0.010 / motion.dt_s))
+    reach = round(LONGEST_BREAKAWAY_S / motion.dt_s)
+    limit = 4 * noise / np.sqrt(rows)
+    for row in range(begin, max(rows, begin - reach), -1):
+        before = motion.speed[row - rows : row]
+        if abs(float(before.mean())) < limit and (motion.mode[row - rows : row] == UNKNOWN).all():
+            return row - rows // 2
+    return None
 
 
 def _holding(window: Window, fit: Fit, rows: np.ndarray[tuple[int], np.dtype[np.intp]]) -> Iterator[Reason]:

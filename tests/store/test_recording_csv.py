@@ -15,10 +15,9 @@ from studies import bench
 COLUMNS = ("voltage_V", "current_A", "speed_rad_per_s", "position_m", "demand_m")
 
 
-def _text(rows: int = 40, dt: float = 0.001, **headers: str) -> str:
-    return bench.table_text(
-        dt, {name: np.linspace(0.0, rows * 0.5, rows, endpoint=False) for name in COLUMNS}, **headers
-    )
+def _text(rows: int = 40, **headers: str) -> str:
+    values = np.linspace(0.0, rows * 0.5, rows, endpoint=False)
+    return bench.table_text(0.001, dict.fromkeys(COLUMNS, values), **headers)
 
 
 def _without(text: str, start: str) -> str:

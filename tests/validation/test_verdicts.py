@@ -155,6 +155,6 @@ def test_nothing_pooled_from_nothing() -> None:
 def test_a_load_that_changed_between_the_windows_is_seen() -> None:
     light = windows(0.003)[0]
     heavy = windows(0.003, plant=bench.Plant(Jt=0.085))[0]
-    estimate, verdict = pool([analyse(light, SETTINGS), analyse(heavy, SETTINGS)], SETTINGS)
+    _, verdict = pool([analyse(light, SETTINGS), analyse(heavy, SETTINGS)], SETTINGS)
     assert not verdict.accepted
     assert [reason.code for reason in verdict.reasons] == ["LoadChanged"]

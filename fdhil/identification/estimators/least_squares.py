@@ -14,11 +14,11 @@ import numpy as np
 from scipy.ndimage import binary_erosion
 
 from fdhil.config import Identification
-from fdhil.identification.covariance import sandwich
+from fdhil.identification.covariance import attenuation, residual_gammas, two_step
 from fdhil.identification.derivatives import OPERATORS, ZERO_FORCING_1, Operator, derivative
-from fdhil.identification.filtering import reach, zero_phase
+from fdhil.identification.filtering import impulse_response, reach, zero_phase
 from fdhil.identification.identifiability import empty_estimate, judge
-from fdhil.identification.motion import surely_moving
+from fdhil.identification.motion import noise_levels, surely_moving
 from fdhil.identification.windows import carried
 from fdhil.records import PARAMETERS, Bool, Estimate, Float, Reason, Result, Window
 
@@ -96,33 +96,48 @@ def estimate_with(windows: Sequence[Window], settings: Identification, operator:
         return empty_estimate(
             NAME, Result.NOT_FINITE, Reason("NotFinite", "a filtered signal is not finite", "record again")
         )
-    return _fit(parts, electrical, mechanical, settings, windows[0].dt_s)
+    noise = np.mean([noise_levels(w).vector() ** 2 for w in windows], axis=0)
+    return _fit(parts, noise, settings, windows[0].dt_s, OPERATORS[operator])
 
 
 def _fit(
-    parts: Sequence[tuple[Float, Float]], electrical: Float, mechanical: Float, settings: Identification, dt: float
+    parts: Sequence[tuple[Float, Float]], noise: Float, settings: Identification, dt: float, operator: Operator
 ) -> Estimate:
-    first, conditions_1 = solve(electrical[:, 1:], electrical[:, 0])
-    inductance, resistance, constant = first
-    torque = mechanical[:, 0] * constant
-    second, conditions_2 = solve(mechanical[:, 1:], torque)
-    values = np.array([resistance, inductance, constant, *second])
+    """Fit [5], then [6] with its K; ``noise`` (3,) are the variances of voltage, current, speed."""
+    electrical, mechanical = (np.vstack([p[k] for p in parts]) for k in (0, 1))
+    first, condition_1 = solve(electrical[:, 1:], electrical[:, 0])
+    torque = mechanical[:, 0] * first[2]
+    second, condition_2 = solve(mechanical[:, 1:], torque)
+    theta = np.concatenate([first, second])
     residual_u = electrical[:, 0] - electrical[:, 1:] @ first
     residual_t = torque - mechanical[:, 1:] @ second
     lengths = [p[0].shape[0] for p in parts]
-    covariance = sandwich(electrical, mechanical, residual_u, residual_t, lengths, round(2 / settings.lowpass_hz / dt))
+    impulse = impulse_response(settings.lowpass_hz, dt)
+    slope = np.nan_to_num(derivative(impulse, dt, operator))
+    noise = np.append(_voltage_variance(residual_u, theta, impulse, slope, noise), noise[1:])
+    gammas = residual_gammas(theta, impulse, slope, noise)
+    covariance = two_step(electrical, mechanical, (residual_u, residual_t), gammas, lengths)
+    bias = attenuation(electrical, mechanical, theta, impulse, slope, noise)
+    covariance += np.outer(bias, bias)
     order = [1, 0, 2, 3, 4, 5]  # from L, R, K to R, L, K
     return judge(
         Estimate(
             method=NAME,
             names=PARAMETERS,
-            values=values,
+            values=theta[order],
             covariance=covariance[np.ix_(order, order)],
-            residuals={"electrical": residual_u, "mechanical": residual_t / constant if constant else residual_t},
+            residuals={"electrical": residual_u, "mechanical": residual_t / first[2] if first[2] else residual_t},
             result=Result.OK,
         ),
-        max(conditions_1, conditions_2),
+        max(condition_1, condition_2),
     )
+
+
+def _voltage_variance(residual_u: Float, theta: Float, impulse: Float, slope: Float, noise: Float) -> float:
+    """Return the variance of the voltage's noise as the residual of [5] shows it: the drive's own ripple is none."""
+    silent = np.append(0.0, noise[1:])
+    others = residual_gammas(theta, impulse, slope, silent)[0][0].max()
+    return max(float(np.mean(residual_u**2) - others) / float(impulse @ impulse), 1e-3 * float(noise[0]))
 
 
 def raw_values(windows: Sequence[Window], settings: Identification) -> Float | None:

@@ -16,11 +16,11 @@ import numpy as np
 from fdhil.config import Identification
 from fdhil.identification.delay import coarse_delay
 from fdhil.identification.estimators import least_squares
-from fdhil.identification.identifiability import empty_estimate, judge
+from fdhil.identification.identifiability import judge
 from fdhil.identification.innovations import Gains, gains_of, innovations
 from fdhil.identification.motion import Motion, Noise, prepare
 from fdhil.identification.noise import fit_noise
-from fdhil.records import PARAMETERS, Estimate, Float, Reason, Result, Window
+from fdhil.records import PARAMETERS, Estimate, Float, Result, Window
 
 NAME = "maximum_likelihood"
 RENEWALS = 3
