@@ -7,6 +7,9 @@ as long as blocks without a new motion code repeat it.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
 from fdhil.errors import ProgramError
 from fdhil.program.modal import AXES, Modal
 from fdhil.program.motions import PLANE_AXES
@@ -16,31 +19,46 @@ from fdhil.program.words import Block
 _CLEARANCE_MM = 0.254  # by which a peck stays clear of where the drill was
 _WITH_DWELL = (820, 860, 880, 890)
 _PECKING = (730, 830)
-_TAPPING = (740, 840)
-_KEPT = "rlpqk"
+_TAPPING = {740: -1, 840: 1}  # how the spindle must turn
+_BACK_BORING = 870
+_SPINNING = (860, 870, 880)
+_KEPT = "rpqijk"
+_MEANING = {"r": "its clearance level", "q": "its peck", "p": "its dwell", "i": "how far beside the hole it enters",
+            "j": "how far beside the hole it enters", "k": "the level to bore up to"}  # fmt: skip
 
 
-def cycle(machine: Machine, block: Block, kept: dict[str, float]) -> None:
-    """Order one canned-cycle block; ``kept`` holds the cycle's words from block to block."""
+@dataclass(slots=True)
+class Series:
+    """What a series of cycle blocks shares: its words in mm, and the level at which it began."""
+
+    words: dict[str, float] = field(default_factory=dict)
+    began: float | None = None
+
+
+def cycle(machine: Machine, block: Block, series: Series, fresh: bool) -> None:
+    """Order one canned-cycle block of a series; ``fresh`` tells that another motion was in force before it."""
     modal = machine.modal
-    new = "motion" in block.g
-    words = _words(modal, block, kept, new)
-    _check(modal, block, words)
-    first, second, normal = PLANE_AXES[modal.plane_name]
+    words = _words(modal, block, series.words)
+    _check(modal, block, block.words if fresh else words, words)
     repeats = round(block.words.get("l", 1.0))
     if "l" in block.words and (repeats < 1 or abs(block.words["l"] - repeats) > 1e-4):
         raise block.fault("l", "is no number of repeats; L must be a whole number from 1")
-    depth, clearance = _levels(modal, words)
-    old = modal.position[normal]
+    first, second, normal = PLANE_AXES[modal.plane_name]
+    if series.began is None:
+        series.began = modal.position[normal]
+    old = series.began
+    depth, clearance = _levels(modal, words, old)
+    if depth > clearance:
+        raise ProgramError(block.line, f"G{modal.motion / 10:g}", "its clearance level R lies below its depth")
     if old < clearance:
         machine.rapid_to(block, _with(modal.position, {normal: clearance}))
-    retract = clearance if modal.retract_to_r or old < clearance else old
+    hole = Hole(machine, block, words, depth, clearance, clearance if modal.retract_to_r else max(old, clearance))
     for _ in range(repeats):
         place = target(modal, block)
         machine.rapid_to(block, _with(modal.position, {first: place[first], second: place[second]}))
         if modal.position[normal] != clearance:
-            machine.rapid_to(block, _with(modal.position, {normal: clearance}))
-        _hole(machine, block, normal, words, depth, clearance, retract)
+            hole.rapid(clearance)
+        hole.work()
 
 
 def _with(position: list[float], changed: dict[int, float]) -> list[float]:
@@ -50,19 +68,16 @@ def _with(position: list[float], changed: dict[int, float]) -> list[float]:
     return moved
 
 
-def _words(modal: Modal, block: Block, kept: dict[str, float], new: bool) -> dict[str, float]:
+def _words(modal: Modal, block: Block, kept: dict[str, float]) -> dict[str, float]:
     """Return the cycle's words, those of the block and those still in force, in mm."""
-    normal = AXES[PLANE_AXES[modal.plane_name][2]]
-    if new:
-        kept.clear()
-    for letter in (normal, *_KEPT):
+    for letter in (AXES[PLANE_AXES[modal.plane_name][2]], *_KEPT):
         if letter in block.words:
-            scale = modal.scale if letter in (normal, "r", "q") else 1.0
-            kept[letter] = block.words[letter] * scale
+            kept[letter] = block.words[letter] * (1.0 if letter == "p" else modal.scale)
     return kept
 
 
-def _check(modal: Modal, block: Block, words: dict[str, float]) -> None:
+def _check(modal: Modal, block: Block, given: Mapping[str, float], words: Mapping[str, float]) -> None:
+    """Raise ProgramError for what the cycle cannot do; ``given`` are the words it may take its own from."""
     code = f"G{modal.motion / 10:g}"
     first, second, normal = (AXES[axis] for axis in PLANE_AXES[modal.plane_name])
     if modal.feed_mode == 930:
@@ -72,67 +87,104 @@ def _check(modal: Modal, block: Block, words: dict[str, float]) -> None:
     for letter in "abcuvw":
         if letter in block.words:
             raise block.fault(letter, "cannot be moved by a canned cycle")
-    needs = [(normal, "its depth"), ("r", "its clearance level")]
-    if modal.motion in _PECKING:
-        needs.append(("q", "its peck"))
-    if modal.motion in _WITH_DWELL:
-        needs.append(("p", "its dwell"))
-    for letter, what in needs:
-        if letter not in words:
-            raise ProgramError(block.line, code, f"wants {letter.upper()}, {what}")
+    needs = [
+        normal,
+        "r",
+        *("q" for m in _PECKING if m == modal.motion),
+        *("p" for m in _WITH_DWELL if m == modal.motion),
+    ]
+    for letter in needs + (["i", "j", "k"] if modal.motion == _BACK_BORING else []):
+        if letter not in given:
+            raise ProgramError(block.line, code, f"wants {letter.upper()}, {_MEANING.get(letter, 'its depth')}")
     if modal.motion in _PECKING and not words["q"] > 0.0:
         raise ProgramError(block.line, f"Q{words['q']:g}", "is no depth of a peck; Q must be positive")
     if words.get("p", 0.0) < 0.0:
         raise ProgramError(block.line, f"P{words['p']:g}", "is no time to dwell; P must not be negative")
-    if modal.motion in (860, 880, *_TAPPING) and modal.spindle_turns == 0:
+    if modal.motion in _SPINNING and modal.spindle_turns == 0:
         raise ProgramError(block.line, code, "wants a turning spindle; give M3 or M4 first")
-    if modal.motion in (870, 880):
-        raise ProgramError(block.line, code, "is not known to fdhil: it waits for an operator's hand")
+    if modal.motion in _TAPPING and modal.spindle_turns != _TAPPING[modal.motion]:
+        raise ProgramError(block.line, code, "wants the spindle to turn into the hole; G84 by M3, G74 by M4")
 
 
-def _levels(modal: Modal, words: dict[str, float]) -> tuple[float, float]:
-    """Return depth and clearance level in active co-ordinates; incremental R is from here, incremental Z from R."""
+def _levels(modal: Modal, words: dict[str, float], began: float) -> tuple[float, float]:
+    """Return depth and clearance level in active co-ordinates; incremental R is from ``began``, Z from R."""
     normal = PLANE_AXES[modal.plane_name][2]
     if modal.absolute:
         return words[AXES[normal]], words["r"]
-    clearance = modal.position[normal] + words["r"]
+    clearance = began + words["r"]
     return clearance + words[AXES[normal]], clearance
 
 
-def _hole(
-    machine: Machine, block: Block, normal: int, words: dict[str, float], depth: float, clearance: float, retract: float
-) -> None:
-    """Order what happens in one hole, from the clearance level back to ``retract``."""
-    modal = machine.modal
-    if depth > clearance:
-        raise ProgramError(block.line, f"G{modal.motion / 10:g}", "its clearance level R lies below its depth")
+@dataclass(slots=True)
+class Hole:
+    """One hole, worked from the clearance level down to ``depth`` and back to ``retract``."""
 
-    def feed(level: float) -> None:
-        machine.feed_to(block, _with(modal.position, {normal: level}))
+    machine: Machine
+    block: Block
+    words: Mapping[str, float]
+    depth: float
+    clearance: float
+    retract: float
 
-    def rapid(level: float) -> None:
-        machine.rapid_to(block, _with(modal.position, {normal: level}))
+    def rapid(self, level: float) -> None:
+        """Go to a level along the normal at rapid speed."""
+        self._go(level, self.machine.rapid_to)
 
-    motion = modal.motion
-    if motion in _PECKING:
-        level = clearance
-        while level - words["q"] > depth:
-            level -= words["q"]
-            feed(level)
-            if motion == 830:
-                rapid(clearance)
-                rapid(level + _CLEARANCE_MM)
-            else:
-                rapid(level + _CLEARANCE_MM)
-        feed(depth)
-        rapid(retract)
-    else:
-        feed(depth)
-        if motion in _WITH_DWELL or motion in _TAPPING:
-            machine.dwell(block, words.get("p", 0.0))
-        if motion in (850, 890, *_TAPPING):
-            feed(clearance)
-            if retract != clearance:
-                rapid(retract)
+    def feed(self, level: float) -> None:
+        """Go to a level along the normal at the feed in force."""
+        self._go(level, self.machine.feed_to)
+
+    def _go(self, level: float, how: Callable[[Block, list[float]], None]) -> None:
+        modal = self.machine.modal
+        how(self.block, _with(modal.position, {PLANE_AXES[modal.plane_name][2]: level}))
+
+    def work(self) -> None:
+        """Order what the cycle in force does from the clearance level on."""
+        motion = self.machine.modal.motion
+        if motion in _PECKING:
+            self._peck(motion == 830)
+        elif motion == _BACK_BORING:
+            self._back_bore()
         else:
-            rapid(retract)
+            self._drill(motion)
+
+    def _drill(self, motion: int) -> None:
+        self.feed(self.depth)
+        if motion in _WITH_DWELL or motion in _TAPPING:
+            self.machine.dwell(self.block, self.words.get("p", 0.0))
+        if motion == 850:
+            self.feed(self.clearance)
+            self.rapid(self.retract)
+        elif motion == 890 or motion in _TAPPING:
+            self.feed(self.retract)
+        elif motion == 880:  # the operator brings the tool back by hand
+            modal = self.machine.modal
+            modal.position = _with(modal.position, {PLANE_AXES[modal.plane_name][2]: self.retract})
+        else:
+            self.rapid(self.retract)
+
+    def _peck(self, to_clearance: bool) -> None:
+        level = self.clearance
+        while level - self.words["q"] > self.depth:
+            level -= self.words["q"]
+            self.feed(level)
+            if to_clearance:
+                self.rapid(self.clearance)
+            self.rapid(level + _CLEARANCE_MM)
+        self.feed(self.depth)
+        self.rapid(self.retract)
+
+    def _back_bore(self) -> None:
+        """G87: beside the hole down, in, up to K and down again at feed, beside it and up."""
+        modal, words = self.machine.modal, self.words
+        first, second, normal = PLANE_AXES[modal.plane_name]
+        letters = "ijk"[first], "ijk"[second], "ijk"[normal]
+        centre = {first: modal.position[first], second: modal.position[second]}
+        beside = {first: centre[first] + words[letters[0]], second: centre[second] + words[letters[1]]}
+        bored = words[letters[2]] if modal.absolute else self.depth + words[letters[2]]
+        for place in (beside, {normal: self.depth}, centre):
+            self.machine.rapid_to(self.block, _with(modal.position, place))
+        self.feed(bored)
+        self.feed(self.depth)
+        for place in (beside, {normal: self.retract}, centre):
+            self.machine.rapid_to(self.block, _with(modal.position, place))

@@ -63,7 +63,7 @@ class Interpreter:
         self._variables.store(5220, 1.0)
         self._kept = KeptModes(modal, self._variables)
         self._flow = Flow(first, self._variables, budget, self._kept.returned)
-        self._cycle_words: dict[str, float] = {}
+        self._series = canned.Series()
         self._blocks = 0
         self._empty_so_far = True
         self._percent = False
@@ -126,6 +126,7 @@ class Interpreter:
             return None
         modal.motion = motion
         modal.position = position
+        self._series.began = None
         return Rapid(line, end) if motion == 0 else Feed(line, end, modal.feed_mm_min)
 
     def _line(self, raw: str, line: int) -> None:
@@ -212,11 +213,14 @@ class Interpreter:
     def _motion(self, block: Block, axes_used: bool) -> None:
         machine, modal = self._machine, self._machine.modal
         axis = next((letter for letter in block.words if letter in INDEX or letter in "@^"), None)
+        before = modal.motion
         if "motion" in block.g:
             modal.motion = block.g["motion"]
         elif axes_used or (axis is None and not (modal.motion in arcs.CODES and _has_centre(block))):
             return
         code = modal.motion
+        if code not in CYCLES:
+            self._series.began = None
         if code == 0:
             machine.rapid_to(block, moves.target(modal, block))
         elif code == 10:
@@ -224,7 +228,7 @@ class Interpreter:
         elif code in arcs.CODES:
             arcs.arc(machine, block)
         elif code in CYCLES:
-            canned.cycle(machine, block, self._cycle_words)
+            canned.cycle(machine, block, self._series, before != code)
         elif code in _PROBES:
             self._probe(block)
         elif code in (330, 331):

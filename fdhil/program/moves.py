@@ -117,11 +117,16 @@ def target(modal: Modal, block: Block) -> list[float]:
 
 
 def _polar(modal: Modal, block: Block) -> tuple[float, float]:
-    """Return X and Y of polar words: @ the distance from the origin, ^ the angle, from the present ones when missing."""
+    """Return X and Y of polar words: @ the distance from the origin, ^ the angle; what is missing stays as it is."""
     for letter in "xy":
         if letter in block.words:
             raise block.fault(letter, "contradicts the polar words @ and ^ in the same block")
+    letter = "@" if "@" in block.words else "^"
+    if modal.plane != 0 and "plane" not in block.g:
+        raise block.fault(letter, "is a polar word, which wants the XY plane (G17)")
     x, y = modal.position[0], modal.position[1]
+    if x == 0.0 and y == 0.0 and not ("^" in block.words and modal.absolute):
+        raise block.fault(letter, "there is no angle at the origin; give an absolute one by ^")
     distance, angle = math.hypot(x, y), math.degrees(math.atan2(y, x))
     if not modal.absolute:
         distance += block.words.get("@", 0.0) * modal.scale

@@ -128,8 +128,10 @@ def set_tool_length(modal: Modal, block: Block) -> None:
         return
     words = {axis: length_mm(modal, axis, value) for axis, value in axis_words(block).items()}
     tool = [words.get(axis, modal.tool[axis]) if code == 431 else 0.0 for axis in range(9)]
-    moved = [p + old - new for p, old, new in zip(modal.position, modal.tool, tool, strict=True)]
-    modal.position, modal.tool = moved, tool
+    shift = [old - new for old, new in zip(modal.tool, tool, strict=True)]
+    shift[0], shift[1] = rotate(shift[0], shift[1], -modal.rotation_deg)
+    modal.position = [p + s for p, s in zip(modal.position, shift, strict=True)]
+    modal.tool = tool
 
 
 def go_home(machine: Machine, variables: Variables, block: Block) -> None:

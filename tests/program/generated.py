@@ -1,0 +1,217 @@
+"""Programs made up at random, by seed: what the differential tests feed to both interpreters."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+
+
+class Writer:
+    """Writes one random program; ``lines`` grows. Co-ordinates have three decimals, so that four tell."""
+
+    def __init__(self, seed: int) -> None:
+        self._random = random.Random(seed)
+        self.lines: list[str] = ["G21 G90 G94 G17 F500", "S600 M3"]
+        self._labels = 100
+        self._inch = False
+        self._plane = 17
+
+    def number(self, low: float = -50.0, high: float = 50.0) -> str:
+        """Return a number, sometimes as an expression."""
+        value = round(self._random.uniform(low, high), 3)
+        kind = self._random.randrange(12)
+        if kind == 0:
+            part = round(self._random.uniform(-5, 5), 2)
+            return f"[{value} + {part} * 2]"
+        if kind == 1:
+            return f"#{self._random.randint(31, 34)}"
+        return f"{value:g}" if "e" not in f"{value:g}" else "0"
+
+    def axes(self, letters: str, least: int = 1) -> str:
+        """Return some axis words."""
+        count = self._random.randint(least, len(letters))
+        chosen = self._random.sample(letters, count)
+        return " ".join(letter + self.number() for letter in chosen)
+
+    def straight(self) -> None:
+        code = self._random.choice(["G0", "G1", "", "", "G1 F" + str(self._random.randint(10, 900))])
+        if not code:
+            code = self._random.choice(["G0", "G1"])
+        self.lines.append(f"{code} {self.axes('XYZ')}")
+
+    def polar(self) -> None:
+        words = self._random.choice(["@{} ^{}", "@{}", "^{1}", "@{} ^{} Z2"])
+        self.lines.append("G1 " + words.format(round(self._random.uniform(1, 30), 2), self._random.randint(-200, 200)))
+
+    def arc(self) -> None:
+        plane = self._random.choice([17, 18, 19])
+        first, second = {17: "XY", 18: "XZ", 19: "YZ"}[plane]
+        offset = {17: "IJ", 18: "IK", 19: "JK"}[plane]
+        code = self._random.choice(["G2", "G3"])
+        normal = {17: "Z", 18: "Y", 19: "X"}[plane]
+        helix = self._random.choice(["", "", f" {normal}{self.number()}"])
+        turns = self._random.choice(["", "", " P2", " P3"])
+        self.lines.append(f"G91 G{plane}")
+        a, b = (round(self._random.uniform(1, 20), 3) for _ in range(2))
+        shape = self._random.randrange(4)
+        if shape == 0:
+            self.lines.append(f"{code} {first}{2 * a:g} {second}0 {offset[0]}{a:g}{helix}{turns}")
+        elif shape == 1:
+            self.lines.append(f"{code} {offset[0]}{a:g} {offset[1]}{-b:g}{helix}{turns}")
+        elif shape == 2:
+            self.lines.append(
+                f"{code} {first}{a:g} {second}{b:g} R{self._random.choice(['', '-'])}{a + b:g}{helix}{turns}"
+            )
+        else:
+            self.lines.append(f"{code} {first}{a:g} {second}{a:g} {offset[0]}{a:g} {offset[1]}0{helix}")
+        self.lines.append(self._random.choice(["G90", "G90", "G90 G17", "G91"]))
+
+    def modes(self) -> None:
+        self.lines.append(
+            self._random.choice(
+                [
+                    "G17",
+                    "G18",
+                    "G19",
+                    "G90",
+                    "G90",
+                    "G91",
+                    "G20",
+                    "G21",
+                    "G98",
+                    "G99",
+                    "G61",
+                    "G64 P0.1",
+                    "G4 P0.25",
+                    "G80",
+                    "G7",
+                    "G8",
+                    "G94 F300",
+                    "M8",
+                    "M9",
+                    "G90 G49 G21 G8",
+                ]
+            )
+        )
+
+    def inverse_time(self) -> None:
+        self.lines += [f"G93 G1 {self.axes('XYZ')} F{self._random.randint(1, 20)}", "G94 F250"]
+
+    def offsets(self) -> None:
+        system = self._random.randint(1, 9)
+        self.lines.append(
+            self._random.choice(
+                [
+                    f"G10 L2 P{system} {self.axes('XYZ')}",
+                    f"G10 L20 P{system} {self.axes('XYZ')}",
+                    f"G10 L2 P{system} R{self._random.randint(-90, 90)}",
+                    "G10 L2 P0 R0",
+                    f"G{SYSTEMS[system - 1]}",
+                    f"G92 {self.axes('XYZ')}",
+                    f"G52 {self.axes('XYZ')}",
+                    "G92.1",
+                    "G92.2",
+                    "G92.3",
+                    f"G90 G53 G0 {self.axes('XYZ')}",
+                    "G28.1",
+                    "G30.1",
+                    "G28",
+                    f"G28 {self.axes('XYZ')}",
+                    "G30",
+                    f"G30 {self.axes('XY')}",
+                    f"G43.1 {self.axes('XYZ')}",
+                    "G49",
+                    "G43.1 Z3",
+                ]
+            )
+        )
+
+    def cycle(self) -> None:
+        code = self._random.choice(["73", "81", "82", "83", "84", "74", "85", "86", "87", "88", "89", "81"])
+        if code == "74":
+            self.lines.append("M4")
+        absolute = self._random.random() < 0.7
+        top = round(self._random.uniform(-5, 20), 2)
+        depth = round((top if absolute else 0.0) - self._random.uniform(0.5, 20), 2)
+        repeat = self._random.choice(["", "", " L2", " L3"])
+        self.lines.append(
+            f"G{90 if absolute else 91} G{self._random.choice([98, 99])} G{code} {self.axes('XY')} Z{depth} R{top}"
+            f"{' Q' + str(round(self._random.uniform(0.7, 9), 2)) if code in ('73', '83') else ''}"
+            f"{' P0.5' if code in ('82', '86', '88', '89') else ''}"
+            f"{' I1.5 J-2 K' + str(round(depth + 0.3, 2)) if code == '87' else ''}{repeat if code != '74' else ''}"
+        )
+        for _ in range(self._random.randrange(3)):
+            self.lines.append(self.axes("XY"))
+        self.lines += ["G80", "M3"]
+
+    def parameter(self) -> None:
+        a, b = self.number(), self.number(1, 5)
+        operator = self._random.choice(["+", "-", "*", "/", "mod", "eq", "gt", "le", "and", "or", "xor", "ne"])
+        function = self._random.choice(["abs", "fix", "fup", "round", "sin", "cos"])
+        self.lines.append(f"#{self._random.randint(31, 34)} = {function}[{a} {operator} {b} - 1]")
+
+    def loop(self) -> None:
+        self._labels += 1
+        label, kind = self._labels, self._random.randrange(4)
+        body = f"G1 X[#40 * 1.5] Y{self.number()} F200"
+        if kind == 0:
+            self.lines += [f"o{label} repeat [{self._random.randint(0, 3)}]", body, f"o{label} endrepeat"]
+        elif kind == 1:
+            self.lines += ["#40 = 0", f"o{label} while [#40 lt 3]", body, "#40 = [#40 + 1]", f"o{label} endwhile"]
+        elif kind == 2:
+            self.lines += ["#40 = 0", f"o{label} do", body, "#40 = [#40 + 1]", f"o{label} while [#40 lt 2]"]
+        else:
+            self.lines += [
+                f"o{label} if [#31 gt 0]",
+                body,
+                f"o{label} elseif [#32 gt 0]",
+                "G0 Z1",
+                f"o{label} else",
+                "G0 X1",
+                f"o{label} endif",
+            ]
+
+    def subroutine(self) -> None:
+        self._labels += 1
+        label = self._labels
+        self.lines += [
+            f"o{label} sub",
+            "G0 X#1 Y[#2 * 2]",
+            "#1 = [#1 + 1]",
+            f"o{label}9 if [#1 gt 3]",
+            f"o{label}9 return [#1]",
+            f"o{label}9 endif",
+            "G1 Z#1",
+            f"o{label} endsub [7]",
+            f"o{label} call [{self.number()}] [2.5]",
+            "G0 X[#<_value>]",
+            f"o{label} call",
+        ]
+
+    def kept(self) -> None:
+        self.lines += [
+            "M70",
+            self._random.choice(["G20 G91", "G18", "G7", "G55", "F33"]),
+            f"G1 {self.axes('XYZ')}",
+            "M72",
+        ]
+
+
+SYSTEMS = ("54", "55", "56", "57", "58", "59", "59.1", "59.2", "59.3")
+GROUPS: dict[str, list[Callable[[Writer], None]]] = {
+    "moves": [Writer.straight, Writer.straight, Writer.modes, Writer.parameter, Writer.polar, Writer.inverse_time],
+    "arcs": [Writer.straight, Writer.arc, Writer.arc],
+    "offsets": [Writer.straight, Writer.straight, Writer.offsets, Writer.offsets, Writer.modes],
+    "cycles": [Writer.straight, Writer.cycle, Writer.cycle, Writer.offsets],
+    "flow": [Writer.straight, Writer.loop, Writer.subroutine, Writer.parameter, Writer.kept],
+}
+GROUPS["all"] = [step for group in list(GROUPS.values()) for step in group]
+
+
+def program(group: str, seed: int, steps: int = 25) -> str:
+    """Return the text of one random program of a group."""
+    writer = Writer(seed)
+    pick = random.Random(seed + 1)
+    for _ in range(steps):
+        pick.choice(GROUPS[group])(writer)
+    return "\n".join([*writer.lines, "M2", ""])
