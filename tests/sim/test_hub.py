@@ -30,7 +30,7 @@ _STANDARD, _EXTENDED = st.integers(0, 0x7FF), st.integers(0, 0x1FFFFFFF)
 def test_the_client_understands_what_the_hub_sends(can_id: int, data: bytes) -> None:
     text = encode([(can_id, data)], 1700000000.25)
     message = convert_ascii_message_to_can_message(text.decode())
-    assert (message.arbitration_id, message.data, message.is_extended_id) == (can_id, data, False)
+    assert (message.arbitration_id, bytes(message.data), message.is_extended_id) == (can_id, data, False)
     assert message.timestamp == 1700000000.25
     assert len(text) == 64
 
@@ -41,7 +41,7 @@ def test_29_bit_identifiers_stay_apart_from_11_bit_ones(can_id: int, data: bytes
     frame = decode_send(convert_can_message_to_ascii_message(message)[:-1].encode())
     assert frame == (can_id | EXTENDED, data)
     back = convert_ascii_message_to_can_message(encode([frame], 0.0).decode())
-    assert (back.arbitration_id, back.data, back.is_extended_id) == (can_id, data, True)
+    assert (back.arbitration_id, bytes(back.data), back.is_extended_id) == (can_id, data, True)
 
 
 @given(_STANDARD, _DATA)

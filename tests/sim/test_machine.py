@@ -23,7 +23,7 @@ PER_MM = 65536 / 20
 
 def read_trace(path: Path) -> dict[str, np.ndarray]:
     table = np.genfromtxt(path, delimiter=",", names=True)
-    return {name: table[name] for name in table.dtype.names}
+    return {name: table[name] for name in table.dtype.names or ()}
 
 
 def test_the_trace_has_a_row_per_demand_row_and_300_ms(tmp_path: Path) -> None:
@@ -204,7 +204,8 @@ def test_the_panel_sets_parameters_and_temperature() -> None:
     panel.obey('{"command": "set", "axis": "X", "parameters": {"Jt": 0.085, "ft": 0.01}}')
     panel.obey('{"command": "temperature", "celsius": 22.0}')
     x = machine.units["X"].drive.physics.parameters
-    assert (x.Jt, x.ft, x.Cd) == (0.085, 0.01, pytest.approx(4.0))
+    assert (x.Jt, x.ft) == (0.085, 0.01)
+    assert x.Cd == pytest.approx(4.0)
     assert machine.units["Y"].drive.physics.parameters.Jt == 0.075
     assert machine.units["Y"].drive.dictionary.number(0x2110, 1) == 2200
     panel.obey("")

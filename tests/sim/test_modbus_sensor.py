@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,12 +44,10 @@ def bench() -> Iterator[Bench]:
     sensor = a_sensor()
     servers = SensorServers({"X": sensor}, {"X": ("127.0.0.1", 0)})
     servers.start()
-    client = ModbusTcpClient("127.0.0.1", port=servers.ports["X"], timeout=5, retries=0)
     try:
-        assert client.connect()
-        yield Bench(sensor, client, servers.ports["X"])
+        with ModbusTcpClient("127.0.0.1", port=servers.ports["X"], timeout=5, retries=0) as client:
+            yield Bench(sensor, client, servers.ports["X"])
     finally:
-        client.close()
         servers.stop()
 
 
@@ -114,11 +112,11 @@ def test_a_latch_gives_what_was_not_latched_before(bench: Bench) -> None:
     assert bench.client.read_holding_registers(11, count=5).registers == [1, 0, 160, 0, 0]
 
 
-def _volts(bench: Bench, words: list[int]) -> list[float]:
+def _volts(bench: Bench, words: Sequence[int]) -> list[float]:
     return [count * bench.sensor.volts_per_count for count in struct.unpack(f">{len(words)}h", _bytes(words))]
 
 
-def _bytes(words: list[int]) -> bytes:
+def _bytes(words: Sequence[int]) -> bytes:
     return struct.pack(f">{len(words)}H", *words)
 
 

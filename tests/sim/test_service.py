@@ -1,0 +1,147 @@
+"""The twin's loop inside this process: on python-can's virtual bus, with commands and files as a caller gives them."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import can
+import numpy as np
+import pytest
+
+from fdhil import config
+from fdhil.cli.sim import _lines
+from fdhil.config import MachineConfig
+from fdhil.errors import ProgramError
+from fdhil.records import Trajectory
+from fdhil.sim.service import SimService, json_emitter
+from tests.bench import bench_document
+from tests.sim.bench_twin import corner, trajectory
+from tests.sim.hub_thread import frames_of
+
+
+class ServiceThread:
+    """A service in a thread; ``events`` in the order they came."""
+
+    def __init__(self, service_config: MachineConfig, load: Callable[[Path, MachineConfig], Trajectory]) -> None:
+        self.events: queue.Queue[dict[str, Any]] = queue.Queue()
+        read_end, self._panel = os.pipe()
+        self._read_end = read_end
+        self.service = SimService(service_config, self.events.put, load, panel_fd=read_end)
+        self._thread = threading.Thread(target=self.service.run, name="sim-service")
+        self._thread.start()
+
+    def command(self, name: str, **keys: Any) -> None:
+        os.write(self._panel, json.dumps({"command": name, **keys}).encode() + b"\n")
+
+    def event(self, name: str) -> dict[str, Any]:
+        while True:
+            event = self.events.get(timeout=30)
+            if event["event"] == name:
+                return event
+
+    def end(self) -> None:
+        self.service.stop()
+        self._thread.join()
+        os.close(self._panel)
+        os.close(self._read_end)
+
+
+@contextmanager
+def running(load: Callable[[Path, MachineConfig], Trajectory], folder: Path, **bus: Any) -> Iterator[ServiceThread]:
+    document = bench_document()
+    document["bus"] = {"can0": bus}
+    document["sim"] = {"pace": "lockstep"}
+    document["store"] = {"directory": str(folder)}
+    thread = ServiceThread(config.parse(document), load)
+    try:
+        yield thread
+    finally:
+        thread.end()
+
+
+def load_corner(path: Path, _: MachineConfig) -> Trajectory:
+    if path.suffix != ".csv":
+        raise ProgramError(3, "G7", "lathe diameters are not supported; write radii")
+    return trajectory(corner())
+
+
+def test_a_peer_on_the_virtual_bus_in_the_same_process(tmp_path: Path) -> None:
+    with (
+        can.Bus(interface="virtual", channel="sim-test") as peer,
+        running(load_corner, tmp_path, interface="virtual", channel="sim-test") as twin,
+    ):
+        ready = twin.event("ready")
+        assert ready["buses"] == {"can0": {"interface": "virtual", "channel": "sim-test"}}
+        assert frames_of(peer, 2)[:2] == [(0x701, b"\0"), (0x702, b"\0")]
+        twin.command("nc", on=True)
+        twin.event("nc")
+        twin.command("play", file="corner.csv")
+        assert twin.event("finished")["rows"] == len(corner())
+        syncs = [data[0] for can_id, data in frames_of(peer, 6000) if can_id == 0x80]
+        assert np.all(np.diff(syncs) % 240 == 1)
+        peer.send(can.Message(arbitration_id=0x601, data=bytes.fromhex("4000100000000000"), is_extended_id=False))
+        while (answer := frames_of(peer, 1))[0][0] != 0x581:
+            pass
+        assert answer == [(0x581, bytes.fromhex("4300100092010200"))]
+
+
+def test_what_cannot_be_read_does_not_end_the_machine(tmp_path: Path) -> None:
+    with running(load_corner, tmp_path, port=0) as twin:
+        twin.event("ready")
+        twin.command("play", file="part.ngc")
+        assert twin.event("error")["text"] == (
+            "part.ngc cannot be played: line 3, 'G7': lathe diameters are not supported; write radii"
+        )
+        twin.command("play", file="corner.csv")
+        assert "switch it on first" in twin.event("error")["text"]
+        twin.command("quit")
+        twin._thread.join(30)
+        assert not twin._thread.is_alive()
+
+
+def test_the_eds_lies_where_the_machine_runs(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    with running(load_corner, tmp_path, port=0) as twin:
+        eds = twin.event("ready")["drives"]["X"]["eds"]
+    assert eds == str(run / "eds" / "fdhil_twin_X.eds")
+    assert "[6064]" in Path(eds).read_text()
+
+
+def test_without_such_a_place_it_lies_in_a_temporary_folder_that_goes(tmp_path: Path) -> None:
+    with running(load_corner, tmp_path / "nowhere", port=0) as twin:
+        eds = Path(twin.event("ready")["drives"]["X"]["eds"])
+        assert eds.is_file()
+    assert not eds.exists()
+    assert not (tmp_path / "nowhere").exists()
+
+
+def test_events_are_one_line_of_json_each() -> None:
+    lines: list[str] = []
+    emit = json_emitter(lines.append)
+    emit({"event": "error", "text": "two\nlines"})
+    assert lines == ['{"event": "error", "text": "two\\nlines"}\n']
+
+
+@pytest.mark.parametrize(
+    ("event", "text"),
+    [
+        ({"event": "nc", "on": False}, "NC off"),
+        ({"event": "playing", "file": "a.csv", "rows": 3}, "playing a.csv, 3 rows"),
+        (
+            {"event": "finished", "file": "a", "rows": 3, "stopped": True, "late_rpdo": {"X": 1}, "trace": "t.csv"},
+            "stopped after 3 rows of a; late offset frames: X 1, recorded to t.csv",
+        ),
+        ({"event": "error", "text": "no"}, "cannot: no"),
+        ({"event": "fault", "sync": 5, "fault": "reboot", "axis": "X"}, "fault: sync 5, fault reboot, axis X"),
+    ],
+)
+def test_people_get_sentences(event: dict[str, Any], text: str) -> None:
+    assert _lines(event) == [text]

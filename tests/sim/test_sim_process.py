@@ -1,0 +1,247 @@
+"""``fdhil sim`` as a process, joined by stock clients: python-can, the canopen library, pymodbus."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import struct
+import sys
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import can
+import canopen
+import numpy as np
+import pytest
+from pymodbus.client import ModbusTcpClient
+
+from fdhil.cli.main import cli, run_safely
+from tests.sim.bench_twin import corner
+from tests.sim.hub_thread import frames_of
+from tests.sim.twin_process import PATIENCE_S, TwinProcess, write_config
+
+PER_MM = 65536 / 20
+
+
+def write_demand(path: Path, rows_mm: np.ndarray) -> Path:
+    lines = [f"{k * 0.001:.6f},{x:.9f},{y:.9f}" for k, (x, y) in enumerate(rows_mm)]
+    path.write_text("time_s,X_mm,Y_mm\n" + "\n".join(lines) + "\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TwinProcess]:
+    """One process without NC; tests leave its drives in pre-operational."""
+    with TwinProcess(write_config(tmp_path_factory.mktemp("twin"))) as process:
+        yield process
+
+
+@pytest.fixture
+def bus(twin: TwinProcess) -> Iterator[can.BusABC]:
+    bus = twin.join()
+    yield bus
+    bus.send(can.Message(arbitration_id=0, data=b"\x81\0", is_extended_id=False))
+    bus.shutdown()
+
+
+def test_the_ready_event_tells_how_to_join(twin: TwinProcess) -> None:
+    ready = twin.ready
+    assert ready["buses"]["can0"].keys() == {"interface", "channel", "host", "port"}
+    assert ready["modbus"]["Y"].keys() == {"host", "port", "unit"}
+    x = ready["drives"]["X"]
+    assert (x["node_id"], x["increments_per_mm"], x["sync_counter"]) == (1, PER_MM, 0)
+    assert Path(x["eds"]).is_file()
+    assert [pdo["cob_id"] for pdo in x["tpdo"]] == [0x181, 0x281, 0x381, 0x481]
+    assert [pdo["cob_id"] for pdo in x["rpdo"]][:2] == [0x201, 0x301]
+    assert x["tpdo"][0]["entries"][0] == [0x6064, 0, 32, "mm", 1 / PER_MM]
+    assert 0.7 < ready["bus_load"]["can0"] < 1.0 < ready["bus_load_worst"]["can0"] < 1.1
+
+
+def test_the_canopen_library_finds_configures_and_reads(twin: TwinProcess, bus: can.BusABC) -> None:
+    network = canopen.Network(bus)
+    network.connect()
+    try:
+        node = network.add_node(1, twin.ready["drives"]["X"]["eds"])
+        assert node.nmt.wait_for_heartbeat(5) == "PRE-OPERATIONAL"
+        assert node.sdo[0x1000].raw == 0x00020192
+        assert node.sdo["Modes of operation"].raw == 0
+        node.sdo["Modes of operation"].raw = 8
+        assert node.sdo["Modes of operation"].raw == 8
+        with pytest.raises(canopen.SdoAbortedError) as abort:
+            node.sdo.upload(0x5FFF, 0)
+        assert abort.value.code == 0x06020000
+        node.nmt.state = "OPERATIONAL"
+        node.nmt.wait_for_heartbeat(5)
+        assert node.nmt.state == "OPERATIONAL"
+    finally:
+        assert network.notifier is not None
+        network.notifier.stop()
+
+
+def test_another_master_takes_over_with_the_stock_client(bus: can.BusABC) -> None:
+    def send(can_id: int, data: bytes) -> None:
+        bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+
+    def answer(can_id: int) -> bytes:
+        for got, data in iter(lambda: frames_of(bus, 1)[0], None):
+            if got == can_id:
+                return data
+        raise AssertionError("unreachable")
+
+    send(0x000, b"\1\1")
+    send(0x601, bytes.fromhex("2f60600008000000"))
+    assert answer(0x581)[0] == 0x60
+    for word in (0x06, 0x07, 0x0F):
+        send(0x201, struct.pack("<Hi", word, 0))
+        send(0x080, b"")
+        status = answer(0x281)
+    assert status[0] & 0x6F == 0x27
+    for k in range(300):
+        send(0x201, struct.pack("<Hi", 0x0F, min(100 * k, 20000)))
+        send(0x080, b"")
+        position = answer(0x181)
+        answer(0x281)
+    assert struct.unpack("<i", position[:4])[0] == pytest.approx(20000, abs=50)
+
+
+def test_any_modbus_client_reads_the_sensor(twin: TwinProcess) -> None:
+    place = twin.ready["modbus"]["X"]
+    with ModbusTcpClient(place["host"], port=place["port"], timeout=5) as client:
+        registers = client.read_input_registers(0, count=10, device_id=place["unit"]).registers
+        assert struct.unpack(">f", struct.pack(">2H", *registers[4:6])) == (1000.0,)
+        assert client.read_holding_registers(500, count=1).exception_code == 2
+
+
+def test_panel_mistakes_are_events(twin: TwinProcess, tmp_path: Path) -> None:
+    twin.command("dance")
+    assert "no command 'dance'" in twin.event("error")["text"]
+    twin.command("play", file=str(tmp_path / "missing.csv"))
+    assert "missing.csv" in twin.event("error")["text"]
+
+
+def test_the_nc_plays_in_real_time_and_no_sync_is_lost(twin: TwinProcess, tmp_path: Path) -> None:
+    demand = write_demand(tmp_path / "corner.csv", corner())
+    trace = tmp_path / "trace.csv"
+    with twin.join() as bus:
+        twin.command("nc", on=True)
+        twin.event("nc")
+        twin.command("trace", file=str(trace))
+        twin.command("play", file=str(demand))
+        frames = frames_of(bus, 5000, timeout_s=PATIENCE_S)
+    finished = twin.event("finished")
+    twin.command("nc", on=False)
+    assert twin.event("nc")["on"] is False
+    counters = [data[0] for can_id, data in frames if can_id == 0x80]
+    assert len(counters) > 500
+    assert all(after == before % 240 + 1 for before, after in pairwise(counters))
+    assert finished["rows"] == len(corner())
+    table = np.genfromtxt(trace, delimiter=",", names=True)
+    assert len(table) == len(corner()) + 300
+    assert np.abs(table["Y_table_mm"] - table["Y_reference_mm"]).max() < 0.3
+
+
+def test_two_lockstep_runs_are_equal_bit_by_bit(tmp_path: Path) -> None:
+    config = write_config(tmp_path, 'pace = "lockstep"')
+    demand = write_demand(tmp_path / "corner.csv", corner() + 2.0)
+    runs = [
+        TwinProcess(config, "--demand", demand, "--trace", tmp_path / f"{k}.csv", "--faults", _load_torque(tmp_path))
+        for k in range(2)
+    ]
+    for run in runs:
+        with run as twin:
+            finished = twin.event("finished")
+            assert finished["late_rpdo"] == {"X": 0, "Y": 0}
+    first, second = ((tmp_path / f"{k}.csv").read_bytes() for k in range(2))
+    assert first == second
+    assert first.count(b"\n") == 1 + len(corner()) + 300
+
+
+def _load_torque(folder: Path) -> Path:
+    script = folder / "faults.toml"
+    script.write_text("[[fault]]\nat_row = 100\naxis = 'Y'\nfault = 'load_torque'\nvalue = 3.0\nduration_s = 0.1\n")
+    return script
+
+
+def test_lockstep_waits_for_a_client_that_answers_every_sync(tmp_path: Path) -> None:
+    """The client may be as slow as it likes: no offset frame comes late, and the runs repeat."""
+    config = write_config(tmp_path, 'pace = "lockstep"\nlockstep_rpdo = ["X:2"]')
+    demand = write_demand(tmp_path / "corner.csv", corner())
+    with TwinProcess(config) as twin, twin.join() as bus:
+        twin.command("nc", on=True)
+        twin.event("nc")
+        for k in range(2):
+            twin.command("trace", file=str(tmp_path / f"{k}.csv"))
+            twin.command("play", file=str(demand))
+            offset = 0
+            for _ in range(len(corner()) + 800):
+                while (message := bus.recv(5)) is not None and message.arbitration_id != 0x201:
+                    pass
+                assert message is not None
+                target = struct.unpack("<i", message.data[2:6])[0]
+                offset = -(target // 1000)  # what a correction is: a function of the demand
+                bus.send(can.Message(arbitration_id=0x301, data=struct.pack("<i", offset), is_extended_id=False))
+            finished = twin.event("finished")
+            assert finished["late_rpdo"] == {"X": 0, "Y": 0}
+            assert finished["trace"] == str(tmp_path / f"{k}.csv")
+            bus.send(can.Message(arbitration_id=0x301, data=struct.pack("<i", 0), is_extended_id=False))
+        twin.close_panel()
+        while frames_of(bus, 1)[0][0] != 0x701:  # it lives on without a panel, and its heartbeat with it
+            pass
+        assert twin.end(signal.SIGINT) == (0, "")
+        first = np.genfromtxt(tmp_path / "0.csv", delimiter=",", names=True)
+    increments = np.round(first["X_reference_mm"] * PER_MM).astype(int)
+    expected = -(increments // 1000) / PER_MM * 1e3
+    assert first["X_offset_um"][3:] == pytest.approx(expected[3:], abs=1e-5)
+
+
+# -- what cannot be started
+
+
+@pytest.fixture
+def failing(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
+    """Run the command in this process; return its exit code and the one thing that it says."""
+
+    def run(*arguments: object) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["fdhil", "sim", *map(str, arguments)])
+        code = run_safely(cli)
+        out, err = capsys.readouterr()
+        assert out == ""
+        return code, err
+
+    return run
+
+
+def test_a_port_in_use_is_one_sentence_and_exit_code_3(failing: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as holder:
+        port = holder.getsockname()[1]
+        code, text = failing(write_config(tmp_path, bus=f"port = {port}"), "--json")
+        assert code == 3
+        assert f"bus can0: TCP port {port}" in text
+        assert text.count("\n") == 1
+        code, text = failing(write_config(tmp_path, axes="X", voltage=f"port = {port}"), "--json")
+        assert code == 3
+        assert f"voltage sensor X: TCP port {port}" in text
+        assert text.count("\n") == 1
+
+
+def test_a_bus_that_does_not_exist_is_exit_code_3(failing: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
+    code, text = failing(write_config(tmp_path, bus='interface = "socketcan"\nchannel = "nocan7"'), "--json")
+    assert code == 3
+    assert "socketcan nocan7 cannot be opened" in text
+    assert text.count("\n") == 1
+
+
+def test_wrong_scripts_and_options_are_exit_code_2(failing: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
+    config = write_config(tmp_path)
+    script = tmp_path / "faults.toml"
+    script.write_text("[[fault]]\nfault = 'meteor'\n")
+    code, text = failing(config, "--faults", script)
+    assert code == 2
+    assert "'meteor' is none of" in text
+    code, text = failing(config, "--demand", "a.csv", "--program", "b.ngc")
+    assert code == 2
+    assert "not both" in text
+    code, text = failing(tmp_path / "missing.toml")
+    assert code == 2
+    assert "cannot be read" in text

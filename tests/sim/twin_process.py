@@ -1,0 +1,129 @@
+"""The simulated machine as the process that users start."""
+
+from __future__ import annotations
+
+import json
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import can
+
+COMMAND = [sys.executable, "-m", "fdhil.cli.main", "sim"]
+PATIENCE_S = 60.0
+
+_AXIS = """
+[axis.{name}]
+screw_pitch_mm = 20.0
+rapid_speed_mm_s = 500.0
+max_acceleration_mm_s2 = 4000.0
+nominal = {{ R = 0.5, L = 0.005, K = 0.8, Jt = 0.075, ft = 0.05, Cd = 5.0 }}
+[axis.{name}.regulators]
+position_gain_per_s = 50.0
+speed_feedforward = 1.0
+speed_kp = 23.562
+speed_ki = 1184.35
+current_limit_a = 200.0
+current_kp = 12.566
+current_ki = 1256.64
+voltage_limit_v = 300.0
+[axis.{name}.voltage]
+{voltage}
+"""
+
+
+def write_config(folder: Path, sim: str = "", bus: str = "", axes: str = "XY", voltage: str = "") -> Path:
+    """Write the bench's configuration with lines for [sim], [bus.can0] and [axis.*.voltage]; return its path."""
+    head = '[machine]\nname = "bench"\nsync_period_s = 0.001\n'
+    text = head + "".join(_AXIS.format(name=name, voltage=voltage) for name in axes)
+    path = folder / "machine.toml"
+    path.write_text(f"{text}[bus.can0]\n{bus}\n[sim]\n{sim}\n")
+    return path
+
+
+class TwinProcess:
+    """A running ``fdhil sim --json``; leaving the with block ends it and checks that it ended well."""
+
+    def __init__(self, *arguments: object) -> None:
+        self._process = subprocess.Popen(
+            [*COMMAND, *map(str, arguments), "--json"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            bufsize=0,
+        )
+        self._pending = b""
+        self.events: list[dict[str, Any]] = []
+
+    def __enter__(self) -> TwinProcess:
+        self.ready = self.event("ready")
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+        if error is not None:
+            self._process.kill()
+        code, stderr = self.end()
+        if error is None:
+            assert (code, stderr) == (0, "")
+
+    def end(self, number: int = signal.SIGTERM) -> tuple[int, str]:
+        """Send a signal unless it has ended; return the exit code and what it said on standard error."""
+        if self._process.poll() is None:
+            self._process.send_signal(number)
+        return self.wait()
+
+    def wait(self) -> tuple[int, str]:
+        """Wait for the end; return the exit code and what was said on standard error."""
+        _, stderr = self._process.communicate(timeout=PATIENCE_S)
+        return self._process.returncode, stderr.decode()
+
+    def command(self, name: str, **keys: Any) -> None:
+        """Give a command on the panel."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(json.dumps({"command": name, **keys}).encode() + b"\n")
+
+    def close_panel(self) -> None:
+        """End standard input."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        self._process.stdin = None
+
+    def event(self, name: str) -> dict[str, Any]:
+        """Wait for the next event of this name."""
+        deadline = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline:
+            event = self._next(deadline)
+            if event["event"] == name:
+                return event
+        raise AssertionError(f"no {name}: {self.events}")
+
+    def _next(self, deadline: float) -> dict[str, Any]:
+        assert self._process.stdout is not None
+        while b"\n" not in self._pending:
+            ready, _, _ = select.select([self._process.stdout], (), (), max(0.0, deadline - time.monotonic()))
+            chunk = self._process.stdout.read(65536) if ready else b""
+            if not chunk:
+                assert self._process.stderr is not None
+                self._process.kill()
+                raise AssertionError(f"no more events after {self.events}: {self._process.stderr.read().decode()}")
+            self._pending += chunk
+        line, _, self._pending = self._pending.partition(b"\n")
+        event: dict[str, Any] = json.loads(line)
+        self.events.append(event)
+        return event
+
+    @property
+    def bus_settings(self) -> Mapping[str, Any]:
+        """What ``can.Bus`` needs."""
+        settings: Mapping[str, Any] = self.ready["buses"]["can0"]
+        return settings
+
+    def join(self) -> can.BusABC:
+        """Join the bus with the stock client."""
+        return can.Bus(**self.bus_settings)
