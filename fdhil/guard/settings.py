@@ -82,8 +82,11 @@ class Settings:
 
     @property
     def silence_s(self) -> float:
-        """How long the bus may be without SYNC: four periods, or 0.5 s of wall clock where time is the SYNC count."""
-        return 0.5 if self.clock == "sync" else 4 * self.sync_period_s
+        """How long the bus may be without SYNC: four periods; 5 s of wall clock where time is the SYNC count.
+
+        A simulated machine stands still between two SYNCs, and its slowest listener may hold it up.
+        """
+        return 5.0 if self.clock == "sync" else 4 * self.sync_period_s
 
     @property
     def heartbeat_cycles(self) -> int:
