@@ -15,6 +15,7 @@ ESTIMATORS: Mapping[str, str] = {
 }
 CORRECTIONS: Mapping[str, str] = {
     "mirror": "fdhil.correction.mirror:plan",
+    "inverse": "fdhil.correction.inverse:plan",
 }
 REGULATORS: Mapping[str, str] = {
     "p_pi_pi": "fdhil.model.p_pi_pi:simulate",

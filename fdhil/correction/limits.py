@@ -13,7 +13,7 @@ import numpy as np
 
 from fdhil.config import Axis
 from fdhil.correction import kernels
-from fdhil.records import Float, Int, Reason
+from fdhil.records import Bool, Float, Int, Reason
 
 AXIS_SPEED_SHARE = 0.10  # an offset never takes more than this of the axis' own speed
 AXIS_ACCELERATION_SHARE = 0.50
@@ -22,6 +22,8 @@ VARIATION_S = 1.0
 # rounding a curve to whole increments moves its first difference by up to 1, its second by up to 2
 ROUNDING_RATE, ROUNDING_ACCELERATION = 1.0, 2.0
 _PASSES = 8
+_NEAR = 150  # rows beside a broken one that are planned anew with it
+_SLACK = 0.05  # increments by which a seam may miss, far below the rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,18 +134,32 @@ def fit(wanted: Float, limits: Limits, before: tuple[float, float] = (0.0, 0.0))
 
 
 def _projected(goal: Float, limits: Limits, before: tuple[float, float]) -> Float:
-    if _inside(goal, limits, before):
+    """Project onto rate, acceleration and amplitude; far from what breaks them the goal stays as it is."""
+    broken = np.flatnonzero(_breaks(goal, limits, before))
+    if broken.size == 0:
         return goal
-    return kernels.project(goal, np.array([limits.offset, limits.rate, limits.acceleration]), np.array(before))
+    result = goal.copy()
+    bounds = np.array([limits.offset, limits.rate, limits.acceleration])
+    apart = np.flatnonzero(np.diff(broken) > 2 * _NEAR) + 1
+    for rows in np.split(broken, apart):
+        first, last = max(0, int(rows[0]) - _NEAR), min(goal.size, int(rows[-1]) + _NEAR)
+        ahead = (
+            before if first == 0 else (float(result[first - 1]), before[0] if first == 1 else float(result[first - 2]))
+        )
+        result[first:last] = kernels.project(goal[first:last], bounds, np.array(ahead))
+    if _breaks(result, limits, before, _SLACK).any():
+        return kernels.project(goal, bounds, np.array(before))
+    return result
 
 
-def _inside(offset: Float, limits: Limits, before: tuple[float, float]) -> bool:
+def _breaks(offset: Float, limits: Limits, before: tuple[float, float], slack: float = 0.0) -> Bool:
+    """Return (n,) the rows at which a limit is broken by more than ``slack`` increments."""
     rate = np.diff(offset, prepend=before[0])
     acceleration = np.diff(rate, prepend=before[0] - before[1])
-    return bool(
-        np.abs(offset).max(initial=0.0) <= limits.offset
-        and np.abs(rate).max(initial=0.0) <= limits.rate
-        and np.abs(acceleration).max(initial=0.0) <= limits.acceleration
+    return np.asarray(
+        (np.abs(offset) > limits.offset + slack)
+        | (np.abs(rate) > limits.rate + slack)
+        | (np.abs(acceleration) > limits.acceleration + slack)
     )
 
 

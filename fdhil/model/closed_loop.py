@@ -8,9 +8,10 @@ tenth of an increment within the position loop.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -91,15 +92,19 @@ def simulate(
     )
     if commanded.ndim != 1 or commanded.size == 0 or not np.isfinite(commanded).all():
         raise ValueError("the reference must be one row of finite positions")
-    structure = axis.regulators.structure
     if state is None:
         # at rest on the reference, not on the offset reference: an offset at row 0 is a step
         state = start(float(reference_mm[0]))
     count = commanded.size - first if rows is None else rows
-    response: Response = tables.load(tables.REGULATORS, structure)(
-        parameters, axis, sync_period_s, commands, state, first, count
+    return _structure(axis.regulators.structure)(parameters, axis, sync_period_s, commands, state, first, count)
+
+
+@lru_cache(maxsize=16)
+def _structure(name: str) -> Callable[[Parameters, Axis, float, Commands, State, int, int], Response]:
+    structure: Callable[[Parameters, Axis, float, Commands, State, int, int], Response] = tables.load(
+        tables.REGULATORS, name
     )
-    return response
+    return structure
 
 
 def start(position_mm: float) -> State:

@@ -7,9 +7,9 @@ integral is kept.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import expm
 
 from fdhil.config import Axis
 from fdhil.model import kernels
@@ -17,6 +17,7 @@ from fdhil.model.closed_loop import Commands, Response, State
 from fdhil.records import Float, Parameters
 
 
+@lru_cache(maxsize=64)
 def plant_step(parameters: Parameters, pitch_mm: float, step_s: float) -> Float:
     """Return (16,) the exact step of [i, w, x] under constant voltage and friction torque, [DES] eqs. 1 and 2.
 
@@ -31,11 +32,26 @@ def plant_step(parameters: Parameters, pitch_mm: float, step_s: float) -> Float:
     a[1, :2] = p.K / p.Jt, -p.ft / p.Jt
     a[1, 4] = 1 / p.Jt
     a[2, 1] = mm_per_rad
-    e = expm(a * step_s)
+    e = _exponential(a * step_s)
     still = math.exp(-p.R / p.L * step_s)
     still_u = -math.expm1(-p.R / p.L * step_s) / p.R
     moving = (e[0, 0], e[0, 1], e[1, 0], e[1, 1], e[2, 0], e[2, 1], *e[:3, 3], *e[:3, 4])
-    return np.array([*moving, still, still_u, p.K, p.Cd])
+    step = np.array([*moving, still, still_u, p.K, p.Cd])
+    step.setflags(write=False)
+    return step
+
+
+def _exponential(a: Float) -> Float:
+    """Return exp(a) of a small matrix by Taylor's series, halved until it converges to the last bit."""
+    halvings = max(0, math.ceil(math.log2(max(float(np.abs(a).sum(axis=1).max()), 1e-12) / 0.5)))
+    scaled = a / 2.0**halvings
+    result = term = np.eye(len(a))
+    for order in range(1, 19):
+        term = term @ scaled / order
+        result = result + term
+    for _ in range(halvings):
+        result = result @ result
+    return result
 
 
 def loop_gains(axis: Axis, sync_period_s: float) -> Float:
@@ -79,3 +95,18 @@ def simulate(
         end,
     )
     return Response.from_rows(out, n_speed * n_current, sync_period_s, end)
+
+
+def rest_loop(axis: Axis, sync_period_s: float, increment_mm: float) -> tuple[float, float, float, float]:
+    """Return what an offset does to the speed loop of a table at rest, per increment.
+
+    Speed error per increment of offset and per increment a cycle of its rate (rad/s), kp, and ki times the period.
+    """
+    g = axis.regulators
+    rad = 2 * math.pi / axis.screw_pitch_mm * increment_mm
+    return (
+        g.position_gain_per_s * rad,
+        g.speed_feedforward * rad / sync_period_s,
+        g.speed_kp,
+        g.speed_ki * sync_period_s,
+    )

@@ -56,9 +56,10 @@ def test_mirror_on_a_lagging_drive(feedforward: float, before_um: float, after_u
     assert contour_error_um(np.column_stack([x, y]), actual, 0.001)[at_d].max() == pytest.approx(after_um, rel=0.08)
 
 
-def test_a_lagging_drive_is_refused_a_mirror() -> None:
-    """The offsets would be far beyond the ceiling; the advice is the drive's own feed-forward."""
-    correction = plan(bench_trajectory(10), MODELS, changed(speed_feedforward=0.5), "mirror")
+@pytest.mark.parametrize("method", ["mirror", "inverse"])
+def test_a_lagging_drive_is_refused(method: str) -> None:
+    """The offsets would be beyond the ceiling; the advice is the drive's own feed-forward."""
+    correction = plan(bench_trajectory(10), MODELS, changed(speed_feedforward=0.5), method)
     assert {reason.code for reason in correction.refused} == {"LagTooLarge"}
     assert "feed-forward" in correction.refused[0].advice
     assert all(not offset.any() for offset in correction.offset_um.values())

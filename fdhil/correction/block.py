@@ -1,0 +1,226 @@
+"""One axis, one block: offsets, in whole increments and inside their limits, that keep the table on its target.
+
+The offset is improved by iteration: simulate the closed loop with it, put the remaining error through the inverse of
+the linear loop, add. Two things are not left to the iteration. The limits hold at every step. And where the axis rests,
+the speed loop's integral would wind up and the table slip by micrometres now and then: there the offset leads the
+current to the middle of the dry friction's band and keeps the position loop silent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fdhil.config import Axis
+from fdhil.correction import kernels
+from fdhil.correction.limits import Limits, check, fit
+from fdhil.correction.linear import Inverse
+from fdhil.model import closed_loop
+from fdhil.model.closed_loop import Response, State
+from fdhil.records import Bool, Float, Parameters
+
+ITERATIONS = 8
+GOOD_ENOUGH_UM = 0.05  # RMS: a sixth of an increment
+STILL_MM_S = 1e-3
+SHORTEST_REST_S = 0.03
+LEAD_S = 0.02  # before an axis starts again the offset is free
+STUCK_UM = 1.5  # a table that rests further away than this is moved, not held
+BAND = 0.97  # of the dry friction: safely stuck
+FADE_S = 0.04
+FORGET_S = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class AxisLoop:
+    """One axis as the inverse sees it."""
+
+    parameters: Parameters
+    axis: Axis
+    sync_period_s: float
+    limits: Limits
+    inverse: Inverse
+
+    @property
+    def increment_mm(self) -> float:
+        """Millimetres per drive increment."""
+        return self.limits.um_per_increment * 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Carry:
+    """What a block hands to the next: the state at its first row, the increments fixed ahead of and in it, a guess.
+
+    ``fixed`` (2,): offsets of the next block's first two rows, which the last cycles have already used. ``guess`` (m,):
+    unrounded offsets found for the rows that were looked at.
+    """
+
+    state: State
+    fixed: Float
+    guess: Float
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """A block's ``offset`` (n,) in increments, the position (n,) in mm that it leads to, and the unrounded guess.
+
+    ``rms_um`` is what is left; ``needed_um`` the largest offset that the linear loop asks for: where it exceeds the
+    limit, the block was not solved.
+    """
+
+    offset: Float
+    position_mm: Float
+    guess: Float
+    rms_um: float
+    needed_um: float
+
+
+def rests(reference_mm: Float, target_mm: Float, sync_period_s: float, ends: bool) -> list[tuple[int, int]]:
+    """Return half-open ranges of rows in which reference and target stand still for long enough.
+
+    ``ends``: the reference ends here, so the last rest has no start behind it.
+    """
+    limit = STILL_MM_S * sync_period_s
+    still = (np.abs(np.diff(reference_mm, append=reference_mm[-1])) <= limit) & (
+        np.abs(np.diff(target_mm, append=target_mm[-1])) <= limit
+    )
+    still &= np.abs(reference_mm - target_mm) <= limit
+    if not ends:
+        still[-1] = False
+    edges = np.flatnonzero(np.diff(still.astype(np.int8), prepend=0, append=0))
+    found = []
+    for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        stop = last if last == still.size else last - round(LEAD_S / sync_period_s)
+        if (stop - first) * sync_period_s > SHORTEST_REST_S:
+            found.append((first, stop))
+    return found
+
+
+def solve(loop: AxisLoop, reference_mm: Float, target_mm: Float, carry: Carry, ends: bool) -> Solution:
+    """Find the offsets of a block whose first two rows are fixed; ``ends`` when nothing follows it."""
+    n = reference_mm.size
+    still = rests(reference_mm, target_mm, loop.sync_period_s, ends)
+    guess = np.zeros(n)
+    known = min(n, carry.guess.size)
+    guess[:known] = carry.guess[:known]
+    if 0 < known < n:
+        guess[known:] = carry.guess[known - 1] * _fade(n - known, loop.sync_period_s)
+    best: Solution | None = None
+    gain = 1.0
+    needed_um = 0.0
+    for iteration in range(ITERATIONS + 1):
+        offset, position, error = _run(loop, reference_mm, target_mm, guess, carry, still)
+        if not ends:
+            error[-round(FORGET_S / loop.sync_period_s) :] = 0.0
+        rms_um = float(np.sqrt(np.mean(error**2))) * 1e3
+        if best is None or rms_um < best.rms_um:
+            best = Solution(offset, position, guess, rms_um, needed_um)
+        elif rms_um > 2.0 * best.rms_um:
+            gain *= 0.5
+            guess = best.guess
+            continue
+        if rms_um < GOOD_ENOUGH_UM:
+            break
+        guess = guess + gain * loop.inverse.apply(error) / loop.increment_mm
+        if iteration == 0:  # before the limits act, the linear loop says what the path needs
+            needed_um = float(np.abs(guess).max()) * loop.limits.um_per_increment
+            if needed_um > loop.limits.offset * loop.limits.um_per_increment:
+                return replace(best, needed_um=needed_um)
+    assert best is not None
+    return replace(best, needed_um=needed_um)
+
+
+def _run(
+    loop: AxisLoop,
+    reference_mm: Float,
+    target_mm: Float,
+    guess: Float,
+    carry: Carry,
+    still: list[tuple[int, int]],
+) -> tuple[Float, Float, Float]:
+    """Simulate with the guess inside its limits; return offset (increments), position, and the error to work on."""
+    offset = np.empty(guess.size)
+    offset[:2] = carry.fixed[: offset.size]
+    before = (float(offset[min(1, offset.size - 1)]), float(offset[0]))
+    guess[2:] = fit(guess[2:], loop.limits, before)  # kept: a guess beyond the limits would only wind up
+    offset[2:] = np.rint(guess[2:])
+    position = np.empty(guess.size)
+    error_of_rest = np.zeros(guess.size)
+    held = np.zeros(guess.size, dtype=np.bool_)
+    state, done = carry.state, 0
+    for first, stop in still:
+        if stop <= done:
+            continue
+        response = _simulate(loop, reference_mm, offset, state, done, stop)
+        stuck = _stuck(loop, response, target_mm[done:stop], max(first - done, 0))
+        if stuck is None:
+            position[done:stop], state, done = response.position_mm, response.end, stop
+            continue
+        row = done + stuck
+        head = _simulate(loop, reference_mm, offset, state, done, row)
+        position[done:row] = head.position_mm
+        _hold(loop, reference_mm, offset, head.end, row, stop)
+        tail = _simulate(loop, reference_mm, offset, head.end, row, stop)
+        position[row:stop], state, done = tail.position_mm, tail.end, stop
+        held[row:stop] = True
+        gone = np.maximum(0.0, 1 - np.arange(stop - row) * loop.sync_period_s / FORGET_S)
+        error_of_rest[row:stop] = (target_mm[row] - position[row]) * gone
+    position[done:] = _simulate(loop, reference_mm, offset, state, done, guess.size).position_mm
+    if held.any() and check(offset[2:].astype(np.int64), loop.limits, before):
+        offset[2:] = np.rint(fit(offset[2:], loop.limits, before))
+        position = _simulate(loop, reference_mm, offset, carry.state, 0, guess.size).position_mm
+    return offset, position, np.where(held, error_of_rest, target_mm - position)
+
+
+def _simulate(loop: AxisLoop, reference_mm: Float, offset: Float, state: State, first: int, stop: int) -> Response:
+    return closed_loop.simulate(
+        loop.parameters,
+        loop.axis,
+        loop.sync_period_s,
+        reference_mm,
+        offset * loop.increment_mm,
+        state=state,
+        first=first,
+        rows=stop - first,
+    )
+
+
+def _stuck(loop: AxisLoop, response: Response, target_mm: Float, first: int) -> int | None:
+    """Return the first row from ``first`` on at which dry friction holds the table near its target."""
+    near: Bool = (
+        (response.speed_rad_s == 0.0)
+        & (loop.parameters.K * np.abs(response.current_a) <= BAND * loop.parameters.Cd)
+        & (np.abs(response.position_mm - target_mm) <= STUCK_UM * 1e-3)
+    )
+    rows = np.flatnonzero(near[first:])
+    return first + int(rows[0]) if rows.size else None
+
+
+def _hold(loop: AxisLoop, reference_mm: Float, offset: Float, state: State, row: int, stop: int) -> None:
+    """Write the offset of a rest from ``row`` + 2 on, and fade what differs from the guess behind it."""
+    from fdhil.model.p_pi_pi import rest_loop
+
+    if stop - row < 3:
+        return
+    n = offset.size
+    planned_end = offset[stop - 1]
+    increment = loop.increment_mm
+    hold = float(state[2] - reference_mm[row]) / increment
+    gains = rest_loop(loop.axis, loop.sync_period_s, increment)
+    integral = float(state[3])
+    error = gains[0] * (offset[row] - hold) + gains[1] * (offset[row + 1] - offset[row])
+    band = BAND * loop.parameters.Cd / loop.parameters.K
+    current = float(np.clip(integral + gains[2] * error, -band, band))
+    curve = loop.limits.curve
+    limits = np.array([np.floor(curve.offset), max(1.0, curve.rate), max(1.0, curve.acceleration)])
+    fade_cycles = FADE_S / loop.sync_period_s
+    kernels.rest(offset, row, stop, integral, np.array([*gains, fade_cycles]), limits, hold, current)
+    if stop < n:
+        change = (offset[stop - 1] - planned_end) * _fade(n - stop, loop.sync_period_s)
+        offset[stop:] = np.rint(offset[stop:] + change)
+
+
+def _fade(rows: int, sync_period_s: float) -> Float:
+    """A smooth factor (rows,) from 1 down to 0 within ``FADE_S``."""
+    share = np.minimum(np.arange(1, rows + 1) * sync_period_s / FADE_S, 1.0)
+    return np.asarray(0.5 * (1 + np.cos(np.pi * share)))

@@ -1,0 +1,77 @@
+"""The closed loop as a linear system: its delay, and a zero-phase inverse of it up to a bandwidth.
+
+Away from the limits and from changes of the friction's sign the loop from offset to position is linear, whatever the
+regulators: one simulated impulse tells all. Its inverse is regularised, so that nothing is asked for where the drive
+gives no answer, and it is applied to a recorded or planned error, so it may look ahead and need not delay.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from fdhil.config import Axis
+from fdhil.model import closed_loop
+from fdhil.records import Float, Parameters
+
+BANDWIDTH_HZ = 120.0
+REGULARISATION = 1e-3
+IMPULSE_S = 1.0
+AHEAD_S = 0.064  # of the impulse's answer that may come before it: the feed-forward looks ahead
+PAD_S = 0.5
+RAMP_MM_S, RAMP_S = 1.0, 3.0
+
+Complex = npt.NDArray[np.complex128]
+
+
+@dataclass(frozen=True, slots=True)
+class Inverse:
+    """The inverse of one axis' loop for errors of up to ``rows`` rows, as a factor on their spectrum."""
+
+    factor: Complex
+    size: int
+    pad: int
+    rows: int
+
+    def apply(self, error: Float) -> Float:
+        """Return the offset (n,) that would undo ``error`` (n,) in the linear loop; what lies outside counts as 0."""
+        padded = np.zeros(self.size)
+        padded[self.pad : self.pad + error.size] = error
+        back = np.fft.irfft(self.factor * np.fft.rfft(padded), self.size)
+        return np.asarray(back[self.pad : self.pad + error.size])
+
+
+def _without_dry_friction(parameters: Parameters, axis: Axis) -> tuple[Parameters, Axis]:
+    """The same loop without what is not linear: dry friction and limits."""
+    free = axis.regulators.model_copy(update={"current_limit_a": 1e9, "voltage_limit_v": 1e9})
+    return replace(parameters, Cd=0.0), axis.model_copy(update={"regulators": free})
+
+
+def delay_s(parameters: Parameters, axis: Axis, sync_period_s: float) -> float:
+    """Return by how much the loop lags at constant speed: 0 with full feed-forward, (1 - Kff) / Kv with less."""
+    linear, free = _without_dry_friction(parameters, axis)
+    ramp = np.arange(round(RAMP_S / sync_period_s), dtype=np.float64) * (sync_period_s * RAMP_MM_S)
+    response = closed_loop.simulate(linear, free, sync_period_s, ramp)
+    # the last rows look beyond the end, where the reference is held
+    return float((ramp[-8] - response.position_mm[-8]) / RAMP_MM_S)
+
+
+def inverse(parameters: Parameters, axis: Axis, sync_period_s: float, rows: int) -> Inverse:
+    """Return the regularised zero-phase inverse of the axis' loop for blocks of up to ``rows`` rows."""
+    linear, free = _without_dry_friction(parameters, axis)
+    ahead = round(AHEAD_S / sync_period_s)
+    impulse = np.zeros(ahead + round(IMPULSE_S / sync_period_s))
+    impulse[ahead] = 1.0
+    answer = closed_loop.simulate(linear, free, sync_period_s, impulse).position_mm
+    pad = round(PAD_S / sync_period_s)
+    size = int(2 ** np.ceil(np.log2(rows + 2 * pad)))
+    around = np.zeros(size)
+    around[: min(size, answer.size)] = answer[:size]
+    around = np.roll(around, -ahead)
+    spectrum = np.fft.rfft(around)
+    frequency = np.fft.rfftfreq(size, sync_period_s)
+    roll_off = 1 / (1 + (frequency / min(BANDWIDTH_HZ, 0.2 / sync_period_s)) ** 4)
+    factor: Complex = np.conj(spectrum) * (roll_off / (np.abs(spectrum) ** 2 + REGULARISATION))
+    return Inverse(factor, size, pad, rows)

@@ -1,0 +1,169 @@
+"""The inverse correction: what it leaves when plant and model differ, its limits, its blocks, its delay."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil import config as configuration
+from fdhil.correction import Limits, check, plan
+from fdhil.correction.inverse import BLOCK_S
+from fdhil.correction.linear import delay_s, inverse
+from fdhil.model import closed_loop
+from fdhil.prediction import predict, predict_corrected
+from fdhil.prediction.models import nominal_models
+from fdhil.records import Correction, Parameters, Trajectory
+from tests.bench import bench_config
+from tests.correction.test_planning import changed
+from tests.paths import bench_demand, bench_trajectory, rms, smooth, trajectory
+
+CONFIG = bench_config()
+MODELS = nominal_models(CONFIG)
+SCATTER = {"R": 0.001, "L": 0.003, "K": 0.0005, "Jt": 0.001, "ft": 0.02, "Cd": 0.03}
+
+
+def scattered(seed: int) -> dict[str, Parameters]:
+    """Plants that differ from the model as much as a model from one rapid differs from its plant."""
+    random = np.random.default_rng(seed)
+    plants = {}
+    for axis in "XY":
+        nominal = MODELS[axis]
+        plants[axis] = replace(
+            nominal, **{k: getattr(nominal, k) * (1 + s * random.standard_normal()) for k, s in SCATTER.items()}
+        )
+    return plants
+
+
+def assert_within_limits(correction: Correction) -> None:
+    """Amplitude with braking, rate, acceleration, variation; whole increments."""
+    for axis, offset in correction.offset_um.items():
+        limits = Limits.of(CONFIG.axis[axis], 0.001)
+        increments = offset / limits.um_per_increment
+        assert np.allclose(increments, np.rint(increments), atol=1e-6)
+        assert check(np.rint(increments).astype(np.int64), limits) == []
+
+
+@pytest.mark.parametrize(("feed", "smoothing"), [(10, (0.060, 0.030)), (20, (0.060, 0.030)), (10, (0.030, 0.015))])
+def test_sixty_times_better_with_an_identified_model(feed: float, smoothing: tuple[float, float]) -> None:
+    """On plants that scatter: RMS, no point worse by 2 um, no zone by 1 um, 8 times better than the mirror."""
+    reference = bench_trajectory(feed, smoothing)
+    correction = plan(reference, MODELS, CONFIG, "inverse")
+    mirror = plan(reference, MODELS, CONFIG, "mirror")
+    assert correction.refused == ()
+    assert_within_limits(correction)
+    for seed in range(3):
+        plants = scattered(seed)
+        before = predict(reference, plants, CONFIG).contour_um
+        after = predict_corrected(reference, plants, CONFIG, correction.offset_um).contour_um
+        mirrored = predict_corrected(reference, plants, CONFIG, mirror.offset_um).contour_um
+        assert rms(before) / rms(after) > 60
+        assert rms(mirrored) / rms(after) > 8
+        assert (after - before).max() < 2.0
+        for zone in predict(reference, plants, CONFIG).zones:
+            rows = (reference.time_s >= zone.start_s) & (reference.time_s < zone.end_s)
+            assert after[rows].max() < zone.max_um + 1.0
+
+
+def test_corners_do_not_oscillate() -> None:
+    """Around a corner the corrected error stays below a micrometre, where the mirror leaves 10 and more."""
+    reference = bench_trajectory(10)
+    after = plan(reference, MODELS, CONFIG, "inverse").after
+    for zone in predict(reference, MODELS, CONFIG).zones:
+        rows = (reference.time_s >= zone.start_s - 0.05) & (reference.time_s < zone.end_s + 0.1)
+        assert after.contour_um[rows].max() < 1.0
+
+
+def test_a_model_that_is_far_off_still_helps() -> None:
+    """5 to 10 % wrong parameters leave a few micrometres."""
+    reference = bench_trajectory(10, (0.030, 0.015))
+    correction = plan(reference, MODELS, CONFIG, "inverse")
+    off = replace(MODELS["X"], R=0.53, L=0.0053, K=0.78, Jt=0.079, ft=0.055, Cd=5.5)
+    plants = {"X": off, "Y": off}
+    before = predict(reference, plants, CONFIG).contour_um
+    after = predict_corrected(reference, plants, CONFIG, correction.offset_um).contour_um
+    assert rms(before) / rms(after) > 8
+
+
+def test_seams_between_blocks_do_not_show() -> None:
+    """The rows around a seam are as good as the rest, and a piece of the path more does not change the first blocks."""
+    reference = bench_trajectory(10)
+    correction = plan(reference, MODELS, CONFIG, "inverse")
+    seam = np.abs(reference.time_s - BLOCK_S) < 0.1
+    assert correction.after.contour_um[seam].max() < 0.5
+
+
+@pytest.mark.parametrize(("feedforward", "expected"), [(1.0, 0.0), (0.5, 0.010), (0.0, 0.020)])
+def test_delay_is_that_of_the_position_loop(feedforward: float, expected: float) -> None:
+    """(1 - Kff) / Kv."""
+    config = changed(speed_feedforward=feedforward)
+    assert delay_s(MODELS["X"], config.axis["X"], 0.001) == pytest.approx(expected, abs=2e-5)
+
+
+def test_a_slow_path_on_a_lagging_drive_needs_small_offsets() -> None:
+    """With one delay for all axes only the corners need offsets: at 4 m/min they fit, the lag itself would not."""
+    config = changed(speed_feedforward=0.5)
+    reference = bench_trajectory(4)
+    correction = plan(reference, MODELS, config, "inverse")
+    lag_um = max(float(np.abs(error).max()) for error in correction.before.error_um.values())
+    assert lag_um > 600
+    assert correction.refused == ()
+    assert max(float(np.abs(offset).max()) for offset in correction.offset_um.values()) < 250
+    assert rms(correction.before.contour_um) / rms(correction.after.contour_um) > 20
+
+
+def test_axes_with_different_lags_are_refused() -> None:
+    """Half the difference of their delays at full speed is more than an offset may be."""
+    config = changed()
+    slow = changed(speed_feedforward=0.5).axis["Y"]
+    mixed = config.model_copy(update={"axis": {"X": config.axis["X"], "Y": slow}})
+    correction = plan(bench_trajectory(10), MODELS, mixed, "inverse")
+    assert {reason.code for reason in correction.refused} == {"LagTooLarge"}
+
+
+def test_the_linear_inverse_undoes_the_linear_loop() -> None:
+    """An error below the bandwidth is undone to a per mille by one step."""
+    axis = CONFIG.axis["X"]
+    parameters = replace(MODELS["X"], Cd=0.0)
+    undo = inverse(parameters, axis, 0.001, 2000)
+    bump = 0.02 * np.exp(-(((np.arange(1500) - 700) / 40.0) ** 2))
+    offset = undo.apply(bump)
+    response = closed_loop.simulate(parameters, axis, 0.001, np.zeros(1500), offset)
+    assert np.abs(response.position_mm - bump).max() < 3e-5
+
+
+def random_path(seed: int) -> Trajectory:
+    """Moves and rests of two axes in random order, away from the limits."""
+    random = np.random.default_rng(seed)
+    speeds = np.concatenate(
+        [np.repeat(random.uniform(-90, 90, (1, 2)) * (random.random(2) > 0.3), random.integers(80, 500), axis=0)
+         for _ in range(9)]
+    )  # fmt: skip
+    path = np.cumsum(np.concatenate([speeds, np.zeros((200, 2))]) * 0.001, axis=0)
+    path = np.concatenate([path[:1], path])
+    path[0] = path[1]
+    return trajectory(smooth(path, (0.060, 0.030), 0.001))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_paths_get_better_within_the_limits(seed: int) -> None:
+    """Reversals, rests and single-axis moves in any order."""
+    reference = random_path(seed)
+    correction = plan(reference, MODELS, CONFIG, "inverse")
+    assert correction.refused == ()
+    assert_within_limits(correction)
+    assert rms(correction.before.contour_um) > 20 * rms(correction.after.contour_um)
+
+
+def test_narrow_limits_are_kept() -> None:
+    """With the default limits (50 um, 2 mm/s, 250 mm/s2) a slow path is corrected within them."""
+    narrow = configuration.CorrectionLimits(max_offset_um=50.0, max_speed_mm_s=2.0, max_acceleration_mm_s2=250.0)
+    axes = {name: axis.model_copy(update={"correction": narrow}) for name, axis in CONFIG.axis.items()}
+    config = CONFIG.model_copy(update={"axis": axes})
+    correction = plan(trajectory(bench_demand(5)), MODELS, config, "inverse")
+    assert correction.refused == ()
+    for axis, offset in correction.offset_um.items():
+        limits = Limits.of(config.axis[axis], 0.001)
+        assert check(np.rint(offset / limits.um_per_increment).astype(np.int64), limits) == []
+    assert rms(correction.before.contour_um) > 4 * rms(correction.after.contour_um)
