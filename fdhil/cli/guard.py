@@ -49,13 +49,12 @@ def guard(config: Path, check: bool) -> None:
     if check:
         click.echo(f"{file}: {len(settings.axes)} axes on {name}")
         return
-    lock = lock_bus(machine.bus[name])
-    transmit = open_bus(name, machine.bus[name])
-    lock.set_inheritable(True)
-    transmit.set_inheritable(True)
-    arguments = ["-m", "fdhil.guard", "--settings", str(file), "--descriptor", str(transmit.fileno())]
-    sys.stdout.flush()
-    os.execv(sys.executable, [sys.executable, *arguments])
+    with lock_bus(machine.bus[name]) as lock, open_bus(name, machine.bus[name]) as transmit:
+        lock.set_inheritable(True)
+        transmit.set_inheritable(True)
+        arguments = ["-m", "fdhil.guard", "--settings", str(file), "--descriptor", str(transmit.fileno())]
+        sys.stdout.flush()
+        os.execv(sys.executable, [sys.executable, *arguments])
 
 
 def corrected_bus(machine: MachineConfig, source: str) -> str:
@@ -190,10 +189,13 @@ def open_bus(name: str, bus: CanBus) -> socket.socket:
 
 
 def _open_raw(name: str, channel: str) -> socket.socket:
+    raw = None
     try:
         raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         raw.bind((channel,))
     except OSError as error:
+        if raw is not None:
+            raw.close()
         text = f"the CAN interface {channel} cannot be opened ({error.strerror}); bring it up with ip link"
         raise ConnectError(f"bus {name}", text) from None
     return raw

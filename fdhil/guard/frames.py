@@ -51,13 +51,12 @@ class _PdoState:
         if self.fresh and data != self.data:
             self.twice = True
         self.data, self.fresh, self.age = data, True, 0
+        self.values = unpack(self.entries, data)  # now, and not at the SYNC, when there is no time
 
     def at_sync(self) -> None:
-        """Age by one cycle and decode what came."""
+        """Age by one cycle."""
         self.twice_run = self.twice_run + 1 if self.twice else 0
         self.age += 1
-        if self.fresh:
-            self.values = unpack(self.entries, self.data)
         self.twice = False
 
     def get(self, index: int) -> int | None:

@@ -279,3 +279,6 @@ def bench(amplitude: int = 300, **changes: object) -> Bench:
     for drive, column in zip(drives, demand, strict=True):
         drive.queue = [(column[0], 0)] * 2
     return Bench(made, path, demand, drives)
+
+
+DEMAND_AT_REST = [[0] * 3, [0] * 3]

@@ -109,7 +109,7 @@ def test_a_closed_hub_is_down(wire: tuple[SocketcandText, socket.socket]) -> Non
 
 
 def test_a_full_queue_is_told(wire: tuple[SocketcandText, socket.socket]) -> None:
-    with pytest.raises(BusDown, match="part of a frame|full"):
+    with pytest.raises(BusDown, match=r"part of a frame|full"):
         pour(wire[0], 1_000_000)
 
 
@@ -238,6 +238,6 @@ def test_two_axes_on_one_offset_are_refused() -> None:
 def test_what_may_be_sent_and_how_long_silence_is() -> None:
     made: Settings = settings()
     assert made.sent_ids == {0x301, 0x302, 0x764}
-    assert made.silence_s == 0.5
+    assert made.silence_s == 5.0
     assert settings(clock="monotonic").silence_s == pytest.approx(0.004)
     assert made.heartbeat_cycles == 20

@@ -1,0 +1,150 @@
+"""fdhil-guard: what it makes of a config, what it refuses, and that it becomes the guard's process."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import signal
+import socket
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fdhil import config as machine_config
+from fdhil.cli.guard import guard, limits_of, lock_bus, open_bus
+from fdhil.cli.main import run_safely
+from fdhil.config import CanBus, CorrectionLimits
+from fdhil.errors import ConnectError, DeviceError, ProtocolError
+from fdhil.guard.limits import Limits
+from fdhil.guard.settings import load
+from tests.guard.machine import DEMAND_AT_REST
+from tests.guard.peer import Peer, write_config
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["fdhil-guard", *arguments])
+    return run_safely(guard)
+
+
+@pytest.fixture
+def peer() -> Iterator[Peer]:
+    made = Peer(DEMAND_AT_REST)
+    made.start()
+    yield made
+    made.ended.set()
+    made.join()
+
+
+def test_help(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(monkeypatch, "--help") == 0
+    text = capsys.readouterr().out
+    assert "sends no frame until the daemon arms" in " ".join(text.split())
+
+
+def test_check_writes_the_settings_and_a_token(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = write_config(tmp_path, 1)
+    assert run(monkeypatch, str(config), "--check") == 0
+    assert "2 axes on can0" in capsys.readouterr().out
+    directory = tmp_path / "fdhil-data" / "run"
+    settings = load(directory / "guard.json")
+    token = (directory / "token").read_text()
+    assert stat.S_IMODE((directory / "token").stat().st_mode) == 0o600
+    assert settings.token_sha256 == hashlib.sha256(token.encode()).hexdigest()
+    assert token not in (directory / "guard.json").read_text()
+    assert settings.sent_ids == {0x301, 0x302, 0x764}
+    assert [axis.name for axis in settings.axes] == ["X", "Y"]
+    assert settings.axes[0].limits == Limits(819, 65, 6, 9830, 1000)
+    assert settings.axes[1].target.cob_id == 0x202
+    assert settings.axes[0].window == 32768
+
+
+def test_default_limits_are_whole_increments(tmp_path: Path) -> None:
+    config = machine_config.load(write_config(tmp_path, 1))
+    axis = config.axis["X"].model_copy(update={"correction": CorrectionLimits()})
+    assert limits_of(axis, 0.001) == Limits(163, 6, 1, 9830, 1000)
+    assert limits_of(axis, 0.002) == Limits(163, 13, 3, 9830, 500)
+
+
+def test_without_a_correction_section_writing_is_off(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = write_config(tmp_path, 1, corrected=False)
+    assert run(monkeypatch, str(config)) == 2
+    assert "writing is off" in capsys.readouterr().err
+
+
+def test_no_hub_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        port = closed.getsockname()[1]
+    config = write_config(tmp_path, port)
+    assert run(monkeypatch, str(config)) == 3
+    told = capsys.readouterr().err
+    assert "start the hub first" in told
+    assert len(told.splitlines()) == 1
+
+
+def test_buses_that_cannot_be_opened() -> None:
+    with pytest.raises(ConnectError, match="inside one process"):
+        open_bus("can0", CanBus(interface="virtual"))
+    with pytest.raises(ConnectError, match="cannot be opened"):
+        open_bus("can0", CanBus(interface="socketcan", channel="none9"))
+
+
+@pytest.mark.parametrize(
+    ("greeting", "error"), [(b"< hello >", ProtocolError), (b"", ConnectError), (b"x" * 300, ConnectError)]
+)
+def test_a_peer_that_is_no_hub(greeting: bytes, error: type[Exception]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        import threading
+
+        def greet() -> None:
+            client, _ = server.accept()
+            with client:
+                client.sendall(greeting)
+
+        thread = threading.Thread(target=greet)
+        thread.start()
+        with pytest.raises(error):
+            open_bus("can0", CanBus(port=server.getsockname()[1]))
+        thread.join()
+
+
+def test_one_guard_per_bus() -> None:
+    bus = CanBus(port=47)
+    with lock_bus(bus), pytest.raises(DeviceError, match="BusLocked"):
+        lock_bus(bus)
+    lock_bus(bus).close()
+
+
+def test_it_becomes_the_guard_owns_its_bus_and_stops_cleanly(tmp_path: Path, peer: Peer) -> None:
+    config = write_config(tmp_path, peer.port)
+    command = [sys.executable, "-m", "fdhil.cli.guard", str(config)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        ready = json.loads(process.stdout.readline())
+        assert (ready["event"], ready["axes"]) == ("ready", ["X", "Y"])
+        second = subprocess.run(command, capture_output=True, text=True, timeout=60)
+        assert second.returncode == 3
+        assert "BusLocked" in second.stderr
+        assert len(second.stderr.splitlines()) == 1
+        process.send_signal(signal.SIGTERM)
+        told = [json.loads(line) for line in process.stdout]
+        assert process.wait(20) == 0
+        assert told[-1]["event"] == "stopped"
+    assert peer.sent == []
+
+
+def test_the_process_alone_refuses_what_it_cannot_use(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "fdhil.guard", "--settings", str(tmp_path / "none.json"), "--descriptor", "0"]
+    refused = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=60)
+    assert refused.returncode == 2
+    assert "run fdhil-guard" in refused.stderr
+    assert len(refused.stderr.splitlines()) == 1
