@@ -1,4 +1,4 @@
-"""How the twin is attached to a CAN bus: its own TCP hub, python-can's ``virtual`` in one process, or SocketCAN.
+"""How the twin is attached to a CAN bus: its own TCP hub, the kernel's SocketCAN, python-can's ``virtual``.
 
 All three offer the same methods to the twin's loop; this is the only module of the twin that imports ``can``.
 """
@@ -8,17 +8,27 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import socket
+import struct
 import threading
 import time
 from collections import deque
 from collections.abc import Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from fdhil.config import CanBus
 from fdhil.errors import ConnectError
 from fdhil.sim.hub import EXTENDED, Frame, Handler, Hub
 
+if TYPE_CHECKING:
+    import can
+
 _RETRY_S = 0.0005
+_MAX_WAITING = 1000
+_FRAMES_PER_TURN = 256
+# struct can_frame of linux/can.h: identifier with its flags, length, 3 bytes of padding, data
+_CAN_FRAME = struct.Struct("=IB3x8s")
+_ERROR_FRAME, _REMOTE_FRAME = 1 << 29, 1 << 30
 
 
 class Selectable(Protocol):
@@ -75,64 +85,133 @@ def attach(name: str, bus: CanBus) -> Attachment:
     """Attach to the bus ``[bus.name]``; ConnectError when it cannot be had."""
     if bus.interface == "socketcand":
         return Hub(bus.channel, bus.host, bus.port)
-    return PythonCan(name, bus)
+    return SocketCan(name, bus) if bus.interface == "socketcan" else Virtual(name, bus)
 
 
-class PythonCan:
-    """A bus of python-can: ``socketcan`` by its descriptor, ``virtual`` through a thread that wakes the loop.
+def _no_bus(name: str, bus: CanBus, error: OSError) -> ConnectError:
+    return ConnectError(
+        f"bus {name}",
+        f"socketcan {bus.channel} cannot be opened ({error.strerror or error}): bring it up (ip link set {bus.channel} "
+        "up), or use the socketcand interface, which needs no CAN in the kernel",
+    )
 
-    ``lost`` counts frames that SocketCAN's transmit queue would not take.
+
+class SocketCan:
+    """A CAN interface of the kernel by a raw socket (half the time per frame of a library's message objects).
+
+    ``lost`` counts frames that were given up because the transmit queue stayed full.
     """
 
     def __init__(self, name: str, bus: CanBus) -> None:
-        import can
-
-        self._error = can.CanError
-        self._message = can.Message
-        self._name, self._settings = name, bus
-        try:
-            self._bus = can.Bus(interface=bus.interface, channel=bus.channel)
-        except (OSError, can.CanError) as error:
-            raise ConnectError(
-                f"bus {name}",
-                f"{bus.interface} {bus.channel} cannot be opened ({error}): bring it up "
-                f"(ip link set {bus.channel} up), or use the socketcand interface, which needs no CAN in the kernel",
-            ) from None
+        self._channel = bus.channel
         self.lost = 0
         self._out: deque[Frame] = deque()
-        self._in: deque[Frame] = deque()
-        self._reader = _Reader(self._bus, self._in) if bus.interface == "virtual" else None
+        try:
+            self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        except OSError as error:
+            raise _no_bus(name, bus, error) from None
+        try:
+            self._socket.bind((bus.channel,))
+        except OSError as error:
+            self._socket.close()
+            raise _no_bus(name, bus, error) from None
+        self._socket.setblocking(False)
 
     @property
     def settings(self) -> dict[str, str | int | None]:
         """The arguments with which ``can.Bus`` joins."""
-        return {"interface": self._settings.interface, "channel": self._settings.channel}
+        return {"interface": "socketcan", "channel": self._channel}
 
     @property
     def congested(self) -> bool:
-        """Never: the kernel's queue is short and is emptied by the bus."""
-        return False
+        """Whether the kernel's transmit queue is full: the bus itself sets the pace then."""
+        return bool(self._out)
 
     def readers(self) -> Sequence[Selectable]:
-        """The descriptor that a received frame makes readable."""
-        return [self._bus if self._reader is None else self._reader]
+        """The socket."""
+        return [self._socket]
 
     def writers(self) -> Sequence[Selectable]:
-        """Nothing: a socket that is full is tried again at the next flush."""
+        """Nothing: a full transmit queue does not show in ``select``."""
         return []
 
     def deadline_s(self) -> float | None:
-        """Soon while frames wait for the kernel's queue."""
+        """Soon while frames wait for the transmit queue."""
         return time.monotonic() + _RETRY_S if self._out else None
 
     def pump(self, ready: Sequence[object], handler: Handler) -> None:
-        """Give every frame that has come to ``handler``."""
-        if self._reader is None:
-            if self._bus in ready:
-                while (message := self._bus.recv(0)) is not None:
-                    if not (message.is_error_frame or message.is_remote_frame):
-                        handler(_frame(message.arbitration_id, message.is_extended_id, message.data))
+        """Give every frame that has come to ``handler``; error and remote frames are no business of the twin."""
+        if self._socket not in ready:
             return
+        for _ in range(_FRAMES_PER_TURN):
+            try:
+                can_id, length, data = _CAN_FRAME.unpack(self._socket.recv(_CAN_FRAME.size))
+            except OSError:  # nothing more, or the interface went down
+                return
+            if not can_id & (_ERROR_FRAME | _REMOTE_FRAME):
+                handler((can_id, data[:length]))
+
+    def send(self, frames: Sequence[Frame]) -> None:
+        """Queue frames."""
+        self._out.extend(frames)
+        while len(self._out) > _MAX_WAITING:  # nobody acknowledges: the bus is off or alone
+            self._out.popleft()
+            self.lost += 1
+
+    def flush(self, now_s: float) -> None:
+        """Send what is queued; what a full transmit queue refuses stays for the next time."""
+        while self._out:
+            can_id, data = self._out[0]
+            try:
+                self._socket.send(_CAN_FRAME.pack(can_id, len(data), data))
+            except OSError as error:
+                if error.errno in (errno.ENOBUFS, errno.EAGAIN):
+                    return
+                self.lost += 1
+            self._out.popleft()
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._socket.close()
+
+
+class Virtual:
+    """python-can's ``virtual`` bus inside this process; a thread wakes the loop for what comes."""
+
+    def __init__(self, name: str, bus: CanBus) -> None:
+        import can
+
+        self._message = can.Message
+        self._channel = bus.channel
+        self._bus = can.Bus(interface="virtual", channel=bus.channel)
+        self._out: list[Frame] = []
+        self._in: deque[Frame] = deque()
+        self._reader = _Reader(self._bus, self._in)
+
+    @property
+    def settings(self) -> dict[str, str | int | None]:
+        """The arguments with which ``can.Bus`` joins."""
+        return {"interface": "virtual", "channel": self._channel}
+
+    @property
+    def congested(self) -> bool:
+        """Never: the peers' queues have no bound."""
+        return False
+
+    def readers(self) -> Sequence[Selectable]:
+        """The pipe through which the thread wakes the loop."""
+        return [self._reader]
+
+    def writers(self) -> Sequence[Selectable]:
+        """Nothing."""
+        return []
+
+    def deadline_s(self) -> float | None:
+        """Never."""
+        return None
+
+    def pump(self, ready: Sequence[object], handler: Handler) -> None:
+        """Give every frame that has come to ``handler``."""
         if self._reader in ready:
             self._reader.clear()
         while self._in:
@@ -143,31 +222,22 @@ class PythonCan:
         self._out.extend(frames)
 
     def flush(self, now_s: float) -> None:
-        """Send what is queued; what a full transmit queue refuses stays for the next time."""
-        while self._out:
-            can_id, data = self._out[0]
-            message = self._message(
-                arbitration_id=can_id & 0x1FFFFFFF, data=data, is_extended_id=can_id >= EXTENDED, check=False
-            )
-            try:
-                self._bus.send(message)
-            except self._error as error:
-                if getattr(error, "error_code", None) == errno.ENOBUFS and len(self._out) < 1000:
-                    return
-                self.lost += 1
-            self._out.popleft()
+        """Send what is queued."""
+        frames, self._out = self._out, []
+        for can_id, data in frames:
+            extended = can_id >= EXTENDED
+            self._bus.send(self._message(arbitration_id=can_id & 0x1FFFFFFF, data=data, is_extended_id=extended))
 
     def close(self) -> None:
         """Leave the bus."""
-        if self._reader is not None:
-            self._reader.stop()
+        self._reader.stop()
         self._bus.shutdown()
 
 
 class _Reader(threading.Thread):
     """Takes frames from a bus without descriptor and wakes the loop through a pipe."""
 
-    def __init__(self, bus: object, inbox: deque[Frame]) -> None:
+    def __init__(self, bus: can.BusABC, inbox: deque[Frame]) -> None:
         super().__init__(name="sim-can-reader", daemon=True)
         self._bus, self._inbox = bus, inbox
         self._ending = False
@@ -188,7 +258,7 @@ class _Reader(threading.Thread):
     def run(self) -> None:
         """Receive until told to stop."""
         while not self._ending:
-            message = self._bus.recv(0.1)  # type: ignore[attr-defined]
+            message = self._bus.recv(0.1)
             if message is not None:
                 self._inbox.append(_frame(message.arbitration_id, message.is_extended_id, message.data))
                 with contextlib.suppress(BlockingIOError):  # the loop has not read the calls before: it is awake

@@ -16,7 +16,8 @@ from fdhil.sim.drive import Drive
 from fdhil.sim.faults import FaultEntry, FaultSchedule
 from fdhil.sim.hub import Frame
 from fdhil.sim.modbus_sensor import SensorFaults, VoltageSensor
-from fdhil.sim.nc import BusFrame, Event, Nc, Row
+from fdhil.sim.nc import Event, Nc, Row
+from fdhil.sim.nc_link import BusFrame
 from fdhil.sim.recorder import Recorder
 from fdhil.sim.sensors import DriveFaults
 from fdhil.sim.thermal import SlideWay

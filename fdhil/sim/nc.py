@@ -6,9 +6,8 @@ runs its set-point ``delay`` cycles late, follows r[k] at SYNC k. All its times 
 
 from __future__ import annotations
 
-import struct
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Any, NamedTuple
 
@@ -17,10 +16,10 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.records import Trajectory
 from fdhil.sim.hub import Frame
+from fdhil.sim.nc_link import ENABLED, SHUTDOWN, BusFrame, Link, Request
 from fdhil.sim.path import Player, Rate, rapid_rows
 from fdhil.sim.power import State
 
-BusFrame = tuple[str, Frame]
 Event = dict[str, Any]
 
 COUNTER_OVERFLOW = 240
@@ -31,25 +30,6 @@ _ENABLE_S = 3.0
 _SILENCE_CYCLES = 5
 _RELEASE_CYCLES = 3
 _MAX_OVERRIDE = 1.5
-_ENABLED = 0x0F
-_SHUTDOWN = 0x06
-_WORDS = {
-    State.SWITCH_ON_DISABLED: _SHUTDOWN,
-    State.READY: 0x07,
-    State.SWITCHED_ON: _ENABLED,
-    State.OPERATION_ENABLED: _ENABLED,
-    State.QUICK_STOP_ACTIVE: 0x00,
-}
-
-
-def power_state(statusword: int) -> State:
-    """Return the power state that a statusword shows (CiA 402-2, table 30)."""
-    for mask in (0x6F, 0x4F):
-        try:
-            return State(statusword & mask)
-        except ValueError:
-            continue
-    return State.NOT_READY
 
 
 class Phase(Enum):
@@ -69,38 +49,6 @@ class Row(NamedTuple):
     position_mm: list[float]
     rapid: bool
     playing: bool
-
-
-@dataclass(slots=True)
-class _Link:
-    """One drive as the NC sees it."""
-
-    axis: str
-    bus: str
-    node_id: int
-    increments_per_mm: float
-    delay: int
-    word: int = _SHUTDOWN
-    status: int | None = None
-    position: int | None = None
-    silent: int = 0
-
-    @property
-    def state(self) -> State:
-        return State.NOT_READY if self.status is None else power_state(self.status)
-
-    def set_point(self, target: int) -> BusFrame:
-        return self.bus, (0x200 + self.node_id, struct.pack("<Hi", self.word, target))
-
-    def walk(self) -> BusFrame | None:
-        """One step toward Operation enabled, with the actual position as target."""
-        if self.position is None:
-            return None
-        if self.state is State.FAULT:  # a reset is a rising edge
-            self.word = 0x00 if self.word == 0x80 else 0x80
-        else:
-            self.word = _WORDS.get(self.state, self.word)
-        return self.set_point(self.position)
 
 
 @dataclass(slots=True)
@@ -126,18 +74,6 @@ class _Job:
     trajectory: Trajectory
 
 
-@dataclass(slots=True)
-class _Request:
-    """An SDO write that awaits its answer."""
-
-    link: _Link
-    index: int
-    value: int
-    required: bool
-    sent: bool = False
-    cycles: int = field(default=0)
-
-
 class Nc:
     """The NC of one machine. ``events`` collects what it has to say; who runs it takes them out.
 
@@ -156,7 +92,7 @@ class Nc:
         self._speeds = [axis.rapid_speed_mm_s for axis in config.axis.values()]
         self._accelerations = [axis.max_acceleration_mm_s2 for axis in config.axis.values()]
         self._links = [
-            _Link(
+            Link(
                 name,
                 axis.drive.bus,
                 config.node_id(name),
@@ -172,7 +108,7 @@ class Nc:
         self._rate = Rate(min(slope, 0.5 / period), period)
         self._rows: deque[Row] = deque(maxlen=self._delay + 1)
         self._stages: deque[_Stage] = deque()
-        self._requests: deque[_Request] = deque()
+        self._requests: deque[Request] = deque()
         self._job: _Job | None = None
         self._position = [0.0] * len(self._links)
         self._counter = 0
@@ -297,9 +233,9 @@ class Nc:
         self._requests.clear()
         for link in self._links:
             link.status = link.position = None
-            link.word = _SHUTDOWN
-            self._requests.append(_Request(link, 0x1019, COUNTER_OVERFLOW, required=False))
-            self._requests.append(_Request(link, 0x6060, 8, required=True))
+            link.word = SHUTDOWN
+            self._requests.append(Request(link, 0x1019, COUNTER_OVERFLOW, required=False))
+            self._requests.append(Request(link, 0x6060, 8, required=True))
 
     def _nmt(self, command: int) -> list[BusFrame]:
         return [(link.bus, (0x000, bytes([command, link.node_id]))) for link in self._links]
@@ -313,14 +249,13 @@ class Nc:
         request = self._requests[0]
         if not request.sent:
             request.sent = True
-            write = struct.pack("<BHBI", 0x2F, request.index, 0, request.value)
-            frames.append((request.link.bus, (0x600 + request.link.node_id, write)))
+            frames.append(request.frame)
         request.cycles += 1
         if request.cycles * self._period_s > _ANSWER_S:
             self._give_up(f"drive {request.link.axis} does not answer; check that it is powered")
         return frames
 
-    def _answer(self, link: _Link, data: bytes) -> None:
+    def _answer(self, link: Link, data: bytes) -> None:
         if not self._requests or not self._requests[0].sent or self._requests[0].link is not link:
             return
         request = self._requests[0]
@@ -348,7 +283,7 @@ class Nc:
             if self._job is not None:
                 self._start_job()
         elif self._waited * self._period_s > _ENABLE_S:
-            stuck = ", ".join(f"{k.axis} ({k.state.name})" for k in self._links if k.word != _ENABLED)
+            stuck = ", ".join(f"{k.axis} ({k.state.name})" for k in self._links if k.word != ENABLED)
             self._give_up(f"these drives do not reach Operation enabled: {stuck}; clear the cause and switch the NC on")
         return frames
 
@@ -359,7 +294,7 @@ class Nc:
             self._let_go()
             return frames
         for link in self._links:
-            link.word = _SHUTDOWN
+            link.word = SHUTDOWN
         return [link.set_point(link.position) for link in self._links if link.position is not None]
 
     def _let_go(self) -> None:
@@ -396,10 +331,10 @@ class Nc:
         frames = []
         for place, link in enumerate(self._links):
             if self.phase is Phase.FAULTED and link.state is not State.OPERATION_ENABLED:
-                link.word = _SHUTDOWN
+                link.word = SHUTDOWN
                 target = link.position or 0
             else:
-                link.word = _ENABLED
+                link.word = ENABLED
                 row = self._rows[link.delay - self._delay - 1]
                 target = round(row.position_mm[place] * link.increments_per_mm)
             frames.append(link.set_point(target))

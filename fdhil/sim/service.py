@@ -26,7 +26,7 @@ from fdhil.sim.faults import FaultEntry
 from fdhil.sim.hub import Frame, Handler
 from fdhil.sim.machine import Machine
 from fdhil.sim.modbus_sensor import SensorServers
-from fdhil.sim.nc import BusFrame
+from fdhil.sim.nc_link import BusFrame
 from fdhil.sim.panel import MAX_LINE, Panel, PanelError
 
 Loader = Callable[[Path, MachineConfig], Trajectory]
