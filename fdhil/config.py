@@ -160,6 +160,9 @@ class Nc(Section):
     )
     corner: Literal["continuous", "exact_stop"] = Field("continuous", description="between feed moves")
     settle_s: NotNegative = Field(0.0, le=10, description="rest that the NC adds at an exact stop")
+    end_rest_s: NotNegative = Field(
+        0.5, le=10, description="rest after the last motion: the drives' settling belongs to the path's error"
+    )
     max_blocks: int = Field(10_000_000, ge=1, description="blocks a program may execute before it is refused")
     max_call_depth: int = Field(50, ge=1, le=200, description="nesting of calls before a program is refused")
 

@@ -84,7 +84,7 @@ class Timeline:
         self._dt_s = config.machine.sync_period_s
         self._max_s = max_rows * self._dt_s
         self._settle_rows = settle_rows + math.ceil(config.nc.settle_s / self._dt_s - _TICK_TOLERANCE)
-        self._end_rows = settle_rows + 1
+        self._end_rows = settle_rows + 1 + math.ceil(config.nc.end_rest_s / self._dt_s - _TICK_TOLERANCE)
         self._stop_always = config.nc.corner == "exact_stop"
         axes = [config.axis.get(name) for name in "XYZ"]
         self._present = [axis is not None for axis in axes]
