@@ -1,0 +1,91 @@
+"""The closed-loop kernel against the same kernel in C -O3, and against real time: one axis, one core.
+
+Compiles closed_loop.c with the system's ``cc``; run as ``python -m benchmarks.closed_loop``.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from fdhil.model import kernels
+from fdhil.model.p_pi_pi import loop_gains, plant_step
+from fdhil.prediction.models import nominal_models
+from fdhil.records import Float
+from tests.bench import bench_config
+from tests.paths import bench_demand
+
+REPEATS = 40
+N_SPEED, N_CURRENT = 4, 8
+
+
+def compiled(folder: Path) -> ctypes.CDLL:
+    """Compile the C kernel; RuntimeError when there is no compiler."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        raise RuntimeError("there is no C compiler: install gcc to compare with it")
+    library = folder / "closed_loop.so"
+    source = Path(__file__).with_suffix(".c")
+    # as the Python kernel: no fused multiply-add beyond what the baseline processor has, no reordering
+    flags = ["-O3", "-shared", "-fPIC", "-lm"]
+    subprocess.run([compiler, str(source), "-o", str(library), *flags], check=True)  # noqa: S603
+    return ctypes.CDLL(str(library))
+
+
+def best(run: Callable[[], object]) -> float:
+    """Return the shortest of many runs, in seconds of this thread's processor time."""
+    times = []
+    for _ in range(REPEATS):
+        start = time.thread_time()
+        run()
+        times.append(time.thread_time() - start)
+    return min(times)
+
+
+def measure() -> dict[str, float]:
+    """Return seconds per run in numba and C, their ratio, the real-time factor, and the largest difference in um."""
+    config = bench_config()
+    axis, model = config.axis["X"], nominal_models(config)["X"]
+    reference = np.ascontiguousarray(bench_demand(10.0)[:, 0])
+    plant = plant_step(model, axis.screw_pitch_mm, axis.regulators.current_period_s)
+    gains, n = loop_gains(axis, 0.001), reference.size
+    empty = np.empty(0)
+
+    def numba() -> Float:
+        return kernels.p_pi_pi(reference, empty, empty, 0, n, plant, gains, N_SPEED, N_CURRENT, np.zeros(12))
+
+    with tempfile.TemporaryDirectory() as folder:
+        library = compiled(Path(folder))
+        out, state = np.empty((n, 6)), np.zeros(12)
+        pointers = [ctypes.c_void_p(array.ctypes.data) for array in (reference, plant, gains, state, out)]
+
+        def c() -> Float:
+            state[:] = 0.0
+            r, p, g, s, o = pointers
+            long = ctypes.c_long
+            library.p_pi_pi(r, long(n), long(0), long(n), p, g, long(N_SPEED), long(N_CURRENT), s, o)
+            return out
+
+        difference = float(np.abs(numba()[:, 0] - c()[:, 0]).max()) * 1e3
+        seconds = {"numba_s": best(numba), "c_s": best(c)}
+    ratio = seconds["numba_s"] / seconds["c_s"]
+    return seconds | {"ratio": ratio, "real_time": n * 0.001 / seconds["numba_s"], "difference_um": difference}
+
+
+def main() -> None:
+    """Print the figures."""
+    figures = measure()
+    print(f"closed loop, one axis, one core: {figures['real_time']:.0f} x real time (wanted: 1000)")
+    print(f"numba {figures['numba_s'] * 1e3:.2f} ms, C -O3 {figures['c_s'] * 1e3:.2f} ms for the bench path:", end=" ")
+    print(f"{figures['ratio']:.2f} x (wanted: <= 1.2); largest difference {figures['difference_um']:.1e} um")
+
+
+if __name__ == "__main__":
+    main()
