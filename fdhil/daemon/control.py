@@ -122,4 +122,10 @@ def ask(path: Path, request: Mapping[str, Any], timeout_s: float = 10.0) -> dict
             raise ConnectError("daemon", text) from None
     if not line:
         raise ConnectError("daemon", "closed the connection without an answer; see its log")
-    return dict(json.loads(line))
+    try:
+        answer = json.loads(line)
+    except ValueError:
+        answer = None
+    if not isinstance(answer, dict):
+        raise ConnectError("daemon", f"gave no answer of a daemon; see what listens at {path}")
+    return answer

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ from fdhil.guard.client import GuardClient
 from fdhil.records import Notice
 
 ABSENT: Mapping[str, Any] = {"state": "absent", "text": "no guard runs: nothing can be armed, nothing is sent"}
+SETTLING_TRIES = 25
+SETTLING_S = 0.2
 REST = {"OFF", "FROZEN", "absent"}
 
 
@@ -85,9 +88,19 @@ class GuardLink:
                 table.axes, _rows(table.demand_increments), _rows(table.offset_increments), table.program_digest
             )
             if answer["ok"]:
-                self._client.alive(None)  # planning took its time: the guard must know us as alive when it is asked
-                answer = self._client.arm(token, table.program_digest, armament.facts)
+                answer = self._ask_to_arm(self._client, armament, token)
             self._status = self._client.status()
+        return answer
+
+    @staticmethod
+    def _ask_to_arm(client: GuardClient, armament: Armament, token: str) -> Mapping[str, Any]:
+        """Ask until the interlocks have been good for long enough, for a few seconds; any other no is final."""
+        for _ in range(SETTLING_TRIES):
+            client.alive(None)  # planning took its time: the guard must know us as alive when it is asked
+            answer = client.arm(token, armament.table.program_digest, armament.facts)
+            if answer["ok"] or [told["code"] for told in answer.get("refused", [])] != ["NotSettled"]:
+                break
+            time.sleep(SETTLING_S)
         return answer
 
     def disarm(self) -> Mapping[str, Any]:

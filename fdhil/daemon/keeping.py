@@ -92,7 +92,8 @@ class Keeper:
         return notices
 
     def _open(self) -> None:
-        self._history = History.open(self._directory)
+        if self._history is None:
+            self._history = History.open(self._directory)
         folder = self._directory / WINDOWS_FOLDER
         self._windows = WindowStore(folder, self._config.store.keep_windows, self._config.digest)
         self.strays = self._windows.strays

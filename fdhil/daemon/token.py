@@ -48,6 +48,9 @@ def read_token(run_directory: Path) -> str:
             raise DeviceError(
                 str(path), f"has mode {mode:04o}, others can read it; delete it and start the daemon again"
             )
-        return os.read(descriptor, MAX_BYTES).decode("ascii", "replace").strip()
+        token = os.read(descriptor, MAX_BYTES).decode("ascii", "replace").strip()
+        if not token:
+            raise DeviceError(str(path), "is empty; delete it and start guard and daemon again")
+        return token
     finally:
         os.close(descriptor)

@@ -6,17 +6,27 @@ import math
 
 import numpy as np
 
+from fdhil import correction
 from fdhil.config import Axis, MachineConfig
 from fdhil.pipeline import AxisPipeline
-from fdhil.records import Float, Stages, Window, frozen
+from fdhil.records import Float, Parameters, Stages, Trajectory, Window, frozen, frozen_ints
 
 
 def warm(config: MachineConfig, method: str | None = None) -> None:
-    """Send made-up rapids of the nominal drive through a pipeline of each axis, so that every kernel is compiled."""
+    """Send made-up rapids of the nominal drives through the pipelines and plan a correction: every kernel compiles."""
+    dt_s = config.machine.sync_period_s
+    windows = {}
     for name, axis in config.axis.items():
         pipeline = AxisPipeline(name, config, method)
         for direction in (1, -1):
-            pipeline.feed(nominal_rapid(name, axis, config.machine.sync_period_s, direction))
+            windows[name] = nominal_rapid(name, axis, dt_s, direction)
+            pipeline.feed(windows[name])
+    rows = min(window.n for window in windows.values())
+    demand = {name: frozen(0.2 * window.demand_mm[:rows]) for name, window in windows.items()}
+    still = np.zeros(rows, dtype=np.int64)
+    reference = Trajectory(dt_s, frozen(np.arange(rows) * dt_s), demand, still.astype(np.bool_), frozen_ints(still))
+    models = {name: Parameters(**axis.nominal.model_dump()) for name, axis in config.axis.items()}
+    correction.plan(reference, models, config)
 
 
 def nominal_rapid(name: str, axis: Axis, dt_s: float, direction: int = 1, seed: int = 1) -> Window:

@@ -3,119 +3,33 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
-import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import pytest
 
-from fdhil import config as machine_config
-from fdhil.cli.demo.processes import Process, Twin
-from fdhil.config import MachineConfig
-from fdhil.daemon.control import ask
+from fdhil.cli.demo.processes import Process
+from fdhil.drivers.commissioning import commission, save_record
 from fdhil.errors import ConnectError
 from fdhil.store.history import History
 from fdhil.store.windows import list_windows
+from tests.daemon.shop import FEED, REAL, SHUTTLE, Shop, fdhil, opened
 
-REAL = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.085, "ft": 0.05, "Cd": 5.0}
-SHUTTLE = "G21 G90 G94\nG0 X300\nG4 P0.4\nG0 X0\nG4 P0.4\nG0 X300\nG4 P0.4\nG0 X0\nG4 P0.4\nM2\n"
-AXIS = """
-[machine]
-name = "bench"
-[axis.X]
-screw_pitch_mm = 20.0
-rapid_speed_mm_s = 500.0
-max_acceleration_mm_s2 = 4000.0
-[axis.X.nominal]
-R = 0.5
-L = 0.005
-K = 0.8
-Jt = 0.075
-ft = 0.05
-Cd = 5.0
-[axis.X.regulators]
-position_gain_per_s = 50.0
-speed_kp = 23.562
-speed_ki = 1184.35
-current_limit_a = 200.0
-current_kp = 12.566
-current_ki = 1256.64
-voltage_limit_v = 300.0
-[axis.X.correction]
-max_offset_um = 250.0
-max_speed_mm_s = 20.0
-max_acceleration_mm_s2 = 2000.0
-"""
-TWIN = '[sim.axis.X]\nJt = 0.085\n[bus.can0]\ninterface = "socketcand"\n'
-
-
-@dataclass
-class Shop:
-    """A twin that runs, and the configuration of the machine that it is."""
-
-    folder: Path
-    twin: Twin
-    path: Path
-    config: MachineConfig
-
-    @property
-    def socket(self) -> Path:
-        """The daemon's control socket."""
-        assert self.config.store.run_directory is not None
-        return self.config.store.run_directory / "daemon.sock"
-
-    def daemon(self) -> Process:
-        """Start a daemon and wait until it listens."""
-        daemon = Process("daemon", ["fdhil", "run", str(self.path)], self.folder / "daemon.log")
-        while not self.listens():
-            daemon.check()
-            time.sleep(0.05)
-        return daemon
-
-    def listens(self) -> bool:
-        """Whether the daemon answers and its bus is open."""
-        try:
-            return bool(ask(self.socket, {"request": "status"})["source"]["state"] == "listening")
-        except ConnectError:
-            return False
-
-    def status_when(self, ready: Any) -> dict[str, Any]:
-        """Return the first status for which ``ready`` holds."""
-        while not ready(status := ask(self.socket, {"request": "status"})):
-            self.twin.check()
-            time.sleep(0.1)
-        return status
+pytestmark = pytest.mark.timeout(300)  # three processes, each of which compiles on the first run
 
 
 @pytest.fixture
 def shop(tmp_path: Path) -> Iterator[Shop]:
     """A twin whose table is heavier than the data sheet says."""
-    (tmp_path / "twin.toml").write_text(AXIS + TWIN)
-    with Twin(tmp_path / "twin.toml", tmp_path / "twin.log") as twin:
-        bus = twin.ready["buses"]["can0"]
-        machine = tmp_path / "machine.toml"
-        place = (
-            f'interface = "socketcand"\nchannel = "{bus["channel"]}"\nhost = "{bus["host"]}"\nport = {bus["port"]}\n'
-        )
-        machine.write_text(f"{AXIS}[bus.can0]\n{place}")
-        yield Shop(tmp_path, twin, machine, machine_config.load(machine))
-
-
-def fdhil(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """Run the command line."""
-    return subprocess.run([sys.executable, "-m", "fdhil", *map(str, arguments)], capture_output=True, text=True)
+    with opened(tmp_path) as shop:
+        yield shop
 
 
 def test_from_the_bus_to_the_history_and_back(shop: Shop) -> None:
-    (shop.folder / "shuttle.ngc").write_text(SHUTTLE)
     with shop.daemon() as daemon:
-        shop.twin.command("nc", on=True)
-        shop.twin.event("nc", 30.0)
-        shop.twin.play(shop.folder / "shuttle.ngc")
+        shop.nc_on()
+        shop.play("shuttle.ngc", SHUTTLE)
         status = shop.status_when(lambda s: s["axes"]["X"]["accepted"] + s["axes"]["X"]["refused"] >= 4)
         second = Process("second daemon", ["fdhil", "run", str(shop.path)], shop.folder / "second.log")
         with pytest.raises(ConnectError, match="BusLocked"):
@@ -172,3 +86,47 @@ def _history_is_told(shop: Shop) -> None:
     stopped = fdhil("status", shop.path)
     assert stopped.returncode == 3
     assert "is not running" in stopped.stderr
+
+
+def test_a_program_is_armed_cut_and_disarmed_by_the_end_of_the_daemon(shop: Shop) -> None:
+    record = commission(shop.config, "X")
+    assert record.watchdog == "proven"
+    save_record(record, shop.config.store.directory)
+    program = shop.folder / "feed.ngc"
+    with shop.guard() as guard, shop.daemon() as daemon:
+        program.write_text(FEED)
+        refused = fdhil("arm", shop.path, program)
+        assert (refused.returncode, refused.stdout) == (1, "")
+        assert "refused: ModelNotValidated" in refused.stderr
+        shop.nc_on()
+        shop.play("shuttle.ngc", SHUTTLE)
+        shop.status_when(lambda s: s["axes"]["X"]["accepted"] == 4)
+        plain = _cut(shop, "plain")
+        armed = fdhil("arm", shop.path, program, "--json")
+        answer = json.loads(armed.stdout)
+        assert armed.returncode == 0, (armed.stdout, armed.stderr)
+        assert answer["state"] == "ARMED"
+        assert answer["after"]["rms_um"] < 0.2 * answer["before"]["rms_um"]
+        status = shop.status_when(lambda s: s["state"] == "ARMED")
+        assert status["armed"]["program"] == str(program)
+        corrected = _cut(shop, "corrected")
+        assert corrected < 0.2 * plain, (corrected, plain)
+        shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
+        again = fdhil("arm", shop.path, program)
+        assert again.returncode == 0, again.stderr
+        assert daemon.stop() == 0  # disarms first
+        assert guard.stop() == 0
+    log = (shop.folder / "daemon.log").read_text()
+    assert "GuardState: ARMED -> RAMPING" in log or "GuardState: ARMED -> ACTIVE" in log
+    assert log.splitlines()[-1] == "stopped, offset 0", log
+    token = (shop.run_directory / "token").read_text()
+    for file in (*shop.folder.glob("*.log"), *shop.config.store.directory.rglob("*.sqlite*")):
+        assert token.encode() not in file.read_bytes(), file
+
+
+def _cut(shop: Shop, name: str) -> float:
+    """Let the NC cut the program; return the RMS of the table's error in um."""
+    trace = shop.folder / f"{name}.csv"
+    shop.play("feed.ngc", FEED, trace=trace)
+    rows = np.genfromtxt(trace, delimiter=",", names=True)
+    return float(np.sqrt(np.mean((rows["X_table_mm"] - rows["X_reference_mm"]) ** 2)) * 1e3)

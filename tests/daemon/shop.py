@@ -1,0 +1,135 @@
+"""The real machine of the daemon's tests: the twin as a process, the daemon and the guard beside it."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fdhil import config as machine_config
+from fdhil.cli.demo.processes import Process, Twin
+from fdhil.config import MachineConfig
+from fdhil.daemon.control import ask
+from fdhil.errors import ConnectError
+
+REAL = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.085, "ft": 0.05, "Cd": 5.0}
+SHUTTLE = "G21 G90 G94\n" + "G0 X300\nG4 P0.4\nG0 X0\nG4 P0.4\n" * 2 + "M2\n"
+FEED = "G21 G90 G94\nG4 P0.5\nG1 X60 F4000\nG1 X20\nG4 P0.3\nM2\n"
+AXIS = """
+[machine]
+name = "bench"
+[axis.X]
+screw_pitch_mm = 20.0
+rapid_speed_mm_s = 500.0
+max_acceleration_mm_s2 = 4000.0
+[axis.X.nominal]
+R = 0.5
+L = 0.005
+K = 0.8
+Jt = 0.075
+ft = 0.05
+Cd = 5.0
+[axis.X.regulators]
+position_gain_per_s = 50.0
+speed_kp = 23.562
+speed_ki = 1184.35
+current_limit_a = 200.0
+current_kp = 12.566
+current_ki = 1256.64
+voltage_limit_v = 300.0
+[axis.X.correction]
+max_offset_um = 250.0
+max_speed_mm_s = 20.0
+max_acceleration_mm_s2 = 2000.0
+[guard]
+clock = "sync"
+"""
+TWIN = '[sim]\npace = "lockstep"\n[sim.axis.X]\nJt = 0.085\n[bus.can0]\ninterface = "socketcand"\n'
+
+
+@dataclass
+class Shop:
+    """A twin that runs, and the configuration of the machine that it is."""
+
+    folder: Path
+    twin: Twin
+    path: Path
+    config: MachineConfig
+
+    @property
+    def run_directory(self) -> Path:
+        """The folder of sockets and token."""
+        assert self.config.store.run_directory is not None
+        return self.config.store.run_directory
+
+    def daemon(self) -> Process:
+        """Start a daemon and wait until it listens."""
+        daemon = Process("daemon", ["fdhil", "run", str(self.path)], self.folder / "daemon.log")
+        self.wait(lambda: self.status() is not None, daemon)
+        self.status_when(lambda s: s["source"]["state"] == "listening")
+        return daemon
+
+    def guard(self) -> Process:
+        """Start a guard and wait until it answers."""
+        guard = Process("guard", ["fdhil.cli.guard", str(self.path)], self.folder / "guard.log")
+        self.wait((self.run_directory / "guard.sock").exists, guard)
+        return guard
+
+    def wait(self, done: Any, process: Process | None = None) -> None:
+        """Wait until ``done()``, or a process has ended."""
+        while not done():
+            self.twin.check()
+            if process is not None:
+                process.check()
+            time.sleep(0.05)
+
+    def status(self) -> dict[str, Any] | None:
+        """Return the daemon's status, None while none runs."""
+        try:
+            return ask(self.run_directory / "daemon.sock", {"request": "status"}, timeout_s=60.0)
+        except ConnectError:
+            return None
+
+    def status_when(self, ready: Any) -> dict[str, Any]:
+        """Return the first status for which ``ready`` holds."""
+        found: dict[str, Any] = {}
+
+        def done() -> bool:
+            found.update(self.status() or {})
+            return bool(found and ready(found))
+
+        self.wait(done)
+        return found
+
+    def nc_on(self) -> None:
+        """Switch the NC on: SYNC, NMT, drives enabled."""
+        self.twin.command("nc", on=True)
+        self.twin.event("nc", 60.0)
+
+    def play(self, name: str, program: str, **options: Any) -> dict[str, Any]:
+        """Write a program and let the NC play it."""
+        path = self.folder / name
+        path.write_text(program)
+        return self.twin.play(path, **options)
+
+
+@contextmanager
+def opened(folder: Path) -> Iterator[Shop]:
+    """Start a twin whose table is heavier than the data sheet says."""
+    (folder / "twin.toml").write_text(AXIS + TWIN)
+    with Twin(folder / "twin.toml", folder / "twin.log") as twin:
+        bus = twin.ready["buses"]["can0"]
+        machine = folder / "machine.toml"
+        place = f'channel = "{bus["channel"]}"\nhost = "{bus["host"]}"\nport = {bus["port"]}\n'
+        machine.write_text(f'{AXIS}[bus.can0]\ninterface = "socketcand"\n{place}')
+        yield Shop(folder, twin, machine, machine_config.load(machine))
+
+
+def fdhil(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run the command line."""
+    return subprocess.run([sys.executable, "-m", "fdhil", *map(str, arguments)], capture_output=True, text=True)

@@ -1,0 +1,142 @@
+"""The small parts: the socket's client, the notify protocol, the log's lines, the lock, the token."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fdhil.daemon import journal
+from fdhil.daemon.control import ask
+from fdhil.daemon.journal import BURST, FloodGate, line_of, printable
+from fdhil.daemon.lock import BusLocked, sole_owner
+from fdhil.daemon.notify import notify
+from fdhil.daemon.token import ensure_token, read_token
+from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
+from fdhil.records import Notice, Skill
+from tests.store.made import outcome, published
+
+
+@pytest.fixture
+def listener(tmp_path: Path) -> Iterator[socket.socket]:
+    """A UNIX stream socket that accepts but says nothing by itself."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as server:
+        server.bind(str(tmp_path / "s"))
+        server.listen()
+        yield server
+
+
+def test_no_daemon_is_one_sentence_with_the_next_action(tmp_path: Path) -> None:
+    with pytest.raises(ConnectError, match=r"is not running .*start it with `fdhil run CONFIG`"):
+        ask(tmp_path / "absent", {"request": "status"})
+
+
+def test_a_daemon_that_does_not_answer_is_a_timeout(tmp_path: Path, listener: socket.socket) -> None:
+    with pytest.raises(DeviceTimeout, match="did not answer"):
+        ask(tmp_path / "s", {"request": "status"}, timeout_s=0.05)
+
+
+def test_a_daemon_that_hangs_up_or_talks_nonsense_is_told(tmp_path: Path, listener: socket.socket) -> None:
+    for answer in (b"", b"nonsense\n", b"[]\n"):
+
+        def serve(answer: bytes = answer) -> None:
+            peer, _ = listener.accept()
+            with peer:
+                peer.recv(1000)
+                peer.sendall(answer)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        with pytest.raises(ConnectError, match=r"without an answer|no answer of a daemon"):
+            ask(tmp_path / "s", {"request": "status"})
+        thread.join()
+
+
+@pytest.mark.parametrize("abstract", [False, True])
+def test_notify_speaks_the_protocol(abstract: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        name = f"@fdhil-test-{tmp_path.name}" if abstract else str(tmp_path / "notify")
+        manager.bind(name.replace("@", "\0", 1) if abstract else name)
+        monkeypatch.setenv("NOTIFY_SOCKET", name)
+        assert notify("READY=1\nSTATUS=x")
+        assert manager.recv(100) == b"READY=1\nSTATUS=x"
+
+
+def test_notify_without_a_service_manager_does_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    assert not notify("READY=1")
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "absent"))
+    assert not notify("READY=1")
+
+
+def test_every_outcome_is_one_line() -> None:
+    assert line_of(outcome())[0] == "X: G0 + at 12.35 s (600 samples) accepted, fit 97.25 %"
+    refused, severity = line_of(outcome(accepted=False))
+    assert refused.endswith("refused, fit 97.25 %: MissingStage(cruise): no plateau")
+    assert severity == "info"
+    assert "revision 1 from 3 windows: R 0.5 ohm, L 0.005 H" in line_of(published())[0]
+    assert "predicted within 0.25 um RMS" in line_of(Skill("X", 5, 0.25, 1.0, 0.0, 24.0))[0]
+    assert line_of(Notice("LoadChanged", "MAJOR", "Jt rose", "X")) == ("X: LoadChanged: Jt rose", "MAJOR")
+
+
+def test_lines_carry_priorities_in_the_journal_and_no_escapes_anywhere(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("JOURNAL_STREAM", "8:1")
+    journal.write_line("bad \x1b[31m\nforged", "MAJOR")
+    monkeypatch.delenv("JOURNAL_STREAM")
+    journal.write_line("Öl µm", "info")
+    assert capsys.readouterr().err == "<3>bad \\x1b[31m\\nforged\nÖl µm\n"
+    assert printable("\u202e") == "\\u202e"
+
+
+def test_a_flood_of_one_class_holds_no_other_back_and_is_counted() -> None:
+    gate = FloodGate()
+    admitted = [gate.admit("A", 0.0) for _ in range(1000)]
+    assert admitted[:BURST] == [0] * BURST
+    assert admitted[BURST:] == [None] * (1000 - BURST)
+    assert gate.admit("B", 0.0) == 0
+    assert gate.admit("A", 1.5) == 1000 - BURST
+    assert gate.admit("A", 1.5) is None
+
+
+def test_the_lock_is_free_again_when_its_owner_is_gone(tmp_path: Path) -> None:
+    for _ in range(2):
+        with sole_owner(tmp_path / "run"):
+            with pytest.raises(BusLocked, match="nothing was sent") as error, sole_owner(tmp_path / "run"):
+                pass
+            assert error.value.exit_code == 3
+    assert (tmp_path / "run").stat().st_mode & 0o777 == 0o700
+
+
+def test_a_run_directory_that_cannot_be_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DeviceError, match="run_directory"), sole_owner(tmp_path / "file" / "run"):
+        pass
+
+
+def test_the_token_is_made_once_and_only_for_its_owner(tmp_path: Path) -> None:
+    token = ensure_token(tmp_path)
+    assert len(token) == 64
+    assert ensure_token(tmp_path) == read_token(tmp_path) == token
+    assert (tmp_path / "token").stat().st_mode & 0o777 == 0o600
+    (tmp_path / "token").chmod(0o644)
+    with pytest.raises(DeviceError, match="others can read it"):
+        read_token(tmp_path)
+
+
+def test_an_empty_or_linked_token_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").write_text("secret")
+    (tmp_path / "token").symlink_to(tmp_path / "elsewhere")
+    for use in (ensure_token, read_token):
+        with pytest.raises(DeviceError, match="cannot be read"):
+            use(tmp_path)
+    (tmp_path / "token").unlink()
+    (tmp_path / "token").touch(0o600)
+    with pytest.raises(DeviceError, match="is empty"):
+        ensure_token(tmp_path)
+    with pytest.raises(ConnectError, match="never run"):
+        read_token(tmp_path / "absent")
