@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdhil.records import Float
+from fdhil.records import Float, Int
 
 KEPT_QUERIES = 256
 RATE_TOLERANCE = 200e-6  # two quartz clocks
@@ -57,23 +57,32 @@ class CounterClock:
             return None
         counter, asked, answered = (np.array(column) for column in zip(*self._queries, strict=True))
         origin = int(counter[-1])
-        step = self._rate(counter, asked, answered)
+        step, slope_error = self._rate(counter, asked, answered)
         begun = step * (counter - origin)
         # sample c is complete at start + step (c - origin + 1), and c + 1 is not yet
         low, high = _agreed(asked - begun - 2 * step, answered - begun - step)
-        return Line(origin, (low + high) / 2, step, max((high - low) / 2, step * 1e-3))
+        return Line(origin, (low + high) / 2, step, max((high - low) / 2, step * 1e-3) + slope_error)
 
-    def _rate(self, counter: np.ndarray, asked: np.ndarray, answered: np.ndarray) -> float:
-        """Slope through the quickest half of the queries, kept within quartz tolerance of the nominal step."""
+    def _rate(self, counter: Int, asked: Float, answered: Float) -> tuple[float, float]:
+        """Slope through the quickest half of the queries, kept within quartz tolerance of the nominal step, and twice
+        its standard error over the span of all queries."""
+        span = float(counter[-1] - counter[0])
+        nominal = self._step, self._step * RATE_TOLERANCE * span
         if counter.size < _SLOPE_QUERIES:
-            return self._step
+            return nominal
         quick = answered - asked <= np.median(answered - asked)
         x, y = counter[quick] - counter[-1], (asked + answered)[quick] / 2
         spread = x - x.mean()
-        if not spread.any():
-            return self._step
-        slope = float(spread @ (y - y.mean()) / (spread @ spread))
-        return float(np.clip(slope, self._step * (1 - RATE_TOLERANCE), self._step * (1 + RATE_TOLERANCE)))
+        power = float(spread @ spread)
+        if not power:
+            return nominal
+        slope = float(spread @ (y - y.mean()) / power)
+        residual = y - y.mean() - slope * spread
+        error = 2 * float(np.sqrt(residual @ residual / max(x.size - 2, 1) / power)) * span
+        if error > nominal[1]:
+            return nominal
+        low, high = self._step * (1 - RATE_TOLERANCE), self._step * (1 + RATE_TOLERANCE)
+        return float(np.clip(slope, low, high)), error
 
 
 def _agreed(low: Float, high: Float) -> tuple[float, float]:

@@ -40,7 +40,7 @@ class EventSource(Protocol):
         """Take a block; return the moves it shows."""
 
 
-class _Out:
+class Outlet:
     """The records on their way out; when nobody takes them the oldest go, and are counted."""
 
     def __init__(self) -> None:
@@ -123,7 +123,7 @@ class BusSource:
             return [Notice("BusSilent", "MAJOR", text)]
         return [Notice("BusSilent", "info", f"Bus {self.name} is heard again.")] if was and not silent else []
 
-    async def run(self, out: _Out) -> None:
+    async def run(self, out: Outlet) -> None:
         """Run for ever; a bus that ended is opened again with growing pauses."""
         pause = BACK_OFF_S[0]
         while True:
@@ -181,7 +181,7 @@ class SensorSource:
         self._failures = 0
         self._told: set[str] = set()
 
-    async def run(self, out: _Out) -> None:
+    async def run(self, out: Outlet) -> None:
         """Poll for ever; a fault is a notice once, its end another."""
         pause = BACK_OFF_S[0]
         while True:
@@ -202,7 +202,7 @@ class SensorSource:
             self._told.clear()
             await asyncio.sleep(max(0.0, POLL_S - (time.monotonic() - begun)))
 
-    def _fault(self, error: DeviceError, out: _Out) -> None:
+    def _fault(self, error: DeviceError, out: Outlet) -> None:
         self._failures += 1
         if isinstance(error, ModbusRefused) and error.code == BUSY:
             return
@@ -237,7 +237,7 @@ class MachineSource:
             for axis, settings in config.axis.items()
             if settings.voltage.source == "modbus"
         }
-        self._out = _Out()
+        self._out = Outlet()
         self._tasks: list[asyncio.Task[None]] = []
 
     async def open(self) -> None:

@@ -20,6 +20,7 @@ from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
 
 MAX_REGISTERS = 125
 BUSY = 6
+CONNECT_S = 2.0  # beyond the time an answer may take: the library has one time-out for both, and ours is the shorter
 EXCEPTIONS = {
     1: "illegal function",
     2: "illegal register address",
@@ -62,16 +63,21 @@ class ModbusLink:
 
     def __init__(self, name: str, host: str, port: int, unit: int, timeout_s: float) -> None:
         self.name = name
+        self._host, self._port = host, port
         self._where = f"{host}:{port}"
         self._unit = unit
         self._timeout_s = timeout_s
-        self._client = AsyncModbusTcpClient(host, port=port, timeout=timeout_s, retries=0, reconnect_delay=0)
+        self._client: AsyncModbusTcpClient | None = None
 
     async def connect(self) -> None:
-        """Connect; ConnectError when nobody answers there."""
+        """Connect anew; ConnectError when nobody answers there."""
+        self.close()
         connected = False
+        self._client = AsyncModbusTcpClient(
+            self._host, port=self._port, timeout=self._timeout_s + CONNECT_S, retries=0, reconnect_delay=0
+        )
         try:
-            async with asyncio.timeout(self._timeout_s + 1.0):
+            async with asyncio.timeout(self._timeout_s + CONNECT_S):
                 connected = await self._client.connect()
         except TimeoutError:
             pass
@@ -83,12 +89,17 @@ class ModbusLink:
     @property
     def connected(self) -> bool:
         """Whether the TCP connection stands."""
-        return bool(self._client.connected)
+        return self._client is not None and bool(self._client.connected)
+
+    def _open(self) -> AsyncModbusTcpClient:
+        if self._client is None:
+            raise ConnectError(self.name, f"the Modbus sensor {self._where} is not connected; connect first")
+        return self._client
 
     async def read_input(self, address: int, count: int) -> list[int]:
         """Read ``count`` <= 125 input registers with one request (so that no value is torn between two)."""
         answer = await self._request(
-            self._client.read_input_registers(address, count=count, device_id=self._unit), address
+            self._open().read_input_registers(address, count=count, device_id=self._unit), address
         )
         registers = list(answer.registers)
         if len(registers) != count:
@@ -99,11 +110,11 @@ class ModbusLink:
 
     async def write(self, address: int, value: int) -> None:
         """Write one holding register."""
-        await self._request(self._client.write_register(address, value, device_id=self._unit), address)
+        await self._request(self._open().write_register(address, value, device_id=self._unit), address)
 
     async def _request(self, call: object, address: int) -> ModbusPDU:
         try:
-            async with asyncio.timeout(self._timeout_s + 0.2):
+            async with asyncio.timeout(self._timeout_s):
                 answer: ModbusPDU = await call  # type: ignore[misc]  # pymodbus types its calls as T of a mixin
         except TimeoutError:
             raise self._silent(address) from None
@@ -123,7 +134,7 @@ class ModbusLink:
 
     def _silent(self, address: int) -> DeviceError:
         # a late answer must not be taken for the next one's: the connection is made anew
-        self._client.close()
+        self.close()
         return DeviceTimeout(
             self.name,
             f"register {address} was not answered within {self._timeout_s:g} s; check the sensor and its line",
@@ -131,4 +142,6 @@ class ModbusLink:
 
     def close(self) -> None:
         """End the connection."""
-        self._client.close()
+        if self._client is not None:
+            self._client.close()
+            self._client = None

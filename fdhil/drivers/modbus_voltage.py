@@ -89,7 +89,7 @@ class ModbusVoltage:
         answered_ns = time.monotonic_ns()
         block = parse_block(self.name, registers)
         for _ in range(_SETTLE_STEPS):  # the SYNCs around the query must have been drained before it can be placed
-            if ticks.covers(answered_ns):
+            if not ticks.running or ticks.covers(answered_ns):
                 break
             await asyncio.sleep(_SETTLE_STEP_S)
         return self.accept(block, asked_ns, answered_ns, ticks)

@@ -1,0 +1,208 @@
+"""The voltage sensor on Modbus: blocks, clocks, and each way in which it can misbehave."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fdhil import tables
+from fdhil.config import MachineConfig
+from fdhil.drivers import machine as machine_module
+from fdhil.drivers.counter_clock import CounterClock
+from fdhil.drivers.machine import Outlet, SensorSource
+from fdhil.drivers.modbus_link import ModbusLink
+from fdhil.drivers.modbus_voltage import ModbusVoltage, SensorBlock, parse_block
+from fdhil.drivers.tick_clock import TickClock
+from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
+from fdhil.records import Notice, Temperature, TickTimes, VoltageSamples
+from tests.drivers.modbus_peer import VOLTS_PER_COUNT, SensorPeer, sensor_peer
+from tests.drivers.wire import machine
+
+
+def config(port: int, **voltage: Any) -> MachineConfig:
+    return machine(voltage={"source": "modbus", "port": port, "timeout_s": 0.2, **voltage})
+
+
+async def test_blocks_follow_each_other_without_a_hole() -> None:
+    async with sensor_peer() as peer:
+        sensor = ModbusVoltage("X", config(peer.port))
+        await sensor.link.connect()
+        records: list[VoltageSamples | Temperature | Notice] = []
+        for _ in range(8):
+            await asyncio.sleep(0.02)
+            records += await sensor.poll(TickClock(0.001))
+        sensor.link.close()
+    blocks = [r for r in records if isinstance(r, VoltageSamples)]
+    counter = np.concatenate([b.counter for b in blocks])
+    assert np.all(np.diff(counter) == 1) or sensor.lost > 0
+    volts = np.concatenate([b.voltage_v for b in blocks])
+    np.testing.assert_allclose(volts, counter % 1000 * VOLTS_PER_COUNT)
+    assert {r.celsius for r in records if isinstance(r, Temperature)} == {21.5}
+    true_ns = peer.start * 1e9 + counter * 1e6
+    t_ns = np.concatenate([b.t_ns for b in blocks])
+    error_ns = np.concatenate([b.t_error_ns for b in blocks])
+    assert np.all(np.abs(t_ns - true_ns)[-5:] <= error_ns[-5:] + 300_000)
+
+
+async def test_samples_that_were_not_fetched_in_time_are_counted() -> None:
+    async with sensor_peer() as peer:
+        sensor = ModbusVoltage("X", config(peer.port))
+        await sensor.link.connect()
+        await sensor.poll(TickClock(0.001))
+        await asyncio.sleep(0.25)
+        notices = [r for r in await sensor.poll(TickClock(0.001)) if isinstance(r, Notice)]
+        sensor.link.close()
+    assert [n.code for n in notices] == ["SampleTiming"]
+    assert sensor.lost >= 100
+
+
+async def test_a_sensor_that_stands_still_is_noticed_once() -> None:
+    async with sensor_peer() as peer:
+        peer.frozen_at = 0
+        sensor = ModbusVoltage("X", config(peer.port))
+        await sensor.link.connect()
+        records = [r for _ in range(60) for r in await sensor.poll(TickClock(0.001))]
+        sensor.link.close()
+    assert [r.code for r in records if isinstance(r, Notice)] == ["StuckValue"]
+
+
+@pytest.mark.parametrize(
+    ("mode", "error", "says"),
+    [
+        ("silent", DeviceTimeout, "was not answered within 0.2 s"),
+        ("exception", ProtocolError, "illegal register address"),
+        ("busy", ProtocolError, "busy"),
+        ("short", DeviceError, ""),
+        ("nan", ProtocolError, "sample rate of nan Hz"),
+        ("too many", ProtocolError, "101 samples"),
+        ("hang up", DeviceError, ""),
+    ],
+)
+async def test_each_misbehaviour_is_one_error(mode: str, error: type[DeviceError], says: str) -> None:
+    async with sensor_peer() as peer:
+        sensor = ModbusVoltage("X", config(peer.port))
+        await sensor.link.connect()
+        peer.mode = mode
+        with pytest.raises(error, match="voltage sensor X") as caught:
+            await sensor.poll(TickClock(0.001))
+        assert says in str(caught.value)
+        sensor.link.close()
+
+
+async def test_nobody_there_is_said() -> None:
+    async with sensor_peer() as peer:
+        port = peer.port
+    with pytest.raises(ConnectError, match="cannot be reached"):
+        await ModbusLink("voltage sensor X", "127.0.0.1", port, 1, 0.2).connect()
+
+
+async def test_a_source_survives_and_tells_both_edges(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(machine_module, "POLL_S", 0.01)
+    out = Outlet()
+    codes: list[tuple[str, str]] = []
+
+    async def until(code: str, severity: str) -> None:
+        async with asyncio.timeout(10):
+            while (code, severity) not in codes:
+                record = await out.get()
+                if isinstance(record, Notice):
+                    codes.append((record.code, record.severity))
+
+    async with sensor_peer() as peer:
+        source = SensorSource("X", config(peer.port), TickClock(0.001))
+        task = asyncio.create_task(source.run(out))
+        for mode, code in (("silent", "ModbusTimeout"), ("exception", "ModbusException"), ("nan", "ModbusShape")):
+            peer.mode = mode
+            await until(code, "MAJOR")
+            peer.mode = "good"
+            await until(code, "info")
+        task.cancel()
+        source.close()
+        await asyncio.gather(task, return_exceptions=True)
+    assert source.counters()["failures"] >= 3
+
+
+def registers(peer: SensorPeer) -> list[int]:
+    peer.frozen_at = 99
+    peer.latch()
+    return peer.registers()
+
+
+@settings(max_examples=200)
+@given(st.integers(0, 115), st.integers(0, 0xFFFF))
+def test_damage_of_a_register_is_checked(at: int, value: int) -> None:
+    words = registers(SensorPeer())
+    words[at] = value
+    try:
+        block = parse_block("sensor", words)
+    except ProtocolError:
+        return
+    assert np.all(np.isfinite(block.volts))
+    assert block.volts.size <= 100
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    drift=st.floats(-100e-6, 100e-6),
+    phase=st.floats(0, 1),
+    delays=st.lists(st.tuples(st.floats(0.0, 2.0), st.floats(0.0, 2.0)), min_size=40, max_size=80),
+)
+def test_the_clock_is_found_within_its_error(drift: float, phase: float, delays: list[tuple[float, float]]) -> None:
+    clock = CounterClock(1.0)
+    step = 1.0 + drift
+    for k, (before, after) in enumerate(delays):
+        read_at = 50.3 * k + phase
+        counter = int((read_at - 7.0) // step) - 1 + 1000
+        clock.add(counter, read_at - before, read_at + after)
+    line = clock.line()
+    assert line is not None
+    true_start = 7.0 + step * (line.origin - 1000)
+    assert abs(line.at(line.origin) - true_start) <= line.error + 0.3
+
+
+def test_a_clock_outvotes_queries_that_lie() -> None:
+    clock = CounterClock(1.0)
+    for k in range(60):
+        late = 30.0 if k % 7 == 3 else 0.0
+        clock.add(50 * k, 50.0 * k + 1.2 + late, 50.0 * k + 1.8 + late)
+    line = clock.line()
+    assert line is not None
+    assert line.at(0) == pytest.approx(0.0, abs=0.5)
+
+
+def test_a_sensor_that_was_restarted_is_placed_anew() -> None:
+    clock = CounterClock(1.0)
+    clock.add(1000, 1000.5, 1001.5)
+    clock.add(0, 2000.5, 2001.5)
+    line = clock.line()
+    assert line is not None
+    assert line.origin == 0
+
+
+def test_samples_are_placed_by_way_of_the_sync_count() -> None:
+    sensor = ModbusVoltage("X", config(1))
+    ticks = TickClock(0.001)
+    # the machine is held up for 80 ms between tick 500 and 501; sensor and SYNC both wait
+    t_ns = np.arange(1000) * 1_000_000 + np.where(np.arange(1000) > 500, 80_000_000, 0)
+    ticks.add(TickTimes(np.arange(1000), t_ns))
+    last: VoltageSamples | None = None
+    for k in range(50, 1000, 50):
+        block = SensorBlock(k - 1, 1000.0, 20.0, False, k - 50, np.zeros(50))
+        asked = int(t_ns[k - 1]) + 999_000 if k > 501 else k * 1_000_000 + 100_000
+        asked = int(np.interp(k + 0.3, np.arange(1000), t_ns))
+        for record in sensor.accept(block, asked, asked + 200_000, ticks):
+            if isinstance(record, VoltageSamples):
+                last = record
+    assert last is not None
+    placed = np.interp(last.t_ns, t_ns, np.arange(1000))
+    np.testing.assert_allclose(placed, last.counter, atol=0.6)
+
+
+@pytest.mark.parametrize("name", tables.VOLTAGE_SOURCES)
+def test_every_listed_source_can_be_loaded(name: str) -> None:
+    assert callable(tables.load(tables.VOLTAGE_SOURCES, name))
