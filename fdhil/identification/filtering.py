@@ -21,9 +21,9 @@ def _sections(lowpass_hz: float, dt_s: float) -> Float:
 
 
 def zero_phase(values: Float, lowpass_hz: float, dt_s: float) -> Float:
-    """Return ``values`` (n,) through a Butterworth low-pass run forward and backward: no delay, squared gain."""
+    """Return ``values`` (..., n) through a Butterworth low-pass run forward and backward: no delay, squared gain."""
     sections = _sections(lowpass_hz, dt_s)
-    padding = min(values.size - 1, round(3 / lowpass_hz / dt_s))
+    padding = min(values.shape[-1] - 1, round(3 / lowpass_hz / dt_s))
     filtered: Float = sosfiltfilt(sections, values, padlen=padding)
     return filtered
 

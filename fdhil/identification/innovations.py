@@ -20,14 +20,27 @@ from fdhil.records import Float, Parameters
 DIFFUSE = 1e6  # variance, in units of the measurement's, of a state about which nothing is known
 
 
+NOTHING: Float = np.zeros(0)
+
+
+def _matrix_plain(theta: Float) -> Float:
+    """Return A (2, 2) for ``theta`` = [R, L, K, Jt, ft, Cd, ...]."""
+    return np.array([[-theta[0] / theta[1], -theta[2] / theta[1]], [theta[2] / theta[3], -theta[4] / theta[3]]])
+
+
+_matrix: Callable[[Float], Float] = njit(cache=True, nogil=True)(_matrix_plain)
+
+
 def _gains_plain(
-    a: Float, lever: Float, dt: float, mode: Float, observed: Float, noise: Float, walk: float
+    theta: Float, dt: float, mode: Float, observed: Float, noise: Float, walk: float
 ) -> tuple[Float, Float, float]:
     """Return the gains (n, 4) and whiteners (n, 3) of the filter, and the log determinant of the innovations.
 
-    ``lever`` = [1/L, 1/Jt]; ``noise`` = variances of voltage, current, speed; a whitener is [w11, w21, w22].
+    ``noise`` = variances of voltage, current, speed; a whitener is [w11, w21, w22].
     """
     n = mode.size
+    a = _matrix(theta)
+    lever = np.array([1 / theta[1], 1 / theta[3]])
     gains = np.zeros((n, 4))
     white = np.zeros((n, 3))
     logdet = 0.0
@@ -76,15 +89,13 @@ _gains: Callable[..., tuple[Float, Float, float]] = njit(cache=True, nogil=True)
 
 
 def _residuals_plain(
-    a: Float,
-    lever: Float,
-    friction: float,
+    theta: Float,
     dt: float,
     mode: Float,
     observed: Float,
     mean_v: Float,
     rise_v: Float,
-    emf: float,
+    share: float,
     load: Float,
     current: Float,
     speed: Float,
@@ -93,10 +104,13 @@ def _residuals_plain(
 ) -> Float:
     """Return the whitened innovations (n, 2); 0 where nothing was measured.
 
-    ``emf`` (V.s) times the speed's rise over an interval is added to ``rise_v``.
+    ``share`` of the back-EMF's rise over an interval is added to ``rise_v``; an empty array is all 0.
     """
     n = mode.size
     out = np.zeros((n, 2))
+    a = _matrix(theta)
+    lever = np.array([1 / theta[1], 1 / theta[3]])
+    friction, emf = theta[5], share * theta[2]
     free = a.copy()
     free[1, :] = 0.0
     phi_m, mean_m, ramp_m = transition(a, dt)
@@ -112,11 +126,11 @@ def _residuals_plain(
         if mode[k] == BROKEN:
             continue
         u = lever[0] * mean_v[k]
-        r = lever[0] * rise_v[k]
+        r = lever[0] * rise_v[k] if rise_v.size else 0.0
         if mode[k] == UNKNOWN:
             i = phi_u[0, 0] * i + phi_u[0, 1] * w + mean_u[0, 0] * u + ramp_u[0, 0] * r
             continue
-        f = -lever[1] * (friction * mode[k] + load[k])
+        f = -lever[1] * (friction * mode[k] + (load[k] if load.size else 0.0))
         w_next = phi_m[1, 0] * i + phi_m[1, 1] * w + mean_m[1, 0] * u + mean_m[1, 1] * f
         r += lever[0] * emf * (w_next - w)
         i = phi_m[0, 0] * i + phi_m[0, 1] * w + mean_m[0, 0] * u + mean_m[0, 1] * f + ramp_m[0, 0] * r
@@ -136,43 +150,36 @@ class Gains:
     logdet: float
 
 
-def matrix_of(theta: Float) -> Float:
-    """Return A (2, 2) for ``theta`` = [R, L, K, Jt, ft, Cd, ...]."""
-    return np.array([[-theta[0] / theta[1], -theta[2] / theta[1]], [theta[2] / theta[3], -theta[4] / theta[3]]])
-
-
 def gains_of(motion: Motion, theta: Float, noise: Noise) -> Gains:
     """Return the filter's gains for ``theta`` (6,) = [R, L, K, Jt, ft, Cd]."""
-    lever = np.array([1 / theta[1], 1 / theta[3]])
-    return Gains(
-        *_gains(
-            matrix_of(theta), lever, motion.dt_s, motion.mode, motion.observed, noise.vector() ** 2, motion.speed_walk
-        )
-    )
+    variances = noise.vector() ** 2
+    return Gains(*_gains(theta, motion.dt_s, motion.mode, motion.observed, variances, motion.speed_walk))
 
 
 def innovations(
-    motion: Motion, theta: Float, gains: Gains, delay_s: float = 0.0, load_nm: Float | None = None
+    motion: Motion,
+    theta: Float,
+    gains: Gains,
+    delay_s: float = 0.0,
+    load_nm: Float | None = None,
+    emf_share: float = 1.0,
 ) -> Float:
     """Return the whitened innovations (n, 2) of [current, speed]: white and of unit variance when the model is right.
 
     ``load_nm`` (n,) is a torque against the positive direction over each interval (none when left out). Of the course
-    of an interval mean within its sample only the back-EMF's ramp is certain: what the current regulator adds depends
-    on the drive, and to take it from neighbouring means biases L.
+    of an interval mean within its sample only the back-EMF's ramp is certain (``emf_share`` of it is taken): what the
+    current regulator adds depends on the drive, and to take it from neighbouring means biases L.
     """
-    lever = np.array([1 / theta[1], 1 / theta[3]])
     means = motion.voltage_sampling == "interval_mean"
     return _residuals(
-        matrix_of(theta),
-        lever,
-        theta[5],
+        theta,
         motion.dt_s,
         motion.mode,
         motion.observed,
         motion.delayed(delay_s),
-        np.zeros(motion.n) if means else motion.voltage_rise,
-        float(theta[2]) if means else 0.0,
-        np.zeros(motion.n) if load_nm is None else load_nm,
+        NOTHING if means else motion.voltage_rise,
+        emf_share if means else emf_share - 1.0,
+        NOTHING if load_nm is None else load_nm,
         motion.current,
         motion.speed,
         gains.gains,

@@ -11,7 +11,7 @@ from fdhil.records import Float
 ITERATIONS = 12
 STEP = 0.05
 LARGEST = 1.0
-ENOUGH = 0.01
+ENOUGH = 0.05
 FLOOR = 1e-3  # of a level's own start: below it a noise has no effect that could be seen
 
 
@@ -22,11 +22,10 @@ def noise_likelihood(motion: Motion, theta: Float, noise: Noise, delay_s: float 
     return gains.logdet + float((e * e).sum())
 
 
-def fit_noise(motion: Motion, theta: Float, delay_s: float = 0.0) -> Noise:
+def fit_noise(motion: Motion, theta: Float, start: Noise, delay_s: float = 0.0) -> Noise:
     """Return the noise levels that make the innovations most likely, by Newton steps on their logarithms."""
-    start = np.log(motion.noise.vector())
-    lower = start + np.log(FLOOR)
-    x = start
+    lower = np.log(motion.noise.vector()) + np.log(FLOOR)
+    x = np.log(start.vector())
 
     def cost(logs: Float) -> float:
         value = noise_likelihood(motion, theta, Noise(*np.exp(logs)), delay_s)

@@ -8,6 +8,7 @@ import numpy as np
 
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.motion import UNKNOWN, Motion, noise_levels
+from fdhil.identification.normal import inverse_of
 from fdhil.identification.windows import carried, smooth
 from fdhil.records import Reason, Window
 from fdhil.validation.plausibility import at_rest
@@ -88,7 +89,7 @@ def _holding(window: Window, fit: Fit, rows: np.ndarray[tuple[int], np.dtype[np.
     current = smooth(carried(window.current_a), window.dt_s)[rows]
     torque = abs(fit.theta[2]) * float(np.median(np.abs(current)))
     peak = abs(fit.theta[2]) * float(np.nanmax(np.abs(window.current_a)))
-    spread = float(np.sqrt(np.linalg.pinv(fit.information)[5, 5]))
+    spread = float(np.sqrt(inverse_of(fit.information)[0][5, 5]))
     limit = HOLDING_SHARE * max(fit.theta[5], 0.0) + SURE * spread + LEAST_TORQUE * peak
     if torque > limit:
         text = f"the shaft rests under {torque:.3g} N.m, though dry friction is {fit.theta[5]:.3g} N.m (Stribeck)"

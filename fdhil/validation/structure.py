@@ -8,18 +8,20 @@ both beyond chance and large enough to matter refuses a window. Whiteness over l
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
-from fdhil.identification.estimators.maximum_likelihood import Fit, Problem
+from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.innovations import innovations
 from fdhil.identification.motion import Motion
+from fdhil.identification.normal import inverse_of
 from fdhil.records import Float, Reason
 
 BEYOND_CHANCE = 5.5  # standard deviations: about 4e-8 a test, some hundred tests a window
-EDGES = 24  # instants at which a load may begin or end, or a gain may step
+EDGES = 20  # instants at which a load may begin or end, or a gain may step
 LEAST_TORQUE = 0.01  # of the peak torque
 LEAST_GAIN = 0.005
 LEAST_OFFSET = 0.004  # of the signal's peak
@@ -31,150 +33,157 @@ STRIBECK_SPEEDS = (0.01, 0.03, 0.06, 0.12)  # of the rapid speed
 
 
 @dataclass(frozen=True, slots=True)
-class Alternative:
-    """One thing that the model does not have: its class, how it reads, and the least amplitude that matters."""
+class Finding:
+    """What one alternative shows: its class, how it reads, its statistic (standard deviations) and amplitude.
+
+    ``least`` is the smallest amplitude that matters, in the amplitude's own unit.
+    """
 
     code: str
     text: str
-    least: float
-    direction: Float
     advice: str
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """An alternative's statistic (standard deviations) and amplitude."""
-
-    alternative: Alternative
+    least: float
     statistic: float
     amplitude: float
 
     @property
     def matters(self) -> bool:
         """Return whether the finding is beyond chance and large enough to matter."""
-        return abs(self.statistic) > BEYOND_CHANCE and abs(self.amplitude) > self.alternative.least
+        return abs(self.statistic) > BEYOND_CHANCE and abs(self.amplitude) > self.least
 
     def reason(self) -> Reason:
         """Return the finding as a reason."""
-        a = self.alternative
-        return Reason(
-            a.code, f"{a.text.format(self.amplitude)} ({abs(self.statistic):.0f} standard deviations)", a.advice
-        )
+        told = self.text.format(self.amplitude)
+        return Reason(self.code, f"{told} ({abs(self.statistic):.0f} standard deviations)", self.advice)
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """One fitted window on which alternatives are tried: how innovations answer, and what the parameters imitate."""
+
+    fit: Fit
+    inverse: Float
+
+    @property
+    def motion(self) -> Motion:
+        """The window."""
+        return self.fit.problem.motions[0]
+
+    @property
+    def peak_torque(self) -> float:
+        """Largest K |i| of the window, N.m."""
+        return float(abs(self.fit.theta[2]) * np.abs(self.motion.current).max())
+
+    def answer(self, motion: Motion, load: Float | None = None) -> Float:
+        """Return minus the change (m,) of the innovations when the window is as in ``motion``, under ``load`` (n,)."""
+        theta, gains = self.fit.theta, self.fit.problem.filters[0]
+        change: Float = self.fit.residuals - innovations(motion, theta, gains, theta[6], load).ravel()
+        return change
+
+    def scores(self, directions: Float) -> tuple[Float, Float]:
+        """Return score (q,) and information (q, q) of ``directions`` (m, q) beyond what the parameters imitate."""
+        jacobian, e = self.fit.jacobian, self.fit.residuals
+        shared = jacobian.T @ directions
+        score: Float = directions.T @ e - shared.T @ (self.inverse @ (jacobian.T @ e))
+        information: Float = directions.T @ directions - shared.T @ self.inverse @ shared
+        return score, information
+
+    def best(self, directions: Sequence[Float]) -> tuple[int, float, float]:
+        """Return the direction with the largest statistic: its index, statistic and amplitude."""
+        score, information = self.scores(np.column_stack(directions))
+        weight = np.maximum(np.diag(information), 1e-12)
+        k = int(np.argmax(np.abs(score) / np.sqrt(weight)))
+        return k, float(score[k] / np.sqrt(weight[k])), float(score[k] / weight[k])
 
 
 def findings(fit: Fit) -> list[Finding]:
     """Return what the fit of one window shows beyond the model, the most significant first."""
-    motion, problem = fit.problem.motions[0], fit.problem
-    basis = np.linalg.qr(fit.jacobian)[0]
-    found = []
-    for alternative in alternatives(motion, problem, fit.theta, fit.residuals):
-        d = alternative.direction - basis @ (basis.T @ alternative.direction)
-        weight = float(d @ d)
-        if weight > 1e-12:
-            score = float(d @ fit.residuals)
-            found.append(Finding(alternative, score / weight**0.5, score / weight))
-    found.sort(key=lambda f: -abs(f.statistic))
-    return found
-
-
-def alternatives(motion: Motion, problem: Problem, theta: Float, base: Float) -> Iterator[Alternative]:
-    """Yield every alternative with its direction (m,): minus the change of the innovations per unit of amplitude."""
-    rows = np.flatnonzero(np.abs(motion.mode) == 1)
+    bench = Bench(fit, inverse_of(fit.information)[0])
+    rows = np.flatnonzero(np.abs(bench.motion.mode) == 1)
     if rows.size < 2 * EDGES:
-        return
+        return []
     edges = np.unique(np.linspace(rows[0], rows[-1] + 1, EDGES + 1).astype(int))
-    yield from _loads(motion, problem, theta, base, edges)
-    yield from _gain_steps(motion, problem, theta, base, edges[2:-2])
-    yield from _offsets(motion, problem, theta, base)
-    yield from _low_speed_friction(motion, problem, theta, base)
+    found = [_load(bench, edges), _low_speed_friction(bench)]
+    for name, unit in (("voltage", "V"), ("current", "A"), ("speed", "rad/s")):
+        found += [_gain_step(bench, name, edges[2:-2:2]), _offset(bench, name, unit)]
+    return sorted(found, key=lambda f: -abs(f.statistic))
 
 
-def _answer(problem: Problem, motion: Motion, theta: Float, base: Float, load: Float | None = None) -> Float:
-    moved = innovations(motion, theta, problem.filters[0], theta[6], load).ravel()
-    answer: Float = base - moved
-    return answer
-
-
-def _loads(motion: Motion, problem: Problem, theta: Float, base: Float, edges: Float) -> Iterator[Alternative]:
-    peak = abs(theta[2]) * float(np.abs(motion.current).max())
-    unit = 0.01 * peak
+def _load(bench: Bench, edges: npt.NDArray[np.int_]) -> Finding:
+    """Try a constant torque between every two edges."""
+    motion, unit = bench.motion, 0.01 * bench.peak_torque
     steps = []
     for edge in edges[:-1]:
         load = np.zeros(motion.n)
-        load[int(edge) :] = unit
-        steps.append(_answer(problem, motion, theta, base, load) / unit)
-    steps.append(np.zeros_like(base))
-    for a in range(len(edges) - 1):
-        for b in range(a + 1, len(edges)):
-            t0, t1 = edges[a] * motion.dt_s, edges[b] * motion.dt_s
-            yield Alternative(
-                "LoadDetected",
-                f"a torque of {{:+.3g}} N.m that is no friction acts from {t0:.3f} to {t1:.3f} s of the window",
-                LEAST_TORQUE * peak,
-                steps[a] - steps[b],
-                "identify from moves without cutting, clamping or collision",
-            )
+        load[edge:] = unit
+        steps.append(bench.answer(motion, load) / unit)
+    steps.append(np.zeros_like(steps[0]))
+    score, information = bench.scores(np.column_stack(steps))
+    own = np.diag(information)
+    weight = np.maximum(own[:, None] + own[None, :] - 2 * information, 1e-12)
+    statistic = (score[:, None] - score[None, :]) / np.sqrt(weight)
+    a, b = np.unravel_index(int(np.argmax(np.abs(np.triu(statistic, 1)))), statistic.shape)
+    span = f"{edges[a] * motion.dt_s:.3f} to {edges[b] * motion.dt_s:.3f} s of the window"
+    return Finding(
+        "LoadDetected",
+        f"a torque of {{:+.3g}} N.m that is no friction acts from {span}",
+        "identify from moves without cutting, clamping or collision",
+        LEAST_TORQUE * bench.peak_torque,
+        float(statistic[a, b]),
+        float((score[a] - score[b]) / weight[a, b]),
+    )
 
 
-def _gain_steps(motion: Motion, problem: Problem, theta: Float, base: Float, edges: Float) -> Iterator[Alternative]:
-    for name in ("voltage", "current", "speed"):
-        for edge in edges:
-            changed = np.zeros(motion.n)
-            changed[int(edge) :] = 1e-3
-            scaled = _scaled(motion, name, 1 + changed)
-            yield Alternative(
-                "CalibrationSuspect",
-                f"the gain of {name} changes by {{:+.2%}} at {edge * motion.dt_s:.3f} s of the window",
-                LEAST_GAIN,
-                _answer(problem, scaled, theta, base) / 1e-3,
-                f"check the {name} sensor and its wiring",
-            )
+def _gain_step(bench: Bench, name: str, edges: npt.NDArray[np.int_]) -> Finding:
+    """Try a gain that changes at one of the edges and stays."""
+    directions = []
+    for edge in edges:
+        changed = np.ones(bench.motion.n)
+        changed[edge:] += 1e-3
+        directions.append(bench.answer(_altered(bench.motion, name, changed, 0.0)) / 1e-3)
+    k, statistic, amplitude = bench.best(directions)
+    at = f"{edges[k] * bench.motion.dt_s:.3f} s of the window"
+    text, advice = f"the gain of {name} changes by {{:+.2%}} at {at}", f"check the {name} sensor and its wiring"
+    # what is tried is the correction of the signal, so the sensor's own change has the other sign
+    return Finding("CalibrationSuspect", text, advice, LEAST_GAIN, statistic, -amplitude)
 
 
-def _scaled(motion: Motion, name: str, factor: Float) -> Motion:
+def _offset(bench: Bench, name: str, unit: str) -> Finding:
+    motion = bench.motion
+    peak = float(np.abs(motion.voltage_mean if name == "voltage" else getattr(motion, name)).max())
+    step = max(1e-3 * peak, 1e-12)
+    _, statistic, amplitude = bench.best([bench.answer(_altered(motion, name, np.ones(motion.n), step)) / step])
+    text, advice = f"{name} has an offset of {{:+.3g}} {unit}", f"set the zero of the {name} sensor at standstill"
+    return Finding("CalibrationSuspect", text, advice, LEAST_OFFSET * peak, statistic, -amplitude)
+
+
+def _altered(motion: Motion, name: str, factor: Float, offset: float) -> Motion:
     if name == "voltage":
-        return replace(motion, voltage_mean=motion.voltage_mean * factor, voltage_rise=motion.voltage_rise * factor)
+        mean, rise = motion.voltage_mean * factor + offset, motion.voltage_rise * factor
+        return replace(motion, voltage_mean=mean, voltage_rise=rise)
     if name == "current":
-        return replace(motion, current=motion.current * factor)
-    return replace(motion, speed=motion.speed * factor)
+        return replace(motion, current=motion.current * factor + offset)
+    return replace(motion, speed=motion.speed * factor + offset)
 
 
-def _shifted(motion: Motion, name: str, step: float) -> Motion:
-    if name == "voltage":
-        return replace(motion, voltage_mean=motion.voltage_mean + step)
-    if name == "current":
-        return replace(motion, current=motion.current + step)
-    return replace(motion, speed=motion.speed + step)
-
-
-def _offsets(motion: Motion, problem: Problem, theta: Float, base: Float) -> Iterator[Alternative]:
-    for name, unit in (("voltage", "V"), ("current", "A"), ("speed", "rad/s")):
-        values: Float = getattr(motion, "voltage_mean" if name == "voltage" else name)
-        peak = float(np.abs(values).max())
-        step = 1e-3 * peak
-        moved = _shifted(motion, name, step)
-        yield Alternative(
-            "CalibrationSuspect",
-            f"{name} has an offset of {{:+.3g}} {unit}",
-            LEAST_OFFSET * peak,
-            _answer(problem, moved, theta, base) / step,
-            f"set the zero of the {name} sensor at standstill",
-        )
-
-
-def _low_speed_friction(motion: Motion, problem: Problem, theta: Float, base: Float) -> Iterator[Alternative]:
-    peak = abs(theta[2]) * float(np.abs(motion.current).max())
+def _low_speed_friction(bench: Bench) -> Finding:
+    """Try friction that rises towards standstill, over several ranges of speed."""
+    motion, unit = bench.motion, 0.01 * bench.peak_torque
     top = float(np.abs(motion.speed).max())
+    moving = np.where(np.abs(motion.mode) == 1, motion.mode, 0)
+    directions = []
     for share in STRIBECK_SPEEDS:
-        fall = np.exp(-((motion.speed / (share * top)) ** 2))
-        load = 0.01 * peak * fall * motion.mode * (np.abs(motion.mode) == 1)
-        yield Alternative(
-            "ValidationFailed",
-            f"friction is {{:+.3g}} N.m higher below {share * top:.3g} rad/s than above (Stribeck)",
-            LEAST_TORQUE * peak,
-            _answer(problem, motion, theta, base, load) / (0.01 * peak),
-            "lubricate the slide-way, or identify faster moves only",
-        )
+        load = unit * np.exp(-((motion.speed / (share * top)) ** 2)) * moving
+        directions.append(bench.answer(motion, load) / unit)
+    k, statistic, amplitude = bench.best(directions)
+    return Finding(
+        "ValidationFailed",
+        f"friction is {{:+.3g}} N.m higher below {STRIBECK_SPEEDS[k] * top:.3g} rad/s than above (Stribeck)",
+        "lubricate the slide-way, or identify faster moves only",
+        LEAST_TORQUE * bench.peak_torque,
+        statistic,
+        amplitude,
+    )
 
 
 def whiteness(fit: Fit) -> Iterator[Reason]:

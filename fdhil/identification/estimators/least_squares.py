@@ -19,6 +19,7 @@ from fdhil.identification.derivatives import OPERATORS, ZERO_FORCING_1, Operator
 from fdhil.identification.filtering import impulse_response, reach, zero_phase
 from fdhil.identification.identifiability import empty_estimate, judge
 from fdhil.identification.motion import noise_levels, surely_moving
+from fdhil.identification.normal import solve
 from fdhil.identification.windows import carried
 from fdhil.records import PARAMETERS, Bool, Estimate, Float, Reason, Result, Window
 
@@ -56,8 +57,8 @@ def align(window: Window, settings: Identification) -> Signals:
     if window.voltage_sampling == "interval_mean":
         current, speed = interval_means(current), interval_means(speed)
     moving = surely_moving(window.speed_rad_s, window.rapid_speed_rad_s)
-    side = np.where(moving, np.sign(zero_phase(raw[2], settings.lowpass_hz, dt)), 0.0)
-    filtered = [zero_phase(s, settings.lowpass_hz, dt) for s in (voltage, current, speed)]
+    filtered = zero_phase(np.stack([voltage, current, speed]), settings.lowpass_hz, dt)
+    side = np.where(moving, np.sign(filtered[2]), 0.0)
     broken = ~(np.isfinite(window.voltage_v) & np.isfinite(window.current_a) & np.isfinite(window.speed_rad_s))
     width = 2 * reach(settings.lowpass_hz, dt) + 1
     usable = binary_erosion(moving & ~broken, np.ones(width, dtype=bool), border_value=False)
@@ -140,9 +141,9 @@ def _voltage_variance(residual_u: Float, theta: Float, impulse: Float, slope: Fl
     return max(float(np.mean(residual_u**2) - others) / float(impulse @ impulse), 1e-3 * float(noise[0]))
 
 
-def raw_values(windows: Sequence[Window], settings: Identification) -> Float | None:
+def raw_values(signals: Sequence[Signals], dt_s: Sequence[float]) -> Float | None:
     """Return [R, L, K, Jt, ft, Cd] (6,) unjudged, as a start for other estimators; None when there are too few rows."""
-    parts = [regressors(align(w, settings), w.dt_s) for w in windows]
+    parts = [regressors(s, dt) for s, dt in zip(signals, dt_s, strict=True)]
     if sum(p[0].shape[0] for p in parts) < 8:
         return None
     electrical, mechanical = (np.vstack([p[k] for p in parts]) for k in (0, 1))
@@ -151,12 +152,3 @@ def raw_values(windows: Sequence[Window], settings: Identification) -> Float | N
     (inductance, resistance, constant), _ = solve(electrical[:, 1:], electrical[:, 0])
     second, _ = solve(mechanical[:, 1:], mechanical[:, 0] * constant)
     return np.array([resistance, inductance, constant, *second])
-
-
-def solve(phi: Float, y: Float) -> tuple[Float, float]:
-    """Return the least-squares solution (k,) of phi theta = y ([DES] eq. 3) and the condition number of scaled phi."""
-    scale = np.sqrt((phi * phi).mean(axis=0))
-    scale[scale == 0] = 1.0
-    theta, _, _, singular = np.linalg.lstsq(phi / scale, y, rcond=None)
-    condition = float(singular[0] / singular[-1]) if singular[-1] > 0 else np.inf
-    return theta / scale, condition

@@ -16,10 +16,12 @@ import numpy as np
 from fdhil.config import Identification
 from fdhil.identification.delay import coarse_delay
 from fdhil.identification.estimators import least_squares
+from fdhil.identification.estimators.least_squares import Signals
 from fdhil.identification.identifiability import judge
 from fdhil.identification.innovations import Gains, gains_of, innovations
 from fdhil.identification.motion import Motion, Noise, prepare
 from fdhil.identification.noise import fit_noise
+from fdhil.identification.normal import inverse_of, solve
 from fdhil.records import PARAMETERS, Estimate, Float, Result, Window
 
 NAME = "maximum_likelihood"
@@ -29,6 +31,7 @@ CONVERGED = 1e-3  # of a standard deviation
 DIFFERENCE = 1e-5
 DELAY_DIFFERENCE_S = 1e-5
 SURE = 5.0  # standard deviations beyond which a delay is believed
+SHAPE_DOUBT = 1.5  # of the back-EMF's ramp within a sample: one standard deviation of the voltage's course
 LEAST_DELAY = 0.02  # of a sample; smaller ones are the voltage's course within a sample
 SETTLED = 0.01  # squared standard deviations moved by a renewal of the filter
 FLOORS = np.array([1e-4, 0.0, 1e-4, 1e-9])
@@ -45,7 +48,16 @@ class Problem:
 
     def residuals(self, theta: Float) -> Float:
         """Return the whitened innovations of all windows (m,); ``theta`` (7,) is [R, L, K, Jt, ft, Cd, delay]."""
-        parts = [innovations(m, theta, f, theta[6]) for m, f in zip(self.motions, self.filters, strict=True)]
+        return self._all(theta, 1.0)
+
+    def shape_effect(self, theta: Float) -> Float:
+        """Return how the innovations (m,) change with what is not known of the voltage's course within its samples."""
+        return self._all(theta, 1.0 + SHAPE_DOUBT) - self._all(theta, 1.0)
+
+    def _all(self, theta: Float, emf_share: float) -> Float:
+        parts = [
+            innovations(m, theta, f, theta[6], None, emf_share) for m, f in zip(self.motions, self.filters, strict=True)
+        ]
         return np.concatenate([p.ravel() for p in parts])
 
 
@@ -102,7 +114,7 @@ def descend(problem: Problem, theta: Float, free: Sequence[int]) -> tuple[Float,
         norms = np.sqrt((j * j).sum(axis=0))
         if not np.isfinite(norms).all() or (norms == 0).any():
             return theta, residuals, j, False
-        step = np.linalg.lstsq(j / norms, residuals, rcond=None)[0] / norms
+        step = solve(j, residuals)[0]
         share, cost = 1.0, float(residuals @ residuals)
         while share > 1e-3:
             trial = theta.copy()
@@ -131,13 +143,13 @@ def fit(motions: Sequence[Motion], start: Float, free: Sequence[int]) -> Fit:
         moved = theta[list(free)] - before[list(free)]
         if turn and float(moved @ information @ moved) < SETTLED:
             break
-        noises = [fit_noise(m, theta, theta[6]) for m in motions]
+        noises = [fit_noise(m, theta, s, theta[6]) for m, s in zip(motions, noises, strict=True)]
     return Fit(theta, information, tuple(free), residuals, j, problem, converged)
 
 
-def starting_point(windows: Sequence[Window], settings: Identification) -> Float | None:
+def starting_point(signals: Sequence[Signals], dt_s: Sequence[float]) -> Float | None:
     """Return the least-squares estimate as theta (7,) without delay; None without one, or when no drive can be so."""
-    first = least_squares.raw_values(windows, settings)
+    first = least_squares.raw_values(signals, dt_s)
     if first is None or not np.isfinite(first).all() or (first[[0, 2, 3]] <= FLOORS[[0, 2, 3]]).any():
         return None
     first[1] = max(first[1], LEAST_TIME_CONSTANT_S * first[0])
@@ -150,11 +162,12 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
     A delay between voltage and the other signals is fitted too when the data surely show one.
     """
     usable = [w for w in windows if w.voltage_v is not None]
-    start = starting_point(usable, settings) if usable else None
+    signals = [least_squares.align(w, settings) for w in usable]
+    start = starting_point(signals, [w.dt_s for w in usable])
     if start is None:
         return None
     motions = [prepare(w) for w in usable]
-    delays = [coarse_delay(w, settings) for w in usable]
+    delays = [coarse_delay(s, w.dt_s) for s, w in zip(signals, usable, strict=True)]
     start[6] = float(np.median(delays))
     if start[6] != 0.0:
         return fit(motions, start, range(7))
@@ -168,8 +181,7 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
 def delay_score(plain: Fit) -> tuple[float, float]:
     """Return the delay (s) that one Newton step from a fit without delay would add, and its standard deviation."""
     d = jacobian(plain.problem, plain.theta, plain.residuals, [6], typical(plain.theta, plain.problem.motions))[:, 0]
-    basis = np.linalg.qr(plain.jacobian)[0]
-    rest = d - basis @ (basis.T @ d)
+    rest = d - plain.jacobian @ solve(plain.jacobian, d)[0]
     weight = float(rest @ rest)
     return (float(rest @ plain.residuals) / weight, weight**-0.5) if weight > 0 else (0.0, np.inf)
 
@@ -187,18 +199,15 @@ def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
 
 def finish(result: Fit) -> Estimate:
     """Return the fit as an estimate with its covariance."""
-    scale = np.sqrt(np.diag(result.information))
-    scale[scale == 0] = 1.0
-    scaled = result.information / np.outer(scale, scale)
-    singular = np.linalg.svd(scaled, compute_uv=False)
-    condition = float(np.sqrt(singular[0] / singular[-1])) if singular[-1] > 0 else np.inf
-    inverse = np.linalg.pinv(scaled) / np.outer(scale, scale)
+    inverse, condition = inverse_of(result.information)
     k = len(PARAMETERS)
+    # what noise cannot explain: an interval mean leaves the voltage's course within the sample open
+    doubt = (inverse @ (result.jacobian.T @ result.problem.shape_effect(result.theta)))[:k]
     answer = Estimate(
         method=NAME,
         names=PARAMETERS,
         values=result.theta[:k],
-        covariance=inverse[:k, :k],
+        covariance=inverse[:k, :k] + np.outer(doubt, doubt),
         residuals={"electrical": result.residuals[0::2], "mechanical": result.residuals[1::2]},
         result=Result.OK if result.converged else Result.DIVERGED,
         delay_s=float(result.theta[6]) if 6 in result.free else None,
