@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from fdhil.guard.interlocks import Alarm, AxisView, Reaction, failing, not_ready, withheld
 from fdhil.guard.limits import brake, follow, violation
-from fdhil.guard.path import EPS, Path, Place, advance, around
+from fdhil.guard.observe import behind, observe, view
+from fdhil.guard.path import Path
 from fdhil.guard.settings import AxisSettings, Settings
 from fdhil.guard.state import (
     IN_CHARGE,
     LANDING,
     SENDING,
-    AxisInput,
     AxisState,
     Inputs,
     Mode,
@@ -23,9 +23,9 @@ from fdhil.guard.state import (
     Request,
     State,
 )
+from fdhil.guard.tracking import await_start, track
 
 SETTLED_CYCLES = 100
-STILL_CYCLES = 10
 HOLD_CYCLES = 10
 FEED_HOLD_S = 10.0
 RESERVE_S = 1.0
@@ -41,8 +41,8 @@ Alarms = tuple[Alarm, ...]
 def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Output]:
     """Decide what leaves the guard now. ``inputs.sync`` False is the local timer's step, taken when SYNC is silent."""
     before = state.mode
-    state = _observe(state, inputs, settings)
-    views = tuple(map(_view, settings.axes, inputs.axes, state.axes))
+    state = observe(state, inputs, settings)
+    views = tuple(map(view, settings.axes, inputs.axes, state.axes))
     alarms = _alarms(state, inputs, views)
     state = state._replace(good_for=0 if alarms else state.good_for + inputs.sync)
     state, refused = _request(state, inputs, alarms, views, settings)
@@ -58,84 +58,6 @@ def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outpu
 # --- what the drives and the bus say ---
 
 
-def _observe(state: State, inputs: Inputs, settings: Settings) -> State:
-    """Take in what was sampled: failed frames, read-backs, following errors, the targets just latched."""
-    axes, failed = state.axes, 0
-    if not inputs.transmitted:
-        axes, failed = tuple(map(_not_sent, state.axes)), state.failed_run + 1
-        state = _behind(state)
-    if not inputs.sync:
-        return state._replace(axes=axes, failed_run=failed, tick=state.tick + (not settings.offset_synchronous))
-    heard = [axis.target for axis in inputs.axes]
-    targets = None if None in heard else tuple([target for target in heard if target is not None])
-    depth = max([axis.setpoint_delay_cycles for axis in settings.axes]) + 2
-    history = (targets, *state.targets)[:depth]
-    sampled = [
-        _sampled(axis, seen, setting, k, history)
-        for k, (axis, seen, setting) in enumerate(zip(axes, inputs.axes, settings.axes, strict=True))
-    ]
-    return state._replace(
-        axes=tuple(sampled),
-        tick=state.tick + 1,
-        targets=history,
-        failed_run=failed,
-        missed=state.missed + (inputs.late and state.mode in SENDING),
-        missed_run=state.missed_run + 1 if inputs.late else 0,
-    )
-
-
-def _not_sent(axis: AxisState) -> AxisState:
-    """The last frame did not leave: the value before it is still in force, at rest."""
-    return axis._replace(offset=axis.sent[1], rate=0, sent=(axis.sent[1], *axis.sent[1:]))
-
-
-def _sampled(
-    axis: AxisState, seen: AxisInput, setting: AxisSettings, k: int, history: tuple[tuple[int, ...] | None, ...]
-) -> AxisState:
-    """Compare what the drive showed at the SYNC before with what was in force then.
-
-    ``axis.sent[0]`` left after that SYNC, ``sent[1]`` after the one before it and was latched at it. The set-point
-    followed then was latched ``setpoint_delay_cycles`` earlier, together with its offset.
-    """
-    error: float = axis.following_error
-    latched = history[1 + setting.setpoint_delay_cycles] if len(history) > 1 + setting.setpoint_delay_cycles else None
-    if seen.following_error is not None:
-        error = seen.following_error
-    elif seen.position is not None and latched is not None:
-        error = latched[k] + axis.sent[1 + setting.setpoint_delay_cycles] - seen.position
-    if seen.read_back is None:
-        return axis if error == axis.following_error else axis._replace(following_error=error)
-    late = seen.read_back != axis.sent[1] and seen.read_back in axis.sent[2:4]
-    wrong = seen.read_back != axis.sent[1] and not late
-    return axis._replace(
-        following_error=error,
-        read_back=seen.read_back,
-        echo_misses=axis.echo_misses + 1 if wrong else 0,
-        late_echoes=axis.late_echoes + late,
-        zero_shown=axis.zero_shown or (seen.read_back == 0 and not any(axis.sent[:2])),
-    )
-
-
-def _view(setting: AxisSettings, seen: AxisInput, axis: AxisState) -> AxisView:
-    return AxisView(
-        setting.name,
-        seen.feedback_age,
-        seen.heartbeat_age_s,
-        setting.heartbeat_timeout_s,
-        seen.nmt,
-        seen.statusword,
-        seen.mode,
-        axis.following_error,
-        setting.window,
-        setting.limits.offset,
-        axis.echo_misses,
-        axis.read_back,
-        seen.target is not None,
-        seen.short_frames,
-        seen.long_frames,
-    )
-
-
 def _alarms(state: State, inputs: Inputs, views: Views) -> Alarms:
     """Everything that is not good at this step, events first."""
     own = []
@@ -148,7 +70,7 @@ def _alarms(state: State, inputs: Inputs, views: Views) -> Alarms:
 
 def standing(state: State, inputs: Inputs, settings: Settings) -> Alarms:
     """Return what was not good at the step that took ``inputs``, what forbids arming included; for the status."""
-    views = tuple(map(_view, settings.axes, inputs.axes, state.axes))
+    views = tuple(map(view, settings.axes, inputs.axes, state.axes))
     return (*_alarms(state, inputs, views), *not_ready(views))
 
 
@@ -293,8 +215,8 @@ def _follow_path(state: State, inputs: Inputs, alarms: Alarms, settings: Setting
         return _ramp_down(state, Alarm("ProgramMismatch"))
     hold = next((alarm for alarm in alarms if alarm.reaction is Reaction.HOLD), None)
     if state.mode is Mode.ARMED:
-        return _held(state, hold, settings) if hold else _await_start(state._replace(held_for=0), path)
-    state, lost = _track(state, path)
+        return _held(state, hold, settings) if hold else _started(state, path)
+    state, lost = track(state, path)
     hold = hold or lost
     if path.final and state.places[0].row >= path.end - 1:
         return _ramp_down(state, Alarm("Finished"))
@@ -307,6 +229,11 @@ def _follow_path(state: State, inputs: Inputs, alarms: Alarms, settings: Setting
     return state._replace(held_for=0)
 
 
+def _started(state: State, path: Path) -> State:
+    state, astray = await_start(state._replace(held_for=0), path)
+    return state if astray is None else _ramp_down(state, astray)
+
+
 def _held(state: State, alarm: Alarm, settings: Settings) -> State:
     """Hold the offset, or when that has lasted too long ramp it down; before the start there is nothing to hold."""
     allowed = settings.cycles(FEED_HOLD_S) if alarm.code == "FeedHold" else HOLD_CYCLES
@@ -314,39 +241,6 @@ def _held(state: State, alarm: Alarm, settings: Settings) -> State:
         return _ramp_down(state, alarm)
     mode = Mode.ARMED if state.mode is Mode.ARMED else Mode.HOLD
     return state._replace(mode=mode, held_for=state.held_for + 1, cause=alarm)
-
-
-def _await_start(state: State, path: Path) -> State:
-    """Armed: once the targets have stood at the path's begin, the first that leaves it says where the path is."""
-    now, last = state.targets[0], state.targets[1] if len(state.targets) > 1 else None
-    if now is None:
-        return state
-    if now == last:
-        distance = path.mismatch(path.first, now)
-        at_start = distance is not None and distance <= EPS
-        return state._replace(still_for=state.still_for + 1 if at_start else 0)
-    if state.still_for < STILL_CYCLES:
-        return state._replace(still_for=0)
-    places = around(path, state.start_row + 1, now)
-    if not places:
-        return _ramp_down(state, Alarm("Misaligned", detail="the first move leaves the path"))
-    return state._replace(mode=Mode.RAMPING, places=places, anchor=places[0].row, cause=None)
-
-
-def _track(state: State, path: Path) -> tuple[State, Alarm | None]:
-    """Move along the path by what the targets say; an alarm when they say something else."""
-    targets = state.targets[0]
-    places = advance(path, state.places, targets)
-    if places:
-        return state._replace(places=places, anchor=places[0].row if targets else state.anchor, resuming=False), None
-    assert targets is not None
-    distance = path.mismatch(state.anchor, targets)
-    if targets == state.targets[1] and distance is not None and distance <= EPS:
-        return state._replace(places=(Place(state.anchor),), resuming=True), Alarm("FeedHold")
-    places = around(path, state.anchor + 1, targets) if state.resuming else ()
-    if places:
-        return state._replace(places=places, anchor=places[0].row, resuming=False), None
-    return state._replace(places=advance(path, state.places, None), resuming=False), Alarm("Misaligned")
 
 
 # --- the motion of the offset ---
@@ -359,7 +253,7 @@ def _move(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outp
     if not inputs.sync and (settings.offset_synchronous or not inputs.bus.silent):
         return state, Output()
     if inputs.late:
-        return _behind(state)._replace(axes=tuple(map(_stands, state.axes))), Output()
+        return behind(state)._replace(axes=tuple(map(_stands, state.axes))), Output()
     offsets, broken = _next_offsets(state, inputs.path, settings)
     if broken is not None:
         state = _ramp_down(state, broken)
@@ -413,11 +307,6 @@ def _sent(axis: AxisState, offset: int, setting: AxisSettings) -> AxisState:
         travel=axis.travel.add(move, setting.limits.window),
         zero_shown=axis.zero_shown and offset == 0,
     )
-
-
-def _behind(state: State) -> State:
-    """A frame did not leave in time: the offset is no longer on the table and has to catch up."""
-    return state._replace(mode=Mode.RAMPING) if state.mode is Mode.ACTIVE else state
 
 
 def _stands(axis: AxisState) -> AxisState:

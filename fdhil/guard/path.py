@@ -91,3 +91,27 @@ def advance(path: Path, places: Sequence[Place], targets: Sequence[int] | None) 
 def best_first(places: Sequence[Place]) -> tuple[Place, ...]:
     """Sort by what they cost so far; equals keep their order."""
     return tuple(sorted(places, key=lambda place: place.cost))
+
+
+def rate_between(path: Path, row: int, last: Sequence[int], targets: Sequence[int]) -> float | None:
+    """Return at what share of the planned rate the targets move along the path near ``row``; None: they leave it.
+
+    Both targets must lie on the straights between neighbouring rows, which an override or a feed hold leads to.
+    """
+    here, there = _fraction(path, row, last), _fraction(path, row, targets)
+    return None if here is None or there is None else there - here
+
+
+def _fraction(path: Path, row: int, targets: Sequence[int]) -> float | None:
+    """Where on the path the targets are, in rows, within ``2 SEARCH`` before and ``SEARCH`` behind ``row``."""
+    for k in range(row + SEARCH, row - 2 * SEARCH, -1):
+        if not path.has(k) or not path.has(k + 1):
+            continue
+        rows = [(values[k - path.first], values[k + 1 - path.first]) for values in path.demand]
+        longest = max(range(len(rows)), key=lambda axis: abs(rows[axis][1] - rows[axis][0]))
+        begin, end = rows[longest]
+        part = (targets[longest] - begin) / (end - begin) if end != begin else -1.0
+        ways = zip(rows, targets, strict=True)
+        if 0 <= part < 1 and all(abs(a + part * (b - a) - target) <= 2 * EPS for (a, b), target in ways):
+            return k + part
+    return None

@@ -361,3 +361,22 @@ def test_vibrating_table_is_left_by_its_total_variation() -> None:
     machine.play()
     machine.until(Mode.RAMP_DOWN)
     assert machine.alarms[-1].code == "OffsetEnergy"
+
+
+@pytest.mark.parametrize("rate", [0.5, 0.9, 1.2])
+def test_another_override_is_told_from_another_path(cutting: Bench, rate: float) -> None:
+    at = float(cutting.row)
+    while cutting.mode is not Mode.RAMP_DOWN:
+        at += rate
+        k, part = int(at), at - int(at)
+        cutting.rest = [round(c[k] + part * (c[k + 1] - c[k])) for c in cutting.demand]
+        cutting.sync()
+    assert cutting.alarms[-1].code == "OverrideChanged"
+    assert f"{100 * rate:.0f} %" in cutting.alarms[-1].detail
+    cutting.until(Mode.OFF)
+
+
+def test_a_shift_along_the_path_is_no_override(cutting: Bench) -> None:
+    cutting.row += 2
+    cutting.until(Mode.RAMP_DOWN)
+    assert cutting.alarms[-1].code == "Misaligned"

@@ -79,7 +79,7 @@ def test_a_table_cut_off_at_any_length_is_no_new_table(tmp_path: FilePath) -> No
     table.write(file, body("old"), SLOT)
     table.write(file, body("new"), SLOT)
     good = file.read_bytes()
-    for length in range(len(good)):
+    for length in range(0, len(good), 7):
         file.write_bytes(good[:length])
         found = table.read(file, 0, SLOT)
         assert found in (None, (1, body("old")))

@@ -1,0 +1,91 @@
+"""What one SYNC tells about the axes: what was in force against what the drives showed. Pure, part of the core."""
+
+from __future__ import annotations
+
+from fdhil.guard.interlocks import AxisView
+from fdhil.guard.settings import AxisSettings, Settings
+from fdhil.guard.state import SENDING, AxisInput, AxisState, Inputs, Mode, State
+
+
+def observe(state: State, inputs: Inputs, settings: Settings) -> State:
+    """Take in what was sampled: failed frames, read-backs, following errors, the targets just latched."""
+    axes, failed = state.axes, 0
+    if not inputs.transmitted:
+        axes, failed = tuple(map(_not_sent, state.axes)), state.failed_run + 1
+        state = behind(state)
+    if not inputs.sync:
+        return state._replace(axes=axes, failed_run=failed, tick=state.tick + (not settings.offset_synchronous))
+    heard = [axis.target for axis in inputs.axes]
+    targets = None if None in heard else tuple([target for target in heard if target is not None])
+    depth = max([axis.setpoint_delay_cycles for axis in settings.axes]) + 2
+    history = (targets, *state.targets)[:depth]
+    sampled = [
+        _sampled(axis, seen, setting, k, history)
+        for k, (axis, seen, setting) in enumerate(zip(axes, inputs.axes, settings.axes, strict=True))
+    ]
+    return state._replace(
+        axes=tuple(sampled),
+        tick=state.tick + 1,
+        targets=history,
+        failed_run=failed,
+        missed=state.missed + (inputs.late and state.mode in SENDING),
+        missed_run=state.missed_run + 1 if inputs.late else 0,
+    )
+
+
+def _not_sent(axis: AxisState) -> AxisState:
+    """The last frame did not leave: the value before it is still in force, at rest."""
+    return axis._replace(offset=axis.sent[1], rate=0, sent=(axis.sent[1], *axis.sent[1:]))
+
+
+def _sampled(
+    axis: AxisState, seen: AxisInput, setting: AxisSettings, k: int, history: tuple[tuple[int, ...] | None, ...]
+) -> AxisState:
+    """Compare what the drive showed at the SYNC before with what was in force then.
+
+    ``axis.sent[0]`` left after that SYNC, ``sent[1]`` after the one before it and was latched at it. The set-point
+    followed then was latched ``setpoint_delay_cycles`` earlier, together with its offset.
+    """
+    error: float = axis.following_error
+    latched = history[1 + setting.setpoint_delay_cycles] if len(history) > 1 + setting.setpoint_delay_cycles else None
+    if seen.following_error is not None:
+        error = seen.following_error
+    elif seen.position is not None and latched is not None:
+        error = latched[k] + axis.sent[1 + setting.setpoint_delay_cycles] - seen.position
+    if seen.read_back is None:
+        return axis if error == axis.following_error else axis._replace(following_error=error)
+    late = seen.read_back != axis.sent[1] and seen.read_back in axis.sent[2:4]
+    wrong = seen.read_back != axis.sent[1] and not late
+    return axis._replace(
+        following_error=error,
+        read_back=seen.read_back,
+        echo_misses=axis.echo_misses + 1 if wrong else 0,
+        late_echoes=axis.late_echoes + late,
+        zero_shown=axis.zero_shown or (seen.read_back == 0 and not any(axis.sent[:2])),
+    )
+
+
+def view(setting: AxisSettings, seen: AxisInput, axis: AxisState) -> AxisView:
+    """Return one axis as the interlocks look at it."""
+    return AxisView(
+        setting.name,
+        seen.feedback_age,
+        seen.heartbeat_age_s,
+        setting.heartbeat_timeout_s,
+        seen.nmt,
+        seen.statusword,
+        seen.mode,
+        axis.following_error,
+        setting.window,
+        setting.limits.offset,
+        axis.echo_misses,
+        axis.read_back,
+        seen.target is not None,
+        seen.short_frames,
+        seen.long_frames,
+    )
+
+
+def behind(state: State) -> State:
+    """A frame did not leave in time: the offset is no longer on the table and has to catch up."""
+    return state._replace(mode=Mode.RAMPING) if state.mode is Mode.ACTIVE else state

@@ -1,0 +1,55 @@
+"""Where on the path the machine is, told by the NC's targets alone. Pure, part of the core's step."""
+
+from __future__ import annotations
+
+from fdhil.guard.interlocks import Alarm
+from fdhil.guard.path import EPS, Path, Place, advance, around, rate_between
+from fdhil.guard.state import Mode, State
+
+STILL_CYCLES = 10
+"""How long the targets must stand at the path's begin before a move can be its start."""
+RATE_TOLERANCE = 0.02
+HIGHEST_RATE = 1.6
+"""Of what an NC's override gives; a larger step along the path is a jump."""
+
+
+def await_start(state: State, path: Path) -> tuple[State, Alarm | None]:
+    """Armed: once the targets have stood at the path's begin, the first that leaves it says where the path is."""
+    now, last = state.targets[0], state.targets[1] if len(state.targets) > 1 else None
+    if now is None:
+        return state, None
+    if now == last:
+        distance = path.mismatch(path.first, now)
+        at_start = distance is not None and distance <= EPS
+        return state._replace(still_for=state.still_for + 1 if at_start else 0), None
+    if state.still_for < STILL_CYCLES:
+        return state._replace(still_for=0), None
+    places = around(path, state.start_row + 1, now)
+    if not places:
+        return state, Alarm("Misaligned", detail="the first move leaves the path")
+    return state._replace(mode=Mode.RAMPING, places=places, anchor=places[0].row, cause=None), None
+
+
+def track(state: State, path: Path) -> tuple[State, Alarm | None]:
+    """Move along the path by what the targets say; an alarm when they say something else."""
+    targets = state.targets[0]
+    places = advance(path, state.places, targets)
+    if places:
+        return state._replace(places=places, anchor=places[0].row if targets else state.anchor, resuming=False), None
+    assert targets is not None
+    distance = path.mismatch(state.anchor, targets)
+    if targets == state.targets[1] and distance is not None and distance <= EPS:
+        return state._replace(places=(Place(state.anchor),), resuming=True), Alarm("FeedHold")
+    places = around(path, state.anchor + 1, targets) if state.resuming else ()
+    if places:
+        return state._replace(places=places, anchor=places[0].row, resuming=False), None
+    return state._replace(places=advance(path, state.places, None), resuming=False), _lost(state, path, targets)
+
+
+def _lost(state: State, path: Path, targets: tuple[int, ...]) -> Alarm:
+    """The targets are at no row: either the path is run at another rate, or it is another path."""
+    last = state.targets[1]
+    rate = rate_between(path, state.places[0].row, last, targets) if last is not None else None
+    if rate is None or not 0 <= rate <= HIGHEST_RATE or abs(rate - 1) <= RATE_TOLERANCE:
+        return Alarm("Misaligned")
+    return Alarm("OverrideChanged", detail=f"{100 * rate:.0f} % of the planned rate")
