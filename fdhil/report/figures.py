@@ -175,11 +175,11 @@ def _near(curves: Sequence[Curve], centre_mm: Float, distance_mm: float) -> Iter
         yield Curve(curve.label, np.where(inside, curve.path_mm, np.nan), curve.dashed)
 
 
-def contour_errors(time_s: Float, cases: Mapping[str, Float]) -> str:
-    """Contour error (um) along the path, one curve a case."""
+def contour_errors(dt_s: float, cases: Mapping[str, Float]) -> str:
+    """Contour error (um) along the path on a grid of ``dt_s``, one curve a case."""
     with _drawing(6.4, 3.2) as (_, axes, svg):
         for (label, error_um), colour in zip(cases.items(), COLOURS, strict=False):
-            axes.plot(time_s[: error_um.size], error_um, label=label, color=colour, lw=1.1)
+            axes.plot(np.arange(error_um.size) * dt_s, error_um, label=label, color=colour, lw=1.1)
         axes.set_xlabel("time (s)")
         axes.set_ylabel("contour error (um)")
         axes.set_ylim(bottom=0)

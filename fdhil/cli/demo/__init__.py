@@ -60,13 +60,14 @@ def _document(loop: Loop, report: Path) -> dict[str, Any]:
         }
         for axis, sets in loop.published.items()
     }
-    before, after, *rest = loop.cuts
+    before, mirror, after, *rest = loop.cuts
     contour = loop.predicted.contour_um
     return {
         "schema": "fdhil-demo-1",
         "identified": identified,
         "predicted": {"rms_um": float((contour**2).mean() ** 0.5), "max_um": float(contour.max())},
         "before": {"rms_um": before.rms_um, "max_um": before.max_um},
+        "mirror": {"rms_um": mirror.rms_um, "max_um": mirror.max_um, "late_offsets": mirror.late_offsets},
         "after": {"rms_um": after.rms_um, "max_um": after.max_um, "late_offsets": after.late_offsets},
         "warm": [{"label": cut.label, "rms_um": cut.rms_um, "max_um": cut.max_um} for cut in rest],
         "frames": {"received": loop.frames[0], "lost": loop.frames[1]},

@@ -142,14 +142,15 @@ def _measure(stage: Stage) -> Loop:
     models = {axis: found[0].parameters for axis, found in published.items()}
     predicted = predict(programs["10 m/min"], models, config)
     stage.say(f"predicted contour error of the path: {float((predicted.contour_um**2).mean() ** 0.5):.1f} um RMS")
-    _cut(stage, "uncorrected", 20.0, armed=False)
-    _cut(stage, "corrected", 20.0, armed=True)
+    _cut(stage, "uncorrected", 20.0)
+    _cut(stage, "mirror", 20.0, "mirror")
+    _cut(stage, "inverse", 20.0, "inverse")
     warm = cold
     for celsius in WARM_C:
         stage.say(f"slide-ways at {celsius:.1f} degC, shuttling")
         stage.twin.command("temperature", celsius=celsius)
         warm = _shuttle(stage, published)
-    _cut(stage, "warm, corrected anew", WARM_C[-1], armed=True)
+    _cut(stage, "inverse, warm", WARM_C[-1], "inverse")
     counters = stage.ask("status")["frames"]
     return Loop(
         config=config,
@@ -204,11 +205,11 @@ def _settled(stage: Stage, before: Mapping[str, int]) -> bool:
     return all(now[axis] >= before[axis] + 2 for axis in stage.config.axis)
 
 
-def _cut(stage: Stage, label: str, celsius: float, armed: bool) -> None:
+def _cut(stage: Stage, label: str, celsius: float, method: str | None = None) -> None:
     program = stage.programs["10 m/min"]
-    if armed:
-        stage.say("arming: predicted to help, inside the limits, drives commissioned")
-        stage.ask("arm", program=str(program), token=_token(stage))
+    if method:
+        stage.say(f"arming by {method}: predicted to help, inside the limits, drives commissioned")
+        stage.ask("arm", program=str(program), method=method, token=_token(stage))
     trace = stage.out / f"cut-{len(stage.cuts) + 1}.csv"
     finished = stage.twin.play(program, trace)
     reference, table = read_trace(trace, tuple(stage.config.axis))
