@@ -1,0 +1,196 @@
+"""The drivers against the simulated machine in a process of its own, over its hub and its Modbus sensors."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil.config import MachineConfig
+from fdhil.drivers import MachineSource, Record, commissioning, commissioning_checks, open_machine
+from fdhil.drivers.commissioning import commission
+from fdhil.errors import ConnectError, DriveFault, ProtocolError
+from fdhil.records import AxisSamples, MoveEvent, MoveKind, Notice, Temperature, VoltageSamples
+from tests.drivers.wire import machine
+
+TOML = """
+[machine]
+name = "bench"
+[axis.X]
+screw_pitch_mm = 20.0
+rapid_speed_mm_s = 500.0
+max_acceleration_mm_s2 = 4000.0
+nominal = { R = 0.5, L = 0.005, K = 0.8, Jt = 0.075, ft = 0.05, Cd = 5.0 }
+[axis.X.regulators]
+position_gain_per_s = 50.0
+speed_kp = 23.562
+speed_ki = 1184.35
+current_limit_a = 200.0
+current_kp = 12.566
+current_ki = 1256.64
+voltage_limit_v = 300.0
+"""
+
+
+class Twin:
+    """The process, its ready event and its panel."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        (folder / "bench.toml").write_text(TOML)
+        command = [sys.executable, "-m", "fdhil.cli.main", "sim", str(folder / "bench.toml"), "--json"]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=folder)
+        self.ready = self.event("ready")
+
+    def event(self, name: str) -> dict[str, Any]:
+        assert self.process.stdout is not None
+        while True:
+            line = self.process.stdout.readline()
+            assert line, "the simulated machine ended"
+            event: dict[str, Any] = json.loads(line)
+            assert event["event"] != "error", event
+            if event["event"] == name:
+                return event
+
+    def tell(self, **command: Any) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write(json.dumps(command) + "\n")
+        self.process.stdin.flush()
+
+    def config(self, **voltage: Any) -> MachineConfig:
+        bus = self.ready["buses"]["can0"]
+        sensor = self.ready["modbus"]["X"]
+        return machine(
+            folder=self.folder,
+            bus={"interface": "socketcand", "host": bus["host"], "port": bus["port"]},
+            voltage={"host": sensor["host"], "port": sensor["port"], "unit": sensor["unit"], **voltage},
+        )
+
+    def close(self) -> None:
+        with contextlib.suppress(BrokenPipeError):
+            self.tell(command="quit")
+        self.process.communicate(timeout=20)
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Twin]:
+    running = Twin(tmp_path_factory.mktemp("twin"))
+    yield running
+    running.close()
+
+
+def rapid(folder: Path) -> Path:
+    """A demand: 200 mm at 500 mm/s and 4 m/s2, then rest."""
+    t = np.arange(0, 1.2, 0.001)
+    speed = np.clip(np.minimum(t * 4000, (0.525 - t) * 4000), 0, 500)
+    position = np.concatenate([[0.0], np.cumsum(speed)[:-1]]) * 0.001
+    path = folder / "demand.csv"
+    path.write_text("time_s,X_mm\n" + "".join(f"{a:.3f},{b:.6f}\n" for a, b in zip(t, position, strict=True)))
+    return path
+
+
+async def gather(source: MachineSource, until: Callable[[list[Record]], bool], seconds: float = 30) -> list[Record]:
+    records: list[Record] = []
+    async with asyncio.timeout(seconds):
+        async for record in source.records():
+            records.append(record)
+            if until(records):
+                break
+    return records
+
+
+def moved(records: list[Record]) -> bool:
+    return any(isinstance(r, MoveEvent) and r.kind is MoveKind.REST for r in records)
+
+
+def test_commissioning_of_the_process(twin: Twin, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(commissioning_checks, "LISTEN_S", 0.3)
+    monkeypatch.setattr(commissioning, "SETTLE_CYCLES", 150)
+    monkeypatch.setattr(commissioning, "AVERAGE_CYCLES", 80)
+    record = commission(twin.config(), "X")
+    assert record.offset_in_feedforward is True
+    assert record.watchdog == "proven"
+    assert record.sign_test_um == pytest.approx(10, abs=3)
+
+
+def test_a_window_that_is_off_is_refused(twin: Twin, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(commissioning_checks, "LISTEN_S", 0.3)
+    settings = twin.config()
+    wrong = settings.axis["X"].model_copy(
+        update={"drive": settings.axis["X"].drive.model_copy(update={"increments_per_rev": 4096})}
+    )
+    with pytest.raises(DriveFault, match="counts 65536 per motor revolution"):
+        commission(settings.model_copy(update={"axis": {"X": wrong}}), "X")
+
+
+async def test_a_rapid_is_recorded_whole(twin: Twin) -> None:
+    twin.tell(command="nc", on=True)
+    trace = twin.folder / "trace.csv"
+    async with open_machine(twin.config()) as source:
+        await gather(source, lambda rs: any(isinstance(r, AxisSamples) and r.tick.size for r in rs))
+        twin.tell(command="trace", file=str(trace))
+        twin.tell(command="play", file=str(rapid(twin.folder)))
+        records = await gather(source, moved)
+        counters = source.counters()
+    await asyncio.to_thread(twin.event, "finished")
+    assert counters["lost"] == 0
+    assert not [r for r in records if isinstance(r, Notice)]
+    blocks = [r for r in records if isinstance(r, AxisSamples)]
+    tick = np.concatenate([b.tick for b in blocks])
+    demand = np.concatenate([b.demand_mm for b in blocks])
+    position = np.concatenate([b.position_mm for b in blocks])
+    assert np.all(np.diff(tick) == 1)
+    (start,) = [r.tick for r in records if isinstance(r, MoveEvent) and r.kind is MoveKind.RAPID]
+    truth = np.genfromtxt(trace, delimiter=",", names=True)
+    # the rapid to the demand's start may come first: find the trace's rows by the demand itself
+    first = int(np.argmin(np.abs(tick - start)))
+    moving = int(np.argmax(truth["X_reference_mm"] > 0.005))
+    begin = first + int(np.argmax(demand[first:] > 0.005)) - moving
+    n = min(truth.size, demand.size - begin) - 1
+    increment = 20 / 65536
+    np.testing.assert_allclose(demand[begin : begin + n], truth["X_reference_mm"][:n], atol=0.6 * increment)
+    np.testing.assert_allclose(position[begin : begin + n], truth["X_table_mm"][:n], atol=1.1 * increment)
+
+
+async def test_an_nc_on_the_bus_refuses_commissioning(twin: Twin) -> None:
+    twin.tell(command="nc", on=True)
+    with pytest.raises(ProtocolError, match="an NC is sending"):
+        await asyncio.to_thread(commission, twin.config(), "X")
+
+
+async def test_the_voltage_sensor_is_read_and_its_silence_told(twin: Twin) -> None:
+    twin.tell(command="nc", on=True)
+    async with open_machine(twin.config(source="modbus", timeout_s=0.3)) as source:
+        records = await gather(source, lambda rs: sum(isinstance(r, VoltageSamples) for r in rs) >= 8)
+        assert any(isinstance(r, Temperature) for r in records)
+        assert all(r.voltage_v is None for r in records if isinstance(r, AxisSamples))
+        twin.tell(command="fault", axis="X", fault="sensor_silent")
+        await gather(source, lambda rs: "ModbusTimeout" in {r.code for r in rs if isinstance(r, Notice)})
+
+
+async def test_a_machine_that_is_switched_off_is_told_and_not_fatal(tmp_path: Path) -> None:
+    own = Twin(tmp_path)
+    own.tell(command="nc", on=True)
+    async with open_machine(own.config()) as source:
+        await gather(source, lambda rs: any(isinstance(r, AxisSamples) for r in rs))
+        await asyncio.to_thread(own.close)
+        records = await gather(source, lambda rs: "BusDown" in {r.code for r in rs if isinstance(r, Notice)})
+    assert isinstance(records[-1], Notice)
+    assert "the CAN hub ended the connection" in records[-1].text
+    with pytest.raises(ConnectError, match="cannot be reached"):
+        async with open_machine(own.config()):
+            pass
+
+
+async def test_a_bus_without_a_drive_is_refused() -> None:
+    with pytest.raises(ConnectError, match="there is no drive on the bus"):
+        async with open_machine(machine()):
+            pass
