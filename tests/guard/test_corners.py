@@ -1,0 +1,120 @@
+"""Corners of the core that no single fault leads to."""
+
+from __future__ import annotations
+
+import pytest
+
+from fdhil.guard import core
+from fdhil.guard.interlocks import Alarm
+from fdhil.guard.path import Path, rate_between
+from fdhil.guard.state import Inputs, Mode, Request
+from tests.guard.machine import Bench, bench
+
+
+def active() -> Bench:
+    machine = bench()
+    machine.settle()
+    assert machine.arm() == ()
+    machine.run(30)
+    machine.play()
+    machine.until(Mode.ACTIVE)
+    machine.run(150)
+    return machine
+
+
+def inputs_of(machine: Bench, withdrawn: tuple[Alarm, ...] = ()) -> Inputs:
+    """The inputs of the next SYNC."""
+    machine.counter = machine.counter % 240 + 1
+    seen, bus = machine.listener.at_sync(bytes([machine.counter]), 0.0, 0.0)
+    return Inputs(True, seen, bus, path=machine.path, withdrawn=withdrawn)
+
+
+def test_what_the_daemon_withdraws_ramps_down() -> None:
+    machine = active()
+    machine.step(inputs_of(machine, (Alarm("ModelStale"),)))
+    assert machine.state.mode is Mode.RAMP_DOWN
+    assert machine.alarms[-1].code == "ModelStale"
+
+
+def test_status_tells_what_is_not_good() -> None:
+    machine = bench()
+    machine.settle()
+    assert core.standing(machine.state, inputs_of(machine), machine.settings) == ()
+    machine.drives[0].mode = 1
+    machine.settle(20)
+    told = core.standing(machine.state, inputs_of(machine), machine.settings)
+    assert ("NotCsp", "X") in {(alarm.code, alarm.axis) for alarm in told}
+
+
+def test_adopting_is_for_off_and_frozen_alone() -> None:
+    machine = active()
+    refused = machine.sync(Request("adopt", token_valid=True)).refused
+    assert refused is not None
+    assert [alarm.code for alarm in refused] == ["NotOff"]
+    assert machine.state.mode is Mode.ACTIVE
+
+
+def test_adopting_waits_for_the_drives_own_word() -> None:
+    machine = active()
+    machine.listener.error("off")
+    machine.sync()
+    machine.listener.error("active")
+    for drive in machine.drives:
+        drive.answers = False
+    machine.run(12)
+    refused = machine.sync(Request("adopt", token_valid=True)).refused
+    assert refused is not None
+    assert "StaleData" in {alarm.code for alarm in refused}
+
+
+def test_a_reboot_while_ramping_down_freezes() -> None:
+    machine = active()
+    machine.sync(Request("disarm"))
+    machine.hear(0x701, b"\x00")
+    machine.sync()
+    assert machine.state.mode is Mode.FROZEN
+
+
+def test_the_start_is_not_found_before_the_targets_have_stood() -> None:
+    machine = bench()
+    machine.settle()
+    assert machine.arm() == ()
+    for k in range(200):  # creeping near the path's begin: a rapid that is about to end
+        assert machine.path is not None
+        machine.rest = [machine.path.demand[0][0] + k % 2, machine.path.demand[1][0]]
+        machine.sync()
+    assert machine.mode is Mode.ARMED
+
+
+def test_heartbeat_alone_never_leaves() -> None:
+    machine = active()
+    machine.run(300)
+    for output in machine.outputs:
+        assert not output.heartbeat or output.offsets is not None
+
+
+def test_rows_outside_the_table() -> None:
+    path = Path(5, ([0, 10, 20],), ([1, 2, 3],), True, "p")
+    assert path.mismatch(4, (0,)) is None
+    assert path.mismatch(8, (0,)) is None
+    assert path.offsets_at(0) == (1,)
+    assert path.offsets_at(99) == (3,)
+    assert path.standing_rows() == 5
+    assert rate_between(path, 6, (0,), (5,)) == 0.5
+    assert rate_between(path, 6, (0,), (500,)) is None
+    assert rate_between(path, 6, (-9,), (5,)) is None
+    resting = Path(0, ([7, 7, 7],), ([0, 0, 0],), True, "p")
+    assert resting.standing_rows() == 2
+    assert rate_between(resting, 1, (7,), (7,)) is None
+
+
+@pytest.mark.parametrize("wrong", [10**6, -(10**6), 1.5, None])
+def test_a_wrong_frame_is_caught_whatever_made_it(monkeypatch: pytest.MonkeyPatch, wrong: object) -> None:
+    machine = active()
+    machine.sync(Request("disarm"))
+    count = len(machine.frames)
+    monkeypatch.setattr(core, "follow", lambda *_: wrong)
+    machine.sync()
+    assert machine.state.mode is Mode.FROZEN
+    assert machine.alarms[-1].code == "InternalError"
+    assert len(machine.frames) == count
