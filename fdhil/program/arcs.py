@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 
 from fdhil.errors import ProgramError
+from fdhil.program.machine import Machine
 from fdhil.program.modal import AXES, Modal
-from fdhil.program.motions import PLANE_AXES, Arc
-from fdhil.program.moves import Machine, axis_words, feed_mm_min, target
+from fdhil.program.motions import PLANE_AXES
+from fdhil.program.targets import axis_words, feed_mm_min, target
 from fdhil.program.words import Block
 
 CODES = (20, 30)
@@ -38,28 +39,12 @@ def arc(machine: Machine, block: Block) -> None:
         centre = _centre_of_offsets(modal, block, first, second)
         _check_radii(block, modal, centre, end, first, second)
     turns = _turns(block)
-    order(machine, block, end, centre, -turns if clockwise else turns, normal)
-
-
-def order(
-    machine: Machine, block: Block, end: list[float], centre: tuple[float, float], turns: int, normal: int
-) -> None:
-    """Order an arc to ``end`` about ``centre`` (both in active co-ordinates, centre in the plane's order of axes)."""
-    modal = machine.modal
-    first, second, _ = PLANE_AXES[modal.plane_name]
-    start = modal.position
-    feed = feed_mm_min(modal, block, _length(start, end, centre, turns, (first, second, normal)))
+    turns = -turns if clockwise else turns
     if modal.rotation_deg and normal != 2:
-        raise ProgramError(block.line, f"G{modal.motion / 10:g}",
-                           "an arc outside the XY plane cannot follow a system that is turned about Z")  # fmt: skip
-    whole = list(start)
-    whole[first], whole[second] = centre
-    shown: list[float | None] = list(modal.machine(whole))
-    shown[normal] = None
-    modal.position = end
-    machine.order(
-        block, Arc(block.line, machine.checked(block), (shown[0], shown[1], shown[2]), turns, modal.plane_name, feed)
-    )
+        what = "an arc outside the XY plane cannot follow a system that is turned about Z"
+        raise ProgramError(block.line, f"G{modal.motion / 10:g}", what)
+    angle, length = _extent(modal.position, end, centre, turns, (first, second, normal))
+    machine.arc_to(block, end, centre, turns, feed_mm_min(modal, block, length), angle)
 
 
 def _turns(block: Block) -> int:
@@ -119,15 +104,16 @@ def _centre_of_radius(
     )
 
 
-def _length(
+def _extent(
     start: list[float], end: list[float], centre: tuple[float, float], turns: int, axes: tuple[int, int, int]
-) -> float:
+) -> tuple[float, float]:
+    """Return the signed angle (rad) and the length (mm) of an arc or helix."""
     first, second, normal = axes
     begin = (start[first] - centre[0], start[second] - centre[1])
     finish = (end[first] - centre[0], end[second] - centre[1])
     angle = sweep(begin, finish, turns)
     radius = (math.hypot(*begin) + math.hypot(*finish)) / 2.0
-    return math.hypot(radius * angle, end[normal] - start[normal])
+    return angle, math.hypot(radius * angle, end[normal] - start[normal])
 
 
 def sweep(begin: tuple[float, float], finish: tuple[float, float], turns: int) -> float:

@@ -11,9 +11,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from fdhil.errors import ProgramError
+from fdhil.program.machine import Machine
 from fdhil.program.modal import AXES, Modal
 from fdhil.program.motions import PLANE_AXES
-from fdhil.program.moves import Machine, target
+from fdhil.program.targets import target
 from fdhil.program.words import Block
 
 _CLEARANCE_MM = 0.254  # by which a peck stays clear of where the drill was
@@ -159,7 +160,7 @@ class Hole:
             self.feed(self.retract)
         elif motion == 880:  # the operator brings the tool back by hand
             modal = self.machine.modal
-            modal.position = _with(modal.position, {PLANE_AXES[modal.plane_name][2]: self.retract})
+            self.machine.stand_at(self.block, _with(modal.position, {PLANE_AXES[modal.plane_name][2]: self.retract}))
         else:
             self.rapid(self.retract)
 

@@ -13,10 +13,12 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from fdhil.errors import ProgramError
-from fdhil.program import arcs, canned, lathe, moves, offsets
+from fdhil.program import arcs, canned, lathe, offsets, targets
 from fdhil.program.budget import Budget
 from fdhil.program.checks import CYCLES, check_readers, one_reader_of_axes
+from fdhil.program.compensation import Compensation
 from fdhil.program.flow import Flow
+from fdhil.program.machine import Machine
 from fdhil.program.modal import INDEX, MM_PER_INCH, NO_MOTION, Modal
 from fdhil.program.motions import Feed, Motion, Rapid
 from fdhil.program.parameters import Variables
@@ -53,7 +55,7 @@ class Interpreter:
     def __init__(self, source: Path | Iterable[str], budget: Budget, block_delete: bool) -> None:
         self._budget = budget
         self._block_delete = block_delete
-        self._machine = moves.Machine(budget)
+        self._machine = Machine(budget)
         modal = self._machine.modal
         first = Source(source, budget.max_line_chars)
         names = names_of(
@@ -67,6 +69,8 @@ class Interpreter:
         self._blocks = 0
         self._empty_so_far = True
         self._percent = False
+        self._tool = False
+        self._pending_tool = 0.0
         self._ended = False
 
     def run(self) -> Iterator[Motion]:
@@ -77,7 +81,7 @@ class Interpreter:
                 raw = flow.source.next()
                 if raw is None:
                     flow.at_end()
-                    return
+                    break
                 line = flow.source.line
                 self._count(line)
                 if flow.skipping:
@@ -91,6 +95,8 @@ class Interpreter:
                 if machine.out:
                     ordered, machine.out = machine.out, []
                     yield from ordered
+            machine.end_compensation()
+            yield from machine.out
         finally:
             flow.close()
 
@@ -163,6 +169,7 @@ class Interpreter:
         check_readers(block, block.g.get("motion", modal.motion))
         _feed(modal, block)
         _spindle(modal, block)
+        self._change_tool(block)
         if "modal state" in block.m and not self._kept.do(block.m["modal state"], self._flow.depth):
             raise ProgramError(block.line, "M72", "has no modes to restore; keep them by M70 first")
         if block.g.get("one-shot") == 40:
@@ -172,6 +179,13 @@ class Interpreter:
         _distance(modal, block)
         self._motion(block, self._set(block))
         self._ended = self._ended or block.m.get("stop") in _STOPS
+
+    def _change_tool(self, block: Block) -> None:
+        self._pending_tool = block.words.get("t", self._pending_tool)
+        if block.m.get("tool") == 6:
+            self._tool = self._pending_tool != 0.0
+        elif block.m.get("tool") == 61:
+            self._tool = block.words.get("q", 0.0) != 0.0
 
     def _call(self, block: Block) -> None:
         code = block.m.get("call")
@@ -187,12 +201,37 @@ class Interpreter:
 
     def _coordinates(self, block: Block) -> None:
         modal, g = self._machine.modal, block.g
-        if g.get("cutter compensation", 400) != 400:
-            raise unknown(block, g["cutter compensation"])
+        if self._machine.compensation is not None:
+            _check_compensated(modal, block)
+        if "cutter compensation" in g:
+            self._compensate(block, g["cutter compensation"])
         if "tool length" in g:
             offsets.set_tool_length(modal, block)
         if "co-ordinate system" in g:
             offsets.select_system(modal, self._variables, offsets.SYSTEMS[g["co-ordinate system"]])
+
+    def _compensate(self, block: Block, code: int) -> None:
+        """G40 turns cutter compensation off, G41 (left) and G42 (right) on; the .1 forms have the diameter as D."""
+        machine, modal = self._machine, self._machine.modal
+        modal.compensation = code
+        if code == 400:
+            machine.end_compensation()
+            return
+        if machine.compensation is not None:
+            raise ProgramError(block.line, f"G{code / 10:g}", "compensation is on already; end it by G40 first")
+        diameter = block.words.get("d")
+        if modal.plane == 2:
+            raise ProgramError(block.line, f"G{code / 10:g}", "does not work in the YZ plane; use G17 or G18")
+        if code % 10 == 0:
+            if diameter or self._tool:
+                what = "fdhil has no tool table, so the radius is not known; give the diameter by G41.1 or G42.1 D"
+                raise ProgramError(block.line, f"G{code / 10:g}", what)
+            diameter = 0.0
+        if diameter is None:
+            raise ProgramError(block.line, f"G{code / 10:g}", "wants the tool's diameter as D")
+        radius = diameter / 2.0 * modal.scale
+        side = (1 if code in (410, 411) else -1) * (1 if radius >= 0.0 else -1)
+        machine.start_compensation(Compensation(abs(radius), side))
 
     def _set(self, block: Block) -> bool:
         """Do a one-shot code; True when one was done that uses the axis words."""
@@ -222,9 +261,9 @@ class Interpreter:
         if code not in CYCLES:
             self._series.began = None
         if code == 0:
-            machine.rapid_to(block, moves.target(modal, block))
+            machine.rapid_to(block, targets.target(modal, block))
         elif code == 10:
-            machine.feed_to(block, moves.target(modal, block))
+            machine.feed_to(block, targets.target(modal, block))
         elif code in arcs.CODES:
             arcs.arc(machine, block)
         elif code in CYCLES:
@@ -244,11 +283,10 @@ class Interpreter:
         code = f"G{modal.motion / 10:g}"
         if modal.feed_mode == 930 or modal.feed_mm_min <= 0.0:
             raise ProgramError(block.line, code, "wants a feed rate per minute; give F")
-        end = moves.target(modal, block)
-        if not moves.axis_words(block):
+        end = targets.target(modal, block)
+        if not targets.axis_words(block):
             raise ProgramError(block.line, code, "wants the axis words of its target")
-        modal.position = end
-        self._machine.checked(block)
+        self._machine.stand_at(block, end)
         for axis, value in enumerate(end):
             self._variables.store(_PROBED_FIRST + axis, value / (modal.scale if axis not in (3, 4, 5) else 1.0))
         self._variables.store(_PROBE_HIT, 1.0)
@@ -257,6 +295,22 @@ class Interpreter:
 def unknown(block: Block, code: int) -> ProgramError:
     """Return the error for a G code (times ten) that fdhil does not know."""
     return ProgramError(block.line, f"G{code / 10:g}", "is a G code that fdhil does not know; see the list of codes")
+
+
+def _check_compensated(modal: Modal, block: Block) -> None:
+    """Raise ProgramError for codes that cannot be used while cutter compensation is on."""
+    moves_origin = block.g.get("one-shot") in (100, 280, 300, 520, 920, 921, 922, 923)
+    refused = [
+        group for group in ("plane", "co-ordinate system", "tool length", "machine co-ordinates") if group in block.g
+    ]
+    motion = block.g.get("motion", modal.motion)
+    if refused and not (refused == ["plane"] and block.g["plane"] == 170 + 10 * modal.plane):
+        raise ProgramError(block.line, f"G{block.g[refused[0]] / 10:g}", "cannot be used with cutter compensation on")
+    if moves_origin:
+        code = block.g["one-shot"] / 10
+        raise ProgramError(block.line, f"G{code:g}", "cannot be used with cutter compensation on")
+    if motion not in (0, 10, *arcs.CODES, NO_MOTION):
+        raise ProgramError(block.line, f"G{motion / 10:g}", "cannot be used with cutter compensation on")
 
 
 def _has_centre(block: Block) -> bool:
@@ -284,7 +338,7 @@ def _spindle(modal: Modal, block: Block) -> None:
         modal.spindle_turns = {3: 1, 4: -1}.get(block.m["spindle"], 0)
 
 
-def _dwell(machine: moves.Machine, block: Block) -> None:
+def _dwell(machine: Machine, block: Block) -> None:
     seconds = block.words.get("p")
     if seconds is None or seconds < 0.0:
         raise ProgramError(block.line, "G4", "a dwell wants its seconds as P, not negative")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from fdhil.errors import ProgramError
-from fdhil.program.moves import Machine, axis_words, target
+from fdhil.program.machine import Machine
+from fdhil.program.targets import axis_words, target
 from fdhil.program.words import Block
 
 

@@ -7,9 +7,10 @@ apart, with the rotation as the tenth; #5211 and on for G92, in force while #521
 from __future__ import annotations
 
 from fdhil.errors import ProgramError
+from fdhil.program.machine import Machine
 from fdhil.program.modal import AXES, Modal, rotate
-from fdhil.program.moves import Machine, axis_words, length_mm, target
 from fdhil.program.parameters import Variables
+from fdhil.program.targets import axis_words, length_mm, target
 from fdhil.program.words import Block
 
 G92_IN_FORCE, G92_FIRST = 5210, 5211

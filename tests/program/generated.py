@@ -45,7 +45,7 @@ class Writer:
 
     def arc(self) -> None:
         plane = self._random.choice([17, 18, 19])
-        first, second = {17: "XY", 18: "XZ", 19: "YZ"}[plane]
+        first, second = {17: ("X", "Y"), 18: ("X", "Z"), 19: ("Y", "Z")}[plane]
         offset = {17: "IJ", 18: "IK", 19: "JK"}[plane]
         code = self._random.choice(["G2", "G3"])
         normal = {17: "Z", 18: "Y", 19: "X"}[plane]
@@ -188,6 +188,33 @@ class Writer:
             f"o{label} call",
         ]
 
+    def compensated(self) -> None:
+        """A path beside which a small tool goes; now and then it cannot."""
+        pick = self._random
+        plane = pick.choice(["G17", "G17", "G18"])
+        first, second, normal = ("X", "Y", "Z") if plane == "G17" else ("X", "Z", "Y")
+        offset = "IJ" if plane == "G17" else "IK"
+        self.lines += [plane, f"G{pick.choice(['41.1', '42.1'])} D{round(pick.uniform(0.2, 3), 2)}", "G91"]
+        self.lines.append(f"G1 {first}{pick.randint(8, 20)} {second}{pick.randint(-20, 20)}")
+        for _ in range(pick.randint(1, 8)):
+            a, b = round(pick.uniform(-25, 25), 2), round(pick.uniform(-25, 25), 2)
+            kind = pick.randrange(9)
+            if kind < 4:
+                self.lines.append(f"{pick.choice(['G1', 'G1', 'G0'])} {first}{a:g} {second}{b:g}")
+            elif kind < 6:
+                radius = round(((a * a + b * b) ** 0.5) * pick.uniform(0.52, 1.5) + 0.01, 3)
+                sign = pick.choice(["", "", "-"])
+                self.lines.append(f"G{pick.choice([2, 3])} {first}{a:g} {second}{b:g} R{sign}{radius:g}")
+            elif kind == 6:
+                self.lines.append(
+                    f"G{pick.choice([2, 3])} {first}{2 * a:g} {offset[0]}{a:g} {normal}{pick.randint(-3, 3)}"
+                )
+            elif kind == 7:
+                self.lines.append(f"G1 {normal}{pick.randint(-5, 5)}")
+            else:
+                self.lines.append(pick.choice(["G4 P0.1", "F333", "M8"]))
+        self.lines += ["G40", "G90", f"G1 {self.axes('XYZ', 2)}", "G17"]
+
     def kept(self) -> None:
         self.lines += [
             "M70",
@@ -203,6 +230,7 @@ GROUPS: dict[str, list[Callable[[Writer], None]]] = {
     "arcs": [Writer.straight, Writer.arc, Writer.arc],
     "offsets": [Writer.straight, Writer.straight, Writer.offsets, Writer.offsets, Writer.modes],
     "cycles": [Writer.straight, Writer.cycle, Writer.cycle, Writer.offsets],
+    "compensation": [Writer.straight, Writer.compensated],
     "flow": [Writer.straight, Writer.loop, Writer.subroutine, Writer.parameter, Writer.kept],
 }
 GROUPS["all"] = [step for group in list(GROUPS.values()) for step in group]

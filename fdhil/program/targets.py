@@ -1,60 +1,14 @@
-"""Straight moves and dwells: what G0, G1, G4 and G53 make of a block's axis words."""
+"""What the words of a block say: where it leads, how long that is, at which feed."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 
 from fdhil.errors import ProgramError
-from fdhil.program.budget import Budget
 from fdhil.program.modal import AXES, INDEX, LINEAR, Modal
-from fdhil.program.motions import Dwell, Feed, Motion, Point, Rapid
 from fdhil.program.words import Block
 
 _MIN_INVERSE_TIME_FEED = 0.1  # program units per minute; a move without length has no feed of its own
-
-
-@dataclass(slots=True)
-class Machine:
-    """The interpreter's machine: its modal state, and the motions that the block at hand has ordered so far."""
-
-    budget: Budget
-    modal: Modal = field(default_factory=Modal)
-    out: list[Motion] = field(default_factory=list)
-
-    def rapid_to(self, block: Block, target: list[float]) -> None:
-        """Order a rapid to a position in active co-ordinates."""
-        self.modal.position = target
-        self.order(block, Rapid(block.line, self.checked(block)))
-
-    def feed_to(self, block: Block, target: list[float]) -> None:
-        """Order a straight feed to a position in active co-ordinates, at the feed in force."""
-        self.feed_at(block, target, feed_mm_min(self.modal, block, straight_length(self.modal.position, target)))
-
-    def feed_at(self, block: Block, target: list[float], feed: float) -> None:
-        """Order a straight feed at ``feed`` mm/min."""
-        self.modal.position = target
-        self.order(block, Feed(block.line, self.checked(block), feed))
-
-    def dwell(self, block: Block, seconds: float) -> None:
-        """Order a dwell."""
-        self.order(block, Dwell(block.line, seconds))
-
-    def order(self, block: Block, motion: Motion) -> None:
-        """Order a motion; ProgramError when one block orders too many."""
-        if len(self.out) >= self.budget.max_motions_per_block:
-            most = self.budget.max_motions_per_block
-            raise ProgramError(block.line, "", f"orders more than {most} motions; split it")
-        self.out.append(motion)
-
-    def checked(self, block: Block) -> Point:
-        """Return where the machine now stands; ProgramError when no machine reaches that."""
-        end = self.modal.machine()
-        limit = self.budget.max_coordinate_mm
-        for letter, value in zip("xyz", end, strict=True):
-            if not abs(value) <= limit:
-                raise block.fault(letter, f"leads to {value:g} mm; no machine reaches beyond {limit:g} mm")
-        return end
 
 
 def straight_length(start: list[float], end: list[float]) -> float:

@@ -1,0 +1,145 @@
+"""The interpreter's machine: it takes moves in active co-ordinates and orders motions in machine millimetres.
+
+With cutter compensation on, a move is ordered only when the next one is known.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from fdhil.errors import ProgramError
+from fdhil.program.budget import Budget
+from fdhil.program.compensation import Compensation, Piece, Waiting
+from fdhil.program.modal import Modal
+from fdhil.program.motions import PLANE_AXES, Arc, Dwell, Feed, Motion, Point, Rapid
+from fdhil.program.targets import feed_mm_min, straight_length
+from fdhil.program.words import Block
+
+_TINY_MM = 1e-9
+
+
+@dataclass(slots=True)
+class Machine:
+    """The modal state, and the motions that the block at hand has ordered so far (``out``)."""
+
+    budget: Budget
+    modal: Modal = field(default_factory=Modal)
+    out: list[Motion] = field(default_factory=list)
+    compensation: Compensation | None = None
+    just_left: bool = False  # compensation, so that the next motion must be straight
+
+    def rapid_to(self, block: Block, target: list[float]) -> None:
+        """Order a rapid to a position in active co-ordinates."""
+        self._straight(block, target, None)
+
+    def feed_to(self, block: Block, target: list[float]) -> None:
+        """Order a straight feed to a position in active co-ordinates, at the feed in force."""
+        self._straight(block, target, feed_mm_min(self.modal, block, straight_length(self.modal.position, target)))
+
+    def feed_at(self, block: Block, target: list[float], feed: float) -> None:
+        """Order a straight feed at ``feed`` mm/min."""
+        self._straight(block, target, feed)
+
+    def dwell(self, block: Block, seconds: float) -> None:
+        """Order a dwell."""
+        dwell = Dwell(block.line, seconds)
+        if self.compensation is None or not self.compensation.wait(Waiting(block, dwell)):
+            self._order(block, dwell)
+
+    def arc_to(
+        self, block: Block, target: list[float], centre: tuple[float, float], turns: int, feed: float, angle: float
+    ) -> None:
+        """Order an arc to ``target`` about ``centre`` (in the plane's order of axes), both in active co-ordinates."""
+        if self.just_left:
+            raise ProgramError(block.line, f"G{self.modal.motion / 10:g}", "the move after G40 must be straight")
+        if self.compensation is None:
+            self._arc(block, target, centre, turns, feed)
+            return
+        start, corner = self._flat(self.modal.position), self._flat(target)
+        self.modal.position = target
+        self._checked(block, target)
+        self._give(self.compensation.arc(block, start, corner, centre, turns, target, feed, angle))
+
+    def start_compensation(self, compensation: Compensation) -> None:
+        """Turn cutter compensation on."""
+        self.compensation = compensation
+
+    def end_compensation(self) -> None:
+        """Turn cutter compensation off (G40, program end) and order what waits."""
+        if self.compensation is not None:
+            self._give(self.compensation.flush())
+            self.just_left = self.compensation.entered
+            self.compensation = None
+
+    def _straight(self, block: Block, target: list[float], feed: float | None) -> None:
+        start = self.modal.position
+        self.modal.position = target
+        self.just_left = False
+        if self.compensation is None:
+            end = self._checked(block, target)
+            self._order(block, Rapid(block.line, end) if feed is None else Feed(block.line, end, feed))
+            return
+        self._checked(block, target)
+        a, b = self._flat(start), self._flat(target)
+        if abs(a[0] - b[0]) < _TINY_MM and abs(a[1] - b[1]) < _TINY_MM and self.compensation.entered:
+            self.compensation.wait(Waiting(block, None, target, feed))
+            return
+        self._give(self.compensation.line(block, a, b, target, feed))
+
+    def _flat(self, position: list[float]) -> tuple[float, float]:
+        first, second, _ = PLANE_AXES[self.modal.plane_name]
+        return position[first], position[second]
+
+    def _give(self, pieces: list[Piece]) -> None:
+        """Order compensated pieces and what waited for their ends."""
+        first, second, _ = PLANE_AXES[self.modal.plane_name]
+        for piece in pieces:
+            end = list(piece.whole)
+            end[first], end[second] = piece.end
+            if piece.centre is not None and piece.feed is not None:
+                self._arc(piece.block, end, piece.centre, piece.turns, piece.feed)
+            else:
+                self._line(piece.block, end, piece.feed)
+            for waiting in piece.waiting:
+                if waiting.dwell is not None:
+                    self._order(waiting.block, waiting.dwell)
+                else:
+                    there = list(waiting.whole)
+                    there[first], there[second] = piece.end
+                    self._line(waiting.block, there, waiting.feed)
+
+    def _line(self, block: Block, target: list[float], feed: float | None) -> None:
+        end = self._checked(block, target)
+        self._order(block, Rapid(block.line, end) if feed is None else Feed(block.line, end, feed))
+
+    def _arc(self, block: Block, target: list[float], centre: tuple[float, float], turns: int, feed: float) -> None:
+        first, second, normal = PLANE_AXES[self.modal.plane_name]
+        whole = list(target)
+        whole[first], whole[second] = centre
+        shown: list[float | None] = list(self.modal.machine(whole))
+        shown[normal] = None
+        if self.compensation is None:
+            self.modal.position = target
+        end = self._checked(block, target)
+        about = (shown[0], shown[1], shown[2])
+        self._order(block, Arc(block.line, end, about, turns, self.modal.plane_name, feed))
+
+    def _order(self, block: Block, motion: Motion) -> None:
+        if len(self.out) >= self.budget.max_motions_per_block:
+            most = self.budget.max_motions_per_block
+            raise ProgramError(block.line, "", f"orders more than {most} motions; split it")
+        self.out.append(motion)
+
+    def _checked(self, block: Block, position: list[float]) -> Point:
+        """Return a position in machine mm; ProgramError when no machine reaches that."""
+        end = self.modal.machine(position)
+        limit = self.budget.max_coordinate_mm
+        for letter, value in zip("xyz", end, strict=True):
+            if not abs(value) <= limit:
+                raise block.fault(letter, f"leads to {value:g} mm; no machine reaches beyond {limit:g} mm")
+        return end
+
+    def stand_at(self, block: Block, position: list[float]) -> None:
+        """Be at a position without a listed motion (a probe's, an operator's)."""
+        self.modal.position = position
+        self._checked(block, position)
