@@ -10,7 +10,7 @@ void p_pi_pi(const double *reference, long n, long first, long rows, const doubl
 {
     const double kv = g[0], kff = g[1], speed_kp = g[2], speed_ki = g[3], current_max = g[4];
     const double current_kp = g[5], current_ki = g[6], voltage_max = g[7], period = g[8], half_step_mm = g[9];
-    double i = state[0], w = state[1], x = state[2], speed_integral = state[3], current_integral = state[4];
+    double i = state[0], w = state[1], x = state[2], speed_integral = state[3], current_integral = state[4], demand_a = state[5];
     for (long row = 0; row < rows; row++) {
         long k = first + row, last = n - 1;
         double r0 = reference[k < last ? k : last];
@@ -19,8 +19,8 @@ void p_pi_pi(const double *reference, long n, long first, long rows, const doubl
         double rise = r1 - r0, slope = rise / period, bend = (r2 - r1) / period - slope;
         double peak_current = 0.0, peak_voltage = 0.0;
         long limited = 0;
-        double *o = out + 6 * row;
-        o[0] = x; o[1] = w; o[2] = i;
+        double *o = out + 9 * row;
+        o[3] = i; o[4] = w; o[5] = x; o[6] = speed_integral; o[7] = current_integral; o[8] = demand_a;
         for (long m = 0; m < n_speed; m++) {
             double part = (double)m / (double)n_speed;
             double demand = kv * (r0 + rise * part - x) + kff * (slope + bend * part);
@@ -28,7 +28,7 @@ void p_pi_pi(const double *reference, long n, long first, long rows, const doubl
             double candidate = speed_integral + speed_ki * error;
             double raw = speed_kp * error + candidate;
             peak_current = high(peak_current, fabs(raw));
-            double demand_a = low(high(raw, -current_max), current_max);
+            demand_a = low(high(raw, -current_max), current_max);
             int current_limited = demand_a != raw;
             if (!current_limited) speed_integral = candidate;
             for (long c = 0; c < n_current; c++) {
@@ -56,7 +56,7 @@ void p_pi_pi(const double *reference, long n, long first, long rows, const doubl
                 }
             }
         }
-        o[3] = (double)limited; o[4] = peak_current; o[5] = peak_voltage;
+        o[0] = (double)limited; o[1] = peak_current; o[2] = peak_voltage;
     }
-    state[0] = i; state[1] = w; state[2] = x; state[3] = speed_integral; state[4] = current_integral;
+    state[0] = i; state[1] = w; state[2] = x; state[3] = speed_integral; state[4] = current_integral; state[5] = demand_a;
 }

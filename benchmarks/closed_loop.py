@@ -63,7 +63,7 @@ def measure() -> dict[str, float]:
 
     with tempfile.TemporaryDirectory() as folder:
         library = compiled(Path(folder))
-        out, state = np.empty((n, 6)), np.zeros(12)
+        out, state = np.empty((n, 9)), np.zeros(12)
         pointers = [ctypes.c_void_p(array.ctypes.data) for array in (reference, plant, gains, state, out)]
 
         def c() -> Float:
@@ -73,7 +73,7 @@ def measure() -> dict[str, float]:
             library.p_pi_pi(r, long(n), long(0), long(n), p, g, long(N_SPEED), long(N_CURRENT), s, o)
             return out
 
-        difference = float(np.abs(numba()[:, 0] - c()[:, 0]).max()) * 1e3
+        difference = float(np.abs(numba()[:, 5] - c()[:, 5]).max()) * 1e3
         seconds = {"numba_s": best(numba), "c_s": best(c)}
     ratio = seconds["numba_s"] / seconds["c_s"]
     return seconds | {"ratio": ratio, "real_time": n * 0.001 / seconds["numba_s"], "difference_um": difference}

@@ -20,12 +20,14 @@ from fdhil.model import closed_loop
 from fdhil.model.closed_loop import Response, State
 from fdhil.records import Bool, Float, Parameters
 
-ITERATIONS = 8
-GOOD_ENOUGH_UM = 0.05  # RMS: a sixth of an increment
+ITERATIONS = 6
+GOOD_ENOUGH_UM = 0.07  # RMS: a quarter of an increment
+LEAST_PROGRESS = 0.8  # an iteration that leaves more than this of the best was one too many; two of them end it
 STILL_MM_S = 1e-3
 SHORTEST_REST_S = 0.03
 LEAD_S = 0.02  # before an axis starts again the offset is free
 STUCK_UM = 1.5  # a table that rests further away than this is moved, not held
+SEARCH_S = 0.15
 BAND = 0.97  # of the dry friction: safely stuck
 FADE_S = 0.04
 FORGET_S = 0.05
@@ -108,19 +110,21 @@ def solve(loop: AxisLoop, reference_mm: Float, target_mm: Float, carry: Carry, e
     best: Solution | None = None
     gain = 1.0
     needed_um = 0.0
+    idle = 0
     for iteration in range(ITERATIONS + 1):
         offset, position, error = _run(loop, reference_mm, target_mm, guess, carry, still)
-        if not ends:
-            error[-round(FORGET_S / loop.sync_period_s) :] = 0.0
-        rms_um = float(np.sqrt(np.mean(error**2))) * 1e3
+        unknown = 0 if ends else round(FORGET_S / loop.sync_period_s)  # what follows would change these rows
+        error[n - unknown :] = 0.0
+        rms_um = float(np.sqrt(np.mean((target_mm - position)[: max(1, n - unknown)] ** 2))) * 1e3
+        idle = 0 if best is None or rms_um < LEAST_PROGRESS * best.rms_um else idle + 1
         if best is None or rms_um < best.rms_um:
             best = Solution(offset, position, guess, rms_um, needed_um)
-        elif rms_um > 2.0 * best.rms_um:
+        if rms_um < GOOD_ENOUGH_UM or idle == 2:
+            break
+        if rms_um > 2.0 * best.rms_um:  # a step too far: half of it, from where it was good
             gain *= 0.5
             guess = best.guess
             continue
-        if rms_um < GOOD_ENOUGH_UM:
-            break
         guess = guess + gain * loop.inverse.apply(error) / loop.increment_mm
         if iteration == 0:  # before the limits act, the linear loop says what the path needs
             needed_um = float(np.abs(guess).max()) * loop.limits.um_per_increment
@@ -151,17 +155,19 @@ def _run(
     for first, stop in still:
         if stop <= done:
             continue
-        response = _simulate(loop, reference_mm, offset, state, done, stop)
-        stuck = _stuck(loop, response, target_mm[done:stop], max(first - done, 0))
+        # dry friction takes hold early in a rest or not at all
+        look = min(stop, max(first, done) + round(SEARCH_S / loop.sync_period_s))
+        response = _simulate(loop, reference_mm, offset, state, done, look)
+        position[done:look] = response.position_mm
+        stuck = _stuck(loop, response, target_mm[done:look], max(first - done, 0))
         if stuck is None:
-            position[done:stop], state, done = response.position_mm, response.end, stop
+            state, done = response.end, look
             continue
         row = done + stuck
-        head = _simulate(loop, reference_mm, offset, state, done, row)
-        position[done:row] = head.position_mm
-        _hold(loop, reference_mm, offset, head.end, row, stop)
-        tail = _simulate(loop, reference_mm, offset, head.end, row, stop)
-        position[row:stop], state, done = tail.position_mm, tail.end, stop
+        state = response.state_at(stuck)
+        _hold(loop, reference_mm, offset, state, row, stop)
+        response = _simulate(loop, reference_mm, offset, state, row, stop)
+        position[row:stop], state, done = response.position_mm, response.end, stop
         held[row:stop] = True
         gone = np.maximum(0.0, 1 - np.arange(stop - row) * loop.sync_period_s / FORGET_S)
         error_of_rest[row:stop] = (target_mm[row] - position[row]) * gone

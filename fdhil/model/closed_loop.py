@@ -41,8 +41,9 @@ class Response:
     """What the axis does, (n,) each, at the SYNC instants t_0 .. t_{n-1}.
 
     ``limited`` is the share of the cycle from that instant on in which the current or voltage limit acts;
-    ``peak_current_a`` and ``peak_voltage_v`` are the largest demands in that cycle before the limits. ``end`` is the
-    state after the last cycle, from which another run may continue.
+    ``peak_current_a`` and ``peak_voltage_v`` are the largest demands in that cycle before the limits. ``states`` (k, n)
+    is the whole state at those instants, and ``end`` (STATES,) that after the last cycle: another run may continue
+    from any of them.
     """
 
     position_mm: Float
@@ -52,16 +53,32 @@ class Response:
     peak_current_a: Float
     peak_voltage_v: Float
     limited_s: float
+    states: Float
     end: State
 
     @staticmethod
     def from_rows(rows: Float, steps: int, sync_period_s: float, end: State) -> Response:
-        """Take apart what a kernel recorded, (n, 6); ``steps`` current-loop steps make a cycle."""
+        """Take apart what a kernel recorded, (n, 3 + k); ``steps`` current-loop steps make a cycle."""
         columns = np.ascontiguousarray(rows.T)
-        columns[kernels.ROW_LIMITED] /= steps
-        limited_s = float(columns[kernels.ROW_LIMITED].sum() * sync_period_s)
-        position, speed, current, limited, peak_current, peak_voltage = columns
-        return Response(position, speed, current, limited, peak_current, peak_voltage, limited_s, end)
+        limited = columns[kernels.ROW_LIMITED] / steps
+        states = columns[kernels.ROW_STATE :]
+        return Response(
+            position_mm=states[kernels.POSITION],
+            speed_rad_s=states[kernels.SPEED],
+            current_a=states[kernels.CURRENT],
+            limited=limited,
+            peak_current_a=columns[kernels.ROW_PEAK_CURRENT],
+            peak_voltage_v=columns[kernels.ROW_PEAK_VOLTAGE],
+            limited_s=float(limited.sum() * sync_period_s),
+            states=states,
+            end=end,
+        )
+
+    def state_at(self, row: int) -> State:
+        """Return the state at the start of a row's cycle."""
+        state = np.zeros(STATES)
+        state[: len(self.states)] = self.states[:, row]
+        return state
 
 
 def simulate(

@@ -11,15 +11,8 @@ from fdhil.records import Float
 
 # places in the state vector (6,)
 CURRENT, SPEED, POSITION, SPEED_INTEGRAL, CURRENT_INTEGRAL, CURRENT_DEMAND = range(6)
-# columns of what a run records at each SYNC instant
-(
-    ROW_POSITION,
-    ROW_SPEED,
-    ROW_CURRENT,
-    ROW_LIMITED,
-    ROW_PEAK_CURRENT,
-    ROW_PEAK_VOLTAGE,
-) = range(6)
+# what a run records at each SYNC instant: the share of the cycle's steps with a limit acting, the peaks, the state
+ROW_LIMITED, ROW_PEAK_CURRENT, ROW_PEAK_VOLTAGE, ROW_STATE = range(4)
 
 
 def _p_pi_pi_plain(
@@ -34,14 +27,14 @@ def _p_pi_pi_plain(
     n_current: int,
     state: Float,
 ) -> Float:
-    """Run SYNC cycles ``first`` .. ``first + rows - 1`` and return (rows, 6) as seen at the start of each cycle.
+    """Run SYNC cycles ``first`` .. ``first + rows - 1`` and return (rows, 9) as seen at the start of each cycle.
 
     ``reference`` (n,) mm is held beyond its end; ``speed_offset`` rad/s and ``current_offset`` A are (n,) or empty.
     ``plant`` (16,): the exact step of [i, w, x], see :func:`fdhil.model.p_pi_pi.plant_step`. ``gains`` (13,): Kv and
     Kff already times 2 pi / pitch, speed kp, ki h, limit, current kp, ki h, limit, SYNC period. ``state`` is written.
     """
     last = reference.size - 1
-    out = np.empty((rows, 6))
+    out = np.empty((rows, 9))
     phi_ii, phi_iw, phi_wi, phi_ww, phi_xi, phi_xw = plant[0], plant[1], plant[2], plant[3], plant[4], plant[5]
     i_u, w_u, x_u, i_t, w_t, x_t = plant[6], plant[7], plant[8], plant[9], plant[10], plant[11]
     still, still_u, torque_constant, dry = plant[12], plant[13], plant[14], plant[15]
@@ -62,9 +55,12 @@ def _p_pi_pi_plain(
         peak_current = 0.0
         peak_voltage = 0.0
         limited = 0
-        out[row, 0] = x
-        out[row, 1] = w
-        out[row, 2] = i
+        out[row, 3] = i
+        out[row, 4] = w
+        out[row, 5] = x
+        out[row, 6] = speed_integral
+        out[row, 7] = current_integral
+        out[row, 8] = demand_a
         for m in range(n_speed):
             part = m / n_speed
             demand = kv * (r0 + rise * part - x) + kff * (slope + bend * part)
@@ -112,9 +108,9 @@ def _p_pi_pi_plain(
                     x += phi_xi * i + phi_xw * w + x_u * u + x_t * friction
                     i = phi_ii * i + phi_iw * w + i_u * u + i_t * friction
                     w = w_next
-        out[row, 3] = limited
-        out[row, 4] = peak_current
-        out[row, 5] = peak_voltage
+        out[row, 0] = limited
+        out[row, 1] = peak_current
+        out[row, 2] = peak_voltage
     state[0], state[1], state[2], state[3], state[4] = i, w, x, speed_integral, current_integral
     state[5] = demand_a
     return out
