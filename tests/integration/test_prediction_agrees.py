@@ -1,0 +1,66 @@
+"""The predictor and the twin's physics are independent code; on the bench path they must say the same.
+
+The twin runs behind its own NC and its own CiA 402, two cycles late and in whole increments; the predictor knows none
+of that.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil import config as machine_config
+from fdhil.config import MachineConfig
+from fdhil.prediction import predict
+from fdhil.program import load_trajectory
+from fdhil.records import Float, Parameters
+from tests.bench import bench_document
+from tests.sim.bench_twin import TwinInHand
+
+PROGRAMS = Path(__file__).parents[2] / "configs" / "programs"
+PLANTS = {
+    "bench": {"X": {}, "Y": {}},
+    "drifted": {"X": {"ft": 0.01, "Cd": 1.0, "Jt": 0.085}, "Y": {"R": 0.53, "L": 0.0046, "K": 0.83}},
+}
+
+
+def machine(feedforward: float, plant: dict[str, dict[str, float]]) -> MachineConfig:
+    document = bench_document()
+    for axis in document["axis"].values():
+        axis["regulators"]["speed_feedforward"] = feedforward
+    quiet = {"voltage_v": 0.0, "current_a": 0.0, "speed_rad_s": 0.0}
+    document["sim"] = {"noise": quiet, "modbus": False, "axis": plant}
+    return machine_config.parse(document)
+
+
+def table(config: MachineConfig, program: Path, folder: Path) -> Float:
+    """Let the twin's NC play the program, and return its true table positions (n, 2) in mm."""
+    reference = load_trajectory(program, config)
+    twin = TwinInHand(config)
+    twin.switch_on()
+    twin.machine.trace(folder / "trace.csv")
+    twin.machine.nc.play("bench", reference)
+    twin.run_until("finished", limit=2 * reference.time_s.size + 5000)
+    rows = np.genfromtxt(folder / "trace.csv", delimiter=",", names=True)
+    return np.column_stack([rows["X_table_mm"], rows["Y_table_mm"]])
+
+
+@pytest.mark.parametrize("plant", PLANTS)
+@pytest.mark.parametrize("feedforward", [1.0, 0.5])
+@pytest.mark.parametrize("program", ["bench_10m.ngc", "bench_20m.ngc"])
+def test_within_half_a_micrometre_away_from_the_limits(
+    program: str, feedforward: float, plant: str, tmp_path: Path
+) -> None:
+    config = machine(feedforward, PLANTS[plant])
+    actual = table(config, PROGRAMS / program, tmp_path)
+    models = {
+        axis: Parameters(**(settings.nominal.model_dump() | PLANTS[plant][axis]))
+        for axis, settings in config.axis.items()
+    }
+    prediction = predict(load_trajectory(PROGRAMS / program, config), models, config)
+    both = np.column_stack([prediction.predicted_mm["X"], prediction.predicted_mm["Y"]])
+    limited = any(prediction.limited_s.values())
+    assert limited == (plant == "drifted" and program == "bench_20m.ngc" and feedforward == 1.0)
+    assert np.max(np.abs(both - actual[: len(both)])) < (5e-3 if limited else 0.5e-3)
