@@ -18,11 +18,17 @@ from fdhil.daemon.control import ask
 from fdhil.errors import ConnectError
 
 REAL = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.085, "ft": 0.05, "Cd": 5.0}
-SHUTTLE = "G21 G90 G94\n" + "G0 X300\nG4 P0.4\nG0 X0\nG4 P0.4\n" * 2 + "M2\n"
-FEED = "G21 G90 G94\nG4 P0.5\nG1 X60 F4000\nG1 X20\nG4 P0.3\nM2\n"
-AXIS = """
+SHUTTLE = "G21 G90 G94\n" + "G0 X300 Y300\nG4 P0.4\nG0 X0 Y0\nG4 P0.4\n" * 2 + "M2\n"
+CORNER = "G21 G90 G94\nG4 P0.5\nG1 X60 F8000\nG1 Y40\nG4 P0.3\nM2\n"
+HEAD = """
 [machine]
 name = "bench"
+[guard]
+clock = "sync"
+[sim]
+pace = "lockstep"
+"""
+AXIS = """
 [axis.X]
 screw_pitch_mm = 20.0
 rapid_speed_mm_s = 500.0
@@ -46,10 +52,10 @@ voltage_limit_v = 300.0
 max_offset_um = 250.0
 max_speed_mm_s = 20.0
 max_acceleration_mm_s2 = 2000.0
-[guard]
-clock = "sync"
+[sim.axis.X]
+Jt = 0.085
 """
-TWIN = '[sim]\npace = "lockstep"\n[sim.axis.X]\nJt = 0.085\n[bus.can0]\ninterface = "socketcand"\n'
+BENCH = HEAD + AXIS + AXIS.replace(".X", ".Y")
 
 
 @dataclass
@@ -120,13 +126,13 @@ class Shop:
 
 @contextmanager
 def opened(folder: Path) -> Iterator[Shop]:
-    """Start a twin whose table is heavier than the data sheet says."""
-    (folder / "twin.toml").write_text(AXIS + TWIN)
+    """Start a twin whose tables are heavier than the data sheet says."""
+    (folder / "twin.toml").write_text(f'{BENCH}[bus.can0]\ninterface = "socketcand"\n')
     with Twin(folder / "twin.toml", folder / "twin.log") as twin:
         bus = twin.ready["buses"]["can0"]
         machine = folder / "machine.toml"
         place = f'channel = "{bus["channel"]}"\nhost = "{bus["host"]}"\nport = {bus["port"]}\n'
-        machine.write_text(f'{AXIS}[bus.can0]\ninterface = "socketcand"\n{place}')
+        machine.write_text(f'{BENCH}[bus.can0]\ninterface = "socketcand"\n{place}')
         yield Shop(folder, twin, machine, machine_config.load(machine))
 
 

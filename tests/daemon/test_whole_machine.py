@@ -12,9 +12,10 @@ import pytest
 from fdhil.cli.demo.processes import Process
 from fdhil.drivers.commissioning import commission, save_record
 from fdhil.errors import ConnectError
+from fdhil.prediction import contour_error_um
 from fdhil.store.history import History
 from fdhil.store.windows import list_windows
-from tests.daemon.shop import FEED, REAL, SHUTTLE, Shop, fdhil, opened
+from tests.daemon.shop import CORNER, REAL, SHUTTLE, Shop, fdhil, opened
 
 pytestmark = pytest.mark.timeout(300)  # three processes, each of which compiles on the first run
 
@@ -30,7 +31,7 @@ def test_from_the_bus_to_the_history_and_back(shop: Shop) -> None:
     with shop.daemon() as daemon:
         shop.nc_on()
         shop.play("shuttle.ngc", SHUTTLE)
-        status = shop.status_when(lambda s: s["axes"]["X"]["accepted"] + s["axes"]["X"]["refused"] >= 4)
+        status = shop.status_when(lambda s: all(s["axes"][a]["accepted"] + s["axes"][a]["refused"] >= 4 for a in "XY"))
         second = Process("second daemon", ["fdhil", "run", str(shop.path)], shop.folder / "second.log")
         with pytest.raises(ConnectError, match="BusLocked"):
             second.event("ready", 60.0)
@@ -40,6 +41,7 @@ def test_from_the_bus_to_the_history_and_back(shop: Shop) -> None:
     assert log.splitlines()[-1] == "stopped, offset 0", log
     axis = status["axes"]["X"]
     assert (axis["accepted"], axis["refused"]) == (4, 0), log
+    assert status["axes"]["Y"]["accepted"] == 4, log
     assert status["state"] == "OFF(SHADOW)"
     assert status["frames"]["received"] > 10_000
     assert status["sync"]["rate_hz"] > 0
@@ -54,7 +56,7 @@ def test_from_the_bus_to_the_history_and_back(shop: Shop) -> None:
 
 def _replays_bit_by_bit(shop: Shop) -> None:
     folder = shop.config.store.directory / "windows"
-    files = [file.path for file in list_windows(folder).windows]
+    files = [file.path for file in list_windows(folder).windows if file.axis == "X"]
     assert len(files) == 4
     replayed = fdhil("replay", "--config", shop.path, "--json", *files)
     assert replayed.returncode == 0, replayed.stderr
@@ -80,7 +82,7 @@ def _replays_bit_by_bit(shop: Shop) -> None:
 
 def _history_is_told(shop: Shop) -> None:
     told = json.loads(fdhil("history", shop.path, "--json").stdout)
-    assert [row["revision"] for row in told["revisions"]] == [1, 2, 3, 4]
+    assert [row["revision"] for row in told["revisions"] if row["axis"] == "Y"] == [1, 2, 3, 4]
     table = fdhil("history", shop.path)
     assert "axis X: 4 revisions" in table.stdout
     stopped = fdhil("status", shop.path)
@@ -89,18 +91,17 @@ def _history_is_told(shop: Shop) -> None:
 
 
 def test_a_program_is_armed_cut_and_disarmed_by_the_end_of_the_daemon(shop: Shop) -> None:
-    record = commission(shop.config, "X")
-    assert record.watchdog == "proven"
-    save_record(record, shop.config.store.directory)
-    program = shop.folder / "feed.ngc"
+    for axis in shop.config.axis:
+        save_record(commission(shop.config, axis), shop.config.store.directory)
+    program = shop.folder / "corner.ngc"
     with shop.guard() as guard, shop.daemon() as daemon:
-        program.write_text(FEED)
+        program.write_text(CORNER)
         refused = fdhil("arm", shop.path, program)
         assert (refused.returncode, refused.stdout) == (1, "")
         assert "refused: ModelNotValidated" in refused.stderr
         shop.nc_on()
         shop.play("shuttle.ngc", SHUTTLE)
-        shop.status_when(lambda s: s["axes"]["X"]["accepted"] == 4)
+        shop.status_when(lambda s: all(s["axes"][axis]["accepted"] == 4 for axis in "XY"))
         plain = _cut(shop, "plain")
         armed = fdhil("arm", shop.path, program, "--json")
         answer = json.loads(armed.stdout)
@@ -125,8 +126,11 @@ def test_a_program_is_armed_cut_and_disarmed_by_the_end_of_the_daemon(shop: Shop
 
 
 def _cut(shop: Shop, name: str) -> float:
-    """Let the NC cut the program; return the RMS of the table's error in um."""
+    """Let the NC cut the program; return the RMS of the contour error in um."""
     trace = shop.folder / f"{name}.csv"
-    shop.play("feed.ngc", FEED, trace=trace)
+    shop.play("corner.ngc", CORNER, trace=trace)
     rows = np.genfromtxt(trace, delimiter=",", names=True)
-    return float(np.sqrt(np.mean((rows["X_table_mm"] - rows["X_reference_mm"]) ** 2)) * 1e3)
+    reference, table = (
+        np.column_stack([rows[f"{axis}_{what}_mm"] for axis in "XY"]) for what in ("reference", "table")
+    )
+    return float(np.sqrt(np.mean(contour_error_um(reference, table, 1e-3) ** 2)))
