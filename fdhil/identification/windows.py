@@ -126,7 +126,7 @@ def _cut(recording: Recording, speed: Float, run: Run, floor: int, ceiling: int,
 def _stages(speed: Float, run: Run, offset: int, dt: float) -> Stages:
     """Return the stages in rows of the window; a recording that begins or ends in the move lacks that stage."""
     moving = np.abs(speed[run.rest_start : run.rest_end])
-    top = float(np.median(moving[moving >= 0.9 * moving.max()]))
+    top = _plateau(moving)
     first, last = longest(np.abs(moving - top) <= PLATEAU_BAND * top)
     begin, end = run.rest_start - offset, run.rest_end - offset
     whole_start = run.start > 0 and abs(speed[run.start - 1]) < abs(speed[run.start]) and run.rest_start > 0
@@ -137,6 +137,15 @@ def _stages(speed: Float, run: Run, offset: int, dt: float) -> Stages:
         cruise=(begin + first, begin + last) if long_enough else None,
         brake=(begin + last, end) if whole_end and run.rest_start + last < run.rest_end else None,
     )
+
+
+def _plateau(moving: Float) -> float:
+    """Return the speed about which most rows lie: the plateau's, also where the drive overshoots it."""
+    ordered = np.sort(moving[moving >= 0.5 * moving.max()])
+    counts = np.searchsorted(ordered, ordered * (1 + PLATEAU_BAND)) - np.searchsorted(
+        ordered, ordered * (1 - PLATEAU_BAND)
+    )
+    return float(ordered[int(np.argmax(counts))])
 
 
 def longest(flags: Bool) -> tuple[int, int]:

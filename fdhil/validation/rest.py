@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from fdhil.identification.estimators.maximum_likelihood import Fit
-from fdhil.identification.motion import UNKNOWN, Motion, noise_levels
+from fdhil.identification.motion import UNKNOWN, noise_levels
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.windows import carried, smooth
 from fdhil.records import Reason, Window
@@ -21,6 +22,7 @@ HOLDING_SHARE = 1.15  # a drive at rest may hold as much as dry friction drags, 
 LEAST_TORQUE = 0.01
 LEAST_BREAKAWAY = 0.02  # of the peak torque
 AFTER_S = 0.015
+HELD_SHARE = 0.7  # of dry friction: what surely does not move the shaft
 LONGEST_BREAKAWAY_S = 0.060
 
 
@@ -51,7 +53,7 @@ def breakaway(window: Window, fit: Fit) -> Iterator[Reason]:
         return
     begin, side = int(sure[0]), int(motion.mode[sure[0]])
     end = begin + round(AFTER_S / window.dt_s)
-    still = _rest_before(motion, begin, fit.problem.noises[0].speed_rad_s)
+    still = _rest_before(fit, begin, side)
     if still is None:
         return
     torque = side * theta[2] * motion.current[still:end]
@@ -72,16 +74,20 @@ def breakaway(window: Window, fit: Fit) -> Iterator[Reason]:
         yield Reason("ValidationFailed", text, "lubricate the slide-way, or check for a clamp or backlash")
 
 
-def _rest_before(motion: Motion, begin: int, noise: float) -> int | None:
-    """Return the last row surely at rest before the move begins; None where there is no such rest."""
+def _rest_before(fit: Fit, begin: int, side: int) -> int | None:
+    """Return the last row before the move at which the torque surely holds the shaft at rest; None without one."""
+    motion, noise = fit.problem.motions[0], fit.problem.noises[0]
     rows = max(8, round(0.010 / motion.dt_s))
-    reach = round(LONGEST_BREAKAWAY_S / motion.dt_s)
-    limit = 4 * noise / np.sqrt(rows)
-    for row in range(begin, max(rows, begin - reach), -1):
-        before = motion.speed[row - rows : row]
-        if abs(float(before.mean())) < limit and (motion.mode[row - rows : row] == UNKNOWN).all():
-            return row - rows // 2
-    return None
+    first = max(rows, begin - round(LONGEST_BREAKAWAY_S / motion.dt_s))
+    width = max(1, round(0.001 / motion.dt_s))
+    torque = side * fit.theta[2] * uniform_filter1d(motion.current, width, mode="nearest")
+    holding = np.flatnonzero(torque[first:begin] < HELD_SHARE * fit.theta[5])
+    if holding.size == 0:
+        return None
+    row = first + int(holding[-1])
+    quiet = abs(float(motion.speed[row - rows : row + 1].mean())) < 4 * noise.speed_rad_s / np.sqrt(rows)
+    unknown = bool((motion.mode[row - rows : row + 1] == UNKNOWN).all())
+    return row if quiet and unknown and row < begin - 1 else None
 
 
 def _holding(window: Window, fit: Fit, rows: np.ndarray[tuple[int], np.dtype[np.intp]]) -> Iterator[Reason]:

@@ -25,9 +25,10 @@ EDGES = 20  # instants at which a load may begin or end, or a gain may step
 LEAST_TORQUE = 0.01  # of the peak torque
 LEAST_GAIN = 0.005
 LEAST_OFFSET = 0.004  # of the signal's peak
+IMITATED = 1e-6  # share of a direction below which only rounding is left of it
 LAGS = 25
 WHITENESS_BEYOND_CHANCE = 5.0
-PRACTICAL_CORRELATION = 0.15  # [LAN 93]: smaller correlations do no harm
+PRACTICAL_CORRELATION = 0.25  # smaller ones come from the voltage's course within a sample and do no harm
 NOISE_RATIO = 1.6
 STRIBECK_SPEEDS = (0.01, 0.03, 0.06, 0.12)  # of the rapid speed
 
@@ -90,10 +91,18 @@ class Bench:
 
     def best(self, directions: Sequence[Float]) -> tuple[int, float, float]:
         """Return the direction with the largest statistic: its index, statistic and amplitude."""
-        score, information = self.scores(np.column_stack(directions))
-        weight = np.maximum(np.diag(information), 1e-12)
-        k = int(np.argmax(np.abs(score) / np.sqrt(weight)))
-        return k, float(score[k] / np.sqrt(weight[k])), float(score[k] / weight[k])
+        matrix = np.column_stack(directions)
+        score, information = self.scores(matrix)
+        statistic, amplitude = _tested(score, np.diag(information), (matrix * matrix).sum(axis=0))
+        k = int(np.argmax(np.abs(statistic)))
+        return k, float(statistic[k]), float(amplitude[k])
+
+
+def _tested(score: Float, weight: Float, whole: Float) -> tuple[Float, Float]:
+    """Return statistics and amplitudes; 0 where the parameters imitate all but rounding of a direction's ``whole``."""
+    seen = weight > IMITATED * whole
+    safe = np.where(seen, weight, 1.0)
+    return np.where(seen, score / np.sqrt(safe), 0.0), np.where(seen, score / safe, 0.0)
 
 
 def findings(fit: Fit) -> list[Finding]:
@@ -118,10 +127,10 @@ def _load(bench: Bench, edges: npt.NDArray[np.int_]) -> Finding:
         load[edge:] = unit
         steps.append(bench.answer(motion, load) / unit)
     steps.append(np.zeros_like(steps[0]))
-    score, information = bench.scores(np.column_stack(steps))
-    own = np.diag(information)
-    weight = np.maximum(own[:, None] + own[None, :] - 2 * information, 1e-12)
-    statistic = (score[:, None] - score[None, :]) / np.sqrt(weight)
+    matrix = np.column_stack(steps)
+    score, information = bench.scores(matrix)
+    # a load from edge a to edge b is the step at a less the step at b
+    statistic, amplitude = _tested(score[:, None] - score[None, :], _apart(information), _apart(matrix.T @ matrix))
     a, b = np.unravel_index(int(np.argmax(np.abs(np.triu(statistic, 1)))), statistic.shape)
     span = f"{edges[a] * motion.dt_s:.3f} to {edges[b] * motion.dt_s:.3f} s of the window"
     return Finding(
@@ -130,8 +139,15 @@ def _load(bench: Bench, edges: npt.NDArray[np.int_]) -> Finding:
         "identify from moves without cutting, clamping or collision",
         LEAST_TORQUE * bench.peak_torque,
         float(statistic[a, b]),
-        float((score[a] - score[b]) / weight[a, b]),
+        float(amplitude[a, b]),
     )
+
+
+def _apart(gram: Float) -> Float:
+    """Return the squared lengths (q, q) of the differences of vectors with this Gram matrix."""
+    own = np.diag(gram)
+    distances: Float = own[:, None] + own[None, :] - 2 * gram
+    return distances
 
 
 def _gain_step(bench: Bench, name: str, edges: npt.NDArray[np.int_]) -> Finding:

@@ -5,19 +5,23 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import solve_discrete_lyapunov
 
 from fdhil.config import Identification
 from fdhil.identification.estimators import chosen, maximum_likelihood
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.identifiability import empty_estimate, unphysical
+from fdhil.identification.motion import noise_levels
 from fdhil.identification.windows import carried
-from fdhil.model.feed_drive import simulate_plant
-from fdhil.records import Estimate, Reason, Result, Verdict, Window, WindowOutcome
+from fdhil.model.feed_drive import discretise, simulate_plant
+from fdhil.records import Estimate, Parameters, Reason, Result, Verdict, Window, WindowOutcome
 from fdhil.validation.plausibility import implausibilities
 from fdhil.validation.rest import rest_faults
 from fdhil.validation.structure import excess_noise, findings, whiteness
 
 LEAST_FIT_PERCENT = 80.0
+EXCESS = 1.5  # of the variance that noise explains
+SHAPE_SHARE = 0.002  # of the rapid speed: what the voltage's course within a sample leaves open
 UNFIT = ("NotFinite",)
 
 
@@ -65,10 +69,26 @@ def _doubts(window: Window, estimate: Estimate, fit: Fit | None, fit_percent: fl
     if np.isfinite(fit.residuals).all():
         reasons += _structure(fit)
         reasons += rest_faults(window, fit)
-    if fit_percent is not None and not fit_percent >= LEAST_FIT_PERCENT:
-        text = f"the model simulated from the measured voltage follows the speed by {fit_percent:.1f} % only"
-        reasons.append(Reason("ValidationFailed", text, "look at the residuals"))
+    least = expected_fit_percent(window, fit)
+    if fit_percent is not None and not fit_percent >= least:
+        text = (
+            f"the model simulated from the measured voltage follows the speed by {fit_percent:.2f} %, not {least:.2f} %"
+        )
+        reasons.append(Reason("ValidationFailed", text, "the drive does what the model does not have"))
     return reasons
+
+
+def expected_fit_percent(window: Window, fit: Fit) -> float:
+    """Return the fit that a right model has at least, from the noise of speed and of the voltage that drives it."""
+    noise = noise_levels(window)
+    own = fit.problem.noises[0].voltage_v
+    p = Parameters(*fit.theta[:6])
+    step = discretise(p, window.dt_s)
+    push = step.mean[:, 0] / p.L * min(own, EXCESS * noise.voltage_v)
+    spread = solve_discrete_lyapunov(step.phi, np.outer(push, push))
+    variance = EXCESS * (noise.speed_rad_s**2 + spread[1, 1]) + (SHAPE_SHARE * window.rapid_speed_rad_s) ** 2
+    deviation = float(np.nanstd(window.speed_rad_s))
+    return max(LEAST_FIT_PERCENT, 100.0 * (1.0 - float(np.sqrt(variance)) / max(deviation, 1e-300)))
 
 
 def _late(window: Window, fit: Fit) -> Reason | None:
