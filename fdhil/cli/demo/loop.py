@@ -81,26 +81,26 @@ def _start_twin(out: Path, realtime: bool, say: Say, stack: ExitStack) -> Stage:
     source = Path(__file__).with_name("machine.toml")
     document = tomllib.loads(source.read_text("utf-8"))
     document["sim"]["pace"] = "realtime" if realtime else "lockstep"
-    (out / "twin.toml").write_text(_toml(document), "utf-8")
+    (out / "twin.toml").write_text(to_toml(document), "utf-8")
     twin = stack.enter_context(Twin(out / "twin.toml", out / "twin.log"))
     bus = twin.ready["buses"]["can0"]
     document["bus"] = {
         "can0": {"interface": "socketcand", "channel": bus["channel"], "host": bus["host"], "port": bus["port"]}
     }
-    (out / "machine.toml").write_text(_toml(document), "utf-8")
+    (out / "machine.toml").write_text(to_toml(document), "utf-8")
     folder = source.parent
     programs = {label: folder / name for label, name in PROGRAMS.items()}
     return Stage(out, machine_config.load(out / "machine.toml"), twin, say, programs)
 
 
-def _toml(document: Mapping[str, Any], path: str = "") -> str:
+def to_toml(document: Mapping[str, Any], path: str = "") -> str:
     """Write a document of nested tables of plain values; enough for the demonstration's own file."""
     plain = {key: value for key, value in document.items() if not isinstance(value, Mapping)}
     lines = [f"[{path}]"] if path and plain else []
     lines += [f"{key} = {json.dumps(value)}" for key, value in plain.items()]
     for key, value in document.items():
         if isinstance(value, Mapping):
-            lines.append(_toml(value, f"{path}.{key}" if path else key))
+            lines.append(to_toml(value, f"{path}.{key}" if path else key))
     return "\n".join(lines) + "\n"
 
 
