@@ -26,7 +26,10 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
     out.print(f"[bold]{escape(status['machine'])}[/bold]: {source['state']}, {rate}, up {status['uptime_s']:.0f} s")
     counted = ", ".join(f"{name} {value}" for name, value in _flat(status.get("counters", {})))
     out.print(f"frames: {counted or 'none'}")
-    out.print(f"guard: {escape(str(guard.get('state', 'not running')))}")
+    loads = "".join(f", {bus} loaded {load:.0f} %" for bus, load in status["bus_load_percent"].items())
+    out.print(
+        f"correction: {escape(status['state'])}, guard {escape(str(guard.get('state', 'absent')))}{escape(loads)}"
+    )
     if status["store"]["fault"]:
         out.print(f"[red]store: {escape(status['store']['fault'])}[/red], in shadow")
     out.print(_axes_table(status["axes"]))

@@ -18,7 +18,8 @@ INTERVAL_95 = 1.959963984540054
 def parameters_status(published: ParameterSet) -> Mapping[str, Mapping[str, Any]]:
     """Return each parameter with its standard deviation and 95 % interval; nothing is told without its interval."""
     told = {}
-    deviations = np.sqrt(np.diag(published.covariance))
+    variances = np.diag(published.covariance)
+    deviations = np.sqrt(np.where(variances >= 0, variances, np.nan))
     for k, name in enumerate(PARAMETERS):
         value, std = float(getattr(published.parameters, name)), float(deviations[k])
         half = INTERVAL_95 * std

@@ -232,7 +232,9 @@ class Service:
         now_s = time.monotonic()
         if any(now_s - since_s > STUCK_S for since_s in self._busy_since_s.values()):
             return False
-        frames = int(self._source.counters().get("frames", 0)) if self._source is not None else 0
+        counters = self._source.counters() if self._source is not None else {}
+        self._watch.counted(counters, now_s)
+        frames = int(counters.get("frames", 0))
         moved, self._frames_seen = frames != self._frames_seen, frames
         return moved or self._watch.source_alive(now_s, period_s)
 
@@ -242,7 +244,9 @@ class Service:
         if request["request"] == "status":
             return self._status()
         if request["request"] == "arm":
-            return await self._armory.arm(request)
+            answer = await self._armory.arm(request)
+            self._tell([_told(answer)])
+            return answer
         if request["request"] == "disarm":
             return await self._armory.disarm()
         if request["request"] == "stop":
@@ -272,6 +276,13 @@ class Service:
             "armed": self._armory.armed,
             "store": store,
         }
+
+
+def _told(answer: Answer) -> Notice:
+    """Return what the log and the history say of a request to arm: an audit needs the refused ones too."""
+    if answer["ok"]:
+        return Notice("Armed", "info", str(answer["text"]))
+    return Notice("ArmRefused", "minor", f"{answer['code']}: {answer['text']}")
 
 
 def run(config: MachineConfig, open_source: OpenSource, method: str | None = None) -> None:

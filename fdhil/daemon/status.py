@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from fdhil.records import Notice, Outcome, ParameterSet, Skill, TickTimes, Windo
 SCHEMA = "fdhil-status-1"
 NOTICES = 20
 SYNC_INTERVALS = 500
+FRAME_BITS = 121  # 8 data bytes, 11 bit identifier, stuffing between none and the worst case
 SILENCES = {"BusSilent", "BusDown", "SyncLost"}
 
 
@@ -41,6 +43,8 @@ class Watch:
         self._lost_times = 0
         self._last_record_s: float | None = None
         self._silent: set[str] = set()
+        self._counted: tuple[float, dict[str, int]] = (now_s, {})
+        self._load_percent: dict[str, float] = {}
 
     def begin(self, axis: str, published: ParameterSet | None, counts: tuple[int, int]) -> None:
         """Start from what the history knows of an axis."""
@@ -75,6 +79,16 @@ class Watch:
                 self._silent.discard(record.code)
             else:
                 self._silent.add(record.code)
+
+    def counted(self, counters: Mapping[str, Any], now_s: float) -> None:
+        """Take the source's counters from time to time: their growth is the load of each bus."""
+        frames = {bus: int(counters.get(f"{bus}.frames", 0)) for bus in self._config.bus}
+        then_s, before = self._counted
+        if before and now_s > then_s:
+            for bus, settings in self._config.bus.items():
+                bits = max(0, frames[bus] - before.get(bus, 0)) * FRAME_BITS / (now_s - then_s)
+                self._load_percent[bus] = round(100 * bits / settings.bitrate, 1)
+        self._counted = now_s, frames
 
     def outcome_came(self, outcome: Outcome, now_s: float) -> None:
         """Note an outcome."""
@@ -117,6 +131,7 @@ class Watch:
                 "expected_hz": round(1 / self._config.machine.sync_period_s, 3),
                 "tick": self._sync_tick[-1] if self._sync_tick else None,
             },
+            "bus_load_percent": self._load_percent,
             "axes": {axis: _axis_status(watch) for axis, watch in self._axes.items()},
             "notices": [_notice_status(now_s - at_s, notice) for at_s, notice in self._notices],
         }

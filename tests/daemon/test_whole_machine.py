@@ -119,6 +119,8 @@ def test_a_program_is_armed_cut_and_disarmed_by_the_end_of_the_daemon(shop: Shop
         assert guard.stop() == 0
     log = (shop.folder / "daemon.log").read_text()
     assert "GuardState: ARMED -> RAMPING" in log or "GuardState: ARMED -> ACTIVE" in log
+    assert log.count("Armed: armed corner.ngc") == 2, log
+    assert "ArmRefused: ModelNotValidated" in log
     assert log.splitlines()[-1] == "stopped, offset 0", log
     token = (shop.run_directory / "token").read_text()
     for file in (*shop.folder.glob("*.log"), *shop.config.store.directory.rglob("*.sqlite*")):
@@ -130,7 +132,6 @@ def _cut(shop: Shop, name: str) -> float:
     trace = shop.folder / f"{name}.csv"
     shop.play("corner.ngc", CORNER, trace=trace)
     rows = np.genfromtxt(trace, delimiter=",", names=True)
-    reference, table = (
-        np.column_stack([rows[f"{axis}_{what}_mm"] for axis in "XY"]) for what in ("reference", "table")
-    )
+    reference = np.column_stack([rows[f"{axis}_reference_mm"] for axis in "XY"])
+    table = np.column_stack([rows[f"{axis}_table_mm"] for axis in "XY"])
     return float(np.sqrt(np.mean(contour_error_um(reference, table, 1e-3) ** 2)))

@@ -92,5 +92,6 @@ def outcome(accepted: bool = True, of: Window | None = None, missing: str = "") 
 
 def published(revision: int = 1, axis: str = "X", parameters: Parameters = BENCH) -> ParameterSet:
     """Return a parameter set with a covariance of its own."""
-    covariance = frozen(np.random.default_rng(revision).normal(0, 1e-3, (6, 6)))
+    root = np.random.default_rng(revision).normal(0, 1e-3, (6, 6))
+    covariance = frozen(root @ root.T)
     return ParameterSet(axis, revision, parameters, covariance, 3, 12_345 + revision, 21.5, "0123456789abcdef")

@@ -1,0 +1,161 @@
+"""replay, history, report, export: what was kept comes back; wrong input is one sentence and an exit code."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from fdhil.cli.main import cli, run_safely
+from fdhil.daemon.keeping import Keeper
+from fdhil.daemon.warm import nominal_rapid
+from fdhil.store.recording_csv import read_recording
+from fdhil.store.windows import encode_window
+from tests.daemon.machine import config_of
+from tests.daemon.shop import BENCH
+from tests.store.made import outcome, published, window
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Path:
+    """A machine's config with a history of three revisions."""
+    path = tmp_path / "machine.toml"
+    path.write_text(BENCH)
+    keeper = Keeper(config_of(tmp_path, ("X", "Y")))
+    keeper.open()
+    keeper.keep([outcome(), published(1), outcome(accepted=False), outcome(), published(2), published(1, "Y")])
+    keeper.close()
+    return path
+
+
+@pytest.fixture
+def rapid(tmp_path: Path) -> Path:
+    """A stored window of a rapid that validates."""
+    path = tmp_path / "w00000001-X.parquet"
+    config = config_of(tmp_path)
+    path.write_bytes(encode_window(nominal_rapid("X", config.axis["X"], 0.001), config.digest))
+    return path
+
+
+def fdhil(*arguments: str | Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
+    """Run the command line as its entry point does; return exit code, stdout and stderr."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["fdhil", *map(str, arguments)])
+        code = run_safely(cli)
+    said = capsys.readouterr()
+    return code, said.out, said.err
+
+
+def test_replay_tells_outcomes_to_full_precision_and_the_verdict(rapid: Path, capsys: Any) -> None:
+    code, out, _ = fdhil("replay", "--json", rapid, capsys=capsys)
+    document = json.loads(out)
+    assert (code, document["schema"], document["validated"]) == (0, "fdhil-replay-1", True)
+    told, parameters = document["files"][0]["outcomes"]
+    assert (told["kind"], told["axis"], told["direction"], told["validated"]) == ("window", "X", 1, True)
+    assert told["parameters"]["Jt"]["unit"] == "kg.m2"
+    assert parameters["parameters"]["Jt"]["value"] == told["parameters"]["Jt"]["value"]
+    assert fdhil("replay", "--json", rapid, capsys=capsys)[1] == out
+    code, out, _ = fdhil("replay", rapid, "--method", "least_squares", capsys=capsys)
+    assert code == 0
+    assert out.startswith("X: G0 + at 0.00 s (850 samples) accepted")
+
+
+def test_replay_of_what_is_not_validated_exits_1(tmp_path: Path, capsys: Any) -> None:
+    bad = tmp_path / "bad.parquet"
+    bad.write_bytes(encode_window(window(), ""))
+    code, out, _ = fdhil("replay", bad, capsys=capsys)
+    assert code == 1
+    assert "refused" in out
+
+
+def test_an_export_is_a_recording_that_replays(rapid: Path, tmp_path: Path, capsys: Any) -> None:
+    out = tmp_path / "out.csv"
+    assert fdhil("export", rapid, "--out", out, capsys=capsys) == (0, "", "")
+    recording = read_recording(out)
+    assert recording.pitch_mm == 20.0
+    assert np.isfinite(recording.speed_rad_s).all()
+    assert fdhil("replay", out, capsys=capsys)[0] == 0
+    before = rapid.read_bytes()
+    code, _, err = fdhil("export", rapid, "--out", rapid, capsys=capsys)
+    assert code == 2
+    assert "is the recording itself" in err
+    assert rapid.read_bytes() == before
+
+
+@pytest.mark.parametrize("command", [["replay"], ["export", "--out", "out.csv"]])
+@pytest.mark.parametrize("content", [None, b"", b"PAR1", b"\x00" * 1000])
+def test_a_recording_that_cannot_be_read_is_one_sentence_and_3(
+    content: bytes | None, command: list[str], tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "broken.parquet"
+    if content is not None:
+        path.write_bytes(content)
+    code, out, err = fdhil(*command, path, capsys=capsys)
+    assert (code, out) == (3, "")
+    assert err.count("\n") == 1
+    assert "broken.parquet" in err
+    assert not (tmp_path / "out.csv").exists()
+
+
+def test_a_recording_of_another_axis_than_the_configs_is_told(machine: Path, tmp_path: Path, capsys: Any) -> None:
+    path = tmp_path / "z.parquet"
+    path.write_bytes(encode_window(window(axis="Z"), ""))
+    code, _, err = fdhil("replay", "--config", machine, path, capsys=capsys)
+    assert code == 3
+    assert "is of axis Z" in err
+
+
+def test_history_as_json_has_intervals_and_every_bit(machine: Path, capsys: Any) -> None:
+    code, out, _ = fdhil("history", machine, "--json", capsys=capsys)
+    document = json.loads(out)
+    assert (code, document["schema"]) == (0, "fdhil-history-1")
+    assert [(row["axis"], row["revision"]) for row in document["revisions"]] == [("X", 1), ("X", 2), ("Y", 1)]
+    told = document["revisions"][0]["parameters"]["R"]
+    assert told["value"] == published(1).parameters.R
+    assert document["revisions"][1]["window_ids"] == [1, 3]
+    code, out, _ = fdhil("history", machine, "--json", "--axis", "Y", capsys=capsys)
+    assert [row["axis"] for row in json.loads(out)["revisions"]] == ["Y"]
+
+
+def test_history_as_a_table_and_a_plot(machine: Path, tmp_path: Path, capsys: Any) -> None:
+    code, out, err = fdhil("history", machine, "--plot", tmp_path / "plot.png", capsys=capsys)
+    assert (code, err) == (0, "")
+    assert "axis X: 2 revisions" in out
+    assert "▁" in out
+    assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
+    code, _, err = fdhil("history", machine, "--plot", tmp_path / "no" / "such" / "plot.png", capsys=capsys)
+    assert code == 3
+    assert "cannot be written" in err
+
+
+def test_history_of_nothing_is_told(tmp_path: Path, capsys: Any) -> None:
+    path = tmp_path / "machine.toml"
+    path.write_text(BENCH)
+    code, _, err = fdhil("history", path, capsys=capsys)
+    assert code == 3
+    assert "nothing was recorded yet" in err
+    code, _, err = fdhil("history", tmp_path / "absent.toml", capsys=capsys)
+    assert code == 2
+    assert "cannot be read" in err
+
+
+def test_a_report_is_one_page_without_anything_from_elsewhere(machine: Path, tmp_path: Path, capsys: Any) -> None:
+    out = tmp_path / "report.html"
+    code, _, err = fdhil("report", machine, "--out", out, capsys=capsys)
+    assert (code, err) == (0, "")
+    page = out.read_text()
+    assert "Axis X" in page
+    assert "<svg" in page
+    assert "<script" not in page
+
+
+@pytest.mark.parametrize("command", ["replay", "history", "report", "export", "run", "status", "arm", "disarm"])
+def test_help_reads_well_without_importing_anything_heavy(command: str) -> None:
+    result: Result = CliRunner().invoke(cli, [command, "--help"])
+    assert result.exit_code == 0
+    assert result.output.startswith("Usage: ")

@@ -1,0 +1,129 @@
+"""status, arm and disarm against a socket that answers; run's refusals."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil.cli.status_view import sparkline, with_interval
+from fdhil.daemon.status import Watch
+from fdhil.daemon.token import ensure_token
+from fdhil.records import Notice
+from tests.cli.test_records import fdhil
+from tests.daemon.machine import config_of
+from tests.daemon.shop import BENCH
+from tests.store.made import outcome, published
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Path:
+    """A machine's config and its run directory with a token."""
+    path = tmp_path / "machine.toml"
+    path.write_text(BENCH)
+    run = tmp_path / "fdhil-data" / "run"
+    run.mkdir(parents=True)
+    ensure_token(run)
+    return path
+
+
+@contextmanager
+def answering(machine: Path, answer: Mapping[str, Any]) -> Iterator[list[dict[str, Any]]]:
+    """Stand in for the daemon: take one request and give ``answer``."""
+    requests: list[dict[str, Any]] = []
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as server:
+        server.bind(str(machine.parent / "fdhil-data" / "run" / "daemon.sock"))
+        server.listen()
+
+        def serve() -> None:
+            peer, _ = server.accept()
+            with peer, peer.makefile("rb") as lines:
+                requests.append(json.loads(lines.readline()))
+                peer.sendall(json.dumps(answer).encode() + b"\n")
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        yield requests
+        thread.join(10)
+
+
+def status_of(tmp_path: Path) -> dict[str, Any]:
+    """Return a status as a daemon gives it after a window and a notice."""
+    watch = Watch(config_of(tmp_path, ("X", "Y")), 0.0)
+    for told in (outcome(), published(), Notice("LoadChanged", "MAJOR", "[red]Jt rose[/red]", "X")):
+        watch.outcome_came(told, 1.0)
+    store = {"directory": "d", "fault": "DiskFull", "strays": []}
+    return {"ok": True, "state": "OFF(SHADOW)", **watch.status(2.0), "counters": {"frames": 7}, "store": store}
+
+
+def test_status_as_a_table_and_as_json(machine: Path, tmp_path: Path, capsys: Any) -> None:
+    with answering(machine, status_of(tmp_path)) as requests:
+        code, out, err = fdhil("status", machine, capsys=capsys)
+    assert (code, err, requests) == (0, "", [{"request": "status"}])
+    for words in ("bench", "no SYNC yet", "frames 7", "1 accepted, 0 refused", "DiskFull", "[red]Jt rose[/red]", "OFF"):
+        assert words in out, (words, out)
+    (machine.parent / "fdhil-data" / "run" / "daemon.sock").unlink()
+    with answering(machine, status_of(tmp_path)):
+        code, out, _ = fdhil("status", machine, "--json", capsys=capsys)
+    assert json.loads(out)["axes"]["X"]["parameters"]["K"]["value"] == 0.8
+
+
+def test_arm_sends_the_token_and_says_what_is_promised(machine: Path, tmp_path: Path, capsys: Any) -> None:
+    with answering(machine, {"ok": True, "text": "armed p.ngc"}) as requests:
+        code, out, _ = fdhil("arm", machine, tmp_path / "p.ngc", "--method", "mirror", capsys=capsys)
+    assert (code, out) == (0, "armed p.ngc\n")
+    token = (machine.parent / "fdhil-data" / "run" / "token").read_text()
+    program = str((tmp_path / "p.ngc").resolve())
+    assert requests == [{"request": "arm", "program": program, "method": "mirror", "token": token}]
+
+
+def test_a_refusal_exits_1_with_class_cause_and_next_action(machine: Path, tmp_path: Path, capsys: Any) -> None:
+    answer = {"ok": False, "code": "PoorSkill", "text": "predictions are bad", "advice": "identify again"}
+    with answering(machine, answer):
+        code, out, err = fdhil("arm", machine, tmp_path / "p.ngc", capsys=capsys)
+    assert (code, out, err) == (1, "", "refused: PoorSkill: predictions are bad; identify again\n")
+    (machine.parent / "fdhil-data" / "run" / "daemon.sock").unlink()
+    with answering(machine, answer):
+        code, out, _ = fdhil("disarm", machine, "--json", capsys=capsys)
+    assert (code, json.loads(out)) == (1, answer)
+
+
+@pytest.mark.parametrize("command", ["status", "disarm"])
+def test_without_a_daemon_it_is_3_and_how_to_start_one(command: str, machine: Path, capsys: Any) -> None:
+    code, out, err = fdhil(command, machine, capsys=capsys)
+    assert (code, out) == (3, "")
+    assert "fdhil run CONFIG" in err
+
+
+def test_a_wrong_method_or_config_is_2(machine: Path, tmp_path: Path, capsys: Any) -> None:
+    assert fdhil("arm", machine, "p.ngc", "--method", "magic", capsys=capsys)[0] == 2
+    (tmp_path / "wrong.toml").write_text(BENCH.replace("speed_kp", "speed_kq"))
+    code, _, err = fdhil("run", tmp_path / "wrong.toml", capsys=capsys)
+    assert code == 2
+    assert "did you mean 'speed_kp'?" in err
+
+
+def test_run_on_a_bus_that_is_not_there_is_3_and_one_sentence(tmp_path: Path, capsys: Any) -> None:
+    path = tmp_path / "machine.toml"
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    path.write_text(f'{BENCH}[bus.can0]\ninterface = "socketcand"\nport = {port}\n')
+    code, out, err = fdhil("run", path, "--method", "least_squares", capsys=capsys)
+    assert (code, out) == (3, "")
+    assert err.splitlines()[-1].startswith("fdhil: ")
+    assert "Traceback" not in err
+
+
+def test_small_pictures() -> None:
+    assert sparkline([1.0, 2.0, 3.0]) == "▁▅█"
+    assert sparkline([1.0, 1.0]) == "▁▁"
+    assert with_interval({"value": 0.5, "low": 0.49, "high": 0.51}) == "0.5 ±0.01"
+    assert with_interval({"value": 0.5, "low": None, "high": None}) == "0.5 (no interval)"
+    assert with_interval({"value": None}) == "?"
