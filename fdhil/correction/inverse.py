@@ -38,18 +38,22 @@ def common_delay_s(
         if np.ptp(path) > 0.0:
             delays[axis] = linear.delay_s(models[axis], config.axis[axis], reference.dt_s)
             speeds[axis] = float(np.abs(np.diff(path)).max()) / reference.dt_s
-    if not delays:
-        return 0.0, ()
-    room = {axis: _allowed_um(config, axis) for axis in delays}
-    if all(abs(delays[a]) * speeds[a] * 1e3 <= SMALL_LAG_SHARE * room[a] for a in delays):
-        return 0.0, ()
-    tau = 0.5 * (min(delays.values()) + max(delays.values()))
+    tau = choose_delay_s(delays, speeds, config)
     refused = []
-    for axis, delay in delays.items():
-        needed = abs(delay - tau) * speeds[axis] * 1e3
-        if needed > room[axis]:
-            refused.append(lag_reason(axis, needed, room[axis], config.axis[axis].regulators.speed_feedforward))
+    for axis, delay in delays.items() if tau else ():
+        needed, room = abs(delay - tau) * speeds[axis] * 1e3, _allowed_um(config, axis)
+        if needed > room:
+            refused.append(lag_reason(axis, needed, room, config.axis[axis].regulators.speed_feedforward))
     return tau, tuple(refused)
+
+
+def choose_delay_s(delays: Mapping[str, float], speeds_mm_s: Mapping[str, float], config: MachineConfig) -> float:
+    """Return tau: 0 where the offsets can make up for every axis' own delay at its speed, else amid their delays."""
+    small = (
+        abs(delay) * speeds_mm_s[axis] * 1e3 <= SMALL_LAG_SHARE * _allowed_um(config, axis)
+        for axis, delay in delays.items()
+    )
+    return 0.0 if all(small) else 0.5 * (min(delays.values()) + max(delays.values()))
 
 
 def _allowed_um(config: MachineConfig, axis: str) -> float:

@@ -1,0 +1,190 @@
+"""The inverse correction while the path is still being made: blocks of 2 s with 0.5 s of look-ahead.
+
+A block is there as soon as its look-ahead is, so nothing waits for the end of the program ([DES], conclusion: "an
+on-line technique is to be studied"). Each block passes limits and gate alone; what is kept between blocks is one state
+per axis and half a second of path.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdhil.config import MachineConfig
+from fdhil.correction import gate, linear
+from fdhil.correction.block import AxisLoop, Carry, Solution, solve
+from fdhil.correction.inverse import BLOCK_S, LOOK_AHEAD_S, axis_loop, choose_delay_s, delayed, first_carry, following
+from fdhil.correction.limits import check
+from fdhil.correction.mirror import lag_reason
+from fdhil.model import closed_loop
+from fdhil.model.closed_loop import State
+from fdhil.prediction.contour import WINDOW_S, contour_error_um
+from fdhil.records import Float, Parameters, Reason
+
+LIMITED_S = 0.02  # a limit that acts longer than this within a block is no settling
+
+
+@dataclass(frozen=True, slots=True)
+class StreamBlock:
+    """The settled rows from ``first_row`` on: offsets per axis in um, contour error (n,) without and with them.
+
+    ``refused`` is not empty where the gate does not let the block through; the stream ends there, and the guard, which
+    then lacks rows, ramps down.
+    """
+
+    first_row: int
+    offset_um: Mapping[str, Float]
+    before_um: Float
+    after_um: Float
+    final: bool
+    refused: tuple[Reason, ...] = ()
+
+
+@dataclass(slots=True)
+class _Axis:
+    """One axis between two blocks; ``free`` is the state that it would have without any offset."""
+
+    loop: AxisLoop
+    carry: Carry
+    free: State
+
+
+@dataclass(frozen=True, slots=True)
+class _Piece:
+    """What one axis makes of one block: offsets (um), positions without and with them, and what was in the way."""
+
+    offset_um: Float
+    before_mm: Float
+    after_mm: Float
+    refused: tuple[Reason, ...]
+
+
+def stream(
+    pieces: Iterable[Mapping[str, Float]], models: Mapping[str, Parameters], config: MachineConfig
+) -> Iterator[StreamBlock]:
+    """Correct a reference that comes in pieces (mm per axis, (m,), in order, of any length); yield blocks of it.
+
+    ValueError when an axis may not be written. The result is that of the whole reference planned at once.
+    """
+    period = config.machine.sync_period_s
+    block, ahead = round(BLOCK_S / period), round(LOOK_AHEAD_S / period)
+    window = round(WINDOW_S / period)
+    path: dict[str, Float] = {}
+    axes: dict[str, _Axis] = {}
+    delay = 0.0
+    kept = row = 0  # rows of ``path`` that lie before the block, and the block's number in the whole
+    source = iter(pieces)
+    with ThreadPoolExecutor(max(1, len(config.axis))) as pool:
+        ended = False
+        while not ended:
+            piece = next(source, None)
+            if piece is not None:
+                path = {axis: np.concatenate([path.get(axis, np.empty(0)), values]) for axis, values in piece.items()}
+            elif not path:
+                return
+            if not axes:
+                axes = {name: _axis(models[name], config, name, float(values[0])) for name, values in path.items()}
+                delay = _delay(models, config, axes)
+            length = next(iter(path.values())).size - kept
+            # one row more than the look-ahead tells that the path goes on
+            while (length > block + ahead or piece is None) and not ended:
+                ended = length <= block + ahead
+                rows = length if ended else block
+                result = _block(pool, axes, path, kept, min(length, block + ahead), rows, delay / period, ended)
+                yield _gated(result, path, kept, rows, row, ended, config, window)
+                if any(piece_.refused for piece_ in result.values()):
+                    return
+                drop = max(0, kept + rows - window)
+                path = {axis: values[drop:] for axis, values in path.items()}
+                kept, row, length = kept + rows - drop, row + rows, length - rows
+
+
+def _axis(parameters: Parameters, config: MachineConfig, name: str, start_mm: float) -> _Axis:
+    return _Axis(axis_loop(parameters, config, name), first_carry(start_mm), closed_loop.start(start_mm))
+
+
+def _delay(models: Mapping[str, Parameters], config: MachineConfig, axes: Mapping[str, _Axis]) -> float:
+    """The common delay, chosen before any speed is known: as if every axis may run its rapid speed."""
+    delays = {name: linear.delay_s(models[name], config.axis[name], config.machine.sync_period_s) for name in axes}
+    speeds = {name: config.axis[name].rapid_speed_mm_s for name in axes}
+    return choose_delay_s(delays, speeds, config)
+
+
+def _block(
+    pool: ThreadPoolExecutor,
+    axes: Mapping[str, _Axis],
+    path: Mapping[str, Float],
+    kept: int,
+    length: int,
+    rows: int,
+    delay_rows: float,
+    ends: bool,
+) -> dict[str, _Piece]:
+    """Solve one block of every axis, one thread each."""
+
+    def one(name: str) -> _Piece:
+        return _solve(axes[name], path[name][: kept + length], kept, rows, delay_rows, ends)
+
+    return dict(zip(axes, pool.map(one, axes), strict=True))
+
+
+def _solve(axis: _Axis, path: Float, kept: int, rows: int, delay_rows: float, ends: bool) -> _Piece:
+    """Solve one block of one axis and move the axis to the next one."""
+    reference = np.ascontiguousarray(path[kept:])
+    target = np.ascontiguousarray(delayed(path, delay_rows)[kept:])
+    loop = axis.loop
+    free = closed_loop.simulate(loop.parameters, loop.axis, loop.sync_period_s, reference, state=axis.free, rows=rows)
+    axis.free = free.end
+    solution = solve(loop, reference, target, axis.carry, ends)
+    refused = _refused(loop, solution, free.limited_s, rows)
+    if not ends:
+        axis.carry = following(loop, reference, solution, axis.carry, rows)
+    offset = solution.offset[:rows] * loop.limits.um_per_increment
+    return _Piece(offset, free.position_mm, solution.position_mm[:rows], refused)
+
+
+def _refused(loop: AxisLoop, solution: Solution, limited_s: float, rows: int) -> tuple[Reason, ...]:
+    """What one axis alone can say against a block: lag, a drive at its limit, an offset that breaks a limit."""
+    um = loop.limits.um_per_increment
+    reasons = []
+    if limited_s > LIMITED_S:
+        text = f"a current or voltage limit acts for {limited_s * 1e3:.0f} ms of this block: no offset can help"
+        reasons.append(Reason("DemandTooHigh", text, "lower the feed, or smooth more"))
+    if solution.needed_um > loop.limits.offset * um:
+        feedforward = loop.axis.regulators.speed_feedforward
+        reasons.append(lag_reason("", solution.needed_um, loop.limits.offset * um, feedforward))
+    whole = solution.offset[2:rows].astype(np.int64)
+    return (*reasons, *check(whole, loop.limits, (float(solution.offset[1]), float(solution.offset[0]))))
+
+
+def _gated(
+    result: Mapping[str, _Piece],
+    path: Mapping[str, Float],
+    kept: int,
+    rows: int,
+    row: int,
+    ended: bool,
+    config: MachineConfig,
+    window: int,
+) -> StreamBlock:
+    """Put the axes together and ask the gate."""
+    low, high = max(0, kept - window), kept + rows + window
+    around = np.column_stack([values[low:high] for values in path.values()])
+    errors = []
+    for which in ("before_mm", "after_mm"):
+        actual = around.copy()
+        actual[kept - low : kept - low + rows] = np.column_stack([getattr(p, which) for p in result.values()])
+        errors.append(contour_error_um(around, actual, config.machine.sync_period_s)[kept - low : kept - low + rows])
+    refused = [
+        Reason(reason.code, f"axis {axis}: {reason.text}", reason.advice)
+        for axis, piece in result.items()
+        for reason in piece.refused
+    ]
+    if gate.worse_rows(errors[0], errors[1], config.machine.sync_period_s).any():
+        text = f"rows {row} to {row + rows} would get worse: {errors[0].max():.1f} um to {errors[1].max():.1f} um"
+        refused.append(Reason("HarmPredicted", text, "lower the feed, or identify again"))
+    offsets = {axis: np.zeros(rows) if refused else piece.offset_um for axis, piece in result.items()}
+    return StreamBlock(row, offsets, errors[0], errors[1], ended, tuple(refused))

@@ -1,0 +1,83 @@
+"""The correction of a path that is still being made."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import pytest
+
+from fdhil.correction import plan
+from fdhil.correction.streaming import stream
+from fdhil.prediction.models import nominal_models
+from fdhil.records import Float
+from tests.bench import bench_config
+from tests.correction.test_planning import changed
+from tests.paths import bench_demand, trajectory
+
+CONFIG = bench_config()
+MODELS = nominal_models(CONFIG)
+
+
+def pieces(demand: Float, size: int) -> Iterator[Mapping[str, Float]]:
+    """A demand as it comes from a planner."""
+    for first in range(0, len(demand), size):
+        yield {axis: demand[first : first + size, a] for a, axis in enumerate("XY")}
+
+
+@pytest.mark.parametrize("size", [7, 500, 2500, 100_000])
+def test_streaming_gives_what_planning_gives(size: int) -> None:
+    """Whatever the pieces, the offsets are those of the whole path planned at once, bit by bit."""
+    demand = bench_demand(10)
+    whole = plan(trajectory(demand), MODELS, CONFIG, "inverse")
+    blocks = list(stream(pieces(demand, size), MODELS, CONFIG))
+    assert [block.final for block in blocks] == [False, True]
+    for axis in "XY":
+        assert np.array_equal(np.concatenate([block.offset_um[axis] for block in blocks]), whole.offset_um[axis])
+    assert np.allclose(np.concatenate([block.after_um for block in blocks]), whole.after.contour_um, atol=1e-9)
+    assert np.allclose(np.concatenate([block.before_um for block in blocks]), whole.before.contour_um, atol=1e-9)
+
+
+def test_a_block_needs_only_its_look_ahead() -> None:
+    """The first 2 s are there when 2.5 s and a row of the path exist."""
+    demand = bench_demand(10)
+    taken = 0
+
+    def counted() -> Iterator[Mapping[str, Float]]:
+        nonlocal taken
+        for piece in pieces(demand, 10):
+            taken += 10
+            yield piece
+
+    first = next(stream(counted(), MODELS, CONFIG))
+    assert first.first_row == 0
+    assert first.before_um.size == 2000
+    assert taken <= 2510
+
+
+def test_a_longer_path_keeps_the_offsets_of_its_settled_blocks() -> None:
+    """What lies beyond the look-ahead cannot change a block."""
+    demand = bench_demand(10)
+    other = demand.copy()
+    other[2501:] = demand[2500]
+    first, changed_first = (next(stream(pieces(d, 50), MODELS, CONFIG)) for d in (demand, other))
+    assert np.array_equal(first.offset_um["X"], changed_first.offset_um["X"])
+
+
+def test_a_refused_block_ends_the_stream() -> None:
+    """A lag too large for the offsets: the first block says so, and nothing follows."""
+    blocks = list(stream(pieces(bench_demand(10), 500), MODELS, changed(speed_feedforward=0.5)))
+    assert len(blocks) == 1
+    assert "LagTooLarge" in {reason.code for reason in blocks[0].refused}
+    assert not blocks[0].offset_um["X"].any()
+
+
+def test_saturation_ends_the_stream() -> None:
+    """A drive at its current limit cannot be helped."""
+    blocks = list(stream(pieces(bench_demand(20, (0.030, 0.015)), 500), MODELS, CONFIG))
+    assert "DemandTooHigh" in {reason.code for reason in blocks[-1].refused}
+
+
+def test_no_path_gives_no_block() -> None:
+    """An empty source ends at once."""
+    assert list(stream(iter([]), MODELS, CONFIG)) == []
