@@ -60,6 +60,36 @@ class Port(Protocol):
         """Release the bus."""
 
 
+class WallClock:
+    """The wall clock against the monotonic one; two readings are never taken at quite the same instant, so a small
+    change is followed slowly, and one of more than 2 ms is a clock that was set."""
+
+    _SET_NS = 2_000_000
+    _SHARE = 64
+    _SPREAD_NS = 200_000
+
+    def __init__(self) -> None:
+        self._ahead_ns: int | None = None
+
+    def ahead_ns(self) -> int:
+        """Return by how much the wall clock is ahead now."""
+        spread, ahead = min(self._reading() for _ in range(3))
+        if self._ahead_ns is not None and spread > self._SPREAD_NS:
+            return self._ahead_ns  # we were interrupted between the clocks: the reading says nothing
+        if self._ahead_ns is None or abs(ahead - self._ahead_ns) > self._SET_NS:
+            self._ahead_ns = ahead
+        else:
+            self._ahead_ns += (ahead - self._ahead_ns) // self._SHARE
+        return self._ahead_ns
+
+    @staticmethod
+    def _reading() -> tuple[int, int]:
+        before = time.monotonic_ns()
+        wall = time.time_ns()
+        after = time.monotonic_ns()
+        return after - before, wall - (before + after) // 2
+
+
 class SocketCanPort:
     """A raw CAN socket on a network interface: kernel stamps, error frames, drop count."""
 
@@ -68,6 +98,7 @@ class SocketCanPort:
     def __init__(self, name: str, channel: str) -> None:
         self._name = name
         self.kernel_drops = 0
+        self._wall_clock = WallClock()
         try:
             self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         except OSError as error:
@@ -97,8 +128,7 @@ class SocketCanPort:
         """Read all that waits; the kernel's wall-clock stamps become monotonic ones at once."""
         if not select.select([self._socket], [], [], timeout_s)[0]:
             return
-        now_ns = time.monotonic_ns()
-        wall_ahead_ns = time.time_ns() - now_ns
+        wall_ahead_ns = self._wall_clock.ahead_ns()
         for _ in range(4096):
             try:
                 data, ancillary, _flags, _address = self._socket.recvmsg(16, 128)
@@ -107,7 +137,7 @@ class SocketCanPort:
             except OSError as error:
                 raise BusEnded(f"the CAN interface is down ({error.strerror})") from None
             can_id, length, payload = _CAN_FRAME.unpack(data)
-            stamp_ns = self._stamp(ancillary, wall_ahead_ns, now_ns)
+            stamp_ns = self._stamp(ancillary, wall_ahead_ns, time.monotonic_ns())
             ring.append(stamp_ns, can_id, payload[:length])
 
     def _stamp(self, ancillary: list[tuple[int, int, bytes]], wall_ahead_ns: int, now_ns: int) -> int:
