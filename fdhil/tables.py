@@ -11,10 +11,12 @@ from typing import Any
 
 ESTIMATORS: Mapping[str, str] = {
     "least_squares": "fdhil.identification.estimators.least_squares:estimate",
+    "partial_moments": "fdhil.identification.estimators.partial_moments:estimate",
     "maximum_likelihood": "fdhil.identification.estimators.maximum_likelihood:estimate",
 }
 CORRECTIONS: Mapping[str, str] = {
     "mirror": "fdhil.correction.mirror:plan",
+    "flatness": "fdhil.correction.flatness:plan",
     "inverse": "fdhil.correction.inverse:plan",
 }
 REGULATORS: Mapping[str, str] = {

@@ -70,7 +70,7 @@ def _doubts(window: Window, estimate: Estimate, fit: Fit | None, fit_percent: fl
         reasons += _structure(fit)
         reasons += rest_faults(window, fit)
     least = expected_fit_percent(window, fit)
-    if fit_percent is not None and not fit_percent >= least:
+    if not reasons and fit_percent is not None and not fit_percent >= least:
         text = (
             f"the model simulated from the measured voltage follows the speed by {fit_percent:.2f} %, not {least:.2f} %"
         )

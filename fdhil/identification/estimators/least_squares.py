@@ -85,53 +85,53 @@ def estimate_with(windows: Sequence[Window], settings: Identification, operator:
     parts = [p for p in parts if p[0].shape[0] > 0]
     rows = sum(p[0].shape[0] for p in parts)
     if rows < 8:
-        reason = Reason(
-            "MissingStage(cruise)",
-            f"only {rows} rows lie beyond the low-pass's reach from standstill",
-            "record a longer rapid or raise lowpass_hz",
-        )
-        return empty_estimate(NAME, Result.UNDER_EXCITED, reason)
-    electrical = np.vstack([p[0] for p in parts])
-    mechanical = np.vstack([p[1] for p in parts])
-    if not (np.isfinite(electrical).all() and np.isfinite(mechanical).all()):
-        return empty_estimate(
-            NAME, Result.NOT_FINITE, Reason("NotFinite", "a filtered signal is not finite", "record again")
-        )
+        return too_short(NAME, rows)
     noise = np.mean([noise_levels(w).vector() ** 2 for w in windows], axis=0)
-    return _fit(parts, noise, settings, windows[0].dt_s, OPERATORS[operator])
+    impulse = impulse_response(settings.lowpass_hz, windows[0].dt_s)
+    slope = np.nan_to_num(derivative(impulse, windows[0].dt_s, OPERATORS[operator]))
+    return fit_two_steps(NAME, parts, noise, impulse, slope)
 
 
-def _fit(
-    parts: Sequence[tuple[Float, Float]], noise: Float, settings: Identification, dt: float, operator: Operator
+def too_short(method: str, rows: int) -> Estimate:
+    """Return the answer for windows that hold hardly any row beyond the reach of standstill."""
+    text = f"only {rows} rows lie beyond the low-pass's reach from standstill"
+    reason = Reason("LowExcitation", text, "record a longer rapid or raise lowpass_hz")
+    return empty_estimate(method, Result.UNDER_EXCITED, reason)
+
+
+def fit_two_steps(
+    method: str, parts: Sequence[tuple[Float, Float]], noise: Float, impulse: Float, slope: Float
 ) -> Estimate:
-    """Fit [5], then [6] with its K; ``noise`` (3,) are the variances of voltage, current, speed."""
+    """Fit [5], then [6] with its K, to rows (m, 4) of [u, Di, i, w] and of [i, Dw, w, sign w] per window.
+
+    ``noise`` (3,) are the variances of voltage, current and speed; ``impulse`` and ``slope`` are the weights with which
+    a noisy sample enters a signal and its derivative.
+    """
     electrical, mechanical = (np.vstack([p[k] for p in parts]) for k in (0, 1))
+    if not (np.isfinite(electrical).all() and np.isfinite(mechanical).all()):
+        reason = Reason("NotFinite", "a filtered signal is not finite", "check the sensor")
+        return empty_estimate(method, Result.NOT_FINITE, reason)
     first, condition_1 = solve(electrical[:, 1:], electrical[:, 0])
     torque = mechanical[:, 0] * first[2]
     second, condition_2 = solve(mechanical[:, 1:], torque)
     theta = np.concatenate([first, second])
     residual_u = electrical[:, 0] - electrical[:, 1:] @ first
     residual_t = torque - mechanical[:, 1:] @ second
-    lengths = [p[0].shape[0] for p in parts]
-    impulse = impulse_response(settings.lowpass_hz, dt)
-    slope = np.nan_to_num(derivative(impulse, dt, operator))
     noise = np.append(_voltage_variance(residual_u, theta, impulse, slope, noise), noise[1:])
     gammas = residual_gammas(theta, impulse, slope, noise)
-    covariance = two_step(electrical, mechanical, (residual_u, residual_t), gammas, lengths)
+    covariance = two_step(electrical, mechanical, (residual_u, residual_t), gammas, [p[0].shape[0] for p in parts])
     bias = attenuation(electrical, mechanical, theta, impulse, slope, noise)
     covariance += np.outer(bias, bias)
     order = [1, 0, 2, 3, 4, 5]  # from L, R, K to R, L, K
-    return judge(
-        Estimate(
-            method=NAME,
-            names=PARAMETERS,
-            values=theta[order],
-            covariance=covariance[np.ix_(order, order)],
-            residuals={"electrical": residual_u, "mechanical": residual_t / first[2] if first[2] else residual_t},
-            result=Result.OK,
-        ),
-        max(condition_1, condition_2),
+    answer = Estimate(
+        method=method,
+        names=PARAMETERS,
+        values=theta[order],
+        covariance=covariance[np.ix_(order, order)],
+        residuals={"electrical": residual_u, "mechanical": residual_t / first[2] if first[2] else residual_t},
+        result=Result.OK,
     )
+    return judge(answer, max(condition_1, condition_2))
 
 
 def _voltage_variance(residual_u: Float, theta: Float, impulse: Float, slope: Float, noise: Float) -> float:

@@ -1,0 +1,89 @@
+"""Reinitialised partial moments [COI 93], the method that the paper compared with its own.
+
+[1] is multiplied by the time since the start of a horizon T and integrated over it; by parts,
+
+    int_0^T s x'(t + s) ds = T x(t + T) - int_0^T x(t + s) ds,
+
+so no derivative and no initial state appears, and the integral itself is the low-pass. The horizon is begun anew at
+every sample (that is the reinitialisation), and least squares is solved over all of them, as in [5] and [6].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fdhil.config import Identification
+from fdhil.identification.estimators.least_squares import fit_two_steps, too_short
+from fdhil.identification.motion import noise_levels, surely_moving
+from fdhil.identification.windows import carried
+from fdhil.records import Estimate, Float, VoltageSampling, Window
+
+NAME = "partial_moments"
+LEAST_STEPS = 8
+
+
+def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
+    """Fit [1], then [2] with its K, by partial moments over a horizon of one period of the low-pass's corner."""
+    usable = [w for w in windows if w.voltage_v is not None]
+    parts = [moments(w, _steps(settings, w.dt_s)) for w in usable]
+    if sum(p[0].shape[0] for p in parts) < 8:
+        return too_short(NAME, sum(p[0].shape[0] for p in parts))
+    noise = np.mean([noise_levels(w).vector() ** 2 for w in usable], axis=0)
+    moment, slope = kernels(_steps(settings, usable[0].dt_s), usable[0].dt_s)
+    return fit_two_steps(NAME, [p for p in parts if p[0].shape[0]], noise, moment, slope)
+
+
+def _steps(settings: Identification, dt_s: float) -> int:
+    return max(LEAST_STEPS, round(1 / settings.lowpass_hz / dt_s))
+
+
+def kernels(steps: int, dt_s: float) -> tuple[Float, Float]:
+    """Return the weights (steps + 1,) of the first moment and of the derivative's, over samples t .. t + T.
+
+    Both are divided by T^2/2, so that the moment of a constant is that constant.
+    """
+    times: Float = np.linspace(0.0, steps * dt_s, steps + 1)
+    horizon = steps * dt_s
+    ends = np.ones(steps + 1)
+    ends[0] = ends[-1] = 0.5
+    moment = times * ends * dt_s
+    slope = -ends * dt_s
+    slope[-1] += horizon
+    whole = 2 / horizon**2
+    return moment * whole, slope * whole
+
+
+def voltage_weights(steps: int, dt_s: float, sampling: VoltageSampling) -> Float:
+    """Return the weights (steps + 1,) of the voltage's moment: exact over each interval for interval means."""
+    if sampling == "instant":
+        return kernels(steps, dt_s)[0]
+    horizon = steps * dt_s
+    weights: Float = np.linspace(0.5, steps + 0.5, steps + 1) * dt_s * dt_s * 2 / horizon**2
+    weights[-1] = 0.0
+    return weights
+
+
+def moments(window: Window, steps: int) -> tuple[Float, Float]:
+    """Return the rows (m, 4) of the moments of [u, i', i, w] and of [i, w', w, sign w]."""
+    assert window.voltage_v is not None
+    dt = window.dt_s
+    moment, slope = kernels(steps, dt)
+    over = voltage_weights(steps, dt, window.voltage_sampling)
+    current, speed = carried(window.current_a), carried(window.speed_rad_s)
+    moving = surely_moving(window.speed_rad_s, window.rapid_speed_rad_s)
+    known = np.isfinite(window.voltage_v) & np.isfinite(window.current_a) & np.isfinite(window.speed_rad_s)
+    if window.n <= steps:
+        return np.zeros((0, 4)), np.zeros((0, 4))
+    usable = np.convolve(moving & known, np.ones(steps + 1), "valid")
+    rows = np.flatnonzero(usable > steps + 0.5)
+
+    def through(values: Float, weights: Float) -> Float:
+        taken: Float = np.correlate(values, weights, "valid")[rows]
+        return taken
+
+    mean_current, mean_speed = through(current, moment), through(speed, moment)
+    electrical = [through(carried(window.voltage_v), over), through(current, slope), mean_current, mean_speed]
+    mechanical = [mean_current, through(speed, slope), mean_speed, np.sign(mean_speed)]
+    return np.column_stack(electrical), np.column_stack(mechanical)
