@@ -4,7 +4,7 @@
     at_s = 2.5                 # or at_sync, counted from the first SYNC; or at_row, from a played file's first row
     axis = "X"
     fault = "load_torque"
-    value = 5.0                # what it means is the fault's own affair, see FAULTS
+    value = 5.0                # what it means depends on the fault, see fault_kinds
     duration_s = 0.3           # left out: for good
 
 A wrong entry is a ConfigError that names every fault of the script at once.
@@ -14,16 +14,14 @@ from __future__ import annotations
 
 import difflib
 import tomllib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from fdhil.errors import ConfigError, ConfigFault
-from fdhil.sim.modbus_sensor import SensorFaults
-from fdhil.sim.sensors import SIGNALS, DriveFaults
+from fdhil.sim.fault_kinds import FAULTS, Target
 
 MAX_SCRIPT_BYTES = 256 * 1024
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -42,6 +40,8 @@ class FaultEntry(BaseModel):
     fault: str
     value: Finite | None = None
     duration_s: Duration | None = None
+    index: Annotated[int, Field(ge=0, le=0xFFFF)] | None = None
+    sub: Annotated[int, Field(ge=0, le=0xFF)] = 0
     can_id: Annotated[int, Field(ge=0, le=0x7FF)] | None = None
     data: str | None = None
 
@@ -61,6 +61,11 @@ class FaultEntry(BaseModel):
             raise ValueError("a CAN frame has at most 8 bytes")
         return text
 
+    @property
+    def number(self) -> float:
+        """The value, 0 where there is none."""
+        return 0.0 if self.value is None else self.value
+
     @model_validator(mode="after")
     def _whole(self) -> FaultEntry:
         kind = FAULTS[self.fault]
@@ -68,148 +73,15 @@ class FaultEntry(BaseModel):
             raise ValueError("give one of at_s, at_sync and at_row")
         if kind.needs_axis and self.axis is None:
             raise ValueError(f"{self.fault} needs an axis")
-        if kind.needs_value and self.value is None:
-            raise ValueError(f"{self.fault} needs a value: {kind.value}")
+        if kind.value is not None and self.value is None:
+            raise ValueError(f"{self.fault} needs a value: {kind.value.meaning}")
+        if kind.value is not None and (wrong := kind.value.fault(self.number)):
+            raise ValueError(f"the value of {self.fault} is {kind.value.meaning}: {wrong}")
+        if self.fault == "object" and self.index is None:
+            raise ValueError("object needs the index (and sub) of what is to be overwritten")
         if self.fault == "frame" and (self.can_id is None or self.data is None):
             raise ValueError("frame needs can_id and data (hexadecimal)")
         return self
-
-
-class Target(Protocol):
-    """What a fault acts on: the drive and sensor of its axis, and the machine around them."""
-
-    @property
-    def drive_faults(self) -> DriveFaults:
-        """The drive's fault state."""
-        ...
-
-    @property
-    def sensor_faults(self) -> SensorFaults | None:
-        """The sensor's fault state, None when the axis has none."""
-        ...
-
-    def trip(self, code: int) -> None:
-        """Let the drive fall into fault with an error code."""
-        ...
-
-    def reboot(self) -> None:
-        """Restart the drive: boot-up message, power-on values."""
-        ...
-
-    def power(self, on: bool) -> None:
-        """Cut or restore the drive's supply."""
-        ...
-
-    def input(self, bit: int, on: bool) -> None:
-        """Set a bit of 0x60FD."""
-        ...
-
-    def inject(self, can_id: int, data: bytes, on: bool) -> None:
-        """Send a foreign frame at every SYNC while it is on."""
-        ...
-
-    def sync(self, on: bool) -> None:
-        """Let the NC's SYNC fail, or come again."""
-        ...
-
-
-Action = Callable[[Target, FaultEntry, bool], None]
-
-
-@dataclass(frozen=True, slots=True)
-class FaultKind:
-    """A fault by name: ``apply(target, entry, on)`` starts it and ends it; ``value`` says what the value means."""
-
-    apply: Action
-    value: str = ""
-    needs_value: bool = False
-    needs_axis: bool = True
-
-
-def _drive(name: str, off: Any, value: str = "") -> FaultKind:
-    def apply(target: Target, entry: FaultEntry, on: bool) -> None:
-        wanted = entry.value if value else True
-        setattr(target.drive_faults, name, wanted if on else off)
-
-    return FaultKind(apply, value, bool(value))
-
-
-def _sensor(name: str, off: Any, value: str = "", convert: Callable[[float], Any] = float) -> FaultKind:
-    def apply(target: Target, entry: FaultEntry, on: bool) -> None:
-        if target.sensor_faults is not None:
-            wanted = convert(entry.value or 0.0) if value else True
-            setattr(target.sensor_faults, name, wanted if on else off)
-
-    return FaultKind(apply, value, bool(value))
-
-
-def _signal(signal: str, name: str, off: Any, value: str, convert: Callable[[float], Any]) -> FaultKind:
-    def apply(target: Target, entry: FaultEntry, on: bool) -> None:
-        wanted = convert(entry.value or 0.0) if value else True
-        setattr(target.drive_faults.signal(signal), name, wanted if on else off)
-
-    return FaultKind(apply, value, bool(value))
-
-
-def _drop_tpdo(target: Target, entry: FaultEntry, on: bool) -> None:
-    number = int(entry.value or 1)
-    if on:
-        target.drive_faults.drop_tpdo[number] = -1
-    else:
-        target.drive_faults.drop_tpdo.pop(number, None)
-
-
-def _trip(target: Target, entry: FaultEntry, on: bool) -> None:
-    if on:
-        target.trip(int(entry.value or 0))
-
-
-def _reboot(target: Target, _: FaultEntry, on: bool) -> None:
-    if on:
-        target.reboot()
-
-
-_SIGNAL_FAULTS: tuple[tuple[str, str, Any, str, Callable[[float], Any]], ...] = (
-    ("delayed", "delay_cycles", 0, "SYNC cycles", int),
-    ("gain", "gain", 1.0, "factor", float),
-    ("offset", "offset", 0.0, "in the signal's unit", float),
-    ("clipped", "clip", None, "limit in the signal's unit", float),
-    ("coarse", "resolution", 0.0, "resolution in the signal's unit", float),
-    ("garbage", "garbage", 0.0, "amplitude in the signal's unit", float),
-    ("stuck", "stuck", False, "", bool),
-)
-
-FAULTS: Mapping[str, FaultKind] = {
-    "load_torque": _drive("load_torque_nm", 0.0, "N.m on the shaft"),
-    "ignore_offset": _drive("ignore_offset", False),
-    "offset_scale": _drive("offset_scale", 1.0, "factor on 0x60B0"),
-    "not_csp": _drive("not_csp", False),
-    "no_heartbeat_consumer": _drive("no_heartbeat_consumer", False),
-    "drop_tpdo": FaultKind(_drop_tpdo, "number of the TPDO, 1 to 4", True),
-    "trip": FaultKind(_trip, "error code of the EMCY, such as 0x3210", True),
-    "reboot": FaultKind(_reboot),
-    "power_off": FaultKind(lambda target, _, on: target.power(not on)),
-    "digital_input": FaultKind(
-        lambda target, entry, on: target.input(int(entry.value or 0), on), "bit of 0x60FD, 0 and 1 limits", True
-    ),
-    **{
-        f"{signal}_{name}": _signal(signal, attribute, off, value, convert)
-        for signal in SIGNALS
-        for name, attribute, off, value, convert in _SIGNAL_FAULTS
-    },
-    "sensor_silent": _sensor("silent", False),
-    "sensor_slow": _sensor("slow_s", 0.0, "seconds by which answers are late"),
-    "sensor_exception": _sensor("exception", 0, "Modbus exception code", int),
-    "sensor_stuck": _sensor("stuck", False),
-    "sensor_delayed": _sensor("delay_samples", 0, "samples", int),
-    "sensor_gain": _sensor("gain", 1.0, "factor"),
-    "sensor_offset": _sensor("offset_v", 0.0, "V"),
-    "sync_lost": FaultKind(lambda target, _, on: target.sync(not on), needs_axis=False),
-    "frame": FaultKind(
-        lambda target, entry, on: target.inject(entry.can_id or 0, bytes.fromhex(entry.data or ""), on),
-        needs_axis=False,
-    ),
-}
 
 
 def load(path: Path, axes: tuple[str, ...]) -> list[FaultEntry]:
@@ -264,7 +136,11 @@ class FaultSchedule:
         self._running: list[tuple[int, FaultEntry]] = []  # SYNC at which it ends
 
     def add(self, entry: FaultEntry) -> None:
-        """Take an entry into the schedule."""
+        """Take an entry into the schedule; ConfigError when its object cannot hold its value."""
+        if entry.fault == "object":
+            wrong = self._target(entry).object_fault(entry.index or 0, entry.sub, int(entry.number))
+            if wrong:
+                raise ConfigError("fault", [ConfigFault("object", wrong, "the drive's EDS lists its objects")])
         self._waiting.append(entry)
 
     @property
@@ -292,5 +168,7 @@ class FaultSchedule:
         return tick >= at
 
     def _apply(self, entry: FaultEntry, *, on: bool) -> None:
-        axis = entry.axis if entry.axis is not None else next(iter(self._targets))
-        FAULTS[entry.fault].apply(self._targets[axis], entry, on)
+        FAULTS[entry.fault].apply(self._target(entry), entry, on)
+
+    def _target(self, entry: FaultEntry) -> Target:
+        return self._targets[entry.axis if entry.axis is not None else next(iter(self._targets))]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,104 +14,16 @@ from fdhil.sim import description
 from fdhil.sim.drive import Drive
 from fdhil.sim.faults import FaultEntry, FaultSchedule
 from fdhil.sim.hub import Frame
-from fdhil.sim.modbus_sensor import SensorFaults, VoltageSensor
+from fdhil.sim.modbus_sensor import VoltageSensor
 from fdhil.sim.nc import Event, Nc, Row
 from fdhil.sim.nc_link import BusFrame
 from fdhil.sim.recorder import Recorder
-from fdhil.sim.sensors import DriveFaults
 from fdhil.sim.thermal import SlideWay
+from fdhil.sim.unit import Stream, Unit
 
 SYNC = 0x80
 OFFSET_RPDO = 2
 _THERMAL_CYCLES = 100  # the temperature moves slowly: the drive learns of it this often
-_GAP_CYCLES = 50  # a longer silence is the end of a stream, not a late frame
-_PATIENCE_CYCLES = 3  # a listed RPDO that was missing this often is not waited for any more
-
-
-@dataclass(slots=True)
-class _Stream:
-    """One RPDO, cycle by cycle; ``late`` counts the cycles in which it was missing in a stream that went on."""
-
-    active: bool = False
-    gap: int = 0
-    late: int = 0
-
-    def step(self, heard: bool) -> None:
-        if heard:
-            self.late += self.gap
-            self.active, self.gap = True, 0
-        elif self.active:
-            self.gap += 1
-            if self.gap > _GAP_CYCLES:
-                self.active, self.gap = False, 0
-
-    @property
-    def awaited(self) -> bool:
-        return self.active and self.gap <= _PATIENCE_CYCLES
-
-
-@dataclass(slots=True)
-class Unit:
-    """One axis of the machine: its drive and what is mounted around it. It is also what a fault acts on."""
-
-    axis: str
-    bus: str
-    drive: Drive
-    slide_way: SlideWay
-    sensor: VoltageSensor | None
-    outbox: list[BusFrame]
-    injected: dict[int, tuple[str, bytes]]
-    offsets: _Stream = field(default_factory=_Stream)
-    sync_on: bool = True
-
-    @property
-    def drive_faults(self) -> DriveFaults:
-        """The drive's fault state."""
-        return self.drive.faults
-
-    @property
-    def sensor_faults(self) -> SensorFaults | None:
-        """The sensor's fault state, None when the axis has no sensor."""
-        return None if self.sensor is None else self.sensor.faults
-
-    def trip(self, code: int) -> None:
-        """Let the drive fall into fault."""
-        self.drive.trip(code)
-
-    def reboot(self) -> None:
-        """Restart the drive."""
-        self.drive.power_off()
-        self.power(True)
-
-    def power(self, on: bool) -> None:
-        """Cut or restore the drive's supply."""
-        if on:
-            self.outbox.extend((self.bus, frame) for frame in self.drive.power_on())
-        else:
-            self.drive.power_off()
-
-    def input(self, bit: int, on: bool) -> None:
-        """Set or clear a bit of 0x60FD."""
-        mask = 1 << (bit & 31)
-        self.drive.digital_inputs = self.drive.digital_inputs | mask if on else self.drive.digital_inputs & ~mask
-
-    def inject(self, can_id: int, data: bytes, on: bool) -> None:
-        """Send a foreign frame at every SYNC while it is on."""
-        if on:
-            self.injected[can_id] = (self.bus, data)
-        else:
-            self.injected.pop(can_id, None)
-
-    def sync(self, on: bool) -> None:
-        """Let the NC's SYNC fail on this axis' bus, or come again."""
-        self.sync_on = on
-
-    def warm(self, celsius: float) -> None:
-        """Set the slide-way's temperature everywhere it is felt."""
-        self.slide_way.celsius = celsius
-        self.drive.set_temperature(celsius)
-        if self.sensor is not None:
-            self.sensor.celsius = celsius
 
 
 class Machine:
@@ -136,7 +47,7 @@ class Machine:
         self._first_bus = next(iter(self._of_bus))
         self.schedule = FaultSchedule(self.units, self.period_s)
         self._listed = [_listed_rpdo(text, self.units) for text in config.sim.lockstep_rpdo]
-        self._streams = {key: _Stream() for key in self._listed}
+        self._streams = {key: Stream() for key in self._listed}
         self._rapid_bit = 1 << config.g0.input_bit
         self._rapid = False
         self._row = 0
@@ -158,7 +69,7 @@ class Machine:
             section.drive.bus,
             Drive(axis, self.config, np.random.default_rng(drive_seed)),
             SlideWay(sim.thermal, section.rapid_speed_rad_s, self.period_s),
-            sensor if sim.modbus else None,
+            sensor,
             self._outbox,
             self._injected,
         )
@@ -281,8 +192,7 @@ class Machine:
             if key[0] == unit.axis:
                 self._streams[key].step(key[1] in heard)
         celsius = unit.slide_way.step(drive.physics.speed_rad_s)
-        if unit.sensor is not None:
-            unit.sensor.feed(drive.ratings.sign * drive.physics.voltage_mean_v)
+        unit.sensor.feed(drive.ratings.sign * drive.physics.voltage_mean_v)
         if drive.tick % _THERMAL_CYCLES == 0:
             unit.warm(celsius)
         return frames

@@ -10,7 +10,8 @@ from typing import Any
 
 from fdhil.errors import ConfigError, FdhilError
 from fdhil.sim import faults
-from fdhil.sim.machine import Machine, Unit
+from fdhil.sim.machine import Machine
+from fdhil.sim.unit import Unit
 
 MAX_LINE = 1 << 16
 _LOWEST_C, _HIGHEST_C = -40.0, 150.0

@@ -94,9 +94,9 @@ class SimService:
         self._handlers: dict[str, Handler] = {}
         self._servers: SensorServers | None = None
         self._folder: tempfile.TemporaryDirectory[str] | None = None
-        for entry in faults:
-            self.machine.fault(entry)
         try:
+            for entry in faults:
+                self.machine.fault(entry)
             self._open()
         except BaseException:
             self.close()
@@ -108,8 +108,8 @@ class SimService:
         for name in self.machine.buses:
             self._buses[name] = attach(name, self.config.bus[name])
             self._handlers[name] = self._handler(name)
-        sensors = {axis: unit.sensor for axis, unit in self.machine.units.items() if unit.sensor is not None}
-        if sensors:
+        if self.config.sim.modbus:
+            sensors = {axis: unit.sensor for axis, unit in self.machine.units.items()}
             voltages = {axis: self.config.axis[axis].voltage for axis in sensors}
             servers = SensorServers(sensors, {axis: (v.host, v.port) for axis, v in voltages.items()})
             servers.start()

@@ -10,7 +10,7 @@ import pytest
 
 from fdhil.errors import ConfigError
 from fdhil.sim import faults
-from fdhil.sim.faults import FAULTS
+from fdhil.sim.fault_kinds import FAULTS
 from fdhil.sim.machine import Machine
 from fdhil.sim.modbus_sensor import SensorFaults
 from fdhil.sim.panel import Panel, PanelError
@@ -144,7 +144,6 @@ def test_two_runs_are_equal_bit_by_bit() -> None:
         twin.play(corner() + 3.0)
         twin.run_until("finished")
         sensor = twin.machine.units["Y"].sensor
-        assert sensor is not None
         return twin.wire, sensor.registers()
 
     assert run(1) == run(1)
@@ -167,7 +166,6 @@ def test_another_master_may_take_over_sync_nmt_and_set_points() -> None:
     assert twin.machine.units["X"].drive.table_mm == pytest.approx(way / PER_MM, abs=0.005)
     assert twin.machine.tick == 403
     sensor = twin.machine.units["X"].sensor
-    assert sensor is not None
     assert sensor.registers()[3] == 402
 
 
@@ -270,8 +268,9 @@ def test_every_fault_ends_without_a_trace(name: str) -> None:
     """Being listed is being tested: started, run, ended, and the machine is as it was."""
     twin = TwinInHand(twin_config("X"))
     twin.switch_on()
-    value = {"drop_tpdo": 1.0, "trip": 0x1000, "sensor_exception": 4.0, "offset_scale": 2.0}.get(name, 1.0)
-    item = {"axis": "X", "fault": name, "value": value, "duration_s": 0.003, "can_id": 0x555, "data": "01"}
+    item = {"axis": "X", "fault": name, "value": 2.0, "duration_s": 0.003, "can_id": 0x555, "data": "01"}
+    item |= {"index": 0x6065}
+    objects = dict(twin.machine.units["X"].drive.dictionary.numbers)
     twin.machine.fault(faults.parse(item, ("X",)))
     twin.run(20)
     assert twin.machine.schedule.idle
@@ -283,6 +282,8 @@ def test_every_fault_ends_without_a_trace(name: str) -> None:
     assert unit.sensor_faults == SensorFaults()
     assert unit.drive.digital_inputs == 0
     assert unit.sync_on
+    for key in (0x606500, 0x1A0101, 0x1A0102, 0x1A0103):
+        assert unit.drive.dictionary.numbers[key] == objects[key]
 
 
 @pytest.mark.parametrize(
@@ -299,6 +300,10 @@ def test_every_fault_ends_without_a_trace(name: str) -> None:
         ("[[fault]]\nfault='reboot'\naxis='X'\nwhen=1", "when"),
         ("[[fault]]\nfault='load_torque'\naxis='X'\nvalue=nan", "finite"),
         ("[[fault]]\nfault='frame'", "needs can_id"),
+        ("[[fault]]\nfault='object'\naxis='X'\nvalue=1", "needs the index"),
+        ("[[fault]]\nfault='drop_tpdo'\naxis='X'\nvalue=5", "5 is not among 1 to 4"),
+        ("[[fault]]\nfault='remap'\naxis='X'\nvalue=1.5", "1.5 is no whole number"),
+        ("[[fault]]\nfault='sensor_exception'\naxis='X'\nvalue=9", "9 is not among 1, 2, 3"),
         ("[[fault]]\nfault='frame'\ncan_id=1\ndata='zz'", "hex"),
         ("[[fault]]\nfault='frame'\ncan_id=1\ndata='000102030405060708'", "at most 8"),
         ("faults = []", "faults: is no key"),
@@ -310,6 +315,20 @@ def test_a_wrong_fault_script_is_refused(text: str, complaint: str, tmp_path: Pa
     script.write_text(text)
     with pytest.raises(ConfigError, match=complaint):
         faults.load(script, ("X", "Y"))
+
+
+@pytest.mark.parametrize(
+    ("item", "complaint"),
+    [
+        ({"index": 0x5FFF, "value": 1}, "no number 5FFF:00"),
+        ({"index": 0x1008, "value": 1}, "no number 1008:00"),
+        ({"index": 0x6060, "value": 200}, "200 does not fit 6060:00"),
+    ],
+)
+def test_an_object_that_cannot_hold_the_value_is_refused(item: dict[str, int], complaint: str) -> None:
+    machine = Machine(twin_config("X"))
+    with pytest.raises(ConfigError, match=complaint):
+        machine.fault(faults.parse({"fault": "object", "axis": "X", **item}, ("X",)))
 
 
 def test_all_wrong_entries_are_named_at_once(tmp_path: Path) -> None:

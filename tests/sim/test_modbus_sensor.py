@@ -184,11 +184,10 @@ def test_the_machine_feeds_one_mean_per_sync() -> None:
     twin.switch_on()
     twin.play(corner())
     unit = twin.machine.units["X"]
-    assert unit.sensor is not None
     fed, reported = [], []
 
     def note() -> None:
-        words = unit.sensor.registers() if unit.sensor else []
+        words = unit.sensor.registers()
         fed.append(struct.unpack(">f", _bytes(words[:2]))[0])
         reported.append(-0.02 * unit.drive.dictionary.number(0x2101))
 
