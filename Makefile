@@ -31,8 +31,8 @@ demo: setup      ## the whole loop on the simulated machine; the report is out/r
 test: setup      ## the default tests: in-process bus and loopback hub, no Debian packages
 	@$(BIN)/python -m pytest -q -m "not socketcan and not debian" -n 2 --dist loadfile
 
-test-vcan: setup ## the integration suite on a real SocketCAN interface
-	@$(VCAN) $(BIN)/python -m pytest -q -p no:cacheprovider -m socketcan tests/integration
+test-vcan: setup ## the integration suite and the socket tests on a real SocketCAN interface
+	@$(VCAN) $(BIN)/python -m pytest -q -p no:cacheprovider -m socketcan tests
 
 test-full: test  ## adds the tests against LinuxCNC (Debian package linuxcnc-uspace)
 	@command -v rs274 >/dev/null || { echo "make test-full needs rs274: apt-get install linuxcnc-uspace" >&2; exit 1; }
