@@ -342,7 +342,8 @@ class Correction:
     """What a correction method plans for a reference: offsets per axis (n,), the path error without and with them.
 
     ``offset_um`` is added to the reference; ``refused`` is empty when the gate lets the correction through, else the
-    offsets are all 0. ``warnings`` do not refuse.
+    offsets are all 0. ``warnings`` do not refuse. ``delay_s`` is the delay tau of r(t - tau) that was aimed at. Speed and
+    torque offsets (n,) per axis are empty unless the method is an on-line feed-forward.
     """
 
     method: str
@@ -351,6 +352,9 @@ class Correction:
     offset_um: Mapping[str, Float]
     refused: tuple[Reason, ...] = ()
     warnings: tuple[Reason, ...] = ()
+    delay_s: float = 0.0
+    speed_offset_rad_s: Mapping[str, Float] = field(default_factory=dict)
+    torque_offset_nm: Mapping[str, Float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -130,6 +130,9 @@ def _correction_columns(planned: Correction) -> dict[str, tuple[Float, int]]:
     columns = _prediction_columns(planned.before)
     for axis in planned.before.reference.axes:
         columns[f"{axis}_offset_um"] = (planned.offset_um[axis], 4)
+        if axis in planned.torque_offset_nm:
+            columns[f"{axis}_speed_offset_rad_per_s"] = (planned.speed_offset_rad_s[axis], 6)
+            columns[f"{axis}_torque_offset_Nm"] = (planned.torque_offset_nm[axis], 6)
         columns[f"{axis}_corrected_error_um"] = (planned.after.error_um[axis], 4)
     columns["corrected_contour_error_um"] = (planned.after.contour_um, 4)
     return columns
@@ -191,6 +194,7 @@ def _correction_document(program: str, planned: Correction) -> dict[str, Any]:
         "before": before,
         "after": after,
         "gain": before["rms_um"] / after["rms_um"] if after["rms_um"] > 0 else 1.0,
+        "delay_s": planned.delay_s,
         "max_offset_um": {axis: float(abs(offset).max()) for axis, offset in planned.offset_um.items()},
         "refused": _reasons(planned.refused),
         "warnings": _reasons(planned.warnings),

@@ -54,7 +54,12 @@ def plan(
     wanted: Plan = factory(reference, models, config, before)
     if wanted.refused:
         return _refuse(name, before, wanted.refused, warnings)
-    offset, after, masked = _mask_harm(reference, models, config, before, wanted)
+    if wanted.torque_offset_nm:
+        speed, torque = wanted.speed_offset_rad_s, wanted.torque_offset_nm
+        after = predict_corrected(reference, models, config, None, speed, torque)
+        offset, masked = wanted.offset_um, tuple[Reason, ...]()
+    else:
+        offset, after, masked = _mask_harm(reference, models, config, before, wanted)
     refused = gate.result(before, after)
     if refused:
         return _refuse(name, before, refused, warnings)
@@ -64,6 +69,9 @@ def plan(
         after=after,
         offset_um={axis: frozen(values) for axis, values in offset.items()},
         warnings=warnings + masked,
+        delay_s=wanted.delay_s,
+        speed_offset_rad_s={axis: frozen(values) for axis, values in wanted.speed_offset_rad_s.items()},
+        torque_offset_nm={axis: frozen(values) for axis, values in wanted.torque_offset_nm.items()},
     )
 
 
@@ -99,9 +107,9 @@ def _mask_harm(
 
 
 def _refuse(method: str, before: Prediction, refused: tuple[Reason, ...], warnings: tuple[Reason, ...]) -> Correction:
-    zero = frozen(np.zeros(before.contour_um.size))
-    offsets = dict.fromkeys(before.reference.axes, zero)
-    return Correction(method, before, before, offsets, refused, warnings)
+    zero = dict.fromkeys(before.reference.axes, frozen(np.zeros(before.contour_um.size)))
+    also = zero if method == "flatness" else {}
+    return Correction(method, before, before, zero, refused, warnings, speed_offset_rad_s=also, torque_offset_nm=also)
 
 
 def table(correction: Correction, config: MachineConfig, program_digest: str) -> CorrectionTable:

@@ -137,12 +137,21 @@ def simulate_axes(
     sync_period_s: float,
     reference_mm: Mapping[str, Float],
     offset_mm: Mapping[str, Float] | None = None,
+    speed_offset_rad_s: Mapping[str, Float] | None = None,
+    torque_offset_nm: Mapping[str, Float] | None = None,
 ) -> dict[str, Response]:
     """Simulate several axes at once, one thread each: the kernels run without the interpreter's lock."""
 
     def one(name: str) -> Response:
-        offset = None if offset_mm is None else offset_mm[name]
-        return simulate(models[name], axes[name], sync_period_s, reference_mm[name], offset)
+        return simulate(
+            models[name],
+            axes[name],
+            sync_period_s,
+            reference_mm[name],
+            (offset_mm or {}).get(name),
+            speed_offset_rad_s=(speed_offset_rad_s or {}).get(name),
+            torque_offset_nm=(torque_offset_nm or {}).get(name),
+        )
 
     if len(reference_mm) == 1:
         return {name: one(name) for name in reference_mm}

@@ -40,11 +40,18 @@ def predict_corrected(
     models: Mapping[str, Parameters],
     config: MachineConfig,
     offset_um: Mapping[str, Float] | None,
+    speed_offset_rad_s: Mapping[str, Float] | None = None,
+    torque_offset_nm: Mapping[str, Float] | None = None,
 ) -> Prediction:
-    """Predict the path with ``offset_um`` (n,) per axis added to the reference; errors stay relative to the path."""
+    """Predict the path with ``offset_um`` (n,) per axis added to the reference; errors stay relative to the path.
+
+    Speed and torque offsets (n,) per axis are those of an on-line feed-forward.
+    """
     check_axes(reference, models, config)
     offsets = None if offset_um is None else {axis: values * 1e-3 for axis, values in offset_um.items()}
-    responses = closed_loop.simulate_axes(models, config.axis, reference.dt_s, reference.position_mm, offsets)
+    responses = closed_loop.simulate_axes(
+        models, config.axis, reference.dt_s, reference.position_mm, offsets, speed_offset_rad_s, torque_offset_nm
+    )
     return assemble(reference, responses)
 
 

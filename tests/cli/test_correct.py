@@ -58,3 +58,26 @@ def test_an_unknown_method_is_refused(bench: Path) -> None:
     result = invoke("correct", bench / "demand.csv", "--config", bench / "bench.toml", "--method", "magic")
     assert result.exit_code == 2
     assert "mirror" in result.stderr
+
+
+def test_flatness_writes_speed_and_torque(bench: Path) -> None:
+    """Position offsets stay 0; the columns of the on-line feed-forward are there."""
+    out = bench / "out.csv"
+    arguments = ["--config", bench / "bench.toml", "--method", "flatness", "--json", "--out", out]
+    result = invoke("correct", bench / "demand.csv", *arguments)
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["gain"] > 50
+    with out.open() as file:
+        rows = list(csv.DictReader(file))
+    assert all(float(row["X_offset_um"]) == 0.0 for row in rows)
+    assert max(float(row["Y_torque_offset_Nm"]) for row in rows) > 50
+    assert "X_speed_offset_rad_per_s" in rows[0]
+
+
+def test_the_default_method_is_the_best_one(bench: Path) -> None:
+    """Without --method: the inverse, more than 60 times better."""
+    result = invoke("correct", bench / "demand.csv", "--config", bench / "bench.toml", "--json")
+    document = json.loads(result.stdout)
+    assert document["method"] == "inverse"
+    assert document["gain"] > 60
+    assert document["delay_s"] == 0.0

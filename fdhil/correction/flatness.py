@@ -1,0 +1,59 @@
+"""On-line feed-forward: the drive is flat, its position tells speed and torque ([ROT 99] as [DES] proposes).
+
+With w = r' 2 pi / pitch, equation [2] gives the torque Jt w' + ft w + Cd sign(w) that follows the path; sent as torque
+offset (0x60B2), the speed loop has only the model's error left to do. What the drive's own feed-forward leaves out of
+the speed, or feeds forward half a cycle too early, is the speed offset (0x60B1). The position offset (0x60B0) stays 0.
+Each row needs two rows of look-ahead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from fdhil.config import Axis, MachineConfig
+from fdhil.correction.method import Plan
+from fdhil.records import Float, Parameters, Prediction, Trajectory
+
+STILL_RAD_S = 1e-6
+PER_MILLE = 1e-3  # 0x60B2 counts in 0.1 % of the rated torque
+
+
+def plan(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, _before: Prediction) -> Plan:
+    """Return speed and torque offsets (n,) of every axis, in whole counts of the drive's objects."""
+    speed, torque = {}, {}
+    for axis in reference.axes:
+        path = np.asarray(reference.position_mm[axis])
+        speed[axis], torque[axis] = offsets(path, models[axis], config.axis[axis], reference.dt_s)
+    zero = np.zeros(reference.time_s.size)
+    return Plan(dict.fromkeys(reference.axes, zero), speed_offset_rad_s=speed, torque_offset_nm=torque)
+
+
+def offsets(reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: float) -> tuple[Float, Float]:
+    """Return the speed offset (rad/s) and torque offset (N.m), (n,) each, of one axis.
+
+    The torque offset is in the drive's own torque: it turns N.m into current with the nominal torque constant.
+    """
+    p = parameters
+    lead = lead_s(parameters, axis)
+    demanded = np.gradient(reference_mm, dt_s) * 2 * np.pi / axis.screw_pitch_mm
+    acceleration = np.gradient(demanded, dt_s)
+    sign = np.where(np.abs(demanded) > STILL_RAD_S, np.sign(demanded), 0.0)
+    current = (p.Jt * acceleration + p.ft * demanded + p.Cd * sign) / p.K
+    times = np.arange(reference_mm.size) * dt_s
+    early = np.interp(times + lead, times, current)
+    # the drive feeds forward the slope of the cycle that begins: half a cycle ahead of the speed at its row
+    ahead = np.diff(reference_mm, append=reference_mm[-1]) / dt_s * 2 * np.pi / axis.screw_pitch_mm
+    speed = demanded - axis.regulators.speed_feedforward * ahead
+    count = 2 * np.pi / axis.drive.increments_per_rev
+    torque_count = PER_MILLE * axis.nominal.K * axis.drive.rated_current_a
+    return (
+        np.asarray(np.rint(speed / count) * count),
+        np.asarray(np.rint(early * axis.nominal.K / torque_count) * torque_count),
+    )
+
+
+def lead_s(parameters: Parameters, axis: Axis) -> float:
+    """Return by how much earlier the current must be asked for: the current loop's lag and half a hold."""
+    return parameters.L / axis.regulators.current_kp + 0.5 * axis.regulators.speed_period_s
