@@ -202,15 +202,6 @@ def error_map(path_mm: Float, error_um: Float, largest_um: float) -> str:
     return svg[0]
 
 
-def history(symbol: str, unit: str, when: Sequence[float], value: Float, std: Float, xlabel: str) -> str:
-    """A parameter's revisions with two-sigma bars against time or temperature."""
-    with _drawing(4.8, 3.0) as (_, axes, svg):
-        axes.errorbar(when, value, 2 * std, fmt="o-", ms=3, lw=0.9, capsize=2, color=COLOURS[0])
-        axes.set_xlabel(xlabel)
-        axes.set_ylabel(f"{symbol} ({unit})")
-    return svg[0]
-
-
 def _equal(axes: Axes) -> None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel("X (mm)")

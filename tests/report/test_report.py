@@ -46,7 +46,6 @@ FIGURES = {
     "corner": lambda: figures.corner(curves(), (5.0, 5.0), 1.0),
     "contour_errors": lambda: figures.contour_errors(0.001, {"before": np.arange(9.0)}),
     "error_map": lambda: figures.error_map(curves()[0].path_mm, np.linspace(0, 9, 200), 9.0),
-    "history": lambda: figures.history("R", "ohm", [1.0, 2.0], np.array([0.5, 0.6]), np.array([0.1, 0.1]), "days"),
 }
 
 
