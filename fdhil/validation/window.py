@@ -12,6 +12,7 @@ from fdhil.identification.estimators import chosen, maximum_likelihood
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.identifiability import empty_estimate, unphysical
 from fdhil.identification.motion import noise_levels
+from fdhil.identification.ratios import estimate_ratios
 from fdhil.identification.windows import carried
 from fdhil.model.feed_drive import discretise, simulate_plant
 from fdhil.records import Estimate, Parameters, Reason, Result, Verdict, Window, WindowOutcome
@@ -29,8 +30,8 @@ def analyse(window: Window, settings: Identification) -> WindowOutcome:
     """Return what one window says of the drive, and whether it is believed; never raises, whatever the data."""
     reasons = implausibilities(window)
     if window.voltage_v is None:
-        reasons.append(Reason("SampleTiming", "the window has no voltage", "connect the voltage sensor"))
-    if window.n < 32 or window.voltage_v is None or any(r.code in UNFIT for r in reasons):
+        return _without_voltage(window, settings, reasons)
+    if window.n < 32 or any(r.code in UNFIT for r in reasons):
         if not reasons:
             reasons.append(Reason("LowExcitation", f"{window.n} rows are no rapid move", "record a whole rapid"))
         missing = empty_estimate(chosen(settings)[0], Result.NOT_FINITE, reasons[0])
@@ -44,6 +45,16 @@ def analyse(window: Window, settings: Identification) -> WindowOutcome:
     fit_percent = simulated_fit_percent(window, estimate)
     reasons += _doubts(window, estimate, fit, fit_percent)
     return WindowOutcome(window, estimate, Verdict(not reasons, fit_percent, tuple(reasons)))
+
+
+def _without_voltage(window: Window, settings: Identification, reasons: list[Reason]) -> WindowOutcome:
+    """Return a refused outcome that still carries Jt/K, ft/K and Cd/K where current and speed are plausible."""
+    reasons = [*reasons, Reason("SampleTiming", "the window has no voltage", "connect the voltage sensor")]
+    if window.n < 32 or any(reason.code in UNFIT for reason in reasons):
+        estimate = empty_estimate(chosen(settings)[0], Result.NOT_FINITE, reasons[0])
+    else:
+        estimate = estimate_ratios([window], settings)
+    return WindowOutcome(window, estimate, Verdict(False, None, tuple(reasons)))
 
 
 def _estimate(window: Window, settings: Identification) -> tuple[Estimate, Fit | None]:

@@ -139,6 +139,29 @@ def test_not_finite_values_never_enter_a_fit() -> None:
 def test_a_window_without_voltage_is_told() -> None:
     outcome = analyse(replace(windows()[0], voltage_v=None), SETTINGS)
     assert not outcome.verdict.accepted
+    told = outcome.estimate
+    assert told is not None
+    for name, truth in (("Jt/K", 0.075 / 0.8), ("ft/K", 0.05 / 0.8), ("Cd/K", 5.0 / 0.8)):
+        assert abs(told.value(name) - truth) < 5 * told.std(name) < 0.4 * truth
+        assert np.isnan(told.value(name.split("/")[0]))
+
+
+def test_a_sensor_with_its_own_clock_is_aligned_by_the_data() -> None:
+    shifted = []
+    for window, share in zip(windows(0.001, moves=2), (0.3, -0.4), strict=True):
+        assert window.voltage_v is not None
+        rise = np.gradient(window.voltage_v)
+        late_v = frozen(window.voltage_v - share * rise)
+        shifted.append(replace(window, voltage_v=late_v, voltage_delay_s=0.0))
+    outcomes = [analyse(window, SETTINGS) for window in shifted]
+    for outcome, share in zip(outcomes, (0.3, -0.4), strict=True):
+        assert outcome.estimate is not None
+        assert outcome.estimate.delay_s == pytest.approx(share * 1e-3, abs=5e-5)
+        assert abs(outcome.estimate.value("L") / 0.005 - 1) < 0.01
+    estimate, verdict = pool(outcomes, SETTINGS)
+    assert verdict.accepted, verdict.reasons
+    assert estimate is not None
+    assert abs(estimate.value("L") / 0.005 - 1) < 0.01
 
 
 def test_nothing_pooled_from_nothing() -> None:

@@ -8,7 +8,7 @@ deviations come from one sandwich over both equations, because filtered residual
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import binary_erosion
@@ -63,6 +63,12 @@ def align(window: Window, settings: Identification) -> Signals:
     width = 2 * reach(settings.lowpass_hz, dt) + 1
     usable = binary_erosion(moving & ~broken, np.ones(width, dtype=bool), border_value=False)
     return Signals(filtered[0], filtered[1], filtered[2], side, usable, broken)
+
+
+def mechanical_signals(window: Window, settings: Identification) -> Float:
+    """Return the usable rows (m, 4) of [i, Dw, w, sign w] of a window, whether or not it has a voltage."""
+    silent = window if window.voltage_v is not None else replace(window, voltage_v=np.zeros(window.n))
+    return regressors(align(silent, settings), window.dt_s)[1]
 
 
 def regressors(signals: Signals, dt_s: float, operator: Operator = ZERO_FORCING_1) -> tuple[Float, Float]:

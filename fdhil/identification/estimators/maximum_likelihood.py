@@ -9,7 +9,7 @@ filter are renewed between them. The information matrix is what remains of the s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -159,7 +159,8 @@ def starting_point(signals: Sequence[Signals], dt_s: Sequence[float]) -> Float |
 def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | None:
     """Fit windows of one drive together; None when they hold nothing to start from.
 
-    A delay between voltage and the other signals is fitted too when the data surely show one.
+    A delay between voltage and the other signals is fitted too when the data surely show one, or when the voltage has
+    a clock of its own.
     """
     usable = [w for w in windows if w.voltage_v is not None]
     signals = [least_squares.align(w, settings) for w in usable]
@@ -167,6 +168,8 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
     if start is None:
         return None
     motions = [prepare(w) for w in usable]
+    if any(w.voltage_delay_s is not None for w in usable):
+        return _fit_separate(motions, start)
     delays = [coarse_delay(s, w.dt_s) for s, w in zip(signals, usable, strict=True)]
     start[6] = float(np.median(delays))
     if start[6] != 0.0:
@@ -176,6 +179,22 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
     if abs(delay) < SURE * std or abs(delay) < LEAST_DELAY * min(m.dt_s for m in motions):
         return plain
     return fit(motions, np.append(plain.theta[:6], delay), range(7))
+
+
+def _fit_separate(motions: Sequence[Motion], start: Float) -> Fit:
+    """Fit windows whose voltage comes from a sensor with a clock of its own: each window has its own delay.
+
+    The delay left after alignment by counters is known to a fraction of a sample only, so it is fitted in every
+    window, taken out, and what remains is fitted once more with the parameters, whose intervals then contain it.
+    """
+    if len(motions) == 1:
+        return fit(motions, start, range(7))
+    alone = [fit([m], start, range(7)) for m in motions]
+    aligned = [
+        replace(m, voltage_mean=m.delayed(f.theta[6]) if f.converged else m.voltage_mean)
+        for m, f in zip(motions, alone, strict=True)
+    ]
+    return fit(aligned, np.append(alone[0].theta[:6], 0.0), range(7))
 
 
 def delay_score(plain: Fit) -> tuple[float, float]:
