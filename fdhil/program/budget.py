@@ -14,7 +14,8 @@ class Budget:
     ``max_blocks`` lines read, those of a loop counted each time; ``max_jumps`` calls and turns of loops;
     ``max_motions_per_block`` what one block may order; ``max_call_depth`` nested calls;
     ``max_nesting`` brackets within a value and loops or conditions within one another; ``max_line_chars`` characters
-    of one line; ``max_coordinate_mm`` largest co-ordinate; ``max_labels`` and ``max_parameters`` names in memory.
+    of one line; ``max_coordinate_mm`` largest co-ordinate; ``max_kept_lines``, ``max_labels`` and ``max_parameters``
+    are kept in memory.
     """
 
     max_blocks: int = 10_000_000
@@ -24,6 +25,7 @@ class Budget:
     max_nesting: int = 50
     max_line_chars: int = 4096
     max_coordinate_mm: float = 1e7
+    max_kept_lines: int = 2000
     max_labels: int = 100_000
     max_parameters: int = 100_000
 

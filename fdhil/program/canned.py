@@ -14,7 +14,7 @@ from fdhil.errors import ProgramError
 from fdhil.program.machine import Machine
 from fdhil.program.modal import AXES, Modal
 from fdhil.program.motions import PLANE_AXES
-from fdhil.program.targets import target
+from fdhil.program.targets import length_mm, target
 from fdhil.program.words import Block
 
 _CLEARANCE_MM = 0.254  # by which a peck stays clear of where the drill was
@@ -71,7 +71,10 @@ def _with(position: list[float], changed: dict[int, float]) -> list[float]:
 
 def _words(modal: Modal, block: Block, kept: dict[str, float]) -> dict[str, float]:
     """Return the cycle's words, those of the block and those still in force, in mm."""
-    for letter in (AXES[PLANE_AXES[modal.plane_name][2]], *_KEPT):
+    normal = PLANE_AXES[modal.plane_name][2]
+    if AXES[normal] in block.words:
+        kept[AXES[normal]] = length_mm(modal, normal, block.words[AXES[normal]])
+    for letter in _KEPT:
         if letter in block.words:
             kept[letter] = block.words[letter] * (1.0 if letter == "p" else modal.scale)
     return kept

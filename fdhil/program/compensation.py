@@ -16,7 +16,6 @@ from fdhil.program.words import Block
 
 Vector = tuple[float, float]
 _TANGENT_RAD = 0.05  # flatter corners are passed as if the path were smooth
-_STRAIGHT_ON_RAD = 1e-6
 _BACKWARDS_MM = 1e-6
 
 
@@ -133,8 +132,8 @@ class Compensation:
         Turning back is an outside corner, unless the arcs that meet both bend away from the tool.
         """
         turn = self.side * _angle(before.leaving, piece.heading)
-        if abs(turn) <= math.pi - _STRAIGHT_ON_RAD:
-            return turn if turn <= math.pi - _TANGENT_RAD else -turn
+        if abs(turn) <= math.pi - _TANGENT_RAD:
+            return turn
         bend = sum(p.turns / abs(p.turns) / p.radius for p in (before, piece) if p.centre is not None)
         return math.pi if self.side * bend < 0.0 else -math.pi
 

@@ -1,7 +1,8 @@
-"""Values of the language: numbers, parameters, functions and bracketed expressions, read and evaluated in one pass.
+"""Values of the language: numbers, parameters, functions and bracketed expressions, read once, evaluated when executed.
 
-A value is evaluated while it is read, as the language wants it: ``#1=2 X#1`` moves to what #1 was before. Operators
-bind in six steps: ``**``; ``* / MOD``; ``+ -``; ``EQ NE GT GE LT LE``; ``AND OR XOR``; equal ones from the left.
+A value that is always the same becomes a number while it is read; any other becomes a function without arguments, so
+that a loop reads its lines once only. Operators bind in steps: ``**``; ``* / MOD``; ``+ -``; ``EQ NE GT GE LT LE``;
+``AND OR XOR``; equal ones from the left.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ from typing import Protocol
 
 from fdhil.errors import ProgramError
 
+Value = float | Callable[[], float]
+
 _NUMBER = re.compile(r"[+-]?(?:\d++\.?\d*+|\.\d++)")
 _OPERATOR = re.compile(r"\*\*|[*/+\-]|mod|and|xor|or|eq|ne|gt|ge|lt|le")
 _FUNCTION = re.compile(r"abs|acos|asin|atan|cos|exists|exp|fix|fup|ln|round|sin|sqrt|tan")
@@ -23,30 +26,36 @@ _STEPS = {
 _EQUAL = 1e-6  # numbers nearer than this are equal to EQ and NE, and to the integer that an index wants
 
 
-class Parameters(Protocol):
-    """Where ``#5`` and ``#<name>`` come from; both raise KeyError for one that is not there."""
+class Context(Protocol):
+    """What values are evaluated in: the parameters (KeyError for one that is not there) and the line executed."""
+
+    line: int
 
     def number(self, index: int) -> float: ...
 
     def named(self, name: str) -> float: ...
 
 
+def now(value: Value) -> float:
+    """Evaluate a value."""
+    return value() if callable(value) else value
+
+
 class Reader:
-    """Reads values from ``text`` (lower case, without blanks and comments) at ``at``; ProgramError with its line."""
+    """Reads values from ``text`` (lower case, without blanks and comments) at ``at``; ProgramError for what is none."""
 
-    __slots__ = ("_depth", "_max_depth", "_parameters", "at", "line", "text", "word_at")
+    __slots__ = ("_context", "_depth", "_max_depth", "at", "text", "word_at")
 
-    def __init__(self, text: str, line: int, parameters: Parameters, max_depth: int) -> None:
+    def __init__(self, text: str, context: Context, max_depth: int) -> None:
         self.text = text
-        self.line = line
         self.at = self.word_at = 0
-        self._parameters = parameters
+        self._context = context
         self._max_depth = max_depth
         self._depth = 0
 
     def fault(self, message: str, word: str | None = None) -> ProgramError:
         """Return the error for the word being read (from ``word_at`` on), or for another one."""
-        return ProgramError(self.line, (word or self.text[self.word_at : self.word_at + 12]).upper(), message)
+        return _fault(self._context, word or self.text[self.word_at : self.word_at + 12], message)
 
     def done(self) -> bool:
         """Tell whether the text is used up."""
@@ -59,12 +68,12 @@ class Reader:
             return True
         return False
 
-    def value(self) -> float:
+    def value(self) -> Value:
         """Read one value: a number, ``#`` parameter, ``[expression]`` or function, each with or without a sign."""
         match = _NUMBER.match(self.text, self.at)
         if match is not None:
             self.at = match.end()
-            return self._finite(float(match.group()))
+            return _finite(self._context, float(match.group()), match.group()[:12])
         self._depth += 1
         if self._depth > self._max_depth:
             raise self.fault(f"nests deeper than {self._max_depth} levels; write it in several steps")
@@ -73,9 +82,10 @@ class Reader:
         finally:
             self._depth -= 1
 
-    def _composed(self) -> float:
+    def _composed(self) -> Value:
         if self.take("-"):
-            return -self.value()
+            value = self.value()
+            return _lazily(lambda a: -a, value)
         if self.take("+"):
             return self.value()
         if self.take("["):
@@ -88,12 +98,7 @@ class Reader:
         self.at = match.end()
         return self._function(match.group())
 
-    def _finite(self, value: float) -> float:
-        if not math.isfinite(value):
-            raise self.fault("is too large a number; write one that a machine can reach")
-        return value
-
-    def bracketed(self) -> float:
+    def bracketed(self) -> Value:
         """Read on to the bracket that closes the one just read, and return the expression's value."""
         values = [self.value()]
         operators: list[str] = []
@@ -101,7 +106,8 @@ class Reader:
             match = _OPERATOR.match(self.text, self.at)
             if match is None:
                 what = "the bracket is not closed" if self.done() else "is no operator"
-                raise self.fault(f"{what}; write [value operator value ...]", None if not self.done() else "[")
+                word = "[" if self.done() else self.text[self.at : self.at + 12]
+                raise self.fault(f"{what}; write [value operator value ...]", word)
             operator = match.group()
             while operators and _STEPS[operators[-1]] >= _STEPS[operator]:
                 self._reduce(values, operators)
@@ -112,27 +118,14 @@ class Reader:
             self._reduce(values, operators)
         return values[0]
 
-    def _reduce(self, values: list[float], operators: list[str]) -> None:
+    def _reduce(self, values: list[Value], operators: list[str]) -> None:
         right, left, operator = values.pop(), values.pop(), operators.pop()
-        try:
-            values.append(self._finite(_BINARY[operator](left, right)))
-        except ZeroDivisionError:
-            raise self.fault("divides by zero; guard it with IF", operator) from None
-        except (ValueError, OverflowError, TypeError):
-            raise self.fault(f"has no real value for {left:g} and {right:g}", operator) from None
+        values.append(_binary(self._context, operator, left, right))
 
-    def _parameter(self) -> float:
+    def _parameter(self) -> Value:
         if self.text.startswith("<", self.at):
-            name = self.name()
-            try:
-                return self._parameters.named(name)
-            except KeyError:
-                raise self.fault("is a parameter that was never given a value; set it first", f"#<{name}>") from None
-        index = self.index()
-        try:
-            return self._parameters.number(index)
-        except KeyError:
-            raise self.fault("is no parameter; they are numbered 1 to 5602", f"#{index}") from None
+            return _named(self._context, self.name())
+        return _numbered(self._context, self.value())
 
     def name(self) -> str:
         """Read ``<name>``."""
@@ -143,14 +136,7 @@ class Reader:
         self.at = end + 1
         return name
 
-    def index(self) -> int:
-        """Read a parameter's number, itself a value of any kind, that must be a whole number."""
-        value = self.value()
-        if abs(value - round(value)) > _EQUAL:
-            raise self.fault("is no whole number; a parameter's number must be one", f"#{value:g}")
-        return round(value)
-
-    def _function(self, name: str) -> float:
+    def _function(self, name: str) -> Value:
         if name == "exists":
             return self._exists()
         if not self.take("["):
@@ -159,23 +145,95 @@ class Reader:
         if name == "atan":
             if not (self.take("/") and self.take("[")):
                 raise self.fault("ATAN wants two arguments: ATAN[y]/[x]", name)
-            return math.degrees(math.atan2(argument, self.bracketed()))
-        try:
-            return self._finite(_UNARY[name](argument))
-        except (ValueError, OverflowError):
-            raise self.fault(f"has no real value for {argument:g}", name) from None
+            other = self.bracketed()
+            return lambda: math.degrees(math.atan2(now(argument), now(other)))
+        return _applied(self._context, name, argument)
 
-    def _exists(self) -> float:
-        if not (self.take("[") and self.take("#") and self.text.startswith("<", self.at)):
-            raise self.fault("EXISTS wants the name of a parameter: EXISTS[#<name>]", "exists")
-        name = self.name()
-        if not self.take("]"):
-            raise self.fault("EXISTS wants the name of a parameter: EXISTS[#<name>]", "exists")
+    def _exists(self) -> Value:
+        if self.take("[") and self.take("#") and self.text.startswith("<", self.at):
+            name = self.name()
+            if self.take("]"):
+                return lambda: _is_there(self._context, name)
+        raise self.fault("EXISTS wants the name of a parameter: EXISTS[#<name>]", "exists")
+
+
+def whole(context: Context, value: float, what: str) -> int:
+    """Return the whole number that a value must be."""
+    if abs(value - round(value)) > _EQUAL:
+        raise _fault(context, f"{what}{value:g}", "is no whole number, as it must be here")
+    return round(value)
+
+
+def _fault(context: Context, word: str, message: str) -> ProgramError:
+    return ProgramError(context.line, word.upper(), message)
+
+
+def _finite(context: Context, value: float, word: str) -> float:
+    if value - value != 0.0:
+        raise _fault(context, word, "gives too large a number; write one that a machine can reach")
+    return value
+
+
+def _lazily(function: Callable[[float], float], value: Value) -> Value:
+    return (lambda: function(value())) if callable(value) else function(value)
+
+
+def _is_there(context: Context, name: str) -> float:
+    try:
+        context.named(name)
+    except KeyError:
+        return 0.0
+    return 1.0
+
+
+def _named(context: Context, name: str) -> Value:
+    def read() -> float:
         try:
-            self._parameters.named(name)
+            return context.named(name)
         except KeyError:
-            return 0.0
-        return 1.0
+            raise _fault(context, f"#<{name}>", "is a parameter that was never given a value; set it first") from None
+
+    return read
+
+
+def _numbered(context: Context, index: Value) -> Value:
+    fixed = whole(context, index, "#") if not callable(index) else None
+
+    def read() -> float:
+        number = fixed if fixed is not None else whole(context, now(index), "#")
+        try:
+            return context.number(number)
+        except KeyError:
+            raise _fault(context, f"#{number}", "is no parameter; they are numbered 1 to 5601") from None
+
+    return read
+
+
+def _applied(context: Context, name: str, argument: Value) -> Value:
+    function = _UNARY[name]
+
+    def apply(value: float) -> float:
+        try:
+            return _finite(context, function(value), name)
+        except (ValueError, OverflowError):
+            raise _fault(context, name, f"has no real value for {value:g}") from None
+
+    return _lazily(apply, argument)
+
+
+def _binary(context: Context, operator: str, left: Value, right: Value) -> Value:
+    function = _BINARY[operator]
+
+    def combine() -> float:
+        a, b = now(left), now(right)
+        try:
+            return _finite(context, function(a, b), operator)
+        except ZeroDivisionError:
+            raise _fault(context, operator, "divides by zero; guard it with IF") from None
+        except (ValueError, OverflowError, TypeError):
+            raise _fault(context, operator, f"has no real value for {a:g} and {b:g}") from None
+
+    return combine if callable(left) or callable(right) else combine()
 
 
 def _modulo(left: float, right: float) -> float:

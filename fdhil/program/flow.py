@@ -14,15 +14,14 @@ from typing import NamedTuple
 
 from fdhil.errors import ProgramError
 from fdhil.program.budget import Budget
-from fdhil.program.expressions import Reader
+from fdhil.program.commands import FANUC, Command
 from fdhil.program.parameters import LOCAL_NUMBERS, Variables
 from fdhil.program.source import Mark, Source
 from fdhil.program.words import clean, without_number
 
-_KEYWORD = re.compile(r"endsub|sub|call|return|while|endwhile|do|repeat|endrepeat|if|elseif|else|endif|break|continue")
 _MAYBE_O_WORD = re.compile(r"[\s/]*(?:n[\d.\s]*)?o", re.IGNORECASE)
+_WITH_VALUES = ("call", "return", "endsub", "if", "elseif", "while", "repeat")
 _FILE_NAME = re.compile(r"[\w+-][\w .+-]*")
-FANUC = "fanuc"  # the keyword of a bare O-number
 
 
 class Place(NamedTuple):
@@ -78,6 +77,8 @@ class Flow:
         self._skip: Skip | None = None
         self._jumps = 0
         self._entering = False
+        self._repeats = False
+        self._known: dict[str, Command] = {}
         self._folder = source.folder
         self._files: list[Source] = [source]
 
@@ -105,76 +106,73 @@ class Flow:
             name = self._frames[-1].name
             raise ProgramError(self.source.line, f"O<{name}>", "the file ends within the subroutine; add its endsub")
 
+    @property
+    def repeats(self) -> bool:
+        """Whether lines may come again, so that it pays to keep them as they were read."""
+        return self._repeats
+
     def skip_over(self, raw: str, line: int) -> None:
         """Look at a line that is read over: it may be the one that is sought."""
         if _MAYBE_O_WORD.match(raw) is None:
             return
-        text = without_number(clean(raw, line).lstrip("/"))
-        if not text.startswith("o"):
-            return
-        reader = self._reader(text, line)
-        label, keyword = self._head(reader)
-        skip = self._skip
-        if skip is None or label != skip.label or keyword not in skip.keywords:
+        command = self._known.get(raw)
+        if command is None:
+            text = without_number(clean(raw, line).lstrip("/"))
+            if not text.startswith("o"):
+                return
+            command = self._known[raw] = self.read(text)
+            if len(self._known) > self._budget.max_kept_lines:
+                self._known.clear()
+        label, skip = command.label(), self._skip
+        if skip is None or label != skip.label or command.keyword not in skip.keywords:
             return
         self._skip = None
         if self._entering:
-            self._begin_sub(label, keyword, line)
+            self._begin_sub(label, command.keyword)
         elif skip.execute:
-            self._do(label, keyword, reader, line)
+            self._do(label, command, line)
 
-    def execute(self, text: str, line: int) -> None:
-        """Execute a cleaned line that begins with O (after its line number)."""
-        reader = self._reader(text, line)
-        label, keyword = self._head(reader)
-        self._do(label, keyword, reader, line)
-        if not reader.done():
-            raise reader.fault("stands after the O-word's end; put it on a line of its own", text[reader.at :][:12])
+    def read(self, text: str) -> Command:
+        """Read a cleaned line that begins with O (after its line number)."""
+        return Command(text, self._variables, self._budget.max_nesting)
 
-    def _reader(self, text: str, line: int) -> Reader:
-        return Reader(text, line, self._variables, self._budget.max_nesting)
+    def execute(self, command: Command, line: int) -> None:
+        """Execute an O-word."""
+        self._do(command.label(), command, line)
 
-    def _head(self, reader: Reader) -> tuple[str, str]:
-        reader.take("o")
-        label = reader.name() if reader.text.startswith("<", reader.at) else str(reader.index())
-        if reader.done():
-            return label, FANUC
-        match = _KEYWORD.match(reader.text, reader.at)
-        if match is None:
-            raise reader.fault("is no O-word; they are sub, call, while, do, repeat, if and their ends")
-        reader.at = match.end()
-        return label, match.group()
-
-    def _do(self, label: str, keyword: str, reader: Reader, line: int) -> None:
-        match keyword:
+    def _do(self, label: str, command: Command, line: int) -> None:
+        self._repeats = True
+        match command.keyword:
             case "sub":
                 self._define(label, line)
             case "call":
-                self._call(label, self._arguments(reader), line)
+                self._call(label, command, line)
             case "return" | "endsub":
-                self._return(label, keyword, reader, line)
+                self._return(label, command)
             case "if":
-                self._if(self._open(label, "if", line), label, reader, line)
+                self._if(label, command, line)
             case "elseif":
-                self._elseif(label, reader, line)
+                self._elseif(label, command, line)
             case "else":
-                self._otherwise(label, reader, line)
+                self._otherwise(label, command, line)
             case "endif":
-                self._label(label, ("if",), reader)
+                self._label(label, ("if",), command)
             case "while":
-                self._while(label, reader, line)
+                self._while(label, command, line)
             case "endwhile":
-                self._jump(self._label(label, ("while",), reader).mark, line)
+                self._jump(self._label(label, ("while",), command).mark, line)
             case "do":
                 self._open(label, "do", line)
             case "repeat":
-                self._repeat(label, reader, line)
+                self._repeat(label, command, line)
             case "endrepeat":
-                self._next_repeat(label, reader, line)
+                self._next_repeat(label, command, line)
             case "break" | "continue":
-                self._leave_loop(label, keyword, reader, line)
+                self._leave_loop(label, command, line)
             case _:
                 self._subs.setdefault(label, (Place(self.source, self.source.here()), True))
+        if command.keyword not in _WITH_VALUES and command.values():
+            raise command.fault(f"{command.keyword} takes no value")
 
     # --- conditions and loops -------------------------------------------------------------------------------------
 
@@ -189,16 +187,11 @@ class Flow:
         opened = labels[label] = Label(kind, line, mark)
         return opened
 
-    def _label(self, label: str, kinds: tuple[str, ...], reader: Reader) -> Label:
+    def _label(self, label: str, kinds: tuple[str, ...], command: Command) -> Label:
         known = self._frames[-1].labels.get(label)
         if known is None or known.kind not in kinds:
-            raise reader.fault(f"has no {' or '.join(kinds)} of the same label before it")
+            raise command.fault(f"has no {' or '.join(kinds)} of the same label before it")
         return known
-
-    def _condition(self, reader: Reader) -> float:
-        if not reader.take("["):
-            raise reader.fault("wants its condition in brackets")
-        return reader.bracketed()
 
     def _jump(self, mark: Mark, line: int) -> None:
         self._count_jump(line)
@@ -209,48 +202,49 @@ class Flow:
         if self._jumps > self._budget.max_jumps:
             raise ProgramError(line, "O", f"more than {self._budget.max_jumps} jumps were made; is a loop endless?")
 
-    def _if(self, state: Label, label: str, reader: Reader, line: int) -> None:
-        state.done = self._condition(reader) != 0.0
+    def _if(self, label: str, command: Command, line: int) -> None:
+        state = self._open(label, "if", line)
+        state.done = command.condition() != 0.0
         if not state.done:
             self._skip = Skip(label, ("elseif", "else", "endif"), line, execute=True)
 
-    def _elseif(self, label: str, reader: Reader, line: int) -> None:
-        state = self._label(label, ("if",), reader)
-        holds = self._condition(reader) != 0.0
+    def _elseif(self, label: str, command: Command, line: int) -> None:
+        state = self._label(label, ("if",), command)
+        holds = command.condition() != 0.0
         if state.done or not holds:
             keywords = ("elseif", "endif") if state.done else ("elseif", "else", "endif")
             self._skip = Skip(label, keywords, line, execute=True)
         state.done = state.done or holds
 
-    def _otherwise(self, label: str, reader: Reader, line: int) -> None:
-        if self._label(label, ("if",), reader).done:
+    def _otherwise(self, label: str, command: Command, line: int) -> None:
+        if self._label(label, ("if",), command).done:
             self._skip = Skip(label, ("endif",), line)
 
-    def _while(self, label: str, reader: Reader, line: int) -> None:
+    def _while(self, label: str, command: Command, line: int) -> None:
         known = self._frames[-1].labels.get(label)
         if known is not None and known.kind == "do":
-            if self._condition(reader) != 0.0:
+            if command.condition() != 0.0:
                 self._jump(known.mark, line)
             return
         self._open(label, "while", line)
-        if self._condition(reader) == 0.0:
+        if command.condition() == 0.0:
             self._skip = Skip(label, ("endwhile",), line)
 
-    def _repeat(self, label: str, reader: Reader, line: int) -> None:
+    def _repeat(self, label: str, command: Command, line: int) -> None:
         state = self._open(label, "repeat", line)
-        state.left = self._condition(reader)
+        state.left = command.condition()
         if state.left <= 0.0:
             self._skip = Skip(label, ("endrepeat",), line)
 
-    def _next_repeat(self, label: str, reader: Reader, line: int) -> None:
-        state = self._label(label, ("repeat",), reader)
+    def _next_repeat(self, label: str, command: Command, line: int) -> None:
+        state = self._label(label, ("repeat",), command)
         state.left -= 1.0
         if state.left > 0.0:
             self._jump(state.mark, line)
 
-    def _leave_loop(self, label: str, keyword: str, reader: Reader, line: int) -> None:
-        state = self._label(label, ("while", "do"), reader)
-        if keyword == "break":
+    def _leave_loop(self, label: str, command: Command, line: int) -> None:
+        state = self._label(label, ("while", "do"), command)
+        if command.keyword == "break":
             self._skip = Skip(label, ("endwhile",) if state.kind == "while" else ("while",), line)
         elif state.kind == "while":
             self._jump(state.mark, line)
@@ -268,15 +262,10 @@ class Flow:
         self._subs[label] = (Place(self.source, self.source.here()), False)
         self._skip = Skip(label, ("endsub",), line)
 
-    def _arguments(self, reader: Reader) -> list[float]:
-        arguments: list[float] = []
-        while reader.take("["):
-            arguments.append(reader.bracketed())
+    def _call(self, name: str, command: Command, line: int) -> None:
+        arguments = command.values()
         if len(arguments) > LOCAL_NUMBERS:
-            raise reader.fault(f"has {len(arguments)} arguments; {LOCAL_NUMBERS} are allowed")
-        return arguments
-
-    def _call(self, name: str, arguments: list[float], line: int) -> None:
+            raise command.fault(f"has {len(arguments)} arguments; {LOCAL_NUMBERS} are allowed")
         self._enter(Frame(name, Place(self.source, self.source.after())), line)
         self._variables.enter(arguments)
 
@@ -292,7 +281,7 @@ class Flow:
             raise ProgramError(line, f"O<{frame.name}>", f"calls nest deeper than {self._budget.max_call_depth} levels")
         known = self._subs.get(frame.name)
         self._frames.append(frame)
-        self._entering = True
+        self._entering = self._repeats = True
         self._skip = Skip(frame.name, (FANUC,) if frame.fanuc else ("sub",), line)
         if known is not None:
             place, fanuc = known
@@ -313,21 +302,21 @@ class Flow:
         path = self._folder / f"{name}.ngc"
         return path if path.is_file() else None
 
-    def _begin_sub(self, label: str, keyword: str, line: int) -> None:
+    def _begin_sub(self, label: str, keyword: str) -> None:
         self._entering = False
         here = Place(self.source, self.source.here())
         self._subs.setdefault(label, (here, keyword == FANUC))
         self._frames[-1].entry = Place(self.source, self.source.after())
 
-    def _return(self, label: str, keyword: str, reader: Reader, line: int) -> None:
+    def _return(self, label: str, command: Command) -> None:
         frame = self._frames[-1]
         if not self.depth or frame.fanuc:
-            raise reader.fault(f"has no subroutine to end; {keyword} belongs between sub and endsub")
-        if keyword == "endsub" and frame.name != label:
-            raise reader.fault(f"names another subroutine than O<{frame.name}>, which is under way")
-        returned = self._condition(reader) if not reader.done() else None
+            raise command.fault(f"has no subroutine to end; {command.keyword} belongs between sub and endsub")
+        if command.keyword == "endsub" and frame.name != label:
+            raise command.fault(f"names another subroutine than O<{frame.name}>, which is under way")
+        values = command.values()
         self._variables.leave()
-        self._variables.set_returned(returned)
+        self._variables.set_returned(values[0] if values else None)
         self._go_back()
 
     def end_fanuc(self) -> bool:

@@ -16,6 +16,7 @@ from fdhil.errors import ProgramError
 from fdhil.program import arcs, canned, lathe, offsets, targets
 from fdhil.program.budget import Budget
 from fdhil.program.checks import CYCLES, check_readers, one_reader_of_axes
+from fdhil.program.commands import Command
 from fdhil.program.compensation import Compensation
 from fdhil.program.flow import Flow
 from fdhil.program.machine import Machine
@@ -24,7 +25,7 @@ from fdhil.program.motions import Feed, Motion, Rapid
 from fdhil.program.parameters import Variables
 from fdhil.program.source import Source
 from fdhil.program.state import KeptModes, names_of, numbers_of
-from fdhil.program.words import Block, clean, read, without_number
+from fdhil.program.words import Block, Line, clean, read, without_number
 
 _VALUE = r"([+-]?(?:\d++\.?\d*+|\.\d++))[ \t]*+"
 _SIMPLE = re.compile(
@@ -66,6 +67,7 @@ class Interpreter:
         self._kept = KeptModes(modal, self._variables)
         self._flow = Flow(first, self._variables, budget, self._kept.returned)
         self._series = canned.Series()
+        self._known: dict[str, Command | Line] = {}
         self._blocks = 0
         self._empty_so_far = True
         self._percent = False
@@ -85,6 +87,7 @@ class Interpreter:
                 line = flow.source.line
                 self._count(line)
                 if flow.skipping:
+                    self._variables.line = line
                     flow.skip_over(raw, line)
                     continue
                 motion = self._simple(raw, line)
@@ -133,27 +136,44 @@ class Interpreter:
         modal.motion = motion
         modal.position = position
         self._series.began = None
+        self._machine.just_left = False
         return Rapid(line, end) if motion == 0 else Feed(line, end, modal.feed_mm_min)
 
     def _line(self, raw: str, line: int) -> None:
+        self._variables.line = line
+        known = self._known.get(raw)
+        if known is None:
+            known = self._read(raw, line)
+            if known is None:
+                return
+            if self._flow.repeats:
+                if len(self._known) >= self._budget.max_kept_lines:
+                    self._known.clear()
+                self._known[raw] = known
+        if isinstance(known, Command):
+            self._flow.execute(known, line)
+            return
+        block = known.block(self._variables)
+        self._execute(block)
+        for key, value in block.settings:
+            self._variables.set(key, value, line)
+        if "call" in block.m:
+            self._call(block)
+
+    def _read(self, raw: str, line: int) -> Command | Line | None:
         text = clean(raw, line)
         if text.startswith("/"):
             text = "" if self._block_delete else text[1:]
         if not text:
-            return
-        if text.startswith("%"):
+            return None
+        if text == "%":
             self._at_percent(line)
-            return
+            return None
         self._empty_so_far = False
         text = without_number(text)
         if text.startswith("o"):
-            self._flow.execute(text, line)
-            return
-        block = read(text, line, self._variables, self._budget.max_nesting)
-        self._execute(block)
-        for key, value in block.settings:
-            self._variables.set(key, value, line)
-        self._call(block)
+            return self._flow.read(text)
+        return read(text, self._variables, self._budget.max_nesting)
 
     def _at_percent(self, line: int) -> None:
         if self._empty_so_far:
@@ -188,15 +208,14 @@ class Interpreter:
             self._tool = block.words.get("q", 0.0) != 0.0
 
     def _call(self, block: Block) -> None:
-        code = block.m.get("call")
-        if code == 98:
+        if block.m["call"] == 98:
             name, times = block.words.get("p", -1.0), block.words.get("l", 1.0)
             if name < 0.0 or abs(name - round(name)) > 1e-4 or not 0 <= times < 1e9:
                 raise ProgramError(
                     block.line, "M98", "wants the subroutine's number as P and may have its repeats as L"
                 )
             self._flow.call_fanuc(str(round(name)), round(times), block.line)
-        elif code == 99 and not self._flow.end_fanuc():
+        elif not self._flow.end_fanuc():
             self._ended = True
 
     def _coordinates(self, block: Block) -> None:
@@ -351,7 +370,9 @@ def _units(modal: Modal, block: Block) -> None:
     if "plane" in block.g:
         modal.plane = {170: 0, 180: 1, 190: 2}[block.g["plane"]]
     if "units" in block.g:
-        modal.scale = MM_PER_INCH if block.g["units"] == 200 else 1.0
+        before, modal.scale = modal.scale, MM_PER_INCH if block.g["units"] == 200 else 1.0
+        # the reference keeps the numbers of a tool's offsets, so that they change their meaning with the units
+        modal.tool = [t * modal.scale / before if axis not in (3, 4, 5) else t for axis, t in enumerate(modal.tool)]
 
 
 def _distance(modal: Modal, block: Block) -> None:

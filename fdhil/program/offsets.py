@@ -29,17 +29,15 @@ def select_system(modal: Modal, variables: Variables, system: int) -> None:
         return
     modal.system = system
     variables.store(5220, float(system))
-    _activate(modal, variables)
-
-
-def _activate(modal: Modal, variables: Variables) -> None:
-    """Take the active system's offsets from its parameters."""
-    first = first_of(modal.system)
-    _change(modal, [variables.number(first + axis) for axis in range(9)], variables.number(first + 9))
+    machine = modal.machine_all()
+    first = first_of(system)
+    modal.g5x = [variables.number(first + axis) for axis in range(9)]
+    modal.rotation_deg = variables.number(first + 9)
+    modal.position = modal.from_machine(machine)
 
 
 def _change(modal: Modal, g5x: list[float], rotation_deg: float) -> None:
-    """Put other offsets in force. Like the reference, this turns the co-ordinates without G92's share of them."""
+    """Put other offsets of the active system in force; the reference turns the co-ordinates without G92's share."""
     position = list(modal.position)
     position[0], position[1] = rotate(position[0], position[1], modal.rotation_deg)
     position = [p + old - new for p, old, new in zip(position, modal.g5x, g5x, strict=True)]

@@ -14,10 +14,21 @@ _READ_ONLY = frozenset({*range(5400, 5410), *range(5420, 5429)})
 class Variables:
     """The parameters #1 to #5602 and #<name>; #1 to #30 and names without leading underscore belong to the call.
 
-    ``state`` gives predefined numbers and names their values. KeyError for a parameter that is not there.
+    ``line`` is the line being executed; ``state_numbers`` and ``state_names`` read the machine's state. KeyError for a
+    parameter that is not there.
     """
 
-    __slots__ = ("_globals", "_locals", "_max", "_numbers", "_stack", "_state_names", "_state_numbers", "returned")
+    __slots__ = (
+        "_globals",
+        "_locals",
+        "_max",
+        "_numbers",
+        "_stack",
+        "_state_names",
+        "_state_numbers",
+        "line",
+        "returned",
+    )
 
     def __init__(
         self,
@@ -27,6 +38,7 @@ class Variables:
     ) -> None:
         self._max = max_names
         self.returned: float | None = None
+        self.line = 0
         self._numbers: dict[int, float] = {}
         self._globals: dict[str, float] = {}
         self._locals: dict[str, float] = {}

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from fdhil.errors import ProgramError
-from fdhil.program.expressions import Parameters, Reader
+from fdhil.program.expressions import Context, Reader, Value, now, whole
 
 _PLAIN = re.compile(r"(?:[a-z@^][+-]?(?:\d++\.?\d*+|\.\d++))*+")
 _WORD = re.compile(r"([a-z@^])([+-]?(?:\d++\.?\d*+|\.\d++))")
@@ -111,40 +111,61 @@ def without_number(text: str) -> str:
     return text
 
 
-def read(text: str, line: int, parameters: Parameters, max_nesting: int) -> Block:
-    """Read a cleaned line; ProgramError with line and word for what the language does not allow.
+@dataclass(frozen=True, slots=True)
+class Line:
+    """A line that was read: ``fixed`` when it is always the same block, else its words and settings to evaluate."""
 
-    Values are evaluated with the parameters as they are before the line's own settings.
-    """
-    block = Block(line)
+    fixed: Block | None
+    words: tuple[tuple[str, Value], ...] = ()
+    settings: tuple[tuple[Value | str, Value], ...] = ()
+
+    def block(self, context: Context) -> Block:
+        """Return the block that the line is now, with the parameters as they are before its own settings."""
+        fixed, line = self.fixed, context.line
+        if fixed is not None:
+            return Block(line, fixed.words, fixed.g, fixed.m)
+        block = Block(line)
+        for letter, value in self.words:
+            _add(block, letter, now(value))
+        for key, value in self.settings:
+            index = key if isinstance(key, str) else whole(context, now(key), "#")
+            block.settings.append((index, now(value)))
+        return block
+
+
+def read(text: str, context: Context, max_nesting: int) -> Line:
+    """Read a cleaned line; ProgramError with line and word for what the language does not allow."""
     text = without_number(text)
     if _PLAIN.fullmatch(text) is not None:
+        block = Block(context.line)
         for letter, digits in _WORD.findall(text):
             value = float(digits)
             if value - value != 0.0:
-                raise ProgramError(line, letter.upper() + digits[:12], "is too large a number")
+                raise ProgramError(context.line, letter.upper() + digits[:12], "is too large a number")
             _add(block, letter, value)
-        return block
-    reader = Reader(text, line, parameters, max_nesting)
+        return Line(block)
+    reader = Reader(text, context, max_nesting)
+    words: list[tuple[str, Value]] = []
+    settings: list[tuple[Value | str, Value]] = []
     while not reader.done():
-        _next(block, reader)
-    return block
+        _next(reader, words, settings)
+    return Line(None, tuple(words), tuple(settings))
 
 
-def _next(block: Block, reader: Reader) -> None:
+def _next(reader: Reader, words: list[tuple[str, Value]], settings: list[tuple[Value | str, Value]]) -> None:
     reader.word_at = reader.at
     letter = reader.text[reader.at]
     if letter == "#":
         reader.at += 1
-        key: int | str = reader.name() if reader.text.startswith("<", reader.at) else reader.index()
+        key = reader.name() if reader.text.startswith("<", reader.at) else reader.value()
         if not reader.take("="):
             raise reader.fault("a parameter's setting wants '=' and a value")
-        block.settings.append((key, reader.value()))
+        settings.append((key, reader.value()))
         return
     if letter not in _LETTERS:
         raise reader.fault("is no word of the language; check the characters")
     reader.at += 1
-    _add(block, letter, reader.value())
+    words.append((letter, reader.value()))
 
 
 def _add(block: Block, letter: str, value: float) -> None:

@@ -129,7 +129,7 @@ class Writer:
     def cycle(self) -> None:
         code = self._random.choice(["73", "81", "82", "83", "84", "74", "85", "86", "87", "88", "89", "81"])
         if code == "74":
-            self.lines.append("M4")
+            self.lines += ["M4", "G17"]
         absolute = self._random.random() < 0.7
         top = round(self._random.uniform(-5, 20), 2)
         depth = round((top if absolute else 0.0) - self._random.uniform(0.5, 20), 2)

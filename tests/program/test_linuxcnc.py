@@ -1,0 +1,94 @@
+"""Every motion against LinuxCNC's own interpreter, over generated programs and the package's examples."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from fdhil.errors import ProgramError
+from fdhil.program import Motion, interpret
+from tests.program.generated import GROUPS, program
+from tests.program.linuxcnc import Answer, ask, difference
+
+pytestmark = pytest.mark.debian
+
+EXAMPLES = Path("/usr/share/linuxcnc/ncfiles")
+# what the examples do that fdhil does otherwise, and why
+OTHERWISE = {
+    "cone.ngc": "W words: the reference has no such axis, fdhil reads and does not list them",
+    "threading.ngc": "G33: fdhil lists the feed that follows from pitch and spindle speed, the reference F",
+    "smartprobe.ngc": "a loop that ends when a probe trips before its target; fdhil's never do",
+    "x-trim.ngc": "a probe's end: fdhil's target, the reference 0.01 inch before it",
+    "tool-length-probe.ngc": "a probe that begins where another ended",
+}
+# seeds whose path has a cusp where one of both sees an inside corner, the other an outside one
+CUSPS = {("compensation", seed) for seed in (140, 243, 287, 289, 290)}
+ROUNDING_MM = 5e-4
+ROUNDING_INCH_MM = 2e-2
+
+
+def ours(path: Path) -> tuple[list[Motion], str]:
+    """Interpret a file: its motions up to its end or error, and the error."""
+    motions: list[Motion] = []
+    try:
+        motions.extend(interpret(path))
+    except ProgramError as error:
+        return motions, str(error)
+    return motions, ""
+
+
+def compare(motions: list[Motion], error: str, reference: Answer, tolerance_mm: float) -> str:
+    """Say what differs: an error on one side alone, or a motion."""
+    if bool(error) != bool(reference.error):
+        return f"ours: {error or 'accepted'}, theirs: {reference.error or 'accepted'}"
+    if error:
+        return ""
+    return difference(motions, reference.motions, tolerance_mm)
+
+
+@pytest.mark.parametrize("group", GROUPS)
+def test_generated_programs_give_the_motions_of_the_reference(group: str, tmp_path: Path) -> None:
+    path = tmp_path / "program.ngc"
+    for seed in range(40):
+        text = program(group, seed, 3 if group == "compensation" else 25)
+        path.write_text(text)
+        tolerance_mm = ROUNDING_INCH_MM if "G20" in text else ROUNDING_MM
+        told = compare(*ours(path), ask(path), tolerance_mm)
+        assert not told or (group, seed) in CUSPS, f"{group} {seed}: {told}\n{text}"
+
+
+def test_the_examples_of_the_package_give_the_motions_of_the_reference() -> None:
+    differing = {}
+    agreed = 0
+    for path in sorted(p for p in EXAMPLES.rglob("*.ngc") if p.name not in OTHERWISE):
+        reference = ask(path)
+        if "no percent sign or program end" in reference.error:  # fdhil takes the file's end for the program's
+            reference.error = ""
+        told = compare(*ours(path), reference, ROUNDING_INCH_MM)
+        if told and "no tool table" not in told:
+            differing[path.name] = told
+        else:
+            agreed += 1
+    assert not differing, f"{agreed} agree"
+
+
+REFUSED = [
+    "G1 X5", "G0 X1 X2", "G0 G1 X1 F1", "G2 X1 F1", "F1 G2 X10 I2", "F1 G2 X10 R2", "G4 P-1", "G0 X[1/0]", "X5",
+    "G80 X5", "G0 X5 N6", "G93 G1 X1", "G95 G1 X1 F1", "F1 G2 X10 I5 P2.5", "F1 G2 X10 I5 P0", "F1 G2 R5", "G92",
+    "G92 X5 G0", "G10 L2 P10 X1", "G10 L2 X1", "G10 L20 P1 R3", "G91 G53 G0 X1", "G0 @5", "G18\nG0 @5 ^3", "P5", "I5",
+    "G0 X1 Q3", "H5", "M7 M9", "M3 M4", "G17 G18", "N-1 G0 X1", "G1.04 X1", "#5420=1", "#0=1", "#5602=1", "#1.5=1",
+    "G0 X#<nope>", "o1 endif", "o1 while [0]", "o1 sub", "o1 foo", "o<nowhere> call", "o1 return", "o1 if 1",
+    "o1 call G0 X1", "o1 if [1]\no1 endif\no2 if [1]\no1 if [1]", "M98", "M98 P77", "F10 G81 X1 Z3 R2", "F1 G81 X1 R2",
+    "F10 G81 X1 Z-3 R2 L0", "F10 G83 X1 Z-3 R2 Q0", "F10 G84 X1 Z-3 R2", "G33 Z-5 K1", "F10 G38.2", "G19 G41.1 D2",
+    "G41.1", "F100 G41.1 D2\nG1 X0.5", "F100 G41.1 D2\nG1 X10\nG55", "M72", "G0 X1 (open", "G0 X1 (a (b) c)", "%%",
+    "S-5", "F-5", "#1=[5 mod 0]", "#1=ln[0]", "#1=asin[2]", "#1=sqrt[-1]", "#1=[-8 ** 0.3]", "G0 X1.2.3", "M1234",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", REFUSED)
+def test_what_the_reference_refuses_is_refused(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "program.ngc"
+    path.write_text(text + "\nM2\n")
+    assert ask(path).error
+    assert ours(path)[1]
