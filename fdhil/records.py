@@ -342,8 +342,8 @@ class Correction:
     """What a correction method plans for a reference: offsets per axis (n,), the path error without and with them.
 
     ``offset_um`` is added to the reference; ``refused`` is empty when the gate lets the correction through, else the
-    offsets are all 0. ``warnings`` do not refuse. ``delay_s`` is the delay tau of r(t - tau) that was aimed at. Speed and
-    torque offsets (n,) per axis are empty unless the method is an on-line feed-forward.
+    offsets are all 0. ``warnings`` do not refuse. ``delay_s`` is the delay tau of r(t - tau) that was aimed at. Speed
+    and torque offsets (n,) per axis are empty unless the method is an on-line feed-forward.
     """
 
     method: str

@@ -40,25 +40,43 @@ def _shared(command: Command) -> Command:
 
 @click.command()
 @_shared
+@click.option("--sensitivity", is_flag=True, help="Tell per zone by how many um 1 % of each parameter raises it.")
 def predict(
-    program: Path, config_path: Path, model_path: Path | None, from_history: bool, out: Path | None, as_json: bool
+    program: Path,
+    config_path: Path,
+    model_path: Path | None,
+    from_history: bool,
+    out: Path | None,
+    as_json: bool,
+    sensitivity: bool,
 ) -> int:
     """Predict the path error that the drives will leave of a PROGRAM (NC program or demand CSV).
 
     The parameters are the configuration's nominal ones unless --model or --from-history says otherwise. Exit codes: 0
     done, 2 wrong option, model or configuration, 3 a file cannot be read or written.
+
+    With --from-history the contour error has its standard deviation, from the parameters' covariance.
     """
     reference, models, config = _inputs(program, config_path, model_path, from_history)
     from fdhil import prediction
 
     predicted = prediction.predict(reference, models, config)
+    columns = _prediction_columns(predicted)
+    document = {"schema": "fdhil-predict-1", "program": str(program), **_prediction_document(predicted)}
+    if from_history:
+        std = prediction.contour_std_um(reference, models, _covariances(reference, config), config)
+        columns["contour_std_um"] = (std, 4)
+        document["contour"]["max_std_um"] = float(std.max())
+    if sensitivity:
+        told = prediction.sensitivity_um(predicted, models, config)
+        for zone, per_axis in zip(document["zones"], told, strict=True):
+            zone["um_per_percent"] = per_axis
     if out is not None:
-        _write(out, _prediction_columns(predicted))
+        _write(out, columns)
     if as_json:
-        document = {"schema": "fdhil-predict-1", "program": str(program), **_prediction_document(predicted)}
         click.echo(json.dumps(document, allow_nan=False))
     else:
-        _show_prediction(predicted)
+        _show_prediction(predicted, document["zones"] if sensitivity else None)
     return 0
 
 
@@ -112,6 +130,17 @@ def _inputs(
         given, source = latest_parameters(config.store.directory), str(config.store.directory)
     reference = load_trajectory(program, config)
     return reference, model_files.models_for(reference, given, config, source), config
+
+
+def _covariances(reference: Trajectory, config: MachineConfig) -> dict[str, Float]:
+    """Return the newest published covariance (6, 6) of each axis; zeros for an axis without one (it stands still)."""
+    import numpy as np
+
+    from fdhil.store.history import History
+
+    with History.read(config.store.directory) as history:
+        known = {revision.set.axis: revision.set.covariance for revision in history.revisions()}
+    return {axis: known.get(axis, np.zeros((6, 6))) for axis in reference.axes}
 
 
 def _prediction_columns(predicted: Prediction) -> dict[str, tuple[Float, int]]:
@@ -201,7 +230,7 @@ def _correction_document(program: str, planned: Correction) -> dict[str, Any]:
     }
 
 
-def _show_prediction(predicted: Prediction) -> None:
+def _show_prediction(predicted: Prediction, told: Sequence[Mapping[str, Any]] | None = None) -> None:
     contour = _contour(predicted)
     click.echo(
         f"{predicted.reference.time_s[-1]:.2f} s of path: contour error {contour['rms_um']:.1f} um RMS,"
@@ -212,8 +241,19 @@ def _show_prediction(predicted: Prediction) -> None:
         click.echo(
             f"  {zone.start_s:8.3f} s .. {zone.end_s:8.3f} s  {zone.max_um:8.1f} um  {zone.cause:12}  at {zone.where}"
         )
+        if told is not None:
+            click.echo(f"{'':26}{_driver(told[predicted.zones.index(zone)]['um_per_percent'])}")
     if len(predicted.zones) > len(zones):
         click.echo(f"  and {len(predicted.zones) - len(zones)} smaller zones (--json lists them all)")
+
+
+def _driver(per_axis: Mapping[str, Mapping[str, float]]) -> str:
+    """Name the parameter that drives a zone's error."""
+    rise, axis, name = max(
+        ((rise, axis, name) for axis, values in per_axis.items() for name, rise in values.items()),
+        key=lambda item: abs(item[0]),
+    )
+    return f"1 % more {name} of axis {axis} changes it by {rise:+.2f} um"
 
 
 def _show_correction(planned: Correction) -> None:

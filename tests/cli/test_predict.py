@@ -6,11 +6,14 @@ import csv
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
 from fdhil.cli.main import cli, run_safely
 from fdhil.program import write_demand_csv
+from fdhil.records import Parameters, ParameterSet, frozen
+from fdhil.store.history import History, Stamp
 from tests.bench import _AXIS
 from tests.paths import bench_trajectory
 
@@ -65,6 +68,31 @@ def test_text_for_people(bench: Path) -> None:
     result = invoke("predict", bench / "demand.csv", "--config", bench / "bench.toml")
     assert "24.2 um RMS" in result.stdout
     assert "corner" in result.stdout
+
+
+def test_sensitivity_names_the_parameter(bench: Path) -> None:
+    """Per zone: what 1 % of each parameter does."""
+    arguments = ["predict", bench / "demand.csv", "--config", bench / "bench.toml", "--sensitivity"]
+    document = json.loads(invoke(*arguments, "--json").stdout)
+    assert set(document["zones"][0]["um_per_percent"]["X"]) == {"R", "L", "K", "Jt", "ft", "Cd"}
+    assert "1 % more" in invoke(*arguments).stdout
+
+
+def test_history_gives_parameters_and_their_uncertainty(bench: Path) -> None:
+    """The newest published set of each axis, with the standard deviation of the contour error."""
+    values = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.085, "ft": 0.05, "Cd": 5.0}
+    covariance = np.diag([(0.003 * value) ** 2 for value in values.values()])
+    with History.open(bench / "fdhil-data") as history:
+        for axis in "XY":
+            published = ParameterSet(axis, 1, Parameters(**values), frozen(covariance), 3, 0, None, "digest")
+            history.add_revision(published, [], Stamp(0.0, "boot", 0))
+    out = bench / "out.csv"
+    arguments = ["--config", bench / "bench.toml", "--from-history", "--json", "--out", out]
+    result = invoke("predict", bench / "demand.csv", *arguments)
+    assert result.exit_code == 0, result.stderr
+    assert 0.1 < json.loads(result.stdout)["contour"]["max_std_um"] < 10
+    with out.open() as file:
+        assert max(float(row["contour_std_um"]) for row in csv.DictReader(file)) > 0.1
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,126 @@
+"""What the parameters' uncertainty does to the predicted path, and which parameter matters where."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+
+from fdhil.config import Axis, MachineConfig
+from fdhil.model import closed_loop
+from fdhil.prediction.contour import contour_error_um
+from fdhil.prediction.predict import check_axes
+from fdhil.records import PARAMETERS, Float, Parameters, Prediction, Trajectory
+
+STEP = 0.005  # relative change of a parameter for its derivative
+SMALLEST = {"ft": 1e-4, "Cd": 1e-2}  # a friction may be 0: its step is not relative then
+
+
+def _changed(parameters: Parameters, name: str) -> tuple[Parameters, float]:
+    """Return the parameters with one of them a little larger, and by how much."""
+    value = float(getattr(parameters, name))
+    step = max(abs(value) * STEP, SMALLEST.get(name, 0.0) * STEP)
+    return replace(parameters, **{name: value + step}), step
+
+
+def _positions(
+    path_mm: Float, parameters: Parameters, axis: Axis, sync_period_s: float, offset_mm: Float | None
+) -> tuple[Float, Float, Float]:
+    """Return (6, n) positions with each parameter changed in turn, the steps (6,), and (n,) with none changed."""
+    here = closed_loop.simulate(parameters, axis, sync_period_s, path_mm, offset_mm).position_mm
+    moved = np.empty((len(PARAMETERS), path_mm.size))
+    steps = np.empty(len(PARAMETERS))
+    for k, name in enumerate(PARAMETERS):
+        other, steps[k] = _changed(parameters, name)
+        moved[k] = closed_loop.simulate(other, axis, sync_period_s, path_mm, offset_mm).position_mm
+    return moved, steps, here
+
+
+def _all_positions(
+    reference: Trajectory,
+    models: Mapping[str, Parameters],
+    config: MachineConfig,
+    offset_um: Mapping[str, Float] | None,
+) -> dict[str, tuple[Float, Float, Float]]:
+    check_axes(reference, models, config)
+
+    def one(axis: str) -> tuple[Float, Float, Float]:
+        offset = None if offset_um is None else offset_um[axis] * 1e-3
+        return _positions(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s, offset)
+
+    with ThreadPoolExecutor(max(1, len(reference.axes))) as pool:
+        return dict(zip(reference.axes, pool.map(one, reference.axes), strict=True))
+
+
+def contour_std_um(
+    reference: Trajectory,
+    models: Mapping[str, Parameters],
+    covariances: Mapping[str, Float],
+    config: MachineConfig,
+    offset_um: Mapping[str, Float] | None = None,
+) -> Float:
+    """Return (n,) one standard deviation of the table's distance from the path, propagated from the parameters'.
+
+    ``covariances`` (6, 6) per axis, in the order of ``PARAMETERS``; NaN rows count as known exactly. First order: the
+    position's derivative by each parameter, of which only what is across the path counts; at rest all of it does.
+    """
+    found = _all_positions(reference, models, config, offset_um)
+    variances = []
+    for axis in reference.axes:
+        moved, steps, here = found[axis]
+        derivative = (moved - here) / steps[:, None]
+        covariance = np.nan_to_num(covariances[axis])
+        variances.append(np.einsum("in,ij,jn->n", derivative, covariance, derivative))
+    across = _across(reference)
+    # axes are identified apart from each other, so that their errors are independent
+    variance = sum(v * share for v, share in zip(variances, across, strict=True))
+    return np.asarray(np.sqrt(np.maximum(variance, 0.0)) * 1e3)
+
+
+def _across(reference: Trajectory) -> list[Float]:
+    """Return per axis (n,) the share of an axis' variance that is across the path: 1 - t^2 of its direction t."""
+    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    if path.shape[1] == 1:
+        return [np.ones(len(path))]
+    velocity = np.gradient(path, axis=0)
+    speed = np.linalg.norm(velocity, axis=1)
+    moving = speed > 1e-9
+    direction = np.where(moving[:, None], velocity / np.maximum(speed, 1e-12)[:, None], 0.0)
+    return [1.0 - direction[:, a] ** 2 for a in range(path.shape[1])]
+
+
+def sensitivity_um(
+    prediction: Prediction,
+    models: Mapping[str, Parameters],
+    config: MachineConfig,
+    offset_um: Mapping[str, Float] | None = None,
+) -> tuple[Mapping[str, Mapping[str, float]], ...]:
+    """Return per zone of ``prediction`` how much its largest contour error rises per 1 % of each parameter, um.
+
+    A mapping axis -> parameter -> um, in the order of the zones: it names the parameter that drives a zone's error.
+    """
+    reference = prediction.reference
+    found = _all_positions(reference, models, config, offset_um)
+    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    here = np.column_stack([found[axis][2] for axis in reference.axes])
+    start = float(reference.time_s[0])
+    ranges = [
+        tuple(round((seconds - start) / reference.dt_s) for seconds in (zone.start_s, zone.end_s))
+        for zone in prediction.zones
+    ]
+    base = contour_error_um(path, here, reference.dt_s)
+    result: list[dict[str, dict[str, float]]] = [{axis: {} for axis in reference.axes} for _ in ranges]
+    for a, axis in enumerate(reference.axes):
+        moved, steps, _ = found[axis]
+        for k, name in enumerate(PARAMETERS):
+            other = here.copy()
+            other[:, a] = moved[k]
+            contour = contour_error_um(path, other, reference.dt_s)
+            value = abs(float(getattr(models[axis], name)))
+            per_percent = 0.01 * value / steps[k]
+            for zone, (first, last) in zip(result, ranges, strict=True):
+                rise = float(contour[first:last].max() - base[first:last].max())
+                zone[axis][name] = rise * per_percent
+    return tuple(result)

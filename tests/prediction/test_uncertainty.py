@@ -1,0 +1,59 @@
+"""The prediction's own uncertainty against drawn plants, and which parameter drives which zone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil.prediction import predict
+from fdhil.prediction.models import nominal_models
+from fdhil.prediction.uncertainty import contour_std_um, sensitivity_um
+from fdhil.records import PARAMETERS, Parameters
+from tests.bench import bench_config
+from tests.paths import bench_trajectory
+
+CONFIG = bench_config()
+MODELS = nominal_models(CONFIG)
+RELATIVE = np.array([0.001, 0.003, 0.0005, 0.005, 0.04, 0.04])
+VALUES = np.array([getattr(MODELS["X"], name) for name in PARAMETERS])
+COVARIANCE = np.diag((RELATIVE * VALUES) ** 2)
+COVARIANCE[4, 5] = COVARIANCE[5, 4] = -0.9 * np.sqrt(COVARIANCE[4, 4] * COVARIANCE[5, 5])
+
+
+def test_standard_deviation_is_that_of_drawn_plants() -> None:
+    """Where the table is well off the path the contour error scatters as told, within the error of 60 draws."""
+    reference = bench_trajectory(10)
+    told = contour_std_um(reference, MODELS, {"X": COVARIANCE, "Y": COVARIANCE}, CONFIG)
+    random = np.random.default_rng(5)
+    drawn = []
+    for _ in range(60):
+        plants = {axis: Parameters(*random.multivariate_normal(VALUES, COVARIANCE)) for axis in "XY"}
+        drawn.append(predict(reference, plants, CONFIG).contour_um)
+    nominal = predict(reference, MODELS, CONFIG).contour_um
+    scatter = np.std(drawn, axis=0)
+    large = (nominal > 20) & (scatter > 0.05)
+    assert large.sum() > 100
+    assert np.median(told[large] / scatter[large]) == pytest.approx(1.0, abs=0.2)
+
+
+def test_an_exact_model_has_no_uncertainty() -> None:
+    """Covariances of 0 or NaN (a parameter the data cannot tell, taken as known) add nothing."""
+    reference = bench_trajectory(10)
+    assert contour_std_um(reference, MODELS, {"X": np.zeros((6, 6)), "Y": np.full((6, 6), np.nan)}, CONFIG).max() == 0.0
+
+
+def test_inertia_drives_the_corners() -> None:
+    """At the corners the inertia matters most; the rise is that of a prediction with 1 % more of it."""
+    reference = bench_trajectory(10)
+    prediction = predict(reference, MODELS, CONFIG)
+    sensitivities = sensitivity_um(prediction, MODELS, CONFIG)
+    assert len(sensitivities) == len(prediction.zones)
+    corner = next(k for k, zone in enumerate(prediction.zones) if zone.cause == "corner")
+    ranked = sensitivities[corner]["Y"]
+    assert max(ranked, key=lambda name: abs(ranked[name])) in ("Jt", "K")
+    zone = prediction.zones[corner]
+    rows = (reference.time_s >= zone.start_s) & (reference.time_s < zone.end_s)
+    more = predict(reference, MODELS | {"Y": replace(MODELS["Y"], Jt=0.075 * 1.01)}, CONFIG)
+    assert ranked["Jt"] == pytest.approx(more.contour_um[rows].max() - zone.max_um, abs=0.05)
