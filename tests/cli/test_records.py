@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from fdhil.cli.main import cli, run_safely
+from fdhil.cli.main import cli
 from fdhil.daemon.keeping import Keeper
 from fdhil.daemon.warm import nominal_rapid
 from fdhil.store.recording_csv import read_recording
 from fdhil.store.windows import encode_window
 from tests.daemon.machine import config_of
-from tests.daemon.shop import BENCH
+from tests.daemon.shop import BENCH, fdhil
 from tests.store.made import outcome, published, window
 
 
@@ -39,15 +39,6 @@ def rapid(tmp_path: Path) -> Path:
     config = config_of(tmp_path)
     path.write_bytes(encode_window(nominal_rapid("X", config.axis["X"], 0.001), config.digest))
     return path
-
-
-def fdhil(*arguments: str | Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
-    """Run the command line as its entry point does; return exit code, stdout and stderr."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sys.argv", ["fdhil", *map(str, arguments)])
-        code = run_safely(cli)
-    said = capsys.readouterr()
-    return code, said.out, said.err
 
 
 def test_replay_tells_outcomes_to_full_precision_and_the_verdict(rapid: Path, capsys: Any) -> None:

@@ -16,9 +16,8 @@ from fdhil.cli.status_view import sparkline, with_interval
 from fdhil.daemon.status import Watch
 from fdhil.daemon.token import ensure_token
 from fdhil.records import Notice
-from tests.cli.test_records import fdhil
 from tests.daemon.machine import config_of
-from tests.daemon.shop import BENCH
+from tests.daemon.shop import BENCH, fdhil
 from tests.store.made import outcome, published
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,8 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from fdhil import config as machine_config
 from fdhil.cli.demo.processes import Process, Twin
+from fdhil.cli.main import cli, run_safely
 from fdhil.config import MachineConfig
 from fdhil.daemon.control import ask
 from fdhil.errors import ConnectError
@@ -136,6 +137,11 @@ def opened(folder: Path) -> Iterator[Shop]:
         yield Shop(folder, twin, machine, machine_config.load(machine))
 
 
-def fdhil(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """Run the command line."""
-    return subprocess.run([sys.executable, "-m", "fdhil", *map(str, arguments)], capture_output=True, text=True)
+def fdhil(*arguments: str | Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
+    """Run the command line as its entry point does, in this process; return exit code, stdout and stderr."""
+    capsys.readouterr()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["fdhil", *map(str, arguments)])
+        code = run_safely(cli)
+    said = capsys.readouterr()
+    return code, said.out, said.err
