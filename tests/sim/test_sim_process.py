@@ -16,7 +16,11 @@ import numpy as np
 import pytest
 from pymodbus.client import ModbusTcpClient
 
+from fdhil import config
 from fdhil.cli.main import cli, run_safely
+from fdhil.program import load_trajectory
+from fdhil.sim import faults
+from fdhil.sim.service import SimService
 from tests.sim.bench_twin import corner
 from tests.sim.hub_thread import frames_of
 from tests.sim.twin_process import PATIENCE_S, TwinProcess, write_config
@@ -142,19 +146,25 @@ def test_the_nc_plays_in_real_time_and_no_sync_is_lost(twin: TwinProcess, tmp_pa
 
 
 def test_two_lockstep_runs_are_equal_bit_by_bit(tmp_path: Path) -> None:
-    config = write_config(tmp_path, 'pace = "lockstep"')
+    """One in a process of its own, one in this process: nothing but the configuration decides."""
+    path = write_config(tmp_path, 'pace = "lockstep"')
     demand = write_demand(tmp_path / "corner.csv", corner() + 2.0)
-    runs = [
-        TwinProcess(config, "--demand", demand, "--trace", tmp_path / f"{k}.csv", "--faults", _load_torque(tmp_path))
-        for k in range(2)
-    ]
-    for run in runs:
-        with run as twin:
-            finished = twin.event("finished")
-            assert finished["late_rpdo"] == {"X": 0, "Y": 0}
-    first, second = ((tmp_path / f"{k}.csv").read_bytes() for k in range(2))
+    script = _load_torque(tmp_path)
+    with TwinProcess(path, "--demand", demand, "--trace", tmp_path / "process.csv", "--faults", script) as twin:
+        _play_here(path, demand, tmp_path / "here.csv", script)
+        assert twin.event("finished")["late_rpdo"] == {"X": 0, "Y": 0}
+    first, second = ((tmp_path / name).read_bytes() for name in ("process.csv", "here.csv"))
     assert first == second
     assert first.count(b"\n") == 1 + len(corner()) + 300
+
+
+def _play_here(path: Path, demand: Path, trace: Path, script: Path) -> None:
+    def emit(event: dict[str, object]) -> None:
+        if event["event"] == "finished":
+            service.stop()
+
+    service = SimService(config.load(path), emit, load_trajectory, faults=faults.load(script, ("X", "Y")))
+    service.run(demand, trace)
 
 
 def _load_torque(folder: Path) -> Path:
@@ -164,32 +174,29 @@ def _load_torque(folder: Path) -> Path:
 
 
 def test_lockstep_waits_for_a_client_that_answers_every_sync(tmp_path: Path) -> None:
-    """The client may be as slow as it likes: no offset frame comes late, and the runs repeat."""
-    config = write_config(tmp_path, 'pace = "lockstep"\nlockstep_rpdo = ["X:2"]')
+    """The client may be as slow as it likes: no offset frame comes late."""
+    path = write_config(tmp_path, 'pace = "lockstep"\nlockstep_rpdo = ["X:2"]')
     demand = write_demand(tmp_path / "corner.csv", corner())
-    with TwinProcess(config) as twin, twin.join() as bus:
+    with TwinProcess(path) as twin, twin.join() as bus:
         twin.command("nc", on=True)
         twin.event("nc")
-        for k in range(2):
-            twin.command("trace", file=str(tmp_path / f"{k}.csv"))
-            twin.command("play", file=str(demand))
-            offset = 0
-            for _ in range(len(corner()) + 800):
-                while (message := bus.recv(5)) is not None and message.arbitration_id != 0x201:
-                    pass
-                assert message is not None
-                target = struct.unpack("<i", message.data[2:6])[0]
-                offset = -(target // 1000)  # what a correction is: a function of the demand
-                bus.send(can.Message(arbitration_id=0x301, data=struct.pack("<i", offset), is_extended_id=False))
-            finished = twin.event("finished")
-            assert finished["late_rpdo"] == {"X": 0, "Y": 0}
-            assert finished["trace"] == str(tmp_path / f"{k}.csv")
-            bus.send(can.Message(arbitration_id=0x301, data=struct.pack("<i", 0), is_extended_id=False))
+        twin.command("trace", file=str(tmp_path / "trace.csv"))
+        twin.command("play", file=str(demand))
+        while not twin.happened("finished"):
+            while (message := bus.recv(5)) is not None and message.arbitration_id != 0x201:
+                pass
+            assert message is not None
+            target = struct.unpack("<i", message.data[2:6])[0]
+            offset = -(target // 1000)  # what a correction is: a function of the demand
+            bus.send(can.Message(arbitration_id=0x301, data=struct.pack("<i", offset), is_extended_id=False))
+        finished = twin.events[-1]
+        assert finished["late_rpdo"] == {"X": 0, "Y": 0}
+        assert finished["trace"] == str(tmp_path / "trace.csv")
         twin.close_panel()
         while frames_of(bus, 1)[0][0] != 0x701:  # it lives on without a panel, and its heartbeat with it
             pass
         assert twin.end(signal.SIGINT) == (0, "")
-        first = np.genfromtxt(tmp_path / "0.csv", delimiter=",", names=True)
+        first = np.genfromtxt(tmp_path / "trace.csv", delimiter=",", names=True)
     increments = np.round(first["X_reference_mm"] * PER_MM).astype(int)
     expected = -(increments // 1000) / PER_MM * 1e3
     assert first["X_offset_um"][3:] == pytest.approx(expected[3:], abs=1e-5)
@@ -233,13 +240,13 @@ def test_a_bus_that_does_not_exist_is_exit_code_3(failing: Callable[..., tuple[i
 
 
 def test_wrong_scripts_and_options_are_exit_code_2(failing: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
-    config = write_config(tmp_path)
+    path = write_config(tmp_path)
     script = tmp_path / "faults.toml"
     script.write_text("[[fault]]\nfault = 'meteor'\n")
-    code, text = failing(config, "--faults", script)
+    code, text = failing(path, "--faults", script)
     assert code == 2
     assert "'meteor' is none of" in text
-    code, text = failing(config, "--demand", "a.csv", "--program", "b.ngc")
+    code, text = failing(path, "--demand", "a.csv", "--program", "b.ngc")
     assert code == 2
     assert "not both" in text
     code, text = failing(tmp_path / "missing.toml")

@@ -103,6 +103,13 @@ class TwinProcess:
                 return event
         raise AssertionError(f"no {name}: {self.events}")
 
+    def happened(self, name: str) -> bool:
+        """Whether an event of this name has come by now; ``events`` keeps them all."""
+        assert self._process.stdout is not None
+        while b"\n" in self._pending or select.select([self._process.stdout], (), (), 0)[0]:
+            self._next(time.monotonic() + PATIENCE_S)
+        return any(event["event"] == name for event in self.events)
+
     def _next(self, deadline: float) -> dict[str, Any]:
         assert self._process.stdout is not None
         while b"\n" not in self._pending:
