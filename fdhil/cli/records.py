@@ -12,6 +12,7 @@ import click
 from fdhil import config as machine_config
 from fdhil import tables
 from fdhil.errors import RecordingError
+from fdhil.records import PARAMETERS
 
 if TYPE_CHECKING:
     from fdhil.records import Outcome, Window
@@ -114,15 +115,17 @@ def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) ->
         from fdhil.cli.history_plot import write_plot
 
         write_plot(rows, plot)
+    slopes = _slopes(machine, axis)
     if as_json:
-        click.echo(json.dumps({"schema": "fdhil-history-1", "revisions": rows}))
+        click.echo(json.dumps({"schema": "fdhil-history-1", "revisions": rows, "slopes": slopes}))
         return
     if not rows:
         click.echo("no parameters were published yet")
         return
-    from fdhil.cli.status_view import show_history
+    from fdhil.cli.status_view import show_history, show_slopes
 
     show_history(rows)
+    show_slopes(slopes)
 
 
 def _revision_rows(machine: machine_config.MachineConfig, axis: str | None) -> list[dict[str, Any]]:
@@ -130,6 +133,30 @@ def _revision_rows(machine: machine_config.MachineConfig, axis: str | None) -> l
 
     with History.read(machine.store.directory) as stored:
         return [_row(revision) for revision in stored.revisions(axis)]
+
+
+def _slopes(machine: machine_config.MachineConfig, axis: str | None) -> dict[str, dict[str, Any]]:
+    """Return how each parameter follows the slide-way's temperature: per kelvin, from the accepted windows."""
+    import numpy as np
+
+    from fdhil.identification.drift import slope
+    from fdhil.store.history import History
+
+    with History.read(machine.store.directory) as stored:
+        windows = [window for window in stored.windows(axis) if window.accepted and window.parameters]
+    told: dict[str, dict[str, Any]] = {}
+    for name in dict.fromkeys(window.axis for window in windows):
+        of_axis = [window for window in windows if window.axis == name and window.temperature_c is not None]
+        celsius = np.array([window.temperature_c for window in of_axis], dtype=np.float64)
+        told[name] = {}
+        for symbol in PARAMETERS:
+            known = [(window.parameters or {}).get(symbol, {}) for window in of_axis]
+            values, stds = (np.array([k.get(key) for k in known], dtype=np.float64) for key in ("value", "std"))
+            line = slope(values, celsius, stds) if np.isfinite(stds).all() else None
+            if line is not None:
+                low, high = line.interval()
+                told[name][symbol] = {"per_kelvin": line.value, "std": line.std, "low": low, "high": high}
+    return told
 
 
 def _row(revision: Revision) -> dict[str, Any]:

@@ -76,6 +76,15 @@ def sparkline(values: Sequence[float]) -> str:
     return "".join(BARS[min(7, int((value - low) / span * 8))] for value in values)
 
 
+def show_slopes(slopes: Mapping[str, Mapping[str, Mapping[str, float]]], console: Console | None = None) -> None:
+    """Print how the parameters follow the temperature, where that is known."""
+    out = console or _console()
+    for axis, lines in slopes.items():
+        sure = [f"{name} {with_interval({'value': line['per_kelvin'], **line})}" for name, line in lines.items()]
+        if sure:
+            out.print(f"axis {axis}, change per kelvin of the slide-way: {', '.join(sure)}")
+
+
 def show_history(rows: Sequence[Mapping[str, Any]], console: Console | None = None, newest: int = 15) -> None:
     """Print the newest revisions of every axis, and each parameter's course over all of them."""
     out = console or _console()

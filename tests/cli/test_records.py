@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from click.testing import CliRunner, Result
 from fdhil.cli.main import cli
 from fdhil.daemon.keeping import Keeper
 from fdhil.daemon.warm import nominal_rapid
+from fdhil.records import frozen
 from fdhil.store.recording_csv import read_recording
 from fdhil.store.windows import encode_window
 from tests.daemon.machine import config_of
@@ -122,6 +124,25 @@ def test_history_as_a_table_and_a_plot(machine: Path, tmp_path: Path, capsys: An
     code, _, err = fdhil("history", machine, "--plot", tmp_path / "no" / "such" / "plot.png", capsys=capsys)
     assert code == 3
     assert "cannot be written" in err
+
+
+def test_history_says_how_the_parameters_follow_the_temperature(tmp_path: Path, capsys: Any) -> None:
+    path = tmp_path / "machine.toml"
+    path.write_text(BENCH)
+    keeper = Keeper(config_of(tmp_path, ("X", "Y")))
+    keeper.open()
+    for k in range(6):
+        warm = outcome(of=window(temperature_c=20.0 + k))
+        assert warm.estimate is not None
+        values = warm.estimate.values * np.where(np.array(warm.estimate.names) == "ft", 1 - 0.1 * k, 1.0)
+        keeper.keep([replace(warm, estimate=replace(warm.estimate, values=frozen(values))), published(k + 1)])
+    keeper.close()
+    _, out, _ = fdhil("history", path, "--json", capsys=capsys)
+    told = json.loads(out)["slopes"]["X"]
+    assert told["ft"]["per_kelvin"] == pytest.approx(-0.005)
+    assert told["ft"]["high"] < 0.0
+    assert told["Jt"]["low"] <= 0.0 <= told["Jt"]["high"]
+    assert "change per kelvin of the slide-way" in fdhil("history", path, capsys=capsys)[1]
 
 
 def test_history_of_nothing_is_told(tmp_path: Path, capsys: Any) -> None:

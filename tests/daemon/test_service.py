@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import signal
+import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -16,7 +18,8 @@ import pytest
 from fdhil.config import MachineConfig
 from fdhil.daemon.control import ask
 from fdhil.daemon.lock import BusLocked
-from fdhil.daemon.service import Service
+from fdhil.daemon.service import InternalError, Service, run
+from fdhil.daemon.status import Watch
 from fdhil.errors import ConnectError, DeviceError
 from fdhil.records import Notice
 from fdhil.store.history import History
@@ -150,3 +153,49 @@ async def test_nonsense_on_the_socket_is_answered_and_harms_nobody(tmp_path: Pat
         assert (await asyncio.to_thread(ask, path, {"request": "status"}))["ok"]
         for stream in (silent[1], writer):
             stream.close()
+
+
+def test_a_fault_of_fdhil_itself_ends_the_daemon_and_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = config_of(tmp_path)
+
+    def fail(*_: Any) -> None:
+        raise ZeroDivisionError("made up")
+
+    monkeypatch.setattr("fdhil.pipeline.AxisPipeline.feed", fail)
+    with pytest.raises(InternalError, match=r"ZeroDivisionError.*nothing is sent any more") as error:
+        run(config, Machine(rapids(config, count=1)).open)
+    assert error.value.exit_code == 3
+    assert "made up" in capsys.readouterr().err
+    assert config.store.run_directory is not None
+    assert not (config.store.run_directory / "daemon.sock").exists()
+
+
+async def test_systemd_hears_ready_the_watchdog_and_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.setblocking(False)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        monkeypatch.setenv("WATCHDOG_USEC", "100000")
+        machine = Machine()
+        async with serving(config_of(tmp_path), machine):
+            heard = [await asyncio.get_running_loop().sock_recv(manager, 200) for _ in range(2)]
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                heard.append(manager.recv(200))
+    assert any(message.startswith(b"READY=1") for message in heard)
+    assert b"WATCHDOG=1" in heard
+    assert b"STOPPING=1" in heard
+
+
+def test_the_watchdog_starves_when_the_source_hangs_but_not_when_the_bus_is_silent(tmp_path: Path) -> None:
+    watch = Watch(config_of(tmp_path), 0.0)
+    assert watch.source_alive(1e6, 2.0)  # not open: it is being opened again
+    watch.source_opened(100.0)
+    assert watch.source_alive(101.0, 2.0)
+    assert not watch.source_alive(103.0, 2.0)
+    watch.record_came(Notice("SyncLost", "MAJOR", "SYNC stopped"), 104.0)
+    assert watch.source_alive(1000.0, 2.0)
+    watch.record_came(Notice("SyncLost", "info", "SYNC is back."), 1000.0)
+    assert not watch.source_alive(1003.0, 2.0)
