@@ -20,7 +20,7 @@ from tests.bench import bench_document
 from tests.sim.bench_twin import TwinInHand
 
 PROGRAMS = Path(__file__).parents[2] / "configs" / "programs"
-PLANTS = {
+PLANTS: dict[str, dict[str, dict[str, float]]] = {
     "bench": {"X": {}, "Y": {}},
     "drifted": {"X": {"ft": 0.01, "Cd": 1.0, "Jt": 0.085}, "Y": {"R": 0.53, "L": 0.0046, "K": 0.83}},
 }
