@@ -6,6 +6,7 @@ import pytest
 
 from fdhil.guard import core
 from fdhil.guard.interlocks import Alarm
+from fdhil.guard.observe import observe
 from fdhil.guard.path import Path, rate_between
 from fdhil.guard.state import Inputs, Mode, Request
 from tests.guard.machine import Bench, bench
@@ -118,3 +119,76 @@ def test_a_wrong_frame_is_caught_whatever_made_it(monkeypatch: pytest.MonkeyPatc
     assert machine.state.mode is Mode.FROZEN
     assert machine.alarms[-1].code == "InternalError"
     assert len(machine.frames) == count
+
+
+def test_a_landing_ends_with_zeros_that_were_read_back() -> None:
+    machine = active()
+    machine.sync(Request("disarm"))
+    machine.until(Mode.OFF)
+    sent = [offsets for _, offsets in machine.frames]
+    zeros = next(k for k, offsets in enumerate(reversed(sent)) if offsets != (0, 0))
+    assert 4 <= zeros <= 4 + 12
+    resting = bench()
+    resting.settle()
+    resting.arm()
+    resting.run(25)
+    count = len(resting.frames)
+    resting.sync(Request("disarm"))
+    resting.until(Mode.OFF)
+    assert len(resting.frames) - count == 4  # zeros were read back before: three more, and the one that ends it
+
+
+def test_unconfirmed_zeros_freeze_after_fifty() -> None:
+    machine = active()
+    machine.sync(Request("disarm"))
+    for drive in machine.drives:
+        drive.answers = False
+    machine.until(Mode.FROZEN)
+    sent = [offsets for _, offsets in machine.frames]
+    zeros = next(k for k, offsets in enumerate(reversed(sent)) if offsets != (0, 0))
+    assert zeros == 52  # the first of them came in motion
+
+
+def test_a_frame_that_did_not_leave_changes_nothing() -> None:
+    machine = active()
+    before = machine.state.axes[0]
+    machine.sync()
+    seen = inputs_of(machine)._replace(transmitted=False)
+    after = observe(machine.state, seen, machine.settings)
+    assert after.axes[0].offset == before.offset
+    assert after.axes[0].rate == 0
+    assert after.axes[0].sent[:3] == (before.offset, before.offset, before.sent[1])
+    assert after.failed_run == 1
+    assert after.mode is Mode.RAMPING
+
+
+def test_a_hold_lasts_ten_cycles_each_time_anew() -> None:
+    machine = active()
+    for _ in range(3):
+        for _ in range(10):  # the first of them still latches what was streamed before
+            machine.sync(nc=False)
+            machine.row += 1
+        machine.sync()
+        assert machine.state.mode is Mode.HOLD
+        machine.until(Mode.ACTIVE, 20)
+    for _ in range(11):
+        machine.sync(nc=False)
+        machine.row += 1
+    assert machine.state.mode is Mode.HOLD
+    assert machine.until(Mode.RAMP_DOWN) == 1
+    assert machine.alarms[-1].code == "TargetLost"
+
+
+def test_time_goes_on_without_sync_only_where_it_can_be_ramped() -> None:
+    machine = active()
+    tick = machine.state.tick
+    machine.silence()
+    assert machine.state.tick == tick
+    machine = bench(offset_synchronous=False)
+    machine.settle()
+    machine.arm()
+    machine.run(30)
+    tick = machine.state.tick
+    machine.silence()
+    machine.silence()
+    assert machine.state.tick == tick + 2
