@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.signal import fftconvolve
 
+from fdhil.identification.filtering import through
 from fdhil.records import Float
 
 
@@ -22,11 +22,8 @@ def coloured_meat(blocks: Sequence[Float], gammas: Sequence[Sequence[Float]], le
     for start, stop in _spans(lengths):
         for a, left in enumerate(blocks):
             for b, right in enumerate(blocks):
-                pulled = fftconvolve(right[start:stop], gammas[a][b][::-1, None], mode="full", axes=0)
-                half = gammas[a][b].size // 2
-                meat[sizes[a] : sizes[a + 1], sizes[b] : sizes[b + 1]] += (
-                    left[start:stop].T @ pulled[half : half + stop - start]
-                )
+                pulled = through(right[start:stop], gammas[a][b][::-1])
+                meat[sizes[a] : sizes[a + 1], sizes[b] : sizes[b + 1]] += left[start:stop].T @ pulled
     return meat
 
 

@@ -1,41 +1,58 @@
-"""The paper's low-pass: the same filter on every signal keeps the identification unbiased ([DES] eq. 8)."""
+"""Filters that move nothing in time: the paper's low-pass, and averages about each row.
+
+The same low-pass on every signal keeps the identification unbiased ([DES] eq. 8). They are a few lines of numpy: the
+library that has them as well takes a second to import, which the daemon's start cannot spare.
+"""
 
 from __future__ import annotations
 
 from functools import lru_cache
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 
-from fdhil.records import Float
+from fdhil.records import Bool, Float
 
 ORDER = 4
 REACH_SHARE = 0.01
-
-
-@lru_cache(maxsize=32)
-def _sections(lowpass_hz: float, dt_s: float) -> Float:
-    corner = min(lowpass_hz * dt_s * 2, 0.95)
-    sections: Float = butter(ORDER, corner, output="sos")
-    return sections
+SPAN_PERIODS = 6  # of the corner's period: beyond it the impulse response is nil
+PADDING_PERIODS = 3
 
 
 def zero_phase(values: Float, lowpass_hz: float, dt_s: float) -> Float:
-    """Return ``values`` (..., n) through a Butterworth low-pass run forward and backward: no delay, squared gain."""
-    sections = _sections(lowpass_hz, dt_s)
-    padding = min(values.shape[-1] - 1, round(3 / lowpass_hz / dt_s))
-    filtered: Float = sosfiltfilt(sections, values, padlen=padding)
+    """Return ``values`` (..., n) through a Butterworth low-pass run forward and backward: no delay, squared gain.
+
+    The ends are continued by their own point reflection, as is usual for a filter run both ways.
+    """
+    n = values.shape[-1]
+    pad = min(n - 1, round(PADDING_PERIODS / lowpass_hz / dt_s))
+    if pad < 1:
+        return values.copy()
+    before = 2 * values[..., :1] - values[..., pad:0:-1]
+    after = 2 * values[..., -1:] - values[..., -2 : -pad - 2 : -1]
+    extended = np.concatenate([before, values, after], axis=-1)
+    size = extended.shape[-1]
+    spectrum = np.fft.rfft(extended) * _gain(size, lowpass_hz, dt_s)
+    filtered: Float = np.fft.irfft(spectrum, size)[..., pad : pad + n]
     return filtered
+
+
+@lru_cache(maxsize=64)
+def _gain(size: int, lowpass_hz: float, dt_s: float) -> Float:
+    """Return the gain at the frequencies of a real transform of ``size`` rows: a Butterworth's, squared."""
+    corner = np.tan(np.pi * min(lowpass_hz * dt_s, 0.475))
+    # the bilinear transform's frequency axis; at the highest one the gain is 0
+    axis = np.tan(np.minimum(np.pi * np.fft.rfftfreq(size), np.pi / 2 * (1 - 1e-9)))
+    gain: Float = 1.0 / (1.0 + (axis / corner) ** (2 * ORDER))
+    return gain
 
 
 @lru_cache(maxsize=32)
 def impulse_response(lowpass_hz: float, dt_s: float) -> Float:
     """Return what the low-pass makes of one sample, centred (odd length)."""
-    half = max(8, round(6 / lowpass_hz / dt_s))
-    impulse = np.zeros(2 * half + 1)
-    impulse[half] = 1.0
-    answer: Float = sosfiltfilt(_sections(lowpass_hz, dt_s), impulse, padlen=0)
-    return answer
+    half = max(8, round(SPAN_PERIODS / lowpass_hz / dt_s))
+    size = 2 * half + 1
+    response: Float = np.roll(np.fft.irfft(_gain(size, lowpass_hz, dt_s), size), half)
+    return response
 
 
 @lru_cache(maxsize=32)
@@ -45,3 +62,27 @@ def reach(lowpass_hz: float, dt_s: float) -> int:
     half = answer.size // 2
     beyond = answer[half:][::-1].cumsum()[::-1] * 2 - answer[half]
     return int(np.argmax(beyond <= REACH_SHARE * answer.sum()))
+
+
+def moving_mean(values: Float, width: int) -> Float:
+    """Return the mean (n,) over ``width`` (odd) rows about each row; the ends are continued by their last value."""
+    if width <= 1 or values.size == 0:
+        return values.copy()
+    padded = np.pad(values, width // 2, mode="edge")
+    return np.convolve(padded, np.full(width, 1.0 / width), "valid")
+
+
+def all_about(flags: Bool, width: int, beyond: bool) -> Bool:
+    """Return where (n,) all ``width`` (odd) rows about a row are set; rows past the ends count as ``beyond``."""
+    padded = np.pad(flags, width // 2, constant_values=beyond)
+    together: Bool = np.convolve(padded, np.ones(width), "valid") > width - 0.5
+    return together
+
+
+def through(columns: Float, kernel: Float) -> Float:
+    """Return each column (m, k) convolved with ``kernel`` (odd length), centred on its rows."""
+    rows, half = columns.shape[0], kernel.size // 2
+    size = rows + kernel.size - 1
+    spectrum = np.fft.rfft(columns, size, axis=0) * np.fft.rfft(kernel, size)[:, None]
+    passed: Float = np.fft.irfft(spectrum, size, axis=0)[half : half + rows]
+    return passed

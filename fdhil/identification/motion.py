@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import binary_erosion, uniform_filter1d
 
+from fdhil.identification.filtering import all_about, moving_mean
 from fdhil.identification.windows import RUN_SHARE, carried, noise_of
 from fdhil.model.feed_drive import interval_shape
 from fdhil.records import Bool, Float, VoltageSampling, Window
@@ -80,11 +80,10 @@ def surely_moving(speed: Float, rapid_rad_s: float) -> Bool:
     """Return where (n,) the shaft surely turns, over the whole reach of the smoothing that decides it."""
     limit = RUN_SHARE * rapid_rad_s
     width = 2 * int(np.clip((5 * noise_of(speed) / limit) ** 2, 0, 15)) + 1
-    smoothed = uniform_filter1d(carried(speed), width, mode="nearest")
+    smoothed = moving_mean(carried(speed), width)
     moving = np.abs(smoothed) >= limit
     moving[1:] &= np.sign(smoothed[1:]) == np.sign(smoothed[:-1])
-    sure: Bool = binary_erosion(moving, np.ones(width + 2, dtype=bool), border_value=True)
-    return sure
+    return all_about(moving, width + 2, beyond=True)
 
 
 def prepare(window: Window) -> Motion:
@@ -147,6 +146,6 @@ def resolution(values: Float) -> float:
 
 def _largest_step(speed: Float, dt: float) -> float:
     width = 2 * round(0.005 / dt / 2) + 1
-    step = np.diff(uniform_filter1d(speed, width, mode="nearest"))
+    step = np.diff(moving_mean(speed, width))
     largest: float = np.abs(step).max(initial=1e-9)
     return largest

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
+from fdhil.identification.filtering import moving_mean
 from fdhil.records import Bool, Float, Recording, Stages, Window, frozen
 
 RUN_SHARE = 0.02
@@ -37,8 +37,7 @@ class Run:
 def smooth(values: Float, dt_s: float, seconds: float = SMOOTHING_S) -> Float:
     """Return ``values`` (n,) averaged over ``seconds`` about each row; lost rows (NaN) take the last one before."""
     width = 2 * round(seconds / dt_s / 2) + 1
-    smoothed: Float = uniform_filter1d(carried(values), width, mode="nearest")
-    return smoothed
+    return moving_mean(carried(values), width)
 
 
 def carried(values: Float) -> Float:

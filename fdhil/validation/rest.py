@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.ndimage import uniform_filter1d
 
 from fdhil.identification.estimators.maximum_likelihood import Fit
+from fdhil.identification.filtering import moving_mean
 from fdhil.identification.motion import UNKNOWN, noise_levels
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.windows import carried, smooth
@@ -79,8 +79,8 @@ def _rest_before(fit: Fit, begin: int, side: int) -> int | None:
     motion, noise = fit.problem.motions[0], fit.problem.noises[0]
     rows = max(8, round(0.010 / motion.dt_s))
     first = max(rows, begin - round(LONGEST_BREAKAWAY_S / motion.dt_s))
-    width = max(1, round(0.001 / motion.dt_s))
-    torque = side * fit.theta[2] * uniform_filter1d(motion.current, width, mode="nearest")
+    width = 2 * round(0.0005 / motion.dt_s) + 1
+    torque = side * fit.theta[2] * moving_mean(motion.current, width)
     holding = np.flatnonzero(torque[first:begin] < HELD_SHARE * fit.theta[5])
     if holding.size == 0:
         return None

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.linalg import solve_discrete_lyapunov
 
 from fdhil.config import Identification
 from fdhil.identification.estimators import chosen, maximum_likelihood
@@ -96,7 +95,8 @@ def expected_fit_percent(window: Window, fit: Fit) -> float:
     p = Parameters(*fit.theta[:6])
     step = discretise(p, window.dt_s)
     push = step.mean[:, 0] / p.L * min(own, EXCESS * noise.voltage_v)
-    spread = solve_discrete_lyapunov(step.phi, np.outer(push, push))
+    # the steady state of P = phi P phi' + push push'
+    spread = np.linalg.solve(np.eye(4) - np.kron(step.phi, step.phi), np.outer(push, push).ravel()).reshape(2, 2)
     variance = EXCESS * (noise.speed_rad_s**2 + spread[1, 1]) + (SHAPE_SHARE * window.rapid_speed_rad_s) ** 2
     deviation = float(np.nanstd(window.speed_rad_s))
     return max(LEAST_FIT_PERCENT, 100.0 * (1.0 - float(np.sqrt(variance)) / max(deviation, 1e-300)))

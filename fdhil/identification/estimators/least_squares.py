@@ -11,12 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import binary_erosion
 
 from fdhil.config import Identification
 from fdhil.identification.covariance import attenuation, residual_gammas, two_step
 from fdhil.identification.derivatives import OPERATORS, ZERO_FORCING_1, Operator, derivative
-from fdhil.identification.filtering import impulse_response, reach, zero_phase
+from fdhil.identification.filtering import all_about, impulse_response, reach, zero_phase
 from fdhil.identification.identifiability import empty_estimate, judge
 from fdhil.identification.motion import noise_levels, surely_moving
 from fdhil.identification.normal import solve
@@ -61,7 +60,7 @@ def align(window: Window, settings: Identification) -> Signals:
     side = np.where(moving, np.sign(filtered[2]), 0.0)
     broken = ~(np.isfinite(window.voltage_v) & np.isfinite(window.current_a) & np.isfinite(window.speed_rad_s))
     width = 2 * reach(settings.lowpass_hz, dt) + 1
-    usable = binary_erosion(moving & ~broken, np.ones(width, dtype=bool), border_value=False)
+    usable = all_about(moving & ~broken, width, beyond=False)
     return Signals(filtered[0], filtered[1], filtered[2], side, usable, broken)
 
 
