@@ -15,6 +15,7 @@ import errno
 import socket
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 from fdhil.errors import ConnectError
@@ -25,8 +26,6 @@ Handler = Callable[[Frame], None]
 EXTENDED = 1 << 31  # marks a 29 bit identifier, as SocketCAN does
 QUEUE_BYTES = 8 << 20
 STALL_S = 5.0
-# python-can takes each greeting with a recv of its own: frames must not follow the last one at once
-GREETING_S = 0.05
 _MAX_COMMAND = 4096
 _CHUNK = 1 << 16
 _ONE_MORE = frozenset({errno.EAGAIN, errno.EWOULDBLOCK, errno.EINTR})
@@ -62,7 +61,7 @@ def decode_send(command: bytes) -> Frame | None:
 
 @dataclass(slots=True, eq=False)
 class _Client:
-    """One connection; ``raw`` once it hears frames, ``hold_until_s`` while its last greeting may still be unread."""
+    """One connection; ``raw`` once it hears frames."""
 
     socket: socket.socket
     inbox: bytearray = field(default_factory=bytearray)
@@ -70,7 +69,6 @@ class _Client:
     opened: bool = False
     raw: bool = False
     gone: bool = False
-    hold_until_s: float = 0.0
     moved_s: float = 0.0
 
 
@@ -123,12 +121,11 @@ class Hub:
 
     def writers(self) -> list[socket.socket]:
         """Sockets to select for writing: those whose queue could not be sent at once."""
-        return [c.socket for c in self._clients if c.outbox and not c.hold_until_s]
+        return [client.socket for client in self._clients if client.outbox]
 
     def deadline_s(self) -> float | None:
-        """Monotonic time at which :meth:`flush` is due although no socket is ready, None for never."""
-        waits = [c.hold_until_s for c in self._clients if c.hold_until_s]
-        return min(waits) if waits else None
+        """Monotonic time at which :meth:`flush` is due although no socket is ready: never."""
+        return None
 
     def pump(self, ready: Sequence[object], handler: Handler) -> None:
         """Read the sockets among ``ready``; each frame goes to the other clients, then to ``handler``, in turn."""
@@ -150,8 +147,7 @@ class Hub:
     def flush(self, now_s: float) -> None:
         """Send what is queued as far as the sockets take it; ``now_s`` is monotonic."""
         for client in self._clients:
-            if client.outbox and client.hold_until_s <= now_s:
-                client.hold_until_s = 0.0
+            if client.outbox:
                 self._write(client, now_s)
         if any(client.gone for client in self._clients):
             for client in self._clients:
@@ -206,7 +202,6 @@ class Hub:
             if frame is None:
                 self.malformed += 1
                 return
-            client.hold_until_s = 0.0  # who sends has read his greetings
             if len(self._clients) > 1:
                 self.send((frame,), client)
             handler(frame)
@@ -219,10 +214,10 @@ class Hub:
         if words == ["open", self.channel] and not client.opened:
             client.opened = True
         elif words == ["rawmode"] and client.opened and not client.raw:
-            client.raw = True
             client.outbox += answer
             self._write(client, time.monotonic())
-            client.hold_until_s = time.monotonic() + GREETING_S
+            self._fence(client)
+            client.raw = True
             return
         elif words == ["echo"]:
             answer = b"< echo >"
@@ -232,6 +227,15 @@ class Hub:
             self.malformed += 1
             answer = b"< error unknown command >"
         client.outbox += answer
+
+    def _fence(self, client: _Client) -> None:
+        """Keep the frames out of the recv that takes the last greeting, however late the client comes to it.
+
+        The stock client takes each greeting with one recv and wants nothing else in it. A recv never reads across
+        the mark of urgent data (RFC 6093), and the urgent byte itself does not appear in the stream.
+        """
+        with suppress(OSError):
+            client.socket.send(b" ", socket.MSG_OOB)
 
     def _write(self, client: _Client, now_s: float) -> None:
         try:

@@ -114,6 +114,19 @@ def test_clients_join_while_the_bus_is_busy(caplog: pytest.LogCaptureFixture) ->
     assert not [record for record in caplog.records if "ncomplete" in record.message]
 
 
+def test_a_client_that_comes_late_to_its_greeting_still_finds_it_alone() -> None:
+    hub = Hub("can0")
+    with serving(hub) as thread, socket.create_connection((hub.host, hub.port)) as late:
+        thread.each_turn = lambda hub: hub.send([(0x80, b"\1"), (0x181, bytes(8))])
+        assert late.recv(256) == b"< hi >"
+        late.sendall(b"< open can0 >")
+        assert late.recv(256) == b"< ok >"
+        late.sendall(b"< rawmode >")
+        time.sleep(0.2)
+        assert late.recv(256) == b"< ok >"
+        assert late.recv(8) == b"< frame "
+
+
 def test_nothing_is_lost_to_a_slow_reader() -> None:
     """20000 frames against a queue of 4 kB: the hub stops taking frames until the slow reader has read."""
     count = 20000
