@@ -16,6 +16,7 @@ FLOOR_UM = 1.0
 BEFORE_S, AFTER_S = 0.05, 0.20
 CORNER_S = 0.045  # a corner turns within twice this time; a turn that goes on is a circle
 ASIDE_S = 0.07  # what lies further away than this is not the corner's own turn
+SHARP = 0.6
 CORNER_RAD = np.deg2rad(20.0)
 MERGE_S = 0.03
 SHORTEST_S = 0.003
@@ -79,7 +80,9 @@ def _corners(turn_rate: Float, dt: float) -> Bool:
 
     here = turned(-half, half)
     aside = np.maximum(turned(-gap - 2 * half, -gap), turned(gap, gap + 2 * half))
-    return np.asarray((here > CORNER_RAD) & (here > 2 * aside))
+    # a circle turns as much in the outer half of that time as in the inner one
+    sharp = turned(-(half // 2), half // 2) > SHARP * here
+    return np.asarray(_near((here > CORNER_RAD) & (here > 1.5 * aside) & sharp, CORNER_S, CORNER_S, dt))
 
 
 def _reversals(velocity: Float) -> Bool:
