@@ -22,6 +22,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "interpret": ("fdhil.cli.program:interpret", "List the motions of an NC program."),
     "predict": ("fdhil.cli.prediction:predict", "Predict the path error of a program before it is cut."),
     "correct": ("fdhil.cli.prediction:correct", "Plan the correction of a program."),
+    "advise": ("fdhil.cli.advise:advise", "Tell the highest feed of each line within a tolerance."),
     "replay": ("fdhil.cli.records:replay", "Analyse a recorded window again, bit by bit as the daemon did."),
     "history": ("fdhil.cli.records:history", "Show how the parameters moved."),
     "report": ("fdhil.cli.records:report", "Write an HTML report of the stored history."),

@@ -57,7 +57,7 @@ def predict(
 
     With --from-history the contour error has its standard deviation, from the parameters' covariance.
     """
-    reference, models, config = _inputs(program, config_path, model_path, from_history)
+    reference, models, config = inputs(program, config_path, model_path, from_history)
     from fdhil import prediction
 
     predicted = prediction.predict(reference, models, config)
@@ -97,7 +97,7 @@ def correct(
     Nothing is sent. A correction that is not predicted to help is refused, with advice: its offsets are 0. Exit codes:
     0 planned, 1 refused, 2 wrong option, model or configuration, 3 a file cannot be read or written.
     """
-    reference, models, config = _inputs(program, config_path, model_path, from_history)
+    reference, models, config = inputs(program, config_path, model_path, from_history)
     from fdhil import correction
 
     planned = correction.plan(reference, models, config, method)
@@ -110,7 +110,7 @@ def correct(
     return 1 if planned.refused else 0
 
 
-def _inputs(
+def inputs(
     program: Path, config_path: Path, model_path: Path | None, from_history: bool
 ) -> tuple[Trajectory, dict[str, Parameters], MachineConfig]:
     """Read configuration, model and reference, in this order."""

@@ -1,0 +1,29 @@
+"""``fdhil advise`` as another program calls it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.cli.test_predict import _bench as _bench
+from tests.cli.test_predict import invoke
+
+
+@pytest.mark.parametrize(("tolerance", "code", "lines"), [(200, 0, 0), (60, 0, 1), (0.01, 1, 2)])
+def test_lists_the_lines_that_leave_the_tolerance(bench: Path, tolerance: float, code: int, lines: int) -> None:
+    """Exit code 1 when no feed helps."""
+    program = bench / "corner.ngc"
+    program.write_text("G21 G90 G64\nG1 X0 Y30 F15000\nG1 X40\nM2\n")
+    arguments = ["advise", program, "--config", bench / "bench.toml", "--tolerance-um", tolerance]
+    result = invoke(*arguments, "--json")
+    assert result.exit_code == code, result.stderr
+    assert len(json.loads(result.stdout)["lines"]) == lines
+    assert ("line 3" in invoke(*arguments).stdout) == (lines > 0)
+
+
+def test_the_tolerance_must_be_positive(bench: Path) -> None:
+    """0 is no tolerance."""
+    result = invoke("advise", bench / "demand.csv", "--config", bench / "bench.toml", "--tolerance-um", 0)
+    assert result.exit_code == 2
