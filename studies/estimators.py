@@ -85,7 +85,7 @@ def monte_carlo(method: Method, recording: Recording, noise: float, runs: int) -
         errors.append(estimate.values / TRUTH - 1)
         inside.append(np.abs(estimate.values - TRUTH) <= 1.96 * np.sqrt(np.diag(estimate.covariance)))
     told = np.array(errors)
-    return np.nanmean(told, axis=0), np.sqrt(np.nanmean(told**2, axis=0)), np.mean(inside, axis=0)
+    return told.mean(axis=0), np.sqrt((told**2).mean(axis=0)), np.mean(inside, axis=0)
 
 
 def page(runs: int) -> tuple[str, dict[str, Array]]:
@@ -102,12 +102,18 @@ def page(runs: int) -> tuple[str, dict[str, Array]]:
         for name, method in methods().items():
             bias, rms, share = monte_carlo(method, recording, noise, runs)
             told = zip(rms / limit, bias, share, strict=True)
-            cells = [f"{r:.2f} ({100 * b:+.2f}; {100 * s:.0f} %)" for r, b, s in told]
+            cells = [_cell(*figures) for figures in told]
             lines.append(f"| {name} | " + " | ".join(cells) + " |")
             if noise == 0.005:
                 drawn[name] = rms / limit
         lines.append("")
     return "\n".join(lines), drawn
+
+
+def _cell(ratio: float, bias: float, share: float) -> str:
+    if not np.isfinite(ratio):
+        return "not published: unphysical or without an interval"
+    return f"{ratio:.2f} ({100 * bias:+.2f}; {100 * share:.0f} %)"
 
 
 def plot(drawn: dict[str, Array], path: Path) -> None:

@@ -174,8 +174,11 @@ def _cells(estimate: Estimate | None, verdict: Verdict) -> list[str]:
 
 
 def _show_reasons(console: Any, result: FileResult) -> None:
-    """Write each reason once, with what to do."""
+    """Write each reason, and what only widens the intervals, once and with what to do."""
+    from fdhil.validation.plausibility import warnings_of
+
     told = [r for outcome in result.outcomes for r in outcome.verdict.reasons] + list(result.verdict.reasons)
+    told += [r for outcome in result.outcomes for r in warnings_of(outcome.window)]
     for reason in dict.fromkeys(told):
         advice = f"; {reason.advice}" if reason.advice else ""
         console.print(f"  {reason}{advice}", highlight=False, markup=False)

@@ -14,6 +14,7 @@ from fdhil.identification.windows import find_windows
 from fdhil.records import Float, Window, WindowOutcome, frozen
 from fdhil.store.recording_csv import parse_recording
 from fdhil.validation import analyse, pool
+from fdhil.validation.plausibility import warnings_of
 from studies import bench
 from tests.identification.recorded import windows
 
@@ -162,6 +163,19 @@ def test_a_sensor_with_its_own_clock_is_aligned_by_the_data() -> None:
     assert verdict.accepted, verdict.reasons
     assert estimate is not None
     assert abs(estimate.value("L") / 0.005 - 1) < 0.01
+
+
+def test_coarse_steps_are_told_and_widen_the_intervals() -> None:
+    window = windows(0.001)[0]
+    coarse = _changed(window, current_a=lambda values: np.round(values / 8.0) * 8.0)
+    (warning,) = warnings_of(coarse)
+    assert warning.code == "Quantised"
+    assert "8 A" in warning.text
+    assert warnings_of(window) == []
+    fine_told, coarse_told = analyse(window, SETTINGS).estimate, analyse(coarse, SETTINGS).estimate
+    assert fine_told is not None
+    assert coarse_told is not None
+    assert coarse_told.std("R") > 2 * fine_told.std("R")
 
 
 def test_nothing_pooled_from_nothing() -> None:

@@ -1,0 +1,24 @@
+"""``make study``: run the Monte-Carlo studies and write their pages to docs/studies. python -m studies [NAME...]"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+
+STUDIES = ("estimators", "verdicts")
+
+
+def main() -> None:
+    """Run the named studies, or all of them, each with its own defaults."""
+    names = sys.argv[1:] or list(STUDIES)
+    unknown = [name for name in names if name not in STUDIES]
+    if unknown:
+        sys.exit(f"no study is called {', '.join(unknown)}: choose from {', '.join(STUDIES)}")
+    sys.argv = sys.argv[:1]
+    for name in names:
+        print(f"{name} ...", flush=True)
+        import_module(f"studies.{name}").main()
+
+
+if __name__ == "__main__":
+    main()
