@@ -11,7 +11,7 @@ from fdhil.records import PARAMETERS, Estimate, Reason, Result
 
 CONDITION_LIMIT = 1e6
 RELATIVE_STD_LIMIT: Mapping[str, float] = {"R": 0.10, "L": 0.10, "K": 0.05, "Jt": 0.10, "ft": 0.5, "Cd": 0.5}
-# ft and Cd may be small in truth: their interval is measured against the friction torque there is
+FRICTION_SHARE = 0.25
 PHYSICAL: Mapping[str, tuple[float, float]] = {
     "R": (1e-3, 1e3),
     "L": (1e-6, 10.0),
@@ -36,8 +36,11 @@ def empty_estimate(method: str, result: Result, reason: Reason) -> Estimate:
     )
 
 
-def judge(estimate: Estimate, condition: float) -> Estimate:
-    """Return the estimate with its result set, and NaN with a reason where the data cannot tell a parameter."""
+def judge(estimate: Estimate, condition: float, top_rad_s: float) -> Estimate:
+    """Return the estimate with its result set, and NaN with a reason where the data cannot tell a parameter.
+
+    ``condition`` is that of the regressor with columns of equal length, ``top_rad_s`` the largest speed in the data.
+    """
     if not np.isfinite(condition) or condition > CONDITION_LIMIT:
         text = f"the regressor is rank deficient (condition number {condition:.1e})"
         reason = Reason("RankDeficient", text, "record a rapid with acceleration and cruise")
@@ -46,7 +49,7 @@ def judge(estimate: Estimate, condition: float) -> Estimate:
         return empty_estimate(
             estimate.method, Result.NOT_FINITE, Reason("NotFinite", "the fit is not finite", "record again")
         )
-    missing = _unknown(estimate)
+    missing = _unknown(estimate, top_rad_s)
     values, covariance = estimate.values.copy(), estimate.covariance.copy()
     for name in missing:
         k = estimate.names.index(name)
@@ -55,14 +58,18 @@ def judge(estimate: Estimate, condition: float) -> Estimate:
     return replace(estimate, values=values, covariance=covariance, missing=missing, result=result)
 
 
-def _unknown(estimate: Estimate) -> dict[str, Reason]:
+def _unknown(estimate: Estimate, top_rad_s: float) -> dict[str, Reason]:
     """Return the parameters whose standard deviation is too large to publish them."""
     missing = {}
+    friction = abs(estimate.value("ft")) * top_rad_s + abs(estimate.value("Cd"))
+    # a friction coefficient may be nil: its interval is measured against the friction torque that there is
+    least = {"ft": FRICTION_SHARE * friction / max(top_rad_s, 1e-300), "Cd": FRICTION_SHARE * friction}
     for name, limit in RELATIVE_STD_LIMIT.items():
         value, std = estimate.value(name), estimate.std(name)
-        share = std / abs(value) if value else np.inf
+        size = max(abs(value), least.get(name, 0.0))
+        share = std / size if size else np.inf
         if share > limit:
-            text = f"the standard deviation of {name} is {100 * share:.0f} % of its value, limit {100 * limit:.0f} %"
+            text = f"the standard deviation of {name} is {100 * share:.0f} % of its size, limit {100 * limit:.0f} %"
             missing[name] = Reason("LowExcitation", text, "record rapids at other speeds and in both directions")
     return missing
 

@@ -23,6 +23,8 @@ from fdhil.identification.windows import carried
 from fdhil.records import PARAMETERS, Bool, Estimate, Float, Reason, Result, Window
 
 NAME = "least_squares"
+# of [L, R, K, Jt, ft, Cd]: what stencils and the voltage's course within a sample leave open, however low the noise
+OPEN_SHARE = np.array([1e-3, 5e-4, 5e-5, 3e-4, 0.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +128,7 @@ def fit_two_steps(
     gammas = residual_gammas(theta, impulse, slope, noise)
     covariance = two_step(electrical, mechanical, (residual_u, residual_t), gammas, [p[0].shape[0] for p in parts])
     bias = attenuation(electrical, mechanical, theta, impulse, slope, noise)
-    covariance += np.outer(bias, bias)
+    covariance += np.outer(bias, bias) + np.diag(np.square(OPEN_SHARE * theta))
     order = [1, 0, 2, 3, 4, 5]  # from L, R, K to R, L, K
     answer = Estimate(
         method=method,
@@ -136,7 +138,7 @@ def fit_two_steps(
         residuals={"electrical": residual_u, "mechanical": residual_t / first[2] if first[2] else residual_t},
         result=Result.OK,
     )
-    return judge(answer, max(condition_1, condition_2))
+    return judge(answer, max(condition_1, condition_2), float(np.abs(mechanical[:, 2]).max()))
 
 
 def _voltage_variance(residual_u: Float, theta: Float, impulse: Float, slope: Float, noise: Float) -> float:

@@ -231,4 +231,4 @@ def finish(result: Fit) -> Estimate:
         result=Result.OK if result.converged else Result.DIVERGED,
         delay_s=float(result.theta[6]) if 6 in result.free else None,
     )
-    return judge(answer, condition)
+    return judge(answer, condition, max(float(np.abs(m.speed).max()) for m in result.problem.motions))
