@@ -27,7 +27,7 @@ def interpret(program: Path, as_document: bool, max_blocks: int) -> None:
     from fdhil.program.interpreter import interpret as motions_of
     from fdhil.program.motions import as_json
 
-    motions = motions_of(program, Budget(max_blocks=max_blocks))
+    motions = motions_of(program, Budget.of_blocks(max_blocks))
     with tempfile.SpooledTemporaryFile(_SPOOL_CHARACTERS, mode="w+", encoding="utf-8") as spool:
         if as_document:
             spool.write('{"schema": "fdhil-interpret-1", "motions": [')

@@ -17,6 +17,7 @@ from fdhil.program.words import Block
 Vector = tuple[float, float]
 _TANGENT_RAD = 0.05  # flatter corners are passed as if the path were smooth
 _BACKWARDS_MM = 1e-6
+_WRAPPED_RAD = 0.3  # an arc that turns so much more than programmed was cut beyond its other end
 
 
 @dataclass(slots=True)
@@ -152,7 +153,7 @@ def _checked(piece: Piece, block: Block) -> Piece:
         gouges = forward < -_BACKWARDS_MM
     else:
         turned = _sweep(piece)
-        gouges = turned > piece.angle + 1e-6 and turned * piece.radius > _BACKWARDS_MM
+        gouges = turned > piece.angle + _WRAPPED_RAD and turned * piece.radius > _BACKWARDS_MM
     if gouges:
         raise ProgramError(block.line, "", "the tool would gouge beyond the inside corner; take a smaller one")
     return piece
@@ -189,7 +190,7 @@ def _crossing(before: Piece, piece: Piece, radius: float, side: int) -> Vector:
 def _turned_round(before: Piece, piece: Piece, point: Vector) -> bool:
     """Tell whether cutting two pieces at ``point`` would make an arc of them longer than programmed."""
     cut = (replace(before, end=point), replace(piece, start=point))
-    return any(part.centre is not None and _sweep(part) > part.angle + 1e-6 for part in cut)
+    return any(part.centre is not None and _sweep(part) > part.angle + _WRAPPED_RAD for part in cut)
 
 
 def _line_and_circle(point: Vector, way: Vector, arc: Piece) -> list[Vector]:

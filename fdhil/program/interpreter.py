@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from fdhil.errors import ProgramError
-from fdhil.program import arcs, canned, lathe, offsets, targets
+from fdhil.program import arcs, canned, curves, lathe, offsets, targets
 from fdhil.program.budget import Budget
 from fdhil.program.checks import CYCLES, check_readers, one_reader_of_axes
 from fdhil.program.commands import Command
@@ -67,8 +67,9 @@ class Interpreter:
         self._kept = KeptModes(modal, self._variables)
         self._flow = Flow(first, self._variables, budget, self._kept.returned)
         self._series = canned.Series()
+        self._spline = curves.Spline()
         self._known: dict[str, Command | Line] = {}
-        self._blocks = 0
+        self._blocks = self._idle = 0
         self._empty_so_far = True
         self._percent = False
         self._tool = False
@@ -92,10 +93,12 @@ class Interpreter:
                     continue
                 motion = self._simple(raw, line)
                 if motion is not None:
+                    self._idle = 0
                     yield motion
                     continue
                 self._line(raw, line)
                 if machine.out:
+                    self._idle = 0
                     ordered, machine.out = machine.out, []
                     yield from ordered
             machine.end_compensation()
@@ -108,6 +111,11 @@ class Interpreter:
         if self._blocks > self._budget.max_blocks:
             what = f"more than {self._budget.max_blocks} blocks were executed; is a loop endless?"
             raise ProgramError(line, "", what)
+        if self._flow.repeats:
+            self._idle += 1
+            if self._idle > self._budget.max_idle_blocks:
+                what = f"{self._idle} blocks were executed without a motion; is a loop endless?"
+                raise ProgramError(line, "", what)
 
     def _simple(self, raw: str, line: int) -> Motion | None:
         """Execute a block of G0, G1, X, Y, Z, F alone; None leaves it to the long way."""
@@ -279,6 +287,8 @@ class Interpreter:
         code = modal.motion
         if code not in CYCLES:
             self._series.began = None
+        if code not in curves.CODES:
+            self._spline.leaving = None
         if code == 0:
             machine.rapid_to(block, targets.target(modal, block))
         elif code == 10:
@@ -291,6 +301,10 @@ class Interpreter:
             self._probe(block)
         elif code in (330, 331):
             lathe.synchronised(machine, block)
+        elif code == 760:
+            lathe.threading(machine, block)
+        elif code in curves.CODES:
+            curves.spline(machine, block, self._spline)
         elif code != NO_MOTION:
             raise unknown(block, code)
         elif axis is not None and not axes_used:

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
 from fdhil.errors import ProgramError
 from fdhil.program.machine import Machine
+from fdhil.program.modal import Modal
 from fdhil.program.targets import axis_words, target
 from fdhil.program.words import Block
+
+_MAX_PASSES = 10_000
 
 
 def synchronised(machine: Machine, block: Block) -> None:
@@ -16,10 +23,118 @@ def synchronised(machine: Machine, block: Block) -> None:
         raise ProgramError(block.line, code, "wants axis words")
     if "k" not in block.words:
         raise ProgramError(block.line, code, "wants K, the distance per revolution")
-    if modal.spindle_turns == 0 or modal.spindle_rpm <= 0.0:
-        raise ProgramError(block.line, code, "wants a turning spindle; give S and M3 or M4 first")
     start = list(modal.position)
-    feed = abs(block.words["k"]) * modal.scale * modal.spindle_rpm
+    feed = _synchronous_feed(modal, block, abs(block.words["k"]) * modal.scale)
     machine.feed_at(block, target(modal, block), feed)
     if modal.motion == 331:
         machine.feed_at(block, start, feed * abs(block.words.get("i", 1.0)))
+
+
+def _synchronous_feed(modal: Modal, block: Block, pitch_mm: float) -> float:
+    if modal.spindle_turns == 0 or modal.spindle_rpm <= 0.0:
+        code = f"G{modal.motion / 10:g}"
+        raise ProgramError(block.line, code, "wants a turning spindle; give S and M3 or M4 first")
+    return pitch_mm * modal.spindle_rpm
+
+
+@dataclass(frozen=True, slots=True)
+class Thread:
+    """A thread in mm: ``offset`` from the drive line to its crest (negative outside), ``depth`` in all, of the first
+    pass ``first``, ``degression`` of the later ones, ``slide`` = tan of the compound's angle, ``taper`` lengths."""
+
+    feed: float
+    offset: float
+    first: float
+    depth: float
+    degression: float
+    slide: float
+    springs: int
+    taper: float
+    at_entry: bool
+    at_exit: bool
+
+    @property
+    def taper_feed(self) -> float:
+        """Feed along a taper, so that the pitch along Z stays what it is."""
+        return self.feed * math.hypot(self.depth, self.taper) / self.taper if self.taper else self.feed
+
+    def depths(self) -> Iterator[float]:
+        """Yield the depth of each pass, the full one ``springs`` times more."""
+        number, depth = 1, self.first
+        while depth < self.depth and number < _MAX_PASSES:
+            yield depth
+            number += 1
+            depth = self.first * number ** (1.0 / self.degression)
+        for _ in range(1 + self.springs):
+            yield self.depth
+
+
+def threading(machine: Machine, block: Block) -> None:
+    """G76: passes of growing depth from the drive line (X at the start) along Z, and a rapid to the end."""
+    modal = machine.modal
+    thread = _thread(modal, block)
+    if modal.plane != 1:
+        raise ProgramError(block.line, "G76", "works in the XZ plane; give G18 first")
+    end = target(modal, block)
+    start = list(modal.position)
+    for depth in thread.depths():
+        _cut(machine, block, thread, start, end[2], depth)
+    machine.rapid_to(block, end)
+
+
+def _cut(machine: Machine, block: Block, thread: Thread, start: list[float], end_z: float, depth: float) -> None:
+    outward = 1.0 if thread.offset > 0.0 else -1.0
+    along = 1.0 if end_z > start[2] else -1.0
+    clear = start[0] - outward * (thread.depth - depth)
+    crest, root = clear + thread.offset, clear + thread.offset + outward * thread.depth
+    first_z = start[2] + along * depth * thread.slide
+    last_z = end_z - along * (thread.depth - depth) * thread.slide
+
+    def at(x: float, z: float) -> list[float]:
+        return [x, start[1], z, *start[3:]]
+
+    machine.rapid_to(block, at(clear, first_z))
+    if thread.at_entry:
+        machine.feed_at(block, at(crest, first_z), thread.taper_feed)
+        machine.feed_at(block, at(root, first_z + along * thread.taper), thread.taper_feed)
+    else:
+        machine.rapid_to(block, at(root, first_z))
+    if thread.at_exit:
+        machine.feed_at(block, at(root, last_z - along * thread.taper), thread.feed)
+        machine.feed_at(block, at(crest, last_z), thread.taper_feed)
+    else:
+        machine.feed_at(block, at(root, last_z), thread.feed)
+    machine.rapid_to(block, at(clear, last_z))
+
+
+def _thread(modal: Modal, block: Block) -> Thread:
+    words = block.words
+    if not axis_words(block):
+        raise ProgramError(block.line, "G76", "wants Z, the thread's end")
+    for letter, meaning in (
+        ("p", "the pitch"),
+        ("i", "the thread's offset"),
+        ("j", "the first depth"),
+        ("k", "the depth"),
+    ):
+        if letter not in words:
+            raise ProgramError(block.line, "G76", f"wants {letter.upper()}, {meaning}")
+    if words["i"] == 0.0 or not 0.0 < words["j"] < words["k"]:
+        raise ProgramError(block.line, "G76", "wants I other than 0, J greater than 0 and K greater than J")
+    ends = round(words.get("l", 0.0))
+    degression, springs, angle = words.get("r", 1.0), words.get("h", 0.0), words.get("q", 0.0)
+    if not 0 <= ends <= 3 or degression <= 0.0 or not 0.0 <= springs <= _MAX_PASSES or not abs(angle) < 89.0:
+        raise ProgramError(block.line, "G76", "wants L from 0 to 3, R and H not negative, and Q below 89 degrees")
+    half = modal.scale * (0.5 if modal.diameter else 1.0)
+    return Thread(
+        feed=_synchronous_feed(modal, block, words["p"] * modal.scale),
+        offset=words["i"] * half,
+        first=words["j"] * half,
+        depth=words["k"] * half,
+        degression=degression,
+        slide=math.tan(math.radians(angle)),
+        springs=round(springs),
+        taper=words.get("e", 0.0) * modal.scale,
+        at_entry=ends in (1, 3),
+        at_exit=ends in (2, 3),
+    )

@@ -215,6 +215,17 @@ class Writer:
                 self.lines.append(pick.choice(["G4 P0.1", "F333", "M8"]))
         self.lines += ["G40", "G90", f"G1 {self.axes('XYZ', 2)}", "G17"]
 
+    def thread(self) -> None:
+        pick = self._random
+        self.lines += ["M3 S600 G18", f"G0 X{pick.randint(10, 30)} Z{pick.randint(-5, 5)}"]
+        first = round(pick.uniform(0.2, 0.5), 2)
+        self.lines.append(
+            f"G76 P1.5 Z{pick.randint(-40, 40)} I{pick.choice([-1, 1]) * round(pick.uniform(0.5, 2), 2)} J{first}"
+            f" K{round(first + pick.uniform(0.1, 2), 2)} R{pick.choice([1, 1.5, 2])} Q{pick.choice([0, 29.5])}"
+            f" H{pick.randint(0, 2)} E{round(pick.uniform(0.1, 2), 2)} L{pick.randint(0, 3)}"
+        )
+        self.lines += [f"G33 {self.axes('XZ')} K{round(pick.uniform(0.5, 3), 2)}", "G33.1 Z-20 K1.25", "G17 G80"]
+
     def kept(self) -> None:
         self.lines += [
             "M70",
@@ -231,6 +242,7 @@ GROUPS: dict[str, list[Callable[[Writer], None]]] = {
     "offsets": [Writer.straight, Writer.straight, Writer.offsets, Writer.offsets, Writer.modes],
     "cycles": [Writer.straight, Writer.cycle, Writer.cycle, Writer.offsets],
     "compensation": [Writer.straight, Writer.compensated],
+    "lathe": [Writer.straight, Writer.thread, Writer.modes],
     "flow": [Writer.straight, Writer.loop, Writer.subroutine, Writer.parameter, Writer.kept],
 }
 GROUPS["all"] = [step for group in list(GROUPS.values()) for step in group]

@@ -39,6 +39,7 @@ class _Canon:
     feed: float = 0.0
     per_revolution: bool = False
     rpm: float = 0.0
+    pitch: float = 0.0
     at: list[float] = field(default_factory=lambda: [0.0] * 3)
     motions: list[Motion] = field(default_factory=list)
 
@@ -48,6 +49,8 @@ class _Canon:
         return (x * c - y * s + self.g5x[0], x * s + y * c + self.g5x[1], z + self.g5x[2])
 
     def mm_min(self) -> float:
+        if self.pitch:
+            return self.pitch * self.rpm
         return self.feed * (self.rpm if self.per_revolution else 1.0)
 
     def straight(self, name: str, values: list[float]) -> None:
@@ -94,6 +97,10 @@ class _Canon:
             self.plane = text.removeprefix("CANON_PLANE_")
         elif name == "SET_FEED_RATE":
             self.feed = float(text) * self.scale
+        elif name == "START_SPEED_FEED_SYNC":
+            self.pitch = numbers()[0] * self.scale
+        elif name == "STOP_SPEED_FEED_SYNCH":
+            self.pitch = 0.0
         elif name == "SET_FEED_MODE":
             self.per_revolution = numbers()[1] == 1
         elif name == "SET_SPINDLE_SPEED":

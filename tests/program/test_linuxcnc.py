@@ -17,7 +17,10 @@ EXAMPLES = Path("/usr/share/linuxcnc/ncfiles")
 # what the examples do that fdhil does otherwise, and why
 OTHERWISE = {
     "cone.ngc": "W words: the reference has no such axis, fdhil reads and does not list them",
-    "threading.ngc": "G33: fdhil lists the feed that follows from pitch and spindle speed, the reference F",
+    "lathe_g70_71_demo.ngc": "G70 to G72 are not known to fdhil",
+    "lathe_g7x_face_boring.ngc": "G70 to G72 are not known to fdhil",
+    "lathe_g7x_quadrants.ngc": "G70 to G72 are not known to fdhil",
+    "systems.ngc": "splines: the reference does not tell their points",
     "smartprobe.ngc": "a loop that ends when a probe trips before its target; fdhil's never do",
     "x-trim.ngc": "a probe's end: fdhil's target, the reference 0.01 inch before it",
     "tool-length-probe.ngc": "a probe that begins where another ended",
