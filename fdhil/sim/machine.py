@@ -183,6 +183,7 @@ class Machine:
         """One SYNC for one axis; its sensor and slide-way go with it when the drive accepted the SYNC."""
         drive = unit.drive
         before = drive.tick
+        ended_v = drive.physics.voltage_mean_v  # of the period that this SYNC ends: no sensor knows it earlier
         frames = drive.receive(SYNC, data)
         if drive.tick == before:
             return frames
@@ -192,7 +193,7 @@ class Machine:
             if key[0] == unit.axis:
                 self._streams[key].step(key[1] in heard)
         celsius = unit.slide_way.step(drive.physics.speed_rad_s)
-        unit.sensor.feed(drive.ratings.sign * drive.physics.voltage_mean_v)
+        unit.sensor.feed(drive.ratings.sign * ended_v)
         if drive.tick % _THERMAL_CYCLES == 0:
             unit.warm(celsius)
         return frames
