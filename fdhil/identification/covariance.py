@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fdhil.identification.filtering import through
-from fdhil.records import Float
+from fdhil.records import Float, VoltageSampling
 
 
 def coloured_meat(blocks: Sequence[Float], gammas: Sequence[Sequence[Float]], lengths: Sequence[int]) -> Float:
@@ -66,6 +66,19 @@ def two_step(
     bread = _bread(phi_1, phi_2, mechanical[:, 0])
     covariance: Float = bread @ coloured_meat([phi_1, phi_2], scaled, lengths) @ bread.T
     return covariance
+
+
+def aliasing(sampling: VoltageSampling, dt_s: float) -> Float:
+    """Return the relative doubt (6,) of [R, L, K, Jt, ft, Cd] that instants of a switching drive's voltage leave.
+
+    Current regulators answer in less than a sample, so an instant taken in step with them is no mean: on the bench, L
+    is 26 to 30 % off, R 3 %, K and Jt 0.2 % at 1 ms, though the model follows the speed as well as ever.
+    """
+    doubt = np.zeros(6)
+    if sampling == "instant":
+        coarse = min(2.0, (dt_s / 1e-3) ** 2)
+        doubt[:4] = 0.025 * coarse, 0.2, 0.0015 * coarse, 0.0015 * coarse
+    return doubt
 
 
 def _bread(phi_1: Float, phi_2: Float, current: Float) -> Float:

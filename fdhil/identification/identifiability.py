@@ -10,7 +10,7 @@ import numpy as np
 from fdhil.records import PARAMETERS, Estimate, Reason, Result
 
 CONDITION_LIMIT = 1e6
-RELATIVE_STD_LIMIT: Mapping[str, float] = {"R": 0.10, "L": 0.10, "K": 0.05, "Jt": 0.10, "ft": 0.5, "Cd": 0.5}
+RELATIVE_STD_LIMIT: Mapping[str, float] = {"R": 0.10, "L": 0.25, "K": 0.05, "Jt": 0.10, "ft": 0.5, "Cd": 0.5}
 FRICTION_SHARE = 0.25
 PHYSICAL: Mapping[str, tuple[float, float]] = {
     "R": (1e-3, 1e3),

@@ -10,9 +10,11 @@ import pytest
 from fdhil import tables
 from fdhil.config import Identification
 from fdhil.identification.estimators import Estimator, chosen
+from fdhil.identification.windows import find_windows
 from fdhil.records import PARAMETERS, Estimate, Float, Result, Window, frozen
+from fdhil.store.recording_csv import parse_recording
 from studies import bench
-from tests.identification.recorded import windows
+from tests.identification.recorded import signals, windows
 
 SETTINGS = Identification()
 TRUTH = np.array([bench.Plant().truth()[name] for name in PARAMETERS])
@@ -106,6 +108,15 @@ def test_lost_rows_are_left_out(name: str) -> None:
         lost[field] = frozen(values)
     holed = Window(**{f: getattr(window, f) for f in window.__slots__} | lost | {"gaps": ((400, 403),)})
     assert (_errors_percent(_estimator(name)([holed], SETTINGS)) < REACH[name]).all()
+
+
+def test_instants_of_a_switching_voltage_are_honest(name: str) -> None:
+    clean = signals()
+    sampled = replace(clean, voltage=clean.voltage_instant)
+    found = find_windows(parse_recording(bench.as_csv(sampled, 0.003, 1, voltage_sampling="instant")))
+    estimate = _estimator(name)(found, SETTINGS)
+    apart = np.abs(estimate.values - TRUTH) / np.sqrt(np.diag(estimate.covariance))
+    assert (apart < 3.0).all()
 
 
 def test_nothing_to_fit_is_told(name: str) -> None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdhil.config import Identification
-from fdhil.identification.covariance import attenuation, residual_gammas, two_step
+from fdhil.identification.covariance import aliasing, attenuation, residual_gammas, two_step
 from fdhil.identification.derivatives import OPERATORS, ZERO_FORCING_1, Operator, derivative
 from fdhil.identification.filtering import all_about, impulse_response, reach, zero_phase
 from fdhil.identification.identifiability import empty_estimate, judge
@@ -96,7 +96,7 @@ def estimate_with(windows: Sequence[Window], settings: Identification, operator:
     noise = np.mean([noise_levels(w).vector() ** 2 for w in windows], axis=0)
     impulse = impulse_response(settings.lowpass_hz, windows[0].dt_s)
     slope = np.nan_to_num(derivative(impulse, windows[0].dt_s, OPERATORS[operator]))
-    return fit_two_steps(NAME, parts, noise, impulse, slope)
+    return fit_two_steps(NAME, parts, noise, impulse, slope, aliasing(windows[0].voltage_sampling, windows[0].dt_s))
 
 
 def too_short(method: str, rows: int) -> Estimate:
@@ -107,12 +107,12 @@ def too_short(method: str, rows: int) -> Estimate:
 
 
 def fit_two_steps(
-    method: str, parts: Sequence[tuple[Float, Float]], noise: Float, impulse: Float, slope: Float
+    method: str, parts: Sequence[tuple[Float, Float]], noise: Float, impulse: Float, slope: Float, alias: Float
 ) -> Estimate:
     """Fit [5], then [6] with its K, to rows (m, 4) of [u, Di, i, w] and of [i, Dw, w, sign w] per window.
 
     ``noise`` (3,) are the variances of voltage, current and speed; ``impulse`` and ``slope`` are the weights with which
-    a noisy sample enters a signal and its derivative.
+    a noisy sample enters a signal and its derivative; ``alias`` (6,) is what the voltage's sampling leaves in doubt.
     """
     electrical, mechanical = (np.vstack([p[k] for p in parts]) for k in (0, 1))
     if not (np.isfinite(electrical).all() and np.isfinite(mechanical).all()):
@@ -134,7 +134,7 @@ def fit_two_steps(
         method=method,
         names=PARAMETERS,
         values=theta[order],
-        covariance=covariance[np.ix_(order, order)],
+        covariance=covariance[np.ix_(order, order)] + np.diag(np.square(alias * theta[order])),
         residuals={"electrical": residual_u, "mechanical": residual_t / first[2] if first[2] else residual_t},
         result=Result.OK,
     )

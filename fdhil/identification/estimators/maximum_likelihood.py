@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdhil.config import Identification
+from fdhil.identification.covariance import aliasing
 from fdhil.identification.delay import coarse_delay
 from fdhil.identification.estimators import least_squares
 from fdhil.identification.estimators.least_squares import Signals
@@ -168,9 +169,9 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
     if start is None:
         return None
     motions = [prepare(w) for w in usable]
-    if any(w.voltage_delay_s is not None for w in usable):
-        return _fit_separate(motions, start)
     delays = [coarse_delay(s, w.dt_s) for s, w in zip(signals, usable, strict=True)]
+    if any(w.voltage_delay_s is not None for w in usable):
+        return _fit_separate(motions, start, delays)
     start[6] = float(np.median(delays))
     if start[6] != 0.0:
         return fit(motions, start, range(7))
@@ -181,15 +182,16 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
     return fit(motions, np.append(plain.theta[:6], delay), range(7))
 
 
-def _fit_separate(motions: Sequence[Motion], start: Float) -> Fit:
+def _fit_separate(motions: Sequence[Motion], start: Float, delays: Sequence[float]) -> Fit:
     """Fit windows whose voltage comes from a sensor with a clock of its own: each window has its own delay.
 
     The delay left after alignment by counters is known to a fraction of a sample only, so it is fitted in every
-    window, taken out, and what remains is fitted once more with the parameters, whose intervals then contain it.
+    window from its coarse value on (the counters may be a whole sample off), taken out, and what remains is fitted once
+    more with the parameters, whose intervals then contain it.
     """
+    alone = [fit([m], np.append(start[:6], delay), range(7)) for m, delay in zip(motions, delays, strict=True)]
     if len(motions) == 1:
-        return fit(motions, start, range(7))
-    alone = [fit([m], start, range(7)) for m in motions]
+        return alone[0]
     aligned = [
         replace(m, voltage_mean=m.delayed(f.theta[6]) if f.converged else m.voltage_mean)
         for m, f in zip(motions, alone, strict=True)
@@ -222,11 +224,13 @@ def finish(result: Fit) -> Estimate:
     k = len(PARAMETERS)
     # what noise cannot explain: an interval mean leaves the voltage's course within the sample open
     doubt = (inverse @ (result.jacobian.T @ result.problem.shape_effect(result.theta)))[:k]
+    first = result.problem.motions[0]
+    alias = aliasing(first.voltage_sampling, first.dt_s)
     answer = Estimate(
         method=NAME,
         names=PARAMETERS,
         values=result.theta[:k],
-        covariance=inverse[:k, :k] + np.outer(doubt, doubt),
+        covariance=inverse[:k, :k] + np.outer(doubt, doubt) + np.diag(np.square(alias * result.theta[:k])),
         residuals={"electrical": result.residuals[0::2], "mechanical": result.residuals[1::2]},
         result=Result.OK if result.converged else Result.DIVERGED,
         delay_s=float(result.theta[6]) if 6 in result.free else None,

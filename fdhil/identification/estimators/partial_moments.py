@@ -15,6 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fdhil.config import Identification
+from fdhil.identification.covariance import aliasing
 from fdhil.identification.estimators.least_squares import fit_two_steps, too_short
 from fdhil.identification.motion import noise_levels, surely_moving
 from fdhil.identification.windows import carried
@@ -32,7 +33,8 @@ def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
         return too_short(NAME, sum(p[0].shape[0] for p in parts))
     noise = np.mean([noise_levels(w).vector() ** 2 for w in usable], axis=0)
     moment, slope = kernels(_steps(settings, usable[0].dt_s), usable[0].dt_s)
-    return fit_two_steps(NAME, [p for p in parts if p[0].shape[0]], noise, moment, slope)
+    alias = aliasing(usable[0].voltage_sampling, usable[0].dt_s)
+    return fit_two_steps(NAME, [p for p in parts if p[0].shape[0]], noise, moment, slope, alias)
 
 
 def _steps(settings: Identification, dt_s: float) -> int:
