@@ -58,6 +58,15 @@ class Nominal(Section):
     Cd: NotNegative = Field(description="dry friction torque, N.m")
 
 
+_CASCADE_ONLY = (
+    "position_ki_per_s2",
+    "speed_kd",
+    "acceleration_feedforward",
+    "setpoint_filter_s",
+    "current_delay_cycles",
+)
+
+
 class Regulators(Section):
     """[axis.X.regulators]: the drive's nested loops."""
 
@@ -74,11 +83,25 @@ class Regulators(Section):
     current_ki: NotNegative = Field(description="integral gain of the current loop, V/(A.s)")
     current_period_s: Positive = Field(3.125e-5, description="cycle of the current loop")
     voltage_limit_v: Positive = Field(description="limit of the current loop's output")
+    position_ki_per_s2: NotNegative = Field(0.0, description="cascade: integral gain of the position loop (double PI)")
+    speed_kd: NotNegative = Field(0.0, description="cascade: derivative gain of the speed loop (PID), A.s2/rad")
+    acceleration_feedforward: Annotated[float, Field(ge=0, le=1.5)] = Field(
+        0.0, description="cascade: share of the nominal inertia's current fed forward"
+    )
+    setpoint_filter_s: NotNegative = Field(0.0, description="cascade: time constant of a filter on set-point and speed")
+    current_delay_cycles: int = Field(0, ge=0, le=4, description="cascade: cycles until a computed voltage acts")
 
     @field_validator("structure")
     @classmethod
     def _known(cls, name: str) -> str:
         return _listed(name, tables.REGULATORS)
+
+    @model_validator(mode="after")
+    def _plain(self) -> Regulators:
+        used = [key for key in _CASCADE_ONLY if getattr(self, key)]
+        if self.structure == "p_pi_pi" and used:
+            raise ValueError(f"structure p_pi_pi has no {used[0]}; set structure = 'cascade'")
+        return self
 
 
 class CorrectionLimits(Section):

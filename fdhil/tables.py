@@ -21,6 +21,7 @@ CORRECTIONS: Mapping[str, str] = {
 }
 REGULATORS: Mapping[str, str] = {
     "p_pi_pi": "fdhil.model.p_pi_pi:simulate",
+    "cascade": "fdhil.model.cascade:simulate",
 }
 VOLTAGE_SOURCES: Mapping[str, str] = {
     "drive": "fdhil.drivers.cia402_drive:VoltageObject",

@@ -204,15 +204,13 @@ def _stuck(loop: AxisLoop, response: Response, target_mm: Float, first: int) -> 
 
 def _hold(loop: AxisLoop, reference_mm: Float, offset: Float, state: State, row: int, stop: int) -> None:
     """Write the offset of a rest from ``row`` + 2 on, and fade what differs from the guess behind it."""
-    from fdhil.model.p_pi_pi import rest_loop
-
-    if stop - row < 3:
+    gains = closed_loop.rest_loop(loop.axis, loop.sync_period_s, loop.increment_mm)
+    if stop - row < 3 or gains is None:  # the rest is left to the drive: nothing is learnt from it
         return
     n = offset.size
     planned_end = offset[stop - 1]
     increment = loop.increment_mm
     hold = float(state[2] - reference_mm[row]) / increment
-    gains = rest_loop(loop.axis, loop.sync_period_s, increment)
     integral = float(state[3])
     error = gains[0] * (offset[row] - hold) + gains[1] * (offset[row + 1] - offset[row])
     band = BAND * loop.parameters.Cd / loop.parameters.K

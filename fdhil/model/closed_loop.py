@@ -2,8 +2,8 @@
 
 During cycle k the drive interpolates its set-point linearly from r[k] to r[k+1], and the speed that is fed forward from
 (r[k+1]-r[k])/T to (r[k+2]-r[k+1])/T. Beyond its end the reference is held. An offset is added to the reference before
-interpolation. Encoder and set-points are not quantised: the drive's rounding has no mean and averages to less than a
-tenth of an increment within the position loop.
+interpolation. Encoder and set-points are not quantised: against a drive with 65536 increments per revolution that costs
+0.02 to 0.07 um RMS on the bench path, at most half an increment where dry friction keeps what rounding left.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib import import_module
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +24,7 @@ from fdhil.records import Float, Parameters
 
 State = npt.NDArray[np.float64]
 
-STATES = 12  # of any structure; current, speed and position come first
+STATES = 16  # of any structure; current, speed and position come first
 _EMPTY = np.empty(0)
 
 
@@ -129,6 +130,25 @@ def start(position_mm: float) -> State:
     state = np.zeros(STATES)
     state[kernels.POSITION] = position_mm
     return state
+
+
+@lru_cache(maxsize=16)
+def _resting(name: str) -> Callable[[Axis, float, float], tuple[float, float, float, float] | None] | None:
+    module = import_module(tables.REGULATORS[name].partition(":")[0])
+    found: Callable[[Axis, float, float], tuple[float, float, float, float] | None] | None = getattr(
+        module, "rest_loop", None
+    )
+    return found
+
+
+def rest_loop(axis: Axis, sync_period_s: float, increment_mm: float) -> tuple[float, float, float, float] | None:
+    """Return what an offset does to the speed loop of a table at rest, None where the structure cannot tell.
+
+    Speed error per increment of offset and per increment a cycle of its rate (rad/s), kp, and ki times the period; the
+    state's fourth place is the speed loop's integral.
+    """
+    tell = _resting(axis.regulators.structure)
+    return None if tell is None else tell(axis, sync_period_s, increment_mm)
 
 
 def simulate_axes(

@@ -117,3 +117,96 @@ def _p_pi_pi_plain(
 
 
 p_pi_pi: Callable[..., Float] = njit(cache=True, nogil=True)(_p_pi_pi_plain)
+
+
+# places in the cascade's state behind those of p_pi_pi
+POSITION_INTEGRAL, SPEED_ERROR, FILTER_LAG, FILTERED_SPEED, WAITING = 6, 7, 8, 9, 10
+
+
+def _cascade_plain(
+    reference: Float,
+    speed_offset: Float,
+    current_offset: Float,
+    first: int,
+    rows: int,
+    plant: Float,
+    gains: Float,
+    extra: Float,
+    n_speed: int,
+    n_current: int,
+    state: Float,
+) -> Float:
+    """Run SYNC cycles as :func:`p_pi_pi` does, with the options of ``extra`` (6,); return (rows, 3 + state.size).
+
+    ``extra``: position ki h, speed kd / h, A per rad/s2 of the demand's acceleration, decay of the set-point filter in
+    a speed cycle (0: none), computing delay in current cycles, rad per mm. The voltages that wait end the state.
+    """
+    last = reference.size - 1
+    out = np.empty((rows, 3 + state.size))
+    dry, delay = plant[15], int(extra[4])
+    decay, period = extra[3], gains[8]
+    for row in range(rows):
+        k = first + row
+        r0, r1, r2 = reference[min(k, last)], reference[min(k + 1, last)], reference[min(k + 2, last)]
+        rise = r1 - r0
+        slope = rise / period
+        bend = (r2 - r1) / period - slope
+        feed = extra[2] * extra[5] * bend / period
+        peak_current, peak_voltage, limited = 0.0, 0.0, 0
+        out[row, 3:] = state
+        for m in range(n_speed):
+            part = m / n_speed
+            state[9] = decay * state[9] + (1.0 - decay) * (slope + bend * part)
+            lag = r0 + rise * part - state[8] - state[2]
+            state[8] = (state[8] + rise / n_speed) * decay
+            place = state[6] + extra[0] * lag
+            demand = gains[0] * lag + place + gains[1] * state[9]
+            if speed_offset.size > 0:
+                v0 = speed_offset[min(k, last)]
+                demand += v0 + (speed_offset[min(k + 1, last)] - v0) * part
+            error = demand - state[1]
+            candidate = state[3] + gains[3] * error
+            raw = gains[2] * error + candidate + extra[1] * (error - state[7]) + feed
+            if current_offset.size > 0:
+                c0 = current_offset[min(k, last)]
+                raw += c0 + (current_offset[min(k + 1, last)] - c0) * part
+            state[7] = error
+            peak_current = max(peak_current, abs(raw))
+            demand_a = min(max(raw, -gains[4]), gains[4])
+            current_limited = demand_a != raw
+            if not current_limited:  # all integrals stand while the limit acts
+                state[3] = candidate
+                state[6] = place
+            for _ in range(n_current):
+                error = demand_a - state[0]
+                candidate = state[4] + gains[6] * error
+                raw = gains[5] * error + candidate
+                u = min(max(raw, -gains[7]), gains[7])
+                peak_voltage = max(peak_voltage, abs(raw))
+                if u == raw:
+                    state[4] = candidate
+                if u != raw or current_limited:
+                    limited += 1
+                for d in range(delay):
+                    waiting = state[WAITING + d]
+                    state[WAITING + d] = u
+                    u = waiting
+                i, w = state[0], state[1]
+                torque = plant[14] * i
+                if w == 0.0 and abs(torque) <= dry:
+                    state[0] = plant[12] * i + plant[13] * u
+                    continue
+                friction = -dry if w > 0.0 or (w == 0.0 and torque > 0.0) else dry
+                w_next = plant[2] * i + plant[3] * w + plant[7] * u + plant[10] * friction
+                state[0] = plant[0] * i + plant[1] * w + plant[6] * u + plant[9] * friction
+                if w_next * friction > 0.0:
+                    state[1] = 0.0
+                    state[2] += gains[9] * w
+                else:
+                    state[1] = w_next
+                    state[2] += plant[4] * i + plant[5] * w + plant[8] * u + plant[11] * friction
+        out[row, 0], out[row, 1], out[row, 2] = limited, peak_current, peak_voltage
+    return out
+
+
+cascade: Callable[..., Float] = njit(cache=True, nogil=True)(_cascade_plain)

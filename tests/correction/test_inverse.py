@@ -167,3 +167,12 @@ def test_narrow_limits_are_kept() -> None:
         limits = Limits.of(config.axis[axis], 0.001)
         assert check(np.rint(offset / limits.um_per_increment).astype(np.int64), limits) == []
     assert rms(correction.before.contour_um) > 4 * rms(correction.after.contour_um)
+
+
+@pytest.mark.parametrize("rows", [2, 3, 4, 40, 1999, 2000, 2001, 2500, 2501, 2502])
+def test_any_length_of_path(rows: int) -> None:
+    """A path that ends anywhere, in or at the edge of a block, has an offset for each row, within the limits."""
+    reference = trajectory(bench_demand(10)[300 : 300 + rows])
+    correction = plan(reference, MODELS, CONFIG, "inverse")
+    assert all(offset.size == rows for offset in correction.offset_um.values())
+    assert_within_limits(correction)
