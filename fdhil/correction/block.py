@@ -21,8 +21,8 @@ from fdhil.model.closed_loop import Response, State
 from fdhil.records import Bool, Float, Parameters
 
 ITERATIONS = 6
-GOOD_ENOUGH_UM = 0.07  # RMS: a quarter of an increment
-LEAST_PROGRESS = 0.8  # an iteration that leaves more than this of the best was one too many; two of them end it
+GOOD_ENOUGH_UM = 0.1  # RMS: a third of an increment
+LEAST_PROGRESS = 0.75  # what an iteration may leave of the best so far; two that leave more end it
 STILL_MM_S = 1e-3
 SHORTEST_REST_S = 0.03
 LEAD_S = 0.02  # before an axis starts again the offset is free
@@ -171,7 +171,8 @@ def _run(
         held[row:stop] = True
         gone = np.maximum(0.0, 1 - np.arange(stop - row) * loop.sync_period_s / FORGET_S)
         error_of_rest[row:stop] = (target_mm[row] - position[row]) * gone
-    position[done:] = _simulate(loop, reference_mm, offset, state, done, guess.size).position_mm
+    if done < guess.size:
+        position[done:] = _simulate(loop, reference_mm, offset, state, done, guess.size).position_mm
     if held.any() and check(offset[2:].astype(np.int64), loop.limits, before):
         offset[2:] = np.rint(fit(offset[2:], loop.limits, before))
         position = _simulate(loop, reference_mm, offset, carry.state, 0, guess.size).position_mm
@@ -179,15 +180,11 @@ def _run(
 
 
 def _simulate(loop: AxisLoop, reference_mm: Float, offset: Float, state: State, first: int, stop: int) -> Response:
+    # a cycle looks two rows ahead and no further
+    ahead = min(stop + 2, reference_mm.size)
+    commanded = reference_mm[first:ahead] + offset[first:ahead] * loop.increment_mm
     return closed_loop.simulate(
-        loop.parameters,
-        loop.axis,
-        loop.sync_period_s,
-        reference_mm,
-        offset * loop.increment_mm,
-        state=state,
-        first=first,
-        rows=stop - first,
+        loop.parameters, loop.axis, loop.sync_period_s, commanded, state=state, rows=stop - first
     )
 
 

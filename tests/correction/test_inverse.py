@@ -176,3 +176,15 @@ def test_any_length_of_path(rows: int) -> None:
     correction = plan(reference, MODELS, CONFIG, "inverse")
     assert all(offset.size == rows for offset in correction.offset_um.values())
     assert_within_limits(correction)
+
+
+@pytest.mark.parametrize("rest_s", [0.5, 2.0, 4.5])
+def test_a_rest_across_blocks(rest_s: float) -> None:
+    """An axis may stand still where one block ends and the next begins, or through a whole block."""
+    demand = bench_demand(10)[:1000]
+    pause = np.repeat(demand[-1:], round(rest_s / 0.001), axis=0)
+    there = smooth(np.concatenate([demand, pause, demand[::-1], np.repeat(demand[:1], 200, axis=0)]), (0.06,), 0.001)
+    correction = plan(trajectory(there), MODELS, CONFIG, "inverse")
+    assert correction.refused == ()
+    assert_within_limits(correction)
+    assert rms(correction.before.contour_um) > 30 * rms(correction.after.contour_um)
