@@ -122,14 +122,21 @@ def _structure(fit: Fit) -> list[Reason]:
 
 
 def simulated_fit_percent(window: Window, estimate: Estimate) -> float | None:
-    """Return 100 (1 - |w - what| / |w - mean w|) of the speed simulated from voltage; None without a model."""
+    """Return 100 (1 - |w - what| / |w - mean w|) of the speed simulated from voltage; None without a model.
+
+    A delay of the voltage that the estimate found, and that is no more than a sample, is taken out first.
+    """
     p = estimate.parameters()
     values = np.array(list(p.as_dict().values()))
     if window.voltage_v is None or not np.isfinite(values).all() or not (values[:4] > 0).all():
         return None
     p = replace(p, ft=max(p.ft, 0.0), Cd=max(p.Cd, 0.0))
     known = np.isfinite(window.speed_rad_s)
-    _, speed = simulate_plant(p, carried(window.voltage_v), window.dt_s, window.voltage_sampling)
+    voltage = carried(window.voltage_v)
+    if estimate.delay_s and abs(estimate.delay_s) <= window.dt_s:
+        row = np.arange(voltage.size)
+        voltage = np.interp(row + estimate.delay_s / window.dt_s, row, voltage)
+    _, speed = simulate_plant(p, voltage, window.dt_s, window.voltage_sampling)
     measured = window.speed_rad_s[known]
     spread = float(np.linalg.norm(measured - measured.mean()))
     if spread == 0.0 or not np.isfinite(speed).all():

@@ -1,0 +1,53 @@
+"""Drives that do not tell their voltage: it comes from Modbus sensors.
+
+How well the sensor's counter can be tied to the SYNC depends on the host that stamps both. What must hold on any host:
+a voltage that is off by more than a sample is refused for its timing, and what is accepted is right.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil.pipeline import AxisPipeline
+from fdhil.records import VoltageSamples, WindowOutcome
+from tests.integration.conftest import Bench
+from tests.integration.test_loop import TRUE, recorded, shuttle
+
+pytestmark = pytest.mark.timeout(240)
+
+
+@pytest.fixture
+def sections() -> dict[str, Any]:
+    """A sensor answers in wall time, so the machine runs in it too."""
+    return {"sim": {"pace": "realtime", "modbus": True}}
+
+
+@pytest.fixture
+def bench(bench: Bench) -> Bench:
+    """The drivers are told to take the voltage from the sensors."""
+    for axis, settings in bench.config.axis.items():
+        voltage = settings.voltage.model_copy(update={"source": "modbus"})
+        bench.config.axis[axis].__dict__["voltage"] = voltage
+    return bench
+
+
+def test_what_is_accepted_is_right(bench: Bench, tmp_path: Path) -> None:
+    records, counters = asyncio.run(recorded(bench, shuttle(tmp_path)))
+    assert counters["lost"] == 0
+    assert any(isinstance(r, VoltageSamples) for r in records)
+    for axis in bench.config.axis:
+        pipeline = AxisPipeline(axis, bench.config)
+        outcomes = [o for r in records if getattr(r, "axis", axis) == axis for o in pipeline.feed(r)]
+        windows = [o for o in outcomes if isinstance(o, WindowOutcome)]
+        assert len(windows) == 4
+        refused = [reason.code for o in windows for reason in o.verdict.reasons]
+        assert set(refused) <= {"SampleTiming"}
+        for accepted in (o.estimate for o in windows if o.verdict.accepted):
+            assert accepted is not None
+            for name, true in TRUE.items():
+                within = 0.01 if name not in ("ft", "Cd") else 0.05
+                assert accepted.value(name) == pytest.approx(true, rel=within), name
