@@ -41,9 +41,7 @@ RING_S = 30.0  # a rapid that is longer than this is cut short, and then refused
 LEAD_S = 0.25  # standstill wanted before a rapid
 SETTLE_S = 0.30  # after the demand has ended: the shaft comes to rest, and stays there for the window's margin
 VOLTAGE_PATIENCE_S = 1.0  # how much later than the drive's samples a separate sensor may deliver
-POOL_WINDOWS = (
-    6  # both directions, several speeds: enough to tell viscous from dry friction, few enough to follow drift
-)
+POOL_WINDOWS = 4  # both directions twice: enough to tell viscous from dry friction, few enough to follow drift
 
 JUMPS = {"LoadChanged", "ParameterJump"}
 
@@ -242,10 +240,10 @@ class AxisPipeline:
 
     def _publish(self, newest: Window) -> list[Outcome]:
         """Publish what the pool says; windows that no longer agree with the newest leave it, the oldest first."""
-        estimate, verdict = validation.pool(tuple(self._pool), self._settings)
+        estimate, verdict = validation.pool(tuple(self._pool), self._settings, refit=False)
         while not verdict.accepted and len(self._pool) > 1:
             self._pool.popleft()
-            estimate, verdict = validation.pool(tuple(self._pool), self._settings)
+            estimate, verdict = validation.pool(tuple(self._pool), self._settings, refit=False)
         if estimate is None or not verdict.accepted:
             text = (
                 "the newest window is not believed as a pool of its own (" + _listed(verdict) + "), the older set stays"

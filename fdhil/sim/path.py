@@ -10,6 +10,8 @@ import numpy as np
 
 from fdhil.records import Bool, Float
 
+NEGLIGIBLE_MM = 1e-9  # far below an increment of any drive
+
 
 def rapid_rows(
     start_mm: Sequence[float],
@@ -26,9 +28,9 @@ def rapid_rows(
     """
     start, end = np.asarray(start_mm, dtype=float), np.asarray(end_mm, dtype=float)
     way = np.abs(end - start)
-    if not np.any(way > 0):
+    moving = way > NEGLIGIBLE_MM
+    if not moving.any():
         return np.empty((0, start.size))
-    moving = way > 0
     speed = float(np.min(np.asarray(speed_mm_s)[moving] / way[moving]))  # parts of the way per second
     acceleration = float(np.min(np.asarray(acceleration_mm_s2)[moving] / way[moving]))
     speed = min(speed, math.sqrt(acceleration))  # a way too short for the rapid speed: a triangle

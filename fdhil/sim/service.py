@@ -53,9 +53,14 @@ class Pace:
         return self._next_s if idle or not self._lockstep else 0.0
 
     def sent(self, now_s: float) -> None:
-        """A SYNC went out: the next one is a period later on the grid, unless the host is late."""
+        """A SYNC went out: the next one is a period later on the grid, unless the host is late.
+
+        In lockstep there is no grid: a machine that ran ahead of the clock must not stand still until the clock has
+        caught up.
+        """
         self._last_s = now_s
-        self._next_s = max(self._next_s + self._period_s, now_s + _MIN_SPACING * self._period_s)
+        on_grid = now_s if self._lockstep else self._next_s
+        self._next_s = max(on_grid + self._period_s, now_s + _MIN_SPACING * self._period_s)
 
 
 class SimService:

@@ -364,6 +364,13 @@ def test_lockstep_runs_when_everything_is_there_and_waits_half_a_second() -> Non
     assert pace.due_s(waits=False, idle=True) == pytest.approx(10.001, abs=3e-4)
 
 
+def test_a_lockstep_machine_that_ran_ahead_of_the_clock_does_not_stand_still_afterwards() -> None:
+    pace = Pace(0.001, lockstep=True)
+    for k in range(5000):  # five seconds of motion in one of wall time
+        pace.sent(10.0 + k * 0.0002)
+    assert pace.due_s(waits=False, idle=True) == pytest.approx(11.001, abs=3e-4)
+
+
 def test_a_played_file_leaves_axes_alone_that_it_does_not_name() -> None:
     twin = TwinInHand(twin_config(sim={"axis": {"Y": {"start_mm": 5.0}}}))
     twin.switch_on()

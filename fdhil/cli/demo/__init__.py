@@ -92,7 +92,6 @@ def _tables(loop: Loop, report: Path) -> None:
         for row in rows:
             table.add_row(*row)
         console.print(table)
-    before, after = loop.cuts[0], loop.cuts[1]
-    console.print(
-        f"The corrected path is [bold]{before.rms_um / after.rms_um:.1f} times[/] nearer (RMS). Report: {report}"
-    )
+    before, mirror, after = loop.cuts[:3]
+    gains = f"mirror {before.rms_um / mirror.rms_um:.1f}, inverse {before.rms_um / after.rms_um:.1f}"
+    console.print(f"RMS contour error smaller by a factor of: [bold]{gains}[/]. Report: {report}")

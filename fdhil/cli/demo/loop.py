@@ -36,6 +36,7 @@ PROGRAMS: Mapping[str, str] = {
     "rounded": "bench_rounded_10m.ngc",
     "shuttle": "shuttle.ngc",
 }
+RAPIDS = 4  # of each axis in the shuttle
 WARM_C = (20.5, 21.0, 21.5, 22.0)
 READY_S = 120.0  # the kernels are compiled on the very first run
 
@@ -176,9 +177,9 @@ def _truth(config: MachineConfig) -> dict[str, Parameters]:
 
 def _shuttle(stage: Stage, published: dict[str, list[Published]]) -> dict[str, tuple[Window, float | None]]:
     """Play the shuttle, wait until both axes publish, and return the last accepted window of each with its fit."""
-    before = _revisions(stage)
+    before = _analysed(stage)
     stage.twin.play(stage.programs["shuttle"])
-    _await(lambda: _settled(stage, before), 30.0, "no validated parameters came from the shuttle", stage)
+    _await(lambda: _settled(stage, before), 60.0, "the rapids of the shuttle were not analysed", stage)
     newest: dict[str, tuple[Window, float | None]] = {}
     with History.read(stage.config.store.directory) as history:
         for axis in stage.config.axis:
@@ -191,18 +192,14 @@ def _shuttle(stage: Stage, published: dict[str, list[Published]]) -> dict[str, t
     return newest
 
 
-def _revisions(stage: Stage) -> dict[str, int]:
-    try:
-        with History.read(stage.config.store.directory) as history:
-            return {axis: len(history.revisions(axis)) for axis in stage.config.axis}
-    except FdhilError:
-        return dict.fromkeys(stage.config.axis, 0)
+def _analysed(stage: Stage) -> dict[str, int]:
+    axes = stage.ask("status")["axes"]
+    return {axis: told["accepted"] + told["refused"] for axis, told in axes.items()}
 
 
 def _settled(stage: Stage, before: Mapping[str, int]) -> bool:
-    """Each rapid of the shuttle was analysed: two per axis and pass, so that many revisions came."""
-    now = _revisions(stage)
-    return all(now[axis] >= before[axis] + 2 for axis in stage.config.axis)
+    """Whether every rapid of the shuttle has been analysed on every axis."""
+    return all(now >= before[axis] + RAPIDS for axis, now in _analysed(stage).items())
 
 
 def _cut(stage: Stage, label: str, celsius: float, method: str | None = None) -> None:
@@ -212,6 +209,11 @@ def _cut(stage: Stage, label: str, celsius: float, method: str | None = None) ->
         stage.ask("arm", program=str(program), method=method, token=_token(stage))
     trace = stage.out / f"cut-{len(stage.cuts) + 1}.csv"
     finished = stage.twin.play(program, trace)
+    if method:
+        _await(lambda: stage.ask("status")["state"] == "OFF", 30.0, "the guard did not come to rest", stage)
+        cause = stage.ask("status")["guard"]["cause"]
+        if cause["code"] != "Finished":
+            raise FdhilError(f"the guard ended the correction: {cause['code']}: {cause['text']}; {cause['advice']}")
     reference, table = read_trace(trace, tuple(stage.config.axis))
     contour = contour_error_um(reference, table, stage.config.machine.sync_period_s)
     late = sum(int(n) for n in finished["late_rpdo"].values())
