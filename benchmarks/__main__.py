@@ -15,6 +15,7 @@ ROOT = Path(__file__).resolve().parent.parent
 BENCHMARKS = {
     "closed_loop": "The closed-loop kernel against the same kernel in C -O3, and against real time",
     "identification": "From the last sample of a rapid to validated parameters",
+    "inverse": "Planning the inverse correction: the whole, and the first block of a stream",
     "acquisition": "A full 1 Mbit/s bus through receive and decode, alone and beside a fit",
     "guard_latency": "From SYNC to the offset frames",
     "whole_machine": "The daemon beside the twin in real time: 60 s of two drives at 1 kHz",

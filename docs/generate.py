@@ -28,7 +28,10 @@ EXAMPLES: Mapping[str, Any] = {  # of required keys: the bench machine
     "current_kp": 12.566, "current_ki": 1256.64, "voltage_limit_v": 300.0,
 }  # fmt: skip
 NAMES = {"axis": "X", "bus": "can0"}  # the user's own names in the template
-OPTIONAL = ("axis.X.correction",)  # a section whose absence means something
+OPTIONAL = {  # sections whose absence means something
+    "axis.X.correction": "Without this section nothing is ever sent to the drive; with it, what the guard lets pass.",
+    "axis.X.temperature": "Without this section the drift is told against time alone.",
+}
 
 
 def keys(section: type[config.Section], path: str = "") -> Iterator[tuple[str, str, FieldInfo]]:
@@ -117,7 +120,7 @@ GENERATED = {
 def _heading(path: str) -> list[str]:
     if path in OPTIONAL:
         return [
-            "# Without this section nothing is ever sent to the drive; with it, what the guard lets through.",
+            "# Without this section nothing is ever sent to the drive; with it, what the guard lets pass.",
             f"# [{path}]",
         ]
     if path.startswith("sim"):

@@ -152,6 +152,17 @@ class Voltage(Section):
         return _listed(name, tables.VOLTAGE_SOURCES)
 
 
+class Thermometer(Section):
+    """[axis.X.temperature]: the slide-way's thermometer, a float32 in two Modbus input registers."""
+
+    host: str = Field("127.0.0.1", description="address of the thermometer")
+    port: int = Field(502, ge=1, le=65535, description="TCP port")
+    unit: int = Field(1, ge=0, le=247, description="unit identifier")
+    address: int = Field(8, ge=0, le=65534, description="the first of its two registers, high word first")
+    period_s: Positive = Field(1.0, le=3600, description="how often it is asked")
+    timeout_s: Positive = Field(0.5, description="how long an answer may take")
+
+
 class Axis(Section):
     """[axis.X]"""
 
@@ -163,6 +174,7 @@ class Axis(Section):
     correction: CorrectionLimits | None = None
     drive: Drive = Drive()
     voltage: Voltage = Voltage()
+    temperature: Thermometer | None = None
 
     @property
     def scaling(self) -> Scaling:

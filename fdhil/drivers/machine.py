@@ -19,6 +19,7 @@ from fdhil.drivers.canopen_bus import CanBus
 from fdhil.drivers.cia402_drive import InputSamples
 from fdhil.drivers.modbus_link import BUSY, ModbusRefused
 from fdhil.drivers.modbus_voltage import ModbusVoltage
+from fdhil.drivers.temperature import ModbusTemperature
 from fdhil.drivers.tick_clock import TickClock
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
 from fdhil.records import AxisSamples, MoveEvent, Notice, Temperature, TickTimes, VoltageSamples
@@ -173,10 +174,10 @@ class BusSource:
 
 
 class SensorSource:
-    """One Modbus sensor: polled, and connected again when it went away."""
+    """One Modbus sensor or thermometer: polled, and connected again when it went away."""
 
-    def __init__(self, axis: str, config: MachineConfig, ticks: TickClock) -> None:
-        self.sensor = ModbusVoltage(axis, config)
+    def __init__(self, sensor: ModbusVoltage | ModbusTemperature, ticks: TickClock) -> None:
+        self.sensor = sensor
         self._ticks = ticks
         self._failures = 0
         self._told: set[str] = set()
@@ -233,9 +234,16 @@ class MachineSource:
         used = dict.fromkeys(axis.drive.bus for axis in config.axis.values())
         self._buses = {name: BusSource(name, config) for name in used}
         self._sensors = {
-            axis: SensorSource(axis, config, self._buses[settings.drive.bus].ticks)
+            axis: SensorSource(ModbusVoltage(axis, config), self._buses[settings.drive.bus].ticks)
             for axis, settings in config.axis.items()
             if settings.voltage.source == "modbus"
+        }
+        self._sensors |= {
+            f"{axis}.temperature": SensorSource(
+                ModbusTemperature(axis, settings.temperature), self._buses[settings.drive.bus].ticks
+            )
+            for axis, settings in config.axis.items()
+            if settings.temperature is not None
         }
         self._out = Outlet()
         self._tasks: list[asyncio.Task[None]] = []

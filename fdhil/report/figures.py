@@ -153,7 +153,7 @@ def corner(curves: Sequence[Curve], place_mm: tuple[float, float], half_width_mm
     reference = curves[0].path_mm
     centre = reference[np.argmin(np.hypot(*(reference - np.asarray(place_mm)).T))]
     with _drawing(4.8, 3.6) as (_, axes, svg):
-        for k, curve in enumerate(_near(curves, centre, 3 * half_width_mm)):
+        for k, curve in enumerate(_near(curves, centre, max(3 * half_width_mm, 1.0))):
             colour, width = (REFERENCE, 2.2) if k == 0 else (COLOURS[(k - 1) % len(COLOURS)], 1.3)
             axes.plot(*curve.path_mm.T, color=colour, lw=width, ls="--" if curve.dashed else "-", label=curve.label)
         x, y = centre

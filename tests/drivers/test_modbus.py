@@ -114,7 +114,7 @@ async def test_a_source_survives_and_tells_both_edges(monkeypatch: pytest.Monkey
                     codes.append((record.code, record.severity))
 
     async with sensor_peer() as peer:
-        source = SensorSource("X", config(peer.port), TickClock(0.001))
+        source = SensorSource(ModbusVoltage("X", config(peer.port)), TickClock(0.001))
         task = asyncio.create_task(source.run(out))
         for mode, code in (("silent", "ModbusTimeout"), ("exception", "ModbusException"), ("nan", "ModbusShape")):
             peer.mode = mode

@@ -88,6 +88,8 @@ def _start_twin(out: Path, realtime: bool, say: Say, stack: ExitStack) -> Stage:
     document["bus"] = {
         "can0": {"interface": "socketcand", "channel": bus["channel"], "host": bus["host"], "port": bus["port"]}
     }
+    for axis, sensor in twin.ready["modbus"].items():  # the twin's voltage sensors tell the slide-way's temperature too
+        document["axis"][axis]["temperature"] = {**sensor, "period_s": 0.2}
     (out / "machine.toml").write_text(to_toml(document), "utf-8")
     folder = source.parent
     programs = {label: folder / name for label, name in PROGRAMS.items()}

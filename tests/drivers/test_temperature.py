@@ -1,0 +1,46 @@
+"""The thermometer: a float32 in two registers, from a peer that can misbehave."""
+
+from __future__ import annotations
+
+import pytest
+
+from fdhil.config import Thermometer
+from fdhil.drivers.temperature import ModbusTemperature
+from fdhil.drivers.tick_clock import TickClock
+from fdhil.errors import DeviceTimeout, ProtocolError
+from fdhil.records import Temperature
+from tests.drivers.modbus_peer import sensor_peer
+
+
+def thermometer(port: int, address: int = 8) -> ModbusTemperature:
+    return ModbusTemperature("X", Thermometer(port=port, address=address, period_s=0.01, timeout_s=0.2))
+
+
+async def test_it_reads_degrees() -> None:
+    async with sensor_peer() as peer:
+        sensor = thermometer(peer.port)
+        await sensor.link.connect()
+        records = await sensor.poll(TickClock(0.001))
+        sensor.link.close()
+    assert [(r.axis, r.celsius, r.place) for r in records] == [("X", 21.5, "slideway")]
+    assert isinstance(records[0], Temperature)
+    assert sensor.samples == 1
+
+
+async def test_a_register_that_holds_something_else_is_told() -> None:
+    async with sensor_peer() as peer:
+        sensor = thermometer(peer.port, address=4)  # the sample rate: 1000
+        await sensor.link.connect()
+        with pytest.raises(ProtocolError, match="register 4 gives 1000 degC; compare the register map"):
+            await sensor.poll(TickClock(0.001))
+        sensor.link.close()
+
+
+async def test_a_silent_one_is_a_timeout() -> None:
+    async with sensor_peer() as peer:
+        sensor = thermometer(peer.port)
+        await sensor.link.connect()
+        peer.mode = "silent"
+        with pytest.raises(DeviceTimeout):
+            await sensor.poll(TickClock(0.001))
+        sensor.link.close()
