@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import inspect
+import sys
 import types
 import typing
 from collections.abc import Iterator, Mapping
@@ -83,7 +84,7 @@ def config_reference() -> str:
 def command_reference() -> str:
     """Return every command's help as Markdown."""
     lines = ["# Commands", "", "Generated from the command line's own help.", ""]
-    top = click.Context(cli, info_name="fdhil")
+    top = click.Context(cli, info_name="fdhil", help_option_names=["-h", "--help"])
     for name in cli.list_commands(top):
         command = cli.get_command(top, name)
         assert command is not None
@@ -164,8 +165,17 @@ def _section_of(annotation: Any) -> type[config.Section] | None:
     return None
 
 
+def main() -> int:
+    """Write the files; with --check only tell which are stale."""
+    stale = [path for path, text in GENERATED.items() if not path.is_file() or path.read_text("utf-8") != text()]
+    for path in stale:
+        click.echo(f"{path.relative_to(ROOT)} is stale: run python docs/generate.py")
+        if "--check" not in sys.argv:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(GENERATED[path](), "utf-8")
+            click.echo("  written")
+    return int("--check" in sys.argv and bool(stale))
+
+
 if __name__ == "__main__":
-    for path, text in GENERATED.items():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text(), "utf-8")
-        click.echo(f"wrote {path.relative_to(ROOT)}")
+    sys.exit(main())
