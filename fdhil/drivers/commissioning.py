@@ -43,6 +43,7 @@ AVERAGE_CYCLES = 200
 RAMPS = 8
 RAMP_CYCLES = 20
 EARLY_CYCLES = 8
+FEEDING_TRIES = 4
 FEEDING_S = 0.3
 STARVE_TIMEOUT_S = 1.0
 HEARTBEATS_MISSED = 3
@@ -245,13 +246,8 @@ def watchdog_test(master: Master) -> str:
         sub, before = _consumer_slot(master, node_id)
         master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, 0, 4)
         undo.callback(master.sdo.write_int, Object.CONSUMER_HEARTBEAT, sub, before, 4)
-        master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, entry, 4)
-        if master.sdo.read_int(Object.CONSUMER_HEARTBEAT, sub) != entry:
-            raise DriveFault(master.device, "it does not keep 0x1016; it cannot watch over fdhil and must not be armed")
         undo.callback(setattr, master, "heartbeat", False)
-        master.heartbeat = True
-        master.wait_cycles(round(FEEDING_S / master.period_s))
-        _require_enabled(master)
+        _feed(master, sub, entry)
         told = len(master.heard.emergencies)
         master.heartbeat = False
         with contextlib.suppress(DeviceError):
@@ -269,6 +265,32 @@ def watchdog_test(master: Master) -> str:
                 master.device, f"it stopped with the EMCY {shown} instead of 8130; find out what else stops it"
             )
     return "proven"
+
+
+def _feed(master: Master, sub: int, entry: int) -> None:
+    """Have the drive watch our heartbeat, and keep it content for a while; DriveFault when that cannot be done.
+
+    A busy computer sends a heartbeat late now and then, and the drive is right to stop then; that is tried again.
+    """
+    for _ in range(FEEDING_TRIES):
+        master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, entry, 4)
+        if master.sdo.read_int(Object.CONSUMER_HEARTBEAT, sub) != entry:
+            raise DriveFault(master.device, "it does not keep 0x1016; it cannot watch over fdhil and must not be armed")
+        told = len(master.heard.emergencies)
+        master.heartbeat = True
+        master.wait_cycles(round(FEEDING_S / master.period_s))
+        if master.state() is State.OPERATION_ENABLED:
+            return
+        codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[told:]]
+        if EMCY_HEARTBEAT not in codes:
+            _require_enabled(master)
+        master.heartbeat = False
+        master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, 0, 4)
+        enable(master)
+    raise DriveFault(
+        master.device,
+        f"it missed our heartbeat {FEEDING_TRIES} times; take load off this computer and try again",
+    )
 
 
 def _consumer_slot(master: Master, node_id: int) -> tuple[int, int]:
