@@ -79,10 +79,11 @@ def test_demand_and_position_lie_on_the_same_tick(bench: Bench, tmp_path: Path) 
     assert np.max(np.abs(travel - (position[1:] - position[0]))) < 0.2
 
 
-def test_an_axis_is_commissioned(bench: Bench) -> None:
+def test_an_axis_is_commissioned(bench: Bench, transport: str) -> None:
     record = commission(bench.config, "X")
     assert record.watchdog == "proven"
-    assert record.offset_in_feedforward is True
+    # a virtual machine with one processor may be too slow to see the ramp begin: then it must not be told either way
+    assert record.offset_in_feedforward in ((True, None) if transport == "socketcan" else (True,))
     assert record.sign_test_um == pytest.approx(10, abs=1)
 
 
