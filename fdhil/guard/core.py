@@ -23,7 +23,7 @@ from fdhil.guard.state import (
     Request,
     State,
 )
-from fdhil.guard.tracking import await_start, track
+from fdhil.guard.tracking import await_start, rest, track
 
 SETTLED_CYCLES = 100
 HOLD_CYCLES = 10
@@ -49,7 +49,7 @@ def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outpu
     state = _react(state, inputs, alarms, settings)
     state = _adopt_at_start(state, inputs, alarms)
     if inputs.sync:
-        state = _follow_path(state, inputs, alarms, settings)
+        state = rest(_follow_path(state, inputs, alarms, settings))
     state, output = _move(state, inputs, settings)
     moved = None if state.mode is before else (before, state.mode, state.cause)
     return state, output._replace(refused=refused, transition=moved)
@@ -121,7 +121,6 @@ def _armed(state: State, inputs: Inputs) -> State:
         start_row=inputs.path.standing_rows(),
         axes=tuple([_at_rest(axis, 0) for axis in state.axes]),
         places=(),
-        still_for=0,
         held_for=0,
         cause=None,
     )

@@ -104,7 +104,8 @@ class State(NamedTuple):
     """The guard's whole memory.
 
     ``places`` are the rows of the path that the machine may be at, best first; ``anchor`` the last row that the
-    targets agreed with. ``cause`` is why the correction went off, kept until the next arming.
+    targets agreed with. ``rest`` are the last targets heard, ``rested_for`` the cycles since they came to stand there.
+    ``cause`` is why the correction went off, kept until the next arming.
     """
 
     mode: Mode
@@ -114,7 +115,8 @@ class State(NamedTuple):
     good_for: int = 0
     program_digest: str = ""
     start_row: int = 0
-    still_for: int = 0
+    rest: tuple[int, ...] | None = None
+    rested_for: int = 0
     places: tuple[Place, ...] = ()
     anchor: int = 0
     held_for: int = 0

@@ -13,17 +13,22 @@ HIGHEST_RATE = 1.6
 """Of what an NC's override gives; a larger step along the path is a jump."""
 
 
+def rest(state: State) -> State:
+    """Count for how long the targets have stood, armed or not; a target that did not come says nothing."""
+    now = state.targets[0]
+    if now is None:
+        return state
+    return state._replace(rest=now, rested_for=state.rested_for + 1 if now == state.rest else 0)
+
+
 def await_start(state: State, path: Path) -> tuple[State, Alarm | None]:
     """Armed: once the targets have stood at the path's begin, the first that leaves it says where the path is."""
-    now, last = state.targets[0], state.targets[1] if len(state.targets) > 1 else None
-    if now is None:
+    now, stood = state.targets[0], state.rest
+    if now is None or stood is None or now == stood or state.rested_for < STILL_CYCLES:
         return state, None
-    if now == last:
-        distance = path.mismatch(path.first, now)
-        at_start = distance is not None and distance <= EPS
-        return state._replace(still_for=state.still_for + 1 if at_start else 0), None
-    if state.still_for < STILL_CYCLES:
-        return state._replace(still_for=0), None
+    distance = path.mismatch(path.first, stood)
+    if distance is None or distance > EPS:
+        return state, None
     places = around(path, state.start_row + 1, now)
     if not places:
         return state, Alarm("Misaligned", detail="the first move leaves the path")

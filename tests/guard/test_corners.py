@@ -78,13 +78,41 @@ def test_a_reboot_while_ramping_down_freezes() -> None:
 
 def test_the_start_is_not_found_before_the_targets_have_stood() -> None:
     machine = bench()
+    assert machine.path is not None
+    creeping = [[machine.path.demand[0][0] + step, machine.path.demand[1][0]] for step in (0, 1)]
+    for k in range(400):  # near the path's begin: a rapid that is about to end
+        machine.rest = creeping[k % 2]
+        if k == 200:
+            assert machine.arm() == ()
+        else:
+            machine.sync()
+    assert machine.mode is Mode.ARMED
+
+
+def test_a_path_that_starts_right_after_arming_is_recognised() -> None:
+    machine = bench()
+    assert machine.path is not None
+    machine.row = machine.path.standing_rows() - 1  # the targets have stood there for long, before the arming too
+    machine.settle()
+    machine.play()
+    assert machine.arm() == ()
+    machine.until(Mode.ACTIVE, 300)
+    machine.until(Mode.OFF)
+    assert machine.alarms[-1].code == "Finished"
+    assert machine.state.missed == 0
+
+
+def test_a_lost_target_at_rest_is_no_start() -> None:
+    machine = bench()
     machine.settle()
     assert machine.arm() == ()
-    for k in range(200):  # creeping near the path's begin: a rapid that is about to end
-        assert machine.path is not None
-        machine.rest = [machine.path.demand[0][0] + k % 2, machine.path.demand[1][0]]
-        machine.sync()
+    machine.run(20)
+    machine.sync(nc=False)
+    machine.stream()
+    machine.run(50)
     assert machine.mode is Mode.ARMED
+    machine.play()
+    machine.until(Mode.ACTIVE, 300)
 
 
 def test_heartbeat_alone_never_leaves() -> None:
