@@ -36,7 +36,6 @@ PROGRAMS: Mapping[str, str] = {
     "rounded": "bench_rounded_10m.ngc",
     "shuttle": "shuttle.ngc",
 }
-ARMINGS = 4
 RAPIDS = 4  # of each axis in the shuttle
 WARM_C = (20.5, 21.0, 21.5, 22.0)
 READY_S = 120.0  # the kernels are compiled on the very first run
@@ -217,19 +216,11 @@ def _cut(stage: Stage, label: str, celsius: float, method: str | None = None) ->
 
 
 def _corrected(stage: Stage, program: Path, trace: Path, method: str) -> dict[str, Any]:
-    """Arm and cut; a guard that did not surely recognise the start of the path has sent nothing, and is armed again."""
-    for _ in range(ARMINGS):
-        stage.say(f"arming by {method}: predicted to help, inside the limits, drives commissioned")
-        stage.ask("arm", program=str(program), method=method, token=_token(stage))
-        finished = stage.twin.play(program, trace)
-        _await(lambda: stage.ask("status")["state"] in ("OFF", "ARMED"), 30.0, "the guard did not come to rest", stage)
-        if stage.ask("status")["state"] == "ARMED":
-            time.sleep(2.0)  # the daemon looks at the guard's state now and then
-        if stage.ask("status")["state"] != "ARMED":
-            break
-        stage.say("  the guard did not recognise the start of the path and sent nothing: once more")
-        stage.ask("disarm")
-        _await(lambda: stage.ask("status")["state"] == "OFF", 30.0, "the guard did not disarm", stage)
+    """Arm and cut; FdhilError when the correction ended for anything but the end of the path."""
+    stage.say(f"arming by {method}: predicted to help, inside the limits, drives commissioned")
+    stage.ask("arm", program=str(program), method=method, token=_token(stage))
+    finished = stage.twin.play(program, trace)
+    _await(lambda: stage.ask("status")["state"] == "OFF", 30.0, "the guard did not come to rest", stage)
     cause = stage.ask("status")["guard"]["cause"]
     if cause["code"] != "Finished":
         raise FdhilError(f"the guard ended the correction: {cause['code']}: {cause['text']}; {cause['advice']}")
