@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import asdict
 from datetime import UTC, datetime
 
 from fdhil import cia402
@@ -319,16 +320,11 @@ def _consumer_slot(master: Master, node_id: int) -> tuple[int, int]:
     raise DriveFault(master.device, "all entries of 0x1016 are taken; free one with the drive's tool")
 
 
-def check_axis(master: Master) -> tuple[checks.Identity, str, dict[str, int], float]:
-    """All that can be checked without moving: identity, mapping fingerprint, options, window in um."""
-    identity = checks.read_identity(master)
-    fingerprint = checks.check_mapping(master)
-    options = checks.read_options(master)
-    window_um = checks.check_options(master, options)
-    checks.check_mode(master)
-    checks.check_scale(master)
-    checks.check_rating(master)
-    return identity, fingerprint, options, window_um
+def check_axis(master: Master) -> checks.Survey:
+    """All that can be checked without moving; DriveFault for the first point that differs."""
+    found = checks.survey(master)
+    checks.require(master, found.findings)
+    return found
 
 
 def commission(
@@ -336,15 +332,18 @@ def commission(
 ) -> CommissioningRecord:
     """Commission one axis and return the signed-off record (not saved yet); ``report`` gets each step's name.
 
+    Nothing is written or moved before ``report`` returns from ``enable``: what it raises there ends it with no trace.
+
     DriveFault, ProtocolError, DeviceTimeout or ConnectError, one sentence each, after everything was rolled back.
     """
     with Master(config, axis) as master:
         report("listen")
         checks.listen(master)
         report("compare")
-        identity, fingerprint, options, window_um = check_axis(master)
+        found = check_axis(master)
+        report("enable")
+        checks.require_alone(master)
         with rolled_back(master):
-            report("enable")
             prepare(master)
             enable(master)
             report("sign test")
@@ -356,14 +355,11 @@ def commission(
             report("restore")
     return CommissioningRecord(
         axis=axis,
-        vendor_id=identity.vendor_id,
-        product_code=identity.product_code,
-        revision=identity.revision,
-        serial=identity.serial,
+        **asdict(found.identity),
         config_digest=axis_digest(config, axis),
-        mapping_fingerprint=fingerprint,
-        options=options,
-        following_error_window_um=window_um,
+        mapping_fingerprint=found.fingerprint,
+        options=found.options,
+        following_error_window_um=found.window_um,
         offset_in_feedforward=in_feedforward,
         sign_test_um=round(moved_um, 2),
         readback_ok=True,

@@ -21,9 +21,9 @@ MAX_RECORD_BYTES = 64 * 1024
 class CommissioningRecord:
     """What was found and proven on one drive.
 
-    ``config_digest`` is :func:`axis_digest`. ``options`` holds 0x6007, 0x605A, 0x605E, 0x6065 and 0x6085 by their
-    hexadecimal index. ``offset_in_feedforward`` None: could not be told. ``watchdog`` is ``proven`` when the drive
-    stopped after our heartbeat did.
+    ``config_digest`` is :func:`axis_digest`. ``options`` holds 0x6007, 0x605A, 0x605E, 0x6065, 0x6085 and 0x1017 by
+    their hexadecimal index, as far as the drive has them. ``offset_in_feedforward`` None: could not be told.
+    ``watchdog`` is ``proven`` when the drive stopped after our heartbeat did.
     """
 
     axis: str
