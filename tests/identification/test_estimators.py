@@ -9,7 +9,7 @@ import pytest
 
 from fdhil import tables
 from fdhil.config import Identification
-from fdhil.identification.estimators import Estimator, chosen
+from fdhil.identification.estimators import Estimator, chosen, instrumental_variables, least_squares
 from fdhil.identification.windows import find_windows
 from fdhil.records import PARAMETERS, Estimate, Float, Result, Window, frozen
 from fdhil.store.recording_csv import parse_recording
@@ -22,6 +22,7 @@ TRUTH = np.array([bench.Plant().truth()[name] for name in PARAMETERS])
 REACH: dict[str, tuple[float, ...]] = {
     "least_squares": (0.3, 0.6, 0.1, 0.5, 8.0, 12.0),
     "partial_moments": (0.3, 0.6, 0.1, 0.5, 8.0, 12.0),
+    "instrumental_variables": (0.3, 0.6, 0.1, 0.5, 8.0, 12.0),
     "maximum_likelihood": (0.1, 0.2, 0.05, 0.1, 1.5, 2.0),
 }
 
@@ -126,3 +127,27 @@ def test_nothing_to_fit_is_told(name: str) -> None:
     assert estimate.result is not Result.OK
     assert set(estimate.missing) == set(PARAMETERS)
     assert np.isnan(estimate.values).all()
+
+
+def test_instruments_take_the_bias_of_raw_noise_out() -> None:
+    unfiltered = SETTINGS.model_copy(update={"lowpass_hz": 1e6})
+    plain, paired = [], []
+    for seed in range(12):
+        found = windows(0.005, seed)
+        signals = [least_squares.align(w, unfiltered) for w in found]
+        plain.append(least_squares.raw_values(signals, [w.dt_s for w in found]))
+        paired.append(instrumental_variables.raw_values(found, unfiltered))
+    biased, clean = (np.mean(np.array(values), axis=0) / TRUTH - 1 for values in (plain, paired))
+    inertia = PARAMETERS.index("Jt")
+    assert biased[inertia] < -0.5
+    assert abs(clean[inertia]) < 0.01
+    assert np.abs(clean[[0, 2]]).max() < 0.002
+
+
+def test_instruments_need_a_demand_that_moves() -> None:
+    window = windows(0.002)[0]
+    still = replace(window, demand_mm=frozen(np.zeros(window.n)))
+    estimate = _estimator("instrumental_variables")([still], SETTINGS)
+    assert estimate.result is not Result.OK
+    assert np.isnan(estimate.values).all()
+    assert {reason.code for reason in estimate.missing.values()} <= {"RankDeficient", "LowExcitation"}
