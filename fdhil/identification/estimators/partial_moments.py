@@ -28,16 +28,17 @@ LEAST_STEPS = 8
 def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
     """Fit [1], then [2] with its K, by partial moments over a horizon of one period of the low-pass's corner."""
     usable = [w for w in windows if w.voltage_v is not None]
-    parts = [moments(w, _steps(settings, w.dt_s)) for w in usable]
+    parts = [moments(w, horizon_steps(settings, w.dt_s)) for w in usable]
     if sum(p[0].shape[0] for p in parts) < 8:
         return too_short(NAME, sum(p[0].shape[0] for p in parts))
     noise = np.mean([noise_levels(w).vector() ** 2 for w in usable], axis=0)
-    moment, slope = kernels(_steps(settings, usable[0].dt_s), usable[0].dt_s)
+    moment, slope = kernels(horizon_steps(settings, usable[0].dt_s), usable[0].dt_s)
     alias = aliasing(usable[0].voltage_sampling, usable[0].dt_s)
     return fit_two_steps(NAME, [p for p in parts if p[0].shape[0]], noise, moment, slope, alias)
 
 
-def _steps(settings: Identification, dt_s: float) -> int:
+def horizon_steps(settings: Identification, dt_s: float) -> int:
+    """Return the samples of a horizon: one period of the low-pass's corner, and never too few to integrate over."""
     return max(LEAST_STEPS, round(1 / settings.lowpass_hz / dt_s))
 
 
