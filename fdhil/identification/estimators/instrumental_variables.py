@@ -28,6 +28,8 @@ from fdhil.records import PARAMETERS, Estimate, Float, Reason, Result, Window
 NAME = "instrumental_variables"
 REFINEMENTS = 4
 LEAST_ROWS = 8
+# a demand in steps of a micrometre has rough derivatives; an instrument need only follow the motion, which is slower
+SMOOTH_HZ = 60.0
 LEAST_VOLTAGE_SHARE = 1e-3  # of the voltage's noise as its third differences show it
 
 
@@ -99,14 +101,14 @@ def gather(windows: Sequence[Window], settings: Identification) -> Rows | None:
 
 
 def _demanded(window: Window, signals: Signals, lowpass_hz: float) -> Float:
-    """Return [w, Dw, DDw, sign w] (n, 4) that the demand gives: through the same low-pass, and the drive's lag.
+    """Return [w, Dw, DDw, sign w] (n, 4) that the demand gives: through a low-pass, and the drive's lag.
 
     The lag is what three coefficients on the demanded speed and its derivatives make of it; they are fitted to the
     measured speed over the whole window, which leaves nothing of its noise in the instruments.
     """
     dt = window.dt_s
     speed = np.append(np.diff(carried(window.demand_mm)), 0.0) / dt * (2 * math.pi / window.pitch_mm)
-    speed = zero_phase(speed, lowpass_hz, dt)
+    speed = zero_phase(speed, min(lowpass_hz, SMOOTH_HZ), dt)
     rate = derivative(speed, dt)
     jerk = derivative(rate, dt)
     basis = np.column_stack([speed, rate, jerk])
