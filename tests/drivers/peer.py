@@ -24,7 +24,6 @@ class DrivePeer:
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def _run(self) -> None:
-        self._send(self.drive.power_on())
         while not self._stopping.is_set():
             message = self._bus.recv(0.001)
             self._send(self.drive.wall_clock(time.monotonic()))
@@ -37,6 +36,7 @@ class DrivePeer:
             self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
 
     def __enter__(self) -> DrivePeer:
+        self._send(self.drive.power_on())  # before the thread runs: what a test spoils then stays spoilt
         self._thread.start()
         return self
 
