@@ -54,7 +54,11 @@ class Mode(IntEnum):
 class Object(IntEnum):
     """Indices of the objects that fdhil reads or writes (CiA 301 and CiA 402-2)."""
 
+    DEVICE_TYPE = 0x1000
     ERROR_REGISTER = 0x1001
+    DEVICE_NAME = 0x1008
+    HARDWARE_VERSION = 0x1009
+    SOFTWARE_VERSION = 0x100A
     CONSUMER_HEARTBEAT = 0x1016
     PRODUCER_HEARTBEAT = 0x1017
     IDENTITY = 0x1018

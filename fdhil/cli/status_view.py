@@ -12,7 +12,7 @@ from rich.table import Table
 BARS = "▁▂▃▄▅▆▇█"
 
 
-def _console() -> Console:
+def open_console() -> Console:
     """Return a console for stdout: as wide as the terminal, or wide enough for the tables where there is none."""
     console = Console()
     return console if console.is_terminal else Console(width=150)
@@ -20,7 +20,7 @@ def _console() -> Console:
 
 def show(status: Mapping[str, Any], console: Console | None = None) -> None:
     """Print the status document."""
-    out = console or _console()
+    out = console or open_console()
     source, sync, guard = status["source"], status["sync"], status.get("guard") or {}
     rate = "no SYNC yet" if sync["rate_hz"] is None else f"SYNC {sync['rate_hz']:.1f} Hz of {sync['expected_hz']:.0f}"
     out.print(f"[bold]{escape(status['machine'])}[/bold]: {source['state']}, {rate}, up {status['uptime_s']:.0f} s")
@@ -78,7 +78,7 @@ def sparkline(values: Sequence[float]) -> str:
 
 def show_slopes(slopes: Mapping[str, Mapping[str, Mapping[str, float]]], console: Console | None = None) -> None:
     """Print how the parameters follow the temperature, where that is known."""
-    out = console or _console()
+    out = console or open_console()
     for axis, lines in slopes.items():
         sure = [f"{name} {with_interval({'value': line['per_kelvin'], **line})}" for name, line in lines.items()]
         if sure:
@@ -87,7 +87,7 @@ def show_slopes(slopes: Mapping[str, Mapping[str, Mapping[str, float]]], console
 
 def show_history(rows: Sequence[Mapping[str, Any]], console: Console | None = None, newest: int = 15) -> None:
     """Print the newest revisions of every axis, and each parameter's course over all of them."""
-    out = console or _console()
+    out = console or open_console()
     for axis in dict.fromkeys(row["axis"] for row in rows):
         of_axis = [row for row in rows if row["axis"] == axis]
         names = list(of_axis[0]["parameters"])

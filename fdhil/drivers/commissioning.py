@@ -204,9 +204,7 @@ def feedforward_test(master: Master) -> bool | None:
     share, gain = settings.regulators.speed_feedforward, settings.regulators.position_gain_per_s
     if share == 0.0:
         return True  # there is no feed-forward that could miss it
-    per_mm, limits = _per_mm(master), _limits(master)
-    step = int(min(2.0, limits.max_speed_mm_s) * per_mm * master.period_s)
-    step = min(step, int(0.8 * min(50.0, limits.max_offset_um) / 1e3 * per_mm / RAMP_CYCLES))
+    step = _ramp_step(master.config, master.axis)
     if step < 1 or checks.read_optional(master, Object.VELOCITY_DEMAND, signed=True) is None:
         return None
     excess: list[float] = []
@@ -220,6 +218,21 @@ def feedforward_test(master: Master) -> bool | None:
         return None
     mean = sum(excess) / len(excess)
     return True if mean > 0.5 * share else False if mean < 0.25 * share else None
+
+
+def _ramp_step(config: MachineConfig, axis: str) -> int:
+    """Increments per cycle of the feed-forward test's ramp: up to 2 mm/s and 40 um, inside the limits."""
+    settings = config.axis[axis]
+    per_mm, limits = settings.scaling.increments_per_mm, settings.correction or CorrectionLimits()
+    fastest = int(min(2.0, limits.max_speed_mm_s) * per_mm * config.machine.sync_period_s)
+    return min(fastest, int(0.8 * min(50.0, limits.max_offset_um) / 1e3 * per_mm / RAMP_CYCLES))
+
+
+def largest_move_um(config: MachineConfig, axis: str) -> float:
+    """How far a commissioning moves the axis at most."""
+    settings = config.axis[axis]
+    ramped = _ramp_step(config, axis) * RAMP_CYCLES / settings.scaling.increments_per_mm * 1e3
+    return max(SIGN_TEST_UM, ramped)
 
 
 def _told_feedforward(master: Master) -> bool | None:

@@ -130,7 +130,10 @@ def compare_identity(profile: DriveProfile, identity: Identity) -> Finding:
     shown = f"vendor {identity.vendor_id:08X}, product {identity.product_code:08X}"
     return Finding(
         "identity",
-        " ".join("any" if number is None else f"{number:08X}" for number, _ in wanted),
+        ", ".join(
+            f"{what} {'any' if number is None else f'{number:08X}'}"
+            for what, (number, _) in zip(("vendor", "product"), wanted, strict=True)
+        ),
         shown,
         all(number in (None, found) for number, found in wanted),
         f"it is {shown}, which profile {profile.name} is not made for",

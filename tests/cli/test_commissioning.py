@@ -1,0 +1,389 @@
+"""scan, check and commission against the simulated machine, a process of its own behind its hub."""
+
+from __future__ import annotations
+
+import io
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from fdhil.cli.main import cli, run_safely
+from fdhil.drivers import bus_scan, canopen_sdo, commissioning, commissioning_checks, config_check
+from fdhil.drivers.commissioning_record import load_record
+from fdhil.sim.hub import Hub
+from tests.sim.hub_thread import HubThread
+from tests.sim.twin_process import TwinProcess, write_config
+
+COMMAND = [sys.executable, "-m", "fdhil"]
+
+
+@dataclass
+class Bench:
+    """The simulated machine, and the config with which others join its bus."""
+
+    twin: TwinProcess
+    folder: Path
+
+    def config(
+        self, name: str = "bench.toml", old: str = "", new: str = "", voltage: str = "", axes: str = "XY"
+    ) -> Path:
+        """Write a config of its own folder for this bus, with ``old`` replaced by ``new``."""
+        folder = self.folder / Path(name).stem
+        folder.mkdir(exist_ok=True)
+        port = self.twin.bus_settings["port"]
+        path = write_config(folder, bus=f'interface = "socketcand"\nport = {port}', voltage=voltage)
+        path.write_text(path.read_text().replace(old, new, 1))
+        return path
+
+    def fault(self, index: int, value: int) -> None:
+        """Set an object of drive X behind everybody's back, as its own tool would."""
+        with self.twin.join() as bus:
+            size = {0x6007: 2, 0x6065: 4, 0x1017: 2, 0x1801: 1}[index]
+            head = 0x23 | (4 - size) << 2
+            bus.send(message(0x601, bytes([head, index & 0xFF, index >> 8, 0]) + value.to_bytes(4, "little")))
+            assert answer_of(bus, 0x581)[0] == 0x60
+
+
+def message(can_id: int, data: bytes) -> can.Message:
+    return can.Message(arbitration_id=can_id, data=data, is_extended_id=False)
+
+
+def answer_of(bus: can.BusABC, can_id: int) -> bytes:
+    deadline = time.monotonic() + 10
+    while time.monotonic() < deadline:
+        heard = bus.recv(1.0)
+        if heard is not None and heard.arbitration_id == can_id:
+            return bytes(heard.data)
+    raise AssertionError(f"no {can_id:03X}")
+
+
+Said = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def fdhil(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Said:
+    """Run a command in this process, with shorter waits than on a real machine: exit code, stdout and stderr."""
+    for module, name, value in (
+        (bus_scan, "LISTEN_S", 0.3),
+        (config_check, "LISTEN_S", 0.3),
+        (commissioning_checks, "LISTEN_S", 0.3),
+        (commissioning, "SETTLE_CYCLES", 120),
+        (commissioning, "AVERAGE_CYCLES", 60),
+        (canopen_sdo, "RESPONSE_TIMEOUT_S", 0.3),
+        (canopen_sdo, "QUIET_S", 0.1),
+    ):
+        monkeypatch.setattr(module, name, value)
+
+    def run(*arguments: object, said: str = "") -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["fdhil", *map(str, arguments)])
+        monkeypatch.setattr(sys, "stdin", io.StringIO(said))
+        code = run_safely(cli)
+        heard = capsys.readouterr()
+        return code, heard.out, heard.err
+
+    return run
+
+
+def document(fdhil: Said, *arguments: object, code: int = 0) -> dict[str, Any]:
+    """Run a command with --json; return the one document on stdout."""
+    got, out, err = fdhil(*arguments, "--json")
+    assert got == code, err
+    found: dict[str, Any] = json.loads(out)
+    assert found["schema"] == f"fdhil-{arguments[0]}-1"
+    return found
+
+
+def points(checked: dict[str, Any], state: str) -> dict[str, dict[str, str]]:
+    return {f"{p['place']} {p['point']}": p for p in checked["points"] if p["state"] == state}
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    folder = tmp_path_factory.mktemp("bench")
+    with TwinProcess(write_config(folder)) as twin:
+        yield Bench(twin, folder)
+
+
+def test_a_scan_lists_the_drives_with_their_eds(fdhil: Said, bench: Bench) -> None:
+    eds = bench.twin.ready["drives"]["X"]["eds"]
+    found = document(fdhil, "scan", bench.config(), "--eds", eds)
+    (bus,) = found["buses"]
+    assert (bus["bus"], bus["master"]) == ("can0", None)
+    assert [(node["node_id"], node["axis"], node["nmt"]) for node in bus["nodes"]] == [
+        (1, "X", "pre-operational"),
+        (2, "Y", "pre-operational"),
+    ]
+    answers = bus["nodes"][1]["answers"]
+    assert answers["identity"] == {
+        "vendor_id": 0x46444849,
+        "product_code": 0x402,
+        "revision": 0x10000,
+        "serial": 1002,
+    }
+    assert answers["name"] == "fdhil twin drive"
+    assert answers["device_type"] & 0xFFFF == 402
+    assert answers["heartbeat_s"] == 0.1
+    assert answers["eds"] == {"file": Path(eds).name, "fit": "exact"}
+    assert bus["nodes"][0]["heartbeat_s"] == pytest.approx(0.1, rel=0.5)
+
+
+def test_a_scan_reads_well(fdhil: Said, bench: Bench) -> None:
+    code, out, err = fdhil("scan", bench.config())
+    assert (code, err) == (0, "")
+    for words in ("no NC is heard; 2 nodes", "pre-operational", "fdhil twin drive", "CiA 402", "none fits"):
+        assert words in out
+
+
+def test_an_eds_that_is_none_is_told(fdhil: Said, bench: Bench) -> None:
+    wrong = bench.folder / "wrong.eds"
+    wrong.write_text("no eds")
+    code, out, err = fdhil("scan", bench.config(), "--eds", wrong)
+    assert (code, out) == (3, "")
+    assert "wrong.eds: line 1: it has no object at all" in err
+
+
+def test_a_machine_that_matches_is_told(fdhil: Said, bench: Bench) -> None:
+    code, out, err = fdhil("check", bench.config())
+    assert (code, err) == (0, "")
+    assert "points ok, 0 differ" in out
+    found = document(fdhil, "check", bench.config())
+    assert found["matches"] is True
+    assert found["complete"] is True
+    for axis in "XY":
+        names = {p["point"] for p in found["points"] if p["place"] == f"axis {axis}"}
+        assert {
+            "drive",
+            "identity",
+            "TPDO1",
+            "RPDO2",
+            "scale",
+            "cycle",
+            "rapid signal",
+            "voltage",
+            "heartbeat",
+        } <= names
+
+
+DRIVE = "[axis.X.voltage]"
+DIFFERENT = {
+    "scale": (
+        DRIVE,
+        "[axis.X.drive]\nincrements_per_rev = 4096\n" + DRIVE,
+        "65536 per revolution",
+    ),
+    "rated current": (DRIVE, "[axis.X.drive]\nrated_current_a = 10.0\n" + DRIVE, "50 A"),
+    "cycle": ("sync_period_s = 0.001", "sync_period_s = 0.002", "1 ms"),
+    "drive": (DRIVE, "[axis.X.drive]\nnode_id = 9\n" + DRIVE, "no answer"),
+    "following error": (
+        DRIVE,
+        "[axis.X.drive]\nfollowing_error_window_mm = 5.0\n" + DRIVE,
+        "10000 um",
+    ),
+}
+
+
+@pytest.mark.parametrize("point", DIFFERENT)
+def test_what_differs_is_told_with_what_to_do(fdhil: Said, point: str, bench: Bench) -> None:
+    old, new, found = DIFFERENT[point]
+    config = bench.config("different.toml", old, new)
+    checked = document(fdhil, "check", config, code=1)
+    assert checked["matches"] is False
+    told = points(checked, "differs")[f"axis X {point}"]
+    assert told["found"] == found
+    assert told["cause"]
+    assert told["advice"]
+    assert (told["expected"], told["found"]) != ("", told["expected"])
+
+
+def test_a_sensor_is_read_and_a_silent_one_is_told(fdhil: Said, bench: Bench) -> None:
+    sensor = bench.twin.ready["modbus"]["X"]
+    voltage = f'source = "modbus"\nhost = "{sensor["host"]}"\nport = {sensor["port"]}\nunit = {sensor["unit"]}'
+    found = document(fdhil, "check", bench.config("sensor.toml", voltage=voltage))
+    assert "V at 1000 Hz" in points(found, "ok")["axis X voltage"]["found"]
+    code, out, _ = fdhil("check", bench.config("dumb.toml", voltage='source = "modbus"\nport = 1'))
+    assert code == 1
+    assert "axis X: the Modbus sensor 127.0.0.1:1 cannot be reached; check its supply, host and port" in out
+
+
+def test_nobody_moves_without_a_yes(fdhil: Said, bench: Bench) -> None:
+    config = bench.config("asked.toml")
+    with overheard(bench) as heard:
+        for said in ("n\n", ""):
+            code, out, err = fdhil("commission", config, "--axis", "X", said=said)
+            assert code == 1
+            assert "step 2 of 7, compare" in out
+            assert "step 3" not in out
+            assert "the axis moves by 10 um" in err
+            assert "nothing was moved or written" in err
+    assert 0x601 in heard
+    assert not {0x000, 0x080, 0x201, 0x301} & set(heard)
+    assert load_record(config.parent / "fdhil-data", "X") is None
+
+
+@contextmanager
+def overheard(bench: Bench) -> Iterator[list[int]]:
+    """The COB-IDs of all frames on the bus meanwhile."""
+    heard: list[int] = []
+
+    def keep(frame: can.Message) -> None:
+        heard.append(frame.arbitration_id)
+
+    with bench.twin.join() as bus:
+        notifier = can.Notifier(bus, [keep], timeout=0.05)
+        try:
+            yield heard
+        finally:
+            notifier.stop()
+
+
+def test_an_axis_is_commissioned_and_signed_off(fdhil: Said, bench: Bench) -> None:
+    config = bench.config("signed.toml")
+    code, out, err = fdhil("commission", config, "--axis", "X", said="y\n")
+    assert code == 0, err
+    for number, step in enumerate(
+        ("listen", "compare", "enable", "sign test", "feed-forward", "watchdog", "restore"), 1
+    ):
+        assert f"step {number} of 7, {step}" in out
+    assert "axis X is commissioned: moved +" in out
+    record = load_record(config.parent / "fdhil-data", "X")
+    assert record is not None
+    assert (record.watchdog, record.serial, record.options["1017"]) == ("proven", 1001, 100)
+
+
+def test_the_document_of_a_commissioning(fdhil: Said, bench: Bench) -> None:
+    config = bench.config("json.toml")
+    found = document(fdhil, "commission", config, "--axis", "Y", "--yes")
+    assert found["refused"] is None
+    record = load_record(config.parent / "fdhil-data", "Y")
+    assert record is not None
+    assert found["axes"]["Y"]["digest"] == record.digest
+    assert found["axes"]["Y"]["sign_test_um"] == pytest.approx(10, abs=3)
+
+
+def test_a_drive_that_must_not_be_used_is_refused(fdhil: Said, bench: Bench) -> None:
+    bench.fault(0x6007, 0)
+    try:
+        found = document(fdhil, "commission", bench.config("wrong.toml"), "--yes", code=1)
+        assert found["axes"] == {}
+        assert found["refused"].startswith("drive X: 0x6007 is 0: it goes on when communication is lost; set it to")
+    finally:
+        bench.fault(0x6007, 1)
+
+
+def test_a_stopped_commissioning_leaves_the_drive_off(fdhil: Said, bench: Bench) -> None:
+    command = [*COMMAND, "commission", str(bench.config("stopped.toml")), "--axis", "X", "--yes"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        for line in process.stdout:
+            if "sign test" in line:
+                break
+        with bench.twin.join() as bus:
+            process.send_signal(signal.SIGTERM)
+            controlwords = words_until_pre_operational(bus)
+        _, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    assert controlwords[-1] == 0
+
+
+def words_until_pre_operational(bus: can.BusABC) -> Sequence[int]:
+    """Controlwords sent to drive X until it is taken out of Operational."""
+    words = []
+    deadline = time.monotonic() + 30
+    while time.monotonic() < deadline:
+        heard = bus.recv(1.0)
+        if heard is None:
+            continue
+        if heard.arbitration_id == 0x201:
+            words.append(int.from_bytes(heard.data[:2], "little"))
+        if heard.arbitration_id == 0 and heard.data[0] == 0x80:
+            return words
+    raise AssertionError("drive X was not taken out of Operational")
+
+
+def test_an_unknown_axis_is_told(fdhil: Said, bench: Bench) -> None:
+    code, out, err = fdhil("commission", bench.config(), "--axis", "Z", "--yes")
+    assert (code, out) == (2, "")
+    assert "there is no axis Z (one of X, Y)" in err
+
+
+@pytest.mark.parametrize("command", ["scan", "check", "commission"])
+def test_a_hub_that_is_not_there_is_told(fdhil: Said, command: str, tmp_path: Path) -> None:
+    config = write_config(tmp_path, bus='interface = "socketcand"\nport = 1')
+    code, out, err = fdhil(command, config, *(["--yes"] if command == "commission" else []), "--json")
+    assert (code, out) == (3, "")
+    assert "the CAN hub 127.0.0.1:1 cannot be reached" in err
+
+
+def test_a_bus_without_a_node_is_told(fdhil: Said, tmp_path: Path) -> None:
+    hub = HubThread(Hub("can0"))
+    hub.start()
+    try:
+        config = write_config(tmp_path, bus=f'interface = "socketcand"\nport = {hub.hub.settings["port"]}')
+        code, out, err = fdhil("scan", config)
+        assert (code, out) == (3, "")
+        assert "no node was heard and none answered" in err
+    finally:
+        hub.stop()
+
+
+@pytest.mark.parametrize("command", ["scan", "check", "commission"])
+def test_help_tells_what_is_sent(fdhil: Said, command: str) -> None:
+    code, out, _ = fdhil(command, "--help")
+    assert code == 0
+    assert "Exit codes" in " ".join(out.split())
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """A machine whose NC runs the bus."""
+    folder = tmp_path_factory.mktemp("nc")
+    with TwinProcess(write_config(folder, sim="nc = true")) as twin:
+        twin.event("nc")
+        yield Bench(twin, folder)
+
+
+def undisturbed(fdhil: Said, cut: Bench, *arguments: object, code: int = 0) -> str:
+    """Run a command and be sure that no SDO went over the bus meanwhile; return what it said."""
+    with overheard(cut) as heard:
+        got, out, err = fdhil(*arguments)
+    assert got == code, (out, err)
+    assert 0x80 in heard
+    assert not {i for i in heard if 0x580 <= i < 0x700}
+    return out + err
+
+
+def test_a_scan_beside_an_nc_only_listens(fdhil: Said, cut: Bench) -> None:
+    said = undisturbed(fdhil, cut, "scan", cut.config())
+    assert "an NC runs it (SYNC heard), so no node was asked" in said
+    assert "operational" in said
+
+
+def test_a_check_beside_an_nc_compares_what_is_heard(fdhil: Said, cut: Bench) -> None:
+    config = cut.config("counted.toml", "[machine]", '[guard]\nclock = "sync"\n[machine]')  # a busy host is late
+    found = json.loads(undisturbed(fdhil, cut, "check", config, "--json"))
+    assert found["matches"] is True
+    assert found["complete"] is False
+    assert points(found, "not compared")["axis X identity"]["advice"] == "switch the NC off and check again"
+    assert {"bus can0 SYNC", "axis X TPDO1", "axis Y TPDO3", "axis X RPDO1"} <= set(points(found, "ok"))
+
+
+def test_another_sync_period_is_told(fdhil: Said, cut: Bench) -> None:
+    config = cut.config("period.toml", "sync_period_s = 0.001", "sync_period_s = 0.0005")
+    said = undisturbed(fdhil, cut, "check", config, code=1)
+    assert "where the config has 0.5 ms; correct machine.sync_period_s or the NC's cycle" in said
+
+
+def test_a_commissioning_beside_an_nc_is_refused(fdhil: Said, cut: Bench) -> None:
+    said = undisturbed(fdhil, cut, "commission", cut.config(), "--yes", code=3)
+    assert "an NC is sending SYNC or set-points; switch it off" in said
