@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 
-STUDIES = ("estimators", "verdicts")
+STUDIES = ("estimators", "comparison", "verdicts")
 
 
 def main() -> None:
