@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import queue
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,9 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.config import MachineConfig
+from fdhil.pipeline import AxisPipeline
 from fdhil.program import load_trajectory
+from fdhil.records import Notice, Outcome
 from fdhil.sim.service import SimService
 from tests.bench import bench_document
 
@@ -48,6 +50,11 @@ class Bench:
         """Join the bus with the arguments that the ready event gives to any python-can program."""
         place = {k: v for k, v in self.ready["buses"]["can0"].items() if v is not None}
         return can.Bus(**place)
+
+
+def digested(pipeline: AxisPipeline, records: Sequence[Any]) -> list[Outcome]:
+    """Feed a pipeline as the daemon does: what an operator should know is for the operator."""
+    return [o for record in records if not isinstance(record, Notice) for o in pipeline.feed(record)]
 
 
 def _virtual(document: dict[str, Any]) -> None:

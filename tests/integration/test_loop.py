@@ -15,7 +15,7 @@ from fdhil.drivers import open_machine
 from fdhil.drivers.commissioning import commission
 from fdhil.pipeline import AxisPipeline
 from fdhil.records import AxisSamples, ParameterSet, WindowOutcome
-from tests.integration.conftest import PATIENCE_S, Bench
+from tests.integration.conftest import PATIENCE_S, Bench, digested
 
 pytestmark = pytest.mark.timeout(240)
 
@@ -56,7 +56,7 @@ def test_nothing_is_lost_and_the_drives_are_identified(bench: Bench, tmp_path: P
         assert tick.size > 4000
         assert np.all(np.diff(tick) == 1)
         pipeline = AxisPipeline(axis, bench.config)
-        outcomes = [outcome for r in records if getattr(r, "axis", axis) == axis for outcome in pipeline.feed(r)]
+        outcomes = digested(pipeline, records)
         windows = [o for o in outcomes if isinstance(o, WindowOutcome)]
         assert [o.verdict.accepted for o in windows] == [True] * 4, [o.verdict for o in windows]
         newest = [o for o in outcomes if isinstance(o, ParameterSet)][-1].parameters.as_dict()

@@ -14,7 +14,7 @@ import pytest
 
 from fdhil.pipeline import AxisPipeline
 from fdhil.records import VoltageSamples, WindowOutcome
-from tests.integration.conftest import Bench
+from tests.integration.conftest import Bench, digested
 from tests.integration.test_loop import TRUE, recorded, shuttle
 
 pytestmark = pytest.mark.timeout(240)
@@ -41,7 +41,7 @@ def test_what_is_accepted_is_right(bench: Bench, tmp_path: Path) -> None:
     assert any(isinstance(r, VoltageSamples) for r in records)
     for axis in bench.config.axis:
         pipeline = AxisPipeline(axis, bench.config)
-        outcomes = [o for r in records if getattr(r, "axis", axis) == axis for o in pipeline.feed(r)]
+        outcomes = digested(pipeline, records)
         windows = [o for o in outcomes if isinstance(o, WindowOutcome)]
         assert len(windows) == 4
         refused = [reason.code for o in windows for reason in o.verdict.reasons]
