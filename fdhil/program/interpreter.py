@@ -145,7 +145,8 @@ class Interpreter:
         modal.position = position
         self._series.began = None
         self._machine.just_left = False
-        return Rapid(line, end) if motion == 0 else Feed(line, end, modal.feed_mm_min)
+        corner = modal.corner
+        return Rapid(line, end, corner) if motion == 0 else Feed(line, end, modal.feed_mm_min, corner)
 
     def _line(self, raw: str, line: int) -> None:
         self._variables.line = line

@@ -77,7 +77,7 @@ class Machine:
         self.just_left = False
         if self.compensation is None:
             end = self._checked(block, target)
-            self._order(block, Rapid(block.line, end) if feed is None else Feed(block.line, end, feed))
+            self._order_straight(block, end, feed)
             return
         self._checked(block, target)
         a, b = self._flat(start), self._flat(target)
@@ -110,7 +110,7 @@ class Machine:
 
     def _line(self, block: Block, target: list[float], feed: float | None) -> None:
         end = self._checked(block, target)
-        self._order(block, Rapid(block.line, end) if feed is None else Feed(block.line, end, feed))
+        self._order_straight(block, end, feed)
 
     def _arc(self, block: Block, target: list[float], centre: tuple[float, float], turns: int, feed: float) -> None:
         first, second, normal = PLANE_AXES[self.modal.plane_name]
@@ -122,7 +122,11 @@ class Machine:
             self.modal.position = target
         end = self._checked(block, target)
         about = (shown[0], shown[1], shown[2])
-        self._order(block, Arc(block.line, end, about, turns, self.modal.plane_name, feed))
+        self._order(block, Arc(block.line, end, about, turns, self.modal.plane_name, feed, self.modal.corner))
+
+    def _order_straight(self, block: Block, end: Point, feed: float | None) -> None:
+        corner = self.modal.corner
+        self._order(block, Rapid(block.line, end, corner) if feed is None else Feed(block.line, end, feed, corner))
 
     def _order(self, block: Block, motion: Motion) -> None:
         if len(self.out) >= self.budget.max_motions_per_block:

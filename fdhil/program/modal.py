@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from fdhil.program.motions import PLANES, Point
+from fdhil.program.motions import BLEND, PLANES, Corner, Point
 
 AXES = "xyzabcuvw"
 INDEX = {letter: place for place, letter in enumerate(AXES)}
 LINEAR = frozenset("xyzuvw")
 MM_PER_INCH = 25.4
 NO_MOTION = 800  # G80
+_EXACT = {610: Corner("exact_path", 0.0), 611: Corner("exact_stop", 0.0)}
 
 
 def _zeros() -> list[float]:
@@ -56,6 +57,13 @@ class Modal:
     def plain(self) -> bool:
         """Whether a straight move needs no more than adding offsets: G94, radius, no cutter compensation."""
         return self.feed_mode == 940 and self.compensation == 400 and not self.diameter
+
+    @property
+    def corner(self) -> Corner:
+        """How the motion at hand may be left, by the path control in force."""
+        if self.path_control != 640:
+            return _EXACT[self.path_control]
+        return Corner("blend", self.path_tolerance_mm) if self.path_tolerance_mm > 0.0 else BLEND
 
     @property
     def plane_name(self) -> str:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 Point = tuple[float, float, float]
 PLANES = ("XY", "XZ", "YZ")
@@ -13,11 +14,26 @@ PLANE_AXES = {"XY": (0, 1, 2), "XZ": (2, 0, 1), "YZ": (1, 2, 0)}
 
 
 @dataclass(frozen=True, slots=True)
+class Corner:
+    """How a motion's end may be left: G61 on the exact path, G61.1 from an exact stop, G64 by a blend.
+
+    ``tolerance_mm`` is how far a blend may be off the path (P); infinite where the program gives none.
+    """
+
+    mode: Literal["exact_path", "exact_stop", "blend"] = "blend"
+    tolerance_mm: float = math.inf
+
+
+BLEND = Corner()
+
+
+@dataclass(frozen=True, slots=True)
 class Rapid:
     """G0: a straight line at rapid speed to ``end`` (mm); ``line`` is the 1-based source line."""
 
     line: int
     end: Point
+    corner: Corner = BLEND
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +43,7 @@ class Feed:
     line: int
     end: Point
     feed: float
+    corner: Corner = BLEND
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +61,7 @@ class Arc:
     turns: int
     plane: str
     feed: float
+    corner: Corner = BLEND
 
 
 @dataclass(frozen=True, slots=True)
