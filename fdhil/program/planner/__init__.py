@@ -14,8 +14,8 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.program.motions import Motion
-from fdhil.program.segments import Segments, Timeline
-from fdhil.program.smoothing import Smoother
+from fdhil.program.planner.timeline import Segments, Timeline
+from fdhil.program.planner.smoothing import Smoother
 from fdhil.records import Float, Int, Trajectory, frozen, frozen_ints
 
 MAX_ROWS = 10_000_000
