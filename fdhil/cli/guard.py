@@ -17,7 +17,7 @@ from fdhil import config as machine_config
 from fdhil.cia402 import PdoEntry
 from fdhil.cli.main import run_safely
 from fdhil.config import Axis, CanBus, MachineConfig
-from fdhil.errors import ConfigError, ConfigFault, ConnectError, DeviceError, ProtocolError
+from fdhil.errors import ConfigError, ConfigFault, ConnectError, DeviceError, ProtocolError, StoreError
 from fdhil.guard.limits import Limits
 from fdhil.guard.settings import AxisSettings, Layout, Pdo, Settings, to_json
 
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 SETTINGS_NAME = "guard.json"
 VARIATION_MM = 3.0
 CONNECT_S = 5.0
+HEARTBEATS_AWAITED = 2.0  # periods of the drive's heartbeat until it counts as lost
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
@@ -124,7 +125,25 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
         limits=limits_of(axis, machine.machine.sync_period_s),
         window=round(axis.drive.following_error_window_mm * axis.scaling.increments_per_mm),
         setpoint_delay_cycles=axis.drive.setpoint_delay_cycles,
+        heartbeat_timeout_s=heartbeat_timeout_s(machine, name),
     )
+
+
+def heartbeat_timeout_s(machine: MachineConfig, axis: str) -> float:
+    """How long the drive's heartbeat may be missing, from the 0x1017 that the axis was commissioned with.
+
+    0, never: without a record that can be read (nothing is armed then), for a drive that sends none, and where time is
+    the count of SYNC, which says nothing about heartbeats of the wall clock.
+    """
+    from fdhil.drivers.commissioning_record import load_record  # late, as above
+
+    try:
+        record = load_record(machine.store.directory, axis)
+    except StoreError:
+        return 0.0
+    if record is None or machine.guard.clock == "sync":
+        return 0.0
+    return HEARTBEATS_AWAITED * record.options.get("1017", 0) * 1e-3
 
 
 def _rpdo(profile: DriveProfile, key: tuple[int, int], axis: str) -> PdoSpec:

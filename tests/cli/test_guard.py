@@ -10,14 +10,16 @@ import stat
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from fdhil import config as machine_config
-from fdhil.cli.guard import guard, limits_of, lock_bus, open_bus
+from fdhil.cli.guard import guard, heartbeat_timeout_s, limits_of, lock_bus, open_bus, settings_of
 from fdhil.cli.main import run_safely
 from fdhil.config import CanBus, CorrectionLimits
+from fdhil.drivers.commissioning_record import CommissioningRecord, save_record
 from fdhil.errors import ConnectError, DeviceError, ProtocolError
 from fdhil.guard.limits import Limits
 from fdhil.guard.settings import load
@@ -69,6 +71,26 @@ def test_default_limits_are_whole_increments(tmp_path: Path) -> None:
     axis = config.axis["X"].model_copy(update={"correction": CorrectionLimits()})
     assert limits_of(axis, 0.001) == Limits(163, 6, 1, 9830, 1000)
     assert limits_of(axis, 0.002) == Limits(163, 13, 3, 9830, 500)
+
+
+RECORD = CommissioningRecord(
+    "X", 1, 2, 3, 4, "c0ffee", "f1f2", {"1017": 100}, 1e4, True, 9.8, True, "proven", "2026-01-01T00:00:00+00:00"
+)
+
+
+def test_the_drives_heartbeat_is_watched_as_it_was_commissioned(tmp_path: Path) -> None:
+    counted = machine_config.load(write_config(tmp_path, 1))
+    assert counted.guard.clock == "sync"
+    config = counted.model_copy(update={"guard": counted.guard.model_copy(update={"clock": "monotonic"})})
+    assert heartbeat_timeout_s(config, "X") == 0
+    path = save_record(RECORD, config.store.directory)
+    assert heartbeat_timeout_s(config, "X") == 0.2
+    assert [axis.heartbeat_timeout_s for axis in settings_of(config, "can0", tmp_path, "").axes] == [0.2, 0]
+    assert heartbeat_timeout_s(counted, "X") == 0  # heartbeats come by the wall clock
+    save_record(replace(RECORD, options={"6007": 1}), config.store.directory)
+    assert heartbeat_timeout_s(config, "X") == 0  # the drive has none
+    path.write_text("changed by hand")
+    assert heartbeat_timeout_s(config, "X") == 0  # and nothing is armed with such a record
 
 
 def test_without_a_correction_section_writing_is_off(

@@ -66,4 +66,4 @@ def test_errors_are_sentences_with_their_exit_code(capsys: pytest.CaptureFixture
 
 
 def test_the_list_is_in_the_order_of_the_workflow() -> None:
-    assert cli.list_commands(click.Context(cli))[:2] == ["demo", "run"]
+    assert cli.list_commands(click.Context(cli))[:5] == ["demo", "scan", "check", "commission", "run"]
