@@ -139,7 +139,7 @@ def _slopes(machine: machine_config.MachineConfig, axis: str | None) -> dict[str
     """Return how each parameter follows the slide-way's temperature: per kelvin, from the accepted windows."""
     import numpy as np
 
-    from fdhil.identification.drift import slope
+    from fdhil.identification.trends import slope
     from fdhil.store.history import History
 
     with History.read(machine.store.directory) as stored:

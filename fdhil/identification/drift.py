@@ -1,4 +1,4 @@
-"""How the parameters move from rapid to rapid: slopes with intervals, jumps held back, a changed load, alarms.
+"""How the parameters move from rapid to rapid: jumps held back, a changed load, maintenance alarms.
 
 Pure: the same estimates in the same order give the same notices. Nothing here reads a clock.
 """
@@ -6,12 +6,13 @@ Pure: the same estimates in the same order give the same notices. Nothing here r
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from fdhil.config import Maintenance
+from fdhil.identification.trends import Slope, slope
 from fdhil.records import PARAMETERS, UNITS, Float, Notice, Parameters
 
 HISTORY = 32
@@ -19,42 +20,11 @@ LEAST_HISTORY = 3
 BEYOND_CHANCE = 5.0
 HELD_EPISODES = 2
 AGREEING = 2
+SURELY = 2.0  # standard deviations by which a change must be beyond its limit
 RELEASE = 0.8  # an alarm is released when the change has fallen to this share of its limit
+RELEASING = 4  # estimates whose mean releases an alarm
 # changes smaller than these are drift, not a jump, however sure the estimates are
 LEAST_JUMP: Mapping[str, float] = {"R": 0.05, "L": 0.08, "K": 0.03, "Jt": 0.03, "ft": 0.40, "Cd": 0.25}
-
-
-@dataclass(frozen=True, slots=True)
-class Slope:
-    """A straight line through a parameter's history: ``value`` per unit of what it was drawn against, with ``std``."""
-
-    value: float
-    std: float
-    at: float
-    level: float
-
-    def interval(self, sigmas: float = 1.96) -> tuple[float, float]:
-        """Return the slope's interval."""
-        return self.value - sigmas * self.std, self.value + sigmas * self.std
-
-
-def slope(points: Float, against: Float, stds: Float | None = None) -> Slope | None:
-    """Fit a line to ``points`` (n,) over ``against`` (n,), weighted by ``stds`` (n,); None when it has no slope.
-
-    The slope's standard deviation is the larger of what ``stds`` promise and what the scatter about the line shows.
-    """
-    known = np.isfinite(points) & np.isfinite(against)
-    y, x = points[known], against[known]
-    if y.size < 3 or np.ptp(x) == 0.0:
-        return None
-    weights = np.ones(y.size) if stds is None else 1.0 / np.maximum(stds[known], 1e-300) ** 2
-    at = float(np.average(x, weights=weights))
-    level = float(np.average(y, weights=weights))
-    spread = float((weights * (x - at) ** 2).sum())
-    value = float((weights * (x - at) * (y - level)).sum()) / spread
-    scatter = float((weights * (y - level - value * (x - at)) ** 2).sum()) / (y.size - 2)
-    inflation = scatter if stds is None else max(1.0, scatter)
-    return Slope(value, float(np.sqrt(inflation / spread)), at, level)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +66,14 @@ class DriftTracker:
             self.points.append(point)
             return self._alarms(point)
         return self._hold(point, moved)
+
+    def resume(self, first: Parameters | None, points: Iterable[Point]) -> None:
+        """Go on where an earlier run left off: an alarm that its ``points`` raised is not raised again."""
+        self.reference = first
+        for point in points:
+            self.points.append(point)
+            if first is not None:
+                self._alarms(point)
 
     @property
     def holding(self) -> bool:
@@ -153,20 +131,32 @@ class DriftTracker:
         return bool((np.abs(one.values - other.values) <= np.maximum(chance, least)).all())
 
     def _alarms(self, point: Point) -> list[Notice]:
-        """Return maintenance alarms that begin or end: relative change from the first value, with hysteresis."""
+        """Return maintenance alarms that begin or end: relative change from the first value, with hysteresis.
+
+        One sure window begins an alarm; it takes the mean of the newest, surely below ``RELEASE``, to end it.
+        """
         assert self.reference is not None
         notices = []
         for k, (name, first) in enumerate(self.reference.as_dict().items()):
+            if not (first and np.isfinite(point.values[k])):
+                continue
             limit = float(getattr(self.maintenance, name))
-            change = abs(point.values[k] - first) / abs(first) if first else 0.0
-            sure = change - 2 * point.stds[k] / abs(first) if first else 0.0
-            if name not in self.alarms and sure > limit:
+            change, doubt = abs(point.values[k] - first) / abs(first), SURELY * point.stds[k] / abs(first)
+            if name not in self.alarms and change - doubt > limit:
                 self.alarms.add(name)
                 moved = f"{name} has moved by {100 * change:.0f} % to {point.values[k]:.4g} {UNITS[name]}"
                 text = f"{moved}, limit {100 * limit:.0f} %"
                 notices.append(Notice("MaintenanceDue", "minor", text, self.axis, point.tick))
-            elif name in self.alarms and change < RELEASE * limit:
+            elif name in self.alarms and self._released(k, first, limit):
                 self.alarms.discard(name)
                 text = f"{name} is back at {point.values[k]:.4g} {UNITS[name]}"
                 notices.append(Notice("MaintenanceDue", "info", text, self.axis, point.tick))
         return notices
+
+    def _released(self, k: int, first: float, limit: float) -> bool:
+        newest = [p for p in list(self.points)[-RELEASING:] if np.isfinite(p.values[k]) and np.isfinite(p.stds[k])]
+        if not newest:
+            return False
+        change = abs(float(np.mean([p.values[k] for p in newest])) / first - 1)
+        doubt = SURELY * float(np.sqrt(np.mean([p.stds[k] ** 2 for p in newest]) / len(newest))) / abs(first)
+        return change + doubt < RELEASE * limit

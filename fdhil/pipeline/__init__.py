@@ -95,8 +95,7 @@ class AxisPipeline:
         known = known or Known()
         self._published = known.newest
         self._tracker = DriftTracker(config.maintenance, axis)
-        self._tracker.points.extend(known.points)
-        self._tracker.reference = known.first.parameters if known.first else None
+        self._tracker.resume(known.first.parameters if known.first else None, known.points)
         self._with_skill = with_skill
 
     @property

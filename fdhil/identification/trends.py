@@ -1,0 +1,216 @@
+"""What a parameter's history tells: its slope, where it stepped, when it will reach a limit, each with its interval.
+
+Pure: rows in, figures out; nothing here reads a clock.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdhil.records import PARAMETERS, Float
+
+SURE_95 = 1.959963984540054
+LEAST_ROWS = 3
+LEAST_STRETCH = 3  # rows on either side of a step: fewer may be one bad estimate
+ENOUGH_FOR_DRIFT = 8  # rows from which on a steady drift is told apart from a step
+ENOUGH_FOR_CURVE = 16
+NEAR = 8  # rows on either side in which a step must be seen too
+BEYOND_CHANCE = 5.0
+COLLINEAR = 1e-4  # share of a covariate that the others must leave
+# a smaller step is not told: drift that is no straight line looks like one
+LEAST_STEP: Mapping[str, float] = {"R": 0.05, "L": 0.08, "K": 0.03, "Jt": 0.02, "ft": 0.15, "Cd": 0.10}
+
+
+@dataclass(frozen=True, slots=True)
+class Slope:
+    """A straight line through a parameter's history: ``value`` per unit of what it was drawn against, with ``std``.
+
+    The line passes through ``level`` (with ``level_std``, independent of the slope's) at ``at``. ``freedom`` is the
+    degrees of freedom that the standard deviations rest on, infinite when they come from the estimates themselves.
+    """
+
+    value: float
+    std: float
+    at: float
+    level: float
+    level_std: float = 0.0
+    freedom: float = math.inf
+
+    def interval(self) -> tuple[float, float]:
+        """Return the slope's 95 % interval."""
+        half = student_95(self.freedom) * self.std
+        return self.value - half, self.value + half
+
+
+@dataclass(frozen=True, slots=True)
+class Crossing:
+    """Where a line reaches a limit, with its 95 % interval, in units of what the line was drawn against."""
+
+    at: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A parameter stepped between rows ``row - 1`` and ``row``: by ``size`` with ``std``, from ``before`` on."""
+
+    name: str
+    row: int
+    size: float
+    std: float
+    before: float
+
+
+def student_95(freedom: float) -> float:
+    """Return the quantile of Student's t that leaves 2.5 % on either side (Cornish-Fisher; within 1 % from 3 on)."""
+    if math.isinf(freedom):
+        return SURE_95
+    z, v = SURE_95, max(freedom, 1.0)
+    terms = (z, (z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96, (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384)
+    return sum(term / v**k for k, term in enumerate(terms))
+
+
+def slope(points: Float, against: Float, stds: Float | None = None, beside: Float | None = None) -> Slope | None:
+    """Fit a line to ``points`` (n,) over ``against`` (n,), weighted by ``stds`` (n,); None when it has no slope.
+
+    ``beside`` (n,) is held constant: what of the points follows it is no slope against the other. The slope's standard
+    deviation is the larger of what ``stds`` promise and what the scatter about the line shows.
+    """
+    known = np.isfinite(points) & np.isfinite(against)
+    if beside is not None:
+        known &= np.isfinite(beside)
+    y, x = points[known], against[known]
+    terms = 2 if beside is None else 3
+    if y.size <= terms - 1 + (terms == 2) or np.ptp(x) == 0.0:
+        return None
+    weights = np.ones(y.size) if stds is None else 1.0 / np.maximum(stds[known], 1e-300) ** 2
+    at, level = (float(np.average(values, weights=weights)) for values in (x, y))
+    root = np.sqrt(weights)
+    lever, left = root * (x - at), root * (y - level)
+    whole = float(lever @ lever)
+    if beside is not None:
+        other = beside[known] - np.average(beside[known], weights=weights)
+        lever, left = (_without(root * other, column) for column in (lever, left))
+    spread = float(lever @ lever)
+    if not spread > COLLINEAR * whole:
+        return None
+    value = float(lever @ left) / spread
+    scatter = float(((left - value * lever) ** 2).sum()) / (y.size - terms) if y.size > terms else math.inf
+    inflation = scatter if stds is None else max(1.0, scatter)
+    promised = stds is not None and scatter <= 1.0
+    freedom = math.inf if promised else float(y.size - terms)
+    level_std = math.sqrt(inflation / float(weights.sum()))
+    return Slope(value, math.sqrt(inflation / spread), at, level, level_std, freedom)
+
+
+def _without(other: Float, column: Float) -> Float:
+    """Return ``column`` (n,) without what of it follows ``other`` (n,)."""
+    length = float(other @ other)
+    rest: Float = column - other * (float(other @ column) / length if length > 0 else 0.0)
+    return rest
+
+
+def crossing(line: Slope, limit: float) -> Crossing | None:
+    """Return where the line reaches ``limit``, by Fieller's theorem; None when the slope may as well be nil."""
+    sure = student_95(line.freedom) ** 2
+    apart = limit - line.level
+    a = line.value**2 - sure * line.std**2
+    if not a > 0:
+        return None
+    b = line.value * apart
+    c = apart**2 - sure * line.level_std**2
+    root = math.sqrt(max(b * b - a * c, 0.0))
+    return Crossing(line.at + apart / line.value, line.at + (b - root) / a, line.at + (b + root) / a)
+
+
+def steps(values: Float, stds: Float, temperature: Float | None = None) -> list[Step]:
+    """Return the steps of all parameters (n, 6) with ``stds`` (n, 6), by row; rows are windows in their order.
+
+    Steady drift, a slow curve and what follows ``temperature`` (n,) are no steps.
+    """
+    found = [s for k, name in enumerate(PARAMETERS) for s in _steps_of(name, values[:, k], stds[:, k], temperature)]
+    return sorted(found, key=lambda step: (step.row, PARAMETERS.index(step.name)))
+
+
+def _steps_of(name: str, values: Float, stds: Float, temperature: Float | None) -> list[Step]:
+    known = np.flatnonzero(np.isfinite(values) & np.isfinite(stds) & (stds > 0))
+    y, n = values[known], known.size
+    if n < 2 * LEAST_STRETCH:
+        return []
+    weights = 1.0 / stds[known]
+    columns = _courses(n, None if temperature is None else temperature[known])
+    rows: list[int] = []
+    least = LEAST_STEP[name] * float(np.median(np.abs(y)))
+    while (row := _best_row(y * weights, weights, [*columns, *_jumps(n, rows)], rows)) is not None:
+        theta, covariance = _fit(y * weights, weights, [*columns, *_jumps(n, [*rows, row])])
+        sure = abs(theta[-1]) >= max(least, BEYOND_CHANCE * math.sqrt(covariance[-1, -1]))
+        if not (sure and _stands_out(y, weights, row, theta[-1])):
+            break
+        rows.append(row)
+    if not rows:
+        return []
+    theta, covariance = _fit(y * weights, weights, [*columns, *_jumps(n, rows)])
+    told = zip(rows, theta[len(columns) :], np.sqrt(np.diag(covariance))[len(columns) :], strict=True)
+    base = np.column_stack([*columns, *_jumps(n, rows)]) @ theta
+    return [Step(name, int(known[r]), float(s), float(d), float(base[r] - s)) for r, s, d in told if abs(s) >= least]
+
+
+def _stands_out(y: Float, weights: Float, row: int, size: float) -> bool:
+    """Return whether the rows close to a step show it too: a smooth curve that is no parabola has none there."""
+    first, last = max(0, row - NEAR), min(y.size, row + NEAR)
+    columns = [np.ones(last - first), np.linspace(-1.0, 1.0, last - first), *_jumps(last - first, [row - first])]
+    if last - first < ENOUGH_FOR_DRIFT:
+        del columns[1]
+    theta, _ = _fit(y[first:last] * weights[first:last], weights[first:last], columns)
+    return theta[-1] * size > 0 and abs(theta[-1]) >= abs(size) / 2
+
+
+def _courses(n: int, temperature: Float | None) -> list[Float]:
+    """Return what a parameter may do without a step: columns (n,)."""
+    order = np.linspace(-1.0, 1.0, n)
+    columns = [np.ones(n)]
+    if n >= ENOUGH_FOR_DRIFT:
+        columns.append(order)
+    if n >= ENOUGH_FOR_CURVE:
+        columns += [order**2, order**3]
+    if temperature is not None and np.isfinite(temperature).all() and n >= ENOUGH_FOR_DRIFT:
+        columns.append(temperature - temperature.mean())
+    return columns
+
+
+def _jumps(n: int, rows: Sequence[int]) -> list[Float]:
+    return [(np.arange(n) >= row).astype(np.float64) for row in rows]
+
+
+def _fit(y: Float, weights: Float, columns: Sequence[Float]) -> tuple[Float, Float]:
+    """Return coefficients and covariance of the weighted regression; scatter beyond the weights widens it."""
+    phi = np.column_stack(columns) * weights[:, None]
+    inverse = np.linalg.pinv(phi.T @ phi)
+    theta = inverse @ (phi.T @ y)
+    freedom = max(1, y.size - phi.shape[1])
+    scatter = float(((y - phi @ theta) ** 2).sum()) / freedom
+    return theta, inverse * max(1.0, scatter)
+
+
+def _best_row(y: Float, weights: Float, columns: Sequence[Float], taken: Sequence[int]) -> int | None:
+    """Return the row whose step explains most of what the columns leave; None when no row may have one."""
+    n = y.size
+    base = np.linalg.qr(np.column_stack(columns) * weights[:, None])[0]
+    left = y - base @ (base.T @ y)
+    # the step from row s on, weighted: its products are sums from s to the end
+    lever = np.cumsum((left * weights)[::-1])[::-1]
+    shadow = np.cumsum((base * weights[:, None])[::-1], axis=0)[::-1]
+    whole = np.cumsum((weights**2)[::-1])[::-1]
+    length = whole - (shadow**2).sum(axis=1)
+    allowed = length > COLLINEAR * whole
+    for edge in (0, n, *taken):
+        allowed[max(0, edge - LEAST_STRETCH + 1) : edge + LEAST_STRETCH] = False
+    if not allowed.any():
+        return None
+    power = np.where(allowed, lever**2 / np.where(allowed, length, 1.0), -1.0)
+    return int(power.argmax())
