@@ -235,7 +235,7 @@ def largest_move_um(config: MachineConfig, axis: str) -> float:
     return max(SIGN_TEST_UM, ramped)
 
 
-def _told_feedforward(master: Master) -> bool | None:
+def tell_feedforward(master: Master) -> bool | None:
     """Ask again while a busy computer saw too little of the ramp's begin; None when it never saw enough."""
     for _ in range(FEEDFORWARD_TRIES):
         answer = feedforward_test(master)
@@ -362,7 +362,7 @@ def commission(
             report("sign test")
             moved_um = sign_test(master)
             report("feed-forward test")
-            in_feedforward = _told_feedforward(master)
+            in_feedforward = tell_feedforward(master)
             report("watchdog test")
             watchdog = watchdog_test(master)
             report("restore")

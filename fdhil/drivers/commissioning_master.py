@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
+from typing import Self
 
 from fdhil import cia402
 from fdhil.config import MachineConfig
@@ -220,7 +221,7 @@ class Master:
         self._thread.join(timeout=2.0)
         self.bus.close()
 
-    def __enter__(self) -> Master:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(

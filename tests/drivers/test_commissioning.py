@@ -177,6 +177,107 @@ def test_a_watchdog_that_does_nothing_is_refused(peer: tuple[DrivePeer, MachineC
     assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
 
 
+class LateMaster(Master):
+    """A master on a computer that is held up: in the first ``late`` feedings no heartbeat follows the first one."""
+
+    late = 0
+    trip: Callable[[], None] | None = None
+    feedings = 0
+    _beating = False
+
+    def _send_heartbeat(self) -> None:
+        if self.heartbeat and not self._beating:
+            self.feedings += 1
+            if self.trip is not None:
+                self.trip()
+            super()._send_heartbeat()
+        self._beating = self.heartbeat
+        if self.feedings > self.late:
+            super()._send_heartbeat()
+
+
+def test_a_feeding_that_this_computer_missed_is_tried_again(
+    peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(commissioning, "FEEDING_S", 0.15)
+    drive, settings = peer
+    with LateMaster(settings, "X") as master:
+        master.late = 2
+        run_steps(master, lambda m: watchdog_test(m) == "proven" or pytest.fail("not proven"))
+        assert 2 < master.feedings <= commissioning.FEEDING_TRIES  # this computer may be late once by itself
+    assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
+
+
+def test_a_computer_that_is_always_late_is_told(
+    peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(commissioning, "FEEDING_S", 0.15)
+    drive, settings = peer
+    with LateMaster(settings, "X") as master:
+        master.late = 99
+        with pytest.raises(DriveFault, match="missed our heartbeat 4 times; take load off this computer"):
+            run_steps(master, watchdog_test)
+        assert master.feedings == commissioning.FEEDING_TRIES
+    assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
+    assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
+
+
+def test_a_drive_that_trips_while_it_is_fed_is_not_tried_again(
+    peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(commissioning, "FEEDING_S", 0.15)
+    drive, settings = peer
+    with LateMaster(settings, "X") as master:
+        master.trip = lambda: drive.drive.trip(0x3210)
+        with pytest.raises(DriveFault, match="it fell from Operation enabled to Fault"):
+            run_steps(master, watchdog_test)
+        assert master.feedings == 1
+
+
+class SlowReader(Master):
+    """A master on a busy computer: the first ``slow`` readings of the speed demand come too late to tell anything."""
+
+    slow = 0
+    readings = 0
+
+    def __init__(self, config: MachineConfig, axis: str) -> None:
+        super().__init__(config, axis)
+        self._read_int = self.sdo.read_int
+        monkey: Any = self.sdo
+        monkey.read_int = self.read_int
+
+    def read_int(self, index: int, sub: int = 0, *, signed: bool = False) -> int:
+        value = self._read_int(index, sub, signed=signed)
+        if index == Object.VELOCITY_DEMAND:
+            self.readings += 1
+            if self.readings <= self.slow:
+                self.wait_cycles(2 * commissioning.EARLY_CYCLES + commissioning.RAMP_CYCLES)
+        return value
+
+
+READINGS = 1 + commissioning.RAMPS  # of a try in which each is late: whether the object is there, and one a ramp
+
+
+def test_a_ramp_whose_begin_was_missed_is_asked_again(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    _, settings = peer
+    with SlowReader(settings, "X") as master, rolled_back(master):
+        prepare(master)
+        enable(master)
+        master.slow = READINGS
+        assert commissioning.tell_feedforward(master) is True
+        assert master.readings > 2 * READINGS
+
+
+def test_a_feedforward_that_is_never_seen_stays_untold(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    _, settings = peer
+    with SlowReader(settings, "X") as master, rolled_back(master):
+        prepare(master)
+        enable(master)
+        master.slow = 1_000_000
+        assert commissioning.tell_feedforward(master) is None
+        assert master.readings == commissioning.FEEDFORWARD_TRIES * READINGS
+
+
 def test_full_heartbeat_consumers_are_refused(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
     for sub in (1, 2, 3, 4):
