@@ -103,6 +103,103 @@ def _weigh_plain(weight: Float, which: int, d0: Float, d1: Float, d2: Float) -> 
 _weigh: Callable[[Float, int, Float, Float, Float], None] = njit(cache=True, nogil=True)(_weigh_plain)
 
 
+def _all_differences_plain(o: Float, start: Float, into: Float) -> None:
+    """Write o and its first two differences into the three rows of ``into`` (3, n)."""
+    for c in range(3):
+        into[c] = _differences(o, start, c)
+
+
+_all_differences: Callable[[Float, Float, Float], None] = njit(cache=True, nogil=True)(_all_differences_plain)
+
+
+def _begin_plain(value: Float, limits: Float, mu: float, slack: Float, force: Float) -> None:
+    """Set slacks (6, n) well inside the limits and the forces that belong to them; row 2 c + side is one bound."""
+    for bound in range(6):
+        c, sign = bound // 2, 1.0 - 2.0 * (bound % 2)
+        for k in range(value.shape[1]):
+            slack[bound, k] = max(limits[c] - sign * value[c, k], 0.1 * limits[c])
+            force[bound, k] = mu / slack[bound, k]
+
+
+_begin: Callable[[Float, Float, float, Float, Float], None] = njit(cache=True, nogil=True)(_begin_plain)
+
+
+def _newton_plain(
+    value: Float, slack: Float, force: Float, limits: Float, mu: float, b: Float, diagonals: Float
+) -> tuple[float, float]:
+    """Add the bounds to the system (``b`` (n,), ``diagonals`` (3, n)); return the mean gap and the worst miss."""
+    n = b.size
+    weight, push = np.empty(n), np.empty(n)
+    gap = 0.0
+    miss = 0.0
+    for c in range(3):
+        for k in range(n):
+            s1, s2 = slack[2 * c, k], slack[2 * c + 1, k]
+            l1, l2 = force[2 * c, k], force[2 * c + 1, k]
+            r1 = s1 + value[c, k] - limits[c]
+            r2 = s2 - value[c, k] - limits[c]
+            gap += l1 * s1 + l2 * s2
+            miss = max(miss, abs(r1) / limits[c], abs(r2) / limits[c])
+            weight[k] = l1 / s1 + l2 / s2
+            # with the forces of this iterate the two -l cancel those in the gradient
+            push[k] = -(mu + l1 * r1) / s1 + (mu + l2 * r2) / s2
+        _scatter(push, c, b)
+        _weigh(weight, c, diagonals[0], diagonals[1], diagonals[2])
+    return gap / (6 * n), miss
+
+
+_newton: Callable[..., tuple[float, float]] = njit(cache=True, nogil=True)(_newton_plain)
+
+
+def _direction_plain(s: float, f: float, value: float, step: float, limit: float, mu: float) -> tuple[float, float]:
+    """Return how slack and force of one bound move with the step; ``value`` and ``step`` carry the bound's sign."""
+    ds = limit - value - s - step
+    return ds, (mu - f * ds) / s - f
+
+
+_direction: Callable[..., tuple[float, float]] = njit(cache=True, nogil=True)(_direction_plain)
+
+
+def _lengths_plain(
+    value: Float, step: Float, slack: Float, force: Float, limits: Float, mu: float
+) -> tuple[float, float]:
+    """Return how much of the step may be taken, so that every slack and every force stays positive."""
+    primal = 1.0
+    dual = 1.0
+    for bound in range(6):
+        c, sign = bound // 2, 1.0 - 2.0 * (bound % 2)
+        for k in range(value.shape[1]):
+            s, f = slack[bound, k], force[bound, k]
+            ds, df = _direction(s, f, sign * value[c, k], sign * step[c, k], limits[c], mu)
+            if ds < 0.0:
+                primal = min(primal, -0.99 * s / ds)
+            if df < 0.0:
+                dual = min(dual, -0.99 * f / df)
+    return primal, dual
+
+
+_lengths: Callable[..., tuple[float, float]] = njit(cache=True, nogil=True)(_lengths_plain)
+
+
+def _advance_plain(
+    value: Float, step: Float, slack: Float, force: Float, limits: Float, mu: float, primal: float, dual: float
+) -> float:
+    """Move slacks and forces by their shares of the step; return the mean gap that is left."""
+    total = 0.0
+    for bound in range(6):
+        c, sign = bound // 2, 1.0 - 2.0 * (bound % 2)
+        for k in range(value.shape[1]):
+            s, f = slack[bound, k], force[bound, k]
+            ds, df = _direction(s, f, sign * value[c, k], sign * step[c, k], limits[c], mu)
+            slack[bound, k] = s + primal * ds
+            force[bound, k] = f + dual * df
+            total += slack[bound, k] * force[bound, k]
+    return float(total / (6 * value.shape[1]))
+
+
+_advance: Callable[..., float] = njit(cache=True, nogil=True)(_advance_plain)
+
+
 def _project_plain(wanted: Float, limits: Float, start: Float) -> Float:
     """Return the nearest (n,) to ``wanted`` (least squares) whose value, first and second difference stay in +-limits.
 
@@ -110,79 +207,27 @@ def _project_plain(wanted: Float, limits: Float, start: Float) -> Float:
     """
     n = wanted.size
     o = np.zeros(n)
-    slack = np.empty((6, n))
-    force = np.empty((6, n))
-    value = np.empty((3, n))
-    step = np.empty((3, n))
+    zero = np.zeros(2)
+    value, step, diagonals = np.empty((3, n)), np.empty((3, n)), np.empty((3, n))
+    slack, force = np.empty((6, n)), np.empty((6, n))
     scale = max(1.0, np.abs(wanted).max())
     mu = 0.1 * scale
-    for c in range(3):
-        value[c] = _differences(o, start, c)
-        for side in range(2):
-            sign = 1.0 - 2.0 * side
-            for k in range(n):
-                slack[2 * c + side, k] = max(limits[c] - sign * value[c, k], 0.1 * limits[c])
-                force[2 * c + side, k] = mu / slack[2 * c + side, k]
+    _all_differences(o, start, value)
+    _begin(value, limits, mu, slack, force)
     for _ in range(ITERATIONS):
-        gap = 0.0
-        miss = 0.0
         b = wanted - o
-        d0 = np.ones(n)
-        d1 = np.zeros(n)
-        d2 = np.zeros(n)
-        for c in range(3):
-            weight = np.empty(n)
-            push = np.empty(n)
-            for k in range(n):
-                s1, s2 = slack[2 * c, k], slack[2 * c + 1, k]
-                l1, l2 = force[2 * c, k], force[2 * c + 1, k]
-                r1 = s1 + value[c, k] - limits[c]
-                r2 = s2 - value[c, k] - limits[c]
-                gap += l1 * s1 + l2 * s2
-                miss = max(miss, abs(r1) / limits[c], abs(r2) / limits[c])
-                weight[k] = l1 / s1 + l2 / s2
-                # with the forces of this iterate the two -l cancel those in the gradient
-                push[k] = -(mu + l1 * r1) / s1 + (mu + l2 * r2) / s2
-            _scatter(push, c, b)
-            _weigh(weight, c, d0, d1, d2)
-        gap /= 6 * n
+        diagonals[0] = 1.0
+        diagonals[1:] = 0.0
+        gap, miss = _newton(value, slack, force, limits, mu, b, diagonals)
         if gap < 1e-7 * scale and miss < 1e-9:
             break
-        move = _solve(d0, d1, d2, b)
-        zero = np.zeros(2)
-        primal = 1.0
-        dual = 1.0
-        for c in range(3):
-            step[c] = _differences(move, zero, c)
-            for side in range(2):
-                sign = 1.0 - 2.0 * side
-                for k in range(n):
-                    s = slack[2 * c + side, k]
-                    f = force[2 * c + side, k]
-                    r = s + sign * value[c, k] - limits[c]
-                    ds = -r - sign * step[c, k]
-                    df = (mu - f * ds) / s - f
-                    if ds < 0.0:
-                        primal = min(primal, -0.99 * s / ds)
-                    if df < 0.0:
-                        dual = min(dual, -0.99 * f / df)
-        total = 0.0
-        for c in range(3):
-            for side in range(2):
-                sign = 1.0 - 2.0 * side
-                for k in range(n):
-                    s = slack[2 * c + side, k]
-                    f = force[2 * c + side, k]
-                    r = s + sign * value[c, k] - limits[c]
-                    ds = -r - sign * step[c, k]
-                    df = (mu - f * ds) / s - f
-                    slack[2 * c + side, k] = s + primal * ds
-                    force[2 * c + side, k] = f + dual * df
-                    total += slack[2 * c + side, k] * force[2 * c + side, k]
+        move = _solve(diagonals[0], diagonals[1], diagonals[2], b)
+        _all_differences(move, zero, step)
+        primal, dual = _lengths(value, step, slack, force, limits, mu)
+        left = _advance(value, step, slack, force, limits, mu, primal, dual)
         o += primal * move
-        for c in range(3):
-            value[c] = _differences(o, start, c)
-        mu = (0.1 if min(primal, dual) > 0.9 else 0.3) * total / (6 * n)
+        _all_differences(o, start, value)
+        mu = (0.1 if min(primal, dual) > 0.9 else 0.3) * left
     return o
 
 
