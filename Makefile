@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
-VCAN   := bash tests/integration/vcan-vm.sh -t 280
+VCAN   := bash tests/integration/vcan-vm.sh -t 900
 
 .PHONY: help setup demo test test-vcan test-full lint bench study lock clean
 
