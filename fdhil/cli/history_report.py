@@ -7,22 +7,25 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from fdhil.cli.history_trends import moved, slope_rows
 from fdhil.cli.status_view import with_interval
 from fdhil.config import MachineConfig
 
 
-def write_report(machine: MachineConfig, rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write the report of all revisions (see ``fdhil history --json``). FdhilError without the extra ``report``."""
+def write_report(
+    machine: MachineConfig, rows: Sequence[Mapping[str, Any]], health: Mapping[str, Mapping[str, Any]], path: Path
+) -> None:
+    """Write the report of revisions and health (see ``fdhil history --json``). FdhilError without extra ``report``."""
     from fdhil.report import Page, write
 
     axes = dict.fromkeys(row["axis"] for row in rows)
-    sections = [_axis_section(axis, [row for row in rows if row["axis"] == axis]) for axis in axes]
+    sections = [_axis_section(axis, [row for row in rows if row["axis"] == axis], health.get(axis)) for axis in axes]
     headline = [(f"axis {axis}", f"{sum(row['axis'] == axis for row in rows)} revisions") for axis in axes]
     page = Page(f"{machine.machine.name}: identified drives", "parameters with 95 % intervals", headline, sections)
     write(page, path)
 
 
-def _axis_section(axis: str, rows: Sequence[Mapping[str, Any]]) -> Any:
+def _axis_section(axis: str, rows: Sequence[Mapping[str, Any]], told: Mapping[str, Any] | None) -> Any:
     from fdhil.report import Section, Table
 
     names = list(rows[0]["parameters"])
@@ -40,13 +43,33 @@ def _axis_section(axis: str, rows: Sequence[Mapping[str, Any]]) -> Any:
         ],
         caption=f"Published parameter sets of axis {axis}",
     )
-    return Section(f"Axis {axis}", tables=[table], figures=[("Course of each parameter", _svg(rows))])
+    tables = [table] if told is None else [table, *_health_tables(told)]
+    return Section(
+        f"Axis {axis}", tables=tables, figures=[("Course of each parameter", _svg(rows, {axis: told} if told else {}))]
+    )
 
 
-def _svg(rows: Sequence[Mapping[str, Any]]) -> str:
+def _health_tables(told: Mapping[str, Any]) -> list[Any]:
+    """Return slopes with dates of the limits, and the changes, each where there are any."""
+    from fdhil.report import Table
+
+    slopes = Table(
+        head=["parameter", "per kelvin", "per day", "maintenance limit"],
+        rows=slope_rows(told),
+        caption="Slopes since the last change, with 95 % intervals",
+    )
+    changes = Table(
+        head=["time", "window", "parameters", "likely cause"],
+        rows=[[c["time"], str(c["window"]), moved(c), c["cause"]] for c in told["changes"]],
+        caption="Changes",
+    )
+    return [table for table in (slopes, changes) if table.rows]
+
+
+def _svg(rows: Sequence[Mapping[str, Any]], health: Mapping[str, Mapping[str, Any]]) -> str:
     from fdhil.cli.history_plot import courses
 
     sink = io.StringIO()
-    courses(rows).savefig(sink, format="svg")
+    courses(rows, health).savefig(sink, format="svg")
     text = sink.getvalue()
     return text[text.index("<svg") :]

@@ -12,7 +12,6 @@ import click
 from fdhil import config as machine_config
 from fdhil import tables
 from fdhil.errors import RecordingError
-from fdhil.records import PARAMETERS
 
 if TYPE_CHECKING:
     from fdhil.records import Outcome, Window
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
 
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 FILE = click.Path(path_type=Path)
+HEALTH = ("slopes", "trends", "limits", "changes", "windows")
 
 
 @click.command()
@@ -105,58 +105,37 @@ def _config_of(window: Window) -> machine_config.MachineConfig:
 @click.command()
 @click.argument("config", type=FILE)
 @click.option("--axis", help="One axis only.")
-@click.option("--plot", type=FILE, help="Also write the courses of the parameters as a PNG.")
+@click.option("--plot", type=FILE, help="Also write the parameters over time and temperature as a PNG.")
 @AS_JSON
 def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) -> None:
-    """Show how the identified parameters of CONFIG's machine moved."""
+    """Show how the identified parameters of CONFIG's machine moved: revisions, slopes, changes, maintenance dates."""
     machine = machine_config.load(config)
-    rows = _revision_rows(machine, axis)
+    rows, told = _history(machine, axis)
     if plot is not None:
         from fdhil.cli.history_plot import write_plot
 
-        write_plot(rows, plot)
-    slopes = _slopes(machine, axis)
+        write_plot(rows, told, plot)
     if as_json:
-        click.echo(json.dumps({"schema": "fdhil-history-1", "revisions": rows, "slopes": slopes}))
+        parts = {key: {name: of_axis[key] for name, of_axis in told.items()} for key in HEALTH}
+        click.echo(json.dumps({"schema": "fdhil-history-1", "revisions": rows} | parts))
         return
     if not rows:
         click.echo("no parameters were published yet")
         return
-    from fdhil.cli.status_view import show_history, show_slopes
+    from fdhil.cli.history_trends import show_health
+    from fdhil.cli.status_view import show_history
 
     show_history(rows)
-    show_slopes(slopes)
+    show_health(told)
 
 
-def _revision_rows(machine: machine_config.MachineConfig, axis: str | None) -> list[dict[str, Any]]:
+def _history(machine: machine_config.MachineConfig, axis: str | None) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Return the published revisions and, by axis, what the windows tell of the drive's health."""
+    from fdhil.cli.history_trends import health
     from fdhil.store.history import History
 
     with History.read(machine.store.directory) as stored:
-        return [_row(revision) for revision in stored.revisions(axis)]
-
-
-def _slopes(machine: machine_config.MachineConfig, axis: str | None) -> dict[str, dict[str, Any]]:
-    """Return how each parameter follows the slide-way's temperature: per kelvin, from the accepted windows."""
-    import numpy as np
-
-    from fdhil.identification.trends import slope
-    from fdhil.store.history import History
-
-    with History.read(machine.store.directory) as stored:
-        windows = [window for window in stored.windows(axis) if window.accepted and window.parameters]
-    told: dict[str, dict[str, Any]] = {}
-    for name in dict.fromkeys(window.axis for window in windows):
-        of_axis = [window for window in windows if window.axis == name and window.temperature_c is not None]
-        celsius = np.array([window.temperature_c for window in of_axis], dtype=np.float64)
-        told[name] = {}
-        for symbol in PARAMETERS:
-            known = [(window.parameters or {}).get(symbol, {}) for window in of_axis]
-            values, stds = (np.array([k.get(key) for k in known], dtype=np.float64) for key in ("value", "std"))
-            line = slope(values, celsius, stds) if np.isfinite(stds).all() else None
-            if line is not None:
-                low, high = line.interval()
-                told[name][symbol] = {"per_kelvin": line.value, "std": line.std, "low": low, "high": high}
-    return told
+        return [_row(revision) for revision in stored.revisions(axis)], health(stored, machine, axis)
 
 
 def _row(revision: Revision) -> dict[str, Any]:
@@ -198,4 +177,4 @@ def report(config: Path, out: Path) -> None:
     machine = machine_config.load(config)
     from fdhil.cli.history_report import write_report
 
-    write_report(machine, _revision_rows(machine, None), out)
+    write_report(machine, *_history(machine, None), out)

@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 BARS = "▁▂▃▄▅▆▇█"
+COURSE = 14  # revisions in a row of bars: what fits the column of a value with its interval
 
 
 def open_console() -> Console:
@@ -76,29 +77,23 @@ def sparkline(values: Sequence[float]) -> str:
     return "".join(BARS[min(7, int((value - low) / span * 8))] for value in values)
 
 
-def show_slopes(slopes: Mapping[str, Mapping[str, Mapping[str, float]]], console: Console | None = None) -> None:
-    """Print how the parameters follow the temperature, where that is known."""
-    out = console or open_console()
-    for axis, lines in slopes.items():
-        sure = [f"{name} {with_interval({'value': line['per_kelvin'], **line})}" for name, line in lines.items()]
-        if sure:
-            out.print(f"axis {axis}, change per kelvin of the slide-way: {', '.join(sure)}")
-
-
 def show_history(rows: Sequence[Mapping[str, Any]], console: Console | None = None, newest: int = 15) -> None:
     """Print the newest revisions of every axis, and each parameter's course over all of them."""
     out = console or open_console()
     for axis in dict.fromkeys(row["axis"] for row in rows):
         of_axis = [row for row in rows if row["axis"] == axis]
         names = list(of_axis[0]["parameters"])
-        table = Table(title=f"axis {axis}: {len(of_axis)} revisions", show_edge=False, pad_edge=False)
+        first, last = (of_axis[k]["time"][:10] for k in (0, -1))
+        title = f"axis {axis}: {len(of_axis)} revisions, {first} to {last}"
+        table = Table(title=title, show_edge=False, pad_edge=False)
         for head in ("revision", "time", "degC", "windows", *names):
             table.add_column(head)
         for row in of_axis[-newest:]:
             degrees = "-" if row["temperature_c"] is None else f"{row['temperature_c']:.2f}"
             cells = [with_interval(row["parameters"][name]) for name in names]
-            table.add_row(str(row["revision"]), row["time"], degrees, str(row["windows_used"]), *cells)
-        courses = [sparkline([row["parameters"][name]["value"] for row in of_axis[-24:]]) for name in names]
+            time = row["time"][5:16].replace("T", " ")
+            table.add_row(str(row["revision"]), time, degrees, str(row["windows_used"]), *cells)
+        courses = [sparkline([row["parameters"][name]["value"] for row in of_axis[-COURSE:]]) for name in names]
         table.add_section()
         table.add_row("course", "", "", "", *courses)
         out.print(table)

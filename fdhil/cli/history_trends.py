@@ -1,0 +1,211 @@
+"""What the stored windows tell of the drives' health: slopes, steps, and the dates of the maintenance limits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+from fdhil.records import PARAMETERS, UNITS
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from fdhil.config import MachineConfig
+    from fdhil.identification.trends import Crossing, Step
+    from fdhil.records import Float
+    from fdhil.store.history import History, StoredWindow
+
+NEWEST_WINDOWS = 2000
+DAY_S = 86_400.0
+LEAST_SPAN_S = 3_600.0  # below it a course in time is warming, not wear
+WEAR_SPAN_S = 2 * DAY_S  # from it on what follows the temperature is told apart from wear
+FARTHEST_DAYS = 3_650.0
+TOGETHER = 2  # windows within which steps have one cause
+CAUSES = {
+    frozenset({"Jt"}): "a changed load",
+    frozenset({"ft"}): "changed lubrication",
+    frozenset({"ft", "Cd"}): "changed lubrication or guides",
+    frozenset({"Cd"}): "changed guides, seals or preload",
+    frozenset({"R"}): "a changed winding or connection",
+    frozenset({"K"}): "changed magnets or a current sensor's gain",
+}
+
+
+def health(history: History, machine: MachineConfig, axis: str | None = None) -> dict[str, dict[str, Any]]:
+    """Return by axis ``slopes``, ``trends``, ``limits``, ``changes`` and their ``windows``, as JSON has them."""
+    stored = [w for w in history.windows(axis, limit=NEWEST_WINDOWS) if w.accepted and w.parameters]
+    told = {}
+    for name in dict.fromkeys(window.axis for window in stored):
+        first = history.first_revision(name)
+        limits = {}
+        if first is not None:
+            shares = machine.maintenance.model_dump()
+            limits = {symbol: (value, shares[symbol]) for symbol, value in first.set.parameters.as_dict().items()}
+        told[name] = of_axis([window for window in stored if window.axis == name], limits)
+    return told
+
+
+def of_axis(windows: Sequence[StoredWindow], limits: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
+    """Return an axis' health; ``limits`` maps a symbol to its first published value and the change that it may have."""
+    import numpy as np
+
+    from fdhil.identification.trends import slope, steps
+
+    values, stds = (_columns(windows, key) for key in ("value", "std"))
+    time_s = np.array([window.stamp.wall_s for window in windows])
+    celsius = np.array([np.nan if w.temperature_c is None else w.temperature_c for w in windows], dtype=np.float64)
+    known = bool(np.isfinite(celsius).all())
+    found = steps(values, stds, celsius if known else None)
+    told: dict[str, Any] = {"slopes": {}, "trends": {}, "limits": {}, "changes": _changes(found, windows)}
+    for k, symbol in enumerate(PARAMETERS):
+        since = max((step.row for step in found if step.name == symbol), default=0)
+        y, std, kelvin = values[since:, k], stds[since:, k], celsius[since:]
+        span_s = float(np.ptp(time_s[since:]))
+        if line := slope(y, kelvin, std, time_s[since:] if span_s >= WEAR_SPAN_S else None):
+            centre = {"level": line.level, "at_celsius": line.at}
+            told["slopes"][symbol] = {"per_kelvin": line.value, "std": line.std, **_interval(line.interval())} | centre
+        if span_s < LEAST_SPAN_S:
+            continue
+        held = known and bool(np.ptp(kelvin) > 0)
+        line = slope(y, time_s[since:] / DAY_S, std, kelvin if held else None)
+        if line is not None:
+            rest: dict[str, Any] = {"level": line.level, "at": _date(line.at * DAY_S), "since": _date(time_s[since])}
+            rest["at_constant_temperature"] = held
+            told["trends"][symbol] = {"per_day": line.value, "std": line.std, **_interval(line.interval())} | rest
+            if symbol in limits:
+                told["limits"] |= _limit(symbol, line, limits[symbol], float(time_s[-1]))
+    return told | {"windows": _rows(windows, values, stds)}
+
+
+def _columns(windows: Sequence[StoredWindow], key: str) -> Float:
+    """Return (n, 6) of the windows' values or standard deviations, NaN where one was not told."""
+    import numpy as np
+
+    told = [[(window.parameters or {}).get(name, {}).get(key) for name in PARAMETERS] for window in windows]
+    return np.array(told, dtype=np.float64).reshape(-1, len(PARAMETERS))
+
+
+def _interval(interval: tuple[float, float]) -> dict[str, float]:
+    return {"low": interval[0], "high": interval[1]}
+
+
+def _date(seconds: float) -> str:
+    return datetime.fromtimestamp(float(seconds), UTC).isoformat(timespec="seconds")
+
+
+def _limit(symbol: str, line: Any, limit: tuple[float, float], newest_s: float) -> dict[str, dict[str, Any]]:
+    """Return when the line reaches the limit that lies ahead of it, and nothing when no date can be told."""
+    from fdhil.identification.trends import crossing
+
+    first, share = limit
+    value = first + abs(first) * (share if line.value > 0 else -share)
+    reached = crossing(line, value)
+    if reached is None or reached.at - newest_s / DAY_S > FARTHEST_DAYS:
+        return {}
+    return {symbol: {"limit": value, "reached": reached.at * DAY_S <= newest_s, **_dates(reached, newest_s)}}
+
+
+def _dates(reached: Crossing, newest_s: float) -> dict[str, str | None]:
+    """Return the date and its interval; one that ends in a farther future has no latest date."""
+    late = reached.high - newest_s / DAY_S > FARTHEST_DAYS
+    return {
+        "date": _date(reached.at * DAY_S),
+        "earliest": _date(reached.low * DAY_S),
+        "latest": None if late else _date(reached.high * DAY_S),
+    }
+
+
+def _changes(found: Sequence[Step], windows: Sequence[StoredWindow]) -> list[dict[str, Any]]:
+    """Return the steps with those of other parameters at about the same window taken together."""
+    changes: list[list[Step]] = []
+    for step in found:
+        if changes and step.row - changes[-1][0].row <= TOGETHER:
+            changes[-1].append(step)
+        else:
+            changes.append([step])
+    told = []
+    for together in changes:
+        window = windows[together[0].row]
+        parameters = {
+            s.name: {"before": s.before, "after": s.before + s.size, "std": s.std, "unit": UNITS[s.name]}
+            for s in together
+        }
+        cause = CAUSES.get(frozenset(parameters), "a changed drive or sensor")
+        told.append(
+            {"window": window.number, "time": _date(window.stamp.wall_s), "cause": cause, "parameters": parameters}
+        )
+    return told
+
+
+def _rows(windows: Sequence[StoredWindow], values: Float, stds: Float) -> list[dict[str, Any]]:
+    """Return the windows as the plot and JSON have them: number, time, temperature, value and standard deviation."""
+    import numpy as np
+
+    def told(number: float) -> float | None:
+        return float(number) if np.isfinite(number) else None
+
+    return [
+        {
+            "window": window.number,
+            "time": _date(window.stamp.wall_s),
+            "temperature_c": window.temperature_c,
+            "parameters": {
+                name: {"value": told(v), "std": told(s)} for name, v, s in zip(PARAMETERS, row, spread, strict=True)
+            },
+        }
+        for window, row, spread in zip(windows, values, stds, strict=True)
+    ]
+
+
+def show_health(told: Mapping[str, Mapping[str, Any]], console: Console | None = None) -> None:
+    """Print slopes, limits and changes of every axis, where there are any."""
+    from rich.table import Table
+
+    from fdhil.cli.status_view import open_console
+
+    out = console or open_console()
+    for axis, its in told.items():
+        if rows := slope_rows(its):
+            table = Table(title=f"axis {axis}: slopes with 95 % intervals", show_edge=False, pad_edge=False)
+            for head in ("parameter", "change per kelvin of the slide-way", "change per day", "maintenance limit"):
+                table.add_column(head)
+            for row in rows:
+                table.add_row(*row)
+            out.print(table)
+        for change in its["changes"]:
+            out.print(
+                f"axis {axis}, window {change['window']} at {change['time']}: {moved(change)}: {change['cause']}",
+                highlight=False,
+            )
+
+
+def slope_rows(told: Mapping[str, Any]) -> list[list[str]]:
+    """Return a row per parameter that has a slope: per kelvin, per day, and its limit's date."""
+    from fdhil.cli.status_view import with_interval
+
+    slopes, trends, limits = (told[key] for key in ("slopes", "trends", "limits"))
+    rows = []
+    for name in PARAMETERS:
+        if name in slopes or name in trends:
+            cells = [
+                with_interval({"value": line[key], **line}) if (line := lines.get(name)) else "-"
+                for lines, key in ((slopes, "per_kelvin"), (trends, "per_day"))
+            ]
+            rows.append([f"{name} {UNITS[name]}", *cells, _when(limits.get(name))])
+    return rows
+
+
+def moved(change: Mapping[str, Any]) -> str:
+    """Return what moved in a change, in words."""
+    parts = change["parameters"].items()
+    return ", ".join(f"{name} {p['before']:.4g} -> {p['after']:.4g} {p['unit']}" for name, p in parts)
+
+
+def _when(limit: Mapping[str, Any] | None) -> str:
+    if limit is None:
+        return "-"
+    if limit["reached"]:
+        return f"{limit['limit']:.4g} has been reached"
+    latest = limit["latest"][:10] if limit["latest"] else "open"
+    return f"{limit['limit']:.4g} on {limit['date'][:10]} ({limit['earliest'][:10]} to {latest})"

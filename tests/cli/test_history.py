@@ -1,0 +1,101 @@
+"""history: slopes against temperature and time, what changed and why, and when a maintenance limit will be reached."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil.records import PARAMETERS, frozen
+from fdhil.store.history import History, Stamp
+from tests.daemon.machine import config_of
+from tests.daemon.shop import BENCH, fdhil
+from tests.store.made import outcome, published, window
+
+START_S = 1_800_000_000.0
+DAYS = 60
+STEP_DAY = 40
+STDS = np.array([0.0005, 1e-5, 0.0002, 0.00005, 0.0005, 0.08])
+WEAR_PER_DAY = 0.0005  # of ft, N.m.s
+PER_KELVIN = -0.25  # of Cd, N.m
+
+
+@pytest.fixture(scope="module")
+def worn(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A machine whose ft wears, whose Cd follows the temperature, and whose table was loaded on day 40."""
+    tmp_path = tmp_path_factory.mktemp("worn")
+    path = tmp_path / "machine.toml"
+    path.write_text(BENCH)
+    rng = np.random.default_rng(3)
+    with History.open(config_of(tmp_path, ("X", "Y")).store.directory) as history:
+        for k in range(2 * DAYS):
+            day = k / 2
+            celsius = 22 + 2 * np.sin(k) + 0.01 * day
+            made = outcome(of=window(temperature_c=float(celsius)))
+            assert made.estimate is not None
+            values = made.estimate.values + STDS * rng.standard_normal(6)
+            values[4] += WEAR_PER_DAY * day
+            values[5] += PER_KELVIN * (celsius - 22)
+            values[3] *= 1.13 if day >= STEP_DAY else 1.0
+            estimate = replace(made.estimate, values=frozen(values), covariance=frozen(np.diag(STDS**2)))
+            stamp = Stamp(START_S + 86_400 * day, "boot", k)
+            number = history.add_window(replace(made, estimate=estimate), "", stamp)
+            parameters = replace(published(1).parameters, **dict(zip(PARAMETERS, values.tolist(), strict=True)))
+            history.add_revision(replace(published(k + 1), parameters=parameters), [number], stamp)
+    return path
+
+
+def _days(date: str) -> float:
+    return (datetime.fromisoformat(date) - datetime.fromtimestamp(START_S, UTC)).total_seconds() / 86_400
+
+
+def test_slopes_hold_wear_and_warming_apart(worn: Path, capsys: Any) -> None:
+    document = json.loads(fdhil("history", worn, "--json", capsys=capsys)[1])
+    wear, warming = document["trends"]["X"]["ft"], document["slopes"]["X"]["Cd"]
+    assert wear["low"] <= WEAR_PER_DAY <= wear["high"]
+    assert wear["per_day"] == pytest.approx(WEAR_PER_DAY, rel=0.05)
+    assert wear["at_constant_temperature"]
+    assert warming["low"] <= PER_KELVIN <= warming["high"]
+    assert warming["per_kelvin"] == pytest.approx(PER_KELVIN, rel=0.1)
+    steady = document["trends"]["X"]["Cd"]
+    assert steady["low"] <= 0 <= steady["high"]
+
+
+def test_a_changed_load_is_found_and_named(worn: Path, capsys: Any) -> None:
+    document = json.loads(fdhil("history", worn, "--json", capsys=capsys)[1])
+    (change,) = document["changes"]["X"]
+    assert _days(change["time"]) == pytest.approx(STEP_DAY, abs=0.6)
+    assert change["cause"] == "a changed load"
+    told = change["parameters"]["Jt"]
+    assert (told["before"], told["after"]) == (pytest.approx(0.075, rel=2e-3), pytest.approx(0.08475, rel=2e-3))
+    # the trend of Jt begins anew at the step: a step is no wear
+    assert _days(document["trends"]["X"]["Jt"]["since"]) == pytest.approx(STEP_DAY, abs=0.6)
+    assert document["trends"]["X"]["Jt"]["low"] <= 0 <= document["trends"]["X"]["Jt"]["high"]
+
+
+def test_the_date_of_a_limit_comes_with_its_interval(worn: Path, capsys: Any) -> None:
+    document = json.loads(fdhil("history", worn, "--json", capsys=capsys)[1])
+    (limit,) = [limit for name, limit in document["limits"]["X"].items() if name == "ft"]
+    first = document["revisions"][0]["parameters"]["ft"]["value"]
+    assert limit["limit"] == pytest.approx(2 * first)  # the limit that is set where the config says nothing
+    due = (2 * first - 0.05) / WEAR_PER_DAY
+    assert _days(limit["earliest"]) <= due <= _days(limit["latest"])
+    assert _days(limit["date"]) == pytest.approx(due, rel=0.05)
+    assert not limit["reached"]
+    _, out, _ = fdhil("history", worn, capsys=capsys)
+    assert f"on {limit['date'][:10]} ({limit['earliest'][:10]} to {limit['latest'][:10]})" in out
+    assert "a changed load" in out
+
+
+def test_the_plot_and_the_report_show_it(worn: Path, tmp_path: Path, capsys: Any) -> None:
+    assert fdhil("history", worn, "--plot", tmp_path / "plot.png", capsys=capsys)[::2] == (0, "")
+    assert (tmp_path / "plot.png").stat().st_size > 50_000
+    assert fdhil("report", worn, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
+    page = (tmp_path / "report.html").read_text()
+    for words in ("Slopes since the last change", "a changed load", "maintenance limit"):
+        assert words in page
