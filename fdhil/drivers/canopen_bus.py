@@ -17,9 +17,9 @@ from fdhil.drivers.frames import DEFAULT_RING_FRAMES, Frames, Latch, Ring
 from fdhil.errors import DeviceError
 
 POLL_S = 0.05
-# frames are read a few milliseconds at a time: a thread that wakes for every one costs more than all the decoding, and
-# the stamps come from the kernel or the hub
-BATCH_S = 0.004
+# frames are read ten milliseconds at a time: a thread that wakes for every one costs more than all the decoding, the
+# stamps come from the kernel or the hub, and even a receive buffer that may not be enlarged holds three times as many
+BATCH_S = 0.010
 HOLD_BACK_S = 0.001
 
 

@@ -63,6 +63,9 @@ class Cia402Decoder:
         needed = [self.profile.position, self.profile.speed, self.profile.current, self.profile.statusword]
         self._places = {key: self._place(key) for key in (*needed, *([self._voltage.key] if self._voltage.key else []))}
         self._required = list(dict.fromkeys(name for name, _ in self._places.values()))
+        shown = (self.profile.position_demand, self.profile.offset, self.profile.digital_inputs)
+        self._shown_places = {key: self._place(key) for key in shown if self.profile.find_tpdo(key)}
+        self._mm_per_increment = self._settings.scaling.sign / self._settings.scaling.increments_per_mm
         self._delay = self._settings.drive.setpoint_delay_cycles
         self._target = self._sniffed(self.profile.target)
         self._offset = self._sniffed(self.profile.offset)
@@ -167,43 +170,40 @@ class Cia402Decoder:
         offset: SetpointRows | None,
         lost: int,
     ) -> AxisSamples:
-        scaling, profile = self._settings.scaling, self.profile
+        profile = self.profile
 
         def raw(key: ObjectKey, back: int = 0) -> Int:
             name, entry = self._places[key]
             return decode(entry, grids[name].words[rows + back])
 
-        per_mm = scaling.sign / scaling.increments_per_mm
+        mm = self._mm_per_increment
         voltage: Float | None = None
         if self._voltage.key is not None:
             voltage = frozen(raw(self._voltage.key, self._voltage.rows_back) * self._voltage.v_per_count)
         return AxisSamples(
             axis=self.axis,
             tick=frozen_ints(rows + first),
-            demand_mm=frozen(demand.value[rows] * per_mm),
-            position_mm=frozen(raw(profile.position) * per_mm),
+            demand_mm=frozen(demand.value[rows] * mm),
+            position_mm=frozen(raw(profile.position) * mm),
             speed_rad_s=frozen(raw(profile.speed) * profile.speed_rad_s_per_count(self._settings)),
             current_a=frozen(raw(profile.current) * profile.current_a_per_count(self._settings)),
             voltage_v=voltage,
-            offset_mm=frozen(offset.value[rows] * per_mm if offset is not None else np.zeros(rows.size)),
+            offset_mm=frozen(offset.value[rows] * mm if offset is not None else np.zeros(rows.size)),
             statusword=frozen_ints(raw(profile.statusword)),
             lost=lost,
         )
 
     def _inputs(self, first: int, stop: int) -> list[InputSamples]:
-        found = self.profile.find_tpdo(self.profile.digital_inputs)
-        if found is None:
-            return []
-        tick, words = self._queues[found[0].name].between(first, stop)
-        return [InputSamples(self.axis, frozen_ints(tick), frozen_ints(decode(found[1], words)))] if tick.size else []
+        tick, inputs = self._shown(self.profile.digital_inputs, first, stop)
+        return [InputSamples(self.axis, frozen_ints(tick), frozen_ints(inputs))] if tick.size else []
 
     def _shown(self, key: ObjectKey, first: int, stop: int) -> tuple[Int, Int]:
         """Ticks and values of a slower TPDO's object; empty when the profile maps it nowhere."""
-        found = self.profile.find_tpdo(key)
-        if found is None:
+        if key not in self._shown_places:
             return np.empty(0, np.int64), np.empty(0, np.int64)
-        tick, words = self._queues[found[0].name].between(first, stop)
-        return tick, decode(found[1], words)
+        name, entry = self._shown_places[key]
+        tick, words = self._queues[name].between(first, stop)
+        return tick, decode(entry, words)
 
     def _read_back_offset(self, first: int, stop: int) -> SetpointRows | None:
         """The offset in force on rows [first, stop): sniffed, else what the drive shows.

@@ -42,6 +42,10 @@ class PdoQueue:
     cob_id: int
     tick: Int = field(default_factory=lambda: np.empty(0, np.int64))
     data: Words = field(default_factory=lambda: np.empty(0, np.uint64))
+    length: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.length = self.spec.length
 
     def add(self, ticked: Ticked, counters: DecoderCounters) -> None:
         """Take this PDO's frames from a block; a short one is discarded, of a long one the mapped bytes are used."""
@@ -49,10 +53,10 @@ class PdoQueue:
         if mine.size == 0:
             return
         length = ticked.length[mine]
-        if (length != self.spec.length).any():
-            whole = length >= self.spec.length
+        if (length != self.length).any():
+            whole = length >= self.length
             counters.short += int(mine.size - np.count_nonzero(whole))
-            counters.long += int(np.count_nonzero(length > self.spec.length))
+            counters.long += int(np.count_nonzero(length > self.length))
             mine = mine[whole]
         self.tick = np.concatenate([self.tick, ticked.tick[mine]])
         self.data = np.concatenate([self.data, ticked.data[mine]])
