@@ -103,10 +103,10 @@ def survey(master: Master) -> Survey:
         compare_identity(master.profile, identity),
         *(compare_pdo(spec, found, master.node_id) for spec, found in pdos),
         *compare_options(master, options),
-        *compare_window(master, options, window_um),
         *compare_mode(master),
         *compare_scale(master),
         *compare_rating(master),
+        *compare_window(master, options, window_um),
     )
     fingerprint = hashlib.sha256(repr([found.words for _, found in pdos]).encode()).hexdigest()[:16]
     return Survey(identity, fingerprint, options, window_um, findings)
