@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from fdhil.model import kernels
-from fdhil.model.p_pi_pi import loop_gains, plant_step
+from fdhil.model.loops import gains as loop_gains
+from fdhil.model.loops import plant_step
 from fdhil.prediction.models import nominal_models
 from fdhil.records import Float
 from tests.bench import bench_config
@@ -57,9 +58,10 @@ def measure() -> dict[str, float]:
     plant = plant_step(model, axis.screw_pitch_mm, axis.regulators.current_period_s)
     gains, n = loop_gains(axis, 0.001), reference.size
     empty = np.empty(0)
+    shape = (kernels.CASCADE, kernels.POSITION_INTEGRAL, N_SPEED, N_CURRENT, 0, 0)
 
     def numba() -> Float:
-        return kernels.p_pi_pi(reference, empty, empty, 0, n, plant, gains, N_SPEED, N_CURRENT, np.zeros(12))
+        return kernels.run(reference, empty, empty, 0, n, plant, gains, shape, np.zeros(kernels.STATES))
 
     with tempfile.TemporaryDirectory() as folder:
         library = compiled(Path(folder))

@@ -58,15 +58,6 @@ class Nominal(Section):
     Cd: NotNegative = Field(description="dry friction torque, N.m")
 
 
-_CASCADE_ONLY = (
-    "position_ki_per_s2",
-    "speed_kd",
-    "acceleration_feedforward",
-    "setpoint_filter_s",
-    "current_delay_cycles",
-)
-
-
 class Regulators(Section):
     """[axis.X.regulators]: the drive's nested loops."""
 
@@ -75,7 +66,9 @@ class Regulators(Section):
     speed_feedforward: Annotated[float, Field(ge=0, le=1.5)] = Field(
         1.0, description="share of the demand's speed fed forward"
     )
-    speed_kp: Positive = Field(description="proportional gain of the speed loop, A.s/rad")
+    speed_kp: Positive = Field(
+        description="proportional gain of the speed loop, A.s/rad; pid: derivative gain, and factor of the other two"
+    )
     speed_ki: NotNegative = Field(description="integral gain of the speed loop, A/rad")
     speed_period_s: Positive = Field(0.00025, description="cycle of the speed loop")
     current_limit_a: Positive = Field(description="limit of the speed loop's output")
@@ -83,13 +76,13 @@ class Regulators(Section):
     current_ki: NotNegative = Field(description="integral gain of the current loop, V/(A.s)")
     current_period_s: Positive = Field(3.125e-5, description="cycle of the current loop")
     voltage_limit_v: Positive = Field(description="limit of the current loop's output")
-    position_ki_per_s2: NotNegative = Field(0.0, description="cascade: integral gain of the position loop (double PI)")
-    speed_kd: NotNegative = Field(0.0, description="cascade: derivative gain of the speed loop (PID), A.s2/rad")
-    acceleration_feedforward: Annotated[float, Field(ge=0, le=1.5)] = Field(
-        0.0, description="cascade: share of the nominal inertia's current fed forward"
+    position_ki_per_s2: NotNegative = Field(0.0, description="double_pi, pid: integral gain of the position loop")
+    torque_feedforward: Annotated[float, Field(ge=0, le=1.5)] = Field(
+        0.0, description="share of the nominal inertia's current fed forward"
     )
-    setpoint_filter_s: NotNegative = Field(0.0, description="cascade: time constant of a filter on set-point and speed")
-    current_delay_cycles: int = Field(0, ge=0, le=4, description="cascade: cycles until a computed voltage acts")
+    setpoint_filter_s: NotNegative = Field(0.0, description="time constant of a filter on the set-point; 0: none")
+    setpoint_filter_order: Literal[1, 2] = Field(1, description="first-order, or two equal ones behind each other")
+    current_delay_cycles: int = Field(0, ge=0, le=4, description="current cycles until a computed voltage acts")
 
     @field_validator("structure")
     @classmethod
@@ -97,10 +90,14 @@ class Regulators(Section):
         return _listed(name, tables.REGULATORS)
 
     @model_validator(mode="after")
-    def _plain(self) -> Regulators:
-        used = [key for key in _CASCADE_ONLY if getattr(self, key)]
-        if self.structure == "p_pi_pi" and used:
-            raise ValueError(f"structure p_pi_pi has no {used[0]}; set structure = 'cascade'")
+    def _integrals(self) -> Regulators:
+        """What a structure does not have would be ignored silently, what it lacks would make it another one."""
+        if self.structure == "p_pi_pi" and self.position_ki_per_s2:
+            raise ValueError("structure p_pi_pi has no position_ki_per_s2; set structure = 'double_pi'")
+        if self.structure == "double_pi" and not self.position_ki_per_s2:
+            raise ValueError("structure double_pi needs position_ki_per_s2; without it, it is p_pi_pi")
+        if self.structure == "pid" and self.speed_ki:
+            raise ValueError("structure pid has no speed_ki: set it to 0, its integral gain is position_ki_per_s2")
         return self
 
 
@@ -169,12 +166,20 @@ class Axis(Section):
     screw_pitch_mm: Positive = Field(description="table travel per motor revolution")
     rapid_speed_mm_s: Positive = Field(description="speed of G0")
     max_acceleration_mm_s2: Positive = Field(description="acceleration of G0")
+    max_jerk_mm_s3: Positive | None = Field(
+        None, description="largest jerk of profile jerk_limited; left out: the acceleration is reached in 25 ms"
+    )
     nominal: Nominal
     regulators: Regulators
     correction: CorrectionLimits | None = None
     drive: Drive = Drive()
     voltage: Voltage = Voltage()
     temperature: Thermometer | None = None
+
+    @property
+    def jerk_mm_s3(self) -> float:
+        """Largest jerk."""
+        return self.max_jerk_mm_s3 or self.max_acceleration_mm_s2 / 0.025
 
     @property
     def scaling(self) -> Scaling:
@@ -190,10 +195,16 @@ class Axis(Section):
 class Nc(Section):
     """[nc]: what the numerical controller makes of a program."""
 
-    smoothing_s: tuple[NotNegative, ...] = Field(
-        (0.060, 0.030), max_length=4, description="moving averages over each axis' demand"
+    profile: Literal["fir", "trapezoidal", "jerk_limited"] = Field(
+        "fir", description="fir: smoothed feed; trapezoidal, jerk_limited: look-ahead within the axes' limits"
     )
-    corner: Literal["continuous", "exact_stop"] = Field("continuous", description="between feed moves")
+    smoothing_s: tuple[NotNegative, ...] = Field(
+        (0.060, 0.030), max_length=4, description="fir: moving averages over each axis' demand"
+    )
+    corner: Literal["continuous", "exact_stop"] = Field(
+        "continuous", description="between feed moves; look-ahead: continuous obeys G61, G61.1 and G64 P"
+    )
+    rapid_stop: bool = Field(True, description="look-ahead: stop between rapid and feed; fir always does")
     settle_s: NotNegative = Field(0.0, le=10, description="rest that the NC adds at an exact stop")
     end_rest_s: NotNegative = Field(
         0.5, le=10, description="rest after the last motion: the drives' settling belongs to the path's error"

@@ -22,7 +22,8 @@ CORRECTIONS: Mapping[str, str] = {
 }
 REGULATORS: Mapping[str, str] = {
     "p_pi_pi": "fdhil.model.p_pi_pi:simulate",
-    "cascade": "fdhil.model.cascade:simulate",
+    "double_pi": "fdhil.model.double_pi:simulate",
+    "pid": "fdhil.model.pid:simulate",
 }
 VOLTAGE_SOURCES: Mapping[str, str] = {
     "drive": "fdhil.drivers.cia402_drive:VoltageObject",

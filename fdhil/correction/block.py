@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdhil.config import Axis
-from fdhil.correction import kernels
 from fdhil.correction.limits import Limits, check, fit
 from fdhil.correction.linear import Inverse
+from fdhil.correction.resting import quiet
 from fdhil.model import closed_loop
 from fdhil.model.closed_loop import Response, State
 from fdhil.records import Bool, Float, Parameters
@@ -201,21 +201,13 @@ def _stuck(loop: AxisLoop, response: Response, target_mm: Float, first: int) -> 
 
 def _hold(loop: AxisLoop, reference_mm: Float, offset: Float, state: State, row: int, stop: int) -> None:
     """Write the offset of a rest from ``row`` + 2 on, and fade what differs from the guess behind it."""
-    gains = closed_loop.rest_loop(loop.axis, loop.sync_period_s, loop.increment_mm)
-    if stop - row < 3 or gains is None:  # the rest is left to the drive: nothing is learnt from it
+    if stop - row < 3:
         return
     n = offset.size
     planned_end = offset[stop - 1]
-    increment = loop.increment_mm
-    hold = float(state[2] - reference_mm[row]) / increment
-    integral = float(state[3])
-    error = gains[0] * (offset[row] - hold) + gains[1] * (offset[row + 1] - offset[row])
-    band = BAND * loop.parameters.Cd / loop.parameters.K
-    current = float(np.clip(integral + gains[2] * error, -band, band))
-    curve = loop.limits.curve
-    limits = np.array([np.floor(curve.offset), max(1.0, curve.rate), max(1.0, curve.acceleration)])
-    fade_cycles = FADE_S / loop.sync_period_s
-    kernels.rest(offset, row, stop, integral, np.array([*gains, fade_cycles]), limits, hold, current)
+    rest = reference_mm[row:stop]
+    fixed = offset[row : row + 2].copy()
+    offset[row:stop] = quiet(loop.parameters, loop.axis, loop.sync_period_s, rest, loop.increment_mm, fixed, state)
     if stop < n:
         change = (offset[stop - 1] - planned_end) * _fade(n - stop, loop.sync_period_s)
         offset[stop:] = np.rint(offset[stop:] + change)

@@ -232,34 +232,3 @@ def _project_plain(wanted: Float, limits: Float, start: Float) -> Float:
 
 
 project: Callable[[Float, Float, Float], Float] = njit(cache=True, nogil=True)(_project_plain)
-
-
-def _rest_plain(
-    offset: Float, first: int, last: int, integral: float, loop: Float, limits: Float, hold: float, current: float
-) -> None:
-    """Write rows ``first + 2`` .. ``last - 1`` of ``offset`` (increments) while dry friction holds the table.
-
-    The current is led from ``current`` to 0 within ``loop[5]`` cycles, so that the speed loop's integral comes to rest
-    far from breaking away, and the offset ends at ``hold``, where the position loop asks for no speed. ``loop`` (6,):
-    rad/s per increment of position, rad/s per increment of rate, kp, ki T, and the fade in cycles (rows 4 unused).
-    Whole increments are taken with their rounding error carried on: on average the loop sees ``hold`` exactly.
-    """
-    kv, kff, kp, ki_step, fade = loop[0], loop[1], loop[2], loop[3], loop[4]
-    error = kv * (offset[first] - hold) + kff * (offset[first + 1] - offset[first])
-    carried = 0.0
-    exact = offset[first + 1]
-    for k in range(first + 2, last):
-        integral += ki_step * error
-        share = min((k - first) / fade, 1.0)
-        wanted_error = (current * 0.5 * (1.0 + np.cos(np.pi * share)) - integral) / kp
-        exact = (wanted_error + kv * hold + kff * exact) / (kv + kff)
-        rate = offset[k - 1] - offset[k - 2]
-        goal = np.rint(exact + carried)
-        move = min(max(goal - offset[k - 1], rate - limits[2]), rate + limits[2])
-        move = min(max(move, -limits[1]), limits[1])
-        offset[k] = np.rint(min(max(offset[k - 1] + move, -limits[0]), limits[0]))
-        carried = min(max(exact + carried - offset[k], -0.5), 0.5)
-        error = kv * (offset[k] - hold) + kff * (offset[k] - offset[k - 1])
-
-
-rest: Callable[..., None] = njit(cache=True, nogil=True)(_rest_plain)

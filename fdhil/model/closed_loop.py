@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib import import_module
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +23,6 @@ from fdhil.records import Float, Parameters
 
 State = npt.NDArray[np.float64]
 
-STATES = 16  # of any structure; current, speed and position come first
 _EMPTY = np.empty(0)
 
 
@@ -43,8 +41,8 @@ class Response:
 
     ``limited`` is the share of the cycle from that instant on in which the current or voltage limit acts;
     ``peak_current_a`` and ``peak_voltage_v`` are the largest demands in that cycle before the limits. ``states`` (k, n)
-    is the whole state at those instants, and ``end`` (STATES,) that after the last cycle: another run may continue
-    from any of them.
+    is the whole state at those instants, and ``end`` (STATES,) that after the last cycle: another run may
+    continue from any of them.
     """
 
     position_mm: Float
@@ -77,7 +75,7 @@ class Response:
 
     def state_at(self, row: int) -> State:
         """Return the state at the start of a row's cycle."""
-        state = np.zeros(STATES)
+        state = np.zeros(kernels.STATES)
         state[: len(self.states)] = self.states[:, row]
         return state
 
@@ -127,28 +125,11 @@ def _structure(name: str) -> Callable[[Parameters, Axis, float, Commands, State,
 
 def start(position_mm: float) -> State:
     """Return the state of an axis at rest at ``position_mm``: no current, no speed, all integrals 0."""
-    state = np.zeros(STATES)
-    state[kernels.POSITION] = position_mm
+    state = np.zeros(kernels.STATES)
+    # what differences and filters remember of the set-point and the position is where the axis stands
+    state[[kernels.POSITION, kernels.SET_POINT_BEFORE, kernels.POSITION_BEFORE]] = position_mm
+    state[[kernels.FILTERED, kernels.FILTERED + 3]] = position_mm
     return state
-
-
-@lru_cache(maxsize=16)
-def _resting(name: str) -> Callable[[Axis, float, float], tuple[float, float, float, float] | None] | None:
-    module = import_module(tables.REGULATORS[name].partition(":")[0])
-    found: Callable[[Axis, float, float], tuple[float, float, float, float] | None] | None = getattr(
-        module, "rest_loop", None
-    )
-    return found
-
-
-def rest_loop(axis: Axis, sync_period_s: float, increment_mm: float) -> tuple[float, float, float, float] | None:
-    """Return what an offset does to the speed loop of a table at rest, None where the structure cannot tell.
-
-    Speed error per increment of offset and per increment a cycle of its rate (rad/s), kp, and ki times the period; the
-    state's fourth place is the speed loop's integral.
-    """
-    tell = _resting(axis.regulators.structure)
-    return None if tell is None else tell(axis, sync_period_s, increment_mm)
 
 
 def simulate_axes(

@@ -1,4 +1,4 @@
-"""An independent drive for the tests: plain Python, Runge-Kutta physics, quantised encoder and set-points.
+"""An independent drive for the tests: plain Python, quantised encoder and set-points, two ways to do the physics.
 
 It shares no code with the model: other integration, other order of work, positions in drive increments.
 """
@@ -7,20 +7,27 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+from scipy.integrate import solve_ivp
+
 from fdhil.config import Axis
-from fdhil.records import Parameters
+from fdhil.records import Float, Parameters
 
 SUBSTEPS = 2
 
 
 class SlowDrive:
-    """One axis with its three loops; ``run`` gives the table's position at each SYNC."""
+    """One axis with its regulators; ``run`` gives the table's position at each SYNC. Physics by Runge-Kutta."""
 
     def __init__(self, parameters: Parameters, axis: Axis, period_s: float, increments: int = 65536) -> None:
         self.p, self.g, self.period = parameters, axis.regulators, period_s
+        self.nominal = axis.nominal
         self.pitch, self.increments = axis.screw_pitch_mm, increments
         self.i = self.w = self.theta = 0.0
-        self.speed_sum = self.current_sum = 0.0
+        self.speed_sum = self.current_sum = self.position_sum = 0.0
+        self.before: tuple[float, float] | None = None
+        self.pipeline = [0.0] * axis.regulators.current_delay_cycles
+        self.memory: list[list[float]] = []
 
     def _slopes(self, i: float, w: float, u: float, friction: float) -> tuple[float, float, float]:
         p = self.p
@@ -52,8 +59,8 @@ class SlowDrive:
         targets = [round(mm * per_mm) for mm in demand_mm]
         start = demand_mm[0]
         self.theta = 0.0
+        self.memory = [[targets[0], 0.0, 0.0] for _ in range(self.g.setpoint_filter_order)]
         n_speed = round(self.period / self.g.speed_period_s)
-        n_current = round(self.g.speed_period_s / self.g.current_period_s)
         positions = []
         for k in range(len(targets)):
             positions.append(start + self.theta * self.pitch / (2 * math.pi))
@@ -61,25 +68,77 @@ class SlowDrive:
             for m in range(n_speed):
                 share = m / n_speed
                 encoder = round((start + self.theta * self.pitch / (2 * math.pi)) * per_mm)
-                lag = r0 + (r1 - r0) * share - encoder
                 slope = ((r1 - r0) + (r2 - 2 * r1 + r0) * share) / self.period
-                demand = (self.g.position_gain_per_s * lag + self.g.speed_feedforward * slope) / per_mm
-                self._speed_cycle(demand * 2 * math.pi / self.pitch, n_current)
+                bend = (r2 - 2 * r1 + r0) / self.period**2
+                ordered = self._filtered([r0 + (r1 - r0) * share, slope, bend])
+                self._cycle(*(2 * math.pi / self.increments * v for v in (*ordered, encoder)))
         return positions
 
-    def _speed_cycle(self, demand_rad_s: float, n_current: int) -> None:
-        g = self.g
-        error = demand_rad_s - self.w
-        candidate = self.speed_sum + g.speed_ki * g.speed_period_s * error
-        wanted = g.speed_kp * error + candidate
+    def _filtered(self, signals: list[float]) -> list[float]:
+        """Set-point, speed and acceleration behind the filter: each stage steps towards its input."""
+        if self.g.setpoint_filter_s > 0:
+            for stage in self.memory:
+                for n, value in enumerate(signals):
+                    stage[n] += -math.expm1(-self.g.speed_period_s / self.g.setpoint_filter_s) * (value - stage[n])
+                signals = list(stage)
+        return signals
+
+    def _cycle(self, place: float, rate: float, acceleration: float, encoder: float) -> None:
+        """One speed cycle, angles in radians."""
+        g, h = self.g, self.g.speed_period_s
+        lag = place - encoder
+        position_sum = self.position_sum + g.position_ki_per_s2 * h * lag
+        outer = g.position_gain_per_s * lag + position_sum
+        speed_sum = self.speed_sum
+        if g.structure == "pid":
+            before = self.before or (place, encoder)
+            difference = g.speed_feedforward * (place - before[0]) - (encoder - before[1])
+            self.before = place, encoder
+            wanted = g.speed_kp * (outer + difference / h)
+        else:
+            error = outer + g.speed_feedforward * rate - self.w
+            speed_sum += g.speed_ki * h * error
+            wanted = g.speed_kp * error + speed_sum
+        wanted += g.torque_feedforward * acceleration * self.nominal.Jt / self.nominal.K
         amps = max(-g.current_limit_a, min(g.current_limit_a, wanted))
         if amps == wanted:
-            self.speed_sum = candidate
-        for _ in range(n_current):
-            error = amps - self.i
-            candidate = self.current_sum + g.current_ki * g.current_period_s * error
-            wanted = g.current_kp * error + candidate
-            volts = max(-g.voltage_limit_v, min(g.voltage_limit_v, wanted))
-            if volts == wanted:
-                self.current_sum = candidate
-            self._integrate(volts, g.current_period_s)
+            self.speed_sum, self.position_sum = speed_sum, position_sum
+        for _ in range(round(h / g.current_period_s)):
+            self._current_cycle(amps)
+
+    def _current_cycle(self, amps: float) -> None:
+        g = self.g
+        error = amps - self.i
+        candidate = self.current_sum + g.current_ki * g.current_period_s * error
+        wanted = g.current_kp * error + candidate
+        volts = max(-g.voltage_limit_v, min(g.voltage_limit_v, wanted))
+        if volts == wanted:
+            self.current_sum = candidate
+        self.pipeline.append(volts)
+        self._integrate(self.pipeline.pop(0), g.current_period_s)
+
+
+class EventDrive(SlowDrive):
+    """The same regulators around equations [1] and [2] as ``solve_ivp`` has them, standstill found as an event."""
+
+    def _integrate(self, u: float, h: float) -> None:
+        p = self.p
+        if self.w == 0.0 and abs(p.K * self.i) <= p.Cd:
+            super()._integrate(u, h)
+            return
+        sign = math.copysign(1.0, self.w if self.w != 0.0 else self.i)
+
+        def slopes(_t: float, x: Float) -> tuple[float, float, float]:
+            return self._slopes(x[0], x[1], u, sign * p.Cd)
+
+        def standstill(_t: float, x: Float) -> float:
+            return float(x[1])
+
+        standstill.terminal = True  # type: ignore[attr-defined]  # scipy's own way to mark an event
+        standstill.direction = -sign  # type: ignore[attr-defined]
+        solution = solve_ivp(slopes, (0.0, h), (self.i, self.w, self.theta), events=standstill, rtol=1e-7, atol=1e-10)
+        self.i, self.w, self.theta = np.asarray(solution.y[:, -1]).tolist()
+        if solution.status == 1:
+            left = h - float(solution.t[-1])
+            self.w = 0.0
+            self.i += (u / p.R - self.i) * (1 - math.exp(-p.R * left / p.L))

@@ -1,0 +1,113 @@
+"""What every regulator structure shares: the plant's exact step, the gains as the kernel takes them, one run.
+
+Each PI integrates first: candidate = integral + ki h e, output = clip(kp e + candidate); where the clip acts, the old
+integral is kept. Three options go with every structure: acceleration fed forward as current, a filter on the
+set-point (with the speed and acceleration that are fed forward), and a delay of the current loop.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+
+from fdhil.config import Axis
+from fdhil.model import kernels
+from fdhil.model.closed_loop import Commands, Response, State
+from fdhil.records import Float, Parameters
+
+
+@lru_cache(maxsize=64)
+def plant_step(parameters: Parameters, pitch_mm: float, step_s: float) -> Float:
+    """Return (16,) the exact step of [i, w, x] under constant voltage and friction torque, [DES] eqs. 1 and 2.
+
+    Order: phi_ii, phi_iw, phi_wi, phi_ww, phi_xi, phi_xw, voltage on i, w, x, torque on i, w, x, then the still
+    motor's decay and voltage gain, K and Cd. x is in mm.
+    """
+    p = parameters
+    mm_per_rad = pitch_mm / (2 * math.pi)
+    a = np.zeros((5, 5))
+    a[0, :2] = -p.R / p.L, -p.K / p.L
+    a[0, 3] = 1 / p.L
+    a[1, :2] = p.K / p.Jt, -p.ft / p.Jt
+    a[1, 4] = 1 / p.Jt
+    a[2, 1] = mm_per_rad
+    e = _exponential(a * step_s)
+    still = math.exp(-p.R / p.L * step_s)
+    still_u = -math.expm1(-p.R / p.L * step_s) / p.R
+    moving = (e[0, 0], e[0, 1], e[1, 0], e[1, 1], e[2, 0], e[2, 1], *e[:3, 3], *e[:3, 4])
+    step = np.array([*moving, still, still_u, p.K, p.Cd])
+    step.setflags(write=False)
+    return step
+
+
+def _exponential(a: Float) -> Float:
+    """Return exp(a) of a small matrix by Taylor's series, halved until it converges to the last bit."""
+    halvings = max(0, math.ceil(math.log2(max(float(np.abs(a).sum(axis=1).max()), 1e-12) / 0.5)))
+    scaled = a / 2.0**halvings
+    result = term = np.eye(len(a))
+    for order in range(1, 19):
+        term = term @ scaled / order
+        result = result + term
+    for _ in range(halvings):
+        result = result @ result
+    return result
+
+
+def gains(axis: Axis, sync_period_s: float) -> Float:
+    """Return (GAINS,) the gains in the order of :mod:`fdhil.model.kernels`."""
+    g = axis.regulators
+    rad_per_mm = 2 * math.pi / axis.screw_pitch_mm
+    values = np.zeros(kernels.GAINS)
+    values[kernels.KV] = g.position_gain_per_s * rad_per_mm
+    values[kernels.KFF] = g.speed_feedforward * rad_per_mm
+    values[kernels.SPEED_KP] = g.speed_kp
+    values[kernels.SPEED_KI] = g.speed_ki * g.speed_period_s
+    values[kernels.CURRENT_MAX] = g.current_limit_a
+    values[kernels.CURRENT_KP] = g.current_kp
+    values[kernels.CURRENT_KI] = g.current_ki * g.current_period_s
+    values[kernels.VOLTAGE_MAX] = g.voltage_limit_v
+    values[kernels.PERIOD] = sync_period_s
+    values[kernels.HALF_STEP_MM] = 0.5 * g.current_period_s / rad_per_mm
+    values[kernels.POSITION_KI] = g.position_ki_per_s2 * rad_per_mm * g.speed_period_s
+    values[kernels.ACCELERATION] = g.torque_feedforward * rad_per_mm * axis.nominal.Jt / axis.nominal.K
+    values[kernels.DECAY] = math.exp(-g.speed_period_s / g.setpoint_filter_s) if g.setpoint_filter_s > 0 else 0.0
+    values[kernels.RAD_PER_MM] = rad_per_mm
+    values[kernels.SPEED_CYCLES_PER_S] = 1.0 / g.speed_period_s
+    return values
+
+
+def run(
+    law: int,
+    places: int,
+    parameters: Parameters,
+    axis: Axis,
+    sync_period_s: float,
+    commands: Commands,
+    state: State,
+    first: int,
+    rows: int,
+) -> Response:
+    """Run ``rows`` SYNC cycles from row ``first`` on with a law of the kernel that uses ``places`` of the state."""
+    g = axis.regulators
+    n_speed = round(sync_period_s / g.speed_period_s)
+    n_current = round(g.speed_period_s / g.current_period_s)
+    order = g.setpoint_filter_order if g.setpoint_filter_s > 0 else 0
+    if order:
+        places = kernels.WAITING
+    if g.current_delay_cycles:
+        places = kernels.WAITING + g.current_delay_cycles
+    end = np.array(state, dtype=np.float64)
+    out = kernels.run(
+        commands.reference_mm,
+        commands.speed_offset_rad_s,
+        commands.torque_offset_nm / axis.nominal.K,
+        first,
+        rows,
+        plant_step(parameters, axis.screw_pitch_mm, g.current_period_s),
+        gains(axis, sync_period_s),
+        (law, places, n_speed, n_current, order, g.current_delay_cycles),
+        end,
+    )
+    return Response.from_rows(out, n_speed * n_current, sync_period_s, end)
