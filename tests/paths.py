@@ -37,7 +37,11 @@ def bench_demand(
     feed_m_min: float, smoothing_s: tuple[float, ...] = (0.060, 0.030), hold_s: float = 0.5, dt_s: float = 0.001
 ) -> Float:
     """Return the demand (n, 2) in mm: the bench path at constant feed, smoothed per axis, held at its end."""
-    path = _geometry()
+    return _demand(_geometry(), feed_m_min, smoothing_s, hold_s, dt_s)
+
+
+def _demand(path: Float, feed_m_min: float, smoothing_s: tuple[float, ...], hold_s: float, dt_s: float) -> Float:
+    """The path (m, 2) run through at constant feed, smoothed per axis, held at its end."""
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     along = np.minimum(np.arange(int(arc[-1] / (feed_m_min / 0.06 * dt_s)) + 2) * feed_m_min / 0.06 * dt_s, arc[-1])
     rows = np.column_stack([np.interp(along, arc, path[:, a]) for a in range(2)])
@@ -65,3 +69,56 @@ def bench_trajectory(feed_m_min: float, smoothing_s: tuple[float, ...] = (0.060,
 def rms(values: Float) -> float:
     """Root mean square."""
     return float(np.sqrt(np.mean(values**2)))
+
+
+def rounded_demand(feed_m_min: float, smoothing_s: tuple[float, ...] = (0.060, 0.030), dt_s: float = 0.001) -> Float:
+    """Return (n, 2) in mm: the path of a 40 mm cutter around the bench's shape (figure 19 of [DES])."""
+    step = 0.002
+    pieces = [
+        _line((-20.0, 0.0), (-20.0, 55.0), step),
+        _arc((0.0, 55.0), 20.0, np.pi, np.pi / 2, step),
+        _line((0.0, 75.0), (100.0, 75.0), step),
+        _arc((100.0, 55.0), 20.0, np.pi / 2, 0.0, step),
+        _arc((150.0, 55.0), 30.0, np.pi, 2 * np.pi, step),
+        _arc((200.0, 55.0), 20.0, np.pi, np.pi / 2, step),
+        _line((200.0, 75.0), (250.0, 75.0), step),
+        np.array([[250.0, 75.0]]),
+    ]
+    return _demand(np.concatenate(pieces), feed_m_min, smoothing_s, 0.5, dt_s)
+
+
+def _arc(centre: tuple[float, float], radius: float, begin: float, end: float, step_mm: float) -> Float:
+    angle = np.linspace(begin, end, round(abs(end - begin) * radius / step_mm), endpoint=False)
+    return np.asarray(centre) + radius * np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def jerky_demand(feed_m_min: float, acceleration_mm_s2: float = 2000.0, dt_s: float = 0.001) -> Float:
+    """Return (n, 2) in mm: the bench path with steps of acceleration and no smoothing, as LinuxCNC orders it.
+
+    Each straight or arc runs a trapezoid of speed; the next one begins where the one before it brakes, each with half
+    of the acceleration, so that corners become parabolas (LinuxCNC's G64 without a tolerance).
+    """
+    path = _geometry()
+    corners = [0, *(int(np.argmin(np.hypot(*(path - c).T))) for c in ((0, 55), (100, 55), (200, 55), (250, 55)))]
+    speed, rate = feed_m_min / 0.06, 0.5 * acceleration_mm_s2
+    begin_s, moves = 0.0, []
+    for first, last in pairwise([*corners, len(path) - 1]):
+        piece = path[first : last + 1]
+        arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(piece, axis=0), axis=1))])
+        top = min(speed, float(np.sqrt(rate * arc[-1])))
+        moves.append((begin_s, piece, arc, top))
+        begin_s += arc[-1] / top  # here it begins to brake
+    rows = round((begin_s + speed / rate + 0.5) / dt_s)
+    demand = np.tile(path[0], (rows, 1))
+    for begin, piece, arc, top in moves:
+        along = _trapezoid_length(np.arange(float(rows)) * dt_s - begin, float(arc[-1]), top, rate)
+        demand += np.column_stack([np.interp(along, arc, piece[:, a]) for a in range(2)]) - piece[0]
+    return demand
+
+
+def _trapezoid_length(time_s: Float, length: float, top: float, rate: float) -> Float:
+    """Length covered by ``time_s`` on a move that accelerates, runs at ``top`` and brakes."""
+    ramp, brake = top / rate, length / top
+    t = np.clip(time_s, 0.0, brake + ramp)
+    up, down = np.minimum(t, ramp), np.maximum(t - brake, 0.0)
+    return np.asarray(0.5 * rate * up**2 + top * np.maximum(t - ramp, 0.0) - 0.5 * rate * down**2)
