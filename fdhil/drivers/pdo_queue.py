@@ -136,6 +136,7 @@ class Setpoint:
         self.held: int | None = None
         self._entry = entry
         self._streaming = False
+        self._held_doubtful = False  # different frames came in its tick: the SYNC between them was lost
         self.shift = delay + 1  # a frame after SYNC j is latched at SYNC j+1 and in force ``delay`` cycles later
         self._reach = delay + 2  # a gap is looked across as far as is known when its row leaves
 
@@ -161,7 +162,8 @@ class Setpoint:
         certain = ~(gap & (values[following] != value)) & ~(exact & doubtful[now])
         if self.held is None:
             certain &= at >= 0
-        lost = int(np.count_nonzero(gap & ~((at >= 0) & doubtful[now])))
+        before_gap = np.where(at >= 0, doubtful[now], self._held_doubtful)
+        lost = int(np.count_nonzero(gap & ~before_gap))
         return SetpointRows(value, certain, lost)
 
     def _latched(self) -> tuple[Int, Words, Bool]:
@@ -182,5 +184,7 @@ class Setpoint:
         count = int(np.searchsorted(self.queue.tick, keep))
         if count:
             self.held = int(decode(self._entry, self.queue.data[count - 1 : count])[0])
+            newest = self.queue.data[int(np.searchsorted(self.queue.tick, self.queue.tick[count - 1])) : count]
+            self._held_doubtful = bool((newest != newest[0]).any())
             self._streaming = int(self.queue.tick[count - 1]) >= keep - self._reach
             self.queue.forget(keep)

@@ -104,6 +104,17 @@ def test_every_lost_frame_is_counted_and_leaves_a_hole(data: st.DataObject, cut:
         assert int(ticks[c]) in holes
 
 
+def test_a_lost_sync_is_no_lost_pdo_wherever_the_blocks_part() -> None:
+    wire = Wire(n=60)
+    frames = wire.frames()
+    syncs = np.flatnonzero(frames["id"] == 0x80)
+    left = without(frames, [int(syncs[11]), int(syncs[33])])
+    for cut in range(left.size):
+        _, _, decoder = decode_all([left[:cut], left[cut:]])
+        assert decoder.counters()["sync_missed"] == 2, cut
+        assert decoder.counters()["pdo_lost"] == 0, cut
+
+
 def test_a_lost_target_is_a_hole_where_it_mattered() -> None:
     wire = Wire(n=60)
     frames = wire.frames()
