@@ -1,8 +1,9 @@
-"""The NC's planner: motions -> reference on the SYNC grid.
+"""The NC's planner: motions -> reference on the SYNC grid, by the profile that the configuration names.
 
-The NC runs along the path at the programmed feed and smooths each axis' demand by causal moving averages, from rest
-at the start point. It stops exactly between rapid and feed, after each rapid and at a dwell, and between feeds only
-when the machine's configuration says so. All sampling is by whole blocks of numpy.
+``fir``: the NC runs along the path at the programmed feed and smooths each axis' demand by causal moving averages,
+from rest at the start point. It stops exactly between rapid and feed, after each rapid and at a dwell, and between
+feeds only when the machine's configuration says so. ``trapezoidal`` and ``jerk_limited`` look ahead and keep each axis'
+limits; corners follow G61, G61.1 and G64 P. All sampling is by whole blocks of numpy.
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.program.motions import Motion
-from fdhil.program.planner.timeline import Segments, Timeline
+from fdhil.program.planner.look_ahead import LookAhead
 from fdhil.program.planner.smoothing import Smoother
+from fdhil.program.planner.timeline import Timeline
 from fdhil.records import Float, Int, Trajectory, frozen, frozen_ints
 
 MAX_ROWS = 10_000_000
 _BLOCK_ROWS = 1 << 16
+Part = tuple[Float, Int, Int]  # position (n, 3) in mm, source line (n,), rapid (n,) 0 or 1
 
 
 def plan(motions: Iterable[Motion], config: MachineConfig) -> Trajectory:
@@ -47,32 +50,51 @@ def stream(
 
     A block is there as soon as the motions that reach into it were read; its times go on from the block before.
     """
-    smoother = Smoother(config.nc.smoothing_s, config.machine.sync_period_s)
-    timeline = Timeline(config, smoother.settle_rows, max_rows)
     row = 0
-    kept: list[tuple[Float, Int, Int]] = []
+    kept: list[Part] = []
     waiting = 0
-    for segments in timeline.batches(motions):
-        for raw, line, rapid in _sampled(segments, config.machine.sync_period_s, block_rows):
-            kept.append((smoother(raw), line, rapid))
-            waiting += line.size
-            while waiting >= block_rows:
-                block, kept = _cut(kept, block_rows)
-                yield _trajectory(block, row, config)
-                row += block_rows
-                waiting -= block_rows
+    parts = _smoothed if config.nc.profile == "fir" else _looked_ahead
+    for part in parts(motions, config, block_rows, max_rows):
+        kept.append(part)
+        waiting += part[1].size
+        while waiting >= block_rows:
+            block, kept = _cut(kept, block_rows)
+            yield _trajectory(block, row, config)
+            row += block_rows
+            waiting -= block_rows
     if waiting:
         block, _ = _cut(kept, waiting)
         yield _trajectory(block, row, config)
 
 
-def _sampled(segments: Segments, dt_s: float, block_rows: int) -> Iterator[tuple[Float, Int, Int]]:
-    for first in range(segments.first_row, segments.end_row, block_rows):
-        last = min(first + block_rows, segments.end_row)
-        yield segments.sample(np.arange(first, last), dt_s)
+def _smoothed(motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float) -> Iterator[Part]:
+    dt_s = config.machine.sync_period_s
+    smoother = Smoother(config.nc.smoothing_s, dt_s)
+    timeline = Timeline(config, smoother.settle_rows, max_rows)
+    for segments in timeline.batches(motions):
+        for rows in _spans(segments.first_row, segments.end_row, block_rows):
+            raw, line, rapid = segments.sample(rows, dt_s)
+            yield smoother(raw), line, rapid
 
 
-def _cut(kept: list[tuple[Float, Int, Int]], rows: int) -> tuple[tuple[Float, Int, Int], list[tuple[Float, Int, Int]]]:
+def _looked_ahead(motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float) -> Iterator[Part]:
+    dt_s = config.machine.sync_period_s
+    ahead = LookAhead(config, max_rows)
+    smoother = Smoother((ahead.filter_rows * dt_s,), dt_s)
+    for stretch in ahead.stretches(motions):
+        for rows in _spans(stretch.first_row, stretch.end_row, block_rows):
+            path, line, rapid = stretch.sample(rows, dt_s)
+            smooth = smoother(path[:, None])[:, 0]
+            yield ahead.curve.at(smooth), line, rapid
+            ahead.curve.forget(float(smooth[-1]))
+
+
+def _spans(first_row: int, end_row: int, block_rows: int) -> Iterator[Int]:
+    for first in range(first_row, end_row, block_rows):
+        yield np.arange(first, min(first + block_rows, end_row))
+
+
+def _cut(kept: list[Part], rows: int) -> tuple[Part, list[Part]]:
     position = np.concatenate([part[0] for part in kept])
     line = np.concatenate([part[1] for part in kept])
     rapid = np.concatenate([part[2] for part in kept])
@@ -80,7 +102,7 @@ def _cut(kept: list[tuple[Float, Int, Int]], rows: int) -> tuple[tuple[Float, In
     return (position[:rows], line[:rows], rapid[:rows]), rest
 
 
-def _trajectory(block: tuple[Float, Int, Int], first_row: int, config: MachineConfig) -> Trajectory:
+def _trajectory(block: Part, first_row: int, config: MachineConfig) -> Trajectory:
     position, line, rapid_rows = block
     n = line.size
     rapid = rapid_rows.astype(np.bool_)

@@ -12,13 +12,12 @@ from fdhil.config import MachineConfig
 from fdhil.errors import ProgramError
 from fdhil.program.arcs import sweep
 from fdhil.program.motions import PLANE_AXES, PLANES, Arc, Dwell, Feed, Motion, Point, Rapid
+from fdhil.program.planner.limits import AxisLimits, check_dwell
 from fdhil.records import Float, Int
 
 _BATCH = 4096
 _BATCH_ROWS = 1 << 18
-_TINY_MM = 1e-9
 _TICK_TOLERANCE = 1e-6  # of a row: an end so little after a row counts as on it
-_MAX_DWELL_ROWS = 1e9
 # columns of a segment
 _END_S, _SPAN_S, _LINE, _RAPID, _KIND = range(5)
 _START, _STOP = slice(5, 8), slice(8, 11)
@@ -86,10 +85,8 @@ class Timeline:
         self._settle_rows = settle_rows + math.ceil(config.nc.settle_s / self._dt_s - _TICK_TOLERANCE)
         self._end_rows = settle_rows + 1 + math.ceil(config.nc.end_rest_s / self._dt_s - _TICK_TOLERANCE)
         self._stop_always = config.nc.corner == "exact_stop"
-        axes = [config.axis.get(name) for name in "XYZ"]
-        self._present = [axis is not None for axis in axes]
-        self._speed = [axis.rapid_speed_mm_s if axis else math.inf for axis in axes]
-        self._acceleration = [axis.max_acceleration_mm_s2 if axis else math.inf for axis in axes]
+        self._limits = limits = AxisLimits.of(config)
+        self._present, self._speed, self._acceleration = limits.present, limits.speed, limits.acceleration
         self._at: Point = (0.0, 0.0, 0.0)
         self._now_s = 0.0
         self._line = 0
@@ -122,7 +119,7 @@ class Timeline:
         if isinstance(motion, Dwell):
             self._dwell(motion)
         else:
-            self._check(motion)
+            self._limits.check(motion, self._at)
             if isinstance(motion, Rapid):
                 self._rapid(motion)
             elif isinstance(motion, Feed):
@@ -131,19 +128,6 @@ class Timeline:
                 self._arc(motion)
             self._at = motion.end
         self._before = kind
-
-    def _check(self, motion: Rapid | Feed | Arc) -> None:
-        if not isinstance(motion, Rapid) and not motion.feed > 0.0:
-            raise ProgramError(motion.line, "F", "the feed rate is 0, so the move would never end; give F")
-        moved = [abs(b - a) > _TINY_MM for a, b in zip(self._at, motion.end, strict=True)]
-        if isinstance(motion, Arc):
-            for axis in PLANE_AXES[motion.plane][:2]:
-                moved[axis] = True
-        for name, moves, present in zip("XYZ", moved, self._present, strict=True):
-            if moves and not present:
-                raise ProgramError(
-                    motion.line, name, f"moves axis {name}, which the configuration lacks; add [axis.{name}]"
-                )
 
     def _append(self, span_s: float, end: Point, kind: float, extra: Row = _NO_EXTRA, rapid: bool = False) -> None:
         self._now_s += span_s
@@ -162,8 +146,7 @@ class Timeline:
         self._now_s = row * self._dt_s
 
     def _dwell(self, motion: Dwell) -> None:
-        if motion.seconds / self._dt_s > _MAX_DWELL_ROWS:
-            raise ProgramError(motion.line, f"P{motion.seconds:g}", "is too long a dwell to plan")
+        check_dwell(motion, self._dt_s)
         self._before = Dwell
         self._hold(motion.seconds, motion.line)
 

@@ -1,0 +1,176 @@
+"""Corners: how fast the path may pass from one piece to the next, and how it is rounded within the tolerance of G64 P.
+
+A blend lets the piece before it fade while the one after it grows: over 2 d of path around the corner, at u from 0 to
+1, the point is p1(end - 2 d F(u)) + p2(2 d G(u)) - corner, where F is the integral of 1 - sigma from u to 1 and G that
+of sigma from 0 to u. With sigma = u this is the parabola of constant acceleration; with sigma = 3 u2 - 2 u3
+acceleration begins and ends at nothing. The length of the path and its course outside the blends stay what they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdhil.program.planner.limits import AxisLimits
+from fdhil.program.planner.pieces import ACCELERATION, BLENDS, JERK, LENGTH, SPEED, TOLERANCE, bends, directions
+from fdhil.records import Float
+
+ARC_SHARE = 0.866  # of the acceleration that turns; half of it is left along the path, as in LinuxCNC's planner
+_BLEND_SHARE = 0.9
+_JERK_SHARE = 0.5  # of the jerk that turning may take
+_UNLIMITED = 1e12
+
+
+@dataclass(frozen=True, slots=True)
+class Corners:
+    """Of each corner (m,): half the blend's length ``half`` mm (0: none), speed, and acceleration along the path."""
+
+    half: Float
+    speed: Float
+    acceleration: Float
+
+
+@dataclass(frozen=True, slots=True)
+class _Turn:
+    """What a corner asks of the axes at unit speed, as a share of their limits (m,): by its kink and by curvature."""
+
+    kink: Float
+    kink_by_acceleration: Float
+    kink_by_jerk: Float
+    bend: Float
+    curve_by_acceleration: Float
+    bend_by_acceleration: Float
+    bend_by_jerk: Float
+    spin_by_jerk: Float
+    jump_by_jerk: Float
+    along_by_acceleration: Float
+    along_by_jerk: Float
+
+
+class CornerRules:
+    """The rules of one machine; ``filter_s`` is the length of the jerk-limiting average, 0 for trapezoidal."""
+
+    def __init__(self, limits: AxisLimits, dt_s: float, filter_s: float) -> None:
+        self._acceleration = np.minimum(np.array(limits.acceleration), _UNLIMITED)
+        self._jerk = np.minimum(np.array(limits.jerk), _UNLIMITED)
+        self._dt_s = dt_s
+        self._filter_s = filter_s
+
+    def pieces(self, pieces: Float) -> tuple[Float, Float]:
+        """Return speed and acceleration (n,) along pieces of path, lowered where an arc turns."""
+        speed, acceleration = pieces[:, SPEED], pieces[:, ACCELERATION]
+        curvature = np.maximum(bends(pieces), 1e-12)
+        speed = np.minimum(speed, np.sqrt(ARC_SHARE * acceleration / curvature))
+        along = acceleration * np.sqrt(1.0 - np.minimum(speed**2 * curvature / acceleration, ARC_SHARE) ** 2)
+        if self._filter_s:
+            jerk = pieces[:, JERK]
+            speed = np.minimum(speed, np.cbrt(_JERK_SHARE * jerk / curvature**2))
+            turning = bends(pieces) > 0.0
+            shared = _JERK_SHARE * jerk / (2.0 / self._filter_s + 3.0 * speed * curvature)
+            along = np.where(turning, np.minimum(along, shared), along)
+        return speed, along
+
+    def corners(self, pieces: Float) -> Corners:
+        """Return the corners between each piece and the next, (n - 1,)."""
+        turn = self._turn(pieces)
+        free, _ = self.pieces(pieces)
+        wanted = np.minimum(free[:-1], free[1:])
+        sharp = self._sharp_speed(turn)
+        room = np.minimum(pieces[:-1, LENGTH], pieces[1:, LENGTH]) / 2.0
+        room = np.minimum(room, self._within(turn, pieces[:-1, TOLERANCE]))
+        blend = (pieces[:-1, BLENDS] > 0.0) & (sharp < wanted) & (room > 0.0)
+        half = np.where(blend, np.minimum(room, self._needed(turn, wanted)), 1.0)
+        speed = np.minimum(wanted, self._speed(turn, half))
+        blend &= speed > sharp
+        along = self._along(turn, half, speed)
+        return Corners(
+            np.where(blend, half, 0.0),
+            np.where(blend, speed, np.minimum(wanted, sharp)),
+            np.where(blend, along, _UNLIMITED),
+        )
+
+    def _turn(self, pieces: Float) -> _Turn:
+        tangent_out, curvature_out = directions(pieces[:-1], at_end=True)
+        tangent_in, curvature_in = directions(pieces[1:], at_end=False)
+        kink = np.abs(tangent_in - tangent_out)
+        jump = np.abs(curvature_in - curvature_out)
+        bend_out, bend_in = np.linalg.norm(curvature_out, axis=1), np.linalg.norm(curvature_in, axis=1)
+        along = np.maximum(np.abs(tangent_out), np.abs(tangent_in))
+        before, after = pieces[:-1], pieces[1:]
+        jerk = np.minimum(before[:, JERK], after[:, JERK])
+        acceleration = np.minimum(before[:, ACCELERATION], after[:, ACCELERATION])
+        # an arc turns within the blend too, by half its length at most, which adds to the kink
+        curve = np.maximum(bend_out, bend_in)
+        bend = curve + self._peak * (bend_out + bend_in) / 2.0
+        return _Turn(
+            kink=np.linalg.norm(kink, axis=1),
+            kink_by_acceleration=np.max(kink / self._acceleration, axis=1) + 1e-15,
+            kink_by_jerk=np.max(kink / self._jerk, axis=1) + 1e-18,
+            bend=bend_out + bend_in,
+            curve_by_acceleration=curve / acceleration,
+            bend_by_acceleration=bend / acceleration,
+            bend_by_jerk=(bend_out + bend_in) / jerk,
+            spin_by_jerk=curve**2 / jerk,
+            jump_by_jerk=np.max(jump / self._jerk, axis=1) + 1e-18,
+            along_by_acceleration=np.max(along / self._acceleration, axis=1),
+            along_by_jerk=np.max(along / self._jerk, axis=1),
+        )
+
+    def _sharp_speed(self, turn: _Turn) -> Float:
+        """Speed at which the corner needs no rounding: its step fits into one period of the limits."""
+        if not self._filter_s:
+            step = turn.kink_by_acceleration / self._dt_s
+            return np.asarray(2.0 / (step + np.sqrt(step**2 + 4.0 * turn.curve_by_acceleration)))
+        step = self._dt_s**2 / turn.kink_by_jerk
+        return np.minimum(step, np.sqrt(self._dt_s / turn.jump_by_jerk))
+
+    def _within(self, turn: _Turn, tolerance_mm: Float) -> Float:
+        """Largest half length that stays within the tolerance: d kink (1/4 or 3/16) + d2 curvature / 16 at most."""
+        tolerance = np.minimum(tolerance_mm, _UNLIMITED)
+        linear = turn.kink * (0.1875 if self._filter_s else 0.25)
+        root = np.sqrt(linear**2 + turn.bend * tolerance / 4.0)
+        return np.asarray(2.0 * tolerance / np.maximum(linear + root, 1e-12))
+
+    def _needed(self, turn: _Turn, speed: Float) -> Float:
+        """Half length at which a corner may be passed at ``speed``."""
+        spared = np.maximum(_BLEND_SHARE - speed**2 * turn.bend_by_acceleration, _BLEND_SHARE / 2.0)
+        half = self._peak * speed**2 * turn.kink_by_acceleration / (2.0 * spared)
+        if not self._filter_s:
+            return np.asarray(half)
+        budget = _JERK_SHARE / speed**3
+        budget = np.maximum(budget - turn.spin_by_jerk, budget / 2.0)
+        root = np.sqrt(turn.bend_by_jerk**2 + 6.0 * turn.kink_by_jerk * budget)
+        return np.maximum(half, (turn.bend_by_jerk + root) / (2.0 * budget))
+
+    def _speed(self, turn: _Turn, half: Float) -> Float:
+        """Speed at which blends of this half length keep acceleration and jerk."""
+        turning = self._peak * turn.kink_by_acceleration / (2.0 * half) + turn.bend_by_acceleration
+        speed = np.sqrt(_BLEND_SHARE / turning)
+        if self._filter_s:
+            jerk = 1.5 * turn.kink_by_jerk / half**2 + turn.bend_by_jerk / half + turn.spin_by_jerk
+            speed = np.minimum(speed, np.cbrt(_JERK_SHARE / jerk))
+        return np.asarray(speed)
+
+    def _along(self, turn: _Turn, half: Float, speed: Float) -> Float:
+        """Acceleration along the path that a blend leaves over."""
+        bend = self._peak * turn.kink_by_acceleration / (2.0 * half) + turn.bend_by_acceleration
+        along = np.maximum(1.0 - speed**2 * bend, 1.0 - _BLEND_SHARE) / turn.along_by_acceleration
+        if self._filter_s:
+            bend_by_jerk = self._peak * turn.kink_by_jerk / (2.0 * half) + turn.bend_by_jerk
+            per_unit = 2.0 / self._filter_s * turn.along_by_jerk + 3.0 * speed * bend_by_jerk
+            along = np.minimum(along, _JERK_SHARE / per_unit)
+        return np.asarray(along)
+
+    @property
+    def _peak(self) -> float:
+        """Largest slope of sigma."""
+        return 1.5 if self._filter_s else 1.0
+
+
+def fade(u: Float, smooth: bool) -> tuple[Float, Float]:
+    """Return F(u) and G(u) (n,) of a blend at u in [0, 1]."""
+    if not smooth:
+        return (1.0 - u) ** 2 / 2.0, u**2 / 2.0
+    grown = u**3 - u**4 / 2.0
+    return 0.5 - u + grown, grown

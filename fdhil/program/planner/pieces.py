@@ -1,0 +1,111 @@
+"""Motions as pieces of path in a table: lines and arcs, their lengths and limits, and how they begin and end."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from fdhil.program.arcs import sweep
+from fdhil.program.motions import PLANE_AXES, PLANES, Arc, Feed, Point, Rapid
+from fdhil.program.planner.limits import AxisLimits
+from fdhil.records import Float, Int
+
+# columns of a piece; a line's kind is -1, an arc's the index of its plane
+KIND, LINE, RAPID, LENGTH, SPEED, ACCELERATION, JERK, BLENDS, TOLERANCE = range(9)
+START, STOP = slice(9, 12), slice(12, 15)
+_EXTRA = slice(15, 21)  # of an arc: centre, radius at start and end, angle at the start, angle swept
+WIDTH = 21
+_NO_EXTRA = (0.0,) * 6
+Row = tuple[float, ...]
+
+
+def piece(motion: Rapid | Feed | Arc, start: Point, limits: AxisLimits) -> Row | None:
+    """Return the row of one motion, None where it has no length. Speeds keep each axis within its own limit."""
+    extra: Row = _NO_EXTRA
+    kind = -1.0
+    if isinstance(motion, Arc):
+        share, length, extra = _arc(motion, start)
+        kind = float(PLANES.index(motion.plane))
+    else:
+        length = math.dist(start, motion.end)
+        share = [abs(b - a) / length if length else 0.0 for a, b in zip(start, motion.end, strict=True)]
+    if length <= 0.0:
+        return None
+    speed, acceleration, jerk = (
+        min(limit / part for limit, part in zip(axes, share, strict=True) if part)
+        for axes in (limits.speed, limits.acceleration, limits.jerk)
+    )
+    if not isinstance(motion, Rapid):
+        speed = min(speed, motion.feed / 60.0)
+    corner = motion.corner
+    return (
+        kind, float(motion.line), float(isinstance(motion, Rapid)), length, speed, acceleration, jerk,
+        float(corner.mode == "blend"), corner.tolerance_mm, *start, *motion.end, *extra,
+    )  # fmt: skip
+
+
+def _arc(motion: Arc, start: Point) -> tuple[list[float], float, Row]:
+    first, second, normal = PLANE_AXES[motion.plane]
+    centre = (motion.centre[first] or 0.0, motion.centre[second] or 0.0)
+    begin = (start[first] - centre[0], start[second] - centre[1])
+    finish = (motion.end[first] - centre[0], motion.end[second] - centre[1])
+    angle = sweep(begin, finish, motion.turns)
+    radii = math.hypot(*begin), math.hypot(*finish)
+    rise = motion.end[normal] - start[normal]
+    length = math.hypot((radii[0] + radii[1]) / 2.0 * angle, rise)
+    share = [1.0, 1.0, 1.0]
+    share[normal] = abs(rise) / length if length else 0.0
+    return share, length, (*centre, *radii, math.atan2(begin[1], begin[0]), angle)
+
+
+def _turning(pieces: Float) -> Iterator[tuple[Int, tuple[int, int, int]]]:
+    """Yield the rows of the arcs of each plane with the plane's axes."""
+    for plane, name in enumerate(PLANES):
+        rows = np.flatnonzero(pieces[:, KIND] == plane)
+        if rows.size:
+            yield rows, PLANE_AXES[name]
+
+
+def points(pieces: Float, distance: Float) -> Float:
+    """Return the points (n, 3) of pieces (n, WIDTH) at ``distance`` (n,) mm from their starts."""
+    share = np.clip(distance / pieces[:, LENGTH], 0.0, 1.0)
+    start, stop = pieces[:, START], pieces[:, STOP]
+    position = start + (stop - start) * share[:, None]
+    at_end = share >= 1.0
+    for rows, (first, second, _) in _turning(pieces):
+        along = share[rows]
+        x, y, begin_radius, end_radius, begin_angle, swept = pieces[rows, _EXTRA].T
+        radius = begin_radius + (end_radius - begin_radius) * along
+        angle = begin_angle + swept * along
+        position[rows, first] = x + radius * np.cos(angle)
+        position[rows, second] = y + radius * np.sin(angle)
+    position[at_end] = stop[at_end]
+    return np.asarray(position)
+
+
+def directions(pieces: Float, at_end: bool) -> tuple[Float, Float]:
+    """Return unit tangents (n, 3) and curvature vectors (n, 3), 1/mm, at the starts or at the ends of pieces."""
+    length = pieces[:, LENGTH, None]
+    tangent = (pieces[:, STOP] - pieces[:, START]) / length
+    curvature = np.zeros_like(tangent)
+    for rows, (first, second, _) in _turning(pieces):
+        _, _, begin_radius, end_radius, begin_angle, swept = pieces[rows, _EXTRA].T
+        radius, angle = (end_radius, begin_angle + swept) if at_end else (begin_radius, begin_angle)
+        rate = swept / pieces[rows, LENGTH]
+        growth = (end_radius - begin_radius) / pieces[rows, LENGTH]
+        c, s = np.cos(angle), np.sin(angle)
+        tangent[rows, first] = growth * c - radius * rate * s
+        tangent[rows, second] = growth * s + radius * rate * c
+        curvature[rows, first] = -radius * rate**2 * c
+        curvature[rows, second] = -radius * rate**2 * s
+    return tangent, curvature
+
+
+def bends(pieces: Float) -> Float:
+    """Return the curvature (n,) of pieces, 1/mm: of an arc the one at its smaller radius."""
+    extra = pieces[:, _EXTRA]
+    radius = np.minimum(extra[:, 2], extra[:, 3])
+    curved = (pieces[:, KIND] >= 0.0) & (radius > 0.0)
+    return np.where(curved, 1.0 / np.where(curved, radius, 1.0), 0.0)
