@@ -2,8 +2,9 @@
 
 The voltage is noisy too, so the model driven by it is off by noise that the drive has filtered. The innovations of
 :mod:`fdhil.identification.innovations` undo that filter: they are white, and the sum of their squares is the exponent
-of the likelihood. Gauss-Newton steps with the filter held fixed solve an unbiased estimating equation; noise levels and
-filter are renewed between them. The information matrix is what remains of the steps.
+of the likelihood. The filter belongs to the parameters: held fixed, it would take noise of the voltage for the voltage
+and make L too large wherever the demand is smooth. Noise levels are renewed between the Gauss-Newton steps. The
+information matrix is what remains of the steps.
 """
 
 from __future__ import annotations
@@ -48,8 +49,11 @@ class Problem:
     filters: tuple[Gains, ...]
 
     def residuals(self, theta: Float) -> Float:
-        """Return the whitened innovations of all windows (m,); ``theta`` (7,) is [R, L, K, Jt, ft, Cd, delay]."""
-        return self._all(theta, 1.0)
+        """Return the whitened innovations (m,) of all windows, each by the filter that is right for ``theta`` (7,).
+
+        ``theta`` is [R, L, K, Jt, ft, Cd, delay].
+        """
+        return pose(self.motions, theta, self.noises)._all(theta, 1.0)
 
     def shape_effect(self, theta: Float) -> Float:
         """Return how the innovations (m,) change with what is not known of the voltage's course within its samples."""
@@ -82,7 +86,7 @@ def pose(motions: Sequence[Motion], theta: Float, noises: Sequence[Noise]) -> Pr
 
 
 def jacobian(problem: Problem, theta: Float, base: Float, free: Sequence[int], scales: Float) -> Float:
-    """Return minus the derivative (m, k) of the innovations by the ``free`` entries of theta, the filter held."""
+    """Return minus the derivative (m, k) of the innovations by the ``free`` entries of theta, filter included."""
     columns = []
     for j in free:
         step = DELAY_DIFFERENCE_S if j == 6 else DIFFERENCE * scales[j]
@@ -108,7 +112,7 @@ def admissible(theta: Float) -> bool:
 
 
 def descend(problem: Problem, theta: Float, free: Sequence[int]) -> tuple[Float, Float, Float, bool]:
-    """Take Gauss-Newton steps with the filter held; return theta, innovations (m,), jacobian (m, k), and success."""
+    """Take Gauss-Newton steps; return theta, innovations (m,), jacobian (m, k), and success."""
     residuals = problem.residuals(theta)
     for _ in range(STEPS):
         j = jacobian(problem, theta, residuals, free, typical(theta, problem.motions))
@@ -145,7 +149,7 @@ def fit(motions: Sequence[Motion], start: Float, free: Sequence[int]) -> Fit:
         if turn and float(moved @ information @ moved) < SETTLED:
             break
         noises = [fit_noise(m, theta, s, theta[6]) for m, s in zip(motions, noises, strict=True)]
-    return Fit(theta, information, tuple(free), residuals, j, problem, converged)
+    return Fit(theta, information, tuple(free), residuals, j, pose(motions, theta, problem.noises), converged)
 
 
 def starting_point(signals: Sequence[Signals], dt_s: Sequence[float]) -> Float | None:
