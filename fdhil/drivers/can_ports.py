@@ -90,6 +90,12 @@ class WallClock:
         return after - before, wall - (before + after) // 2
 
 
+def monotonic_ns(wall_ns: int, wall_ahead_ns: int) -> int:
+    """Return a wall-clock stamp on the monotonic clock; now, when the wall clock was set since the stamp."""
+    now_ns, stamp_ns = time.monotonic_ns(), wall_ns - wall_ahead_ns
+    return stamp_ns if now_ns - 1_000_000_000 < stamp_ns <= now_ns + 5_000_000 else now_ns
+
+
 class SocketCanPort:
     """A raw CAN socket on a network interface: kernel stamps, error frames, drop count."""
 
@@ -137,19 +143,17 @@ class SocketCanPort:
             except OSError as error:
                 raise BusEnded(f"the CAN interface is down ({error.strerror})") from None
             can_id, length, payload = _CAN_FRAME.unpack(data)
-            stamp_ns = self._stamp(ancillary, wall_ahead_ns, time.monotonic_ns())
-            ring.append(stamp_ns, can_id, payload[:length])
+            ring.append(self._stamp(ancillary, wall_ahead_ns), can_id, payload[:length])
 
-    def _stamp(self, ancillary: list[tuple[int, int, bytes]], wall_ahead_ns: int, now_ns: int) -> int:
-        stamp_ns = now_ns
+    def _stamp(self, ancillary: list[tuple[int, int, bytes]], wall_ahead_ns: int) -> int:
+        stamp_ns = None
         for _level, kind, value in ancillary:
             if kind == SO_TIMESTAMPNS:
                 seconds, nanoseconds = struct.unpack("qq", value[:16])
-                stamp_ns = seconds * 1_000_000_000 + nanoseconds - wall_ahead_ns
+                stamp_ns = monotonic_ns(seconds * 1_000_000_000 + nanoseconds, wall_ahead_ns)
             elif kind == SO_RXQ_OVFL:
                 (self.kernel_drops,) = struct.unpack("I", value[:4])
-        # a wall clock that was set between the stamp and here must not move the frame
-        return stamp_ns if now_ns - 1_000_000_000 < stamp_ns <= now_ns + 5_000_000 else now_ns
+        return time.monotonic_ns() if stamp_ns is None else stamp_ns
 
     def send(self, can_id: int, data: bytes) -> None:
         """Send one frame; a full transmit queue (ENOBUFS) is an error at once, never a wait."""
@@ -284,21 +288,24 @@ class VirtualPort:
 
     def __init__(self, name: str, channel: str) -> None:
         self._name = name
+        self._wall_clock = WallClock()
         try:
             self._bus = can.Bus(interface="virtual", channel=channel)
         except can.CanError as error:
             raise ConnectError(name, f"the virtual bus {channel} cannot be opened ({error})") from None
 
     def receive(self, ring: Ring, timeout_s: float) -> None:
-        """Append one frame, and all others that wait."""
+        """Append one frame, and all others that wait; the sender's wall-clock stamps become monotonic ones."""
         wait: float = timeout_s
+        wall_ahead_ns = self._wall_clock.ahead_ns()
         for _ in range(4096):
             message = self._bus.recv(wait)
             if message is None:
                 return
+            stamp_ns = monotonic_ns(int(message.timestamp * 1e9), wall_ahead_ns)
             can_id = message.arbitration_id | (EXTENDED_FLAG if message.is_extended_id else 0)
             can_id |= (ERROR_FLAG if message.is_error_frame else 0) | (REMOTE_FLAG if message.is_remote_frame else 0)
-            ring.append(time.monotonic_ns(), can_id, bytes(message.data[:8]))
+            ring.append(stamp_ns, can_id, bytes(message.data[:8]))
             wait = 0.0
 
     def send(self, can_id: int, data: bytes) -> None:

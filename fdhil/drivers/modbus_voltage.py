@@ -12,13 +12,14 @@ from __future__ import annotations
 import asyncio
 import math
 import time
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.drivers.counter_clock import CounterClock
+from fdhil.drivers.counter_clock import CounterClock, Line
 from fdhil.drivers.modbus_link import ModbusLink, float32, uint32
 from fdhil.drivers.tick_clock import TickClock
 from fdhil.errors import ProtocolError
@@ -33,6 +34,7 @@ STUCK_POLLS = 20
 SYNC_LATENESS_NS = 200_000  # how late the stamp of a SYNC may be on a busy computer
 _SETTLE_STEPS = 8
 _SETTLE_STEP_S = 0.01
+_SETTLED_NS = 50_000_000  # a query is placed when so many later SYNCs have shown which stamps around it were late
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +78,7 @@ class ModbusVoltage:
         self._host_clock: CounterClock | None = None
         self._tick_clock: CounterClock | None = None
         self._rate_hz = 0.0
+        self._waiting: deque[tuple[int, int, int]] = deque(maxlen=BLOCK_SAMPLES)
         self._next: int | None = None
         self._still = 0
         self.lost = 0
@@ -112,10 +115,19 @@ class ModbusVoltage:
             self._rate_hz = block.rate_hz
             self._host_clock = CounterClock(1e9 / block.rate_hz)
             self._tick_clock = CounterClock(1 / block.rate_hz / self._period_s)
+            self._waiting.clear()
         self._host_clock.add(block.newest, asked_ns, answered_ns)
-        between = ticks.bounds(asked_ns, answered_ns)
-        if between is not None:
-            self._tick_clock.add(block.newest, *between)
+        self._waiting.append((block.newest, asked_ns, answered_ns))
+        while self._waiting and (ticks.covers(self._waiting[0][2] + _SETTLED_NS) or self._tick_clock.line() is None):
+            newest, asked, answered = self._waiting.popleft()
+            between = ticks.bounds(asked, answered)
+            if between is not None:
+                self._tick_clock.add(newest, *between)
+
+    @property
+    def line(self) -> Line | None:
+        """Where the sensor's samples lie on the SYNC count, None before that is known."""
+        return self._tick_clock.line() if self._tick_clock else None
 
     def _continuity(self, block: SensorBlock) -> list[Notice]:
         """Count samples that are missing between blocks, and notice a counter that stands still."""
@@ -150,7 +162,7 @@ class ModbusVoltage:
     def _times(self, counter: np.ndarray, ticks: TickClock) -> tuple[np.ndarray, float]:
         """Host time at which each sample begins: by way of the SYNC count where there is one, so that what was late
         in both SYNC and sensor cancels."""
-        line = self._tick_clock.line() if self._tick_clock else None
+        line = self.line
         if line is not None and ticks.running:
             fraction = line.start + line.step * (counter - line.origin)
             return ticks.time_ns(fraction), line.error * ticks.period_ns + SYNC_LATENESS_NS

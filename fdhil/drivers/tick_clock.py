@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from fdhil.records import Float, TickTimes
+from fdhil.records import Float, Int, TickTimes
 
 KEPT_TICKS = 8192
 _STALE_TICKS = 50.0
+_LATE_TICKS = 512  # stamps that are late for longer than that are taken for a SYNC that was late
 
 
 class TickClock:
@@ -44,18 +45,26 @@ class TickClock:
     def bounds(self, from_ns: int, to_ns: int) -> tuple[float, float] | None:
         """Return fractional ticks that surely enclose the span; None when SYNC does not run at that time.
 
-        A span that ends after the newest SYNC is carried on at the nominal period, as far as the SYNC is not overdue.
+        A stamp is never too early but often late, when the computer was. So the stamps alone tell how many SYNCs had
+        come for sure; how many may have come is told by the earliest instants that the later stamps allow. A span
+        that ends after the newest SYNC is carried on at the period, as far as the SYNC is not overdue.
         """
         if not self.running or from_ns < self._t_ns[0] or to_ns - self._t_ns[-1] > _STALE_TICKS * self.period_ns:
             return None
-        low, high = (self._tick_at(t) for t in (from_ns, to_ns))
-        return low, high
+        start = max(0, int(self._t_ns.searchsorted(to_ns)) - _LATE_TICKS)
+        tick, t_ns = self._tick[start:], self._t_ns[start:]
+        return _tick_at(from_ns, self._tick, self._t_ns, self.period_ns), _tick_at(
+            to_ns, tick, *self._earliest(tick, t_ns)
+        )
 
-    def _tick_at(self, t_ns: int) -> float:
-        beyond = t_ns - int(self._t_ns[-1])
-        if beyond > 0:
-            return float(self._tick[-1] + beyond / self.period_ns)
-        return float(np.interp(t_ns, self._t_ns, self._tick))
+    def _earliest(self, tick: Int, t_ns: Int) -> tuple[Float, float]:
+        """Return the earliest instants (n,) of these SYNCs, and the period: none comes sooner than that after another.
+
+        A simulated machine may run ahead of the clock: its own period then counts.
+        """
+        steps = np.diff(t_ns) / np.diff(tick)
+        period_ns = min(self.period_ns, float(np.median(steps))) if steps.size else self.period_ns
+        return np.minimum.accumulate((t_ns - tick * period_ns)[::-1])[::-1] + tick * period_ns, period_ns
 
     def time_ns(self, tick: Float) -> Float:
         """Return the host time (n,) of fractional ticks (n,), carried on at the nominal period at both ends."""
@@ -63,3 +72,8 @@ class TickClock:
         before = np.minimum(tick - self._tick[0], 0) * self.period_ns
         after = np.maximum(tick - self._tick[-1], 0) * self.period_ns
         return np.asarray(inside + before + after, dtype=np.float64)
+
+
+def _tick_at(t_ns: int, tick: Int, stamps_ns: Int | Float, period_ns: float) -> float:
+    beyond = t_ns - float(stamps_ns[-1])
+    return float(tick[-1] + beyond / period_ns if beyond > 0 else np.interp(t_ns, stamps_ns, tick))

@@ -159,3 +159,28 @@ def test_tick_clock_follows_a_producer_that_is_held_up() -> None:
     assert clock.bounds(60 * MS, 600 * MS) is None
     clock.add(TickTimes(np.array([0, 1]), np.array([100, 101]) * MS))
     assert clock.newest_tick == 1
+
+
+def test_a_stamp_that_was_late_does_not_narrow_the_bounds() -> None:
+    clock = TickClock(0.001)
+    stamps = np.arange(200) * MS
+    stamps[50:60] = 59 * MS + 500_000  # this computer did not look for ten SYNCs
+    clock.add(TickTimes(np.arange(200), stamps))
+    low, high = clock.bounds(55 * MS, 55 * MS + MS // 2) or (0.0, 0.0)
+    assert low <= 55.0
+    assert high == pytest.approx(55.5)
+    assert clock.bounds(100 * MS, 101 * MS) == pytest.approx((100.0, 101.0))
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(10, 280), st.floats(0, 5), st.sampled_from([0.4, 1.0]))
+def test_bounds_enclose_the_truth_though_some_stamps_are_late(
+    seed: int, asked: float, takes: float, pace: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    true_ms = np.arange(300) * pace  # a simulated machine may run faster than the clock
+    late_ms = np.where(rng.random(300) < 0.1, rng.uniform(0, 3, 300) * pace, 0.0)
+    clock = TickClock(0.001)
+    clock.add(TickTimes(np.arange(300), (np.maximum.accumulate(true_ms + late_ms) * MS).astype(np.int64)))
+    low, high = clock.bounds(round(asked * pace * MS), round((asked + takes) * pace * MS)) or (0.0, 300.0)
+    assert low <= asked + 0.01
+    assert high >= asked + takes - 0.01

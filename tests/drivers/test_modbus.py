@@ -203,6 +203,28 @@ def test_samples_are_placed_by_way_of_the_sync_count() -> None:
     np.testing.assert_allclose(placed, last.counter, atol=0.6)
 
 
+def test_late_stamps_of_sync_do_not_move_the_samples() -> None:
+    rng = np.random.default_rng(1)
+    sensor = ModbusVoltage("X", config(1))
+    ticks = TickClock(0.001)
+    asked = np.arange(50, 5900, 50) * 1_000_000 - 12_000_000 + rng.integers(0, 900_000, 117)
+    stamps = np.arange(6000) * 1_000_000
+    # most often this computer is busy just when the sensor answers: SYNCs that come in these 6 ms are stamped later
+    for busy_ns in asked[rng.random(asked.size) < 0.8]:
+        late = (stamps > busy_ns) & (stamps < busy_ns + 6_000_000)
+        stamps[late] = busy_ns + 6_000_000
+    begins = []
+    for k, asked_ns in zip(range(50, 5900, 50), asked, strict=True):
+        ticks.add(TickTimes(np.arange(k - 50, k), stamps[k - 50 : k]))
+        answered_ns = int(asked_ns + rng.integers(2_000_000, 4_000_000))
+        newest = (int(asked_ns) + answered_ns) // 2_000_000 - 1
+        block = SensorBlock(newest, 1000.0, 20.0, False, newest - 49, np.zeros(50))
+        sensor.accept(block, int(asked_ns), answered_ns, ticks)
+        assert sensor.line is not None
+        begins.append(sensor.line.at(0))
+    np.testing.assert_allclose(begins[20:], 0.0, atol=0.6)
+
+
 @pytest.mark.parametrize("name", tables.VOLTAGE_SOURCES)
 def test_every_listed_source_can_be_loaded(name: str) -> None:
     assert callable(tables.load(tables.VOLTAGE_SOURCES, name))
