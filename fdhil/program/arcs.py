@@ -7,8 +7,7 @@ import math
 from fdhil.errors import ProgramError
 from fdhil.program.machine import Machine
 from fdhil.program.modal import AXES, Modal
-from fdhil.program.motions import PLANE_AXES
-from fdhil.program.targets import axis_words, feed_mm_min, target
+from fdhil.program.targets import axis_words, feed_mm_min, plane_axes, target
 from fdhil.program.words import Block
 
 CODES = (20, 30)
@@ -24,7 +23,7 @@ _CHORD_RELATIVE = 0.001  # by how much half the chord may exceed the radius of a
 def arc(machine: Machine, block: Block) -> None:
     """Order the arc of a G2 or G3 block; ProgramError when its words give none."""
     modal = machine.modal
-    first, second, normal = PLANE_AXES[modal.plane_name]
+    first, second, normal = plane_axes(modal, block)
     if "r" in block.words and any(letter in block.words for letter in _OFFSETS):
         raise block.fault("r", "contradicts I, J or K in the same block; give the radius or the centre")
     words = axis_words(block)
@@ -79,10 +78,15 @@ def _check_radii(
     word = next(letter for letter in _OFFSETS if letter in block.words)
     if begin < _MIN_RADIUS_MM or finish < _MIN_RADIUS_MM:
         raise block.fault(word, "the arc has no radius; move the centre away from start and end")
-    off = abs(begin - finish)
-    if off > _SPIRAL_ABSOLUTE_MM or (off > _SPIRAL_SMALL_MM and off > _SPIRAL_RELATIVE * begin):
+    if not radii_agree(begin, finish):
         raise block.fault(word, f"the radius is {begin:.4f} mm at the start and {finish:.4f} mm at the end of the arc; "
                                 f"correct centre or end ({AXES[first].upper()}, {AXES[second].upper()})")  # fmt: skip
+
+
+def radii_agree(begin_mm: float, finish_mm: float) -> bool:
+    """Tell whether the radii at both ends of an arc are near enough for one arc."""
+    off = abs(begin_mm - finish_mm)
+    return off <= _SPIRAL_ABSOLUTE_MM and (off <= _SPIRAL_SMALL_MM or off <= _SPIRAL_RELATIVE * begin_mm)
 
 
 def _centre_of_radius(

@@ -14,7 +14,7 @@ from fdhil.errors import ProgramError
 from fdhil.program.machine import Machine
 from fdhil.program.modal import AXES, Modal
 from fdhil.program.motions import PLANE_AXES
-from fdhil.program.targets import length_mm, target
+from fdhil.program.targets import length_mm, plane_axes, target
 from fdhil.program.words import Block
 
 _CLEARANCE_MM = 0.254  # by which a peck stays clear of where the drill was
@@ -24,13 +24,17 @@ _TAPPING = {740: -1, 840: 1}  # how the spindle must turn
 _BACK_BORING = 870
 _SPINNING = (860, 870, 880)
 _KEPT = "rpqijk"
+_DEPTH = "depth"  # kept under one name in every plane, as the reference does
 _MEANING = {"r": "its clearance level", "q": "its peck", "p": "its dwell", "i": "how far beside the hole it enters",
             "j": "how far beside the hole it enters", "k": "the level to bore up to"}  # fmt: skip
 
 
 @dataclass(slots=True)
 class Series:
-    """What a series of cycle blocks shares: its words in mm, and the level at which it began."""
+    """What a series of cycle blocks shares: its words and the level at which it began, both in program units.
+
+    The numbers stay what they are when the units or the plane change, as in the reference.
+    """
 
     words: dict[str, float] = field(default_factory=dict)
     began: float | None = None
@@ -39,15 +43,17 @@ class Series:
 def cycle(machine: Machine, block: Block, series: Series, fresh: bool) -> None:
     """Order one canned-cycle block of a series; ``fresh`` tells that another motion was in force before it."""
     modal = machine.modal
-    words = _words(modal, block, series.words)
-    _check(modal, block, block.words if fresh else words, words)
+    first, second, normal = plane_axes(modal, block)
+    given = {} if fresh else dict(series.words)
+    _words(modal, block, given)
+    words = {letter: _mm(modal, letter, value) for letter, value in _words(modal, block, series.words).items()}
+    _check(modal, block, given, words)
     repeats = round(block.words.get("l", 1.0))
     if "l" in block.words and (repeats < 1 or abs(block.words["l"] - repeats) > 1e-4):
         raise block.fault("l", "is no number of repeats; L must be a whole number from 1")
-    first, second, normal = PLANE_AXES[modal.plane_name]
     if series.began is None:
-        series.began = modal.position[normal]
-    old = series.began
+        series.began = modal.position[normal] / modal.scale
+    old = series.began * modal.scale
     depth, clearance = _levels(modal, words, old)
     if depth > clearance:
         raise ProgramError(block.line, f"G{modal.motion / 10:g}", "its clearance level R lies below its depth")
@@ -56,7 +62,9 @@ def cycle(machine: Machine, block: Block, series: Series, fresh: bool) -> None:
     hole = Hole(machine, block, words, depth, clearance, clearance if modal.retract_to_r else max(old, clearance))
     for _ in range(repeats):
         place = target(modal, block)
-        machine.rapid_to(block, _with(modal.position, {first: place[first], second: place[second]}))
+        level = modal.position[normal] if modal.position[normal] > clearance else hole.retract
+        there = {first: place[first], second: place[second], normal: level}
+        machine.rapid_to(block, _with(modal.position, there))
         if modal.position[normal] != clearance:
             hole.rapid(clearance)
         hole.work()
@@ -70,14 +78,18 @@ def _with(position: list[float], changed: dict[int, float]) -> list[float]:
 
 
 def _words(modal: Modal, block: Block, kept: dict[str, float]) -> dict[str, float]:
-    """Return the cycle's words, those of the block and those still in force, in mm."""
+    """Return the cycle's words, those of the block and those still in force, in program units."""
     normal = PLANE_AXES[modal.plane_name][2]
     if AXES[normal] in block.words:
-        kept[AXES[normal]] = length_mm(modal, normal, block.words[AXES[normal]])
+        kept[_DEPTH] = length_mm(modal, normal, block.words[AXES[normal]]) / modal.scale
     for letter in _KEPT:
         if letter in block.words:
-            kept[letter] = block.words[letter] * (1.0 if letter == "p" else modal.scale)
+            kept[letter] = block.words[letter]
     return kept
+
+
+def _mm(modal: Modal, letter: str, value: float) -> float:
+    return value if letter == "p" else value * modal.scale
 
 
 def _check(modal: Modal, block: Block, given: Mapping[str, float], words: Mapping[str, float]) -> None:
@@ -92,14 +104,15 @@ def _check(modal: Modal, block: Block, given: Mapping[str, float], words: Mappin
         if letter in block.words:
             raise block.fault(letter, "cannot be moved by a canned cycle")
     needs = [
-        normal,
+        _DEPTH,
         "r",
         *("q" for m in _PECKING if m == modal.motion),
         *("p" for m in _WITH_DWELL if m == modal.motion),
     ]
     for letter in needs + (["i", "j", "k"] if modal.motion == _BACK_BORING else []):
         if letter not in given:
-            raise ProgramError(block.line, code, f"wants {letter.upper()}, {_MEANING.get(letter, 'its depth')}")
+            shown = normal if letter == _DEPTH else letter
+            raise ProgramError(block.line, code, f"wants {shown.upper()}, {_MEANING.get(letter, 'its depth')}")
     if modal.motion in _PECKING and not words["q"] > 0.0:
         raise ProgramError(block.line, f"Q{words['q']:g}", "is no depth of a peck; Q must be positive")
     if words.get("p", 0.0) < 0.0:
@@ -112,11 +125,10 @@ def _check(modal: Modal, block: Block, given: Mapping[str, float], words: Mappin
 
 def _levels(modal: Modal, words: dict[str, float], began: float) -> tuple[float, float]:
     """Return depth and clearance level in active co-ordinates; incremental R is from ``began``, Z from R."""
-    normal = PLANE_AXES[modal.plane_name][2]
     if modal.absolute:
-        return words[AXES[normal]], words["r"]
+        return words[_DEPTH], words["r"]
     clearance = began + words["r"]
-    return clearance + words[AXES[normal]], clearance
+    return clearance + words[_DEPTH], clearance
 
 
 @dataclass(slots=True)

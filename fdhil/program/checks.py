@@ -28,8 +28,8 @@ _READERS: Mapping[str, tuple[frozenset[int], frozenset[int], str]] = {
 }  # fmt: skip
 
 
-def check_readers(block: Block, motion: int) -> None:
-    """Raise ProgramError for a letter that neither a code of the block nor the ``motion`` in force reads."""
+def check_readers(block: Block, motion: int | None) -> None:
+    """Raise ProgramError for a letter that neither a code of the block nor its ``motion`` reads."""
     words = block.words
     for letter in words:
         if letter in _READERS:
@@ -42,7 +42,6 @@ def one_reader_of_axes(block: Block) -> None:
     """Raise ProgramError when two codes of the block both want its axis words."""
     wanting = [code for group, code in block.g.items()
                if (group == "one-shot" and code in (100, 280, 300, 520, 920))
-               or (group == "tool length" and code == 431)
                or (group == "motion" and code != 800)]  # fmt: skip
     if len(wanting) > 1:
         names = " and ".join(f"G{code / 10:g}" for code in sorted(wanting))

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 from fdhil.errors import ProgramError
 from fdhil.program.machine import Machine
+from fdhil.program.modal import NO_MOTION
 from fdhil.program.targets import axis_words, feed_mm_min, target
 from fdhil.program.words import Block
 
@@ -32,6 +33,8 @@ def spline(machine: Machine, block: Block, series: Spline) -> None:
         raise ProgramError(block.line, code, "works in the XY plane; give G17 first")
     if machine.compensation is not None:
         raise ProgramError(block.line, code, "cannot be used with cutter compensation on")
+    if not axis_words(block):
+        raise ProgramError(block.line, code, "wants X or Y, the end of the curve")
     if any(axis > 1 for axis in axis_words(block)):
         raise ProgramError(block.line, code, "moves X and Y alone; take the other axis words out")
     start, end = modal.position, target(modal, block)
@@ -42,15 +45,15 @@ def spline(machine: Machine, block: Block, series: Spline) -> None:
             raise ProgramError(block.line, code, "wants I and J, the control point from the start")
         control = _plus(a, heading)
         series.leaving = None
+        modal.motion = NO_MOTION  # G5.1 does not stay in force
         points = (a, _between(a, control, 2 / 3), _between(d, control, 2 / 3), d)
     else:
         leaving = _vector(block, "pq", modal.scale)
-        if leaving is None or ("i" in block.words) != ("j" in block.words):
+        words = block.words
+        if leaving is None or ("p" in words) != ("q" in words) or ("i" in words) != ("j" in words):
             raise ProgramError(block.line, code, "wants both P and Q, and I and J both or none")
-        if heading is None:
-            if series.leaving is None:
-                raise ProgramError(block.line, code, "wants I and J, since no spline stands before it")
-            heading = (-series.leaving[0], -series.leaving[1])
+        if heading is None:  # the first of a series leaves without a direction of its own, as in the reference
+            heading = (-series.leaving[0], -series.leaving[1]) if series.leaving is not None else (0.0, 0.0)
         series.leaving = leaving
         points = (a, _plus(a, heading), _plus(d, leaving), d)
     _order(machine, block, points, end)

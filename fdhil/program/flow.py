@@ -17,7 +17,7 @@ from fdhil.program.budget import Budget
 from fdhil.program.commands import FANUC, Command
 from fdhil.program.parameters import LOCAL_NUMBERS, Variables
 from fdhil.program.source import Mark, Source
-from fdhil.program.words import clean, without_number
+from fdhil.program.words import Block, clean, without_number
 
 _MAYBE_O_WORD = re.compile(r"[\s/]*(?:n[\d.\s]*)?o", re.IGNORECASE)
 _WITH_VALUES = ("call", "return", "endsub", "if", "elseif", "while", "repeat")
@@ -274,6 +274,14 @@ class Flow:
         if times > 0:
             frame = Frame(name, Place(self.source, self.source.after()), fanuc=True, again=times - 1)
             self._enter(frame, line)
+
+    def call_contour(self, block: Block, name: str) -> None:
+        """Enter the subroutine that describes a contour (G70 to G72.2); it must stand before the block."""
+        known = self._subs.get(name)
+        if known is None or known[1]:
+            raise block.fault("q", "names no subroutine that stands before this line")
+        self._enter(Frame(name, Place(self.source, self.source.after())), block.line)
+        self._variables.enter([])
 
     def _enter(self, frame: Frame, line: int) -> None:
         self._count_jump(line)

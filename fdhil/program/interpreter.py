@@ -13,14 +13,14 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from fdhil.errors import ProgramError
-from fdhil.program import arcs, canned, curves, lathe, offsets, targets
+from fdhil.program import arcs, canned, curves, lathe, modes, nurbs, offsets, roughing, targets
 from fdhil.program.budget import Budget
 from fdhil.program.checks import CYCLES, check_readers, one_reader_of_axes
 from fdhil.program.commands import Command
 from fdhil.program.compensation import Compensation
 from fdhil.program.flow import Flow
 from fdhil.program.machine import Machine
-from fdhil.program.modal import INDEX, MM_PER_INCH, NO_MOTION, Modal
+from fdhil.program.modal import INDEX, NO_MOTION, Modal
 from fdhil.program.motions import Feed, Motion, Rapid
 from fdhil.program.parameters import Variables
 from fdhil.program.source import Source
@@ -35,6 +35,7 @@ _SIMPLE = re.compile(
 )
 _STOPS = (2, 30)
 _PROBES = (382, 383, 384, 385)
+_MIN_PROBE_MM = 0.254
 _PROBED_FIRST, _PROBE_HIT = 5061, 5070
 
 
@@ -68,6 +69,7 @@ class Interpreter:
         self._flow = Flow(first, self._variables, budget, self._kept.returned)
         self._series = canned.Series()
         self._spline = curves.Spline()
+        self._nurbs = nurbs.Nurbs()
         self._known: dict[str, Command | Line] = {}
         self._blocks = self._idle = 0
         self._empty_so_far = True
@@ -149,25 +151,33 @@ class Interpreter:
         return Rapid(line, end, corner) if motion == 0 else Feed(line, end, modal.feed_mm_min, corner)
 
     def _line(self, raw: str, line: int) -> None:
+        block = self._fetch(raw, line)
+        if block is not None:
+            self._execute(block)
+            self._settle(block)
+            if "call" in block.m:
+                self._call(block)
+
+    def _fetch(self, raw: str, line: int) -> Block | None:
+        """Return a line's block, None when it has none; an O-word is executed."""
         self._variables.line = line
         known = self._known.get(raw)
         if known is None:
             known = self._read(raw, line)
             if known is None:
-                return
+                return None
             if self._flow.repeats:
                 if len(self._known) >= self._budget.max_kept_lines:
                     self._known.clear()
                 self._known[raw] = known
         if isinstance(known, Command):
             self._flow.execute(known, line)
-            return
-        block = known.block(self._variables)
-        self._execute(block)
+            return None
+        return known.block(self._variables)
+
+    def _settle(self, block: Block) -> None:
         for key, value in block.settings:
-            self._variables.set(key, value, line)
-        if "call" in block.m:
-            self._call(block)
+            self._variables.set(key, value, block.line)
 
     def _read(self, raw: str, line: int) -> Command | Line | None:
         text = clean(raw, line)
@@ -195,17 +205,17 @@ class Interpreter:
     def _execute(self, block: Block) -> None:
         machine, modal = self._machine, self._machine.modal
         one_reader_of_axes(block)
-        check_readers(block, block.g.get("motion", modal.motion))
-        _feed(modal, block)
-        _spindle(modal, block)
+        check_readers(block, _motion_of(modal, block))
+        modes.set_feed(modal, block)
+        modes.set_spindle(modal, block)
         self._change_tool(block)
         if "modal state" in block.m and not self._kept.do(block.m["modal state"], self._flow.depth):
             raise ProgramError(block.line, "M72", "has no modes to restore; keep them by M70 first")
         if block.g.get("one-shot") == 40:
-            _dwell(machine, block)
-        _units(modal, block)
+            modes.dwell(machine, block)
+        modes.set_units(modal, block)
         self._coordinates(block)
-        _distance(modal, block)
+        modes.set_distance(modal, block)
         self._motion(block, self._set(block))
         self._ended = self._ended or block.m.get("stop") in _STOPS
 
@@ -230,7 +240,7 @@ class Interpreter:
     def _coordinates(self, block: Block) -> None:
         modal, g = self._machine.modal, block.g
         if self._machine.compensation is not None:
-            _check_compensated(modal, block)
+            modes.check_compensated(modal, block)
         if "cutter compensation" in g:
             self._compensate(block, g["cutter compensation"])
         if "tool length" in g:
@@ -248,8 +258,9 @@ class Interpreter:
         if machine.compensation is not None:
             raise ProgramError(block.line, f"G{code / 10:g}", "compensation is on already; end it by G40 first")
         diameter = block.words.get("d")
-        if modal.plane == 2:
-            raise ProgramError(block.line, f"G{code / 10:g}", "does not work in the YZ plane; use G17 or G18")
+        if modal.plane >= 2:
+            what = f"does not work in the {modal.plane_name} plane; use G17 or G18"
+            raise ProgramError(block.line, f"G{code / 10:g}", what)
         if code % 10 == 0:
             if diameter or self._tool:
                 what = "fdhil has no tool table, so the radius is not known; give the diameter by G41.1 or G42.1 D"
@@ -279,17 +290,21 @@ class Interpreter:
 
     def _motion(self, block: Block, axes_used: bool) -> None:
         machine, modal = self._machine, self._machine.modal
-        axis = next((letter for letter in block.words if letter in INDEX or letter in "@^"), None)
+        axis = _axis_letter(block)
         before = modal.motion
         if "motion" in block.g:
             modal.motion = block.g["motion"]
-        elif axes_used or (axis is None and not (modal.motion in arcs.CODES and _has_centre(block))):
+        elif "machine co-ordinates" in block.g and modal.motion not in (0, 10):
+            raise ProgramError(block.line, "G53", "wants G0 or G1")
+        elif axes_used or _motion_of(modal, block) is None:
             return
         code = modal.motion
         if code not in CYCLES:
             self._series.began = None
         if code not in curves.CODES:
             self._spline.leaving = None
+        if code not in (nurbs.BEGIN, nurbs.END):
+            self._nurbs.points.clear()
         if code == 0:
             machine.rapid_to(block, targets.target(modal, block))
         elif code == 10:
@@ -306,13 +321,46 @@ class Interpreter:
             lathe.threading(machine, block)
         elif code in curves.CODES:
             curves.spline(machine, block, self._spline)
+        elif code in roughing.CODES:
+            self._work_contour(block, before)
+        elif code == nurbs.BEGIN:
+            self._nurbs.gather(machine, block)
+        elif code == nurbs.END:
+            self._nurbs.order_motions(machine, block)
         elif code != NO_MOTION:
             raise unknown(block, code)
         elif axis is not None and not axes_used:
             raise block.fault(axis, "has no motion to go with; give G0, G1, G2 or G3")
 
+    def _work_contour(self, block: Block, before: int) -> None:
+        """G70 to G72.2: read the contour that the subroutine Q describes, without executing its blocks, and work it."""
+        modal, flow = self._machine.modal, self._flow
+        start = roughing.start_of(self._machine, block)
+        here = list(modal.position)
+        flow.call_contour(block, str(round(block.words["q"])))
+        contour = roughing.Drawn(modal, before, start)
+        depth = flow.depth
+        while flow.depth >= depth:
+            raw = flow.source.next()
+            if raw is None:
+                flow.at_end()
+                break
+            line = flow.source.line
+            self._count(line)
+            if flow.skipping:
+                self._variables.line = line
+                flow.skip_over(raw, line)
+                continue
+            drawn = self._fetch(raw, line)
+            if drawn is not None:
+                contour.add(drawn)
+                self._settle(drawn)
+        modal.position = here
+        roughing.work(self._machine, block, contour, start)
+        modal.motion = contour.motion
+
     def _probe(self, block: Block) -> None:
-        """G38.2 to G38.5: not listed; the probe is taken to trip at the target."""
+        """G38.2 to G38.5: not listed; the probe is taken to reach its target without a touch, as in the reference."""
         modal = self._machine.modal
         code = f"G{modal.motion / 10:g}"
         if modal.feed_mode == 930 or modal.feed_mm_min <= 0.0:
@@ -320,10 +368,12 @@ class Interpreter:
         end = targets.target(modal, block)
         if not targets.axis_words(block):
             raise ProgramError(block.line, code, "wants the axis words of its target")
+        if targets.straight_length(modal.position, end) < _MIN_PROBE_MM:
+            raise ProgramError(block.line, code, "starts too near to its target to probe")
         self._machine.stand_at(block, end)
         for axis, value in enumerate(end):
             self._variables.store(_PROBED_FIRST + axis, value / (modal.scale if axis not in (3, 4, 5) else 1.0))
-        self._variables.store(_PROBE_HIT, 1.0)
+        self._variables.store(_PROBE_HIT, 0.0)
 
 
 def unknown(block: Block, code: int) -> ProgramError:
@@ -331,73 +381,13 @@ def unknown(block: Block, code: int) -> ProgramError:
     return ProgramError(block.line, f"G{code / 10:g}", "is a G code that fdhil does not know; see the list of codes")
 
 
-def _check_compensated(modal: Modal, block: Block) -> None:
-    """Raise ProgramError for codes that cannot be used while cutter compensation is on."""
-    moves_origin = block.g.get("one-shot") in (100, 280, 300, 520, 920, 921, 922, 923)
-    refused = [
-        group for group in ("plane", "co-ordinate system", "tool length", "machine co-ordinates") if group in block.g
-    ]
-    motion = block.g.get("motion", modal.motion)
-    if refused and not (refused == ["plane"] and block.g["plane"] == 170 + 10 * modal.plane):
-        raise ProgramError(block.line, f"G{block.g[refused[0]] / 10:g}", "cannot be used with cutter compensation on")
-    if moves_origin:
-        code = block.g["one-shot"] / 10
-        raise ProgramError(block.line, f"G{code:g}", "cannot be used with cutter compensation on")
-    if motion not in (0, 10, *arcs.CODES, NO_MOTION):
-        raise ProgramError(block.line, f"G{motion / 10:g}", "cannot be used with cutter compensation on")
+def _axis_letter(block: Block) -> str | None:
+    return next((letter for letter in block.words if letter in INDEX or letter in "@^"), None)
 
 
-def _has_centre(block: Block) -> bool:
-    return any(letter in block.words for letter in "ijkr")
-
-
-def _feed(modal: Modal, block: Block) -> None:
-    if "feed mode" in block.g:
-        modal.feed_mode = block.g["feed mode"]
-        modal.feed_mm_min = modal.feed_word = 0.0
-    if "f" in block.words:
-        feed = block.words["f"]
-        if feed < 0.0:
-            raise block.fault("f", "is a negative feed rate")
-        modal.feed_word = feed
-        modal.feed_mm_min = feed * modal.scale
-
-
-def _spindle(modal: Modal, block: Block) -> None:
-    if "s" in block.words:
-        if block.words["s"] < 0.0:
-            raise block.fault("s", "is a negative spindle speed; M4 turns it backwards")
-        modal.spindle_rpm = block.words["s"]
-    if "spindle" in block.m:
-        modal.spindle_turns = {3: 1, 4: -1}.get(block.m["spindle"], 0)
-
-
-def _dwell(machine: Machine, block: Block) -> None:
-    seconds = block.words.get("p")
-    if seconds is None or seconds < 0.0:
-        raise ProgramError(block.line, "G4", "a dwell wants its seconds as P, not negative")
-    machine.dwell(block, seconds)
-
-
-def _units(modal: Modal, block: Block) -> None:
-    if "lathe diameter" in block.g:
-        modal.diameter = block.g["lathe diameter"] == 70
-    if "plane" in block.g:
-        modal.plane = {170: 0, 180: 1, 190: 2}[block.g["plane"]]
-    if "units" in block.g:
-        before, modal.scale = modal.scale, MM_PER_INCH if block.g["units"] == 200 else 1.0
-        # the reference keeps the numbers of a tool's offsets, so that they change their meaning with the units
-        modal.tool = [t * modal.scale / before if axis not in (3, 4, 5) else t for axis, t in enumerate(modal.tool)]
-
-
-def _distance(modal: Modal, block: Block) -> None:
-    g = block.g
-    if "path control" in g:
-        modal.path_control = g["path control"]
-        modal.path_tolerance_mm = block.words.get("p", 0.0) * modal.scale
-    if "distance" in g:
-        modal.absolute = g["distance"] == 900
-    if "arc distance" in g:
-        modal.arc_absolute = g["arc distance"] == 901
-    if "return" in g:
-        modal.retract_to_r = g["return"] == 990
+def _motion_of(modal: Modal, block: Block) -> int | None:
+    """Return the motion that the block says, or goes on with because it has words for it."""
+    if "motion" in block.g:
+        return block.g["motion"]
+    arc = modal.motion in arcs.CODES and any(letter in block.words for letter in "ijkr")
+    return modal.motion if arc or _axis_letter(block) is not None else None

@@ -73,8 +73,6 @@ def threading(machine: Machine, block: Block) -> None:
     """G76: passes of growing depth from the drive line (X at the start) along Z, and a rapid to the end."""
     modal = machine.modal
     thread = _thread(modal, block)
-    if modal.plane != 1:
-        raise ProgramError(block.line, "G76", "works in the XZ plane; give G18 first")
     end = target(modal, block)
     start = list(modal.position)
     for depth in thread.depths():
@@ -119,19 +117,19 @@ def _thread(modal: Modal, block: Block) -> Thread:
     ):
         if letter not in words:
             raise ProgramError(block.line, "G76", f"wants {letter.upper()}, {meaning}")
-    if words["i"] == 0.0 or not 0.0 < words["j"] < words["k"]:
-        raise ProgramError(block.line, "G76", "wants I other than 0, J greater than 0 and K greater than J")
+    if words["i"] == 0.0 or words["p"] <= 0.0 or not 0.0 < words["j"] < words["k"]:
+        raise ProgramError(block.line, "G76", "wants P and J greater than 0, K greater than J, and I other than 0")
     ends = round(words.get("l", 0.0))
     degression, springs, angle = words.get("r", 1.0), words.get("h", 0.0), words.get("q", 0.0)
-    if not 0 <= ends <= 3 or degression <= 0.0 or not 0.0 <= springs <= _MAX_PASSES or not abs(angle) < 89.0:
-        raise ProgramError(block.line, "G76", "wants L from 0 to 3, R and H not negative, and Q below 89 degrees")
+    if ends < 0 or springs != round(springs) or springs > _MAX_PASSES or not abs(angle) < 89.0:
+        raise ProgramError(block.line, "G76", "wants H whole, L not negative, and Q below 89 degrees")
     half = modal.scale * (0.5 if modal.diameter else 1.0)
     return Thread(
         feed=_synchronous_feed(modal, block, words["p"] * modal.scale),
         offset=words["i"] * half,
         first=words["j"] * half,
         depth=words["k"] * half,
-        degression=degression,
+        degression=max(1.0, degression),
         slide=math.tan(math.radians(angle)),
         springs=round(springs),
         taper=words.get("e", 0.0) * modal.scale,

@@ -16,6 +16,7 @@ INDEX = {letter: place for place, letter in enumerate(AXES)}
 LINEAR = frozenset("xyzuvw")
 MM_PER_INCH = 25.4
 NO_MOTION = 800  # G80
+PLANE_CODES = (170, 180, 190, 171, 181, 191)  # times ten; the last three are planes of U V W, which fdhil does not list
 _EXACT = {610: Corner("exact_path", 0.0), 611: Corner("exact_stop", 0.0)}
 
 
@@ -67,8 +68,8 @@ class Modal:
 
     @property
     def plane_name(self) -> str:
-        """XY, XZ or YZ."""
-        return PLANES[self.plane]
+        """XY, XZ, YZ, UV, UW or VW."""
+        return (*PLANES, "UV", "UW", "VW")[self.plane]
 
     def machine(self, position: list[float] | None = None) -> Point:
         """Return X, Y, Z of a position (default: the present one) in machine millimetres."""

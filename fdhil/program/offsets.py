@@ -15,6 +15,7 @@ from fdhil.program.words import Block
 
 G92_IN_FORCE, G92_FIRST = 5210, 5211
 HOME_FIRST = {280: 5161, 300: 5181}
+_TABLE = (1, 10, 11)
 SYSTEMS = {540: 1, 550: 2, 560: 3, 570: 4, 580: 5, 590: 6, 591: 7, 592: 8, 593: 9}
 
 
@@ -48,11 +49,18 @@ def _change(modal: Modal, g5x: list[float], rotation_deg: float) -> None:
 def set_data(modal: Modal, variables: Variables, block: Block) -> None:
     """G10: L2 sets a system's offsets, L20 sets them so that the tool stands at the words given.
 
-    ProgramError for L1, L10 and L11, which change the tool table: fdhil has none.
+    L1, L10 and L11 change the tool table, which moves nothing: fdhil reads them and keeps no table.
     """
     kind = block.words.get("l")
-    if kind is None or round(kind) not in (2, 20) or abs(kind - round(kind)) > 1e-4:
-        raise block.fault("l" if kind is not None else "G10", "sets no co-ordinate system; fdhil knows G10 L2 and L20")
+    if kind is None or round(kind) not in (*_TABLE, 2, 20) or abs(kind - round(kind)) > 1e-4:
+        raise block.fault("l" if kind is not None else "G10", "sets nothing; fdhil knows G10 L1, L2, L10, L11 and L20")
+    if round(kind) in _TABLE:
+        if block.words.get("p", 0.0) < 1.0:
+            raise ProgramError(block.line, "G10", "wants the tool's number as P, from 1")
+        return
+    for letter in "ij":
+        if letter in block.words:
+            raise block.fault(letter, "belongs to a tool (L1, L10, L11), not to a co-ordinate system")
     number = int(block.words.get("p", -1.0))
     if not 0 <= number <= 9:
         raise block.fault("p", "is no co-ordinate system; P must be 1 (G54) to 9 (G59.3), or 0 for the active one")
@@ -124,6 +132,8 @@ def set_tool_length(modal: Modal, block: Block) -> None:
     """G43.1 sets the tool's offsets; G43, G43.2 and G49 leave none, since fdhil knows no tool table."""
     code = block.g["tool length"]
     if code == 432:
+        if "h" not in block.words and not axis_words(block):
+            raise ProgramError(block.line, "G43.2", "wants the tool's number as H, or axis words")
         return
     words = {axis: length_mm(modal, axis, value) for axis, value in axis_words(block).items()}
     tool = [words.get(axis, modal.tool[axis]) if code == 431 else 0.0 for axis in range(9)]

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from fdhil.program.modal import AXES, INDEX, LINEAR, Modal
-from fdhil.program.offsets import select_system
+from fdhil.program.modal import AXES, INDEX, LINEAR, PLANE_CODES, Modal
+from fdhil.program.offsets import G92_IN_FORCE, drop_g92, select_system
 from fdhil.program.parameters import Variables
 
 Reading = Callable[[], float]
@@ -57,7 +57,7 @@ def names_of(
         "_line": lambda: float(line()),
         "_call_level": lambda: float(depth()),
         "_motion_mode": lambda: float(modal.motion),
-        "_plane": lambda: 170.0 + 10.0 * modal.plane,
+        "_plane": lambda: float(PLANE_CODES[modal.plane]),
         "_ccomp": lambda: float(modal.compensation),
         "_coord_system": lambda: (540, 550, 560, 570, 580, 590, 591, 592, 593)[modal.system - 1] * 1.0,
         "_feed": lambda: modal.feed_word,
@@ -101,6 +101,7 @@ def _machine(modal: Modal, index: int) -> Reading:
 @dataclass(frozen=True)
 class _Kept:
     values: Mapping[str, Any]
+    g92_in_force: bool
     restore_on_return: bool
 
 
@@ -115,7 +116,8 @@ class KeptModes:
     def do(self, code: int, level: int) -> bool:
         """Do one of the four codes; False when M72 finds nothing to restore."""
         if code in (70, 73):
-            self._kept[level] = _Kept({name: getattr(self._modal, name) for name in _KEPT}, code == 73)
+            values = {name: getattr(self._modal, name) for name in _KEPT}
+            self._kept[level] = _Kept(values, self._variables.number(G92_IN_FORCE) == 1.0, code == 73)
         elif code == 71:
             self._kept.pop(level, None)
         elif level not in self._kept:
@@ -136,3 +138,4 @@ class KeptModes:
                 select_system(self._modal, self._variables, value)
             else:
                 setattr(self._modal, name, value)
+        drop_g92(self._modal, self._variables, 923 if kept.g92_in_force else 922)

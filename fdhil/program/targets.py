@@ -6,6 +6,7 @@ import math
 
 from fdhil.errors import ProgramError
 from fdhil.program.modal import AXES, INDEX, LINEAR, Modal
+from fdhil.program.motions import PLANE_AXES
 from fdhil.program.words import Block
 
 _MIN_INVERSE_TIME_FEED = 0.1  # program units per minute; a move without length has no feed of its own
@@ -33,6 +34,15 @@ def feed_mm_min(modal: Modal, block: Block, length_mm: float) -> float:
             raise ProgramError(block.line, "G95", "feed per revolution wants a spindle speed; give S")
         return modal.feed_mm_min * modal.spindle_rpm
     return modal.feed_mm_min
+
+
+def plane_axes(modal: Modal, block: Block) -> tuple[int, int, int]:
+    """Return the plane's axes as ``PLANE_AXES`` has them; ProgramError for a plane of U V W."""
+    axes = PLANE_AXES.get(modal.plane_name)
+    if axes is None:
+        what = f"cannot be worked in the {modal.plane_name} plane, whose axes fdhil does not list; use G17, G18 or G19"
+        raise ProgramError(block.line, f"G{modal.motion / 10:g}", what)
+    return axes
 
 
 def axis_words(block: Block) -> dict[int, float]:

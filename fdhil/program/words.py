@@ -24,12 +24,15 @@ def _groups(*members: tuple[str, tuple[int, ...]]) -> Mapping[int, str]:
     return {code: name for name, codes in members for code in codes}
 
 
-MOTION = (0, 10, 20, 30, 50, 51, 52, 53, 330, 331, 382, 383, 384, 385, 730, 740, 760, 800, *range(810, 900, 10))
+MOTION = (
+    0, 10, 20, 30, 50, 51, 52, 53, 330, 331, 382, 383, 384, 385, 700, 710, 711, 712, 720, 721, 722, 730, 740, 760, 800,
+    *range(810, 900, 10),
+)  # fmt: skip
 G_GROUPS: Mapping[int, str] = _groups(
     ("motion", MOTION),
     ("one-shot", (40, 100, 280, 281, 300, 301, 520, 920, 921, 922, 923)),
     ("machine co-ordinates", (530,)),
-    ("plane", (170, 180, 190)),
+    ("plane", (170, 171, 180, 181, 190, 191)),
     ("distance", (900, 910)),
     ("arc distance", (901, 911)),
     ("feed mode", (930, 940, 950)),

@@ -1,0 +1,285 @@
+"""Contours of a turned part: lines and arcs in the ZX plane, as complex numbers z + j x, and their parallels.
+
+The geometry under G70 to G72: where a contour crosses a height, its mirror images, its parallel at a distance.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+_NEAR = 1e-6
+_SHORT = 1e-3  # what is shorter is left out of a parallel
+_GAP = 1e-2  # by which the ends at an outside corner must part before an arc joins them
+_MAX_STEPS = 5_000
+
+
+class ContourError(Exception):
+    """A contour that cannot be worked; the message is the reason, without line and word."""
+
+
+@dataclass(slots=True)
+class Part:
+    """A line from ``start`` to ``end``, or with a ``centre`` an arc, counter-clockwise (from Z to X) when ``ccw``.
+
+    ``corner`` other than 0 marks a corner that is still to be rounded by that radius (with a centre) or cut (without).
+    """
+
+    start: complex
+    end: complex
+    centre: complex | None = None
+    ccw: bool = False
+    corner: float = 0.0
+
+    @property
+    def size(self) -> float:
+        """The shortest length in it: of the chord, and of an arc's radius."""
+        chord = abs(self.start - self.end)
+        return chord if self.centre is None else min(chord, abs(self.start - self.centre))
+
+    def mapped(self, turn: Callable[[complex], complex], mirrored: bool) -> Part:
+        """Return its image."""
+        centre = None if self.centre is None else turn(self.centre)
+        return Part(turn(self.start), turn(self.end), centre, self.ccw != mirrored, self.corner)
+
+    def falls(self) -> bool:
+        """Tell whether z never grows along it, within tolerance."""
+        dz = (self.end - self.start).real
+        if self.centre is None:
+            return dz <= _SHORT
+        if self.corner:
+            return True
+        entry, leaving = (self.start - self.centre).imag, (self.end - self.centre).imag
+        sign = 1.0 if self.ccw else -1.0
+        return sign * entry >= -_SHORT and sign * leaving >= -_SHORT and dz <= -_SHORT
+
+    def crossings(self, x: float) -> list[float]:
+        """Return the z at which it has the height ``x``: both ends of a level line."""
+        if self.centre is not None:
+            return self._arc_crossings(self.centre, x)
+        low, high = sorted((self.start.imag, self.end.imag))
+        if low > x + _NEAR or high < x - _NEAR:
+            return []
+        rise = self.end.imag - self.start.imag
+        if abs(rise) < _NEAR:
+            return [self.start.real, self.end.real]
+        return [(x - self.start.imag) / rise * (self.end.real - self.start.real) + self.start.real]
+
+    def _arc_crossings(self, centre: complex, x: float) -> list[float]:
+        radius = abs(self.start - centre)
+        square = -(x - radius - centre.imag) * (x + radius - centre.imag)
+        if square < -_NEAR:
+            return []
+        half = math.sqrt(max(0.0, square))
+        places = (complex(centre.real + half, x), complex(centre.real - half, x))
+        return [place.real for place in places if self._on_arc(centre, place)]
+
+    def _on_arc(self, centre: complex, place: complex) -> bool:
+        sign = 1.0 if self.ccw else -1.0
+        first, last = ((end - centre).conjugate() * (place - centre) for end in (self.start, self.end))
+        return sign * first.imag >= -_NEAR and sign * last.imag <= _NEAR
+
+    def shift(self, distance: float) -> None:
+        """Move it to its parallel, to the left of its direction from end to start."""
+        if self.centre is None:
+            way = self.start - self.end
+            aside = 1j * distance * way
+            length = abs(way)
+            step = complex(aside.real / length, aside.imag / length)
+            self.start, self.end = self.start + step, self.end + step
+            return
+        radius = abs(self.start - self.centre)
+        if radius == 0.0:
+            raise ContourError("an arc of the contour has no radius")
+        share = (radius + (distance if self.ccw else -distance)) / radius
+        self.start = share * (self.start - self.centre) + self.centre
+        self.end = share * (self.end - self.centre) + self.centre
+
+
+@dataclass(slots=True)
+class Contour:
+    """A contour and how it lies: its ``parts`` are the programmed ones turned by ``turn`` after mirroring."""
+
+    parts: list[Part]
+    turn: complex = 1.0 + 0.0j
+    mirrored: bool = False
+
+    def copy(self) -> Contour:
+        """Return a contour of its own."""
+        return Contour([replace(part) for part in self.parts], self.turn, self.mirrored)
+
+    def programmed(self, place: complex) -> complex:
+        """Return a place as the program has it."""
+        back = self.turn.conjugate() * place
+        return back.conjugate() if self.mirrored else back
+
+    def quarter(self) -> None:
+        """Turn it so that x becomes z."""
+        self._map(-1j, False)
+
+    def lead_down(self) -> None:
+        """Mirror it so that both z and x are larger at the end of its first part than at its end."""
+        way = self.parts[0].end - self.parts[-1].end
+        if way.imag > 0.0:
+            self._map(1.0 + 0.0j, True)
+        if way.real < 0.0:
+            self._map(-1.0 + 0.0j, True)
+
+    def _map(self, turn: complex, mirrored: bool) -> None:
+        def image(place: complex) -> complex:
+            return turn * (place.conjugate() if mirrored else place)
+
+        self.parts = [part.mapped(image, mirrored) for part in self.parts]
+        self.turn = turn * (self.turn.conjugate() if mirrored else self.turn)
+        self.mirrored = self.mirrored != mirrored
+
+    def finish_corners(self) -> None:
+        """Round and cut the corners that are marked; ContourError where they are too small for that."""
+        for before, part, after in zip(self.parts, self.parts[1:], self.parts[2:], strict=False):
+            if part.corner:
+                _finish_corner(before, part, after)
+        self.parts = [part for part in self.parts if part.size >= _SHORT]
+
+    def check_falling(self) -> None:
+        """Raise ContourError unless z falls along all of it; a first part that leads back is set upright."""
+        first = self.parts[0]
+        if (first.end - first.start).real > 0.0:
+            first.start = complex(first.end.real, first.start.imag)
+        if not all(part.falls() for part in self.parts):
+            raise ContourError("its contour does not go on in one direction along the cut")
+
+    def widen(self, distance: float) -> None:
+        """Move all but the first part to the parallel at ``distance``; the first one ends where that begins.
+
+        ContourError when that cannot be joined.
+        """
+        first = self.parts[0]
+        across = (first.end - first.start) * (self.parts[-1].start - first.start).conjugate()
+        parts = self.parts[1:]
+        if across.imag < 0.0:
+            distance = -distance
+        done = 0.0
+        for _ in range(_MAX_STEPS):
+            if done == distance or not parts:
+                break
+            step = min(min(part.size for part in parts) / 2.0, abs(distance - done))
+            step = -step if distance < 0.0 else step
+            parts = _joined(_shifted(parts, step))
+            done += step
+        if not parts or done != distance:
+            raise ContourError("the contour has no parallel at the distance left for finishing; take a smaller D")
+        for before, after in pairwise(parts):
+            before.end = after.start = (before.end + after.start) / 2.0
+        first.end = parts[0].start
+        self.parts = [first, *parts]
+
+
+def _finish_corner(before: Part, part: Part, after: Part) -> None:
+    for distance in (part.corner, -part.corner):
+        one, two = replace(before), replace(after)
+        one.shift(distance)
+        two.shift(distance)
+        if (one.end - two.start).real <= _GAP:
+            break
+    else:
+        raise ContourError("a corner is too small to be rounded or cut as A or C wants")
+    _cut(one, two)
+    centre = (one.end + two.start) / 2.0
+    one.shift(-distance)
+    two.shift(-distance)
+    part.start = before.end = one.end
+    part.end = after.start = two.start
+    if part.centre is not None:
+        part.centre, part.corner = centre, 0.0
+        part.ccw = (part.start - centre).imag > 0.0 or (part.end - centre).imag > 0.0
+
+
+def _shifted(parts: list[Part], step: float) -> list[Part]:
+    """Shift parts, leave out what became too short, and join the ends at outside corners by arcs."""
+    for part in parts:
+        part.shift(step)
+    parts = [part for part in parts if part.size >= _SHORT]
+    joined = parts[:1]
+    for before, after in pairwise(parts):
+        if (before.end - after.start).real > _GAP:
+            one, two = replace(before), replace(after)
+            one.shift(-step)
+            two.shift(-step)
+            joined.append(Part(before.end, after.start, (one.end + two.start) / 2.0, step > 0.0))
+        joined.append(after)
+    return joined
+
+
+def _joined(parts: list[Part]) -> list[Part]:
+    """Cut neighbours at their common point; a part that was turned round by that is left out."""
+    at = rounds = 0
+    while at < len(parts) - 1:
+        rounds += 1
+        if rounds > _MAX_STEPS:
+            raise ContourError("the contour has no parallel at the distance left for finishing; take a smaller D")
+        if not parts[at].falls() and at > 0:
+            del parts[at if parts[at].size < parts[at - 1].size else at - 1]
+            at = 0
+            if len(parts) < 2:
+                break
+        if parts[at].size < _SHORT:
+            del parts[at]
+            at = 0
+        else:
+            _cut(parts[at], parts[at + 1])
+        at += 1
+    return parts
+
+
+def _cut(before: Part, after: Part) -> None:
+    if before.centre is not None and after.centre is not None:
+        place = _two_arcs(before, before.centre, after, after.centre)
+    elif before.centre is None and after.centre is None:
+        place = _two_lines(before, after)
+    elif abs(after.start - before.end) < _NEAR:
+        return
+    elif before.centre is not None:
+        place = _line_and_arc(after, before, before.centre, after.start)
+    else:
+        assert after.centre is not None
+        place = _line_and_arc(before, after, after.centre, after.start)
+    if place is not None:
+        before.end = after.start = place
+
+
+def _along(line: Part) -> complex:
+    way, length = (line.start - line.end).conjugate(), abs(line.start - line.end)
+    return complex(way.real / length, way.imag / length)
+
+
+def _two_lines(before: Part, after: Part) -> complex:
+    turn = _along(after)
+    start, end = (before.start - after.end) * turn, (before.end - after.end) * turn
+    if start.imag - end.imag == 0.0:
+        raise ContourError("two lines of the contour follow each other in one direction; make them one")
+    share = start.imag / (start.imag - end.imag)
+    return (start + share * (end - start)) / turn + after.end
+
+
+def _line_and_arc(line: Part, arc: Part, centre: complex, near: complex) -> complex:
+    turn = _along(line)
+    radius = (arc.end - line.end) * turn
+    middle = (centre - line.end) * turn
+    square = abs(middle - radius) ** 2 - middle.imag**2
+    half = math.sqrt(max(0.0, square))
+    places = [(middle.real + half) / turn + line.end, (middle.real - half) / turn + line.end]
+    return min(reversed(places), key=lambda place: abs(near - place))
+
+
+def _two_arcs(before: Part, one: complex, after: Part, two: complex) -> complex | None:
+    between = abs(two - one)
+    if between == 0.0:
+        return None
+    a, b = abs(after.start - two), abs(before.start - one)
+    if a == 0.0:
+        raise ContourError("an arc of the contour has no radius")
+    cosine = (between * between + a * a - b * b) / 2.0 / a / between
+    turn = complex(cosine, math.sqrt(max(0.0, 1.0 - cosine * cosine)))
+    return turn * (one - two) / between * a + two

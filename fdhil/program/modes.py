@@ -1,0 +1,79 @@
+"""The modes that a block sets: feed, spindle, units, plane, distances; what cutter compensation forbids; the dwell."""
+
+from __future__ import annotations
+
+from fdhil.errors import ProgramError
+from fdhil.program import arcs, roughing
+from fdhil.program.machine import Machine
+from fdhil.program.modal import MM_PER_INCH, NO_MOTION, PLANE_CODES, Modal
+from fdhil.program.words import Block
+
+
+def set_feed(modal: Modal, block: Block) -> None:
+    if "feed mode" in block.g:
+        modal.feed_mode = block.g["feed mode"]
+        modal.feed_mm_min = modal.feed_word = 0.0
+    if "f" in block.words:
+        feed = block.words["f"]
+        if feed < 0.0:
+            raise block.fault("f", "is a negative feed rate")
+        modal.feed_word = feed
+        modal.feed_mm_min = feed * modal.scale
+
+
+def set_spindle(modal: Modal, block: Block) -> None:
+    if "s" in block.words:
+        if block.words["s"] < 0.0:
+            raise block.fault("s", "is a negative spindle speed; M4 turns it backwards")
+        modal.spindle_rpm = block.words["s"]
+    if block.g.get("spindle mode") == 960 and "s" not in block.words:
+        raise ProgramError(block.line, "G96", "constant surface speed wants the speed as S")
+    if "spindle" in block.m:
+        modal.spindle_turns = {3: 1, 4: -1}.get(block.m["spindle"], 0)
+
+
+def dwell(machine: Machine, block: Block) -> None:
+    seconds = block.words.get("p")
+    if seconds is None or seconds < 0.0:
+        raise ProgramError(block.line, "G4", "a dwell wants its seconds as P, not negative")
+    machine.dwell(block, seconds)
+
+
+def set_units(modal: Modal, block: Block) -> None:
+    if "lathe diameter" in block.g:
+        modal.diameter = block.g["lathe diameter"] == 70
+    if "plane" in block.g:
+        modal.plane = PLANE_CODES.index(block.g["plane"])
+    if "units" in block.g:
+        before, modal.scale = modal.scale, MM_PER_INCH if block.g["units"] == 200 else 1.0
+        # the reference keeps the numbers of a tool's offsets, so that they change their meaning with the units
+        modal.tool = [t * modal.scale / before if axis not in (3, 4, 5) else t for axis, t in enumerate(modal.tool)]
+
+
+def set_distance(modal: Modal, block: Block) -> None:
+    g = block.g
+    if "path control" in g:
+        modal.path_control = g["path control"]
+        modal.path_tolerance_mm = block.words.get("p", 0.0) * modal.scale
+    if "distance" in g:
+        modal.absolute = g["distance"] == 900
+    if "arc distance" in g:
+        modal.arc_absolute = g["arc distance"] == 901
+    if "return" in g:
+        modal.retract_to_r = g["return"] == 990
+
+
+def check_compensated(modal: Modal, block: Block) -> None:
+    """Raise ProgramError for codes that cannot be used while cutter compensation is on."""
+    moves_origin = block.g.get("one-shot") in (100, 280, 300, 520, 920, 921, 922, 923)
+    refused = [
+        group for group in ("plane", "co-ordinate system", "tool length", "machine co-ordinates") if group in block.g
+    ]
+    motion = block.g.get("motion", modal.motion)
+    if refused and not (refused == ["plane"] and block.g["plane"] == PLANE_CODES[modal.plane]):
+        raise ProgramError(block.line, f"G{block.g[refused[0]] / 10:g}", "cannot be used with cutter compensation on")
+    if moves_origin:
+        code = block.g["one-shot"] / 10
+        raise ProgramError(block.line, f"G{code:g}", "cannot be used with cutter compensation on")
+    if motion not in (0, 10, *arcs.CODES, roughing.FINISH, NO_MOTION):
+        raise ProgramError(block.line, f"G{motion / 10:g}", "cannot be used with cutter compensation on")
