@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import struct
-from collections.abc import Sequence
+from collections.abc import Awaitable, Sequence
 
 from pymodbus import ModbusException
 from pymodbus.client import AsyncModbusTcpClient
@@ -112,10 +112,10 @@ class ModbusLink:
         """Write one holding register."""
         await self._request(self._open().write_register(address, value, device_id=self._unit), address)
 
-    async def _request(self, call: object, address: int) -> ModbusPDU:
+    async def _request(self, call: Awaitable[ModbusPDU], address: int) -> ModbusPDU:
         try:
             async with asyncio.timeout(self._timeout_s):
-                answer: ModbusPDU = await call  # type: ignore[misc]  # pymodbus types its calls as T of a mixin
+                answer = await call
         except TimeoutError:
             raise self._silent(address) from None
         except ModbusException as error:

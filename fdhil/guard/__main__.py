@@ -31,11 +31,11 @@ def main() -> int:
         can = adopt_descriptor(settings.transport, options.descriptor, settings.sent_ids, wanted)
         guard = Guard(settings, can, Journal(), Notifier(os.environ.get("NOTIFY_SOCKET")))
     except FdhilError as error:
-        print(f"fdhil-guard: {error}", file=sys.stderr)  # noqa: T201 - a process without click tells its error here
+        sys.stderr.write(f"fdhil-guard: {error}\n")
         return error.exit_code
     except OSError as error:
         text = f"descriptor {options.descriptor} cannot be used ({error.strerror}); start the guard with fdhil-guard"
-        print(f"fdhil-guard: {text}", file=sys.stderr)  # noqa: T201 - as above
+        sys.stderr.write(f"fdhil-guard: {text}\n")
         return 3
     gc.collect()
     gc.freeze()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import socket
 import struct
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from typing import Literal
 
@@ -36,7 +37,7 @@ class ForbiddenFrame(Exception):
     """Something tried to send a frame that the guard must never send."""
 
 
-class CanSocket:
+class CanSocket(ABC):
     """What both transports share: the descriptor and the filter of what may be sent."""
 
     def __init__(self, descriptor: socket.socket, allowed: Iterable[int]) -> None:
@@ -49,9 +50,9 @@ class CanSocket:
         """The descriptor, for poll."""
         return self._socket.fileno()
 
+    @abstractmethod
     def receive(self) -> list[Frame]:
         """Return all frames that wait, without waiting; BusDown when the bus is gone."""
-        raise NotImplementedError
 
     def send(self, cob_id: int, data: bytes) -> bool:
         """Send one frame now; False when the queue is full. BusDown, ForbiddenFrame."""
@@ -64,8 +65,9 @@ class CanSocket:
                 return False
             raise BusDown(error.strerror or str(error)) from None
 
+    @abstractmethod
     def _send(self, cob_id: int, data: bytes) -> bool:
-        raise NotImplementedError
+        """Send one frame that may be sent; OSError."""
 
     def close(self) -> None:
         """Close the descriptor."""
