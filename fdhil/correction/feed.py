@@ -9,6 +9,7 @@ import numpy as np
 
 from fdhil.config import Axis, MachineConfig
 from fdhil.model import closed_loop
+from fdhil.prediction import load
 from fdhil.records import Float, Parameters, Trajectory
 
 _HALVINGS = 9
@@ -25,17 +26,8 @@ class Load:
 
 
 def required(reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: float) -> Load:
-    """Return the current and voltage that follow ``reference_mm`` (n,) exactly, [DES] eqs. 1 and 2 turned around."""
-    p = parameters
-    speed = np.gradient(reference_mm, dt_s) * 2 * np.pi / axis.screw_pitch_mm
-    acceleration = np.gradient(speed, dt_s)
-    moving = np.abs(speed) > 1e-9 * max(1.0, float(np.abs(speed).max()))
-    current = (p.Jt * acceleration + p.ft * speed + p.Cd * np.where(moving, np.sign(speed), 0.0)) / p.K
-    # dry friction's steps are left out of di/dt: the current loop takes them in a fraction of a cycle
-    slope = np.gradient((p.Jt * acceleration + p.ft * speed) / p.K, dt_s)
-    voltage = p.L * slope + p.R * current + p.K * speed
-    currents = np.abs(current) / axis.regulators.current_limit_a
-    voltages = np.abs(voltage) / axis.regulators.voltage_limit_v
+    """Return the largest current and voltage that ``reference_mm`` (n,) demands."""
+    currents, voltages = load.required(reference_mm, parameters, axis, dt_s)
     row = int(np.argmax(np.maximum(currents, voltages)))
     return Load(float(currents.max()), float(voltages.max()), row)
 
@@ -53,8 +45,8 @@ def held_share(reference: Trajectory, models: Mapping[str, Parameters], config: 
             if np.ptp(path) == 0.0:
                 continue
             scaled = path[0] + share * (path - path[0])
-            load = required(scaled, models[axis], config.axis[axis], reference.dt_s)
-            if max(load.current_share, load.voltage_share) > 1.0:
+            demand = required(scaled, models[axis], config.axis[axis], reference.dt_s)
+            if max(demand.current_share, demand.voltage_share) > 1.0:
                 return False
             response = closed_loop.simulate(models[axis], config.axis[axis], reference.dt_s, scaled)
             if response.limited_s > 0.0:

@@ -30,9 +30,16 @@ def check_axes(reference: Trajectory, models: Mapping[str, Parameters], config: 
         raise ConfigError("prediction", faults)
 
 
-def predict(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> Prediction:
-    """Predict what the drives leave of ``reference``; ConfigError when an axis has no model or configuration."""
-    return predict_corrected(reference, models, config, None)
+def predict(
+    reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, zones_above_um: float | None = None
+) -> Prediction:
+    """Predict what the drives leave of ``reference``; ConfigError when an axis has no model or configuration.
+
+    Zones are what stands out, or with ``zones_above_um`` all that is above it.
+    """
+    check_axes(reference, models, config)
+    responses = closed_loop.simulate_axes(models, config.axis, reference.dt_s, reference.position_mm)
+    return assemble(reference, responses, zones_above_um)
 
 
 def predict_corrected(
@@ -55,7 +62,9 @@ def predict_corrected(
     return assemble(reference, responses)
 
 
-def assemble(reference: Trajectory, responses: Mapping[str, closed_loop.Response]) -> Prediction:
+def assemble(
+    reference: Trajectory, responses: Mapping[str, closed_loop.Response], zones_above_um: float | None = None
+) -> Prediction:
     """Put the axes' responses together: errors per axis, contour error, zones."""
     axes = reference.axes
     path = np.column_stack([reference.position_mm[axis] for axis in axes])
@@ -69,5 +78,5 @@ def assemble(reference: Trajectory, responses: Mapping[str, closed_loop.Response
         contour_um=contour,
         current_a={axis: frozen(responses[axis].current_a) for axis in axes},
         limited_s={axis: responses[axis].limited_s for axis in axes},
-        zones=find_zones(reference, contour, limited),
+        zones=find_zones(reference, contour, limited, zones_above_um),
     )

@@ -94,10 +94,14 @@ def _reversals(velocity: Float) -> Bool:
     return found
 
 
-def find_zones(reference: Trajectory, contour_um: Float, limited: Float) -> tuple[Zone, ...]:
-    """Return the zones in the order of time; ``limited`` (n,) is the share of each cycle with a limit acting."""
-    largest = float(contour_um.max())
-    above = contour_um > max(FLOOR_UM, SHARE * largest)
+def find_zones(
+    reference: Trajectory, contour_um: Float, limited: Float, above_um: float | None = None
+) -> tuple[Zone, ...]:
+    """Return the zones in the order of time; ``limited`` (n,) is the share of each cycle with a limit acting.
+
+    ``above_um``: every error above it belongs to a zone; left out, what stands out against the largest.
+    """
+    above = contour_um > (max(FLOOR_UM, SHARE * float(contour_um.max())) if above_um is None else above_um)
     if not above.any():
         return ()
     shape = geometry(reference)

@@ -11,7 +11,7 @@ from tests.cli.test_predict import _bench as _bench
 from tests.cli.test_predict import invoke
 
 
-@pytest.mark.parametrize(("tolerance", "code", "lines"), [(200, 0, 0), (60, 0, 1), (0.01, 1, 2)])
+@pytest.mark.parametrize(("tolerance", "code", "lines"), [(200, 0, 0), (60, 0, 2), (0.001, 1, 2)])
 def test_lists_the_lines_that_leave_the_tolerance(bench: Path, tolerance: float, code: int, lines: int) -> None:
     """Exit code 1 when no feed helps."""
     program = bench / "corner.ngc"
@@ -19,7 +19,12 @@ def test_lists_the_lines_that_leave_the_tolerance(bench: Path, tolerance: float,
     arguments = ["advise", program, "--config", bench / "bench.toml", "--tolerance-um", tolerance]
     result = invoke(*arguments, "--json")
     assert result.exit_code == code, result.stderr
-    assert len(json.loads(result.stdout)["lines"]) == lines
+    found = json.loads(result.stdout)["lines"]
+    assert len(found) == lines
+    for entry in found if code == 0 else []:
+        assert entry["cause"] == "corner"
+        assert entry["advised_feed_mm_min"] == pytest.approx(entry["feed_share"] * 15000)
+        assert entry["advised_feed_mm_min"] < entry["corrected_feed_mm_min"] == 15000
     assert ("line 3" in invoke(*arguments).stdout) == (lines > 0)
 
 
