@@ -70,7 +70,7 @@ def template() -> str:
 
 def config_reference() -> str:
     """Return the table of every configuration key as Markdown."""
-    lines = ["# Configuration keys", "", "Generated from `fdhil/config.py`. Unknown keys are refused.", ""]
+    lines = ["# Configuration keys", "", "Generated from `fdhil/config/`. Unknown keys are refused.", ""]
     current = None
     for path, key, field in keys(config.MachineConfig):
         if path != current:

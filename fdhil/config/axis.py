@@ -1,0 +1,120 @@
+"""[axis.X]: one feed axis, its data sheet, its drive and its sensors."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from pydantic import Field, field_validator
+
+from fdhil import tables
+from fdhil.cia402 import Scaling
+from fdhil.config.regulators import Regulators
+from fdhil.config.section import NotNegative, Positive, Section, listed
+
+# the built-in ceilings of what may ever be added to a set-point; a config can only lower them
+CEILING_OFFSET_UM = 250.0
+CEILING_SPEED_MM_S = 20.0
+CEILING_ACCELERATION_MM_S2 = 2000.0
+
+
+class Nominal(Section):
+    """[axis.X.nominal]: the data sheet's values, used until validated ones exist."""
+
+    R: Positive = Field(description="resistance, ohm")
+    L: Positive = Field(description="inductance, H")
+    K: Positive = Field(description="torque constant = back-EMF constant, N.m/A")
+    Jt: Positive = Field(description="total inertia on the motor shaft, kg.m2")
+    ft: NotNegative = Field(description="viscous friction, N.m.s")
+    Cd: NotNegative = Field(description="dry friction torque, N.m")
+
+
+class CorrectionLimits(Section):
+    """[axis.X.correction]: what the guard lets through. Without this section writing is off."""
+
+    max_offset_um: Positive = Field(50.0, le=CEILING_OFFSET_UM, description="largest offset")
+    max_speed_mm_s: Positive = Field(2.0, le=CEILING_SPEED_MM_S, description="largest rate of the offset")
+    max_acceleration_mm_s2: Positive = Field(
+        250.0, le=CEILING_ACCELERATION_MM_S2, description="largest acceleration of the offset"
+    )
+
+
+class Drive(Section):
+    """[axis.X.drive]: how the drive is reached and scaled."""
+
+    bus: str = Field("can0", description="the [bus.*] it is on")
+    node_id: int | None = Field(
+        None, ge=1, le=127, description="CANopen node-ID; left out: 1 for the first axis, 2 for the next"
+    )
+    profile: str = Field("fdhil_twin", description="the vendor profile, a name of the DRIVE_PROFILES table")
+    increments_per_rev: int = Field(
+        65536, ge=4, le=2**31 - 1, description="encoder and set-point increments per revolution"
+    )
+    sign: Literal[1, -1] = Field(1, description="-1 where the drive counts against the axis")
+    rated_current_a: Positive = Field(50.0, description="0x6075; 0x6078 counts in 0.1 % of it")
+    setpoint_delay_cycles: int = Field(
+        2, ge=0, le=16, description="SYNC cycles by which the drive runs its set-point late"
+    )
+    following_error_window_mm: Positive = Field(10.0, description="0x6065: beyond it the drive faults")
+    speed_limit_mm_s: Positive | None = Field(None, description="the axis maximum; left out: the rapid speed")
+
+
+class Voltage(Section):
+    """[axis.X.voltage]: where the motor's terminal voltage comes from."""
+
+    source: str = Field("drive", description="drive (a vendor object in a TPDO) or modbus (a separate sensor)")
+    sampling: Literal["interval_mean", "instant"] = Field(
+        "interval_mean", description="the drive's value is the mean since the last sample, or an instant"
+    )
+    host: str = Field("127.0.0.1", description="modbus: address of the sensor")
+    port: int = Field(0, ge=0, le=65535, description="modbus: TCP port; 0 lets the simulator choose one")
+    unit: int = Field(1, ge=0, le=247, description="modbus: unit identifier")
+    timeout_s: Positive = Field(0.5, description="modbus: how long an answer may take")
+
+    @field_validator("source")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        return listed(name, tables.VOLTAGE_SOURCES)
+
+
+class Thermometer(Section):
+    """[axis.X.temperature]: the slide-way's thermometer, a float32 in two Modbus input registers."""
+
+    host: str = Field("127.0.0.1", description="address of the thermometer")
+    port: int = Field(502, ge=1, le=65535, description="TCP port")
+    unit: int = Field(1, ge=0, le=247, description="unit identifier")
+    address: int = Field(8, ge=0, le=65534, description="the first of its two registers, high word first")
+    period_s: Positive = Field(1.0, le=3600, description="how often it is asked")
+    timeout_s: Positive = Field(0.5, description="how long an answer may take")
+
+
+class Axis(Section):
+    """[axis.X]"""
+
+    screw_pitch_mm: Positive = Field(description="table travel per motor revolution")
+    rapid_speed_mm_s: Positive = Field(description="speed of G0")
+    max_acceleration_mm_s2: Positive = Field(description="acceleration of G0")
+    max_jerk_mm_s3: Positive | None = Field(
+        None, description="largest jerk of profile jerk_limited; left out: the acceleration is reached in 25 ms"
+    )
+    nominal: Nominal
+    regulators: Regulators
+    correction: CorrectionLimits | None = None
+    drive: Drive = Drive()
+    voltage: Voltage = Voltage()
+    temperature: Thermometer | None = None
+
+    @property
+    def jerk_mm_s3(self) -> float:
+        """Largest jerk."""
+        return self.max_jerk_mm_s3 or self.max_acceleration_mm_s2 / 0.025
+
+    @property
+    def scaling(self) -> Scaling:
+        """Between millimetres and the drive's increments."""
+        return Scaling(self.drive.increments_per_rev, self.screw_pitch_mm, self.drive.sign)
+
+    @property
+    def rapid_speed_rad_s(self) -> float:
+        """Shaft speed of G0."""
+        return self.rapid_speed_mm_s / self.screw_pitch_mm * 2 * math.pi

@@ -1,0 +1,55 @@
+"""[nc], [g0], [identification]: what the NC does with a program, and what is made of its rapids."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, field_validator
+
+from fdhil import tables
+from fdhil.config.section import NotNegative, Positive, Section, listed
+
+
+class Nc(Section):
+    """[nc]: what the numerical controller makes of a program."""
+
+    profile: Literal["fir", "trapezoidal", "jerk_limited"] = Field(
+        "fir", description="fir: smoothed feed; trapezoidal, jerk_limited: look-ahead within the axes' limits"
+    )
+    smoothing_s: tuple[NotNegative, ...] = Field(
+        (0.060, 0.030), max_length=4, description="fir: moving averages over each axis' demand"
+    )
+    corner: Literal["continuous", "exact_stop"] = Field(
+        "continuous", description="between feed moves; look-ahead: continuous obeys G61, G61.1 and G64 P"
+    )
+    rapid_stop: bool = Field(True, description="look-ahead: stop between rapid and feed; fir always does")
+    settle_s: NotNegative = Field(0.0, le=10, description="rest that the NC adds at an exact stop")
+    end_rest_s: NotNegative = Field(
+        0.5, le=10, description="rest after the last motion: the drives' settling belongs to the path's error"
+    )
+    max_blocks: int = Field(10_000_000, ge=1, description="blocks a program may execute before it is refused")
+    max_call_depth: int = Field(50, ge=1, le=200, description="nesting of calls before a program is refused")
+
+
+class G0(Section):
+    """[g0]: how a rapid move is recognised."""
+
+    source: str = Field("inferred", description="inferred (from the demand's speed) or digital_input (the NC's signal)")
+    input_bit: int = Field(16, ge=0, le=31, description="digital_input: bit of 0x60FD that the NC raises")
+
+    @field_validator("source")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        return listed(name, tables.EVENT_SOURCES)
+
+
+class Identification(Section):
+    """[identification]"""
+
+    method: str | None = Field(None, description="a name of the ESTIMATORS table; left out: the best there is")
+    lowpass_hz: Positive = Field(40.0, description="least_squares: corner of the zero-phase low-pass on every signal")
+
+    @field_validator("method")
+    @classmethod
+    def _known(cls, name: str | None) -> str | None:
+        return None if name is None else listed(name, tables.ESTIMATORS)

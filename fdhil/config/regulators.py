@@ -1,0 +1,65 @@
+"""[axis.X.regulators]: the drive's nested loops."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from fdhil import tables
+from fdhil.config.section import NotNegative, Positive, Section, listed
+
+
+class Regulators(Section):
+    """[axis.X.regulators]: the drive's nested loops."""
+
+    structure: str = Field("p_pi_pi", description="the regulators' structure, a name of the REGULATORS table")
+    position_gain_per_s: Positive = Field(description="Kv of the position loop, 1/s")
+    speed_feedforward: Annotated[float, Field(ge=0, le=1.5)] = Field(
+        1.0, description="share of the demand's speed fed forward"
+    )
+    speed_kp: Positive = Field(
+        description="proportional gain of the speed loop, A.s/rad; pid: derivative gain, and factor of the other two"
+    )
+    speed_ki: NotNegative = Field(description="integral gain of the speed loop, A/rad")
+    speed_period_s: Positive = Field(0.00025, description="cycle of the speed loop")
+    current_limit_a: Positive = Field(description="limit of the speed loop's output")
+    current_kp: Positive = Field(description="proportional gain of the current loop, V/A")
+    current_ki: NotNegative = Field(description="integral gain of the current loop, V/(A.s)")
+    current_period_s: Positive = Field(3.125e-5, description="cycle of the current loop")
+    voltage_limit_v: Positive = Field(description="limit of the current loop's output")
+    position_ki_per_s2: NotNegative = Field(0.0, description="double_pi, pid: integral gain of the position loop")
+    torque_feedforward: Annotated[float, Field(ge=0, le=1.5)] = Field(
+        0.0, description="share of the nominal inertia's current fed forward"
+    )
+    setpoint_filter_s: NotNegative = Field(0.0, description="time constant of a filter on the set-point; 0: none")
+    setpoint_filter_order: Literal[1, 2] = Field(1, description="first-order, or two equal ones behind each other")
+    current_delay_cycles: int = Field(0, ge=0, le=4, description="current cycles until a computed voltage acts")
+
+    @field_validator("structure")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        return listed(name, tables.REGULATORS)
+
+    @model_validator(mode="after")
+    def _integrals(self) -> Regulators:
+        """What a structure does not have would be ignored silently, what it lacks would make it another one."""
+        if self.structure == "p_pi_pi" and self.position_ki_per_s2:
+            raise ValueError("structure p_pi_pi has no position_ki_per_s2; set structure = 'double_pi'")
+        if self.structure == "double_pi" and not self.position_ki_per_s2:
+            raise ValueError("structure double_pi needs position_ki_per_s2; without it, it is p_pi_pi")
+        if self.structure == "pid" and self.speed_ki:
+            raise ValueError("structure pid has no speed_ki: set it to 0, its integral gain is position_ki_per_s2")
+        return self
+
+
+def period_faults(regulators: Regulators, sync_period_s: float) -> list[str]:
+    faults = []
+    for key, longer, shorter in (
+        ("speed_period_s", sync_period_s, regulators.speed_period_s),
+        ("current_period_s", regulators.speed_period_s, regulators.current_period_s),
+    ):
+        ratio = longer / shorter
+        if ratio < 0.999 or abs(ratio - round(ratio)) > 1e-6 * ratio:
+            faults.append(f"{key}: {shorter} s does not divide {longer} s")
+    return faults

@@ -1,0 +1,28 @@
+"""What all tables of the file share: the base class, and the kinds of number."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+AxisName = Annotated[str, Field(pattern="^[A-Z]$")]
+
+
+class Section(BaseModel):
+    """A table of the TOML file: frozen, and a key it does not know is a fault."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
+
+
+def listed(name: str, table: Mapping[str, str]) -> str:
+    if name not in table:
+        near = difflib.get_close_matches(name, table, n=1)
+        raise ValueError(f"{name!r} is none of {', '.join(table)}" + (f"; did you mean {near[0]!r}?" if near else ""))
+    return name

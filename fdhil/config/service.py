@@ -1,0 +1,50 @@
+"""[bus.NAME], [store], [guard], [maintenance]: what the daemon and the guard run on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from fdhil.config.section import Positive, Section
+
+
+class CanBus(Section):
+    """[bus.NAME]: a CAN bus."""
+
+    interface: Literal["socketcan", "socketcand", "virtual"] = Field("socketcand", description="python-can interface")
+    channel: str = Field("can0", description="socketcan: the network interface; socketcand: the bus behind the hub")
+    host: str = Field("127.0.0.1", description="socketcand: address of the hub")
+    port: int = Field(0, ge=0, le=65535, description="socketcand: TCP port of the hub; 0 lets the simulator choose one")
+    bitrate: int = Field(1_000_000, ge=10_000, le=1_000_000, description="bit/s, for the bus load")
+
+
+class Store(Section):
+    """[store]"""
+
+    directory: Path = Field(Path("fdhil-data"), description="recordings and history; relative to the config's folder")
+    run_directory: Path | None = Field(None, description="sockets and the guard's table; left out: <directory>/run")
+    keep_windows: int = Field(10_000, ge=1, description="recorded windows kept; the oldest go first")
+
+
+class Guard(Section):
+    """[guard]: the process that owns the transmit socket."""
+
+    node_id: int = Field(100, ge=1, le=127, description="the node-ID of fdhil's own heartbeat")
+    heartbeat_s: Positive = Field(0.020, le=1.0, description="period of that heartbeat while armed")
+    clock: Literal["monotonic", "sync"] = Field(
+        "monotonic",
+        description="sync: time is SYNC count x period, for a simulated machine that does not run in real time",
+    )
+
+
+class Maintenance(Section):
+    """[maintenance]: relative change of a parameter from its first published value that raises an alarm."""
+
+    R: Positive = Field(0.3, description="relative change")
+    L: Positive = Field(0.3, description="relative change")
+    K: Positive = Field(0.1, description="relative change")
+    Jt: Positive = Field(0.3, description="relative change")
+    ft: Positive = Field(1.0, description="relative change")
+    Cd: Positive = Field(1.0, description="relative change")

@@ -1,0 +1,59 @@
+"""[sim]: the simulated machine; a real one needs none of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+from pydantic import Field
+
+from fdhil.config.section import AxisName, Finite, NotNegative, Positive, Section
+
+
+class Noise(Section):
+    """[sim.noise]: standard deviations of the twin's white sensor noise."""
+
+    voltage_v: NotNegative = Field(0.06, description="terminal voltage")
+    current_a: NotNegative = Field(0.05, description="motor current")
+    speed_rad_s: NotNegative = Field(0.15, description="shaft speed")
+
+
+class SimAxis(Section):
+    """[sim.axis.X]: what the simulated drive really is; what is left out is the nominal value."""
+
+    R: Positive | None = Field(None, description="ohm")
+    L: Positive | None = Field(None, description="H")
+    K: Positive | None = Field(None, description="N.m/A")
+    Jt: Positive | None = Field(None, description="kg.m2")
+    ft: NotNegative | None = Field(None, description="N.m.s, at the reference temperature")
+    Cd: NotNegative | None = Field(None, description="N.m, at the reference temperature")
+    ft_per_kelvin: Finite = Field(0.0, description="relative change of ft per kelvin of slide-way temperature")
+    Cd_per_kelvin: Finite = Field(0.0, description="relative change of Cd per kelvin of slide-way temperature")
+    backlash_um: NotNegative = Field(0.0, description="lost motion between screw and table")
+    start_mm: Finite = Field(0.0, description="position at power-on")
+    offset_in_feedforward: bool = Field(True, description="whether 0x60B0 is seen by the speed feed-forward")
+
+
+class Thermal(Section):
+    """[sim.thermal]: the slide-ways warm with the work of friction and cool toward the ambient."""
+
+    ambient_c: Finite = Field(20.0, description="ambient and start temperature, the reference of ft and Cd")
+    rise_c: NotNegative = Field(2.0, description="rise in steady shuttling at rapid speed")
+    time_constant_s: Positive = Field(600.0, description="time constant of that rise")
+
+
+class Sim(Section):
+    """[sim]: the simulated machine; a real machine's config needs none of it."""
+
+    pace: Literal["realtime", "lockstep"] = Field(
+        "realtime", description="lockstep: as fast as the bus answers, repeatable"
+    )
+    seed: int = Field(1, ge=0, description="seed of the sensor noise")
+    nc: bool = Field(False, description="whether the simulated NC is switched on at start")
+    lockstep_rpdo: tuple[str, ...] = Field(
+        (), description="lockstep: RPDOs to wait for, such as X:2; left out: those heard in the cycle before"
+    )
+    modbus: bool = Field(True, description="serve a Modbus voltage sensor per axis")
+    noise: Noise = Noise()
+    thermal: Thermal = Thermal()
+    axis: Mapping[AxisName, SimAxis] = Field(default_factory=dict)
