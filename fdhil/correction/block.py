@@ -15,13 +15,13 @@ import numpy as np
 from fdhil.config import Axis
 from fdhil.correction.limits import Limits, check, fit
 from fdhil.correction.linear import Inverse
-from fdhil.correction.resting import quiet
+from fdhil.correction.resting import Resting
 from fdhil.model import closed_loop
 from fdhil.model.closed_loop import Response, State
 from fdhil.records import Bool, Float, Parameters
 
 ITERATIONS = 6
-GOOD_ENOUGH_UM = 0.1  # RMS: a third of an increment
+GOOD_ENOUGH_UM, PEAK_UM = 0.15, 0.5  # RMS and largest: half an increment, one and a half
 LEAST_PROGRESS = 0.75  # what an iteration may leave of the best so far; two that leave more end it
 STILL_MM_S = 1e-3
 SHORTEST_REST_S = 0.03
@@ -42,6 +42,7 @@ class AxisLoop:
     sync_period_s: float
     limits: Limits
     inverse: Inverse
+    resting: Resting
 
     @property
     def increment_mm(self) -> float:
@@ -112,14 +113,15 @@ def solve(loop: AxisLoop, reference_mm: Float, target_mm: Float, carry: Carry, e
     needed_um = 0.0
     idle = 0
     for iteration in range(ITERATIONS + 1):
-        offset, position, error = _run(loop, reference_mm, target_mm, guess, carry, still)
+        offset, position, error = _run(loop, reference_mm, target_mm, guess, carry, still, lead=iteration > 0)
         unknown = 0 if ends else round(FORGET_S / loop.sync_period_s)  # what follows would change these rows
         error[n - unknown :] = 0.0
-        rms_um = float(np.sqrt(np.mean((target_mm - position)[: max(1, n - unknown)] ** 2))) * 1e3
+        left_um = 1e3 * (target_mm - position)[: max(1, n - unknown)]
+        rms_um = float(np.sqrt(np.mean(left_um**2)))
         idle = 0 if best is None or rms_um < LEAST_PROGRESS * best.rms_um else idle + 1
         if best is None or rms_um < best.rms_um:
             best = Solution(offset, position, guess, rms_um, needed_um)
-        if rms_um < GOOD_ENOUGH_UM or idle == 2:
+        if (rms_um < GOOD_ENOUGH_UM and np.abs(left_um).max() < PEAK_UM) or idle == 2:
             break
         if rms_um > 2.0 * best.rms_um:  # a step too far: half of it, from where it was good
             gain *= 0.5
@@ -141,8 +143,13 @@ def _run(
     guess: Float,
     carry: Carry,
     still: list[tuple[int, int]],
+    *,
+    lead: bool,
 ) -> tuple[Float, Float, Float]:
-    """Simulate with the guess inside its limits; return offset (increments), position, and the error to work on."""
+    """Simulate with the guess inside its limits; return offset (increments), position, and the error to work on.
+
+    ``lead``: the offsets of the rests lead the current to rest; the first look does without.
+    """
     offset = np.empty(guess.size)
     offset[:2] = carry.fixed[: offset.size]
     before = (float(offset[min(1, offset.size - 1)]), float(offset[0]))
@@ -165,7 +172,8 @@ def _run(
             continue
         row = done + stuck
         state = response.state_at(stuck)
-        _hold(loop, reference_mm, offset, state, row, stop)
+        if lead:
+            _hold(loop, reference_mm, offset, state, row, stop)
         response = _simulate(loop, reference_mm, offset, state, row, stop)
         position[row:stop], state, done = response.position_mm, response.end, stop
         held[row:stop] = True
@@ -205,9 +213,7 @@ def _hold(loop: AxisLoop, reference_mm: Float, offset: Float, state: State, row:
         return
     n = offset.size
     planned_end = offset[stop - 1]
-    rest = reference_mm[row:stop]
-    fixed = offset[row : row + 2].copy()
-    offset[row:stop] = quiet(loop.parameters, loop.axis, loop.sync_period_s, rest, loop.increment_mm, fixed, state)
+    offset[row:stop] = loop.resting.quiet(reference_mm[row:stop], offset[row : row + 2].copy(), state)
     if stop < n:
         change = (offset[stop - 1] - planned_end) * _fade(n - stop, loop.sync_period_s)
         offset[stop:] = np.rint(offset[stop:] + change)

@@ -19,6 +19,7 @@ from fdhil.correction.block import AxisLoop, Carry, Solution, solve
 from fdhil.correction.limits import Limits
 from fdhil.correction.method import Plan
 from fdhil.correction.mirror import lag_reason
+from fdhil.correction.resting import Resting
 from fdhil.model import closed_loop
 from fdhil.records import Float, Parameters, Prediction, Reason, Trajectory
 
@@ -98,12 +99,14 @@ def axis_loop(parameters: Parameters, config: MachineConfig, axis: str) -> AxisL
     """Return what the blocks of one axis share; ValueError when writing is off for it."""
     period = config.machine.sync_period_s
     rows = round((BLOCK_S + LOOK_AHEAD_S) / period)
+    limits, drive = Limits.of(config.axis[axis], period), config.axis[axis]
     return AxisLoop(
         parameters,
-        config.axis[axis],
+        drive,
         period,
-        Limits.of(config.axis[axis], period),
-        linear.inverse(parameters, config.axis[axis], period, rows),
+        limits,
+        linear.inverse(parameters, drive, period, rows),
+        Resting(parameters, drive, period, limits.um_per_increment * 1e-3),
     )
 
 

@@ -232,3 +232,29 @@ def _project_plain(wanted: Float, limits: Float, start: Float) -> Float:
 
 
 project: Callable[[Float, Float, Float], Float] = njit(cache=True, nogil=True)(_project_plain)
+
+
+def _rounded_plain(exact: Float, settled: int, uneven: float) -> Float:
+    """Round (n,) with the error carried on; from row ``settled`` on change the increment as seldom as it can be.
+
+    Rows 0 and 1 are rounded alone. ``uneven``: rounding error (increments times rows) that ends an increment's turn.
+    """
+    out = np.rint(exact)
+    carried = 0.0
+    for k in range(2, min(settled, exact.size)):
+        out[k] = np.rint(exact[k] + carried)
+        carried += exact[k] - out[k]
+    if settled >= exact.size:
+        return out
+    low = np.floor(exact[settled])
+    share = exact[settled] - low
+    high = 1.0 if share >= 0.5 else 0.0
+    for k in range(settled, exact.size):
+        out[k] = low + high
+        carried += share - high
+        if abs(carried) > uneven:
+            high = 1.0 if carried > 0.0 else 0.0
+    return out
+
+
+rounded: Callable[[Float, int, float], Float] = njit(cache=True, nogil=True)(_rounded_plain)

@@ -21,7 +21,7 @@ REGULARISATION = 1e-3
 IMPULSE_S = 1.0
 AHEAD_S = 0.064  # of the impulse's answer that may come before it: the feed-forward looks ahead
 PAD_S = 0.5
-RAMP_MM_S, RAMP_S = 1.0, 3.0
+RAMP_MM_S, RAMP_S = 1.0, 1.5
 
 Complex = npt.NDArray[np.complex128]
 

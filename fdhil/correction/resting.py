@@ -7,13 +7,14 @@ leads the current to the middle of the dry friction's band, and which one, by as
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import lru_cache
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import BSpline
+from scipy.linalg.lapack import dposv
 
 from fdhil.config import Axis
+from fdhil.correction import kernels
 from fdhil.model import closed_loop
 from fdhil.model.closed_loop import Response, State
 from fdhil.model.kernels import CURRENT_DEMAND, POSITION
@@ -26,43 +27,47 @@ AGAIN_S = 0.4
 UNEVEN = 20.0  # increments times cycles of rounding error after which the other neighbour is taken
 PASSES = 4
 KNOT_ROWS = 8
+EVERY = 3  # of the cycles says enough: the current cannot change faster than the spline
+RIDGE = 1e-6  # for splines that lie behind a short rest but for their tail
 HELD_NM = 1e9
 
 
-def quiet(
-    parameters: Parameters,
-    axis: Axis,
-    sync_period_s: float,
-    reference_mm: Float,
-    increment_mm: float,
-    fixed: Float,
-    state: State,
-) -> Float:
-    """Return the offset (n,) in whole increments for a rest (n,) of ``reference_mm`` that begins in ``state``.
+class Resting:
+    """The rests of one axis: what depends on its drive alone is found once."""
 
-    ``fixed`` (2,): the offsets of its first two rows, which are already used.
-    """
-    held = _held(parameters, axis)
-    silent = float(state[POSITION] - reference_mm[0]) / increment_mm
-    offset = np.full(reference_mm.size, silent)
-    offset[:2] = fixed
-    again = round(AGAIN_S / sync_period_s)
-    impulse = np.zeros(round((FREE_S + WATCHED_S) / sync_period_s))
-    impulse[2] = increment_mm
-    answer = _demand(closed_loop.simulate(*held, sync_period_s, impulse))
-    for first in range(0, reference_mm.size - 2, again):  # what rounding left in the integrals is led away as well
-        rest = reference_mm[first:]
-        rows = min(answer.size, rest.size)
-        exact = np.full(rest.size, silent)
-        exact[:2] = offset[first : first + 2]
-        base = _demand(closed_loop.simulate(*held, sync_period_s, rest + exact * increment_mm, state=state, rows=rows))
-        free = min(rows - 2, round(FREE_S / sync_period_s))
-        exact[2 : 2 + free] += _lead_away(base, answer[:rows], exact[:2] - silent, free)
-        offset[first:] = _rounded(exact, 2 + free)
-        rows = min(again, rest.size)
-        commanded = rest + offset[first:] * increment_mm
-        state = closed_loop.simulate(*held, sync_period_s, commanded, state=state, rows=rows).end
-    return offset
+    def __init__(self, parameters: Parameters, axis: Axis, sync_period_s: float, increment_mm: float) -> None:
+        self._held = _held(parameters, axis)
+        self._period_s, self._increment_mm = sync_period_s, increment_mm
+        self._free, self._again = round(FREE_S / sync_period_s), round(AGAIN_S / sync_period_s)
+        impulse = np.zeros(round((FREE_S + WATCHED_S) / sync_period_s))
+        impulse[2] = increment_mm
+        self._answer_a = _demand(closed_loop.simulate(*self._held, sync_period_s, impulse))
+        self._lead = _Lead.of(self._answer_a, self._free)
+
+    def quiet(self, reference_mm: Float, fixed: Float, state: State) -> Float:
+        """Return the offset (n,) in whole increments for a rest (n,) of ``reference_mm`` that begins in ``state``.
+
+        ``fixed`` (2,): the offsets of its first two rows, which are already used.
+        """
+        silent = float(state[POSITION] - reference_mm[0]) / self._increment_mm
+        offset = np.full(reference_mm.size, silent)
+        offset[:2] = fixed
+        for first in range(0, reference_mm.size - 2, self._again):  # what rounding left is led away as well
+            rest = reference_mm[first:]
+            exact = np.full(rest.size, silent)
+            exact[:2] = offset[first : first + 2]
+            rows = min(self._answer_a.size, rest.size)
+            free = min(rows - 2, self._free)
+            base_a = _demand(self._simulate(rest, exact, state, rows))
+            exact[2 : 2 + free] += self._lead.away(base_a, exact[:2] - silent)
+            offset[first:] = kernels.rounded(exact, 2 + free, UNEVEN)
+            state = self._simulate(rest, offset[first:], state, min(self._again, rest.size)).end
+        return offset
+
+    def _simulate(self, rest_mm: Float, offset: Float, state: State, rows: int) -> Response:
+        ahead = min(rows + 2, rest_mm.size)  # a cycle looks two rows ahead and no further
+        commanded = rest_mm[:ahead] + offset[:ahead] * self._increment_mm
+        return closed_loop.simulate(*self._held, self._period_s, commanded, state=state, rows=rows)
 
 
 def _held(parameters: Parameters, axis: Axis) -> tuple[Parameters, Axis]:
@@ -76,56 +81,53 @@ def _demand(response: Response) -> Float:
     return np.append(response.states[CURRENT_DEMAND, 1:], response.end[CURRENT_DEMAND])
 
 
-def _lead_away(base_a: Float, answer_a: Float, before: Float, free: int) -> Float:
-    """Return d (free,), increments from row 2 on: least squares of the current base + answer * d and of d's bends.
+@dataclass(frozen=True, slots=True)
+class _Lead:
+    """What an offset d from row 2 on does, as a cubic spline of knots ``step`` rows apart.
 
-    d is a cubic spline that ends in 0 unless the rest ends first; ``before`` (2,) are its values in rows 0 and 1.
+    ``spline`` (free + step, m) holds d's basis, ``bends`` its second differences, ``effect`` (n, m) what each of them
+    asks for, in A. A rest of less than n rows uses their first rows.
     """
-    goes_on = base_a.size > free + 2
-    spline = _spline(free, goes_on)
-    effect = np.column_stack([np.convolve(answer_a, column)[: base_a.size] for column in spline.T])
-    bends = np.diff(np.pad(spline, ((2, 2 if goes_on else 0), (0, 0))), 2, axis=0)
-    known = np.zeros(len(bends))
-    known[:2] = before[0] - 2 * before[1], before[1]
-    smooth = STEADINESS**2 * bends.T
-    counts = np.ones(base_a.size)
-    if not goes_on:
-        counts[-2:] = 0.0  # these cycles look at rows behind the rest
-    weight = counts
-    found = np.zeros(spline.shape[1])
-    for _ in range(PASSES):  # the largest currents weigh most: it is they that break the table loose
-        left = (effect.T * weight) @ effect + smooth @ bends
-        found = np.linalg.solve(left, -(effect.T @ (weight * base_a)) - smooth @ known)
-        weight = counts * (1.0 + (base_a + effect @ found) ** 2)
-    return np.asarray(spline @ found)
 
+    free: int
+    step: float
+    spline: Float
+    bends: Float
+    effect: Float
 
-@lru_cache(maxsize=64)
-def _spline(rows: int, to_zero: bool) -> Float:
-    """Return (rows, m) cubic basis splines on even knots; ``to_zero``: those that are 0 with their slope at the end."""
-    pieces = max(1, round(rows / KNOT_ROWS))
-    step = rows / pieces
-    knots = np.arange(-3, pieces + 1) * step
-    values: Float = BSpline.design_matrix(
-        np.arange(rows) + 0.0, np.append(knots, knots[-1] + step * np.arange(1, 4)), 3
-    ).toarray()
-    return values[:, :pieces] if to_zero else values
+    @staticmethod
+    def of(answer_a: Float, free: int) -> _Lead:
+        """Prepare for rests of up to ``free`` rows and longer; ``answer_a`` (n,): what an offset of 1 in row 2 does."""
+        pieces = max(1, round(free / KNOT_ROWS))
+        step = free / pieces
+        knots = np.arange(-3, pieces + 5) * step
+        spline = np.asarray(BSpline.design_matrix(np.arange(0.0, free + step), knots, 3).toarray())
+        size = 2 * max(answer_a.size, len(spline))
+        spectrum = np.fft.rfft(answer_a, size)[:, None] * np.fft.rfft(spline, size, axis=0)
+        effect = np.ascontiguousarray(np.fft.irfft(spectrum, size, axis=0)[: answer_a.size])
+        return _Lead(free, step, spline, np.diff(np.pad(spline, ((2, 0), (0, 0))), 2, axis=0), effect)
 
+    def away(self, base_a: Float, before: Float) -> Float:
+        """Return d (free,): least squares of the current base (n,) + effect and of d's bends.
 
-def _rounded(exact: Float, settled: int) -> Float:
-    """Round (n,) with the error carried on; from row ``settled`` on change the increment as seldom as it can be."""
-    out = np.rint(exact)
-    carried = 0.0
-    for k in range(2, min(settled, exact.size)):
-        out[k] = np.rint(exact[k] + carried)
-        carried += exact[k] - out[k]
-    if settled >= exact.size:
-        return out
-    low, share = np.floor(exact[settled]), exact[settled] % 1.0
-    high = share >= 0.5
-    for k in range(settled, exact.size):
-        out[k] = low + high
-        carried += share - high
-        if abs(carried) > UNEVEN:
-            high = carried > 0
-    return out
+        d ends in 0 with its slope, unless the rest ends first. ``before`` (2,) are its values in rows 0 and 1.
+        """
+        n = base_a.size
+        free = min(n - 2, self.free)
+        goes_on = n > free + 2
+        columns = round(self.free / self.step) if goes_on else int(np.ceil(free / self.step)) + 3
+        spline = self.spline[:free, :columns]
+        seen = n if goes_on else n - 2  # the last cycles of a rest look at rows behind it
+        effect, base_a = self.effect[:seen:EVERY, :columns], base_a[:seen:EVERY]
+        bends = self.bends[: free + 2 if goes_on else free, :columns]
+        smooth = (STEADINESS**2 / EVERY) * bends.T
+        bent = smooth[:, 0] * (before[0] - 2 * before[1])
+        if len(bends) > 1:
+            bent = bent + smooth[:, 1] * before[1]
+        stiffness = smooth @ bends
+        stiffness[np.diag_indices(columns)] += RIDGE
+        weighted, found = effect.T, np.zeros(columns)
+        for _ in range(PASSES):  # the largest currents weigh most: it is they that break the table loose
+            found = dposv(weighted @ effect + stiffness, -(weighted @ base_a) - bent)[1]
+            weighted = effect.T * (1.0 + (base_a + effect @ found) ** 2)
+        return np.asarray(spline @ found)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from collections.abc import Iterator, Mapping
 
 import numpy as np
 import pytest
 
-from fdhil.correction import plan
+from fdhil.correction import Limits, check, plan
 from fdhil.correction.streaming import stream
 from fdhil.prediction.models import nominal_models
 from fdhil.records import Float
@@ -76,6 +77,40 @@ def test_saturation_ends_the_stream() -> None:
     """A drive at its current limit cannot be helped."""
     blocks = list(stream(pieces(bench_demand(20, (0.030, 0.015)), 500), MODELS, CONFIG))
     assert "DemandTooHigh" in {reason.code for reason in blocks[-1].refused}
+
+
+def test_seams_do_not_show() -> None:
+    """Near a seam the error is no larger than it is there when the seams lie elsewhere, to 0.05 um."""
+    there = bench_demand(10)
+    shift = 731  # rows of rest ahead: every seam moves to another place of the path
+    paths = there, np.concatenate([np.repeat(there[:1], shift, axis=0), there])
+    one, other = (np.concatenate([block.after_um for block in stream(pieces(p, 500), MODELS, CONFIG)]) for p in paths)
+    near = slice(2000 - 100, 2000 + 100)
+    assert one[near].max() < max(other[shift:][near].max(), one.max(where=np.arange(one.size) < 1900, initial=0)) + 0.05
+    offsets = [block.offset_um for block in stream(pieces(there, 500), MODELS, CONFIG)]
+    for axis in "XY":
+        joined = (
+            np.concatenate([block[axis] for block in offsets]) / Limits.of(CONFIG.axis[axis], 0.001).um_per_increment
+        )
+        assert check(np.rint(joined).astype(np.int64), Limits.of(CONFIG.axis[axis], 0.001)) == []
+
+
+def test_memory_is_flat() -> None:
+    """After the first blocks a longer program needs no more memory: what is kept is half a second of path."""
+    there = bench_demand(20)
+    loop = np.concatenate([there, there[::-1]])
+
+    def long() -> Iterator[Mapping[str, Float]]:
+        for _ in range(8):
+            yield from pieces(loop, 200)
+
+    tracemalloc.start()
+    try:
+        held = [tracemalloc.get_traced_memory()[0] for _ in stream(long(), MODELS, CONFIG)]
+    finally:
+        tracemalloc.stop()
+    assert len(held) > 12
+    assert max(held[6:]) < 1.05 * max(held[:6])
 
 
 def test_no_path_gives_no_block() -> None:

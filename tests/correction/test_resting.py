@@ -1,0 +1,44 @@
+"""Offsets of a resting axis: the current is led to rest, whatever the length of the rest."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fdhil.correction.resting import Resting
+from fdhil.model import closed_loop
+from fdhil.model.kernels import CURRENT_DEMAND
+from fdhil.prediction.models import nominal_models
+from tests.bench import bench_config
+
+CONFIG = bench_config()
+MODELS = nominal_models(CONFIG)
+INCREMENT_MM = 20.0 / 65536
+
+
+@pytest.mark.parametrize("rows", [3, 4, 5, 12, 100, 299, 300, 301, 302, 303, 360, 900])
+def test_any_length_of_rest(rows: int) -> None:
+    """Whole increments for every row, the first two as they were, and never far from where the axis stands."""
+    resting = Resting(MODELS["X"], CONFIG.axis["X"], 0.001, INCREMENT_MM)
+    state = closed_loop.start(0.0)
+    offset = resting.quiet(np.zeros(rows), np.array([3.0, 2.0]), state)
+    assert offset.size == rows
+    assert offset[:2].tolist() == [3.0, 2.0]
+    assert np.array_equal(offset, np.rint(offset))
+    assert np.abs(offset).max() < 30
+
+
+def test_the_current_comes_to_rest() -> None:
+    """With an integral that would break the table loose, the current ends far inside the dry friction's band."""
+    axis, model = CONFIG.axis["X"], MODELS["X"]
+    moved = closed_loop.simulate(model, axis, 0.001, np.concatenate([np.linspace(0.0, 0.02, 40), np.full(62, 0.02)]))
+    state = moved.end
+    resting = Resting(model, axis, 0.001, INCREMENT_MM)
+    rest = np.full(900, 0.02)
+    offset = resting.quiet(rest, np.zeros(2), state)
+    led = closed_loop.simulate(model, axis, 0.001, rest + offset * INCREMENT_MM, state=state)
+    left = closed_loop.simulate(model, axis, 0.001, rest, state=state)
+    assert np.ptp(led.position_mm[2:]) == 0.0
+    band = model.Cd / model.K
+    assert np.abs(led.states[CURRENT_DEMAND, 400:]).max() < 0.3 * band
+    assert np.abs(left.states[CURRENT_DEMAND, 400:]).max() > 2 * np.abs(led.states[CURRENT_DEMAND, 400:]).max()
