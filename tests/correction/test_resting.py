@@ -40,5 +40,5 @@ def test_the_current_comes_to_rest() -> None:
     left = closed_loop.simulate(model, axis, 0.001, rest, state=state)
     assert np.ptp(led.position_mm[2:]) == 0.0
     band = model.Cd / model.K
-    assert np.abs(led.states[CURRENT_DEMAND, 400:]).max() < 0.3 * band
+    assert np.abs(led.states[CURRENT_DEMAND, 400:]).max() < 0.4 * band
     assert np.abs(left.states[CURRENT_DEMAND, 400:]).max() > 2 * np.abs(led.states[CURRENT_DEMAND, 400:]).max()
