@@ -23,7 +23,7 @@ _STEPS = {
     "**": 6, "*": 5, "/": 5, "mod": 5, "+": 4, "-": 4,
     "eq": 3, "ne": 3, "gt": 3, "ge": 3, "lt": 3, "le": 3, "and": 2, "or": 2, "xor": 2,
 }  # fmt: skip
-_EQUAL = 1e-6  # numbers nearer than this are equal to EQ and NE, and to the integer that an index wants
+_EQUAL = 1e-4  # numbers nearer than this are equal to EQ and NE, and to the integer that an index wants
 
 
 class Context(Protocol):

@@ -124,6 +124,8 @@ class Flow:
             if len(self._known) > self._budget.max_kept_lines:
                 self._known.clear()
         label, skip = command.label(), self._skip
+        if command.keyword == "sub" and skip is not None and skip.keywords == ("endsub",):
+            raise command.fault(f"begins within the subroutine O<{skip.label}>; move it out")
         if skip is None or label != skip.label or command.keyword not in skip.keywords:
             return
         self._skip = None
@@ -232,7 +234,7 @@ class Flow:
 
     def _repeat(self, label: str, command: Command, line: int) -> None:
         state = self._open(label, "repeat", line)
-        state.left = command.condition()
+        state.left = float(round(command.condition()))
         if state.left <= 0.0:
             self._skip = Skip(label, ("endrepeat",), line)
 
@@ -274,6 +276,7 @@ class Flow:
         if times > 0:
             frame = Frame(name, Place(self.source, self.source.after()), fanuc=True, again=times - 1)
             self._enter(frame, line)
+            self._variables.enter_names()
 
     def call_contour(self, block: Block, name: str) -> None:
         """Enter the subroutine that describes a contour (G70 to G72.2); it must stand before the block."""
@@ -340,6 +343,7 @@ class Flow:
             frame.again -= 1
             self._jump(frame.entry.mark, self.source.line)
             return True
+        self._variables.leave_names()
         self._go_back()
         return True
 

@@ -86,6 +86,7 @@ class Interpreter:
                 raw = flow.source.next()
                 if raw is None:
                     flow.at_end()
+                    self._check_end()
                     break
                 line = flow.source.line
                 self._count(line)
@@ -127,7 +128,7 @@ class Interpreter:
         g, x, y, z, f = match.groups()
         modal = self._machine.modal
         motion = modal.motion if g is None else 10 * int(g)
-        if motion not in (0, 10) or not modal.plain or (x is None and y is None and z is None):
+        if motion not in (0, 10) or not modal.plain or self._nurbs.points or (x is None and y is None and z is None):
             return None
         position = list(modal.position)
         for index, word in ((0, x), (1, y), (2, z)):
@@ -143,8 +144,10 @@ class Interpreter:
             modal.feed_mm_min = modal.feed_word * modal.scale
         if motion == 10 and not 0.0 < modal.feed_mm_min < math.inf:
             return None
+        self._empty_so_far = False
         modal.motion = motion
         modal.position = position
+        self._spline.leaving = None
         self._series.began = None
         self._machine.just_left = False
         corner = modal.corner
@@ -152,11 +155,13 @@ class Interpreter:
 
     def _line(self, raw: str, line: int) -> None:
         block = self._fetch(raw, line)
-        if block is not None:
-            self._execute(block)
-            self._settle(block)
-            if "call" in block.m:
-                self._call(block)
+        if block is None:
+            return
+        if "call" in block.m:
+            self._call(block, without_number(clean(raw, line).lstrip("/")))
+            return
+        self._execute(block)
+        self._settle(block)
 
     def _fetch(self, raw: str, line: int) -> Block | None:
         """Return a line's block, None when it has none; an O-word is executed."""
@@ -180,19 +185,27 @@ class Interpreter:
             self._variables.set(key, value, block.line)
 
     def _read(self, raw: str, line: int) -> Command | Line | None:
+        if raw.strip() == "%":
+            self._at_percent(line)
+            return None
         text = clean(raw, line)
+        self._empty_so_far = self._empty_so_far and not raw.strip()
         if text.startswith("/"):
             text = "" if self._block_delete else text[1:]
         if not text:
             return None
-        if text == "%":
-            self._at_percent(line)
-            return None
-        self._empty_so_far = False
         text = without_number(text)
         if text.startswith("o"):
             return self._flow.read(text)
         return read(text, self._variables, self._budget.max_nesting)
+
+    def _check_end(self) -> None:
+        """Refuse an empty program, and one that begins with "%" and does not end with it."""
+        line = max(1, self._flow.source.line)
+        if self._percent:
+            raise ProgramError(line, "%", "the program begins with % and ends without; add it, or M2")
+        if self._empty_so_far:
+            raise ProgramError(line, "", "the program is empty; give one with at least one block")
 
     def _at_percent(self, line: int) -> None:
         if self._empty_so_far:
@@ -208,6 +221,7 @@ class Interpreter:
         check_readers(block, _motion_of(modal, block))
         modes.set_feed(modal, block)
         modes.set_spindle(modal, block)
+        modes.set_switches(modal, block)
         self._change_tool(block)
         if "modal state" in block.m and not self._kept.do(block.m["modal state"], self._flow.depth):
             raise ProgramError(block.line, "M72", "has no modes to restore; keep them by M70 first")
@@ -226,10 +240,16 @@ class Interpreter:
         elif block.m.get("tool") == 61:
             self._tool = block.words.get("q", 0.0) != 0.0
 
-    def _call(self, block: Block) -> None:
-        if block.m["call"] == 98:
+    def _call(self, block: Block, text: str) -> None:
+        """M98 and M99: they begin their line, and nothing else in it is executed."""
+        code = block.m["call"]
+        if not text.startswith(f"m{code}") or (code == 99 and text != "m99"):
+            raise ProgramError(block.line, f"M{code}", "must begin its line; M99 stands alone, M98 with P and L")
+        check_readers(block, None)
+        if code == 98:
             name, times = block.words.get("p", -1.0), block.words.get("l", 1.0)
-            if name < 0.0 or abs(name - round(name)) > 1e-4 or not 0 <= times < 1e9:
+            off = max(abs(name - round(name)), abs(times - round(times)))
+            if name < 0.0 or off > 1e-4 or not 0 <= times < 1e9:
                 raise ProgramError(
                     block.line, "M98", "wants the subroutine's number as P and may have its repeats as L"
                 )

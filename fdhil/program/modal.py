@@ -49,6 +49,13 @@ class Modal:
     feed_mm_min: float = 0.0
     spindle_rpm: float = 0.0
     spindle_turns: int = 0
+    surface_speed: bool = False
+    flood: bool = False
+    mist: bool = False
+    feed_override: bool = True
+    speed_override: bool = True
+    adaptive_feed: bool = False
+    feed_hold: bool = True
     retract_to_r: bool = True
     compensation: int = 400
     path_control: int = 640

@@ -26,10 +26,27 @@ def set_spindle(modal: Modal, block: Block) -> None:
         if block.words["s"] < 0.0:
             raise block.fault("s", "is a negative spindle speed; M4 turns it backwards")
         modal.spindle_rpm = block.words["s"]
+    if "spindle mode" in block.g:
+        modal.surface_speed = block.g["spindle mode"] == 960
     if block.g.get("spindle mode") == 960 and "s" not in block.words:
         raise ProgramError(block.line, "G96", "constant surface speed wants the speed as S")
     if "spindle" in block.m:
         modal.spindle_turns = {3: 1, 4: -1}.get(block.m["spindle"], 0)
+
+
+_OVERRIDES = {50: "feed_override", 51: "speed_override", 52: "adaptive_feed", 53: "feed_hold"}
+
+
+def set_switches(modal: Modal, block: Block) -> None:
+    """Turn coolant (M7 to M9) and the operator's overrides (M48 to M53) on and off: read, without effect on motions."""
+    coolant, override = block.m.get("coolant"), block.m.get("overrides")
+    if coolant is not None:
+        modal.mist = coolant == 7 or (modal.mist and coolant != 9)
+        modal.flood = coolant == 8 or (modal.flood and coolant != 9)
+    if override in (48, 49):
+        modal.feed_override = modal.speed_override = override == 48
+    elif override is not None:
+        setattr(modal, _OVERRIDES[override], block.words.get("p", 1.0) != 0.0)
 
 
 def dwell(machine: Machine, block: Block) -> None:

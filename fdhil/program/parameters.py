@@ -89,6 +89,15 @@ class Variables:
         self._locals = {}
         self._numbers.update(enumerate(arguments, start=1))
 
+    def enter_names(self) -> None:
+        """Begin a call by M98: its own local names, while #1 to #30 are the caller's."""
+        self._stack.append(({}, self._locals))
+        self._locals = {}
+
+    def leave_names(self) -> None:
+        """End a call by M98: the caller's local names are back."""
+        _, self._locals = self._stack.pop()
+
     def leave(self) -> None:
         """End a call: the caller's local parameters are back."""
         for index in range(1, LOCAL_NUMBERS + 1):

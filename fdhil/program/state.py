@@ -14,7 +14,8 @@ Reading = Callable[[], float]
 # what M70 keeps: the modes, not the position and not the motion in force
 _KEPT = (
     "scale", "plane", "absolute", "arc_absolute", "diameter", "feed_mode", "feed_word", "feed_mm_min", "spindle_rpm",
-    "spindle_turns", "retract_to_r", "path_control", "path_tolerance_mm", "system",
+    "spindle_turns", "surface_speed", "flood", "mist", "feed_override", "speed_override", "adaptive_feed", "feed_hold",
+    "retract_to_r", "path_control", "path_tolerance_mm", "system",
 )  # fmt: skip
 
 
@@ -42,8 +43,14 @@ def names_of(
         "_units_per_rev": lambda: modal.feed_mode == 950,
         "_retract_r_plane": lambda: modal.retract_to_r,
         "_retract_old_z": lambda: not modal.retract_to_r,
-        "_spindle_rpm_mode": lambda: True,
-        "_spindle_css_mode": lambda: False,
+        "_spindle_rpm_mode": lambda: not modal.surface_speed,
+        "_spindle_css_mode": lambda: modal.surface_speed,
+        "_flood": lambda: modal.flood,
+        "_mist": lambda: modal.mist,
+        "_feed_override": lambda: modal.feed_override,
+        "_speed_override": lambda: modal.speed_override,
+        "_adaptive_feed": lambda: modal.adaptive_feed,
+        "_feed_hold": lambda: modal.feed_hold,
         "_ijk_absolute_mode": lambda: modal.arc_absolute,
         "_lathe_diameter_mode": lambda: modal.diameter,
         "_lathe_radius_mode": lambda: not modal.diameter,
@@ -71,15 +78,10 @@ def names_of(
         "_vminor",
         "_task",
         "_remap_level",
-        "_mist",
-        "_flood",
-        "_adaptive_feed",
         "_current_tool",
         "_selected_tool",
     ):
         readings[name] = lambda: 0.0
-    for name in ("_speed_override", "_feed_override", "_feed_hold"):
-        readings[name] = lambda: 1.0
     for letter in AXES:
         readings[f"_{letter}"] = _own(modal, INDEX[letter])
         readings[f"_abs_{letter}"] = _machine(modal, INDEX[letter])

@@ -17,6 +17,7 @@ _PLAIN = re.compile(r"(?:[a-z@^][+-]?(?:\d++\.?\d*+|\.\d++))*+")
 _WORD = re.compile(r"([a-z@^])([+-]?(?:\d++\.?\d*+|\.\d++))")
 _NUMBER = re.compile(r"n(\d++)(?:\.\d++)?+")
 _BLANKS = str.maketrans("", "", " \t\r\v\f")
+_COMMENT = "("
 _LETTERS = frozenset("abcdefghijklmpqrstuvwxyz@^")
 
 
@@ -76,9 +77,12 @@ class Block:
 
 
 def clean(raw: str, line: int) -> str:
-    """Return a line in lower case without comments and blanks; ProgramError for a comment that is not closed."""
+    """Return a line in lower case without blanks; ProgramError for a comment that is not closed.
+
+    A comment between two words is left as one mark, since it may not stand within a word.
+    """
     if "(" in raw or ";" in raw:
-        raw = _without_comments(raw, line)
+        return _without_comments(raw, line).lower().translate(_BLANKS).strip(_COMMENT)
     return raw.lower().translate(_BLANKS)
 
 
@@ -91,7 +95,7 @@ def _without_comments(raw: str, line: int) -> str:
             kept.append(raw[at:])
             break
         start = min(marks)
-        kept.append(raw[at:start])
+        kept += (raw[at:start], _COMMENT)
         if raw[start] == ";":
             break
         end = raw.find(")", start)
@@ -138,7 +142,6 @@ class Line:
 
 def read(text: str, context: Context, max_nesting: int) -> Line:
     """Read a cleaned line; ProgramError with line and word for what the language does not allow."""
-    text = without_number(text)
     if _PLAIN.fullmatch(text) is not None:
         block = Block(context.line)
         for letter, digits in _WORD.findall(text):
@@ -164,6 +167,9 @@ def _next(reader: Reader, words: list[tuple[str, Value]], settings: list[tuple[V
         if not reader.take("="):
             raise reader.fault("a parameter's setting wants '=' and a value")
         settings.append((key, reader.value()))
+        return
+    if letter == _COMMENT:
+        reader.at += 1
         return
     if letter not in _LETTERS:
         raise reader.fault("is no word of the language; check the characters")
