@@ -12,7 +12,9 @@ import click
 from fdhil import tables
 
 if TYPE_CHECKING:
+    from fdhil.cli.forecast import Past
     from fdhil.config import MachineConfig
+    from fdhil.prediction.forecast import Step
     from fdhil.records import Correction, Float, Parameters, Prediction, Reason, Trajectory
 
 FILE = click.Path(path_type=Path)
@@ -41,6 +43,14 @@ def _shared(command: Command) -> Command:
 @click.command()
 @_shared
 @click.option("--sensitivity", is_flag=True, help="Tell per zone by how many um 1 % of each parameter raises it.")
+@click.option(
+    "--tolerance-um",
+    type=click.FloatRange(min=0.0, min_open=True),
+    help="With --from-history: when each zone leaves this tolerance, if the parameters go on as they did.",
+)
+@click.option(
+    "--since", type=int, metavar="REVISION", help="With --from-history: compare inertia and friction with REVISION."
+)
 def predict(
     program: Path,
     config_path: Path,
@@ -49,34 +59,52 @@ def predict(
     out: Path | None,
     as_json: bool,
     sensitivity: bool,
+    tolerance_um: float | None,
+    since: int | None,
 ) -> int:
     """Predict the path error that the drives will leave of a PROGRAM (NC program or demand CSV).
 
     The parameters are the configuration's nominal ones unless --model or --from-history says otherwise. Exit codes: 0
     done, 2 wrong option, model or configuration, 3 a file cannot be read or written.
 
-    With --from-history the contour error has its standard deviation, from the parameters' covariance.
+    With --from-history the contour error has its standard deviation, from the parameters' covariance, and a step of an
+    axis' inertia or friction is told with what it costs: since REVISION, or since before the last step.
     """
+    if not from_history and (tolerance_um is not None or since is not None):
+        raise click.UsageError("--tolerance-um and --since look at the history: give --from-history too")
     reference, models, config = inputs(program, config_path, model_path, from_history)
     from fdhil import prediction
+    from fdhil.cli import forecast
 
     predicted = prediction.predict(reference, models, config)
     columns = _prediction_columns(predicted)
     document = {"schema": "fdhil-predict-1", "program": str(program), **_prediction_document(predicted)}
+    zones = document["zones"]
+    steps: Sequence[Step] = ()
+    if sensitivity or tolerance_um is not None:
+        told = prediction.sensitivity_um(predicted, models, config)
+        for zone, per_axis in zip(zones, told, strict=True):
+            zone["um_per_percent"] = per_axis
     if from_history:
-        std = prediction.contour_std_um(reference, models, _covariances(reference, config), config)
+        past = forecast.Past.read(config)
+        std = prediction.contour_std_um(reference, models, _covariances(reference, past), config)
         columns["contour_std_um"] = (std, 4)
         document["contour"]["max_std_um"] = float(std.max())
-    if sensitivity:
-        told = prediction.sensitivity_um(predicted, models, config)
-        for zone, per_axis in zip(document["zones"], told, strict=True):
-            zone["um_per_percent"] = per_axis
+        for zone, row in zip(zones, _peak_rows(predicted), strict=True):
+            zone["std_um"] = float(std[row])
+        steps = forecast.steps(past, predicted, models, config, since)
+        document["steps"] = forecast.step_entries(steps)
+        if tolerance_um is not None:
+            document["tolerance_um"] = tolerance_um
+            for zone, when in zip(zones, forecast.crossings(past, predicted, told, models, tolerance_um), strict=True):
+                zone["crosses"] = when
     if out is not None:
         _write(out, columns)
     if as_json:
         click.echo(json.dumps(document, allow_nan=False))
     else:
-        _show_prediction(predicted, document["zones"] if sensitivity else None)
+        _show_prediction(predicted, zones, tolerance_um)
+        forecast.show_steps(steps)
     return 0
 
 
@@ -132,15 +160,19 @@ def inputs(
     return reference, model_files.models_for(reference, given, config, source), config
 
 
-def _covariances(reference: Trajectory, config: MachineConfig) -> dict[str, Float]:
+def _covariances(reference: Trajectory, past: Past) -> dict[str, Float]:
     """Return the newest published covariance (6, 6) of each axis; zeros for an axis without one (it stands still)."""
     import numpy as np
 
-    from fdhil.store.history import History
-
-    with History.read(config.store.directory) as history:
-        known = {revision.set.axis: revision.set.covariance for revision in history.revisions()}
+    known = {axis: found[-1].set.covariance for axis, found in past.revisions.items() if found}
     return {axis: known.get(axis, np.zeros((6, 6))) for axis in reference.axes}
+
+
+def _peak_rows(predicted: Prediction) -> list[int]:
+    """Return the row of the largest contour error of each zone."""
+    start, dt_s = float(predicted.reference.time_s[0]), predicted.reference.dt_s
+    ranges = ((round((z.start_s - start) / dt_s), round((z.end_s - start) / dt_s)) for z in predicted.zones)
+    return [first + int(predicted.contour_um[first:last].argmax()) for first, last in ranges]
 
 
 def _prediction_columns(predicted: Prediction) -> dict[str, tuple[Float, int]]:
@@ -204,8 +236,15 @@ def _prediction_document(predicted: Prediction) -> dict[str, Any]:
 
 def _zones(predicted: Prediction) -> list[dict[str, Any]]:
     return [
-        {"start_s": z.start_s, "end_s": z.end_s, "where": z.where, "max_um": z.max_um, "cause": z.cause}
-        for z in predicted.zones
+        {
+            "start_s": z.start_s,
+            "end_s": z.end_s,
+            "where": z.where,
+            "line": int(predicted.reference.line[row]),
+            "max_um": z.max_um,
+            "cause": z.cause,
+        }
+        for z, row in zip(predicted.zones, _peak_rows(predicted), strict=True)
     ]
 
 
@@ -230,21 +269,31 @@ def _correction_document(program: str, planned: Correction) -> dict[str, Any]:
     }
 
 
-def _show_prediction(predicted: Prediction, told: Sequence[Mapping[str, Any]] | None = None) -> None:
+def _show_prediction(
+    predicted: Prediction, told: Sequence[Mapping[str, Any]] | None = None, tolerance_um: float | None = None
+) -> None:
+    from fdhil.cli.forecast import crossing_text
+
     contour = _contour(predicted)
     click.echo(
         f"{predicted.reference.time_s[-1]:.2f} s of path: contour error {contour['rms_um']:.1f} um RMS,"
         f" {contour['max_um']:.1f} um at most"
     )
-    zones = sorted(predicted.zones, key=lambda zone: -zone.max_um)[:MANY_ZONES]
-    for zone in sorted(zones, key=lambda zone: zone.start_s):
+    entries = _zones(predicted) if told is None else told
+    shown = sorted(sorted(entries, key=lambda zone: -zone["max_um"])[:MANY_ZONES], key=lambda zone: zone["start_s"])
+    for zone in shown:
+        std = f" +- {2 * zone['std_um']:.1f}" if "std_um" in zone else ""
+        line = f"line {zone['line']}, " if zone["line"] else ""
         click.echo(
-            f"  {zone.start_s:8.3f} s .. {zone.end_s:8.3f} s  {zone.max_um:8.1f} um  {zone.cause:12}  at {zone.where}"
+            f"  {zone['start_s']:8.3f} s .. {zone['end_s']:8.3f} s  {zone['max_um']:8.1f}{std} um  {zone['cause']:12}"
+            f"  at {line}{zone['where']}"
         )
-        if told is not None:
-            click.echo(f"{'':26}{_driver(told[predicted.zones.index(zone)]['um_per_percent'])}")
-    if len(predicted.zones) > len(zones):
-        click.echo(f"  and {len(predicted.zones) - len(zones)} smaller zones (--json lists them all)")
+        if "um_per_percent" in zone:
+            click.echo(f"{'':26}{_driver(zone['um_per_percent'])}")
+        if "crosses" in zone and tolerance_um is not None:
+            click.echo(f"{'':26}{crossing_text(zone['crosses'], tolerance_um)}")
+    if len(entries) > len(shown):
+        click.echo(f"  and {len(entries) - len(shown)} smaller zones (--json lists them all)")
 
 
 def _driver(per_axis: Mapping[str, Mapping[str, float]]) -> str:

@@ -14,15 +14,14 @@ from fdhil.cli.main import cli, run_safely
 from fdhil.program import write_demand_csv
 from fdhil.records import Parameters, ParameterSet, frozen
 from fdhil.store.history import History, Stamp
-from tests.bench import _AXIS
+from tests.bench import bench_toml
 from tests.paths import bench_trajectory
 
 
 @pytest.fixture(name="bench")
 def _bench(tmp_path: Path) -> Path:
     """A folder with the bench's configuration and a demand."""
-    axes = "".join(f"[axis.{a}]\n{_AXIS.replace('[regulators]', f'[axis.{a}.regulators]')}" for a in "XY")
-    (tmp_path / "bench.toml").write_text(f'[machine]\nname = "bench"\nsync_period_s = 0.001\n{axes}')
+    (tmp_path / "bench.toml").write_text(bench_toml())
     write_demand_csv(bench_trajectory(10), tmp_path / "demand.csv")
     return tmp_path
 
@@ -48,7 +47,7 @@ def test_writes_json_and_csv(bench: Path) -> None:
     document = json.loads(result.stdout)
     assert document["contour"]["rms_um"] == pytest.approx(24.2, rel=0.02)
     assert set(document["axes"]["X"]) == {"rms_error_um", "max_error_um"}
-    assert set(document["zones"][0]) == {"start_s", "end_s", "where", "max_um", "cause"}
+    assert set(document["zones"][0]) == {"start_s", "end_s", "where", "line", "max_um", "cause"}
     assert document["duration_s"] == pytest.approx(3.09, abs=0.01)
     with out.open() as file:
         rows = list(csv.DictReader(file))
@@ -93,6 +92,52 @@ def test_history_gives_parameters_and_their_uncertainty(bench: Path) -> None:
     assert 0.1 < json.loads(result.stdout)["contour"]["max_std_um"] < 10
     with out.open() as file:
         assert max(float(row["contour_std_um"]) for row in csv.DictReader(file)) > 0.1
+
+
+def remember(folder: Path, revisions: list[dict[str, float]]) -> None:
+    """Store equal revisions of X and Y, one a day, known to 0.3 %, with some values other than nominal."""
+    nominal = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
+    covariance = np.diag([(0.003 * value) ** 2 for value in nominal.values()])
+    with History.open(folder / "fdhil-data") as history:
+        for number, changed in enumerate(revisions, 1):
+            for axis in "XY":
+                values = Parameters(**nominal | changed)
+                known = ParameterSet(axis, number, values, frozen(covariance), 3, 0, None, "digest")
+                history.add_revision(known, [], Stamp(86400.0 * number, "boot", 0))
+
+
+def test_history_tells_what_a_fixture_costs(bench: Path) -> None:
+    """Since the last step, or since the revision that is asked for; an unknown one is refused."""
+    remember(bench, [{}, {}, {"Jt": 0.085}, {"Jt": 0.085}])
+    program = bench / "corner.ngc"
+    program.write_text("G21 G90 G64\nG1 X0 Y30 F10000\nG1 X40\nM2\n")
+    arguments = ["predict", program, "--config", bench / "bench.toml", "--from-history"]
+    steps = json.loads(invoke(*arguments, "--json").stdout)["steps"]
+    assert {(step["axis"], step["what"], step["since_revision"]) for step in steps} >= {("X", "inertia", 2)}
+    assert steps[0]["line"] == 3
+    assert steps[0]["parameters"] == {"Jt": {"before": 0.075, "now": 0.085}}
+    assert "has changed since revision 2 (Jt 0.075 -> 0.085): it costs" in invoke(*arguments).stdout
+    assert json.loads(invoke(*arguments, "--since", 3, "--json").stdout)["steps"] == []
+    assert invoke(*arguments, "--since", 99).exit_code != 0
+    assert invoke("predict", program, "--config", bench / "bench.toml", "--since", 1).exit_code == 2
+
+
+def test_history_tells_when_a_zone_leaves_the_tolerance(bench: Path) -> None:
+    """Jt rises by 0.2 % a day: the corners leave 105 um within weeks, the largest are over 98 um already."""
+    remember(bench, [{"Jt": 0.075 * (1 + 0.002 * (day - 20))} for day in range(21)])
+    arguments = ["predict", bench / "demand.csv", "--config", bench / "bench.toml", "--from-history"]
+    document = json.loads(invoke(*arguments, "--tolerance-um", 105, "--json").stdout)
+    corners = [zone["crosses"] for zone in document["zones"] if zone["max_um"] > 90]
+    assert corners
+    for crosses in corners:
+        assert crosses["state"] == "foreseen"
+        assert 3 < crosses["in_days"] < 100
+        assert "1970-01-22" < crosses["earliest"] <= crosses["date"] <= crosses["latest"]
+        assert crosses["parameter"] == "Jt"
+    assert all(zone["std_um"] >= 0 for zone in document["zones"])
+    text = invoke(*arguments, "--tolerance-um", 98).stdout
+    assert "is over 98 um" in text
+    assert "leaves 98 um about 1970-" in text
 
 
 @pytest.mark.parametrize(

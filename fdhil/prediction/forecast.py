@@ -1,0 +1,164 @@
+"""What the history of the parameters says about a path: when a zone leaves a tolerance, and what a step has cost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fdhil.config import MachineConfig
+from fdhil.identification import trends
+from fdhil.identification.trends import LEAST_STEP, Slope, slope
+from fdhil.prediction.predict import predict
+from fdhil.records import PARAMETERS, Float, Parameters, ParameterSet, Prediction, Zone
+
+BEYOND_CHANCE = 3.0  # standard deviations
+GROUPS: Mapping[str, tuple[str, ...]] = {"inertia": ("Jt",), "friction": ("ft", "Cd")}
+COMMON_UM = 0.01  # a step that costs less is not told
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A sudden change of an axis' inertia or friction, and what it costs on a path.
+
+    ``changed`` maps a symbol to (before, now). ``cost_um`` is the largest change of the contour error, + worse, at
+    ``line`` (0: a demand) and ``where``; ``rms_um`` the change of the whole path's RMS.
+    """
+
+    axis: str
+    what: str
+    changed: Mapping[str, tuple[float, float]]
+    since_revision: int
+    cost_um: float
+    rms_um: float
+    line: int
+    where: str
+
+
+@dataclass(frozen=True, slots=True)
+class Crossing:
+    """When a zone leaves the tolerance if the parameters go on as they did: days from the newest ones, 95 % interval.
+
+    ``axis`` and ``parameter`` drive it most.
+    """
+
+    days: float
+    earliest_days: float
+    latest_days: float
+    axis: str
+    parameter: str
+
+
+def moved(before: ParameterSet, now: ParameterSet) -> dict[str, tuple[str, ...]]:
+    """Return which of ``GROUPS`` differ by more than drift and chance explain, with the symbols that do."""
+    found = {}
+    for what, names in GROUPS.items():
+        symbols = tuple(name for name in names if _apart(before, now, PARAMETERS.index(name)))
+        if symbols:
+            found[what] = symbols
+    return found
+
+
+def _apart(before: ParameterSet, now: ParameterSet, k: int) -> bool:
+    name = PARAMETERS[k]
+    old, new = getattr(before.parameters, name), getattr(now.parameters, name)
+    variance = np.nan_to_num(before.covariance[k, k]) + np.nan_to_num(now.covariance[k, k])
+    return bool(abs(new - old) > max(LEAST_STEP[name] * abs(old), BEYOND_CHANCE * float(np.sqrt(variance))))
+
+
+def last_step(sets: Sequence[ParameterSet]) -> int | None:
+    """Return the place, in an axis' sets (oldest first), of the last one before the newest step; None without one."""
+    for k in range(len(sets) - 2, -1, -1):
+        if moved(sets[k], sets[k + 1]) and moved(sets[k], sets[-1]):
+            return k
+    return None
+
+
+def step_costs(
+    prediction: Prediction,
+    models: Mapping[str, Parameters],
+    earlier: Mapping[str, ParameterSet],
+    now: Mapping[str, ParameterSet],
+    config: MachineConfig,
+) -> tuple[Step, ...]:
+    """Return what each axis' inertia and friction cost since ``earlier``, dearest first.
+
+    Each is put back alone; ``models`` are those of ``prediction``, whose values ``now`` holds.
+    """
+    reference = prediction.reference
+    steps = []
+    for axis in reference.axes:
+        if axis not in earlier or axis not in now:
+            continue
+        for what in moved(earlier[axis], now[axis]):
+            names = GROUPS[what]
+            old = {name: float(getattr(earlier[axis].parameters, name)) for name in names}
+            without = predict(reference, {**models, axis: replace(models[axis], **old)}, config).contour_um
+            change = prediction.contour_um - without
+            row = int(np.argmax(np.abs(change)))
+            if abs(change[row]) < COMMON_UM:
+                continue
+            steps.append(
+                Step(
+                    axis=axis,
+                    what=what,
+                    changed={name: (old[name], float(getattr(models[axis], name))) for name in names},
+                    since_revision=earlier[axis].revision,
+                    cost_um=float(change[row]),
+                    rms_um=_rms(prediction.contour_um) - _rms(without),
+                    line=int(reference.line[row]),
+                    where=" ".join(f"{a} {reference.position_mm[a][row]:.1f}" for a in reference.axes),
+                )
+            )
+    return tuple(sorted(steps, key=lambda step: -abs(step.cost_um)))
+
+
+def _rms(values: Float) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def slopes_per_day(sets: Sequence[ParameterSet], days: Float) -> dict[str, Slope]:
+    """Return the slope of each parameter over time, after the last step, of sets published on ``days`` (n,)."""
+    step = last_step(sets)
+    first = 0 if step is None else step + 1
+    found = {}
+    for k, name in enumerate(PARAMETERS):
+        values = np.array([getattr(s.parameters, name) for s in sets[first:]])
+        stds = np.array([np.sqrt(max(float(np.nan_to_num(s.covariance[k, k])), 0.0)) for s in sets[first:]])
+        line = slope(values, days[first:], stds if (stds > 0).all() else None)
+        if line is not None:
+            found[name] = line
+    return found
+
+
+def crossing(
+    zone: Zone,
+    um_per_percent: Mapping[str, Mapping[str, float]],
+    models: Mapping[str, Parameters],
+    slopes: Mapping[str, Mapping[str, Slope]],
+    tolerance_um: float,
+) -> Crossing | None:
+    """Return when the zone's largest error crosses the tolerance, to first order; None where that is not foreseeable:
+    it falls, or its slope may as well be nil. It must be within the tolerance now.
+    """
+    rates: dict[tuple[str, str], float] = {}
+    variance = 0.0
+    for axis, lines in slopes.items():
+        for name, line in lines.items():
+            value = abs(float(getattr(models[axis], name)))
+            if value == 0.0:
+                continue
+            um_per_unit = 100.0 * um_per_percent[axis][name] / value
+            rates[axis, name] = line.value * um_per_unit
+            variance += (line.std * um_per_unit) ** 2
+    rate = sum(rates.values())
+    if rate <= 0.0:
+        return None
+    freedom = min(line.freedom for lines in slopes.values() for line in lines.values())
+    course = Slope(rate, float(np.sqrt(variance)), at=0.0, level=zone.max_um, freedom=freedom)
+    found = trends.crossing(course, tolerance_um)
+    if found is None:
+        return None
+    axis, name = max(rates, key=rates.__getitem__)
+    return Crossing(found.at, found.low, found.high, axis, name)

@@ -1,0 +1,124 @@
+"""What the parameters' history says about a path."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil.prediction import predict, sensitivity_um
+from fdhil.prediction.forecast import crossing, last_step, slopes_per_day, step_costs
+from fdhil.prediction.models import nominal_models
+from fdhil.records import PARAMETERS, Parameters, ParameterSet, Trajectory, frozen, frozen_ints
+from tests.bench import bench_config
+from tests.paths import bench_trajectory
+
+CONFIG = bench_config()
+NOMINAL = nominal_models(CONFIG)["X"]
+STD = np.array([0.003 * value for value in NOMINAL.as_dict().values()])
+
+
+def published(axis: str, revision: int, **changed: float) -> ParameterSet:
+    """A set with some values other than nominal, known to 0.3 %."""
+    values = replace(NOMINAL, **changed)
+    return ParameterSet(axis, revision, values, frozen(np.diag(STD**2)), 3, 0, None, "digest")
+
+
+def with_lines(reference: Trajectory) -> Trajectory:
+    """The reference as a program of one line per 100 ms would give it."""
+    return replace(reference, line=frozen_ints(1 + np.arange(reference.time_s.size) // 100))
+
+
+def test_a_fixture_costs_what_the_prediction_without_it_says() -> None:
+    """Jt + 13 % on X: the largest rise of the contour error, at its line; Y has not changed."""
+    reference = with_lines(bench_trajectory(10))
+    now = {"X": published("X", 4, Jt=0.085), "Y": published("Y", 9)}
+    earlier = {"X": published("X", 3), "Y": published("Y", 8)}
+    models = {axis: known.parameters for axis, known in now.items()}
+    predicted = predict(reference, models, CONFIG)
+    (step,) = step_costs(predicted, models, earlier, now, CONFIG)
+    assert (step.axis, step.what, step.since_revision) == ("X", "inertia", 3)
+    assert step.changed == {"Jt": (0.075, 0.085)}
+    rise = predicted.contour_um - predict(reference, {"X": NOMINAL, "Y": NOMINAL}, CONFIG).contour_um
+    assert step.cost_um == pytest.approx(float(rise.max()))
+    assert step.cost_um > 5
+    assert step.line == reference.line[int(np.argmax(rise))]
+
+
+def test_a_change_to_the_better_saves() -> None:
+    """Friction that falls costs at the stops; where it rises again the same is saved. ft and Cd go together."""
+    reference = bench_trajectory(10)
+    low, usual = {"X": published("X", 2, ft=0.01, Cd=1.0)}, {"X": published("X", 1)}
+    costs = []
+    for earlier, now in ((usual, low), (low, usual)):
+        models = {"X": now["X"].parameters, "Y": NOMINAL}
+        (step,) = step_costs(predict(reference, models, CONFIG), models, earlier, now, CONFIG)
+        assert step.what == "friction"
+        assert set(step.changed) == {"ft", "Cd"}
+        assert step.line == 0
+        costs.append(step.cost_um)
+    assert costs[0] > 5
+    assert costs[1] == pytest.approx(-costs[0])
+
+
+def test_the_last_step_is_found_and_drift_is_none() -> None:
+    """The newest jump between two revisions that is still there."""
+    course = [0.075, 0.0752, 0.0751, 0.085, 0.0851]
+    assert last_step([published("X", k, Jt=jt) for k, jt in enumerate(course)]) == 2
+    assert last_step([published("X", k, Jt=0.075 + 0.0005 * k) for k in range(9)]) is None
+    assert last_step([published("X", k, Jt=jt) for k, jt in enumerate([0.075, 0.085, 0.0752])]) == 1
+    assert last_step([]) is None
+
+
+def test_the_day_on_which_a_zone_leaves_the_tolerance() -> None:
+    """Jt rises by 0.1 % a day: the prediction with the parameters of that day is at the tolerance."""
+    reference = bench_trajectory(10)
+    days = np.arange(-20.0, 1.0)
+    random = np.random.default_rng(3)
+    sets = [published("Y", k, Jt=0.075 * (1 + 0.001 * day) + random.normal(0, 3e-5)) for k, day in enumerate(days)]
+    slopes = {"Y": {"Jt": slopes_per_day(sets, days)["Jt"]}}
+    models = {"X": NOMINAL, "Y": NOMINAL}
+    predicted = predict(reference, models, CONFIG)
+    k = next(k for k, zone in enumerate(predicted.zones) if zone.cause == "corner")
+    zone, told = predicted.zones[k], sensitivity_um(predicted, models, CONFIG)[k]
+    tolerance = zone.max_um + 4.0
+    found = crossing(zone, told, models, slopes, tolerance)
+    assert found is not None
+    assert (found.axis, found.parameter) == ("Y", "Jt")
+    assert found.earliest_days < found.days < found.latest_days
+    then = replace(NOMINAL, Jt=0.075 * (1 + 0.001 * found.days))
+    rows = (reference.time_s >= zone.start_s) & (reference.time_s < zone.end_s)
+    error = predict(reference, {"X": NOMINAL, "Y": then}, CONFIG).contour_um[rows].max()
+    assert error == pytest.approx(tolerance, abs=0.5)
+
+
+def test_what_may_stand_still_is_not_foreseen() -> None:
+    """No slope beyond chance, or one to the better: no day."""
+    reference = bench_trajectory(10)
+    models = {"X": NOMINAL, "Y": NOMINAL}
+    predicted = predict(reference, models, CONFIG)
+    k = next(k for k, zone in enumerate(predicted.zones) if zone.cause == "corner")
+    zone, told = predicted.zones[k], sensitivity_um(predicted, models, CONFIG)[k]
+    days = np.arange(-9.0, 1.0)
+    for course in (np.zeros(10), -0.001 * days):
+        sets = [published("Y", n, Jt=0.075 * (1 + rise)) for n, rise in enumerate(course)]
+        slopes = {"Y": {"Jt": slopes_per_day(sets, days)["Jt"]}}
+        rising = told["Y"]["Jt"] * slopes["Y"]["Jt"].value > 0 and course.any()
+        assert (crossing(zone, told, models, slopes, zone.max_um + 4.0) is not None) == rising
+
+
+def test_slopes_begin_behind_the_last_step() -> None:
+    """A step is not a slope."""
+    course = [0.075] * 6 + [0.085] * 6
+    slopes = slopes_per_day([published("X", k, Jt=jt) for k, jt in enumerate(course)], np.arange(12.0))
+    assert abs(slopes["Jt"].value) < 1e-9
+    assert set(slopes) == set(PARAMETERS)
+
+
+def test_a_parameter_set_without_covariance_still_has_steps() -> None:
+    """NaN covariance counts as known exactly."""
+    unknown = frozen(np.full((6, 6), np.nan))
+    before, after = (replace(published("X", k, Jt=jt), covariance=unknown) for k, jt in ((1, 0.075), (2, 0.085)))
+    assert last_step([before, after]) == 0
+    assert isinstance(before.parameters, Parameters)

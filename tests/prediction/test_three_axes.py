@@ -1,0 +1,86 @@
+"""X, Y and Z end to end: a program, its prediction, and its correction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil.correction import plan as plan_correction
+from fdhil.prediction import contour_error_um, contour_std_um, predict, sensitivity_um
+from fdhil.prediction.models import nominal_models
+from fdhil.program import Budget, interpret
+from fdhil.program import plan as plan_program
+from fdhil.records import Correction, Trajectory
+from tests.bench import bench_config
+from tests.paths import rms
+
+CONFIG = bench_config("XYZ")
+MODELS = nominal_models(CONFIG)
+# a ramp into the work, a helix, a corner in space, and the way up
+PROGRAM = """
+G21 G17 G90 G64 F8000
+G1 X30 Y10 Z-5
+G1 X60 Y40 Z-5
+G2 X60 Y80 I0 J20 Z-25
+G1 X20 Y80 Z-10
+G1 Z10
+M2
+""".splitlines()
+
+
+@pytest.fixture(scope="module", name="reference")
+def _reference() -> Trajectory:
+    """The program as the NC orders it."""
+    return plan_program(interpret(PROGRAM, Budget.of(CONFIG.nc)), CONFIG)
+
+
+@pytest.fixture(scope="module", name="correction")
+def _correction(reference: Trajectory) -> Correction:
+    """Its correction."""
+    return plan_correction(reference, MODELS, CONFIG)
+
+
+def test_all_axes_move_and_count(reference: Trajectory, correction: Correction) -> None:
+    """The contour error is the distance in space: more than that of any plane, less than that of the axes together."""
+    assert reference.axes == ("X", "Y", "Z")
+    before = correction.before
+    space = np.column_stack([before.predicted_mm[axis] for axis in "XYZ"])
+    path = np.column_stack([reference.position_mm[axis] for axis in "XYZ"])
+    plane = contour_error_um(path[:, :2], space[:, :2], 0.001)
+    together = np.sqrt(sum(before.error_um[axis] ** 2 for axis in "XYZ"))
+    assert (before.contour_um <= together + 1e-6).all()
+    assert before.contour_um.max() > 1.05 * plane.max()
+    assert {zone.cause for zone in before.zones} >= {"corner", "reversal"}
+    assert all("Z " in zone.where for zone in before.zones)
+
+
+def test_the_correction_corrects_all_of_them(correction: Correction) -> None:
+    """60 times smaller on the model, within the limits on all three axes, also where Z alone drifted."""
+    assert correction.refused == ()
+    assert all(np.abs(correction.offset_um[axis]).max() > 5 for axis in "XYZ")
+    assert rms(correction.before.contour_um) > 60 * rms(correction.after.contour_um)
+    reference = correction.before.reference
+    drifted = MODELS | {"Z": replace(MODELS["Z"], Jt=0.085)}
+    again = plan_correction(reference, drifted, CONFIG)
+    assert again.before.contour_um.max() > correction.before.contour_um.max()
+    assert rms(again.before.contour_um) > 60 * rms(again.after.contour_um)
+
+
+def test_uncertainty_and_sensitivity_know_the_third_axis(reference: Trajectory, correction: Correction) -> None:
+    """A covariance of Z alone makes the last stretch uncertain, where Z alone moves away; its inertia drives it."""
+    values = np.array(list(MODELS["Z"].as_dict().values()))
+    known = np.zeros((6, 6))
+    std = contour_std_um(reference, MODELS, {"X": known, "Y": known, "Z": np.diag((0.01 * values) ** 2)}, CONFIG)
+    assert std.max() > 0.3
+    told = sensitivity_um(correction.before, MODELS, CONFIG)
+    assert max(abs(per_axis["Z"]["Jt"]) for per_axis in told) > 0.2
+
+
+def test_prediction_needs_no_rotation_of_axes(reference: Trajectory) -> None:
+    """Equal drives: with the axes exchanged the errors are exchanged, the contour error stays."""
+    turned = replace(reference, position_mm={a: reference.position_mm[b] for a, b in zip("XYZ", "YZX", strict=True)})
+    one, other = predict(reference, MODELS, CONFIG), predict(turned, MODELS, CONFIG)
+    assert np.array_equal(one.error_um["Y"], other.error_um["X"])
+    assert np.allclose(one.contour_um, other.contour_um, atol=1e-9)
