@@ -14,6 +14,7 @@ from pathlib import Path
 
 from fdhil.cli.demo import loop
 from fdhil.cli.demo.processes import Process, Twin
+from fdhil.cli.demo.toml import to_toml
 from fdhil.daemon.control import SOCKET_NAME, ask
 from fdhil.errors import FdhilError
 
@@ -33,12 +34,12 @@ def main() -> None:
         out = Path(folder)
         document = tomllib.loads(Path(loop.__file__).with_name("machine.toml").read_text("utf-8"))
         document["sim"]["pace"] = "realtime"
-        (out / "twin.toml").write_text(loop.to_toml(document), "utf-8")
+        (out / "twin.toml").write_text(to_toml(document), "utf-8")
         (out / "shuttle.ngc").write_text(PROGRAM, "utf-8")
         with Twin(out / "twin.toml", out / "twin.log") as twin:
             place = twin.ready["buses"]["can0"]
             document["bus"] = {"can0": {"interface": "socketcand", "port": place["port"]}}
-            (out / "machine.toml").write_text(loop.to_toml(document), "utf-8")
+            (out / "machine.toml").write_text(to_toml(document), "utf-8")
             with Process("daemon", ["fdhil", "run", str(out / "machine.toml")], out / "daemon.log") as daemon:
                 _measure(twin, daemon, out, seconds)
 

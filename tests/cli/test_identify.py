@@ -12,6 +12,7 @@ from click.testing import CliRunner, Result
 from fdhil.cli.identify import identify
 from fdhil.cli.main import cli, run_safely
 from studies import bench
+from tests.bench import bench_toml
 from tests.identification.recorded import signals
 
 
@@ -95,23 +96,7 @@ def test_config_gives_the_rapid_speed(shuttle: Path, tmp_path: Path) -> None:
 
 
 def _config(rapid: float) -> str:
-    return f"""
-[machine]
-name = "bench"
-[axis.X]
-screw_pitch_mm = 20.0
-rapid_speed_mm_s = {rapid}
-max_acceleration_mm_s2 = 4000.0
-nominal = {{ R = 0.5, L = 0.005, K = 0.8, Jt = 0.075, ft = 0.05, Cd = 5.0 }}
-[axis.X.regulators]
-position_gain_per_s = 50.0
-speed_kp = 23.562
-speed_ki = 1184.35
-current_limit_a = 200.0
-current_kp = 12.566
-current_ki = 1256.64
-voltage_limit_v = 300.0
-"""
+    return bench_toml("X", rapid_speed_mm_s=rapid)
 
 
 def test_unreadable_recording_is_exit_3_in_one_sentence(

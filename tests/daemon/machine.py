@@ -16,30 +16,14 @@ from fdhil.daemon.warm import nominal_rapid
 from fdhil.errors import ConnectError
 from fdhil.pipeline import Record
 from fdhil.records import AxisSamples, MoveEvent, MoveKind, Notice, TickTimes, frozen, frozen_ints
+from tests.bench import AXIS, bench_axis
 
-NOMINAL = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
-REGULATORS = {
-    "position_gain_per_s": 50.0,
-    "speed_kp": 23.562,
-    "speed_ki": 1184.35,
-    "current_limit_a": 200.0,
-    "current_kp": 12.566,
-    "current_ki": 1256.64,
-    "voltage_limit_v": 300.0,
-}
-AXIS = {
-    "screw_pitch_mm": 20.0,
-    "rapid_speed_mm_s": 500.0,
-    "max_acceleration_mm_s2": 4000.0,
-    "nominal": NOMINAL,
-    "regulators": REGULATORS,
-    "correction": {"max_offset_um": 250.0, "max_speed_mm_s": 20.0, "max_acceleration_mm_s2": 2000.0},
-}
+NOMINAL = AXIS["nominal"]
 
 
 def config_of(folder: Path, axes: Sequence[str] = ("X",), **sections: Any) -> MachineConfig:
     """Return the bench's configuration with its store in ``folder``."""
-    document = {"machine": {"name": "bench"}, "axis": dict.fromkeys(axes, AXIS), **sections}
+    document = {"machine": {"name": "bench"}, "axis": dict.fromkeys(axes, bench_axis()), **sections}
     return machine_config.parse(document, "test", folder)
 
 

@@ -17,6 +17,7 @@ from fdhil.cli.main import cli, run_safely
 from fdhil.config import MachineConfig
 from fdhil.daemon.control import ask
 from fdhil.errors import ConnectError
+from tests.bench import axis_toml
 
 REAL = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.085, "ft": 0.05, "Cd": 5.0}
 SHUTTLE = "G21 G90 G94\n" + "G0 X300 Y300\nG4 P0.4\nG0 X0 Y0\nG4 P0.4\n" * 2 + "M2\n"
@@ -29,33 +30,7 @@ clock = "sync"
 [sim]
 pace = "lockstep"
 """
-AXIS = """
-[axis.X]
-screw_pitch_mm = 20.0
-rapid_speed_mm_s = 500.0
-max_acceleration_mm_s2 = 4000.0
-[axis.X.nominal]
-R = 0.5
-L = 0.005
-K = 0.8
-Jt = 0.075
-ft = 0.05
-Cd = 5.0
-[axis.X.regulators]
-position_gain_per_s = 50.0
-speed_kp = 23.562
-speed_ki = 1184.35
-current_limit_a = 200.0
-current_kp = 12.566
-current_ki = 1256.64
-voltage_limit_v = 300.0
-[axis.X.correction]
-max_offset_um = 250.0
-max_speed_mm_s = 20.0
-max_acceleration_mm_s2 = 2000.0
-[sim.axis.X]
-Jt = 0.085
-"""
+AXIS = axis_toml("X") + "[sim.axis.X]\nJt = 0.085\n"
 BENCH = HEAD + AXIS + AXIS.replace(".X", ".Y")
 
 

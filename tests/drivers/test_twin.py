@@ -18,25 +18,8 @@ from fdhil.drivers import MachineSource, Record, commissioning, commissioning_ch
 from fdhil.drivers.commissioning import commission
 from fdhil.errors import ConnectError, DriveFault, ProtocolError
 from fdhil.records import AxisSamples, MoveEvent, MoveKind, Notice, Temperature, VoltageSamples
+from tests.bench import bench_toml
 from tests.drivers.wire import machine
-
-TOML = """
-[machine]
-name = "bench"
-[axis.X]
-screw_pitch_mm = 20.0
-rapid_speed_mm_s = 500.0
-max_acceleration_mm_s2 = 4000.0
-nominal = { R = 0.5, L = 0.005, K = 0.8, Jt = 0.075, ft = 0.05, Cd = 5.0 }
-[axis.X.regulators]
-position_gain_per_s = 50.0
-speed_kp = 23.562
-speed_ki = 1184.35
-current_limit_a = 200.0
-current_kp = 12.566
-current_ki = 1256.64
-voltage_limit_v = 300.0
-"""
 
 
 class Twin:
@@ -44,7 +27,7 @@ class Twin:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        (folder / "bench.toml").write_text(TOML)
+        (folder / "bench.toml").write_text(bench_toml("X", corrected=False))
         command = [sys.executable, "-m", "fdhil.cli.main", "sim", str(folder / "bench.toml"), "--json"]
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=folder)
         self.ready = self.event("ready")

@@ -11,19 +11,9 @@ import numpy as np
 
 from fdhil.config import MachineConfig, parse
 from fdhil.drivers.frames import Frames, frames_of
+from tests.bench import bench_axis
 
 Row = tuple[int, int, bytes]
-
-NOMINAL = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
-REGULATORS = {
-    "position_gain_per_s": 50.0,
-    "speed_kp": 23.562,
-    "speed_ki": 1184.35,
-    "current_limit_a": 200.0,
-    "current_kp": 12.566,
-    "current_ki": 1256.64,
-    "voltage_limit_v": 300.0,
-}
 
 
 def machine(
@@ -33,14 +23,7 @@ def machine(
     per_axis: dict[str, object] = {
         key: sections.pop(key) for key in ("drive", "voltage", "correction") if key in sections
     }
-    axis: dict[str, object] = {
-        "screw_pitch_mm": 20.0,
-        "rapid_speed_mm_s": 500.0,
-        "max_acceleration_mm_s2": 4000.0,
-        "nominal": NOMINAL,
-        "regulators": REGULATORS,
-        **per_axis,
-    }
+    axis = bench_axis(corrected=False, **per_axis)
     document = {
         "machine": {"name": "bench"},
         "axis": dict.fromkeys(axes, axis),

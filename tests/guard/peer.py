@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from tests.bench import bench_toml
 from tests.guard.machine import Drive, Frame
 
 ANSWER_S = 0.3
@@ -144,52 +145,9 @@ class Peer(threading.Thread):
             time.sleep(0.002)
 
 
-MACHINE = """
-[machine]
-name = "bench"
-sync_period_s = 0.001
-{axes}
-[bus.can0]
-interface = "socketcand"
-host = "127.0.0.1"
-port = {port}
-[guard]
-clock = "{clock}"
-"""
-AXIS = """
-[axis.{name}]
-screw_pitch_mm = 20.0
-rapid_speed_mm_s = 500.0
-max_acceleration_mm_s2 = 4000.0
-[axis.{name}.nominal]
-R = 0.5
-L = 0.005
-K = 0.8
-Jt = 0.075
-ft = 0.05
-Cd = 5.0
-[axis.{name}.regulators]
-position_gain_per_s = 50.0
-speed_kp = 23.562
-speed_ki = 1184.35
-current_limit_a = 200.0
-current_kp = 12.566
-current_ki = 1256.64
-voltage_limit_v = 300.0
-{correction}
-"""
-CORRECTION = """[axis.{name}.correction]
-max_offset_um = 250.0
-max_speed_mm_s = 20.0
-max_acceleration_mm_s2 = 2000.0
-"""
-
-
 def write_config(folder: Path, port: int, clock: str = "sync", axes: str = "XY", corrected: bool = True) -> Path:
     """A machine config of the bench whose bus is on ``port``."""
-    text = "".join(
-        AXIS.format(name=name, correction=CORRECTION.format(name=name) if corrected else "") for name in axes
-    )
+    bus = f'[bus.can0]\ninterface = "socketcand"\nhost = "127.0.0.1"\nport = {port}\n[guard]\nclock = "{clock}"\n'
     file = folder / "machine.toml"
-    file.write_text(MACHINE.format(axes=text, port=port, clock=clock), "utf-8")
+    file.write_text(bench_toml(axes, corrected) + bus, "utf-8")
     return file

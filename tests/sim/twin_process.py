@@ -15,33 +15,17 @@ from typing import Any
 
 import can
 
+from tests.bench import axis_toml, bench_toml
+
 COMMAND = [sys.executable, "-m", "fdhil.cli.main", "sim"]
 PATIENCE_S = 60.0
-
-_AXIS = """
-[axis.{name}]
-screw_pitch_mm = 20.0
-rapid_speed_mm_s = 500.0
-max_acceleration_mm_s2 = 4000.0
-nominal = {{ R = 0.5, L = 0.005, K = 0.8, Jt = 0.075, ft = 0.05, Cd = 5.0 }}
-[axis.{name}.regulators]
-position_gain_per_s = 50.0
-speed_feedforward = 1.0
-speed_kp = 23.562
-speed_ki = 1184.35
-current_limit_a = 200.0
-current_kp = 12.566
-current_ki = 1256.64
-voltage_limit_v = 300.0
-[axis.{name}.voltage]
-{voltage}
-"""
 
 
 def write_config(folder: Path, sim: str = "", bus: str = "", axes: str = "XY", voltage: str = "") -> Path:
     """Write the bench's configuration with lines for [sim], [bus.can0] and [axis.*.voltage]; return its path."""
-    head = '[machine]\nname = "bench"\nsync_period_s = 0.001\n'
-    text = head + "".join(_AXIS.format(name=name, voltage=voltage) for name in axes)
+    text = bench_toml("", corrected=False)
+    for name in axes:
+        text += axis_toml(name, corrected=False) + f"[axis.{name}.voltage]\n{voltage}\n"
     path = folder / "machine.toml"
     path.write_text(f"{text}[bus.can0]\n{bus}\n[sim]\n{sim}\n")
     return path

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import time
 import tomllib
@@ -17,6 +16,7 @@ import numpy as np
 from fdhil import config as machine_config
 from fdhil.cli.demo.processes import Process, Twin
 from fdhil.cli.demo.report import Cut, Loop, Published
+from fdhil.cli.demo.toml import to_toml
 from fdhil.config import MachineConfig
 from fdhil.daemon.control import SOCKET_NAME, ask
 from fdhil.drivers.commissioning import commission
@@ -94,17 +94,6 @@ def _start_twin(out: Path, realtime: bool, say: Say, stack: ExitStack) -> Stage:
     folder = source.parent
     programs = {label: folder / name for label, name in PROGRAMS.items()}
     return Stage(out, machine_config.load(out / "machine.toml"), twin, say, programs)
-
-
-def to_toml(document: Mapping[str, Any], path: str = "") -> str:
-    """Write a document of nested tables of plain values; enough for the demonstration's own file."""
-    plain = {key: value for key, value in document.items() if not isinstance(value, Mapping)}
-    lines = [f"[{path}]"] if path and plain else []
-    lines += [f"{key} = {json.dumps(value)}" for key, value in plain.items()]
-    for key, value in document.items():
-        if isinstance(value, Mapping):
-            lines.append(to_toml(value, f"{path}.{key}" if path else key))
-    return "\n".join(lines) + "\n"
 
 
 def _daemon(name: str, arguments: list[str], out: Path) -> Process:

@@ -1,0 +1,18 @@
+"""A machine's configuration as the text of a file: nested tables of plain values."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+
+def to_toml(document: Mapping[str, Any], path: str = "") -> str:
+    """Return a document of nested tables of plain values, below the table ``path``, as TOML."""
+    plain = {key: value for key, value in document.items() if not isinstance(value, Mapping)}
+    lines = [f"[{path}]"] if path and plain else []
+    lines += [f"{key} = {json.dumps(value)}" for key, value in plain.items()]
+    for key, value in document.items():
+        if isinstance(value, Mapping):
+            lines.append(to_toml(value, f"{path}.{key}" if path else key))
+    return "\n".join(lines) + "\n"
