@@ -17,7 +17,7 @@ from fdhil.program.planner.pieces import ACCELERATION, BLENDS, JERK, LENGTH, SPE
 from fdhil.records import Float
 
 ARC_SHARE = 0.866  # of the acceleration that turns; half of it is left along the path, as in LinuxCNC's planner
-_BLEND_SHARE = 0.9
+_BLEND_SHARE = 0.9  # of the acceleration that a corner may take, so that some is left to pass it
 _JERK_SHARE = 0.5  # of the jerk that turning may take
 _UNLIMITED = 1e12
 
@@ -83,11 +83,11 @@ class CornerRules:
         half = np.where(blend, np.minimum(room, self._needed(turn, wanted)), 1.0)
         speed = np.minimum(wanted, self._speed(turn, half))
         blend &= speed > sharp
-        along = self._along(turn, half, speed)
+        through = np.minimum(wanted, sharp)
         return Corners(
             np.where(blend, half, 0.0),
-            np.where(blend, speed, np.minimum(wanted, sharp)),
-            np.where(blend, along, _UNLIMITED),
+            np.where(blend, speed, through),
+            np.where(blend, self._along(turn, half, speed), self._sharp_along(turn, through)),
         )
 
     def _turn(self, pieces: Float) -> _Turn:
@@ -121,9 +121,17 @@ class CornerRules:
         """Speed at which the corner needs no rounding: its step fits into one period of the limits."""
         if not self._filter_s:
             step = turn.kink_by_acceleration / self._dt_s
-            return np.asarray(2.0 / (step + np.sqrt(step**2 + 4.0 * turn.curve_by_acceleration)))
+            root = np.sqrt(step**2 + 4.0 * _BLEND_SHARE * turn.curve_by_acceleration)
+            return np.asarray(2.0 * _BLEND_SHARE / (step + root))
         step = self._dt_s**2 / turn.kink_by_jerk
         return np.minimum(step, np.sqrt(self._dt_s / turn.jump_by_jerk))
+
+    def _sharp_along(self, turn: _Turn, speed: Float) -> Float:
+        """Acceleration along the path that a sharp corner's step leaves over."""
+        if self._filter_s:
+            return np.full(speed.size, _UNLIMITED)
+        used = speed * turn.kink_by_acceleration / self._dt_s + speed**2 * turn.curve_by_acceleration
+        return np.asarray(np.maximum(1.0 - used, 1.0 - _BLEND_SHARE) / turn.along_by_acceleration)
 
     def _within(self, turn: _Turn, tolerance_mm: Float) -> Float:
         """Largest half length that stays within the tolerance: d kink (1/4 or 3/16) + d2 curvature / 16 at most."""

@@ -1,0 +1,115 @@
+"""LinuxCNC as a whole, headless: the demand that its trajectory planner orders each millisecond for a program."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from fdhil.records import Float
+
+HERE = Path(__file__).parent
+_NOBODY = 65534
+_AXIS = """
+[AXIS_{letter}]
+MAX_VELOCITY = {speed}
+MAX_ACCELERATION = {acceleration}
+MIN_LIMIT = -1000
+MAX_LIMIT = 1000
+[JOINT_{number}]
+TYPE = LINEAR
+HOME = 0
+HOME_SEARCH_VEL = 0
+HOME_LATCH_VEL = 0
+MAX_VELOCITY = {speed}
+MAX_ACCELERATION = {acceleration}
+MIN_LIMIT = -1000
+MAX_LIMIT = 1000
+FERROR = 10
+MIN_FERROR = 10
+"""
+_MACHINE = """
+[EMC]
+VERSION = 1.1
+MACHINE = bench
+[DISPLAY]
+DISPLAY = {folder}/nobody_at_the_panel.py
+PROGRAM_PREFIX = {folder}
+[TASK]
+TASK = milltask
+CYCLE_TIME = 0.001
+[RS274NGC]
+PARAMETER_FILE = {folder}/machine.var
+[EMCMOT]
+EMCMOT = motmod
+COMM_TIMEOUT = 1.0
+SERVO_PERIOD = 1000000
+[EMCIO]
+EMCIO = io
+CYCLE_TIME = 0.1
+TOOL_TABLE = {folder}/machine.tbl
+[HAL]
+HALFILE = machine.hal
+[KINS]
+KINEMATICS = trivkins coordinates=xyz
+JOINTS = 3
+[TRAJ]
+COORDINATES = X Y Z
+LINEAR_UNITS = mm
+ANGULAR_UNITS = degree
+NO_FORCE_HOMING = 1
+DEFAULT_LINEAR_VELOCITY = {speed}
+MAX_LINEAR_VELOCITY = 2000
+DEFAULT_LINEAR_ACCELERATION = {acceleration}
+MAX_LINEAR_ACCELERATION = {acceleration}
+"""
+
+
+def demand(program: str, speed_mm_s: float = 500.0, acceleration_mm_s2: float = 2000.0) -> Float:
+    """Return the commanded X, Y, Z (n, 3) in mm of each servo cycle of a program, from its first motion to its last.
+
+    AssertionError with LinuxCNC's own words when it did not run, or a cycle was not recorded.
+    """
+    with tempfile.TemporaryDirectory(prefix="fdhil-linuxcnc-") as name:
+        folder = Path(name)
+        _write(folder, program, speed_mm_s, acceleration_mm_s2)
+        command = ["linuxcnc", str(folder / "machine.ini")]
+        if os.geteuid() == 0:  # it refuses to run as root
+            for path in (folder, *folder.iterdir()):
+                os.chown(path, _NOBODY, _NOBODY)
+            command = ["setpriv", f"--reuid={_NOBODY}", f"--regid={_NOBODY}", "--clear-groups", *command]
+        environment = os.environ | {
+            "HOME": name, "PROGRAM": str(folder / "program.ngc"), "DEMAND": str(folder / "demand.txt"),
+        }  # fmt: skip
+        environment.pop("DISPLAY", None)
+        done = subprocess.run(
+            command, cwd=folder, env=environment, capture_output=True, text=True, timeout=120, check=False
+        )
+        recorded = folder / "demand.txt"
+        assert recorded.exists(), f"LinuxCNC did not run:\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
+        lines = [line.split() for line in recorded.read_text().splitlines()]
+        assert not any("overrun" in line for line in lines), "the sampler lost cycles; the computer is overloaded"
+    table = np.array([[float(word) for word in line] for line in lines if len(line) == 4])
+    assert (np.diff(table[:, 0]) == 1).all(), "a cycle is missing in the recorded demand"
+    moving = np.flatnonzero(np.abs(np.diff(table[:, 1:], axis=0)).max(axis=1) > 0.0)
+    assert moving.size, f"nothing moved:\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
+    return np.asarray(table[moving[0] : moving[-1] + 2, 1:])
+
+
+def _write(folder: Path, program: str, speed_mm_s: float, acceleration_mm_s2: float) -> None:
+    for file in ("nobody_at_the_panel.py", "machine.hal"):
+        shutil.copy(HERE / file, folder)
+    (folder / "nobody_at_the_panel.py").chmod(0o755)
+    ini = _MACHINE.format(folder=folder, speed=speed_mm_s, acceleration=acceleration_mm_s2)
+    ini += "".join(
+        _AXIS.format(letter=letter, number=number, speed=speed_mm_s, acceleration=acceleration_mm_s2)
+        for number, letter in enumerate("XYZ")
+    )
+    (folder / "machine.ini").write_text(ini)
+    (folder / "machine.tbl").touch()
+    (folder / "machine.var").touch()
+    (folder / "program.ngc").write_text(program)
