@@ -19,7 +19,7 @@ _READERS: Mapping[str, tuple[frozenset[int], frozenset[int], str]] = {
     "i": (frozenset({20, 30, 50, 51, 100, 331, 760, 870}) | _LATHE, frozenset(), "G2, G3, G5 or G76"),
     "j": (frozenset({20, 30, 50, 51, 100, 331, 760, 870}), frozenset(), "G2, G3, G5 or G76"),
     "k": (frozenset({20, 30, 330, 331, 760, 870}), frozenset(), "G2, G3, G33 or G76"),
-    "l": ((CYCLES - {740}) | _COMPENSATION | {52, 100, 760}, frozenset({66, 98}), "G10, a cycle, M66 or M98"),
+    "l": ((CYCLES - {740}) | (_COMPENSATION - {400}) | {52, 100, 760}, frozenset({66, 98}), "G10, a cycle, M66 or M98"),
     "p": (frozenset({20, 30, 40, 50, 52, 100, 640, 700, 760, 820, 840, 740, 860, 880, 890}),
           frozenset({50, 51, 52, 53, 62, 63, 64, 65, 66, 98, 19}), "G2, G3, G4, G10, G64, G82, G86, G89 or M50 to M66"),
     "q": (frozenset({50, 100, 640, 730, 760, 830}) | _LATHE,

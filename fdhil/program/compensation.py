@@ -17,6 +17,7 @@ from fdhil.program.words import Block
 Vector = tuple[float, float]
 _TANGENT_RAD = 0.05  # flatter corners are passed as if the path were smooth
 _BACKWARDS_MM = 1e-6
+_TIPS = {1: (1, -1), 2: (-1, -1), 3: (-1, 1), 4: (1, 1), 5: (1, 0), 6: (0, -1), 7: (-1, 0), 8: (0, 1)}
 _WRAPPED_RAD = 0.3  # an arc that turns so much more than programmed was cut beyond its other end
 
 
@@ -40,6 +41,7 @@ class Piece:
     turns: int = 0
     angle: float = 0.0  # what an arc may turn at most before it is cut at its ends
     waiting: list[Waiting] = field(default_factory=list)
+    given: bool = False  # its motion was ordered already
 
     @property
     def radius(self) -> float:
@@ -60,10 +62,14 @@ class Waiting:
 
 @dataclass(slots=True)
 class Compensation:
-    """Compensation by ``radius_mm`` on one ``side`` (1 left, -1 right) of the path."""
+    """Compensation by ``radius_mm`` on one ``side`` (1 left, -1 right) of the path.
+
+    ``orientation`` 1 to 8 tells where the tip of a turning tool lies about the centre of its nose.
+    """
 
     radius_mm: float
     side: int
+    orientation: int = 0
     entered: bool = False
     pending: Piece | None = None
 
@@ -87,7 +93,7 @@ class Compensation:
         sense = 1 if turns > 0 else -1
         near, far = math.dist(start, centre), math.dist(corner, centre)
         inward = self.side * sense * self.radius_mm
-        if min(near, far) - inward <= 0.0 or (not self.entered and far <= self.radius_mm):
+        if min(near, far) - inward <= 0.0 or (not self.entered and far < self.radius_mm):
             raise ProgramError(block.line, "G2" if turns < 0 else "G3", "the arc's radius must exceed the tool's")
         end = _toward(centre, corner, far - inward)
         heading, leaving = _tangent(centre, start, sense), _tangent(centre, corner, sense)
@@ -104,6 +110,20 @@ class Compensation:
         self.pending.waiting.append(waiting)
         return True
 
+    @property
+    def tip(self) -> Vector:
+        """Where the tool's tip lies from the centre of its nose (z, x) in mm."""
+        z, x = _TIPS.get(self.orientation, (0, 0))
+        return z * self.radius_mm, x * self.radius_mm
+
+    def settle(self) -> list[Piece]:
+        """Return what is pending as it is now: the machine stops there, but the next corner is still cut or rounded."""
+        if self.pending is None or self.pending.given:
+            return []
+        piece = replace(self.pending, waiting=[])
+        self.pending.given = True
+        return [piece]
+
     def flush(self) -> list[Piece]:
         """Return what is pending: no further motion will change it."""
         last, self.pending = self.pending, None
@@ -118,7 +138,7 @@ class Compensation:
             return []
         turn = self._turn(before, piece)
         settled = [before]
-        if turn < -_TANGENT_RAD:
+        if turn < -_TANGENT_RAD and self.radius_mm > 0.0:
             settled.append(self._round(before, piece))
         elif turn > _TANGENT_RAD:
             before.end = piece.start = _crossing(before, piece, self.radius_mm, self.side)

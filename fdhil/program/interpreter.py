@@ -217,6 +217,10 @@ class Interpreter:
 
     def _execute(self, block: Block) -> None:
         machine, modal = self._machine, self._machine.modal
+        if machine.compensation is not None:
+            modes.check_compensated(modal, block)
+            if "stop" in block.m or "tool" in block.m:
+                machine.settle()
         one_reader_of_axes(block)
         check_readers(block, _motion_of(modal, block))
         modes.set_feed(modal, block)
@@ -259,8 +263,6 @@ class Interpreter:
 
     def _coordinates(self, block: Block) -> None:
         modal, g = self._machine.modal, block.g
-        if self._machine.compensation is not None:
-            modes.check_compensated(modal, block)
         if "cutter compensation" in g:
             self._compensate(block, g["cutter compensation"])
         if "tool length" in g:
@@ -290,7 +292,7 @@ class Interpreter:
             raise ProgramError(block.line, f"G{code / 10:g}", "wants the tool's diameter as D")
         radius = diameter / 2.0 * modal.scale
         side = (1 if code in (410, 411) else -1) * (1 if radius >= 0.0 else -1)
-        machine.start_compensation(Compensation(abs(radius), side))
+        machine.start_compensation(Compensation(abs(radius), side, _orientation(modal, block)))
 
     def _set(self, block: Block) -> bool:
         """Do a one-shot code; True when one was done that uses the axis words."""
@@ -399,6 +401,14 @@ class Interpreter:
 def unknown(block: Block, code: int) -> ProgramError:
     """Return the error for a G code (times ten) that fdhil does not know."""
     return ProgramError(block.line, f"G{code / 10:g}", "is a G code that fdhil does not know; see the list of codes")
+
+
+def _orientation(modal: Modal, block: Block) -> int:
+    """Return L of G41.1 and G42.1: where the tip of a turning tool lies about the centre of its nose."""
+    value = block.words.get("l", 0.0)
+    if value < 0.0 or abs(value - round(value)) > 1e-4 or (value and modal.plane != 1):
+        raise block.fault("l", "is no orientation of a turning tool; L must be 0 to 9, in the XZ plane (G18)")
+    return round(value)
 
 
 def _axis_letter(block: Block) -> str | None:

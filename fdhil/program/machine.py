@@ -64,6 +64,11 @@ class Machine:
         """Turn cutter compensation on."""
         self.compensation = compensation
 
+    def settle(self) -> None:
+        """Order what waits for the next corner, since the machine stops here (M0, M1, M60)."""
+        if self.compensation is not None:
+            self._give(self.compensation.settle())
+
     def end_compensation(self) -> None:
         """Turn cutter compensation off (G40, program end) and order what waits."""
         if self.compensation is not None:
@@ -93,11 +98,18 @@ class Machine:
     def _give(self, pieces: list[Piece]) -> None:
         """Order compensated pieces and what waited for their ends."""
         first, second, _ = PLANE_AXES[self.modal.plane_name]
+        tip = self.compensation.tip if self.compensation is not None else (0.0, 0.0)
+
+        def shifted(place: tuple[float, float]) -> tuple[float, float]:
+            return place[0] + tip[0], place[1] + tip[1]
+
         for piece in pieces:
             end = list(piece.whole)
-            end[first], end[second] = piece.end
-            if piece.centre is not None and piece.feed is not None:
-                self._arc(piece.block, end, piece.centre, piece.turns, piece.feed)
+            end[first], end[second] = shifted(piece.end)
+            if piece.given:
+                pass
+            elif piece.centre is not None and piece.feed is not None:
+                self._arc(piece.block, end, shifted(piece.centre), piece.turns, piece.feed)
             else:
                 self._line(piece.block, end, piece.feed)
             for waiting in piece.waiting:
@@ -105,7 +117,7 @@ class Machine:
                     self._order(waiting.block, waiting.dwell)
                 else:
                     there = list(waiting.whole)
-                    there[first], there[second] = piece.end
+                    there[first], there[second] = shifted(piece.end)
                     self._line(waiting.block, there, waiting.feed)
 
     def _line(self, block: Block, target: list[float], feed: float | None) -> None:

@@ -80,17 +80,26 @@ def set_distance(modal: Modal, block: Block) -> None:
         modal.retract_to_r = g["return"] == 990
 
 
+_GROUPS_REFUSED = ("co-ordinate system", "tool length", "machine co-ordinates", "path control")
+_ORIGINS = (280, 281, 300, 301, 520, 920, 921, 922, 923)
+
+
 def check_compensated(modal: Modal, block: Block) -> None:
     """Raise ProgramError for codes that cannot be used while cutter compensation is on."""
-    moves_origin = block.g.get("one-shot") in (100, 280, 300, 520, 920, 921, 922, 923)
-    refused = [
-        group for group in ("plane", "co-ordinate system", "tool length", "machine co-ordinates") if group in block.g
-    ]
-    motion = block.g.get("motion", modal.motion)
-    if refused and not (refused == ["plane"] and block.g["plane"] == PLANE_CODES[modal.plane]):
-        raise ProgramError(block.line, f"G{block.g[refused[0]] / 10:g}", "cannot be used with cutter compensation on")
-    if moves_origin:
-        code = block.g["one-shot"] / 10
-        raise ProgramError(block.line, f"G{code:g}", "cannot be used with cutter compensation on")
+    g, m = block.g, block.m
+    refused = [f"G{g[group] / 10:g}" for group in _GROUPS_REFUSED if group in g]
+    if g.get("plane", PLANE_CODES[modal.plane]) != PLANE_CODES[modal.plane]:
+        refused.append(f"G{g['plane'] / 10:g}")
+    if g.get("one-shot") in _ORIGINS:
+        refused.append(f"G{g['one-shot'] / 10:g}")
+    if g.get("one-shot") == 100 and block.words.get("l") in (2.0, 20.0):
+        if int(block.words.get("p", 0.0)) in (0, modal.system):
+            refused.append("G10")
+    refused += [f"M{m[group]}" for group in ("signals", "overrides") if group in m]
+    if m.get("tool") == 6:
+        refused.append("M6")
+    motion = g.get("motion", modal.motion)
     if motion not in (0, 10, *arcs.CODES, roughing.FINISH, NO_MOTION):
-        raise ProgramError(block.line, f"G{motion / 10:g}", "cannot be used with cutter compensation on")
+        refused.append(f"G{motion / 10:g}")
+    if refused:
+        raise ProgramError(block.line, refused[0], "cannot be used with cutter compensation on; end it by G40 first")
