@@ -33,6 +33,7 @@ def _shared(command: Command) -> Command:
             click.option("--model", "model_path", type=FILE, help="Parameters of each axis (JSON)."),
             click.option("--from-history", is_flag=True, help="Use the newest validated parameters of the store."),
             click.option("--out", type=FILE, help="Write a CSV with a row per SYNC period."),
+            click.option("--report", type=FILE, help="Write an HTML page: a map of the error, its worst places."),
             click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else."),
         )
     ):
@@ -57,6 +58,7 @@ def predict(
     model_path: Path | None,
     from_history: bool,
     out: Path | None,
+    report: Path | None,
     as_json: bool,
     sensitivity: bool,
     tolerance_um: float | None,
@@ -100,6 +102,8 @@ def predict(
                 zone["crosses"] = when
     if out is not None:
         _write(out, columns)
+    if report is not None:
+        _report(report, program, config, predicted)
     if as_json:
         click.echo(json.dumps(document, allow_nan=False))
     else:
@@ -117,6 +121,7 @@ def correct(
     model_path: Path | None,
     from_history: bool,
     out: Path | None,
+    report: Path | None,
     as_json: bool,
     method: str | None,
 ) -> int:
@@ -131,11 +136,28 @@ def correct(
     planned = correction.plan(reference, models, config, method)
     if out is not None:
         _write(out, _correction_columns(planned))
+    if report is not None:
+        _report(report, program, config, planned)
     if as_json:
         click.echo(json.dumps(_correction_document(str(program), planned), allow_nan=False))
     else:
         _show_correction(planned)
     return 1 if planned.refused else 0
+
+
+def _report(path: Path, program: Path, config: MachineConfig, found: Prediction | Correction) -> None:
+    """Write the page of a prediction or correction; FdhilError without the extra ``report``."""
+    from fdhil.records import Prediction
+    from fdhil.report import require, write
+
+    require()
+    from fdhil.report.path import correction_page, prediction_page
+
+    machine = config.machine.name
+    if isinstance(found, Prediction):
+        write(prediction_page(program.name, machine, found), path)
+    else:
+        write(correction_page(program.name, machine, found), path)
 
 
 def inputs(

@@ -3,6 +3,6 @@
 Needs the extra ``report`` (matplotlib, jinja2); importing this package does not import them.
 """
 
-from fdhil.report.page import Page, Section, Table, write
+from fdhil.report.page import Page, Section, Table, require, write
 
-__all__ = ["Page", "Section", "Table", "write"]
+__all__ = ["Page", "Section", "Table", "require", "write"]

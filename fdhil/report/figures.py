@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+PIECES = 600  # of a coloured path
+MOST_POINTS = 6000
 INK, REFERENCE = "#1d2733", "#9aa5b1"
 # colours that stay apart in print and for colour-blind readers (Okabe and Ito)
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -144,7 +147,12 @@ def path(reference_mm: Float, points: Mapping[str, tuple[float, float]]) -> str:
     return svg[0]
 
 
-def corner(curves: Sequence[Curve], place_mm: tuple[float, float], half_width_mm: float) -> str:
+def corner(
+    curves: Sequence[Curve],
+    place_mm: tuple[float, float],
+    half_width_mm: float,
+    names: tuple[str, str] = ("X", "Y"),
+) -> str:
     """A place of the path enlarged (Figures 11-15, 17, 18, 20): reference grey, the others in colour.
 
     The NC rounds its corners by far more than the drives err, so the view is centred on the point of the reference (the
@@ -154,15 +162,15 @@ def corner(curves: Sequence[Curve], place_mm: tuple[float, float], half_width_mm
     centre = reference[np.argmin(np.hypot(*(reference - np.asarray(place_mm)).T))]
     with _drawing(4.8, 3.6) as (_, axes, svg):
         for k, curve in enumerate(_near(curves, centre, max(3 * half_width_mm, 1.0))):
-            colour, width = (REFERENCE, 2.2) if k == 0 else (COLOURS[(k - 1) % len(COLOURS)], 1.3)
+            colour, width = (REFERENCE, 3.4) if k == 0 else (COLOURS[(k - 1) % len(COLOURS)], 1.3)
             axes.plot(*curve.path_mm.T, color=colour, lw=width, ls="--" if curve.dashed else "-", label=curve.label)
         x, y = centre
         axes.set_xlim(x - half_width_mm, x + half_width_mm)
         axes.set_ylim(y - 0.75 * half_width_mm, y + 0.75 * half_width_mm)
         axes.ticklabel_format(useOffset=False)
         axes.locator_params(nbins=6)
-        axes.set_xlabel("X (mm)")
-        axes.set_ylabel("Y (mm)")
+        axes.set_xlabel(f"{names[0]} (mm)")
+        axes.set_ylabel(f"{names[1]} (mm)")
         columns = len(curves) if len(curves) < 4 else 2
         axes.legend(loc="upper left", bbox_to_anchor=(0.0, 1.1), ncols=columns, columnspacing=1.2)
     return svg[0]
@@ -187,22 +195,36 @@ def contour_errors(dt_s: float, cases: Mapping[str, Float]) -> str:
     return svg[0]
 
 
-def error_map(path_mm: Float, error_um: Float, largest_um: float) -> str:
-    """The path coloured by its contour error, from 0 to ``largest_um``."""
+def error_map(path_mm: Float, error_um: Float, largest_um: float, names: tuple[str, str] = ("X", "Y")) -> str:
+    """The path (n, 2) coloured by its contour error, from 0 to ``largest_um``.
+
+    It is drawn in at most ``PIECES`` pieces, each in the colour of its largest error; the larger lie on top.
+    """
     from matplotlib.collections import LineCollection
 
-    segments = np.stack([path_mm[:-1], path_mm[1:]], axis=1)
-    with _drawing() as (figure, axes, svg):
-        lines = LineCollection(list(segments), array=error_um[1:], cmap="viridis", lw=3.5)
-        lines.set_clim(0, largest_um)
-        axes.add_collection(lines)
+    edges = np.unique(np.linspace(0, len(path_mm) - 1, PIECES + 1).round().astype(np.int64))
+    pieces = list(pairwise(edges.tolist()))
+    worst = np.array([error_um[first : last + 1].max() for first, last in pieces])
+    order = np.argsort(worst, kind="stable")
+    lines = [path_mm[pieces[k][0] : pieces[k][1] + 1][:: max(1, len(path_mm) // MOST_POINTS)] for k in order]
+    ends = [path_mm[pieces[k][1]] for k in order]
+    joined = [np.vstack([line, end]) for line, end in zip(lines, ends, strict=True)]
+    across, along = np.maximum(np.ptp(path_mm, axis=0), 1e-9)
+    height = float(np.clip(4.6 * along / across, 1.6, 5.0)) + 0.9  # of the picture: the path fills it
+    with _drawing(6.4, height) as (figure, axes, svg):
+        drawn = LineCollection(joined, array=worst[order], cmap="viridis", lw=3.5, capstyle="round")
+        drawn.set_clim(0, max(largest_um, 1e-3))
+        axes.add_collection(drawn)
         axes.autoscale()
-        figure.colorbar(lines, ax=axes, label="contour error (um)", shrink=0.85)
-        _equal(axes)
+        left, bottom, _, tall = axes.get_position().bounds
+        axes.set_position((left, bottom, 1 - left - 1.15 / 6.4, tall))
+        beside = figure.add_axes((1 - 0.95 / 6.4, bottom, 0.15 / 6.4, tall))
+        figure.colorbar(drawn, cax=beside, label="contour error (um)")
+        _equal(axes, names)
     return svg[0]
 
 
-def _equal(axes: Axes) -> None:
+def _equal(axes: Axes, names: tuple[str, str] = ("X", "Y")) -> None:
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xlabel("X (mm)")
-    axes.set_ylabel("Y (mm)")
+    axes.set_xlabel(f"{names[0]} (mm)")
+    axes.set_ylabel(f"{names[1]} (mm)")

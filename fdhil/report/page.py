@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 
 from fdhil.errors import FdhilError
@@ -39,12 +40,17 @@ class Page:
     sections: Sequence[Section] = field(default_factory=tuple)
 
 
+def require() -> None:
+    """Raise FdhilError where what draws and renders a report is not installed."""
+    if any(find_spec(name) is None for name in ("jinja2", "matplotlib")):
+        raise FdhilError("a report needs the extra 'report': pip install 'fdhil[report]'")
+
+
 def write(page: Page, path: Path) -> None:
     """Render ``page`` to ``path`` (a temporary name first, so that a reader never sees half a page)."""
-    try:
-        from jinja2 import Environment
-    except ImportError:
-        raise FdhilError("a report needs the extra 'report': pip install 'fdhil[report]'") from None
+    require()
+    from jinja2 import Environment
+
     template = files("fdhil.report").joinpath("page.html.j2").read_text("utf-8")
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     text = environment.from_string(template).render(page=page)

@@ -81,3 +81,16 @@ def test_the_default_method_is_the_best_one(bench: Path) -> None:
     assert document["method"] == "inverse"
     assert document["gain"] > 60
     assert document["delay_s"] == 0.0
+
+
+def test_a_report_shows_before_and_after(bench: Path) -> None:
+    """``predict`` and ``correct`` write a page of their own."""
+    for command, shown in (("predict", "predicted, RMS"), ("correct", "smaller by")):
+        page = bench / f"{command}.html"
+        arguments = [command, bench / "demand.csv", "--config", bench / "bench.toml", "--report", page]
+        assert invoke(*arguments).exit_code == 0
+        assert shown in page.read_text("utf-8")
+    missing = bench / "demand.csv" / "page.html"
+    refused = invoke("predict", bench / "demand.csv", "--config", bench / "bench.toml", "--report", missing)
+    assert refused.exit_code == 3
+    assert "cannot be written" in refused.stderr

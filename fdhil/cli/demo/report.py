@@ -241,7 +241,6 @@ def _corrected(loop: Loop) -> Section:
         plan_correction(loop.programs["rounded"], _models(loop), loop.config, method)
         for method in ("mirror", "inverse")
     )
-    largest = float(before.contour_um.max())
     return Section(
         "Cut without and with the correction",
         "Measured by the twin at its own table, with the offsets sent over the bus by the guard and checked there.",
@@ -251,7 +250,13 @@ def _corrected(loop: Loop) -> Section:
                 "Contour error along the path (Figure 16 closes this loop)",
                 figures.contour_errors(loop.config.machine.sync_period_s, errors),
             ),
-            ("Where the error is, uncorrected", figures.error_map(before.reference_mm, before.contour_um, largest)),
+            *(
+                (
+                    f"Where the error is, {cut.label}: the colours reach to {cut.max_um:.1f} um",
+                    figures.error_map(cut.reference_mm, cut.contour_um, cut.max_um),
+                )
+                for cut in (before, loop.cuts[2])
+            ),
             ("Area A, measured (Figure 17)", figures.corner(measured, POINTS["A"], 0.5)),
             ("Area B, measured (Figure 18)", figures.corner(measured, (85.0, 55.0), 0.05)),
             ("Area E, measured", figures.corner(measured, POINTS["E"], 0.5)),

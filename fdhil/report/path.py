@@ -1,0 +1,167 @@
+"""A program's path error as a report: before and after the correction, as a map and with its worst places enlarged."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from fdhil.records import Correction, Float, Prediction, Trajectory, Zone
+from fdhil.report import figures
+from fdhil.report.figures import Curve
+from fdhil.report.page import Page, Section, Table
+
+MOST_PLACES = 8
+APART_MM = 3.0  # places nearer to each other are one picture
+FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+SEEN = 0.25  # of the picture's half width that the largest error may take
+LEAST_HALF_MM, MOST_HALF_MM = 0.5, 8.0
+
+
+def prediction_page(name: str, machine: str, predicted: Prediction) -> Page:
+    """Lay a prediction out: where the error is, its zones, its worst places."""
+    return Page(
+        title=f"Path error of {name}",
+        subtitle=f"Predicted for {machine} from its identified drives, before the cut.",
+        headline=[*_figures("predicted", predicted), ("duration", f"{_duration(predicted.reference):.2f} s")],
+        sections=[_along([("predicted", predicted)]), _places([("predicted", predicted)]), _zones(predicted, None)],
+    )
+
+
+def correction_page(name: str, machine: str, planned: Correction) -> Page:
+    """Lay a correction out, before and after; a refused one with its reasons."""
+    before, after = planned.before, planned.after
+    if planned.refused:
+        cases = [("uncorrected", before)]
+        told = " ".join(f"{reason}; {reason.advice}." for reason in planned.refused)
+        verdict = [("correction", "refused")]
+    else:
+        cases = [("uncorrected", before), (f"{planned.method} correction", after)]
+        told = ""
+        verdict = [*_figures("corrected", after), ("smaller by", f"{_rms(before) / max(_rms(after), 1e-12):.0f} x")]
+    return Page(
+        title=f"Correction of {name}",
+        subtitle=f"Planned for {machine} with the method {planned.method}; predicted, nothing was sent.",
+        headline=[*_figures("uncorrected", before), *verdict],
+        sections=[
+            *([Section("Why it was refused", told)] if told else []),
+            _along(cases),
+            _places(cases),
+            _zones(before, None if planned.refused else after),
+        ],
+    )
+
+
+def _rms(predicted: Prediction) -> float:
+    return float(np.sqrt(np.mean(predicted.contour_um**2)))
+
+
+def _um(value: float) -> str:
+    """Three digits, and no exponent."""
+    return f"{value:.3g} um" if value < 999.5 else f"{value:.0f} um"
+
+
+def _figures(label: str, predicted: Prediction) -> list[tuple[str, str]]:
+    return [
+        (f"{label}, RMS", _um(_rms(predicted))),
+        (f"{label}, largest", _um(float(predicted.contour_um.max()))),
+    ]
+
+
+def _duration(reference: Trajectory) -> float:
+    return float(reference.time_s[-1] - reference.time_s[0])
+
+
+def planes(reference: Trajectory, rows: slice = slice(None)) -> list[tuple[str, str]]:
+    """Return the planes in which the path moves, the one with most of it first; empty when one axis moves alone."""
+    reach = {axis: float(np.ptp(path[rows])) for axis, path in reference.position_mm.items()}
+    moving = sorted((axis for axis in reach if reach[axis] > 1e-6), key=lambda axis: -reach[axis])
+    if len(moving) < 2:
+        return []
+    order = list(reference.axes)
+    pairs = [(moving[0], other) for other in moving[1:]]
+    return [(a, b) if order.index(a) < order.index(b) else (b, a) for a, b in pairs]
+
+
+def _flat(reference: Trajectory, positions: Prediction | None, plane: tuple[str, str]) -> Float:
+    """Return the reference's, or a prediction's, path (n, 2) in a plane."""
+    source = reference.position_mm if positions is None else positions.predicted_mm
+    return np.column_stack([source[axis] for axis in plane])
+
+
+def _along(cases: Sequence[tuple[str, Prediction]]) -> Section:
+    reference = cases[0][1].reference
+    pictures = []
+    for plane in planes(reference):
+        for label, predicted in cases:
+            largest = float(predicted.contour_um.max())
+            caption = f"{label}, plane {plane[0]}{plane[1]}: the colours reach to {_um(largest)}"
+            path = _flat(reference, None, plane)
+            pictures.append((caption, figures.error_map(path, predicted.contour_um, largest, plane)))
+    errors = {label: predicted.contour_um for label, predicted in cases}
+    pictures.append(("Contour error over time", figures.contour_errors(reference.dt_s, errors)))
+    return Section(
+        "Where the error is",
+        "The contour error is the distance of the table from the path, wherever on the path it should be.",
+        figures=pictures,
+    )
+
+
+def worst_places(predicted: Prediction) -> list[tuple[Zone, int]]:
+    """Return the zones with the largest errors and the row of each, far enough from each other, in the path's order."""
+    reference = predicted.reference
+    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    found: list[tuple[Zone, int]] = []
+    for zone in sorted(predicted.zones, key=lambda zone: -zone.max_um):
+        first, last = _rows(reference, zone)
+        row = first + int(np.argmax(predicted.contour_um[first:last]))
+        if all(np.linalg.norm(path[row] - path[other]) > APART_MM for _, other in found):
+            found.append((zone, row))
+        if len(found) == MOST_PLACES:
+            break
+    return sorted(found, key=lambda place: place[1])
+
+
+def _rows(reference: Trajectory, zone: Zone) -> tuple[int, int]:
+    start = float(reference.time_s[0])
+    return round((zone.start_s - start) / reference.dt_s), round((zone.end_s - start) / reference.dt_s)
+
+
+def _places(cases: Sequence[tuple[str, Prediction]]) -> Section:
+    before = cases[0][1]
+    reference = before.reference
+    pictures = []
+    for zone, row in worst_places(before):
+        first, last = _rows(reference, zone)
+        found = planes(reference, slice(max(0, first - 50), last + 50))
+        if not found:
+            continue
+        plane = found[0]
+        path = _flat(reference, None, plane)
+        half = float(np.clip(0.75 * np.ptp(path[first:last], axis=0).max(), LEAST_HALF_MM, MOST_HALF_MM))
+        factor = max(f for f in FACTORS if f == 1 or f * zone.max_um * 1e-3 <= SEEN * half)
+        curves = [Curve("desired", path)]
+        curves += [
+            Curve(label, figures.magnified(path, _flat(reference, predicted, plane), factor))
+            for label, predicted in cases
+        ]
+        larger = f", errors {factor} times as large" if factor > 1 else ""
+        line = f"line {reference.line[row]}, " if reference.line[row] else ""
+        caption = f"{line}{zone.where}: {zone.cause}, {zone.max_um:.1f} um{larger}"
+        centre = (float(path[row, 0]), float(path[row, 1]))
+        pictures.append((caption, figures.corner(curves, centre, half, plane)))
+    text = "The largest zones, in the order of the path (paper: Figures 11 to 20)."
+    return Section("Its worst places enlarged", text if pictures else "No zone stands out.", figures=pictures)
+
+
+def _zones(before: Prediction, after: Prediction | None) -> Section:
+    reference = before.reference
+    rows = []
+    for zone in before.zones:
+        first, last = _rows(reference, zone)
+        row = first + int(np.argmax(before.contour_um[first:last]))
+        cells = [f"{zone.start_s:.2f} - {zone.end_s:.2f}", str(reference.line[row] or ""), zone.where, zone.cause]
+        cells.append(f"{zone.max_um:.1f}")
+        rows.append(cells if after is None else [*cells, f"{after.contour_um[first:last].max():.2f}"])
+    head = ["time s", "line", "where", "cause", "max um"]
+    return Section("Zones", tables=[Table(head if after is None else [*head, "corrected, max um"], rows)])

@@ -1,0 +1,85 @@
+"""The page of a prediction and of a correction."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil.correction import plan
+from fdhil.prediction import predict
+from fdhil.prediction.models import nominal_models
+from fdhil.records import Correction, frozen
+from fdhil.report import write
+from fdhil.report.path import APART_MM, correction_page, planes, prediction_page, worst_places
+from tests.bench import bench_config
+from tests.paths import bench_trajectory, trajectory
+
+CONFIG = bench_config()
+MODELS = nominal_models(CONFIG)
+
+
+@pytest.fixture(scope="module", name="correction")
+def _correction() -> Correction:
+    """The bench path, corrected."""
+    return plan(bench_trajectory(10), MODELS, CONFIG)
+
+
+def test_before_and_after(correction: Correction, tmp_path: Path) -> None:
+    """A map and a scale for each, every corner enlarged with both, the zones with both figures."""
+    page = correction_page("part.ngc", "bench", correction)
+    along, places, zones = page.sections
+    assert [caption.partition(":")[0] for caption, _ in along.figures][:2] == [
+        "uncorrected, plane XY",
+        "inverse correction, plane XY",
+    ]
+    corners = [caption for caption, _ in places.figures if "corner" in caption]
+    assert len(corners) == 4
+    assert all("times as large" in caption for caption in corners)
+    assert all("inverse correction" in svg and "desired" in svg for _, svg in places.figures)
+    for row in zones.tables[0].rows:
+        assert float(row[-1]) < 0.05 * float(row[-2])
+    write(page, tmp_path / "page.html")
+    assert (tmp_path / "page.html").stat().st_size < 2_000_000
+
+
+def test_a_refused_correction_says_why() -> None:
+    """Its page shows the path as it would be cut, and the advice."""
+    refused = plan(bench_trajectory(20, (0.030, 0.015)), MODELS, CONFIG)
+    page = correction_page("part.ngc", "bench", refused)
+    assert ("correction", "refused") in page.headline
+    assert "can be held" in page.sections[0].text
+    assert not re.search(r"\de[+-]\d", " ".join(value for _, value in page.headline))
+
+
+def test_the_worst_places_are_apart_and_in_order(correction: Correction) -> None:
+    """One picture a place, however many zones it has."""
+    found = worst_places(correction.before)
+    rows = [row for _, row in found]
+    assert rows == sorted(rows)
+    path = np.column_stack([correction.before.reference.position_mm[axis] for axis in "XY"])
+    assert all(np.linalg.norm(path[a] - path[b]) > APART_MM for a, b in pairwise(rows))
+
+
+def test_planes_of_three_axes_and_of_one() -> None:
+    """The plane with most of the path first; an axis alone has no map, and the page is made all the same."""
+    flat = bench_trajectory(10)
+    z = 30 * np.sin(flat.time_s)
+    solid = replace(flat, position_mm={**flat.position_mm, "Z": frozen(z)})
+    assert planes(solid) == [("X", "Y"), ("X", "Z")]
+    alone = trajectory(np.asarray(flat.position_mm["Y"])[:, None], "Y")
+    assert planes(alone) == []
+    page = prediction_page("up.ngc", "bench", predict(alone, MODELS, CONFIG))
+    assert [caption for caption, _ in page.sections[0].figures] == ["Contour error over time"]
+    assert page.sections[1].figures == []
+
+
+def test_a_path_without_error_has_a_page() -> None:
+    """Nothing stands out, nothing is enlarged."""
+    still = trajectory(np.zeros((300, 2)))
+    page = prediction_page("nothing.ngc", "bench", predict(still, MODELS, CONFIG))
+    assert page.sections[1].text == "No zone stands out."
