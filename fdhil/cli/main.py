@@ -21,6 +21,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "arm": ("fdhil.cli.service:arm", "Arm the correction of one program."),
     "disarm": ("fdhil.cli.service:disarm", "Ramp the correction to zero and disarm."),
     "sim": ("fdhil.cli.sim:sim", "Run the simulated machine: drives, sensors, NC."),
+    "record": ("fdhil.cli.record:record", "Record the demand of an air cut from the bus, by listening."),
     "identify": ("fdhil.cli.identify:identify", "Identify a drive from recordings."),
     "interpret": ("fdhil.cli.program:interpret", "List the motions of an NC program."),
     "predict": ("fdhil.cli.prediction:predict", "Predict the path error of a program before it is cut."),

@@ -1,0 +1,127 @@
+"""``fdhil record``: the demand of an air cut, captured from the bus by listening alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fdhil import config as machine_config
+
+if TYPE_CHECKING:
+    from fdhil.drivers.demand_recorder import DemandRecorder, RecordedDemand
+
+_FILE = click.Path(dir_okay=False, path_type=Path)
+_SHOWN_GAPS = 5
+
+
+@click.command()
+@click.argument("config", type=_FILE)
+@click.option("--out", required=True, type=_FILE, help="The demand CSV to write.")
+@click.option("--seconds", type=click.FloatRange(0.0, min_open=True), help="Record no longer than this.")
+@click.option(
+    "--rest",
+    type=click.FloatRange(0.0, min_open=True),
+    default=2.0,
+    show_default=True,
+    help="Seconds of rest after a motion that end the recording; more than the program's longest dwell.",
+)
+@click.option("--with-gaps", is_flag=True, help="Write a demand with lost rows too, each marked nan.")
+@click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
+def record(config: Path, out: Path, seconds: float | None, rest: float, with_gaps: bool, as_json: bool) -> None:
+    """Record the demand that the NC sends to CONFIG's machine during an air cut, as a demand CSV.
+
+    It listens and sends nothing. The recording begins with the first motion and ends with --rest, --seconds or Ctrl-C;
+    row k is r[k], what the drives follow at that SYNC, without offsets. Exit 1 when rows were lost (nothing is written
+    then, but with --with-gaps) or nothing moved.
+    """
+    machine = machine_config.load(config)
+    import asyncio
+
+    from fdhil.drivers.demand_recorder import DemandRecorder
+
+    recorder = DemandRecorder(machine, rest)
+    asyncio.run(_listen(machine, recorder, seconds))
+    recorded = recorder.demand()
+    written = recorded is not None and (with_gaps or recorded.complete)
+    if recorded is not None and written:
+        from fdhil.program import write_demand_csv
+
+        write_demand_csv(recorded.reference, out)
+    if as_json:
+        click.echo(json.dumps(_document(out, recorded, written)))
+    else:
+        _tell(out, recorded, written)
+    if recorded is None or not recorded.complete:
+        click.get_current_context().exit(1)
+
+
+async def _listen(machine: machine_config.MachineConfig, recorder: DemandRecorder, seconds: float | None) -> None:
+    """Feed the recorder until it is done, the time is over, or the operator stops it."""
+    import asyncio
+    import signal
+
+    from fdhil.drivers import open_machine
+
+    loop, stopped = asyncio.get_running_loop(), asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stopped.set)
+    async with open_machine(machine) as source:
+
+        async def feed() -> None:
+            told = None
+            async for one in source.records():
+                recorder.feed(one)
+                state = "recording" if recorder.moving else "waiting for a motion" if recorder.heard else None
+                if state != told:
+                    click.echo(f"{state} (Ctrl-C ends)", err=True)
+                    told = state
+                if recorder.done:
+                    return
+
+        tasks = [asyncio.create_task(feed()), asyncio.create_task(stopped.wait())]
+        await asyncio.wait(tasks, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
+        for task in tasks:
+            task.cancel()
+        results = await asyncio.gather(*tasks, return_exceptions=True)
+    for result in results:
+        if isinstance(result, Exception):
+            raise result
+
+
+def _document(out: Path, recorded: RecordedDemand | None, written: bool) -> dict[str, Any]:
+    gaps = (
+        []
+        if recorded is None
+        else [{"axis": g.axis, "first": g.first, "rows": g.stop - g.first} for g in recorded.gaps]
+    )
+    return {
+        "schema": "fdhil-record-1",
+        "file": str(out) if written else None,
+        "rows": 0 if recorded is None else int(recorded.reference.time_s.size),
+        "duration_s": 0.0 if recorded is None else float(recorded.reference.time_s[-1]),
+        "complete": recorded is not None and recorded.complete,
+        "gaps": gaps,
+        "doubts": [] if recorded is None else list(recorded.doubts),
+    }
+
+
+def _tell(out: Path, recorded: RecordedDemand | None, written: bool) -> None:
+    if recorded is None:
+        click.echo("nothing moved; start the program on the NC while the recording waits", err=True)
+        return
+    rows = recorded.reference.time_s.size
+    click.echo(f"{rows} rows, {recorded.reference.time_s[-1]:.3f} s" + (f", written to {out}" if written else ""))
+    for gap in recorded.gaps[:_SHOWN_GAPS]:
+        lost, at_s = gap.stop - gap.first, recorded.reference.time_s[gap.first]
+        click.echo(f"lost: {lost} rows of axis {gap.axis} at {at_s:.3f} s", err=True)
+    if len(recorded.gaps) > _SHOWN_GAPS:
+        click.echo(f"lost: {len(recorded.gaps) - _SHOWN_GAPS} gaps more", err=True)
+    for doubt in recorded.doubts:
+        click.echo(doubt, err=True)
+    if not written:
+        click.echo(
+            "not written: a demand with holes corrects nothing; free the computer and cut the air again", err=True
+        )

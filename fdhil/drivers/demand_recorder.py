@@ -1,0 +1,137 @@
+"""The demand of an air cut as it is sniffed: r[k] of every axis on the SYNC grid, from the first motion to the last.
+
+Pure: records in, a demand out. What was lost stays a gap; nothing is interpolated.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdhil.config import MachineConfig
+from fdhil.errors import ConfigError, ConfigFault
+from fdhil.records import AxisSamples, Float, Int, Notice, Trajectory, frozen, frozen_ints
+
+_SPOILING = ("DemandMismatch", "BusDown", "SyncCollision", "RxOverflow", "ForeignProducer")
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Rows [first, stop) of an axis' demand that were lost."""
+
+    axis: str
+    first: int
+    stop: int
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedDemand:
+    """A demand with NaN in the rows that were lost, its gaps, and what else speaks against trusting it."""
+
+    reference: Trajectory
+    gaps: tuple[Gap, ...]
+    doubts: tuple[str, ...]
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing was lost and nothing speaks against it."""
+        return not self.gaps and not self.doubts
+
+
+@dataclass(slots=True)
+class _Sniffed:
+    """One axis: blocks of ticks and demands; before any motion the newest block alone."""
+
+    ticks: list[Int]
+    demands: list[Float]
+    newest: int = -1
+    moved_first: int | None = None
+    moved_last: int | None = None
+
+    def add(self, samples: AxisSamples, anything_moved: bool) -> None:
+        if not samples.tick.size:
+            return
+        demand = samples.demand_mm
+        before = self.demands[-1][-1] if self.demands else demand[0]
+        steps = np.flatnonzero(np.diff(demand, prepend=before))
+        if steps.size:
+            self.moved_first = int(samples.tick[steps[0]]) if self.moved_first is None else self.moved_first
+            self.moved_last = int(samples.tick[steps[-1]])
+        if not anything_moved and not steps.size and len(self.ticks) > 1:
+            del self.ticks[0], self.demands[0]
+        self.ticks.append(samples.tick)
+        self.demands.append(demand)
+        self.newest = int(samples.tick[-1])
+
+
+class DemandRecorder:
+    """Fed with the records of a machine; ``done`` once all axes have rested ``rest_s`` after a motion.
+
+    ConfigError when the axes are on several buses, whose SYNC cycles cannot be told to be the same.
+    """
+
+    def __init__(self, config: MachineConfig, rest_s: float) -> None:
+        buses = list(dict.fromkeys(axis.drive.bus for axis in config.axis.values()))
+        if len(buses) > 1:
+            what = f"the axes are on {', '.join(buses)}, whose cycles have no common count"
+            raise ConfigError(
+                config.machine.name, [ConfigFault("axis", what, "record each bus with a config of its axes")]
+            )
+        self._dt_s = config.machine.sync_period_s
+        self._rest_rows = math.ceil(rest_s / self._dt_s)
+        self._end_rows = math.ceil(config.nc.end_rest_s / self._dt_s)
+        self._axes = {name: _Sniffed([], []) for name in config.axis}
+        self._doubts: dict[str, str] = {}
+
+    def feed(self, record: object) -> None:
+        """Take a record of the machine; what is no sample and no warning does not matter here."""
+        if isinstance(record, AxisSamples):
+            self._axes[record.axis].add(record, self.moving)
+        elif isinstance(record, Notice) and record.code in _SPOILING and record.severity != "info":
+            self._doubts[record.code] = record.text
+
+    @property
+    def heard(self) -> bool:
+        """Whether the demand of every axis is known."""
+        return all(axis.newest >= 0 for axis in self._axes.values())
+
+    @property
+    def moving(self) -> bool:
+        """Whether any axis has moved."""
+        return any(axis.moved_first is not None for axis in self._axes.values())
+
+    @property
+    def done(self) -> bool:
+        """Whether a motion has ended for as long as was asked; a demand that cannot be trusted any more ends too."""
+        last = [axis.moved_last for axis in self._axes.values() if axis.moved_last is not None]
+        newest = min(axis.newest for axis in self._axes.values())
+        return "BusDown" in self._doubts or (bool(last) and newest >= max(last) + self._rest_rows)
+
+    def demand(self) -> RecordedDemand | None:
+        """Return what was heard, from the row before the first motion to the rest after the last, if any."""
+        firsts = [axis.moved_first for axis in self._axes.values() if axis.moved_first is not None]
+        lasts = [axis.moved_last for axis in self._axes.values() if axis.moved_last is not None]
+        if not firsts:
+            return None
+        first = min(firsts) - 1
+        stop = 1 + min(max(lasts) + self._end_rows, max(axis.newest for axis in self._axes.values()))
+        position, gaps = {}, []
+        for name, axis in self._axes.items():
+            rows = np.full(stop - first, np.nan)
+            tick = np.concatenate(axis.ticks) if axis.ticks else np.empty(0, np.int64)
+            inside = (tick >= first) & (tick < stop)
+            rows[tick[inside] - first] = (np.concatenate(axis.demands) if axis.ticks else np.empty(0))[inside]
+            position[name] = frozen(rows)
+            gaps += [Gap(name, int(run[0]), int(run[-1]) + 1) for run in _runs(np.flatnonzero(np.isnan(rows)))]
+        rapid = np.zeros(stop - first, np.bool_)
+        rapid.setflags(write=False)
+        time_s = frozen(np.arange(stop - first) * self._dt_s)
+        reference = Trajectory(self._dt_s, time_s, position, rapid, frozen_ints(np.zeros(stop - first)))
+        return RecordedDemand(reference, tuple(gaps), tuple(self._doubts.values()))
+
+
+def _runs(rows: Int) -> list[Int]:
+    """Cut ascending numbers where one is missing."""
+    return [run for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if run.size]

@@ -1,0 +1,81 @@
+"""``fdhil record`` beside the simulated machine, both as processes on the hub."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil import config as configuration
+from fdhil.program import load_trajectory
+from fdhil.records import Float, Trajectory
+from tests.sim.twin_process import TwinProcess, write_config
+
+PROGRAM = "G61 G1 X12 F6000\nG3 X24 Y12 J12\nG1 Y20\nG4 P0.2\nG0 X0 Y0\nM2\n"
+NC = '[nc]\nprofile = "jerk_limited"\n'
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[TwinProcess, Path]]:
+    """The twin with its NC on, and the config with which it is joined."""
+    folder = tmp_path_factory.mktemp("twin")
+    path = write_config(folder, sim="modbus = false")
+    path.write_text(path.read_text() + NC)
+    with TwinProcess(path) as process:
+        place = process.ready["buses"]["can0"]
+        joined = write_config(folder, bus=f'interface = "socketcand"\nport = {place["port"]}')
+        joined.write_text(joined.read_text() + NC)
+        process.command("nc", on=True)
+        process.event("nc")
+        yield process, joined
+
+
+class Recording:
+    """A running ``fdhil record --json`` that waits for a motion."""
+
+    def __init__(self, config: Path, out: Path, *options: str) -> None:
+        command = [sys.executable, "-m", "fdhil.cli.main", "record", str(config), "--out", str(out), "--json", *options]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        assert self.process.stderr is not None
+        assert "waiting" in self.process.stderr.readline()
+
+    def end(self) -> tuple[int, dict[str, object]]:
+        stdout, _ = self.process.communicate(timeout=60)
+        return self.process.returncode, json.loads(stdout)
+
+
+def increments(reference: Trajectory) -> Float:
+    return np.round(np.column_stack(list(reference.position_mm.values())) * (65536 / 20))
+
+
+def test_a_recorded_program_is_its_demand_to_the_increment(twin: tuple[TwinProcess, Path], tmp_path: Path) -> None:
+    process, config = twin
+    program, out = tmp_path / "program.ngc", tmp_path / "demand.csv"
+    program.write_text(PROGRAM)
+    recording = Recording(config, out, "--rest", "0.6")
+    process.command("play", file=str(program))
+    code, document = recording.end()
+    assert (code, document["complete"], document["gaps"]) == (0, True, []), document
+    machine = configuration.load(config)
+    ordered, heard = increments(load_trajectory(program, machine)), increments(load_trajectory(out, machine))
+    first = int(np.flatnonzero(np.abs(np.diff(ordered, axis=0)).max(axis=1))[0])  # the first increment that moves
+    rows = min(len(heard), len(ordered) - first)
+    assert rows > len(ordered) - 60
+    np.testing.assert_array_equal(heard[:rows], ordered[first : first + rows])
+
+
+def test_without_a_motion_there_is_nothing_to_write(twin: tuple[TwinProcess, Path], tmp_path: Path) -> None:
+    out = tmp_path / "demand.csv"
+    for number in (signal.SIGINT, None):
+        recording = Recording(twin[1], out, *(() if number else ("--seconds", "2")))
+        if number is not None:
+            recording.process.send_signal(number)
+        code, document = recording.end()
+        assert (code, document["rows"], document["file"]) == (1, 0, None)
+        assert not out.exists()

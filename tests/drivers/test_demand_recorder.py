@@ -1,0 +1,93 @@
+"""The recorder of an air cut: what is kept, what counts as lost, when it is done."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from fdhil import config as configuration
+from fdhil.drivers.demand_recorder import DemandRecorder, Gap
+from fdhil.errors import ConfigError
+from fdhil.records import AxisSamples, Float, Notice, frozen, frozen_ints
+from tests.bench import bench_config, bench_document
+
+PATH = np.concatenate([np.zeros(500), np.linspace(0.0, 10.0, 301), np.full(3000, 10.0)])
+
+
+def samples(axis: str, demand: Float, ticks: Sequence[int]) -> AxisSamples:
+    tick = np.array(ticks, dtype=np.int64)
+    values, rest = frozen(demand[tick]), frozen(np.zeros(tick.size))
+    return AxisSamples(axis, frozen_ints(tick), values, values, rest, rest, None, rest, frozen_ints(rest))
+
+
+def feed(recorder: DemandRecorder, lost: Sequence[int] = (), until: int = PATH.size) -> None:
+    """Blocks of 40 rows of X and of Y, which lacks the rows ``lost``."""
+    for first in range(0, until, 40):
+        if recorder.done:
+            return
+        rows = range(first, min(first + 40, until))
+        recorder.feed(samples("X", PATH, rows))
+        recorder.feed(samples("Y", 2.0 * PATH, [row for row in rows if row not in lost]))
+
+
+def test_the_demand_is_what_was_heard_from_the_first_motion_to_the_rest_after_the_last() -> None:
+    recorder = DemandRecorder(bench_config(), rest_s=1.0)
+    assert not recorder.heard
+    feed(recorder)
+    assert recorder.done
+    recorded = recorder.demand()
+    assert recorded is not None
+    assert recorded.complete
+    first = 500
+    rows = recorded.reference.time_s.size
+    assert rows == 300 + 500 + 1
+    np.testing.assert_array_equal(recorded.reference.position_mm["X"], PATH[first : first + rows])
+    np.testing.assert_array_equal(recorded.reference.position_mm["Y"], 2.0 * PATH[first : first + rows])
+
+
+def test_lost_rows_are_gaps_and_never_filled() -> None:
+    recorder = DemandRecorder(bench_config(), rest_s=1.0)
+    feed(recorder, lost=(10, 600, 601, 700))
+    recorded = recorder.demand()
+    assert recorded is not None
+    assert not recorded.complete
+    assert recorded.gaps == (Gap("Y", 100, 102), Gap("Y", 200, 201))
+    assert np.flatnonzero(np.isnan(recorded.reference.position_mm["Y"])).tolist() == [100, 101, 200]
+
+
+def test_a_demand_that_cannot_be_trusted_is_not_complete() -> None:
+    recorder = DemandRecorder(bench_config(), rest_s=1.0)
+    recorder.feed(Notice("DemandMismatch", "MAJOR", "another demand", "X"))
+    recorder.feed(Notice("BusSilent", "info", "heard again"))
+    feed(recorder)
+    recorded = recorder.demand()
+    assert recorded is not None
+    assert recorded.doubts == ("another demand",)
+    assert not recorded.complete
+
+
+def test_rest_alone_is_no_demand_and_is_not_kept() -> None:
+    recorder = DemandRecorder(bench_config(), rest_s=1.0)
+    feed(recorder, until=500)
+    assert recorder.heard
+    assert not recorder.done
+    assert recorder.demand() is None
+
+
+def test_stopped_early_it_ends_where_it_was() -> None:
+    recorder = DemandRecorder(bench_config(), rest_s=1.0)
+    feed(recorder, until=600)
+    assert not recorder.done
+    recorded = recorder.demand()
+    assert recorded is not None
+    assert recorded.reference.position_mm["X"][-1] == PATH[599]
+
+
+def test_axes_on_two_buses_have_no_common_count() -> None:
+    document = bench_document()
+    document["bus"] = {"can0": {}, "can1": {}}
+    document["axis"]["Y"]["drive"] = {"bus": "can1"}
+    with pytest.raises(ConfigError, match="common count"):
+        DemandRecorder(configuration.parse(document), 1.0)
