@@ -28,6 +28,7 @@ from fdhil.records import AxisSamples
 
 AXES = ("X", "Y")
 CYCLES = 240
+STAMP = b"1700000000.000000"
 
 
 def machine() -> MachineConfig:
@@ -67,7 +68,7 @@ def hub(pipe: Connection) -> None:
     texts = []
     for k in range(CYCLES):
         text = "".join(
-            f"< frame {i:03X} 1700000000.000000 {d.hex().upper()}".ljust(62) + " >" for i, d in cycle_frames(k)
+            f"< frame {i:03X} {STAMP.decode()} {d.hex().upper()}".ljust(62) + " >" for i, d in cycle_frames(k)
         )
         texts.append(text.encode())
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -85,7 +86,7 @@ def hub(pipe: Connection) -> None:
                 if paced:
                     due += 0.001
                     time.sleep(max(0.0, due - time.monotonic()))
-                client.sendall(texts[k % CYCLES])
+                client.sendall(texts[k % CYCLES].replace(STAMP, b"%.6f" % time.time()))
             pipe.send("done")
 
 
