@@ -12,7 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdhil.config import MachineConfig, Nominal, SimAxis
+from fdhil.config import MachineConfig, Nominal, Regulators, SimAxis
+from fdhil.errors import ConfigError, ConfigFault
 from fdhil.records import Parameters
 from fdhil.sim import monitor
 from fdhil.sim.dictionary import Dictionary
@@ -31,6 +32,8 @@ from fdhil.sim.trace import TraceBuffer
 
 __all__ = ["Drive", "DriveFaults", "Frame", "SignalFault"]
 
+# what regulators other than these would need, this drive does not have
+_PLAIN = {"structure": "p_pi_pi", "torque_feedforward": 0.0, "setpoint_filter_s": 0.0, "current_delay_cycles": 0}
 OFF, STOPPED, OPERATIONAL, PRE_OPERATIONAL = -1, 0x04, 0x05, 0x7F
 
 
@@ -44,6 +47,7 @@ class Drive:
 
     def __init__(self, axis: str, config: MachineConfig, rng: np.random.Generator) -> None:
         section = config.axis[axis]
+        _check_structure(axis, section.regulators)
         twin = config.sim.axis.get(axis, SimAxis())
         self.axis = axis
         self.ratings = Ratings.of(config, axis)
@@ -388,3 +392,14 @@ def _true_parameters(nominal: Nominal, twin: SimAxis) -> Parameters:
             for name in ("R", "L", "K", "Jt", "ft", "Cd")
         )
     )
+
+
+def _check_structure(axis: str, regulators: Regulators) -> None:
+    """Raise ConfigError for regulators that the simulated drive does not have: it would run others silently."""
+    faults = [
+        ConfigFault(f"axis.{axis}.regulators.{key}", "the simulated drive does not have it", f"leave it at {plain!r}")
+        for key, plain in _PLAIN.items()
+        if getattr(regulators, key) != plain
+    ]
+    if faults:
+        raise ConfigError("sim", faults)

@@ -1,0 +1,23 @@
+"""The simulated drive's regulators are those of the default structure."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fdhil import config
+from fdhil.errors import ConfigError
+from fdhil.sim.drive import Drive
+from tests.bench import bench_document
+
+
+def test_other_regulators_are_refused() -> None:
+    """They would be simulated as p_pi_pi silently."""
+    document = bench_document("X")
+    document["axis"]["X"]["regulators"] |= {"structure": "pid", "speed_ki": 0.0, "current_delay_cycles": 1}
+    with pytest.raises(ConfigError) as caught:
+        Drive("X", config.parse(document), np.random.default_rng(0))
+    assert [fault.path for fault in caught.value.faults] == [
+        "axis.X.regulators.structure",
+        "axis.X.regulators.current_delay_cycles",
+    ]
