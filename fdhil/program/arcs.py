@@ -6,16 +6,16 @@ import math
 
 from fdhil.errors import ProgramError
 from fdhil.program.machine import Machine
-from fdhil.program.modal import AXES, Modal
+from fdhil.program.modal import AXES, MM_PER_INCH, Modal
 from fdhil.program.targets import axis_words, feed_mm_min, plane_axes, target
 from fdhil.program.words import Block
 
 CODES = (20, 30)
 _OFFSETS = "ijk"
 _MIN_RADIUS_MM = 1e-6
-# the ends of an arc may lie at radii that differ by the first, or by the second as long as that is 0.1 % of the radius
-_SPIRAL_ABSOLUTE_MM = 0.5
-_SPIRAL_SMALL_MM = 0.005
+# the radii at the ends of an arc may differ by the small one, or by 0.1 % up to the large one
+_SPIRAL_SMALL = {1.0: math.sqrt(8.0) * 0.01, MM_PER_INCH: math.sqrt(8.0) * 0.001 * MM_PER_INCH}  # mm, by the units
+_SPIRAL_LARGE = 100.0  # times the small one
 _SPIRAL_RELATIVE = 0.001
 _CHORD_RELATIVE = 0.001  # by how much half the chord may exceed the radius of an R arc
 
@@ -30,7 +30,7 @@ def arc(machine: Machine, block: Block) -> None:
     end = target(modal, block)
     clockwise = modal.motion == 20
     if "r" in block.words:
-        if first not in words and second not in words:
+        if first not in words and second not in words and "@" not in block.words and "^" not in block.words:
             raise block.fault("r", "an arc by radius wants an end in its plane; a circle wants its centre")
         centre = _centre_of_radius(modal, block, (modal.position[first], modal.position[second]),
                                    (end[first], end[second]), clockwise)  # fmt: skip
@@ -78,15 +78,15 @@ def _check_radii(
     word = next(letter for letter in _OFFSETS if letter in block.words)
     if begin < _MIN_RADIUS_MM or finish < _MIN_RADIUS_MM:
         raise block.fault(word, "the arc has no radius; move the centre away from start and end")
-    if not radii_agree(begin, finish):
+    if not radii_agree(begin, finish, modal.scale):
         raise block.fault(word, f"the radius is {begin:.4f} mm at the start and {finish:.4f} mm at the end of the arc; "
                                 f"correct centre or end ({AXES[first].upper()}, {AXES[second].upper()})")  # fmt: skip
 
 
-def radii_agree(begin_mm: float, finish_mm: float) -> bool:
-    """Tell whether the radii at both ends of an arc are near enough for one arc."""
-    off = abs(begin_mm - finish_mm)
-    return off <= _SPIRAL_ABSOLUTE_MM and (off <= _SPIRAL_SMALL_MM or off <= _SPIRAL_RELATIVE * begin_mm)
+def radii_agree(begin_mm: float, finish_mm: float, scale: float) -> bool:
+    """Tell whether the radii at both ends of an arc are near enough for one arc, as the reference does in mm or inch."""
+    off, small = abs(begin_mm - finish_mm), _SPIRAL_SMALL[scale]
+    return off <= small or off <= min(_SPIRAL_LARGE * small, _SPIRAL_RELATIVE * max(begin_mm, finish_mm))
 
 
 def _centre_of_radius(

@@ -38,6 +38,46 @@ def check_readers(block: Block, motion: int | None) -> None:
                 raise block.fault(letter, f"has no code that reads it; it belongs to {names}")
 
 
+def check_machine_words(block: Block) -> None:
+    """Raise ProgramError for values that a tool, a spindle, an input or an output cannot have."""
+    words, m = block.words, block.m
+    tool = words.get("t", 0.0)
+    if tool < 0.0 or not _is_whole(tool):
+        raise block.fault("t", "is no number of a tool; T must be a whole number from 0")
+    if words.get("$", 0.0) not in (0.0, -1.0):
+        raise block.fault("$", "is no spindle; the machine has spindle 0 alone")
+    if m.get("tool") == 61 and words.get("q", -1.0) < 0.0:
+        raise ProgramError(block.line, "M61", "wants the tool's number as Q, not negative")
+    if m.get("spindle") == 19:
+        if not 0.0 <= words.get("r", 0.0) <= 360.0:
+            raise block.fault("r", "is no angle of the spindle; R must be 0 to 360")
+        if words.get("p", 0.0) not in (0.0, 1.0, 2.0):
+            raise block.fault("p", "is no way to turn the spindle; P must be 0, 1 or 2")
+    if "signals" in m:
+        _check_signal(block, m["signals"])
+
+
+def _check_signal(block: Block, code: int) -> None:
+    """M62 to M65 name an output by P, M67 and M68 by E; M66 an input by one of them."""
+    words = block.words
+    wanted = {67: "e", 68: "e"}.get(code, "p")
+    given = [letter for letter in ("pe" if code == 66 else wanted) if words.get(letter, -1.0) >= 0.0]
+    if len(given) != 1:
+        what = "one input as P or E" if code == 66 else f"the output's number as {wanted.upper()}"
+        raise ProgramError(block.line, f"M{code}", f"wants {what}, not negative")
+    if code != 66:
+        return
+    wait = words.get("l", 0.0)
+    if wait not in (0.0, 1.0, 2.0, 3.0, 4.0) or (given == ["e"] and wait != 0.0):
+        raise ProgramError(block.line, "M66", "wants L from 0 to 4, and 0 for an analogue input")
+    if wait != 0.0 and words.get("q", 0.0) <= 0.0:
+        raise ProgramError(block.line, "M66", "wants the longest time to wait as Q")
+
+
+def _is_whole(value: float) -> bool:
+    return abs(value - round(value)) <= 1e-4
+
+
 def one_reader_of_axes(block: Block) -> None:
     """Raise ProgramError when two codes of the block both want its axis words."""
     wanting = [code for group, code in block.g.items()

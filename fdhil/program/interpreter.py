@@ -15,7 +15,7 @@ from pathlib import Path
 from fdhil.errors import ProgramError
 from fdhil.program import arcs, canned, curves, lathe, modes, nurbs, offsets, roughing, targets
 from fdhil.program.budget import Budget
-from fdhil.program.checks import CYCLES, check_readers, one_reader_of_axes
+from fdhil.program.checks import CYCLES, check_machine_words, check_readers, one_reader_of_axes
 from fdhil.program.commands import Command
 from fdhil.program.compensation import Compensation
 from fdhil.program.flow import Flow
@@ -223,6 +223,7 @@ class Interpreter:
                 machine.settle()
         one_reader_of_axes(block)
         check_readers(block, _motion_of(modal, block))
+        check_machine_words(block)
         modes.set_feed(modal, block)
         modes.set_spindle(modal, block)
         modes.set_switches(modal, block)

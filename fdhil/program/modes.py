@@ -92,9 +92,9 @@ def check_compensated(modal: Modal, block: Block) -> None:
         refused.append(f"G{g['plane'] / 10:g}")
     if g.get("one-shot") in _ORIGINS:
         refused.append(f"G{g['one-shot'] / 10:g}")
-    if g.get("one-shot") == 100 and block.words.get("l") in (2.0, 20.0):
-        if int(block.words.get("p", 0.0)) in (0, modal.system):
-            refused.append("G10")
+    sets_system = g.get("one-shot") == 100 and block.words.get("l") in (2.0, 20.0)
+    if sets_system and int(block.words.get("p", 0.0)) in (0, modal.system):
+        refused.append("G10")
     refused += [f"M{m[group]}" for group in ("signals", "overrides") if group in m]
     if m.get("tool") == 6:
         refused.append("M6")

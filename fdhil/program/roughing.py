@@ -154,7 +154,7 @@ class Tool:
         if max(abs((there - here).real), abs((there - here).imag)) < _SAME_PLACE * modal.scale:
             return
         begin, finish = here - centre, there - centre
-        if not radii_agree(abs(begin), abs(finish)):
+        if not radii_agree(abs(begin), abs(finish), modal.scale):
             raise ContourError("an arc of its contour ends at another radius than it begins; correct its centre")
         turns = 1 if ccw else -1
         angle = sweep((begin.real, begin.imag), (finish.real, finish.imag), turns)

@@ -18,7 +18,7 @@ _WORD = re.compile(r"([a-z@^])([+-]?(?:\d++\.?\d*+|\.\d++))")
 _NUMBER = re.compile(r"n(\d++)(?:\.\d++)?+")
 _BLANKS = str.maketrans("", "", " \t\r\v\f")
 _COMMENT = "("
-_LETTERS = frozenset("abcdefghijklmpqrstuvwxyz@^")
+_LETTERS = frozenset("abcdefghijklmpqrstuvwxyz@^$")
 
 
 def _groups(*members: tuple[str, tuple[int, ...]]) -> Mapping[int, str]:
@@ -26,11 +26,12 @@ def _groups(*members: tuple[str, tuple[int, ...]]) -> Mapping[int, str]:
 
 
 MOTION = (
-    0, 10, 20, 30, 50, 51, 52, 53, 330, 331, 382, 383, 384, 385, 700, 710, 711, 712, 720, 721, 722, 730, 740, 760, 800,
+    0, 10, 20, 30, 50, 51, 52, 53, 330, 331, 382, 383, 384, 385, 700, 710, 711, 712, 720, 721, 722, 730, 740, 760,
     *range(810, 900, 10),
 )  # fmt: skip
 G_GROUPS: Mapping[int, str] = _groups(
     ("motion", MOTION),
+    ("cycle end", (800,)),
     ("one-shot", (40, 100, 280, 281, 300, 301, 520, 920, 921, 922, 923)),
     ("machine co-ordinates", (530,)),
     ("plane", (170, 171, 180, 181, 190, 191)),
@@ -137,7 +138,14 @@ class Line:
         for key, value in self.settings:
             index = key if isinstance(key, str) else whole(context, now(key), "#")
             block.settings.append((index, now(value)))
-        return block
+        return _ended(block)
+
+
+def _ended(block: Block) -> Block:
+    """Make G80 the motion of a block that has no other: beside one it says nothing."""
+    if "cycle end" in block.g:
+        block.g.setdefault("motion", block.g["cycle end"])
+    return block
 
 
 def read(text: str, context: Context, max_nesting: int) -> Line:
@@ -149,7 +157,7 @@ def read(text: str, context: Context, max_nesting: int) -> Line:
             if value - value != 0.0:
                 raise ProgramError(context.line, letter.upper() + digits[:12], "is too large a number")
             _add(block, letter, value)
-        return Line(block)
+        return Line(_ended(block))
     reader = Reader(text, context, max_nesting)
     words: list[tuple[str, Value]] = []
     settings: list[tuple[Value | str, Value]] = []
