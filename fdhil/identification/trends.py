@@ -16,6 +16,7 @@ from fdhil.records import PARAMETERS, Float
 SURE_95 = 1.959963984540054
 LEAST_ROWS = 3
 LEAST_STRETCH = 3  # rows on either side of a step: fewer may be one bad estimate
+NEWEST = 2  # rows after the newest step: two that agree are believed, as they are when they are taken in
 ENOUGH_FOR_DRIFT = 8  # rows from which on a steady drift is told apart from a step
 ENOUGH_FOR_CURVE = 16
 NEAR = 8  # rows on either side in which a step must be seen too
@@ -140,7 +141,7 @@ def steps(values: Float, stds: Float, temperature: Float | None = None) -> list[
 def _steps_of(name: str, values: Float, stds: Float, temperature: Float | None) -> list[Step]:
     known = np.flatnonzero(np.isfinite(values) & np.isfinite(stds) & (stds > 0))
     y, n = values[known], known.size
-    if n < 2 * LEAST_STRETCH:
+    if n < LEAST_STRETCH + NEWEST:
         return []
     weights = 1.0 / stds[known]
     columns = _courses(n, None if temperature is None else temperature[known])
@@ -167,7 +168,7 @@ def _stands_out(y: Float, weights: Float, row: int, size: float) -> bool:
     if last - first < ENOUGH_FOR_DRIFT:
         del columns[1]
     theta, _ = _fit(y[first:last] * weights[first:last], weights[first:last], columns)
-    return theta[-1] * size > 0 and abs(theta[-1]) >= abs(size) / 2
+    return bool(theta[-1] * size > 0 and abs(theta[-1]) >= abs(size) / 2)
 
 
 def _courses(n: int, temperature: Float | None) -> list[Float]:
@@ -208,7 +209,8 @@ def _best_row(y: Float, weights: Float, columns: Sequence[Float], taken: Sequenc
     whole = np.cumsum((weights**2)[::-1])[::-1]
     length = whole - (shadow**2).sum(axis=1)
     allowed = length > COLLINEAR * whole
-    for edge in (0, n, *taken):
+    allowed[n - NEWEST + 1 :] = False
+    for edge in (0, *taken):
         allowed[max(0, edge - LEAST_STRETCH + 1) : edge + LEAST_STRETCH] = False
     if not allowed.any():
         return None

@@ -97,7 +97,7 @@ def test_the_date_of_a_limit_and_its_interval() -> None:
 
 
 def test_no_date_without_a_sure_slope() -> None:
-    line = slope(5 + 0.1 * (-1.0) ** np.arange(20), np.arange(20.0), np.full(20, 0.1))
+    line = slope(np.array([4.9, 5.1] * 10), np.arange(20.0), np.full(20, 0.1))
     assert line is not None
     assert crossing(line, 10.0) is None
 
@@ -116,6 +116,13 @@ def test_a_step_is_found_where_it_is_while_the_ways_warm_up(name: str, share: fl
         friction = (1 - 0.1 * (celsius[at] - 20)) if k >= 4 else 1.0
         assert step.size == pytest.approx((share - 1) * BENCH[k] * friction, rel=0.25)
         assert abs(step.size) > 5 * step.std
+
+
+def test_the_newest_step_is_told_from_its_second_row_on() -> None:
+    values, stds = _series(np.random.default_rng(13), np.ones(12))
+    values[10:, 3] *= 1.13
+    assert [(step.name, step.row) for step in steps(values, stds)] == [("Jt", 10)]
+    assert steps(values[:11], stds[:11]) == []
 
 
 def test_two_changes_are_told_apart() -> None:

@@ -1,0 +1,81 @@
+"""From the twin's bus to the history: warm slide-ways have their slopes, a loaded table is seen at its first rapid."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil import config as machine_config
+from fdhil.cli.demo.processes import Twin
+from tests.daemon.shop import AXIS, HEAD, Shop, fdhil
+
+pytestmark = pytest.mark.timeout(400)  # three processes, each of which compiles on the very first run
+FT_PER_KELVIN, CD_PER_KELVIN = -0.16, -0.10
+SHUTTLE = "G21 G90 G94\nG0 X300\nG4 P0.35\nG0 X0\nG4 P0.35\nM2\n"
+CELSIUS = np.linspace(20.0, 22.0, 6)
+# heavier than the data sheet says, with slide-ways that keep the temperature they are given
+TWIN = f"""
+ft_per_kelvin = {FT_PER_KELVIN}
+Cd_per_kelvin = {CD_PER_KELVIN}
+[sim.thermal]
+rise_c = 0.0
+time_constant_s = 1e9
+"""
+
+
+@pytest.fixture
+def shop(tmp_path: Path) -> Iterator[Shop]:
+    """A twin of one axis whose friction falls with the temperature, which its sensor tells."""
+    bench = HEAD + AXIS + TWIN
+    (tmp_path / "twin.toml").write_text(f'{bench}[bus.can0]\ninterface = "socketcand"\n')
+    with Twin(tmp_path / "twin.toml", tmp_path / "twin.log") as twin:
+        bus, sensor = twin.ready["buses"]["can0"], twin.ready["modbus"]["X"]
+        told = "\n".join(f"{key} = {json.dumps(value)}" for key, value in {**sensor, "period_s": 0.05}.items())
+        place = "\n".join(f"{key} = {json.dumps(bus[key])}" for key in ("channel", "host", "port"))
+        machine = tmp_path / "machine.toml"
+        machine.write_text(f'{bench}[axis.X.temperature]\n{told}\n[bus.can0]\ninterface = "socketcand"\n{place}\n')
+        yield Shop(tmp_path, twin, machine, machine_config.load(machine))
+
+
+def test_warming_and_load(shop: Shop, capsys: pytest.CaptureFixture[str]) -> None:
+    with shop.daemon() as daemon:
+        shop.nc_on()
+        for celsius in CELSIUS:
+            shop.twin.command("temperature", celsius=float(celsius))
+            _shuttle(shop)
+        assert not [n for n in _notices(shop) if n["code"] in {"LoadChanged", "ParameterJump", "MaintenanceDue"}]
+        shop.twin.command("set", axis="X", parameters={"Jt": 0.085 * 1.13})
+        _shuttle(shop)
+        loaded = [notice for notice in _notices(shop) if notice["code"] == "LoadChanged"]
+        assert [notice["severity"] for notice in loaded] == ["MAJOR", "minor"]
+        assert daemon.stop() == 0
+    document = json.loads(fdhil("history", shop.path, "--json", capsys=capsys)[1])
+    slopes = document["slopes"]["X"]
+    assert slopes["ft"]["per_kelvin"] == pytest.approx(0.05 * FT_PER_KELVIN, rel=0.1)
+    assert slopes["Cd"]["per_kelvin"] == pytest.approx(5.0 * CD_PER_KELVIN, rel=0.1)
+    (change,) = document["changes"]["X"]
+    assert (change["cause"], list(change["parameters"])) == ("a changed load", ["Jt"])
+    assert change["parameters"]["Jt"]["after"] == pytest.approx(0.085 * 1.13, rel=0.01)
+    windows = document["windows"]["X"]
+    assert [w["temperature_c"] for w in windows[:-2:2]] == pytest.approx(list(CELSIUS), abs=0.02)
+
+
+def _shuttle(shop: Shop) -> None:
+    """Play the shuttle and wait until its rapids are analysed."""
+    before = _analysed(shop.status() or {})
+    shop.play("shuttle.ngc", SHUTTLE)
+    shop.status_when(lambda status: _analysed(status) >= before + 2)
+
+
+def _analysed(status: dict[str, Any]) -> int:
+    axis = status["axes"]["X"]
+    return int(axis["accepted"] + axis["refused"])
+
+
+def _notices(shop: Shop) -> list[dict[str, Any]]:
+    return list((shop.status() or {})["notices"])
