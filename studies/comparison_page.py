@@ -83,7 +83,7 @@ def _best_operator(found: Sequence[Figures], names: Names) -> list[str]:
         sample off, which no low-pass mends (largest bias of R at 40 Hz, in the order of the table: {shifts} %). No
         operator can be used without a low-pass (largest bias of Jt: {raw} %)."""
     )
-    return [*lines, "RMS error over the bound, geometric mean over the six parameters:", "", *_grid(head, rows), ""]
+    return [*lines, "RMS error over the bound, geometric mean over the six parameters:", "", *grid(head, rows), ""]
 
 
 def _largest(found: Sequence[Figures], k: int, methods: Sequence[int], parameter: int) -> str:
@@ -91,7 +91,8 @@ def _largest(found: Sequence[Figures], k: int, methods: Sequence[int], parameter
     return ", ".join(f"{max(abs(f.bias[k, m, parameter]) for f in found):.2g}" for m in methods)
 
 
-def _grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+def grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return a table of a page."""
     return ["| " + " | ".join(head) + " |", "|---" * len(head) + "|", *("| " + " | ".join(row) + " |" for row in rows)]
 
 
@@ -111,7 +112,7 @@ def _moments(found: Sequence[Figures], names: Names) -> list[str]:
         bring one of their own, their horizon."""
     )
     head = ["low-pass", *parameters, "all six together"]
-    return [*lines, "Cases in which zero forcing #1 has the smaller RMS error:", "", *_grid(head, rows), ""]
+    return [*lines, "Cases in which zero forcing #1 has the smaller RMS error:", "", *grid(head, rows), ""]
 
 
 def _same_filter(found: Sequence[Figures], names: Names, one_sided: str) -> list[str]:
@@ -132,7 +133,7 @@ def _same_filter(found: Sequence[Figures], names: Names, one_sided: str) -> list
     )
     head = ["noise %", "low-pass", *parameters]
     told = "Bias of zero forcing #1 at a period of 1 ms, % of the true value (RMS error):"
-    return [*lines, told, "", *_grid(head, rows), ""]
+    return [*lines, told, "", *grid(head, rows), ""]
 
 
 def _cells(bias: Array, rms: Array) -> list[str]:
@@ -161,7 +162,7 @@ def _hausman(found: Sequence[Figures], names: Names) -> list[str]:
         the sensors. They pay with a spread that grows with the noise let through, in ft and Cd most."""
     )
     head = ["low-pass", "period ms", "noise %", *(SHORT[n] for n in shown)]
-    return [*lines, "Rejections, % of the rapids, for L / Jt:", "", *_grid(head, rows), ""]
+    return [*lines, "Rejections, % of the rapids, for L / Jt:", "", *grid(head, rows), ""]
 
 
 def _table(f: Figures, names: Names) -> list[str]:
@@ -172,7 +173,7 @@ def _table(f: Figures, names: Names) -> list[str]:
             cells = [f"{f.rms[k, m, j]:.3g} ({f.bias[k, m, j]:+.2g})" for m in range(len(methods))]
             rows.append([name, parameter, *cells, f"{f.bound[j]:.3f}"])
     head = ["low-pass", "", *(SHORT[n] for n in methods), "bound"]
-    return [f"### {1e3 * f.period_s:g} ms, {100 * f.noise:g} % noise", "", *_grid(head, rows), ""]
+    return [f"### {1e3 * f.period_s:g} ms, {100 * f.noise:g} % noise", "", *grid(head, rows), ""]
 
 
 def figure(found: Sequence[Figures], names: Names) -> Any:
