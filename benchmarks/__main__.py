@@ -16,6 +16,7 @@ BENCHMARKS = {
     "closed_loop": "The closed-loop kernel against the same kernel in C -O3, and against real time",
     "identification": "From the last sample of a rapid to validated parameters",
     "inverse": "Planning the inverse correction: the whole, and the first block of a stream",
+    "planner": "The planner: speed, LinuxCNC's own demand beside it, and what the correction makes of jerky demands",
     "acquisition": "A full 1 Mbit/s bus through receive and decode, alone and beside a fit",
     "guard_latency": "From SYNC to the offset frames",
     "whole_machine": "The daemon beside the twin in real time: 60 s of two drives at 1 kHz",

@@ -14,9 +14,14 @@ import pytest
 from scipy.spatial import cKDTree
 
 from fdhil import config as configuration
+from fdhil.correction import mirror
+from fdhil.correction import plan as correct
+from fdhil.prediction import predict_corrected
+from fdhil.prediction.models import nominal_models
 from fdhil.program import Dwell, interpret, plan
 from fdhil.records import Float
-from tests.bench import bench_document
+from tests.bench import bench_config, bench_document
+from tests.paths import rms, trajectory
 from tests.program.linuxcnc_machine import demand
 from tests.program.test_look_ahead import dense_path
 
@@ -96,3 +101,18 @@ def test_g64_stays_within_p_and_takes_about_the_same_time(
     for rows in (a, b):
         assert np.max(tree.query(rows[:, :2])[0]) <= tolerance_mm + 0.003
     assert len(a) == pytest.approx(len(b), rel=share)
+
+
+def test_the_correction_stands_the_jerky_demand() -> None:
+    """The bench path by G64 without P: steps of acceleration, rounded to the drives' increments."""
+    text = "G21 G90 G17 G64\nF10000\nG1 Y55\nX100\nG3 X200 I50\nG1 X250\nY0\nM2\n"
+    rows = theirs(text)[:, :2]
+    reference = trajectory(np.round(np.concatenate([rows, np.repeat(rows[-1:], 500, axis=0)]) * 3276.8) / 3276.8)
+    config = bench_config()
+    models = nominal_models(config)
+    correction = correct(reference, models, config, "inverse")
+    assert not correction.refused
+    mirrored = mirror.plan(reference, models, config, correction.before).offset_um
+    left = rms(correction.after.contour_um)
+    assert rms(correction.before.contour_um) >= 14 * left
+    assert rms(predict_corrected(reference, models, config, mirrored).contour_um) >= 2 * left

@@ -13,7 +13,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from fdhil import config as configuration
+from fdhil.correction import plan as correct
+from fdhil.correction import streaming
 from fdhil.errors import ProgramError
+from fdhil.prediction.models import nominal_models
 from fdhil.program import Arc, Dwell, Feed, Motion, Rapid, plan
 from fdhil.program.motions import BLEND, Corner
 from fdhil.program.planner import stream
@@ -21,6 +24,7 @@ from fdhil.program.planner.limits import AxisLimits
 from fdhil.program.planner.pieces import LENGTH, piece, points
 from fdhil.records import Float, Trajectory
 from tests.bench import bench_config, bench_document
+from tests.paths import rms
 from tests.program.test_planner import MOVES
 
 DT_S = 1e-3
@@ -235,3 +239,20 @@ def test_the_smoothed_profile_is_what_it_was() -> None:
     digest = hashlib.sha256(b"".join(path.tobytes() for path in reference.position_mm.values()))
     digest.update(reference.line.tobytes() + reference.rapid.tobytes() + reference.time_s.tobytes())
     assert digest.hexdigest() == "1366187971d19c82b485a2c3003acf9866421043e61bd88f3dfdcfcc24c77987"
+
+
+def test_a_jerky_demand_is_corrected_while_it_is_planned() -> None:
+    """Steps of acceleration from a stream of blocks into the streamed correction: as good as the whole at once."""
+    config = machine("trapezoidal")
+    moves = [move for move in MOVES if not isinstance(move, Rapid)]
+    models = nominal_models(config)
+    pieces = (block.position_mm for block in stream(moves, config, 100))
+    blocks = list(streaming.stream(pieces, models, config))
+    assert blocks[-1].final
+    assert not any(block.refused for block in blocks)
+    before = np.concatenate([block.before_um for block in blocks])
+    after = np.concatenate([block.after_um for block in blocks])
+    whole = correct(plan(moves, config), models, config, "inverse")
+    assert before.size == whole.after.contour_um.size
+    assert rms(before) >= 14 * rms(after)
+    assert rms(after) == pytest.approx(rms(whole.after.contour_um), rel=0.2, abs=0.05)

@@ -1,0 +1,115 @@
+"""The planner: how fast it is, how near to LinuxCNC's own demand, and what the correction makes of jerky demands.
+
+Run as ``python -m benchmarks.planner``; without LinuxCNC (Debian's linuxcnc-uspace) its parts are left out.
+"""
+
+from __future__ import annotations
+
+import math
+import shutil
+import time
+from collections.abc import Iterator
+
+import numpy as np
+
+from benchmarks.inverse import gains
+from fdhil import config as configuration
+from fdhil.program import Arc, Feed, Motion, interpret, plan
+from fdhil.program.motions import Corner
+from fdhil.program.planner import stream
+from fdhil.records import Float
+from tests.bench import bench_config, bench_document
+from tests.program.linuxcnc_machine import demand
+from tests.program.test_linuxcnc_demand import ACCELERATION_MM_S2, EXACT_SHARE, PATHS, apart_mm, ours, program
+
+BENCH = "G21 G90 G17 {mode}\nF{feed:g}\nG1 Y55\nX100\nG3 X200 I50\nG1 X250\nY0\nM2\n"
+MODES = ("G61", "G64 P0.05", "G64")
+PROFILES = ("fir", "trapezoidal", "jerk_limited")
+MOVES = 100_000
+HAVE_LINUXCNC = shutil.which("linuxcnc") is not None
+
+
+def machine(profile: str, acceleration_mm_s2: float = ACCELERATION_MM_S2) -> configuration.MachineConfig:
+    """The bench with another profile and acceleration of the NC."""
+    document = bench_document()
+    for axis in document["axis"].values():
+        axis["max_acceleration_mm_s2"] = acceleration_mm_s2
+    document["nc"] = {"profile": profile}
+    return configuration.parse(document)
+
+
+def chords(count: int) -> Iterator[Motion]:
+    """A wavy line in chords of 0.2 mm and an arc now and then."""
+    for number in range(1, count + 1):
+        end = (0.2 * number, 5.0 * math.sin(0.02 * number), 0.0)
+        if number % 50:
+            yield Feed(number, end, 6000.0, Corner("blend", 0.01))
+        else:
+            before = (0.2 * (number - 1), 5.0 * math.sin(0.02 * (number - 1)))
+            centre = ((before[0] + end[0]) / 2.0, (before[1] + end[1]) / 2.0, None)
+            yield Arc(number, end, centre, 1, "XY", 6000.0, Corner("blend", 0.01))
+
+
+def speeds() -> None:
+    """Motions and seconds of path per second."""
+    for profile in PROFILES:
+        begun, rows = time.process_time(), 0
+        for block in stream(chords(MOVES), machine(profile), 1000):
+            rows += block.time_s.size
+        took = time.process_time() - begun
+        print(f"{profile}: {MOVES / took:.0f} motions/s, {rows * 0.001 / took:.0f} x real time on one core")
+
+
+def beside_linuxcnc() -> None:
+    """Rows, and the largest distance at the same millisecond, of demands of the same program."""
+    print(
+        "path, mode, feed: rows of fdhil and of LinuxCNC, difference of time, largest distance at the same millisecond"
+    )
+    for path in PATHS:
+        for mode, feed in (("G61", 6000.0), ("G61", 20000.0), ("G64 P0.05", 3000.0), ("G64 P0.05", 10000.0)):
+            text = program(path, mode, feed)
+            a = ours(text, ACCELERATION_MM_S2 * (EXACT_SHARE if mode == "G61" else 1.0))
+            b = demand(text, acceleration_mm_s2=ACCELERATION_MM_S2)
+            told = f"{len(a)} and {len(b)}, {100 * (len(a) / len(b) - 1):+.2f} %, {apart_mm(a, b):.3f} mm"
+            print(f"{path}, {mode}, {feed / 1000:g} m/min: {told}")
+
+
+def jerky() -> Iterator[tuple[str, Float]]:
+    """Demands of the bench path with steps of acceleration of 2 m/s2, by name."""
+    for feed in (10_000.0, 20_000.0):
+        for mode in MODES:
+            text = BENCH.format(mode=mode, feed=feed)
+            reference = plan(interpret(text.splitlines()), machine("trapezoidal"))
+            name = f"{mode}, {feed / 1000:g} m/min"
+            yield f"trapezoidal, {name}", np.column_stack(list(reference.position_mm.values()))
+            if HAVE_LINUXCNC:
+                rows = demand(text, acceleration_mm_s2=ACCELERATION_MM_S2)[:, :2]
+                yield f"LinuxCNC, {name}", np.concatenate([rows, np.repeat(rows[-1:], 500, axis=0)])
+
+
+def corrections() -> None:
+    """Gains of the inverse correction on jerky demands as the drives get them, rounded to increments."""
+    print("least gain over uncorrected (wanted: 14) and over mirror (2) on 40 scattered plants; RMS on the nominal one")
+    per_mm = next(iter(bench_config().axis.values())).scaling.increments_per_mm
+    for name, rows in jerky():
+        rounded = np.round(rows * per_mm) / per_mm
+        found, (before, after) = gains(rounded)
+        least = found.min(axis=0)
+        print(
+            f"{name}: {least[0]:.0f}, over mirror {least[1]:.1f}, point worse by {found[:, 2].max():.2f} um; "
+            f"{before:.1f} to {after:.2f} um"
+        )
+
+
+def main() -> None:
+    """Print the figures."""
+    speeds()
+    if HAVE_LINUXCNC:
+        beside_linuxcnc()
+    else:
+        print("LinuxCNC is not installed: apt-get install linuxcnc-uspace")
+    corrections()
+
+
+if __name__ == "__main__":
+    main()
