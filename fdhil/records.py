@@ -91,6 +91,20 @@ class VoltageSamples:
 
 
 @dataclass(frozen=True, slots=True)
+class SlowVoltage:
+    """Voltage of a sensor slower than the drive, on the sensor's own grid beside a window: ``voltage_v`` (m,); lost: NaN.
+
+    Sample j covers ``begin_s`` + j ``period_s`` after row 0 of the window and one period from there (or is the value at
+    its begin, as the window's ``voltage_sampling`` says). ``error_s`` is how far off ``begin_s`` may be.
+    """
+
+    begin_s: float
+    period_s: float
+    error_s: float
+    voltage_v: Float
+
+
+@dataclass(frozen=True, slots=True)
 class TickTimes:
     """Host-monotonic time ``t_ns`` (n,) at which the SYNC of each ``tick`` (n,) was received."""
 
@@ -142,7 +156,8 @@ class Window:
     Arrays are (n,); a lost sample is NaN in every signal, and ``gaps`` lists the half-open ranges that were lost.
     ``voltage_v`` of row k is the mean over [t_k, t_k + dt) when ``voltage_sampling`` is ``interval_mean``, else the
     value at t_k; ``voltage_delay_s`` (what is left after alignment by counters, None when not known) has not been
-    taken out. ``start_s`` is the time of row 0 in its recording or since the first tick. ``offset_mm`` is the position
+    taken out. ``slow_voltage`` stands in its place where a sensor samples more slowly than the drive.
+    ``start_s`` is the time of row 0 in its recording or since the first tick. ``offset_mm`` is the position
     offset in force, None where it was 0 throughout or is not known.
     """
 
@@ -165,6 +180,7 @@ class Window:
     voltage_delay_s: float | None = None
     source: str = ""
     offset_mm: Float | None = None
+    slow_voltage: SlowVoltage | None = None
 
     @property
     def n(self) -> int:
@@ -220,7 +236,8 @@ class Estimate:
     """An estimator's answer: ``values`` (k,) and ``covariance`` (k, k) of ``names``; NaN where the data cannot tell.
 
     ``residuals`` maps "electrical" (V) and "mechanical" (A) to their residuals (m,). ``missing`` maps the names that
-    are NaN to the reason. ``delay_s`` is the voltage delay that the data show, None when not estimated.
+    are NaN to the reason. ``delay_s`` is the voltage delay that the data show, None when not estimated, and
+    ``delay_std_s`` its standard deviation.
     """
 
     method: str
@@ -231,6 +248,7 @@ class Estimate:
     result: Result
     missing: Mapping[str, Reason] = field(default_factory=dict)
     delay_s: float | None = None
+    delay_std_s: float | None = None
 
     def value(self, name: str) -> float:
         """Return one parameter's value (NaN when the data cannot tell it)."""

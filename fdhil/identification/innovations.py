@@ -8,11 +8,12 @@ Where friction is not known (standstill, reversal) the speed is a random walk an
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numba import njit
 
+from fdhil.identification import slow_voltage
 from fdhil.identification.motion import BROKEN, UNKNOWN, Motion, Noise
 from fdhil.model.feed_drive import transition
 from fdhil.records import Float, Parameters
@@ -143,16 +144,29 @@ _residuals: Callable[..., Float] = njit(cache=True, nogil=True)(_residuals_plain
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """The filter's gains (n, 4), whiteners (n, 3), and log determinant, for fixed parameters and noise."""
+    """The filter's gains (n, 4), whiteners (n, 3), and log determinant, for fixed parameters and noise.
+
+    With a slow voltage they belong to the ``events`` (e, 3) at ``times_s`` (e,), in order for a voltage that is late by
+    ``delay_s``.
+    """
 
     gains: Float
     whiteners: Float
     logdet: float
+    events: slow_voltage.Events = field(default_factory=lambda: np.zeros((0, 3), np.int64))
+    times_s: Float = field(default_factory=lambda: np.zeros(0))
+    delay_s: float = 0.0
 
 
 def gains_of(motion: Motion, theta: Float, noise: Noise) -> Gains:
-    """Return the filter's gains for ``theta`` (6,) = [R, L, K, Jt, ft, Cd]."""
+    """Return the filter's gains for ``theta`` (7,) = [R, L, K, Jt, ft, Cd, delay]."""
     variances = noise.vector() ** 2
+    if motion.slow is not None:
+        delay = float(theta[6])
+        events, times = slow_voltage.events_of(motion.slow, motion.voltage_sampling, motion.n, motion.dt_s, delay)
+        walks = (motion.speed_walk, motion.slope_walk, motion.slow.period_s)
+        made = slow_voltage.gains(theta, motion.dt_s, motion.mode, motion.observed, variances, *walks, events, times)
+        return Gains(*made, events, times, delay)
     return Gains(*_gains(theta, motion.dt_s, motion.mode, motion.observed, variances, motion.speed_walk))
 
 
@@ -164,12 +178,31 @@ def innovations(
     load_nm: Float | None = None,
     emf_share: float = 1.0,
 ) -> Float:
-    """Return the whitened innovations (n, 2) of [current, speed]: white and of unit variance when the model is right.
+    """Return the whitened innovations (2 n,) of current and speed row by row.
+
+    Those of the samples of a slow voltage (m,) follow them. All are white, of unit variance, in a right model.
 
     ``load_nm`` (n,) is a torque against the positive direction over each interval (none when left out). Of the course
     of an interval mean within its sample only the back-EMF's ramp is certain (``emf_share`` of it is taken): what the
     current regulator adds depends on the drive, and to take it from neighbouring means biases L.
     """
+    load = NOTHING if load_nm is None else load_nm
+    if motion.slow is not None:
+        return slow_voltage.residuals(
+            theta,
+            motion.mode,
+            motion.observed,
+            load,
+            motion.current,
+            motion.speed,
+            motion.voltage_mean,
+            motion.slow.period_s,
+            gains.events,
+            gains.times_s,
+            delay_s - gains.delay_s,
+            gains.gains,
+            gains.whiteners,
+        )
     means = motion.voltage_sampling == "interval_mean"
     return _residuals(
         theta,
@@ -179,12 +212,12 @@ def innovations(
         motion.delayed(delay_s),
         NOTHING if means else motion.voltage_rise,
         emf_share if means else emf_share - 1.0,
-        NOTHING if load_nm is None else load_nm,
+        load,
         motion.current,
         motion.speed,
         gains.gains,
         gains.whiteners,
-    )
+    ).ravel()
 
 
 def vector_of(parameters: Parameters) -> Float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from fdhil.identification.filtering import all_about, moving_mean
 from fdhil.identification.windows import RUN_SHARE, carried, noise_of
 from fdhil.model.feed_drive import interval_shape
-from fdhil.records import Bool, Float, VoltageSampling, Window
+from fdhil.records import Bool, Float, SlowVoltage, VoltageSampling, Window
 
 UNKNOWN = 0  # stuck, reversing or about to move: the friction torque is not known
 # what the model can explain at best, as a share of a signal's peak: the voltage's course within a sample is not known
@@ -41,7 +41,8 @@ class Motion:
     +1 or -1: the drive surely moves that way; ``UNKNOWN``: friction is not known; ``BROKEN``: samples are lost.
     ``voltage_mean`` and ``voltage_rise`` (n,) describe the voltage over each interval; ``current`` and ``speed`` (n,)
     are instants, ``observed`` (n,) marks the rows that were measured. ``speed_walk`` is the standard deviation of the
-    speed's change over an interval of unknown friction.
+    speed's change over an interval of unknown friction. Where the voltage is ``slow``, ``voltage_mean`` (m,) are its
+    samples, and ``slope_walk`` is the variance that the current's slope gains per second, (A/s)^2/s.
     """
 
     dt_s: float
@@ -54,11 +55,32 @@ class Motion:
     noise: Noise
     speed_walk: float
     voltage_sampling: VoltageSampling = "interval_mean"
+    slow: SlowVoltage | None = None
+    slope_walk: float = 0.0
 
     @property
     def n(self) -> int:
         """Number of rows."""
         return int(self.speed.size)
+
+    @property
+    def voltage_period_s(self) -> float:
+        """The time from one voltage sample to the next."""
+        return self.dt_s if self.slow is None else self.slow.period_s
+
+    def at_voltage(self, course: Float) -> Float:
+        """Return a course over the rows (n,) at the begin of each voltage sample."""
+        if self.slow is None:
+            return course
+        begins = self.slow.begin_s + self.slow.period_s * np.arange(self.slow.voltage_v.size)
+        sampled: Float = np.interp(begins, np.arange(self.n) * self.dt_s, course)
+        return sampled
+
+    def aligned(self, delay_s: float) -> Motion:
+        """Return the motion with its voltage earlier by ``delay_s``."""
+        if self.slow is not None:
+            return replace(self, slow=replace(self.slow, begin_s=self.slow.begin_s - delay_s))
+        return replace(self, voltage_mean=self.delayed(delay_s))
 
     def delayed(self, delay_s: float) -> Float:
         """Return the mean voltage (n,) of each interval when the measured voltage is late by ``delay_s``."""
@@ -88,16 +110,19 @@ def surely_moving(speed: Float, rapid_rad_s: float) -> Bool:
 
 def prepare(window: Window) -> Motion:
     """Return the window as the estimators need it; its voltage must be there and it must have rows."""
-    if window.voltage_v is None:
+    slow = window.slow_voltage
+    if window.voltage_v is None and slow is None:
         raise ValueError("a window without voltage has no electrical equation")
     observed = np.isfinite(window.speed_rad_s) & np.isfinite(window.current_a)
-    powered = np.isfinite(window.voltage_v)
     sure = surely_moving(window.speed_rad_s, window.rapid_speed_rad_s)
     side = np.sign(carried(window.speed_rad_s)).astype(np.int8)
     mode = np.where(sure, np.sign(_majority(side, sure)), UNKNOWN).astype(np.int8)
     mode[:-1][mode[:-1] != mode[1:]] = UNKNOWN  # an interval belongs to a motion when both its ends do
-    mode[~powered] = BROKEN
-    mean, rise = interval_shape(carried(window.voltage_v), window.voltage_sampling)
+    if slow is not None:
+        mean, rise = carried(slow.voltage_v), np.zeros(slow.voltage_v.size)
+    elif window.voltage_v is not None:
+        mode[~np.isfinite(window.voltage_v)] = BROKEN
+        mean, rise = interval_shape(carried(window.voltage_v), window.voltage_sampling)
     speed, current = carried(window.speed_rad_s), carried(window.current_a)
     return Motion(
         dt_s=window.dt_s,
@@ -110,6 +135,7 @@ def prepare(window: Window) -> Motion:
         noise=noise_levels(window),
         speed_walk=_largest_step(speed, window.dt_s),
         voltage_sampling=window.voltage_sampling,
+        slow=slow,
     )
 
 
@@ -124,7 +150,8 @@ def _majority(side: Modes, sure: Bool) -> Modes:
 
 def noise_levels(window: Window) -> Noise:
     """Return the noise of the three signals as their third differences show it, never below their resolution."""
-    signals = (window.voltage_v, window.current_a, window.speed_rad_s)
+    voltage = window.slow_voltage.voltage_v if window.slow_voltage is not None else window.voltage_v
+    signals = (voltage, window.current_a, window.speed_rad_s)
     levels = [_level(s, share) for s, share in zip(signals, SHAPE_SHARE, strict=True)]
     return Noise(*levels)
 

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdhil.records import AxisSamples, Bool, Float, Int, TickTimes, VoltageSamples
+from fdhil.records import AxisSamples, Bool, Float, Int, SlowVoltage, TickTimes, VoltageSamples, frozen
 
 PLACING_BLOCKS = 40  # some 2 s of a sensor that is asked every 50 ms
+CLOCK_TOLERANCE = 500e-6  # two quartz clocks
+LEAST_FOR_RATE = 100  # samples from which the sensor's own rate is believed
 RATE_TOLERANCE = 0.01  # a sensor's rate may be off a multiple of the SYNC rate by this much
 
 
@@ -25,7 +27,8 @@ class Stretch:
     ``offset_mm`` is the position offset in force.
 
     Row k of ``voltage_v`` is the mean over the period that begins at tick k (or the instant, as the source samples);
-    None without a source. ``voltage_delay_s`` is what the placing on whole ticks left over.
+    None without a source. ``voltage_delay_s`` is what the placing on whole ticks left over. A sensor slower than the
+    SYNC keeps its own grid: ``slow_voltage``, counted from ``start_tick``.
     """
 
     start_tick: int
@@ -37,6 +40,7 @@ class Stretch:
     voltage_delay_s: float | None
     offset_mm: Float
     gaps: tuple[tuple[int, int], ...]
+    slow_voltage: SlowVoltage | None = None
 
 
 class Ring:
@@ -81,6 +85,9 @@ class Ring:
 
     def voltage_reaches(self, tick: int) -> bool:
         """Whether the separate sensor has delivered past ``tick``; False until its place on the grid is known."""
+        if self._is_slow():
+            line = self._slow_line()
+            return line is not None and line[0] + line[1] * (int(self._voltage[-1].counter[-1]) + 1) >= tick
         place = self._placing()
         return place is not None and int(self._voltage[-1].counter[-1]) >= place.counter_of(tick + 1)
 
@@ -97,8 +104,10 @@ class Ring:
             return values
 
         speed = placed(b.speed_rad_s for b in blocks)
-        voltage, delay = None, None
-        if separate_voltage:
+        voltage, delay, slow = None, None, None
+        if separate_voltage and self._is_slow():
+            slow = self._slow(start, stop)
+        elif separate_voltage:
             voltage, delay = self._separate(start, stop)
         elif blocks and all(b.voltage_v is not None for b in blocks):
             voltage = placed(b.voltage_v for b in blocks if b.voltage_v is not None)
@@ -112,7 +121,53 @@ class Ring:
             delay,
             placed(b.offset_mm for b in blocks),
             runs(~np.isfinite(speed)),
+            slow,
         )
+
+    def _is_slow(self) -> bool:
+        """Whether the separate sensor samples more slowly than the SYNC, beyond what two clocks differ by."""
+        return bool(self._voltage) and self._samples_per_tick() < 1 - RATE_TOLERANCE
+
+    def _samples_per_tick(self) -> float:
+        return self._period_ns * 1e-9 * self._voltage[-1].sample_rate_hz
+
+    def _slow_line(self) -> tuple[float, float] | None:
+        """Return begin (ticks) of sample 0 and ticks per sample, as the newest blocks and the SYNC's arrivals show."""
+        if not self._voltage or not self._times:
+            return None
+        recent = list(self._voltage)[-PLACING_BLOCKS:]
+        tick_ns = np.concatenate([b.t_ns for b in self._times])
+        tick = np.concatenate([b.tick for b in self._times])
+        counter = np.concatenate([b.counter for b in recent])
+        begins_ns = np.concatenate([b.t_ns for b in recent])
+        inside = (begins_ns >= tick_ns[0]) & (begins_ns <= tick_ns[-1])
+        if not inside.any():
+            return None
+        begins, counter = np.interp(begins_ns[inside], tick_ns, tick), counter[inside]
+        nominal = 1 / self._samples_per_tick()
+        spread = counter - counter.mean()
+        power = float(spread @ spread)
+        slope = float(spread @ begins) / power if counter.size >= LEAST_FOR_RATE else nominal
+        slope = float(np.clip(slope, nominal * (1 - CLOCK_TOLERANCE), nominal * (1 + CLOCK_TOLERANCE)))
+        return float(np.median(begins - slope * counter)), slope
+
+    def _slow(self, start: int, stop: int) -> SlowVoltage | None:
+        """Return the sensor's samples that lie wholly between the ticks, on its own grid; None without any."""
+        line = self._slow_line()
+        if line is None:
+            return None
+        first = int(np.ceil((start - line[0]) / line[1] - 1e-9))
+        count = int(np.floor((stop - 1 - line[0]) / line[1] + 1e-9)) - first
+        if count < 1:
+            return None
+        values = np.full(count, np.nan)
+        for block in self._voltage:
+            row = block.counter - first
+            inside = (row >= 0) & (row < count)
+            values[row[inside]] = block.voltage_v[inside]
+        error = float(np.median(np.concatenate([b.t_error_ns for b in self._voltage]))) * 1e-9
+        period_s = self._period_ns * 1e-9
+        return SlowVoltage((line[0] + first * line[1] - start) * period_s, line[1] * period_s, error, frozen(values))
 
     def _separate(self, start: int, stop: int) -> tuple[Float | None, float | None]:
         place = self._placing()
@@ -129,7 +184,7 @@ class Ring:
         """Return the sensor's place on the grid; None while it is not known or its rate is no multiple of SYNC's."""
         if not self._voltage or not self._times:
             return None
-        samples = self._period_ns * 1e-9 * self._voltage[-1].sample_rate_hz
+        samples = self._samples_per_tick()
         ratio = round(samples)
         if ratio < 1 or abs(samples / ratio - 1) > RATE_TOLERANCE:
             return None

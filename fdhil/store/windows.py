@@ -22,7 +22,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fdhil.errors import RecordingError, StoreError
-from fdhil.records import Float, Stages, Window, frozen
+from fdhil.records import Float, SlowVoltage, Stages, Window, frozen
 from fdhil.store.atomic import store_error, sync_folder, write_file
 
 FORMAT = "fdhil-window-1"
@@ -89,6 +89,10 @@ def encode_window(window: Window, config_digest: str, scales: Scales | None = No
         raw = scale is not None
         encodings[name] = "DELTA_BINARY_PACKED" if raw else "BYTE_STREAM_SPLIT"
         described[name] = {"unit": unit} | ({"factor": scale.factor, "divisor": scale.divisor} if scale else {})
+    if window.slow_voltage is not None:
+        rest = window.n - window.slow_voltage.voltage_v.size
+        columns["slow_voltage_v"] = pa.array(np.append(window.slow_voltage.voltage_v, np.full(rest, np.nan)))
+        encodings["slow_voltage_v"] = "BYTE_STREAM_SPLIT"
     head = _head(window) | {"columns": described, "config_digest": config_digest}
     head["digest"] = _digest(window)
     table = pa.table(columns).replace_schema_metadata({_META: json.dumps(head).encode()})
@@ -110,8 +114,9 @@ def _column(values: Float, candidates: Sequence[RawScale]) -> tuple[RawScale | N
 
 def _head(window: Window) -> dict[str, Any]:
     """The fields of a window that are no arrays, as JSON keeps them exactly."""
-    stages = window.stages
-    return {
+    stages, slow = window.stages, window.slow_voltage
+    sensor = {} if slow is None else {"slow_voltage": _grid(slow)}
+    return sensor | {
         "format": FORMAT,
         "clock": "SYNC tick",
         "axis": window.axis,
@@ -130,12 +135,24 @@ def _head(window: Window) -> dict[str, Any]:
     }
 
 
+def _grid(slow: SlowVoltage) -> dict[str, Any]:
+    """The grid of a slow sensor beside the rows; its samples are a column that ends earlier than the others."""
+    return {
+        "begin_s": slow.begin_s,
+        "period_s": slow.period_s,
+        "error_s": slow.error_s,
+        "samples": slow.voltage_v.size,
+    }
+
+
 def _digest(window: Window) -> str:
     """SHA-256 of a window's meaning: no bit of it can change unseen."""
     digest = hashlib.sha256(json.dumps(_head(window), sort_keys=True).encode())
     for name in COLUMNS:
         values = getattr(window, name)
         digest.update(name.encode() + (b"-" if values is None else _bits(values).tobytes()))
+    if window.slow_voltage is not None:
+        digest.update(_bits(window.slow_voltage.voltage_v).tobytes())
     return digest.hexdigest()
 
 
@@ -159,13 +176,20 @@ def _decode(content: bytes) -> tuple[Window, str]:
     if head.get("format") != FORMAT:
         raise ValueError(f"its format is {head.get('format')!r}, not {FORMAT}")
     table = file.read()
-    arrays: dict[str, Float | None] = {}
+    arrays: dict[str, Any] = {}
     for name in COLUMNS:
         described = head["columns"].get(name)
         arrays[name] = None if described is None else _values(table.column(name), described)
     if any(arrays[name] is None for name in COLUMNS.keys() - OPTIONAL):
         raise ValueError("a column is missing")
-    return _window(head, arrays), str(head["digest"])
+    grid = head.pop("slow_voltage", None)
+    slow = None if grid is None else _slow(grid, table.column("slow_voltage_v"))
+    return _window(head, arrays | {"slow_voltage": slow}), str(head["digest"])
+
+
+def _slow(grid: Mapping[str, Any], column: Any) -> SlowVoltage:
+    samples = np.asarray(column.to_numpy(), dtype=np.float64)[: int(grid["samples"])]
+    return SlowVoltage(float(grid["begin_s"]), float(grid["period_s"]), float(grid["error_s"]), frozen(samples))
 
 
 def _values(column: Any, described: Mapping[str, Any]) -> Float:

@@ -175,6 +175,7 @@ def _offset(bench: Bench, name: str, unit: str) -> Finding:
 
 def _altered(motion: Motion, name: str, factor: Float, offset: float) -> Motion:
     if name == "voltage":
+        factor, offset = motion.at_voltage(factor), motion.at_voltage(np.broadcast_to(offset, motion.n))
         mean, rise = motion.voltage_mean * factor + offset, motion.voltage_rise * factor
         return replace(motion, voltage_mean=mean, voltage_rise=rise)
     if name == "current":
@@ -206,11 +207,13 @@ def whiteness(fit: Fit) -> Iterator[Reason]:
     """Yield a reason where an autocorrelation of the innovations is neither chance (over all lags) nor harmless."""
     motion = fit.problem.motions[0]
     rows = (np.abs(motion.mode) == 1) & motion.observed
-    e = fit.residuals.reshape(-1, 2)[rows]
+    e = fit.residuals[: 2 * motion.n].reshape(-1, 2)[rows]
     if e.shape[0] < 4 * LAGS:
         return
     limit = max(WHITENESS_BEYOND_CHANCE / np.sqrt(e.shape[0]), PRACTICAL_CORRELATION)
     for k, name in enumerate(("current", "speed")):
+        if name == "current" and motion.slow is not None:
+            continue  # a slow voltage does not foretell the current from row to row
         power = float(e[:, k] @ e[:, k])
         correlations = np.array([e[lag:, k] @ e[:-lag, k] for lag in range(1, LAGS + 1)]) / power
         worst = int(np.argmax(np.abs(correlations)))

@@ -10,11 +10,10 @@ from fdhil.config import Identification
 from fdhil.identification.estimators import chosen, maximum_likelihood
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.identifiability import empty_estimate, unphysical
-from fdhil.identification.motion import noise_levels
 from fdhil.identification.ratios import estimate_ratios
 from fdhil.identification.windows import carried
 from fdhil.model.feed_drive import discretise, simulate_plant
-from fdhil.records import Estimate, Parameters, Reason, Result, Verdict, Window, WindowOutcome
+from fdhil.records import Estimate, Float, Parameters, Reason, Result, Verdict, Window, WindowOutcome
 from fdhil.validation.plausibility import implausibilities
 from fdhil.validation.rest import rest_faults
 from fdhil.validation.structure import excess_noise, findings, whiteness
@@ -28,7 +27,7 @@ UNFIT = ("NotFinite",)
 def analyse(window: Window, settings: Identification) -> WindowOutcome:
     """Return what one window says of the drive, and whether it is believed; never raises, whatever the data."""
     reasons = implausibilities(window)
-    if window.voltage_v is None:
+    if window.voltage_v is None and window.slow_voltage is None:
         return _without_voltage(window, settings, reasons)
     if window.n < 32 or any(r.code in UNFIT for r in reasons):
         if not reasons:
@@ -90,25 +89,28 @@ def _doubts(window: Window, estimate: Estimate, fit: Fit | None, fit_percent: fl
 
 def expected_fit_percent(window: Window, fit: Fit) -> float:
     """Return the fit that a right model has at least, from the noise of speed and of the voltage that drives it."""
-    noise = noise_levels(window)
+    noise = fit.problem.motions[0].noise
     own = fit.problem.noises[0].voltage_v
     p = Parameters(*fit.theta[:6])
-    step = discretise(p, window.dt_s)
+    step = discretise(p, fit.problem.motions[0].voltage_period_s)
     push = step.mean[:, 0] / p.L * min(own, EXCESS * noise.voltage_v)
     # the steady state of P = phi P phi' + push push'
     spread = np.linalg.solve(np.eye(4) - np.kron(step.phi, step.phi), np.outer(push, push).ravel()).reshape(2, 2)
     variance = EXCESS * (noise.speed_rad_s**2 + spread[1, 1]) + (SHAPE_SHARE * window.rapid_speed_rad_s) ** 2
+    if window.slow_voltage is not None:
+        return LEAST_FIT_PERCENT  # the voltage's course within its samples is not known
     deviation = float(np.nanstd(window.speed_rad_s))
     return max(LEAST_FIT_PERCENT, 100.0 * (1.0 - float(np.sqrt(variance)) / max(deviation, 1e-300)))
 
 
 def _late(window: Window, fit: Fit) -> Reason | None:
     delay = float(fit.theta[6])
-    if abs(delay) <= window.dt_s:
+    period = max(window.dt_s, fit.problem.motions[0].voltage_period_s)
+    if abs(delay) <= period:
         return None
     text = (
         f"voltage is {1e3 * abs(delay):.2f} ms {'late' if delay > 0 else 'early'} against current and speed, "
-        f"more than a sample of {1e3 * window.dt_s:g} ms"
+        f"more than a sample of {1e3 * period:g} ms"
     )
     return Reason("SampleTiming", text, "take voltage, current and speed from one SYNC, or enter the sensor's delay")
 
@@ -128,17 +130,34 @@ def simulated_fit_percent(window: Window, estimate: Estimate) -> float | None:
     """
     p = estimate.parameters()
     values = np.array(list(p.as_dict().values()))
-    if window.voltage_v is None or not np.isfinite(values).all() or not (values[:4] > 0).all():
+    if not np.isfinite(values).all() or not (values[:4] > 0).all():
         return None
     p = replace(p, ft=max(p.ft, 0.0), Cd=max(p.Cd, 0.0))
+    if window.slow_voltage is not None:
+        return _slow_fit_percent(window, p, estimate.delay_s or 0.0)
+    if window.voltage_v is None:
+        return None
     known = np.isfinite(window.speed_rad_s)
     voltage = carried(window.voltage_v)
     if estimate.delay_s and abs(estimate.delay_s) <= window.dt_s:
         row = np.arange(voltage.size)
         voltage = np.interp(row + estimate.delay_s / window.dt_s, row, voltage)
     _, speed = simulate_plant(p, voltage, window.dt_s, window.voltage_sampling)
-    measured = window.speed_rad_s[known]
-    spread = float(np.linalg.norm(measured - measured.mean()))
+    return _explained_percent(window.speed_rad_s[known], speed[known])
+
+
+def _slow_fit_percent(window: Window, parameters: Parameters, delay_s: float) -> float | None:
+    """Simulate on the grid of the slow sensor itself, and compare with the measured speed at its instants."""
+    slow = window.slow_voltage
+    assert slow is not None
+    begin = slow.begin_s - delay_s + slow.period_s * np.arange(slow.voltage_v.size)
+    _, speed = simulate_plant(parameters, carried(slow.voltage_v), slow.period_s, window.voltage_sampling)
+    measured = np.interp(begin, np.arange(window.n) * window.dt_s, carried(window.speed_rad_s))
+    return _explained_percent(measured, speed)
+
+
+def _explained_percent(measured: Float, speed: Float) -> float | None:
+    spread = float(np.linalg.norm(measured - measured.mean())) if measured.size else 0.0
     if spread == 0.0 or not np.isfinite(speed).all():
         return None
-    return 100.0 * (1.0 - float(np.linalg.norm(measured - speed[known])) / spread)
+    return 100.0 * (1.0 - float(np.linalg.norm(measured - speed)) / spread)

@@ -10,7 +10,7 @@ information matrix is what remains of the steps.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,11 +24,12 @@ from fdhil.identification.innovations import Gains, gains_of, innovations
 from fdhil.identification.motion import Motion, Noise, prepare
 from fdhil.identification.noise import fit_noise
 from fdhil.identification.normal import inverse_of, solve
+from fdhil.identification.slow_start import slow_start, with_slope_walk
 from fdhil.records import PARAMETERS, Estimate, Float, Result, Window
 
 NAME = "maximum_likelihood"
 RENEWALS = 3
-STEPS = 8
+STEPS = 16
 CONVERGED = 1e-3  # of a standard deviation
 DIFFERENCE = 1e-5
 DELAY_DIFFERENCE_S = 1e-5
@@ -167,6 +168,9 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
     A delay between voltage and the other signals is fitted too when the data surely show one, or when the voltage has
     a clock of its own.
     """
+    slow = [w for w in windows if w.slow_voltage is not None]
+    if slow:
+        return _fit_slow(slow, settings)
     usable = [w for w in windows if w.voltage_v is not None]
     signals = [least_squares.align(w, settings) for w in usable]
     start = starting_point(signals, [w.dt_s for w in usable])
@@ -196,11 +200,22 @@ def _fit_separate(motions: Sequence[Motion], start: Float, delays: Sequence[floa
     alone = [fit([m], np.append(start[:6], delay), range(7)) for m, delay in zip(motions, delays, strict=True)]
     if len(motions) == 1:
         return alone[0]
-    aligned = [
-        replace(m, voltage_mean=m.delayed(f.theta[6]) if f.converged else m.voltage_mean)
-        for m, f in zip(motions, alone, strict=True)
-    ]
+    aligned = [m.aligned(f.theta[6]) if f.converged else m for m, f in zip(motions, alone, strict=True)]
     return fit(aligned, np.append(alone[0].theta[:6], 0.0), range(7))
+
+
+def _fit_slow(windows: Sequence[Window], settings: Identification) -> Fit | None:
+    """Fit windows whose voltage comes more slowly than the drive's rows; the delay is always a parameter."""
+    begun = slow_start(windows, settings)
+    if begun is None or not np.isfinite(begun[0]).all() or (begun[0][[0, 2, 3]] <= FLOORS[[0, 2, 3]]).any():
+        return None
+    theta, delays, motions = begun
+    theta[1] = max(theta[1], LEAST_TIME_CONSTANT_S * theta[0])
+    walking = [
+        with_slope_walk(m, np.append(theta[:6], delay), settings.lowpass_hz)
+        for m, delay in zip(motions, delays, strict=True)
+    ]
+    return _fit_separate(walking, theta, delays)
 
 
 def delay_score(plain: Fit) -> tuple[float, float]:
@@ -229,7 +244,7 @@ def finish(result: Fit) -> Estimate:
     # what noise cannot explain: an interval mean leaves the voltage's course within the sample open
     doubt = (inverse @ (result.jacobian.T @ result.problem.shape_effect(result.theta)))[:k]
     first = result.problem.motions[0]
-    alias = aliasing(first.voltage_sampling, first.dt_s)
+    alias = aliasing(first.voltage_sampling, first.voltage_period_s)
     answer = Estimate(
         method=NAME,
         names=PARAMETERS,
@@ -238,5 +253,6 @@ def finish(result: Fit) -> Estimate:
         residuals={"electrical": result.residuals[0::2], "mechanical": result.residuals[1::2]},
         result=Result.OK if result.converged else Result.DIVERGED,
         delay_s=float(result.theta[6]) if 6 in result.free else None,
+        delay_std_s=float(np.sqrt(inverse[6, 6])) if 6 in result.free else None,
     )
     return judge(answer, condition, max(float(np.abs(m.speed).max()) for m in result.problem.motions))

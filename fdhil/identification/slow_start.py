@@ -1,0 +1,93 @@
+"""Where the fit of windows with a slow voltage starts: [5] over the sensor's own samples, and the delay to some ms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from fdhil.config import Identification
+from fdhil.identification.estimators.least_squares import mechanical_signals
+from fdhil.identification.filtering import zero_phase
+from fdhil.identification.innovations import gains_of, innovations
+from fdhil.identification.motion import Motion, prepare
+from fdhil.identification.normal import solve
+from fdhil.identification.windows import carried
+from fdhil.records import Float, Window
+
+SPAN_S = 0.025
+SPAN_SAMPLES = 3
+SHIFTS_PER_SAMPLE = 4
+IMPROVEMENT = 1.5  # the residual's power must fall by this factor before a shift is believed
+LEAST_SAMPLES = 16
+WALKS = 10.0 ** np.arange(-1.0, 4.01, 0.5)  # of what the low-passed current's slope changes by
+
+
+def slow_start(windows: Sequence[Window], settings: Identification) -> tuple[Float, list[float], list[Motion]] | None:
+    """Return theta (7,) = [R, L, K, Jt, ft, Cd, 0], each window's coarse delay in s, and the windows prepared.
+
+    None when there are too few samples to start from.
+    """
+    shifts = [_coarse_shift(w, settings.lowpass_hz) for w in windows]
+    electrical = np.vstack([_samples(w, s, settings.lowpass_hz) for w, s in zip(windows, shifts, strict=True)])
+    mechanical = np.vstack([mechanical_signals(w, settings) for w in windows])
+    known = np.isfinite(electrical).all() and np.isfinite(mechanical).all()
+    if not known or electrical.shape[0] < LEAST_SAMPLES or mechanical.shape[0] < LEAST_SAMPLES:
+        return None
+    inductance, resistance, constant = solve(electrical[:, 1:], electrical[:, 0])[0]
+    second = solve(mechanical[:, 1:], mechanical[:, 0] * constant)[0]
+    theta = np.array([resistance, inductance, constant, *second, 0.0])
+    return theta, shifts, [prepare(w) for w in windows]
+
+
+def _samples(window: Window, delay_s: float, lowpass_hz: float) -> Float:
+    """Return the rows (m, 4) of [u, Di, i, w] of the voltage samples that lie wholly inside."""
+    slow = window.slow_voltage
+    assert slow is not None
+    dt, last = window.dt_s, (window.n - 1) * window.dt_s
+    begin = slow.begin_s - delay_s + slow.period_s * np.arange(slow.voltage_v.size)
+    inside = (begin >= 0) & (begin + slow.period_s <= last) & np.isfinite(slow.voltage_v)
+    begin, voltage = begin[inside], slow.voltage_v[inside]
+    time = np.arange(window.n) * dt
+    current, speed = carried(window.current_a), carried(window.speed_rad_s)
+    if window.voltage_sampling == "instant":
+        slope = np.gradient(zero_phase(current, lowpass_hz, dt), dt)
+        return np.column_stack([voltage, *(np.interp(begin, time, s) for s in (slope, current, speed))])
+    end = begin + slow.period_s
+    rise = np.interp(end, time, current) - np.interp(begin, time, current)
+    sums = [np.concatenate([[0.0], np.cumsum((s[1:] + s[:-1]) / 2)]) * dt for s in (current, speed)]
+    swept = [np.interp(end, time, s) - np.interp(begin, time, s) for s in sums]
+    return np.column_stack([voltage, *(part / slow.period_s for part in (rise, *swept))])
+
+
+def _coarse_shift(window: Window, lowpass_hz: float) -> float:
+    """Return by how many seconds the voltage is late (early: negative), to a quarter of its sample; 0 unless sure."""
+    slow = window.slow_voltage
+    assert slow is not None
+    reach = max(SPAN_S, SPAN_SAMPLES * slow.period_s)
+    step = slow.period_s / SHIFTS_PER_SAMPLE
+    shifts = np.arange(-np.ceil(reach / step), np.ceil(reach / step) + 1) * step
+    costs = np.full(shifts.size, np.inf)
+    for k, shift in enumerate(shifts):
+        rows = _samples(window, float(shift), lowpass_hz)
+        if rows.shape[0] >= LEAST_SAMPLES and np.isfinite(rows).all():
+            residual = rows[:, 0] - rows[:, 1:] @ solve(rows[:, 1:], rows[:, 0])[0]
+            costs[k] = float(residual @ residual) / rows.shape[0]
+    best, none = int(np.argmin(costs)), shifts.size // 2
+    if not np.isfinite(costs[[best, none]]).all() or costs[none] <= IMPROVEMENT * costs[best]:
+        return 0.0
+    return float(shifts[best])
+
+
+def with_slope_walk(motion: Motion, theta: Float, lowpass_hz: float) -> Motion:
+    """Return the motion with the most likely walk of the current's slope, on a coarse scale."""
+    slope = np.gradient(zero_phase(motion.current, lowpass_hz, motion.dt_s), motion.dt_s)
+    walk = max(float(np.mean(np.diff(slope) ** 2)) / motion.dt_s, 1e-12)
+    trials = [replace(motion, slope_walk=walk * share) for share in WALKS]
+    costs = []
+    for trial in trials:
+        gains = gains_of(trial, theta, trial.noise)
+        e = innovations(trial, theta, gains, float(theta[6]))
+        costs.append(gains.logdet + float(e @ e))
+    return trials[int(np.nanargmin(costs))] if np.isfinite(costs).any() else trials[WALKS.size // 2]

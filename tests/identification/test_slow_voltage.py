@@ -1,0 +1,79 @@
+"""A voltage sensor slower than the drive: each of its samples is one row of the likelihood, its delay a parameter."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil.config import Identification
+from fdhil.identification.estimators import maximum_likelihood
+from fdhil.records import PARAMETERS, Float, Result, VoltageSampling, frozen
+from fdhil.validation import analyse
+from studies import bench
+from tests.identification.slow_sensor import slow_windows
+
+SETTINGS = Identification()
+TRUTH = np.array([bench.Plant().truth()[name] for name in PARAMETERS])
+# per cent of the truth that one rapid at 0.1 % noise must reach
+MEANS = (0.2, 0.6, 0.03, 0.08, 3.0, 4.0)
+
+
+def _errors_percent(values: Float) -> Float:
+    errors: Float = 100 * np.abs(values / TRUTH - 1)
+    return errors
+
+
+@pytest.mark.parametrize("period_s", [0.005, 0.010])
+def test_means_give_all_six_and_the_delay(period_s: float) -> None:
+    delay = 0.3 * period_s
+    estimate = maximum_likelihood.estimate(slow_windows(period_s, delay_s=delay), SETTINGS)
+    assert estimate.result is Result.OK
+    assert (_errors_percent(estimate.values) < MEANS).all()
+    assert estimate.delay_s is not None
+    assert estimate.delay_std_s is not None
+    assert abs(estimate.delay_s - delay) < 0.01 * period_s
+    assert 0 < estimate.delay_std_s < 0.01 * period_s
+
+
+def test_means_are_accepted_and_their_intervals_hold() -> None:
+    outcome = analyse(slow_windows(0.010, delay_s=0.003, noise=0.005)[0], SETTINGS)
+    assert outcome.verdict.accepted, outcome.verdict.reasons
+    assert outcome.verdict.fit_percent is not None
+    assert outcome.estimate is not None
+    apart = np.abs(outcome.estimate.values - TRUTH) / np.sqrt(np.diag(outcome.estimate.covariance))
+    assert (apart < 3.5).all()
+
+
+def test_instants_tell_all_but_the_inductance() -> None:
+    sampling: VoltageSampling = "instant"
+    estimate = maximum_likelihood.estimate(slow_windows(0.010, sampling, delay_s=0.003, noise=0.005), SETTINGS)
+    assert set(estimate.missing) == {"L"}
+    assert "standard deviation of L" in estimate.missing["L"].text
+    known = [0, 2, 3, 4, 5]
+    assert (_errors_percent(estimate.values)[known] < (4.0, 0.4, 0.4, 6.0, 9.0)).all()
+
+
+@pytest.mark.parametrize("delay_s", [0.0065, -0.008])
+def test_a_delay_beyond_a_sample_is_refused_with_its_figure(delay_s: float) -> None:
+    outcome = analyse(slow_windows(0.005, delay_s=delay_s, noise=0.005)[0], SETTINGS)
+    late = {r.code: r.text for r in outcome.verdict.reasons}["SampleTiming"]
+    assert f"{1e3 * abs(delay_s):.0f}" in late or f"{1e3 * abs(delay_s):.1f}"[:3] in late
+    assert "more than a sample of 5 ms" in late
+
+
+def test_lost_samples_of_the_sensor_cost_no_more_than_themselves() -> None:
+    window = slow_windows(0.005)[0]
+    assert window.slow_voltage is not None
+    told = np.array(window.slow_voltage.voltage_v)
+    told[60:66] = np.nan
+    holed = replace(window, slow_voltage=replace(window.slow_voltage, voltage_v=frozen(told)))
+    estimate = maximum_likelihood.estimate([holed], SETTINGS)
+    assert (_errors_percent(estimate.values) < MEANS).all()
+
+
+def test_windows_with_clocks_of_their_own_are_pooled() -> None:
+    two = [slow_windows(delay_s=delay, noise=0.005, seed=seed)[0] for seed, delay in ((1, 0.001), (2, -0.001))]
+    estimate = maximum_likelihood.estimate(two, SETTINGS)
+    assert (_errors_percent(estimate.values)[:4] < (0.3, 1.2, 0.1, 0.2)).all()

@@ -1,0 +1,30 @@
+"""A window with the voltage of a slow sensor comes out of its file as it went in."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fdhil.errors import RecordingError
+from fdhil.store.windows import decode_window, encode_window
+from tests.identification.slow_sensor import slow_windows
+
+
+def test_the_sensors_own_grid_is_kept_bit_by_bit() -> None:
+    window = slow_windows(0.005)[0]
+    assert window.slow_voltage is not None
+    back = decode_window(encode_window(window, "digest")).slow_voltage
+    assert back is not None
+    assert (back.begin_s, back.period_s, back.error_s) == (
+        window.slow_voltage.begin_s,
+        window.slow_voltage.period_s,
+        window.slow_voltage.error_s,
+    )
+    np.testing.assert_array_equal(back.voltage_v, window.slow_voltage.voltage_v)
+
+
+def test_a_changed_grid_is_damage() -> None:
+    content = encode_window(slow_windows(0.005)[0], "digest")
+    assert content.count(b'"period_s": 0.005') == 1
+    with pytest.raises(RecordingError, match="digest"):
+        decode_window(content.replace(b'"period_s": 0.005', b'"period_s": 0.006'))

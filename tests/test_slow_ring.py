@@ -1,0 +1,74 @@
+"""A sensor slower than the SYNC keeps its own samples: the ring gives them with their times and the clock's error."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fdhil.pipeline.ring import Ring
+from fdhil.records import AxisSamples, Float, TickTimes, VoltageSamples, frozen, frozen_ints
+
+PERIOD_NS = 1_000_000
+SKEW = 1.0002  # the sensor's clock runs slower than the drive's by this factor
+
+
+def _ring(rate_hz: float, begin_ticks: float, samples: int, lost: int = -1) -> tuple[Ring, Float]:
+    """Return a ring with 2 s of a drive and of a sensor whose sample c is c V and begins ``begin_ticks`` late.
+
+    Block ``lost`` of the sensor's 20 is left out.
+    """
+    ring, ticks = Ring(30_000, 1e-3), np.arange(2000)
+    zero = frozen(np.zeros(ticks.size))
+    ring.add(TickTimes(frozen_ints(ticks), frozen_ints(ticks * PERIOD_NS)))
+    ring.add(AxisSamples("X", frozen_ints(ticks), zero, zero, zero, zero, None, zero, frozen_ints(ticks * 0)))
+    counter = np.arange(samples)
+    begins = (begin_ticks + counter * SKEW * 1e3 / rate_hz) * PERIOD_NS
+    for k, part in enumerate(np.array_split(counter, 20)):
+        if k == lost:
+            continue
+        ring.add(
+            VoltageSamples(
+                sensor="voltage sensor X",
+                axis="X",
+                counter=frozen_ints(part),
+                t_ns=frozen_ints(np.round(begins[part])),
+                t_error_ns=frozen_ints(np.full(part.size, 150_000)),
+                voltage_v=frozen(part),
+                sample_rate_hz=rate_hz,
+            )
+        )
+    return ring, begins / PERIOD_NS
+
+
+def test_samples_keep_their_own_times() -> None:
+    ring, begins = _ring(200.0, 2.4, 390)
+    stretch = ring.cut(500, 1500, separate_voltage=True)
+    assert stretch.voltage_v is None
+    slow = stretch.slow_voltage
+    assert slow is not None
+    first = int(slow.voltage_v[0])
+    assert begins[first] >= 500 > begins[first - 1]
+    np.testing.assert_array_equal(slow.voltage_v, first + np.arange(slow.voltage_v.size))
+    times = 500 + 1e3 * (slow.begin_s + slow.period_s * np.arange(slow.voltage_v.size))
+    np.testing.assert_allclose(times, begins[first : first + times.size], atol=0.05)
+    assert times[-1] + 1e3 * slow.period_s <= 1499 + 0.05
+    assert abs(slow.error_s - 150e-6) < 1e-12
+
+
+def test_lost_samples_stay_lost() -> None:
+    ring, _ = _ring(100.0, 0.0, 196, lost=10)
+    slow = ring.cut(500, 1500, separate_voltage=True).slow_voltage
+    assert slow is not None
+    assert 5 < np.isnan(slow.voltage_v).sum() < 12
+
+
+def test_a_cut_waits_for_the_sensor() -> None:
+    ring, _ = _ring(200.0, 0.0, 300)
+    assert ring.voltage_reaches(1400)
+    assert not ring.voltage_reaches(1600)
+
+
+def test_a_sensor_as_fast_as_the_sync_is_placed_on_it() -> None:
+    ring, _ = _ring(1000.0, 0.0, 1990)
+    stretch = ring.cut(500, 1500, separate_voltage=True)
+    assert stretch.slow_voltage is None
+    assert stretch.voltage_v is not None
