@@ -72,10 +72,26 @@ def test_a_recorded_program_is_its_demand_to_the_increment(twin: tuple[TwinProce
 
 def test_without_a_motion_there_is_nothing_to_write(twin: tuple[TwinProcess, Path], tmp_path: Path) -> None:
     out = tmp_path / "demand.csv"
-    for number in (signal.SIGINT, None):
-        recording = Recording(twin[1], out, *(() if number else ("--seconds", "2")))
-        if number is not None:
-            recording.process.send_signal(number)
-        code, document = recording.end()
-        assert (code, document["rows"], document["file"]) == (1, 0, None)
-        assert not out.exists()
+    recording = Recording(twin[1], out)
+    recording.process.send_signal(signal.SIGINT)
+    code, document = recording.end()
+    assert (code, document["rows"], document["file"]) == (1, 0, None)
+    assert not out.exists()
+
+
+def test_a_demand_with_a_hole_is_not_written(twin: tuple[TwinProcess, Path], tmp_path: Path) -> None:
+    process, config = twin
+    program, out = tmp_path / "program.ngc", tmp_path / "demand.csv"
+    program.write_text("G1 X12 Y12 F6000\nM2\n")
+    recording = Recording(config, out, "--rest", "0.3")
+    process.command("play", file=str(program))
+    process.event("playing")
+    process.command("fault", axis="X", fault="drop_tpdo", value=1, duration_s=0.005, at_row=60)
+    code, document = recording.end()
+    assert code == 1, document
+    assert not document["complete"]
+    gaps = document["gaps"]
+    assert isinstance(gaps, list)
+    assert gaps[0]["axis"] == "X"
+    assert 1 <= gaps[0]["rows"] <= 10
+    assert not out.exists()

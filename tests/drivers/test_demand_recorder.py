@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fdhil import config as configuration
 from fdhil.drivers.demand_recorder import DemandRecorder, Gap
-from fdhil.errors import ConfigError
+from fdhil.errors import ConfigError, RecordingError
+from fdhil.program import load_trajectory, write_demand_csv
 from fdhil.records import AxisSamples, Float, Notice, frozen, frozen_ints
 from tests.bench import bench_config, bench_document
 
@@ -47,7 +49,7 @@ def test_the_demand_is_what_was_heard_from_the_first_motion_to_the_rest_after_th
     np.testing.assert_array_equal(recorded.reference.position_mm["Y"], 2.0 * PATH[first : first + rows])
 
 
-def test_lost_rows_are_gaps_and_never_filled() -> None:
+def test_lost_rows_are_gaps_and_never_filled(tmp_path: Path) -> None:
     recorder = DemandRecorder(bench_config(), rest_s=1.0)
     feed(recorder, lost=(10, 600, 601, 700))
     recorded = recorder.demand()
@@ -55,6 +57,9 @@ def test_lost_rows_are_gaps_and_never_filled() -> None:
     assert not recorded.complete
     assert recorded.gaps == (Gap("Y", 100, 102), Gap("Y", 200, 201))
     assert np.flatnonzero(np.isnan(recorded.reference.position_mm["Y"])).tolist() == [100, 101, 200]
+    write_demand_csv(recorded.reference, tmp_path / "marked.csv")
+    with pytest.raises(RecordingError, match="row 102 holds a value that is no finite number"):
+        load_trajectory(tmp_path / "marked.csv", bench_config())
 
 
 def test_a_demand_that_cannot_be_trusted_is_not_complete() -> None:
