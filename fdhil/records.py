@@ -92,7 +92,7 @@ class VoltageSamples:
 
 @dataclass(frozen=True, slots=True)
 class SlowVoltage:
-    """Voltage of a sensor slower than the drive, on the sensor's own grid beside a window: ``voltage_v`` (m,); lost: NaN.
+    """Voltage of a sensor slower than the drive, on its own grid beside a window: ``voltage_v`` (m,), lost samples NaN.
 
     Sample j covers ``begin_s`` + j ``period_s`` after row 0 of the window and one period from there (or is the value at
     its begin, as the window's ``voltage_sampling`` says). ``error_s`` is how far off ``begin_s`` may be.

@@ -162,7 +162,7 @@ def advise(
 
 
 def _joined(found: Sequence[Advice], zones: Sequence[Zone | None]) -> tuple[Advice, ...]:
-    """Join the advices of pieces whose worst rows are in one zone, or in two of one cause close to each other."""
+    """Join the advice on pieces whose worst rows are in one zone, or in two of one cause close to each other."""
     joined: list[Advice] = []
     before: Zone | None = None
     for zone, advice in zip(zones, found, strict=True):

@@ -45,7 +45,9 @@ def test_what_is_accepted_is_right(bench: Bench, tmp_path: Path) -> None:
         windows = [o for o in outcomes if isinstance(o, WindowOutcome)]
         assert len(windows) == 4
         refused = [reason.code for o in windows for reason in o.verdict.reasons]
-        assert set(refused) <= {"SampleTiming"}
+        # a host that is held up for longer than the sensor's buffer lasts loses samples, and says so
+        lost = {"NotFinite"} if counters[f"modbus.{axis}.lost"] else set()
+        assert set(refused) <= {"SampleTiming"} | lost
         for accepted in (o.estimate for o in windows if o.verdict.accepted):
             assert accepted is not None
             for name, true in TRUE.items():
