@@ -18,8 +18,9 @@ from fdhil.cia402 import PdoEntry
 from fdhil.cli.main import run_safely
 from fdhil.config import Axis, CanBus, MachineConfig
 from fdhil.errors import ConfigError, ConfigFault, ConnectError, DeviceError, ProtocolError, StoreError
+from fdhil.guard.feedforward import Limits as FeedforwardLimits
 from fdhil.guard.limits import Limits
-from fdhil.guard.settings import AxisSettings, Layout, Pdo, Settings, to_json
+from fdhil.guard.settings import AxisSettings, Feedforward, Layout, Pdo, Settings, to_json
 
 if TYPE_CHECKING:
     from fdhil.drivers.profile import DriveProfile, PdoSpec
@@ -126,6 +127,31 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
         window=round(axis.drive.following_error_window_mm * axis.scaling.increments_per_mm),
         setpoint_delay_cycles=axis.drive.setpoint_delay_cycles,
         heartbeat_timeout_s=heartbeat_timeout_s(machine, name),
+        feedforward=_feedforward(profile, machine, name, axis),
+    )
+
+
+def _feedforward(profile: DriveProfile, machine: MachineConfig, name: str, axis: Axis) -> Feedforward | None:
+    """Return what the on-line feed-forward of an axis may send; None without [axis.X.feedforward]."""
+    limits = axis.feedforward
+    if limits is None:
+        return None
+    found = profile.find_rpdo(profile.speed_offset)
+    if found is None or [(e.index, e.sub) for e in found[0].entries] != [profile.speed_offset, profile.torque_offset]:
+        text = f"{profile.name} maps no RPDO with 60B1 and 60B2 alone"
+        fault = ConfigFault(f"axis.{name}.feedforward", text, "leave the section out, or give the profile such an RPDO")
+        raise ConfigError(profile.name, [fault])
+    period = machine.machine.sync_period_s
+    speed = axis.drive.increments_per_rev / (2 * math.pi)
+    torque = 1e3 / (axis.nominal.K * axis.drive.rated_current_a)
+    return Feedforward(
+        _pdo(found[0], machine.node_id(name)),
+        FeedforwardLimits(
+            speed=max(1, math.floor(limits.max_speed_rad_s * speed)),
+            speed_rate=max(1, math.floor(limits.max_speed_rate_rad_s2 * speed * period)),
+            torque=min(0x7FFF, max(1, math.floor(limits.max_torque_nm * torque))),
+            torque_rate=max(1, math.floor(limits.max_torque_rate_nm_s * torque * period)),
+        ),
     )
 
 

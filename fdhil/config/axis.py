@@ -39,6 +39,15 @@ class CorrectionLimits(Section):
     )
 
 
+class FeedforwardLimits(Section):
+    """[axis.X.feedforward]: what the guard lets the on-line feed-forward send. Without this section it is off."""
+
+    max_torque_nm: Positive = Field(40.0, description="largest torque offset (0x60B2)")
+    max_torque_rate_nm_s: Positive = Field(20e3, description="largest rate of the torque offset")
+    max_speed_rad_s: Positive = Field(5.0, description="largest speed offset (0x60B1), of the motor")
+    max_speed_rate_rad_s2: Positive = Field(5e3, description="largest rate of the speed offset")
+
+
 class Drive(Section):
     """[axis.X.drive]: how the drive is reached and scaled."""
 
@@ -100,6 +109,7 @@ class Axis(Section):
     nominal: Nominal
     regulators: Regulators
     correction: CorrectionLimits | None = None
+    feedforward: FeedforwardLimits | None = None
     drive: Drive = Drive()
     voltage: Voltage = Voltage()
     temperature: Thermometer | None = None

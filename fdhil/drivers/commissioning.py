@@ -17,6 +17,7 @@ from fdhil.cia402 import Mode, NmtCommand, Object, State
 from fdhil.config import CorrectionLimits, MachineConfig
 from fdhil.drivers import commissioning_checks as checks
 from fdhil.drivers.canopen_sdo import NO_OBJECT, NO_SUB_INDEX
+from fdhil.drivers.commissioning_feeding import open_feedforward
 from fdhil.drivers.commissioning_master import Master
 from fdhil.drivers.commissioning_record import (
     CommissioningRecord,
@@ -352,6 +353,7 @@ def commission(
     with Master(config, axis) as master:
         report("listen")
         checks.listen(master)
+        feeding = open_feedforward(master)
         report("compare")
         found = check_axis(master)
         report("enable")
@@ -371,7 +373,7 @@ def commission(
         **asdict(found.identity),
         config_digest=axis_digest(config, axis),
         mapping_fingerprint=found.fingerprint,
-        options=found.options,
+        options={**found.options, **feeding},
         following_error_window_um=found.window_um,
         offset_in_feedforward=in_feedforward,
         sign_test_um=round(moved_um, 2),

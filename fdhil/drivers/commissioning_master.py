@@ -42,7 +42,8 @@ class Master:
         settings = config.axis[axis]
         self.config, self.axis = config, axis
         self.node_id = config.node_id(axis)
-        self.profile: DriveProfile = load_profile(settings.drive.profile)
+        profile = load_profile(settings.drive.profile)
+        self.profile: DriveProfile = profile.with_feedforward() if settings.feedforward else profile
         self.period_s = config.machine.sync_period_s
         self.device = f"drive {axis}"
         self.bus = CanBus(settings.drive.bus, config.bus[settings.drive.bus], transmit=True)

@@ -22,7 +22,8 @@ class CommissioningRecord:
     """What was found and proven on one drive.
 
     ``config_digest`` is :func:`axis_digest`. ``options`` holds 0x6007, 0x605A, 0x605E, 0x6065, 0x6085 and 0x1017 by
-    their hexadecimal index, as far as the drive has them. ``offset_in_feedforward`` None: could not be told.
+    their hexadecimal index, as far as the drive has them, and the COB-ID of the feed-forward's RPDO where it was made
+    valid. ``offset_in_feedforward`` None: could not be told.
     ``watchdog`` is ``proven`` when the drive stopped after our heartbeat did.
     """
 
@@ -54,6 +55,8 @@ def axis_digest(config: MachineConfig, axis: str) -> str:
     Where sensors are reached and what the motor's data sheet says may change without commissioning again.
     """
     settings = config.axis[axis].model_dump(mode="json", exclude={"voltage", "nominal", "regulators"})
+    if settings["feedforward"] is None:
+        del settings["feedforward"]
     guard = config.guard.model_dump(mode="json", include={"node_id", "heartbeat_s"})
     text = json.dumps([settings, guard, config.machine.sync_period_s, config.node_id(axis)], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from fdhil import tables
@@ -64,6 +64,8 @@ class DriveProfile:
     tpdos: tuple[PdoSpec, ...]
     target: ObjectKey = (0x607A, 0)
     offset: ObjectKey = (0x60B0, 0)
+    speed_offset: ObjectKey = (0x60B1, 0)
+    torque_offset: ObjectKey = (0x60B2, 0)
     position: ObjectKey = (0x6064, 0)
     speed: ObjectKey = (0x606C, 0)
     current: ObjectKey = (0x6078, 0)
@@ -87,6 +89,12 @@ class DriveProfile:
     def find_rpdo(self, key: ObjectKey) -> tuple[PdoSpec, PdoEntry] | None:
         """Return the RPDO and entry that carry ``key``, or None."""
         return _find(self.rpdos, key)
+
+    def with_feedforward(self) -> DriveProfile:
+        """Return the profile of a drive whose RPDO of speed and torque offset is exchanged."""
+        found = self.find_rpdo(self.speed_offset)
+        rpdos = tuple(replace(spec, valid=True) if found and spec is found[0] else spec for spec in self.rpdos)
+        return replace(self, rpdos=rpdos)
 
     def speed_rad_s_per_count(self, axis: Axis) -> float:
         """Scale of the speed object, the axis' sign included."""

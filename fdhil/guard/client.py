@@ -76,6 +76,13 @@ class GuardClient:
         request = {"request": "arm", "token": token, "program_digest": program_digest, "facts": dict(facts)}
         return self.ask(request)
 
+    def feed_forward(
+        self, token: str, laws: Mapping[str, Mapping[str, Any]], facts: Mapping[str, bool]
+    ) -> dict[str, Any]:
+        """Switch the on-line feed-forward on; ``laws`` per axis as in ``feedforward.Law``, facts as its interlocks."""
+        laws = {axis: dict(law) for axis, law in laws.items()}
+        return self.ask({"request": "feedforward", "token": token, "laws": laws, "facts": dict(facts)})
+
     def disarm(self) -> dict[str, Any]:
         """Ramp to zero; the answer comes at once, ``status`` shows when the state is OFF."""
         return self.ask({"request": "disarm"})

@@ -7,7 +7,9 @@ path, the motion of the offset, and a check of the frame by other formulas than 
 
 from __future__ import annotations
 
-from fdhil.guard.interlocks import Alarm, AxisView, Reaction, failing, not_ready, withheld
+from fdhil.guard import feedforward
+from fdhil.guard.feedforward import FADE_S, FeedMode
+from fdhil.guard.interlocks import FEEDFORWARD_FACTS, Alarm, AxisView, Reaction, failing, not_ready, withheld
 from fdhil.guard.limits import brake, follow, violation
 from fdhil.guard.observe import behind, observe, view
 from fdhil.guard.path import Path
@@ -51,6 +53,7 @@ def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outpu
     if inputs.sync:
         state = rest(_follow_path(state, inputs, alarms, settings))
     state, output = _move(state, inputs, settings)
+    state, output = _feed(state, inputs, alarms, settings, output)
     moved = None if state.mode is before else (before, state.mode, state.cause)
     return state, output._replace(refused=refused, transition=moved)
 
@@ -87,26 +90,46 @@ def _request(
     if request.kind == "arm":
         refused = _refusals(state, inputs, request, alarms, views)
         return (state, refused) if refused else (_armed(state, inputs), ())
+    if request.kind == "feedforward":
+        refused = _feed_refusals(state, inputs, request, alarms, views, settings)
+        return (state, refused) if refused else (state._replace(feed=feedforward.armed(request.laws)), ())
     if request.kind == "adopt":
         refused = _adopt_refusals(state, request, alarms, settings)
         return (state, refused) if refused else (_adopting(state), ())
+    cause = Alarm("Disarmed" if request.kind == "disarm" else "Stopped")
     if state.mode in IN_CHARGE:
-        state = _ramp_down(state, Alarm("Disarmed" if request.kind == "disarm" else "Stopped"))
-    return state, ()
+        state = _ramp_down(state, cause)
+    return state._replace(feed=feedforward.end(state.feed, cause)), ()
 
 
-def _refusals(state: State, inputs: Inputs, request: Request, alarms: Alarms, views: Views) -> Alarms:
-    """All that forbids arming; an empty answer is the only way from OFF to ARMED."""
+def _forbidding(state: State, inputs: Inputs, request: Request, alarms: Alarms, views: Views) -> list[Alarm]:
+    """What forbids arming anything, but for what the daemon vouches for."""
     refused: list[Alarm] = []
-    if state.mode is not Mode.OFF:
+    if state.mode is not Mode.OFF or state.feed.mode is not FeedMode.OFF:
         refused.append(Alarm("NotOff", detail=state.mode.value))
     if request.token_valid is not True:
         refused.append(Alarm("AuthRequired"))
     if inputs.main_alive is not True:
         refused.append(Alarm("MainLost"))
-    refused += [*withheld(request.facts), *alarms, *not_ready(views)]
+    refused += [*alarms, *not_ready(views)]
     if not alarms and not state.good_for >= SETTLED_CYCLES:
         refused.append(Alarm("NotSettled", detail=f"{state.good_for} so far"))
+    return refused
+
+
+def _feed_refusals(
+    state: State, inputs: Inputs, request: Request, alarms: Alarms, views: Views, settings: Settings
+) -> Alarms:
+    """All that forbids the on-line feed-forward; an empty answer is the only way to switch it on."""
+    refused = [*_forbidding(state, inputs, request, alarms, views), *withheld(request.facts, FEEDFORWARD_FACTS)]
+    if not settings.feeds or len(request.laws) != len(settings.axes):
+        refused.append(Alarm("FeedforwardOff"))
+    return tuple(refused)
+
+
+def _refusals(state: State, inputs: Inputs, request: Request, alarms: Alarms, views: Views) -> Alarms:
+    """All that forbids arming; an empty answer is the only way from OFF to ARMED."""
+    refused = [*_forbidding(state, inputs, request, alarms, views), *withheld(request.facts)]
     path = inputs.path
     if path is None or not request.program_digest or path.program_digest != request.program_digest or path.first:
         refused.append(Alarm("ProgramMismatch"))
@@ -329,3 +352,29 @@ def _arrived(state: State, path: Path | None, settings: Settings) -> State:
     if sent > ZEROS_UNCONFIRMED:
         return state._replace(mode=Mode.FROZEN, cause=Alarm("EchoMismatch", detail="no zero was read back"))
     return state._replace(zeros_sent=sent)
+
+
+# --- the on-line feed-forward ---
+
+
+def _feed(state: State, inputs: Inputs, alarms: Alarms, settings: Settings, output: Output) -> tuple[State, Output]:
+    """Go on with the feed-forward; on a lost SYNC its zeros are sent all the same."""
+    before = state.feed
+    if before.mode is FeedMode.OFF:
+        return state, output
+    own = () if inputs.main_alive is True else (Alarm("MainLost"),)
+    feed = feedforward.react(before, (*alarms, *inputs.withdrawn, *own))
+    if inputs.sync:
+        feed = feedforward.hear(feed, [axis.target for axis in inputs.axes])
+    if inputs.late or not (inputs.sync or feed.mode is FeedMode.ZEROING):
+        return state._replace(feed=feed), output
+    limits = [axis.limits for axis in settings.feeds]
+    moved = feedforward.move(feed, limits, settings.cycles(FADE_S))
+    ways = zip(limits, before.applied, moved.applied, strict=True)
+    if any(feedforward.violates(*way) for way in ways):
+        cause = Alarm("InternalError", detail=f"feed-forward {before.applied} -> {moved.applied}")
+        moved = feedforward.move(feedforward.react(before, (cause,)), limits, settings.cycles(FADE_S))
+    heartbeat = output.heartbeat or state.tick % settings.heartbeat_cycles == 0
+    changed = None if moved.mode is before.mode else (before.mode, moved.mode)
+    state = state._replace(feed=moved)
+    return state, output._replace(feed=moved.applied, heartbeat=heartbeat, feed_transition=changed)

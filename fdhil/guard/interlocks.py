@@ -118,6 +118,7 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     # what the daemon vouches for
     "NotCommissioned": (_N, "there is no valid commissioning record", "run fdhil commission"),
     "FeedforwardUnknown": (_N, "it is unknown whether the offset enters the feed-forward", "run fdhil commission"),
+    "FeedforwardOff": (_N, "this drive is not set up for speed and torque offsets", "run fdhil commission"),
     "ModelNotValidated": (_N, "the model was not validated", "record a rapid move of each axis"),
     "ModelStale": (_R, "the model is too old or of another state of the machine", "record a rapid move of each axis"),
     "PoorSkill": (_R, "predictions of the last moves were not good enough", "check load and gains, identify again"),
@@ -144,6 +145,15 @@ FACTS: Mapping[str, str] = {
     "model_fresh": "ModelStale",
     "skill_enough": "PoorSkill",
     "gain_positive": "HarmPredicted",
+    "journal_writable": "ReadOnlyStore",
+    "watchdog_proven": "WatchdogNotArmed",
+}
+# the same for the on-line feed-forward, which needs no program
+FEEDFORWARD_FACTS: Mapping[str, str] = {
+    "commissioned": "NotCommissioned",
+    "feedforward_commissioned": "FeedforwardOff",
+    "model_validated": "ModelNotValidated",
+    "model_fresh": "ModelStale",
     "journal_writable": "ReadOnlyStore",
     "watchdog_proven": "WatchdogNotArmed",
 }
@@ -247,6 +257,6 @@ def not_ready(axes: tuple[AxisView, ...]) -> tuple[Alarm, ...]:
     return tuple(Alarm(code, a.name) for a in axes for code, good in ARMING_INTERLOCKS if not good(a))
 
 
-def withheld(facts: Mapping[str, object]) -> tuple[Alarm, ...]:
-    """Return an alarm for every fact that the daemon does not vouch for; only a true ``True`` counts."""
-    return tuple(Alarm(code) for fact, code in FACTS.items() if facts.get(fact) is not True)
+def withheld(facts: Mapping[str, object], needed: Mapping[str, str] = FACTS) -> tuple[Alarm, ...]:
+    """Return an alarm for every needed fact that the daemon does not vouch for; only a true ``True`` counts."""
+    return tuple(Alarm(code) for fact, code in needed.items() if facts.get(fact) is not True)

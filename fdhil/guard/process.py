@@ -19,6 +19,7 @@ from fdhil.cia402 import COB_HEARTBEAT, COB_SYNC, Nmt, pack
 from fdhil.guard import core, table
 from fdhil.guard.can_socket import ERROR, BusDown, CanSocket
 from fdhil.guard.control import Client, Control
+from fdhil.guard.feedforward import FeedMode, Law, parse_law
 from fdhil.guard.frames import Listener
 from fdhil.guard.interlocks import FACTS, WITHDRAWABLE, Alarm
 from fdhil.guard.journal import Journal, Notifier
@@ -67,7 +68,7 @@ class Guard:
         self._catch_signals()
         self._notifier.tell("READY=1")
         self._journal.write("ready", bus=self.settings.bus, axes=[axis.name for axis in self.settings.axes])
-        while not (self._stopping and self.state.mode not in SENDING and not self._requests):
+        while not (self._stopping and not self.state.sending and not self._requests):
             self._turn()
         off = self.state.mode is Mode.OFF
         self._journal.write("stopped", state=self.state.mode.value, offset_um=self._offsets_um())
@@ -99,7 +100,7 @@ class Guard:
         poll.register(self.wake, select.POLLIN)
         for client in self.control.clients:
             poll.register(client, select.POLLIN | (select.POLLOUT if client.outbox else 0))
-        busy = self.state.mode in SENDING or self._requests
+        busy = self.state.sending or self._requests
         wait_s = 0.0 if self._loading else min(IDLE_S, self.settings.sync_period_s) if busy else IDLE_S
         return {descriptor for descriptor, _ in poll.poll(wait_s * 1000)}
 
@@ -155,7 +156,7 @@ class Guard:
         if not self._silent:
             self._silent = True
             self._listener.forget_sync()
-        busy = self.state.mode in SENDING or self._requests
+        busy = self.state.sending or self._requests
         if busy and now_s - self._stepped_s >= self.settings.sync_period_s:
             self._step(sync=False, late=False, now_s=now_s, silent=True)
 
@@ -174,7 +175,7 @@ class Guard:
     def _advance(self, seen: Inputs, late: bool, now_s: float) -> None:
         """Run one step of the core and send what it says; answer and journal after that."""
         client, document, request = self._requests.popleft() if self._requests and not late else (None, {}, None)
-        arming = request is not None and request.kind == "arm"
+        arming = request is not None and request.kind in ("arm", "feedforward")
         inputs = Inputs(
             seen.sync,
             seen.axes,
@@ -196,14 +197,18 @@ class Guard:
             self._answer(client, document, output.refused)
         if output.transition is not None and not {*output.transition[:2]} <= {Mode.RAMPING, Mode.ACTIVE}:
             self._tell(*output.transition)
+        if output.feed_transition is not None:
+            self._tell_feed(*output.feed_transition)
 
     def _send(self, output: Output) -> bool:
-        if output.offsets is None:
-            return True
         sent = True
         try:
-            for axis, entries, offset in zip(self.settings.axes, self._entries, output.offsets, strict=True):
-                sent = self._can.send(axis.offset.cob_id, pack(entries, (offset,))) and sent
+            if output.offsets is not None:
+                for axis, entries, offset in zip(self.settings.axes, self._entries, output.offsets, strict=True):
+                    sent = self._can.send(axis.offset.cob_id, pack(entries, (offset,))) and sent
+            if output.feed is not None:
+                for feed, pair in zip(self.settings.feeds, output.feed, strict=True):
+                    sent = self._can.send(feed.pdo.cob_id, pack(feed.pdo.entries, pair)) and sent
             if output.heartbeat:
                 self._can.send(COB_HEARTBEAT + self.settings.node_id, bytes([Nmt.OPERATIONAL]))
         except BusDown as error:
@@ -226,6 +231,12 @@ class Guard:
         )
         self._notifier.tell(f"STATUS={mode.value}" + (f": {cause.cause}" if cause else ""))
 
+    def _tell_feed(self, before: FeedMode, mode: FeedMode) -> None:
+        cause = self.state.feed.cause
+        told = {"code": cause.code, "axis": cause.axis, "text": cause.sentence(mode is FeedMode.OFF)} if cause else {}
+        self._journal.write("feedforward", before=before.value, state=mode.value, tick=self.state.tick, **told)
+        self._notifier.tell(f"STATUS=feed-forward {mode.value}" + (f": {cause.cause}" if cause else ""))
+
     def _offsets_um(self) -> dict[str, float]:
         """What is applied per axis as far as is known, in the axis' direction."""
         pairs = zip(self.settings.axes, self.state.axes, strict=True)
@@ -243,7 +254,7 @@ class Guard:
                 self._withdraw(client, document)
             elif kind == "table":
                 self._begin_loading(client, document)
-            elif kind in ("arm", "disarm", "adopt"):
+            elif kind in ("arm", "feedforward", "disarm", "adopt"):
                 self._requests.append((client, document, self._request(kind, document)))
             else:
                 client.reply(
@@ -259,7 +270,14 @@ class Guard:
         digest = hashlib.sha256(str(document.get("token", "")).encode()).hexdigest()
         wanted = self.settings.token_sha256
         valid = bool(wanted) and hmac.compare_digest(digest, wanted)
-        return Request(kind, valid, str(document.get("program_digest", "")), facts if isinstance(facts, dict) else {})
+        program = str(document.get("program_digest", ""))
+        return Request(kind, valid, program, facts if isinstance(facts, dict) else {}, self._laws(document))
+
+    def _laws(self, document: dict[str, Any]) -> tuple[Law, ...]:
+        """The feed-forward's law of every axis, in the guard's order; empty when one is missing or none."""
+        given = document.get("laws")
+        laws = [parse_law(given.get(axis.name)) for axis in self.settings.axes] if isinstance(given, dict) else []
+        return tuple([law for law in laws if law is not None]) if None not in laws else ()
 
     def _withdraw(self, client: Client, document: dict[str, Any]) -> None:
         """The daemon's keep-alive; what it no longer vouches for ends the correction."""
@@ -283,6 +301,12 @@ class Guard:
         return {
             "state": state.mode.value,
             "cause": _told(cause) if cause else None,
+            "feedforward": {
+                "state": state.feed.mode.value,
+                "cause": _told(state.feed.cause) if state.feed.cause else None,
+                "limited_cycles": state.feed.limited,
+                "applied": {s.name: list(p) for s, p in zip(self.settings.axes, state.feed.applied, strict=False)},
+            },
             "sync_heard": not self._silent,
             "tick": state.tick,
             "good_for": state.good_for,

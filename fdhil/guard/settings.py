@@ -6,13 +6,14 @@ The file is written by ``fdhil-guard`` from the machine's config and profile; th
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from fdhil.cia402 import PdoEntry, lay_out
 from fdhil.errors import ConfigError, ConfigFault
+from fdhil.guard import feedforward
 from fdhil.guard.limits import Limits
 
 SCHEMA = "fdhil-guard-settings-1"
@@ -35,6 +36,14 @@ class Pdo:
 
 
 @dataclass(frozen=True, slots=True)
+class Feedforward:
+    """What the on-line feed-forward may send: ``pdo`` maps 0x60B1 and 0x60B2, ``limits`` in the drive's counts."""
+
+    pdo: Pdo
+    limits: feedforward.Limits
+
+
+@dataclass(frozen=True, slots=True)
 class AxisSettings:
     """One axis: ``target`` is the NC's RPDO with 0x607A, ``offset`` our own RPDO with 0x60B0 alone.
 
@@ -53,6 +62,7 @@ class AxisSettings:
     window: int
     setpoint_delay_cycles: int
     heartbeat_timeout_s: float = 0.0
+    feedforward: Feedforward | None = None
 
     @property
     def reads_back(self) -> bool:
@@ -100,7 +110,14 @@ class Settings:
     @property
     def sent_ids(self) -> frozenset[int]:
         """The only COB-IDs that may ever leave: our heartbeat and the configured offset RPDOs."""
-        return frozenset([0x700 + self.node_id, *(axis.offset.cob_id for axis in self.axes)])
+        fed = [axis.feedforward.pdo.cob_id for axis in self.axes if axis.feedforward is not None]
+        return frozenset([0x700 + self.node_id, *(axis.offset.cob_id for axis in self.axes), *fed])
+
+    @property
+    def feeds(self) -> tuple[Feedforward, ...]:
+        """The feed-forward of every axis; empty when an axis has none."""
+        found = [axis.feedforward for axis in self.axes if axis.feedforward is not None]
+        return tuple(found) if len(found) == len(self.axes) else ()
 
 
 def to_json(settings: Settings) -> str:
@@ -140,7 +157,10 @@ def _pdo(document: Mapping[str, Any]) -> Pdo:
 def _axis(document: dict[str, Any]) -> AxisSettings:
     tpdos = tuple(_pdo(pdo) for pdo in document.pop("tpdos"))
     target, offset = _pdo(document.pop("target")), _pdo(document.pop("offset"))
-    return AxisSettings(target=target, offset=offset, tpdos=tpdos, limits=Limits(**document.pop("limits")), **document)
+    limits, feed = Limits(**document.pop("limits")), document.pop("feedforward")
+    if feed is not None:
+        feed = Feedforward(_pdo(feed["pdo"]), feedforward.Limits(*map(int, feed["limits"])))
+    return AxisSettings(target=target, offset=offset, tpdos=tpdos, limits=limits, feedforward=feed, **document)
 
 
 def _check(settings: Settings) -> None:
@@ -151,8 +171,8 @@ def _check(settings: Settings) -> None:
         raise ValueError("sync_period_s or heartbeat_s is out of range")
     if settings.clock not in ("monotonic", "sync") or settings.transport not in ("can_raw", "socketcand"):
         raise ValueError("unknown clock or transport")
-    if not _distinct([axis.offset.cob_id for axis in settings.axes]):
-        raise ValueError("two axes share one offset COB-ID")
+    if len(settings.sent_ids) != 1 + len(settings.axes) + sum(a.feedforward is not None for a in settings.axes):
+        raise ValueError("two of our PDOs share one COB-ID")
     for axis in settings.axes:
         _check_axis(axis)
 
@@ -160,6 +180,11 @@ def _check(settings: Settings) -> None:
 def _check_axis(axis: AxisSettings) -> None:
     if [(entry[0], entry[1]) for entry in axis.offset.layout] != [(0x60B0, 0)]:
         raise ValueError(f"axis {axis.name}: the offset RPDO must map 0x60B0:00 and nothing else")
+    feed = axis.feedforward
+    if feed is not None and [entry[:2] for entry in feed.pdo.layout] != [(0x60B1, 0), (0x60B2, 0)]:
+        raise ValueError(f"axis {axis.name}: the feed-forward's RPDO must map 0x60B1:00 and 0x60B2:00 and nothing else")
+    if feed is not None and not (0x180 <= feed.pdo.cob_id < 0x580 and min(feed.limits) >= 1):
+        raise ValueError(f"axis {axis.name}: the feed-forward has no RPDO, or a limit below 1")
     if not all(type(value) is int and value >= 1 for value in asdict(axis.limits).values()):
         raise ValueError(f"axis {axis.name}: limits must be whole increments, at least 1")
     if not 0x180 <= axis.offset.cob_id < 0x580 or type(axis.window) is not int or axis.window < 1:
@@ -168,7 +193,3 @@ def _check_axis(axis: AxisSettings) -> None:
         )
     if type(axis.setpoint_delay_cycles) is not int or not 0 <= axis.setpoint_delay_cycles <= 16:
         raise ValueError(f"axis {axis.name}: setpoint_delay_cycles is out of range")
-
-
-def _distinct(values: Sequence[int]) -> bool:
-    return len(set(values)) == len(values)

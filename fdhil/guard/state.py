@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Literal, NamedTuple
 
+from fdhil.guard.feedforward import Feed, FeedMode, Law, Pair
 from fdhil.guard.interlocks import Alarm, BusView
 from fdhil.guard.limits import Travel
 from fdhil.guard.path import Path, Place
@@ -38,10 +39,11 @@ SENDING = IN_CHARGE | LANDING
 class Request:
     """What the operator or the daemon asks for; only an arm and an adopt need the operator's token."""
 
-    kind: Literal["arm", "disarm", "adopt", "stop"]
+    kind: Literal["arm", "feedforward", "disarm", "adopt", "stop"]
     token_valid: bool = False
     program_digest: str = ""
     facts: Mapping[str, object] = field(default_factory=dict)
+    laws: tuple[Law, ...] = ()
 
 
 class AxisInput(NamedTuple):
@@ -127,18 +129,27 @@ class State(NamedTuple):
     missed: int = 0
     missed_run: int = 0
     failed_run: int = 0
+    feed: Feed = Feed()
+
+    @property
+    def sending(self) -> bool:
+        """Whether frames of ours leave."""
+        return self.mode in SENDING or self.feed.mode is not FeedMode.OFF
 
 
 class Output(NamedTuple):
     """What to do now: the offset of each axis in increments (None: send nothing), our heartbeat, what to journal.
 
-    ``refused`` answers a request: None when there was none, empty when it was granted.
+    ``refused`` answers a request: None when there was none, empty when it was granted. ``feed`` are speed and torque
+    offset of each axis in the drive's counts.
     """
 
     offsets: tuple[int, ...] | None = None
     heartbeat: bool = False
     refused: tuple[Alarm, ...] | None = None
     transition: tuple[Mode, Mode, Alarm | None] | None = None
+    feed: tuple[Pair, ...] | None = None
+    feed_transition: tuple[FeedMode, FeedMode] | None = None
 
 
 def initial(settings: Settings) -> State:

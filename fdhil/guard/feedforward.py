@@ -1,0 +1,187 @@
+"""The on-line feed-forward: speed and torque offsets (0x60B1, 0x60B2) from the targets that the NC sends. Pure.
+
+The law is a few whole weights per axis, found by the daemon from the identified drive; here it is integer arithmetic on
+the last targets, with limits of its own. It has a state beside the position offset's and is never on together with it.
+Zero is always the safer value: whatever freezes a position offset sets these offsets to zero at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from typing import Any, NamedTuple
+
+from fdhil.guard.interlocks import Alarm, Reaction
+from fdhil.guard.limits import clamp
+
+SHIFT = 24
+MOST_WEIGHTS = 64
+MOST_WEIGHT = 1 << 48
+FADE_S = 0.1
+HOLD_CYCLES = 10
+ZEROS = 3
+
+Targets = tuple[int, ...]
+Pair = tuple[int, int]
+
+
+class Limits(NamedTuple):
+    """Largest speed offset (increments/s) and torque offset (0.1 % of the rated torque), and each per SYNC cycle."""
+
+    speed: int
+    speed_rate: int
+    torque: int
+    torque_rate: int
+
+
+class Law(NamedTuple):
+    """One axis' weights, times 2^24, on how far the last targets lie from the newest one, newest first.
+
+    ``pace`` gives the speed as a share of that from which dry friction acts in full, ``dry`` that friction's torque.
+    """
+
+    speed: tuple[int, ...]
+    torque: tuple[int, ...]
+    pace: tuple[int, ...]
+    dry: int
+
+    @property
+    def depth(self) -> int:
+        """How many targets it looks at."""
+        return 1 + max(len(self.speed), len(self.torque), len(self.pace))
+
+    def offsets(self, targets: Sequence[int]) -> Pair:
+        """Return speed and torque offset for the last ``targets``, newest first."""
+        newest = targets[0]
+        ways = [target - newest for target in targets[1:]]
+        pace = clamp(_sum(self.pace, ways), -(1 << SHIFT), 1 << SHIFT)
+        return _whole(_sum(self.speed, ways)), _whole(_sum(self.torque, ways) + self.dry * pace)
+
+
+def _sum(weights: Sequence[int], ways: Sequence[int]) -> int:
+    return sum([weight * way for weight, way in zip(weights, ways, strict=False)])
+
+
+def _whole(value: int) -> int:
+    """Divide by 2^24, to the nearest."""
+    return (value + (1 << SHIFT - 1)) >> SHIFT
+
+
+def parse_law(document: object) -> Law | None:
+    """Return the law that a request carries, None when it is none."""
+    if not isinstance(document, Mapping):
+        return None
+    parts: list[tuple[int, ...]] = []
+    for key in ("speed", "torque", "pace"):
+        weights = document.get(key)
+        if not isinstance(weights, list) or not 0 < len(weights) <= MOST_WEIGHTS or not all(map(_fits, weights)):
+            return None
+        parts.append(tuple(weights))
+    dry = document.get("dry")
+    return Law(parts[0], parts[1], parts[2], dry) if _fits(dry) and isinstance(dry, int) else None
+
+
+def _fits(value: Any) -> bool:
+    return type(value) is int and abs(value) <= MOST_WEIGHT
+
+
+class FeedMode(Enum):
+    """Whether the feed-forward acts: ENDING fades out, ZEROING sends zeros at once."""
+
+    OFF = "OFF"
+    ON = "ON"
+    ENDING = "ENDING"
+    ZEROING = "ZEROING"
+
+
+class Feed(NamedTuple):
+    """The feed-forward's memory: ``share`` of ``FADE_S`` faded in (cycles), the last targets per axis, newest first.
+
+    ``applied`` are the offsets sent last; ``held`` counts cycles in which something was not as it should be,
+    ``limited`` those in which a limit took something away.
+    """
+
+    mode: FeedMode = FeedMode.OFF
+    laws: tuple[Law, ...] = ()
+    share: int = 0
+    targets: tuple[Targets, ...] = ()
+    applied: tuple[Pair, ...] = ()
+    held: int = 0
+    limited: int = 0
+    zeros: int = 0
+    cause: Alarm | None = None
+
+
+def armed(laws: tuple[Law, ...]) -> Feed:
+    """Return the state behind an arming: nothing is sent but zeros until enough targets were heard."""
+    return Feed(FeedMode.ON, laws, applied=((0, 0),) * len(laws), targets=((),) * len(laws))
+
+
+def end(feed: Feed, cause: Alarm) -> Feed:
+    """Fade out."""
+    return feed._replace(mode=FeedMode.ENDING, cause=cause) if feed.mode is FeedMode.ON else feed
+
+
+def react(feed: Feed, alarms: Sequence[Alarm]) -> Feed:
+    """Zero at once on what stops a drive or the bus, fade out on the rest; a short gap is bridged."""
+    if feed.mode is FeedMode.OFF:
+        return feed
+    worst = max(alarms, key=lambda alarm: alarm.reaction, default=None)
+    if worst is None or worst.reaction is Reaction.REFUSE:
+        return feed._replace(held=0)
+    if worst.reaction is Reaction.FREEZE and feed.mode is not FeedMode.ZEROING:
+        return feed._replace(mode=FeedMode.ZEROING, share=0, zeros=0, cause=worst)
+    if worst.reaction is Reaction.RAMP_DOWN or feed.held >= HOLD_CYCLES:
+        return end(feed, worst)
+    return feed._replace(held=feed.held + 1)
+
+
+def hear(feed: Feed, targets: Sequence[int | None]) -> Feed:
+    """Take the targets that a SYNC latched; one that did not come goes on as the two before it."""
+    heard = []
+    for law, past, target in zip(feed.laws, feed.targets, targets, strict=True):
+        newest = target
+        if newest is None:
+            newest = 2 * past[0] - past[1] if len(past) > 1 else None
+        heard.append(past if newest is None else (newest, *past)[: law.depth])
+    return feed._replace(targets=tuple(heard))
+
+
+def move(feed: Feed, limits: Sequence[Limits], fade_cycles: int) -> Feed:
+    """Go one cycle on: the next offsets are ``applied``, inside their limits; OFF once zeros were sent."""
+    if feed.mode is FeedMode.ZEROING:
+        off = feed.zeros >= ZEROS
+        mode = FeedMode.OFF if off else feed.mode
+        return feed._replace(mode=mode, applied=((0, 0),) * len(feed.laws), zeros=feed.zeros + 1)
+    known = all(len(past) == law.depth for law, past in zip(feed.laws, feed.targets, strict=True))
+    share = feed.share + 1 if feed.mode is FeedMode.ON else feed.share - 1
+    feed = feed._replace(share=clamp(share, 0, fade_cycles) if known else 0)
+    applied, limited = [], False
+    for k, (law, past, own) in enumerate(zip(feed.laws, feed.targets, limits, strict=True)):
+        speed, torque = law.offsets(past) if known else (0, 0)
+        limited = limited or abs(speed) > own.speed or abs(torque) > own.torque
+        applied.append(_inside(feed.applied[k], (speed, torque), feed.share, fade_cycles, own))
+    feed = feed._replace(applied=tuple(applied), limited=feed.limited + limited)
+    still = feed.mode is FeedMode.ENDING and feed.share == 0 and not any(map(any, applied))
+    feed = feed._replace(zeros=feed.zeros + 1 if still else 0)
+    return feed._replace(mode=FeedMode.OFF) if feed.zeros > ZEROS else feed
+
+
+def _inside(before: Pair, wanted: Pair, share: int, fade_cycles: int, limits: Limits) -> Pair:
+    """Fade, then keep amplitude and rate."""
+    bounds = ((limits.speed, limits.speed_rate), (limits.torque, limits.torque_rate))
+    values = []
+    for last, goal, (largest, rate) in zip(before, wanted, bounds, strict=True):
+        faded = clamp(goal, -largest, largest) * share // fade_cycles if share else 0
+        values.append(clamp(faded, last - rate, last + rate))
+    return values[0], values[1]
+
+
+def violates(limits: Limits, before: Pair, after: Pair) -> bool:
+    """Check what is to be sent by the limits alone; zero may always be sent."""
+    for last, value, largest, rate in zip(before, after, limits[::2], limits[1::2], strict=True):
+        if type(value) is not int or not -largest <= value <= largest:
+            return True
+        if value != 0 and not -rate <= value - last <= rate:
+            return True
+    return False

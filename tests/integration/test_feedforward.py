@@ -1,0 +1,120 @@
+"""The on-line feed-forward on the simulated machine: no program is known, the targets on the bus are enough."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil.cli.demo.processes import Process
+from fdhil.correction.online import law
+from fdhil.daemon.token import read_token
+from fdhil.drivers.commissioning import commission
+from fdhil.guard.client import GuardClient
+from fdhil.guard.interlocks import FEEDFORWARD_FACTS
+from fdhil.prediction.models import nominal_models
+from fdhil.records import Float
+from tests.bench import bench_document
+from tests.integration.conftest import PATIENCE_S, Bench
+from tests.integration.test_guard import toml
+from tests.paths import bench_demand
+
+pytestmark = pytest.mark.timeout(240)
+LIMITS = {"max_torque_nm": 100.0, "max_speed_rad_s": 30.0}
+
+
+@pytest.fixture
+def transport() -> str:
+    """The transport that joins processes."""
+    return "hub"
+
+
+@pytest.fixture(params=[1.0, 0.5])
+def speed_feedforward(request: pytest.FixtureRequest) -> float:
+    """The bench, and its variant that lags."""
+    return float(request.param)
+
+
+@pytest.fixture
+def sections(speed_feedforward: float) -> dict[str, Any]:
+    """Both axes may be fed forward; quantisation stays, sensor noise is none of the table's."""
+    document = bench_document()
+    for axis in document["axis"].values():
+        axis["feedforward"] = LIMITS
+        axis["regulators"]["speed_feedforward"] = speed_feedforward
+    return {"axis": document["axis"], "sim": {"pace": "lockstep", "modbus": False}, "guard": {"clock": "sync"}}
+
+
+@pytest.fixture
+def client(bench: Bench, tmp_path: Path) -> Iterator[GuardClient]:
+    """A guard on the bench's bus, the drives commissioned before."""
+    for axis in "XY":
+        record = commission(bench.config, axis)
+        assert record.options["1402"] == 0x400 + bench.config.node_id(axis)
+    path = tmp_path / "machine.toml"
+    path.write_text(toml(json.loads(bench.config.model_dump_json(exclude_none=True))), "utf-8")
+    run = bench.config.store.run_directory
+    assert run is not None
+    with Process("guard", ["fdhil.cli.guard", str(path)], tmp_path / "guard.log") as guard:
+        guard.event("ready", PATIENCE_S)
+        with GuardClient(run) as guard_client:
+            yield guard_client
+        assert guard.stop() == 0
+
+
+def switch_on(client: GuardClient, bench: Bench) -> None:
+    """Switch the feed-forward on as soon as the interlocks have been good for long enough."""
+    models = nominal_models(bench.config)
+    laws = {axis: law(models[axis], bench.config.axis[axis], 0.001) for axis in "XY"}
+    run = bench.config.store.run_directory
+    assert run is not None
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        client.alive()
+        answer = client.feed_forward(read_token(run), laws, dict.fromkeys(FEEDFORWARD_FACTS, True))
+        if answer["ok"]:
+            return
+        time.sleep(0.1)
+    raise AssertionError(answer)
+
+
+def largest_error_um(bench: Bench, client: GuardClient, demand: Path, trace: Path, rows: int) -> float:
+    """Play the demand and return the largest tracking error of both axes."""
+    bench.command(json.dumps({"command": "trace", "file": str(trace)}))
+    bench.command(json.dumps({"command": "play", "file": str(demand)}))
+    while bench.events.empty() or not any(e["event"] == "finished" for e in list(bench.events.queue)):
+        client.alive()
+        time.sleep(0.05)
+    bench.event("finished")
+    data = np.genfromtxt(trace, delimiter=",", names=True)[:rows]
+    errors: list[Float] = [data[f"{axis}_table_mm"] - data[f"{axis}_reference_mm"] for axis in "XY"]
+    return 1e3 * float(max(np.abs(error).max() for error in errors))
+
+
+def test_the_largest_tracking_error_shrinks(
+    bench: Bench, client: GuardClient, tmp_path: Path, speed_feedforward: float
+) -> None:
+    """At least 3 times on the bench, 50 times on a drive that lags; off again, nothing stays applied."""
+    demand = tmp_path / "demand.csv"
+    path = bench_demand(10)
+    lines = [f"{k * 0.001:.3f},{x:.9f},{y:.9f}" for k, (x, y) in enumerate(path)]
+    demand.write_text("time_s,X_mm,Y_mm\n" + "\n".join(lines) + "\n", "utf-8")
+    bench.command('{"command": "nc", "on": true}')
+    bench.event("nc")
+    before = largest_error_um(bench, client, demand, tmp_path / "before.csv", len(path))
+    switch_on(client, bench)
+    after = largest_error_um(bench, client, demand, tmp_path / "after.csv", len(path))
+    assert before / after >= (3 if speed_feedforward == 1.0 else 50)
+    client.disarm()
+    deadline = time.monotonic() + PATIENCE_S
+    while client.status()["feedforward"]["state"] != "OFF" and time.monotonic() < deadline:
+        time.sleep(0.02)
+    told = client.status()["feedforward"]
+    assert told["state"] == "OFF"
+    assert told["cause"]["code"] == "Disarmed"
+    assert told["applied"] == {"X": [0, 0], "Y": [0, 0]}
