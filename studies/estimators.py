@@ -1,4 +1,4 @@
-"""Estimators and derivative operators on one rapid of the bench, by Monte Carlo (``python -m studies.estimators``).
+"""The product's estimators, as it publishes them, on one rapid of the bench (``python -m studies.estimators``).
 
 The table gives each method's RMS error over its bound: the standard deviation that the information in the same noisy
 rows allows. It goes to ``docs/studies/estimators.md`` with a plot beside it.
@@ -15,9 +15,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from fdhil import tables
 from fdhil.config import Identification
-from fdhil.identification.derivatives import OPERATORS
-from fdhil.identification.estimators import least_squares, maximum_likelihood, partial_moments
 from fdhil.identification.estimators.maximum_likelihood import jacobian, pose, typical
 from fdhil.identification.motion import Noise, prepare
 from fdhil.identification.windows import find_windows
@@ -29,7 +28,6 @@ Array = npt.NDArray[np.float64]
 Method = Callable[[list[Window]], Estimate]
 TRUTH = np.array([bench.Plant().truth()[name] for name in PARAMETERS])
 SIZES = np.array([60.0, 50.0, 150.0])
-UNFILTERED_HZ = 450.0
 
 
 def clean() -> Recording:
@@ -61,20 +59,12 @@ def bound(recording: Recording, noise: float) -> Array:
 
 
 def methods() -> dict[str, Method]:
-    """Return what is compared, by name."""
+    """Return the listed estimators by name, each with the product's settings."""
     settings = Identification()
-    raw = Identification(lowpass_hz=UNFILTERED_HZ)
-    compared: dict[str, Method] = {
-        f"least squares, {name}": partial(_operator, settings=settings, operator=name) for name in OPERATORS
+    return {
+        name.replace("_", " "): partial(tables.load(tables.ESTIMATORS, name), settings=settings)
+        for name in tables.ESTIMATORS
     }
-    compared["least squares, zero_forcing_1, no low-pass"] = partial(_operator, settings=raw, operator="zero_forcing_1")
-    compared["partial moments"] = partial(partial_moments.estimate, settings=settings)
-    compared["maximum likelihood"] = partial(maximum_likelihood.estimate, settings=settings)
-    return compared
-
-
-def _operator(windows: list[Window], settings: Identification, operator: str) -> Estimate:
-    return least_squares.estimate_with(windows, settings, operator)
 
 
 def monte_carlo(method: Method, recording: Recording, noise: float, runs: int) -> tuple[Array, Array, Array]:
