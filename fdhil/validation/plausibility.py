@@ -8,18 +8,21 @@ from collections.abc import Iterator
 import numpy as np
 
 from fdhil.identification.motion import noise_levels, resolution
-from fdhil.identification.windows import carried, longest, moving_range, smooth
+from fdhil.identification.windows import carried, longest, moving_range, noise_of, smooth
 from fdhil.records import Bool, Float, Reason, Window
+from fdhil.validation.backlash import backlash
+from fdhil.validation.episode import interruptions
 
 CHANCE = 1e-7  # of a false alarm of one check on one good window
 TOLERATED_GAP = 3  # rows: a longer gap hides what the drive did
 TOLERATED_LOSS = 0.02
 STUCK_S = 0.003
 RAIL_SAMPLES = 3
+RESOLVED = 0.2  # of a step: noise below it hides in the resolution
 QUANTISATION = 1 / 50
 SURE = 6.0
 SCALE_TOLERANCE = 0.005  # of the travel: pitch and speed scale are known to that
-BACKLASH_UM = 60.0
+ELASTIC_UM = 60.0  # a screw's wind-up, and backlash too small to be told
 
 
 def implausibilities(window: Window) -> list[Reason]:
@@ -30,8 +33,10 @@ def implausibilities(window: Window) -> list[Reason]:
     reasons += list(_gaps(window))
     reasons += list(_stuck(window))
     reasons += list(_clipped(window))
-    reasons += list(_position(window))
-    return reasons
+    play = backlash(window)
+    parted = list(_position(window, play.um if play is not None else 0.0))
+    # what position tells of the move's course is worth nothing where it contradicts the speed
+    return reasons + (parted or list(interruptions(window)) + ([play.reason()] if play is not None else []))
 
 
 def warnings_of(window: Window) -> list[Reason]:
@@ -99,7 +104,9 @@ def _stuck(window: Window) -> Iterator[Reason]:
         start, end = longest(same)
         least = max(2, round(STUCK_S / window.dt_s))
         at_rail = end > start and part[start] in (np.nanmax(values), np.nanmin(values))
-        if end - start >= least and not at_rail and _beyond_chance(same, start, end):
+        if end - start < least or at_rail:
+            continue
+        if _beyond_chance(part, start, end) or _wakes_with_a_jump(part, start, end):
             text = (
                 f"{name} repeats {part[start]:.6g} {unit} for {(end - start + 1) * window.dt_s * 1e3:.0f} ms "
                 f"from {_time(window, a + start):.3f} s while the axis moves"
@@ -107,11 +114,38 @@ def _stuck(window: Window) -> Iterator[Reason]:
             yield Reason("StuckValue", text, "check the sensor or the object's mapping")
 
 
-def _beyond_chance(same: Bool, start: int, end: int) -> bool:
-    """Return whether a run of repeats is longer than the repeats outside it make likely."""
+def _beyond_chance(part: Float, start: int, end: int) -> bool:
+    """Return whether the repeats from row ``start`` to ``end`` are more than the rows about them make likely."""
+    same = np.diff(part) == 0.0
     outside = np.concatenate([same[:start], same[end:]])
     share = (float(outside.sum()) + 1.0) / (outside.size + 2.0)
-    return same.size * share ** (end - start) < CHANCE
+    likely = likely_repeat(np.concatenate([part[:start], part[end + 1 :]]))
+    chance: float = same.size * max(share, likely) ** (end - start)
+    return chance < CHANCE
+
+
+def likely_repeat(values: Float) -> float:
+    """Return how likely a constant with this noise repeats its reading at most, in the resolution it is read with.
+
+    The likeliest constant lies in the middle of a step: q of its readings are that step, the rest the two beside it.
+    """
+    step = resolution(values[np.isfinite(values)])
+    # the steps themselves show as noise of step / sqrt(12)
+    variance = noise_of(values) ** 2 - step**2 / 12
+    if step == 0.0 or variance < (RESOLVED * step) ** 2:
+        return 1.0 if step else 0.0
+    inside = math.erf(step / math.sqrt(8 * variance))
+    return inside**2 + (1 - inside) ** 2 / 2
+
+
+def _wakes_with_a_jump(part: Float, start: int, end: int) -> bool:
+    """Return whether the signal goes on after a run of repeats by more than it ever changes otherwise."""
+    change = np.abs(np.diff(part))
+    if end >= change.size:
+        return False
+    others = np.concatenate([change[:start], change[end + 1 :]])
+    others = others[np.isfinite(others)]
+    return others.size > 0 and bool(change[end] > 2 * others.max(initial=0.0))
 
 
 def _clipped(window: Window) -> Iterator[Reason]:
@@ -119,7 +153,7 @@ def _clipped(window: Window) -> Iterator[Reason]:
         for rail, side in ((np.nanmax(values), "upper"), (np.nanmin(values), "lower")):
             at_rail = values == rail
             start, end = longest(at_rail)
-            if rail == 0.0 or end - start < RAIL_SAMPLES or not _rail_is_hard(values, start, end):
+            if rail == 0.0 or end - start < RAIL_SAMPLES or not _beyond_chance(values, start, end - 1):
                 continue
             text = (
                 f"{name} stays at its {side} extreme {rail:.6g} {unit} for {end - start} samples "
@@ -128,12 +162,11 @@ def _clipped(window: Window) -> Iterator[Reason]:
             yield Reason("Saturated", text, "use a larger measuring range")
 
 
-def _rail_is_hard(values: Float, start: int, end: int) -> bool:
-    return _beyond_chance(np.diff(values) == 0.0, start, end - 1)
+def _position(window: Window, play_um: float) -> Iterator[Reason]:
+    """Compare the position with the integral of speed: a hidden gap, a stuck signal or a wrong scale shows up.
 
-
-def _position(window: Window) -> Iterator[Reason]:
-    """Compare the position with the integral of speed: a hidden gap, a stuck signal or a wrong scale shows up."""
+    ``play_um`` is the backlash that the window shows, by which both may part.
+    """
     if not np.isfinite(window.position_mm).any() or np.ptp(carried(window.position_mm)) == 0.0:
         return
     to_mm = window.pitch_mm / (2 * math.pi)
@@ -143,8 +176,9 @@ def _position(window: Window) -> Iterator[Reason]:
     noise = noise_levels(window).speed_rad_s * window.dt_s * to_mm
     quantum = max(resolution(position), 1e-6)
     error = position - position[0] - travel
-    yield from _jump(window, error, noise, quantum)
-    yield from _scale(travel, error, noise, quantum)
+    elastic = 1e-3 * (ELASTIC_UM + 1.5 * play_um)
+    yield from _jump(window, error, noise, quantum, elastic)
+    yield from _scale(travel, error, noise, quantum, elastic)
 
 
 def _bridged(values: Float) -> Float:
@@ -155,7 +189,7 @@ def _bridged(values: Float) -> Float:
     return bridged
 
 
-def _jump(window: Window, error: Float, noise: float, quantum: float) -> Iterator[Reason]:
+def _jump(window: Window, error: Float, noise: float, quantum: float, elastic: float) -> Iterator[Reason]:
     """Find the stretch over which position and integral part most beyond noise, at any length up to 100 ms."""
     worst, where, amount = 0.0, 0, 0.0
     for seconds in (0.0, 0.005, 0.02, 0.05, 0.1):
@@ -163,8 +197,7 @@ def _jump(window: Window, error: Float, noise: float, quantum: float) -> Iterato
         if length >= error.size:
             continue
         change = np.abs(error[length:] - error[:-length])
-        # backlash and the screw's elasticity move the table against the motor by some um
-        allowed = SURE * np.hypot(noise * np.sqrt(length + 1), quantum) + BACKLASH_UM * 1e-3
+        allowed = SURE * np.hypot(noise * np.sqrt(length + 1), quantum) + elastic
         k = int(np.argmax(change))
         if change[k] / allowed > worst:
             worst, where, amount = float(change[k] / allowed), k, float(change[k])
@@ -173,9 +206,9 @@ def _jump(window: Window, error: Float, noise: float, quantum: float) -> Iterato
         yield Reason("Implausible", text, "samples are lost or repeated there: check counters and time stamps")
 
 
-def _scale(travel: Float, error: Float, noise: float, quantum: float) -> Iterator[Reason]:
+def _scale(travel: Float, error: Float, noise: float, quantum: float, elastic: float) -> Iterator[Reason]:
     whole = abs(float(travel[-1]))
-    allowed = SURE * np.hypot(noise * np.sqrt(error.size), quantum) + SCALE_TOLERANCE * whole + BACKLASH_UM * 1e-3
+    allowed = SURE * np.hypot(noise * np.sqrt(error.size), quantum) + SCALE_TOLERANCE * whole + elastic
     if whole > 0 and abs(float(error[-1])) > allowed:
         share = 100 * float(error[-1]) / whole
         text = f"the position travels {share:+.2f} % more than the integral of speed"

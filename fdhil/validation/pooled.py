@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +10,16 @@ import numpy as np
 from fdhil.config import Identification
 from fdhil.identification.estimators import chosen
 from fdhil.identification.identifiability import unphysical
-from fdhil.records import PARAMETERS, Estimate, Reason, Verdict, WindowOutcome, frozen
+from fdhil.records import PARAMETERS, Estimate, Float, Reason, Verdict, WindowOutcome, frozen
 
 BEYOND_CHANCE = 5.0
+MODEL_SHARE = 0.003  # how well equal drives agree at any noise: the voltage's course within a sample is not known
+UNEXPLAINED = 30.0  # chi-square of 5 degrees of freedom: 2e-5 by chance
+GAINS: Mapping[str, Float] = {  # powers of R, L, K, Jt, ft, Cd
+    "voltage": np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0]),
+    "current": np.array([-1.0, -1.0, 0.0, 1.0, 1.0, 1.0]),
+    "speed": np.array([0.0, 0.0, -1.0, -2.0, -2.0, -1.0]),
+}
 LEAST_CHANGE: Mapping[str, float] = {"R": 0.02, "L": 0.03, "K": 0.01, "Jt": 0.02, "ft": 0.15, "Cd": 0.10}
 
 
@@ -31,8 +38,8 @@ def pool(
         return None, Verdict(False, None, (reason,))
     accepted = [o for o in outcomes if o.verdict.accepted]
     if not accepted:
-        seen = {r.code: r for o in outcomes for r in o.verdict.reasons}
-        return None, Verdict(False, None, tuple(seen.values()))
+        seen = dict.fromkeys(r for o in outcomes for r in o.verdict.reasons)
+        return None, Verdict(False, None, tuple(seen))
     fits = [o.verdict.fit_percent for o in accepted if o.verdict.fit_percent is not None]
     if len(accepted) == 1 and accepted[0].estimate is not None:
         return accepted[0].estimate, Verdict(True, accepted[0].verdict.fit_percent)
@@ -71,8 +78,14 @@ def weighted(estimates: Sequence[Estimate]) -> Estimate | None:
     )
 
 
-def _moved(estimates: Sequence[Estimate]) -> Iterator[Reason]:
-    """Yield a reason for each parameter that differs between windows beyond chance and by enough to matter."""
+def _moved(estimates: Sequence[Estimate]) -> list[Reason]:
+    """Return a reason for each parameter that differs between windows beyond chance and by enough to matter.
+
+    One sensor's gain moves several parameters at once, each in its own proportion: where that explains all of it, the
+    sensor is the reason.
+    """
+    reasons: list[Reason] = []
+    worst = (0, 0)
     for name in PARAMETERS:
         values = np.array([e.value(name) for e in estimates])
         stds = np.array([e.std(name) for e in estimates])
@@ -80,6 +93,41 @@ def _moved(estimates: Sequence[Estimate]) -> Iterator[Reason]:
         apart = float(values[high] - values[low])
         chance = BEYOND_CHANCE * float(np.hypot(stds[low], stds[high]))
         if apart > max(chance, LEAST_CHANGE[name] * abs(float(np.nanmedian(values)))):
+            worst = worst if reasons else (min(low, high), max(low, high))
             code = "LoadChanged" if name == "Jt" else "ParameterJump"
             text = f"{name} moves from {values[low]:.4g} to {values[high]:.4g} between the windows"
-            yield Reason(code, text, "identify the windows before and after the change apart")
+            reasons.append(Reason(code, text, "identify the windows before and after the change apart"))
+    sensor = gain_change(estimates[worst[0]], estimates[worst[1]]) if len(reasons) > 1 else None
+    return [sensor] if sensor is not None else reasons
+
+
+def gain_change(before: Estimate, after: Estimate) -> Reason | None:
+    """Return the reason when one sensor's gain explains all that differs between two estimates; None when none does.
+
+    With g the factor of a sensor's gain, [1] and [2] hold again for parameters times g to the powers of ``GAINS``.
+    """
+    names = [name for name in PARAMETERS if min(before.value(name), after.value(name)) > 0]
+    if len(names) < len(PARAMETERS) - 1:  # friction may be nil
+        return None
+    rows = [PARAMETERS.index(name) for name in names]
+    moved = np.log(after.values[rows] / before.values[rows])
+    spread = np.diag(np.full(len(rows), MODEL_SHARE**2))
+    for estimate in (before, after):
+        spread += (estimate.covariance / np.outer(estimate.values, estimate.values))[np.ix_(rows, rows)]
+    weight = np.linalg.inv(spread)
+    singles = np.eye(len(rows))
+    patterns = {name: powers[rows] for name, powers in GAINS.items()}
+    left = {name: _unexplained(moved, weight, pattern)[1] for name, pattern in patterns.items()}
+    sensor = min(left, key=lambda name: left[name])
+    if left[sensor] > min(UNEXPLAINED, *(_unexplained(moved, weight, single)[1] for single in singles)):
+        return None
+    share = float(np.expm1(_unexplained(moved, weight, patterns[sensor])[0]))
+    text = f"the gain of {sensor} changes by {share:+.2%} between the windows: that alone explains what moves"
+    return Reason("CalibrationSuspect", text, f"check the {sensor} sensor and its wiring")
+
+
+def _unexplained(moved: Float, weight: Float, pattern: Float) -> tuple[float, float]:
+    """Return the best amplitude of a pattern, and the chi-square that it leaves."""
+    amplitude = float(pattern @ weight @ moved / (pattern @ weight @ pattern))
+    rest = moved - amplitude * pattern
+    return amplitude, float(rest @ weight @ rest)

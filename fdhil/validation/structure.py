@@ -18,13 +18,13 @@ from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.innovations import innovations
 from fdhil.identification.motion import Motion
 from fdhil.identification.normal import inverse_of
-from fdhil.records import Float, Reason
+from fdhil.records import Float, Reason, Window
 
 BEYOND_CHANCE = 5.5  # standard deviations: about 4e-8 a test, some hundred tests a window
 EDGES = 20  # instants at which a load may begin or end, or a gain may step
 LEAST_TORQUE = 0.01  # of the peak torque
-LEAST_GAIN = 0.005
-LEAST_OFFSET = 0.004  # of the signal's peak
+LEAST_GAIN = 0.01  # what pooled windows may differ in K
+LEAST_OFFSET = 0.01  # of the signal's peak
 IMITATED = 1e-6  # share of a direction below which only rounding is left of it
 LAGS = 25
 WHITENESS_BEYOND_CHANCE = 5.0
@@ -64,6 +64,7 @@ class Bench:
 
     fit: Fit
     inverse: Float
+    course: Float
 
     @property
     def motion(self) -> Motion:
@@ -81,6 +82,12 @@ class Bench:
         change: Float = self.fit.residuals - innovations(motion, theta, gains, theta[6], load).ravel()
         return change
 
+    def course_scores(self, directions: Float) -> Float:
+        """Return the scores (q,) that the voltage's unknown course within its samples may give ``directions``."""
+        jacobian, course = self.fit.jacobian, self.course
+        seen: Float = directions.T @ course - (directions.T @ jacobian) @ (self.inverse @ (jacobian.T @ course))
+        return seen
+
     def scores(self, directions: Float) -> tuple[Float, Float]:
         """Return score (q,) and information (q, q) of ``directions`` (m, q) beyond what the parameters imitate."""
         jacobian, e = self.fit.jacobian, self.fit.residuals
@@ -93,28 +100,33 @@ class Bench:
         """Return the direction with the largest statistic: its index, statistic and amplitude."""
         matrix = np.column_stack(directions)
         score, information = self.scores(matrix)
-        statistic, amplitude = _tested(score, np.diag(information), (matrix * matrix).sum(axis=0))
+        whole = (matrix * matrix).sum(axis=0)
+        statistic, amplitude = _tested(score, np.diag(information), whole, self.course_scores(matrix))
         k = int(np.argmax(np.abs(statistic)))
         return k, float(statistic[k]), float(amplitude[k])
 
 
-def _tested(score: Float, weight: Float, whole: Float) -> tuple[Float, Float]:
-    """Return statistics and amplitudes; 0 where the parameters imitate all but rounding of a direction's ``whole``."""
+def _tested(score: Float, weight: Float, whole: Float, course: Float) -> tuple[Float, Float]:
+    """Return statistics and amplitudes; 0 where the parameters imitate all but rounding of a direction's ``whole``.
+
+    The variance of a score is its ``weight``, and the square of what one standard deviation of the voltage's ``course``
+    within the samples gives.
+    """
     seen = weight > IMITATED * whole
     safe = np.where(seen, weight, 1.0)
-    return np.where(seen, score / np.sqrt(safe), 0.0), np.where(seen, score / safe, 0.0)
+    return np.where(seen, score / np.sqrt(safe + course**2), 0.0), np.where(seen, score / safe, 0.0)
 
 
 def findings(fit: Fit) -> list[Finding]:
     """Return what the fit of one window shows beyond the model, the most significant first."""
-    bench = Bench(fit, inverse_of(fit.information)[0])
+    bench = Bench(fit, inverse_of(fit.information)[0], fit.problem.shape_effect(fit.theta))
     rows = np.flatnonzero(np.abs(bench.motion.mode) == 1)
     if rows.size < 2 * EDGES:
         return []
     edges = np.unique(np.linspace(rows[0], rows[-1] + 1, EDGES + 1).astype(int))
     found = [_load(bench, edges), _low_speed_friction(bench)]
     for name, unit in (("voltage", "V"), ("current", "A"), ("speed", "rad/s")):
-        found += [_gain_step(bench, name, edges[2:-2:2]), _offset(bench, name, unit)]
+        found += [_gain(bench, name, edges), _offset(bench, name, unit, edges)]
     return sorted(found, key=lambda f: -abs(f.statistic))
 
 
@@ -130,7 +142,9 @@ def _load(bench: Bench, edges: npt.NDArray[np.int_]) -> Finding:
     matrix = np.column_stack(steps)
     score, information = bench.scores(matrix)
     # a load from edge a to edge b is the step at a less the step at b
-    statistic, amplitude = _tested(score[:, None] - score[None, :], _apart(information), _apart(matrix.T @ matrix))
+    course = bench.course_scores(matrix)
+    apart, whole = score[:, None] - score[None, :], _apart(matrix.T @ matrix)
+    statistic, amplitude = _tested(apart, _apart(information), whole, course[:, None] - course[None, :])
     a, b = np.unravel_index(int(np.argmax(np.abs(np.triu(statistic, 1)))), statistic.shape)
     span = f"{edges[a] * motion.dt_s:.3f} to {edges[b] * motion.dt_s:.3f} s of the window"
     return Finding(
@@ -150,30 +164,41 @@ def _apart(gram: Float) -> Float:
     return distances
 
 
-def _gain_step(bench: Bench, name: str, edges: npt.NDArray[np.int_]) -> Finding:
-    """Try a gain that changes at one of the edges and stays."""
-    directions = []
-    for edge in edges:
-        changed = np.ones(bench.motion.n)
-        changed[edge:] += 1e-3
-        directions.append(bench.answer(_altered(bench.motion, name, changed, 0.0)) / 1e-3)
+def _gain(bench: Bench, name: str, edges: npt.NDArray[np.int_]) -> Finding:
+    """Try a gain that steps at one of the inner edges and stays, and one that drifts from the first to the last."""
+    courses = [(np.arange(bench.motion.n) >= edge).astype(np.float64) for edge in edges[2:-2:2]]
+    courses.append(_drift(bench, edges))
+    directions = [bench.answer(_altered(bench.motion, name, 1.0 + 1e-3 * c, 0.0)) / 1e-3 for c in courses]
     k, statistic, amplitude = bench.best(directions)
-    at = f"{edges[k] * bench.motion.dt_s:.3f} s of the window"
-    text, advice = f"the gain of {name} changes by {{:+.2%}} at {at}", f"check the {name} sensor and its wiring"
+    drifts = k == len(courses) - 1
+    at = "over the move" if drifts else f"at {edges[2:-2:2][k] * bench.motion.dt_s:.3f} s of the window"
+    text = f"the gain of {name} {'drifts' if drifts else 'changes'} by {{:+.2%}} {at}"
     # what is tried is the correction of the signal, so the sensor's own change has the other sign
-    return Finding("CalibrationSuspect", text, advice, LEAST_GAIN, statistic, -amplitude)
+    return Finding(
+        "CalibrationSuspect", text, f"check the {name} sensor and its wiring", LEAST_GAIN, statistic, -amplitude
+    )
 
 
-def _offset(bench: Bench, name: str, unit: str) -> Finding:
+def _offset(bench: Bench, name: str, unit: str, edges: npt.NDArray[np.int_]) -> Finding:
+    """Try an offset that is there throughout, and one that drifts from nothing on over the move."""
     motion = bench.motion
     peak = float(np.abs(motion.voltage_mean if name == "voltage" else getattr(motion, name)).max())
     step = max(1e-3 * peak, 1e-12)
-    _, statistic, amplitude = bench.best([bench.answer(_altered(motion, name, np.ones(motion.n), step)) / step])
-    text, advice = f"{name} has an offset of {{:+.3g}} {unit}", f"set the zero of the {name} sensor at standstill"
+    courses = (np.ones(motion.n), _drift(bench, edges))
+    directions = [bench.answer(_altered(motion, name, np.ones(motion.n), step * c)) / step for c in courses]
+    k, statistic, amplitude = bench.best(directions)
+    text = f"{name} has an offset of {{:+.3g}} {unit}" if k == 0 else f"the zero of {name} drifts by {{:+.3g}} {unit}"
+    advice = f"set the zero of the {name} sensor at standstill"
     return Finding("CalibrationSuspect", text, advice, LEAST_OFFSET * peak, statistic, -amplitude)
 
 
-def _altered(motion: Motion, name: str, factor: Float, offset: float) -> Motion:
+def _drift(bench: Bench, edges: npt.NDArray[np.int_]) -> Float:
+    """Return a course (n,) that rises from 0 at the first edge to 1 at the last."""
+    course: Float = np.clip((np.arange(bench.motion.n) - edges[0]) / max(1, edges[-1] - edges[0]), 0.0, 1.0)
+    return course
+
+
+def _altered(motion: Motion, name: str, factor: Float, offset: Float | float) -> Motion:
     if name == "voltage":
         factor, offset = motion.at_voltage(factor), motion.at_voltage(np.broadcast_to(offset, motion.n))
         mean, rise = motion.voltage_mean * factor + offset, motion.voltage_rise * factor
@@ -225,14 +250,25 @@ def whiteness(fit: Fit) -> Iterator[Reason]:
             yield Reason("ValidationFailed", text, "the drive does what the model does not have: look at the residuals")
 
 
-def excess_noise(fit: Fit) -> Iterator[Reason]:
-    """Yield a reason where the fit needs more noise than the signal's own short-term scatter shows."""
-    motion, fitted = fit.problem.motions[0], fit.problem.noises[0]
-    for name, unit, wanted, seen in (
-        ("voltage", "V", fitted.voltage_v, motion.noise.voltage_v),
-        ("current", "A", fitted.current_a, motion.noise.current_a),
-        ("speed", "rad/s", fitted.speed_rad_s, motion.noise.speed_rad_s),
+def excess_noise(fit: Fit, window: Window) -> Iterator[Reason]:
+    """Yield a reason where the fit needs more noise than the signal's own scatter from row to row shows."""
+    fitted = fit.problem.noises[0]
+    for name, unit, wanted, values in (
+        ("voltage", "V", fitted.voltage_v, window.voltage_v),
+        ("current", "A", fitted.current_a, window.current_a),
+        ("speed", "rad/s", fitted.speed_rad_s, window.speed_rad_s),
     ):
+        seen = max(_scatter(values), getattr(fit.problem.motions[0].noise, _FIELDS[name]))
         if wanted > NOISE_RATIO * seen:
-            text = f"the model explains {name} to {wanted:.3g} {unit} only, while its noise is {seen:.3g} {unit}"
+            text = f"the model explains {name} to {wanted:.3g} {unit} only, while it scatters by {seen:.3g} {unit}"
             yield Reason("ValidationFailed", text, "the drive does what the model does not have: look at the residuals")
+
+
+_FIELDS = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}
+
+
+def _scatter(values: Float | None) -> float:
+    """Return what a signal scatters from row to row: noise, resolution, and what it does within a few rows."""
+    third = np.diff(values, 3) if values is not None else np.zeros(0)
+    third = third[np.isfinite(third)]
+    return float(np.sqrt(np.mean(third * third) / 20.0)) if third.size else 0.0

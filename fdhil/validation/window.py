@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from fdhil.config import Identification
-from fdhil.identification.estimators import chosen, maximum_likelihood
+from fdhil.identification.delay import coarse_delay
+from fdhil.identification.estimators import chosen, least_squares, maximum_likelihood
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.identifiability import empty_estimate, unphysical
 from fdhil.identification.ratios import estimate_ratios
@@ -35,13 +36,15 @@ def analyse(window: Window, settings: Identification) -> WindowOutcome:
         missing = empty_estimate(chosen(settings)[0], Result.NOT_FINITE, reasons[0])
         return WindowOutcome(window, missing, Verdict(False, None, tuple(reasons)))
     try:
-        estimate, fit = _estimate(window, settings)
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            estimate, fit = _estimate(window, settings)
+            fit_percent = simulated_fit_percent(window, estimate)
+            doubts = _doubts(window, estimate, fit, fit_percent, settings)
     except (np.linalg.LinAlgError, FloatingPointError, ZeroDivisionError, OverflowError) as error:
         reasons.append(Reason("SolverFailed", f"the solver gave up ({error})", "look at the window's signals"))
         missing = empty_estimate(chosen(settings)[0], Result.DIVERGED, reasons[-1])
         return WindowOutcome(window, missing, Verdict(False, None, tuple(reasons)))
-    fit_percent = simulated_fit_percent(window, estimate)
-    reasons += _doubts(window, estimate, fit, fit_percent)
+    reasons += doubts
     return WindowOutcome(window, estimate, Verdict(not reasons, fit_percent, tuple(reasons)))
 
 
@@ -58,14 +61,15 @@ def _without_voltage(window: Window, settings: Identification, reasons: list[Rea
 def _estimate(window: Window, settings: Identification) -> tuple[Estimate, Fit | None]:
     """Return the estimate by the chosen method, and the maximum-likelihood fit that the checks of structure need."""
     name, estimator = chosen(settings)
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        fit = maximum_likelihood.fit_windows([window], settings)
-        if name == maximum_likelihood.NAME and fit is not None:
-            return maximum_likelihood.finish(fit), fit
-        return estimator([window], settings), fit
+    fit = maximum_likelihood.fit_windows([window], settings)
+    if name == maximum_likelihood.NAME and fit is not None:
+        return maximum_likelihood.finish(fit), fit
+    return estimator([window], settings), fit
 
 
-def _doubts(window: Window, estimate: Estimate, fit: Fit | None, fit_percent: float | None) -> list[Reason]:
+def _doubts(
+    window: Window, estimate: Estimate, fit: Fit | None, fit_percent: float | None, settings: Identification
+) -> list[Reason]:
     reasons = list({r.text: r for r in estimate.missing.values()}.values())
     if estimate.result is Result.DIVERGED:
         reasons.append(Reason("SolverFailed", "the fit does not converge", "look at the window's signals"))
@@ -73,11 +77,15 @@ def _doubts(window: Window, estimate: Estimate, fit: Fit | None, fit_percent: fl
     if fit is None:
         return reasons or [Reason("RankDeficient", "there is no fit to check", "record a whole rapid")]
     late = _late(window, fit)
-    if late is not None:
+    if late is not None and _electrically_late(window, settings):
         return [*reasons, late]
-    if np.isfinite(fit.residuals).all():
-        reasons += _structure(fit)
-        reasons += rest_faults(window, fit)
+    if late is not None:  # what else is wrong moves the delay too: without it, it shows under its own name
+        fit = maximum_likelihood.fit(fit.problem.motions, np.append(fit.theta[:6], 0.0), range(6))
+    if np.isfinite(fit.residuals).all() and np.isfinite(fit.information).all():
+        found = [*_structure(fit, window), *rest_faults(window, fit)]
+        reasons += found or ([late] if late is not None else [])
+    elif late is not None:
+        reasons.append(late)
     least = expected_fit_percent(window, fit)
     if not reasons and fit_percent is not None and not fit_percent >= least:
         text = (
@@ -103,6 +111,11 @@ def expected_fit_percent(window: Window, fit: Fit) -> float:
     return max(LEAST_FIT_PERCENT, 100.0 * (1.0 - float(np.sqrt(variance)) / max(deviation, 1e-300)))
 
 
+def _electrically_late(window: Window, settings: Identification) -> bool:
+    """Return whether [5] alone shows a delay of whole samples: no torque or friction can pass for that."""
+    return window.voltage_v is None or coarse_delay(least_squares.align(window, settings), window.dt_s) != 0.0
+
+
 def _late(window: Window, fit: Fit) -> Reason | None:
     delay = float(fit.theta[6])
     period = max(window.dt_s, fit.problem.motions[0].voltage_period_s)
@@ -115,12 +128,12 @@ def _late(window: Window, fit: Fit) -> Reason | None:
     return Reason("SampleTiming", text, "take voltage, current and speed from one SYNC, or enter the sensor's delay")
 
 
-def _structure(fit: Fit) -> list[Reason]:
+def _structure(fit: Fit, window: Window) -> list[Reason]:
     """Return the named finding that explains most, else what has no name."""
     found = [f for f in findings(fit) if f.matters]
     if found:
         return [found[0].reason()]
-    return [*whiteness(fit), *excess_noise(fit)]
+    return [*whiteness(fit), *excess_noise(fit, window)]
 
 
 def simulated_fit_percent(window: Window, estimate: Estimate) -> float | None:

@@ -1,0 +1,128 @@
+"""Was the rapid carried out as it was ordered? One plateau, both ramps alike, and rest where the demand rests.
+
+Feed override and feed hold change the speed on the way; an abort brakes harder than any planned ramp or leaves the
+demand behind. Position and demand tell, so that no fault of the speed sensor can pass for one. A slower rapid at a
+constant override keeps its three stages and is as good as any; a hold that comes to rest leaves two whole moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from fdhil.identification.filtering import moving_mean
+from fdhil.identification.windows import longest, moving_range
+from fdhil.records import Float, Reason, Window
+
+CODE = "EpisodeAborted"
+ADVICE = "record a rapid without feed hold, override change or stop"
+SMOOTHING_S = 0.020
+TOP = 0.95
+OVERSHOOT = 0.85
+RAMP_S = 0.005
+LEAST_DIP = 0.06  # of the plateau: a drive's own following of one ramp stays below
+HELD_S = 0.040
+HELD_RATE = 0.2  # of the steepest ramp: a speed that changes more slowly is held
+BETWEEN = (0.1, 0.92)  # of the plateau: a ramp with limited jerk is slow only beyond them
+HARDER = 2.0
+LEFT_MM = 1.0
+LEFT_SHARE = 0.01
+
+
+def interruptions(window: Window) -> Iterator[Reason]:
+    """Yield the reason why the window is no whole rapid, with the figure that shows it."""
+    a, b = (min(row, window.n) for row in moving_range(window))
+    speed = _course(window.position_mm, window)
+    if speed is None or b - a < 8:
+        return
+    plateau = _plateau(window, speed[a:b], speed)
+    if plateau <= 0:
+        return
+    seen = np.clip(speed[a:b], 0.0, plateau)
+    reason = _left_behind(window, b) or _dip(window, seen, plateau, a) or _held(window, seen, plateau, a)
+    reason = reason or _quick_stop(window, a, b)
+    if reason is not None:
+        yield Reason(CODE, reason, ADVICE)
+
+
+def _plateau(window: Window, moving: Float, speed: Float) -> float:
+    """Return the speed the rapid is held at: the longest level, or a higher one that no overshoot explains."""
+    high = float(np.quantile(moving, TOP))
+    if window.stages.cruise is None:
+        return high
+    held = speed[slice(*window.stages.cruise)]
+    if held.size == 0:
+        return high
+    longest_level = float(np.median(held))
+    return longest_level if longest_level >= OVERSHOOT * high else high
+
+
+def _course(position_mm: Float, window: Window, seconds: float = SMOOTHING_S) -> Float | None:
+    """Return the speed (n,) in the window's direction, mm/s, of a position; None where there is none."""
+    known = np.flatnonzero(np.isfinite(position_mm))
+    if known.size < 2 or np.ptp(position_mm[known]) == 0.0:
+        return None
+    position = np.interp(np.arange(position_mm.size), known, position_mm[known])  # across a gap: one even speed
+    width = 2 * round(seconds / window.dt_s / 2) + 1
+    if position.size < width:
+        return None
+    course: Float = moving_mean(window.direction * np.gradient(position, window.dt_s), width)
+    return course
+
+
+def _dip(window: Window, seen: Float, plateau: float, begin: int) -> str | None:
+    before = np.maximum.accumulate(seen)
+    after = np.maximum.accumulate(seen[::-1])[::-1]
+    depth = np.minimum(before, after) - seen
+    k = int(np.argmax(depth))
+    if depth[k] <= LEAST_DIP * plateau:
+        return None
+    return f"the speed falls from {plateau:.4g} to {seen[k]:.4g} mm/s at {_at(window, begin + k)} s and rises again"
+
+
+def _held(window: Window, seen: Float, plateau: float, begin: int) -> str | None:
+    rate = np.abs(np.gradient(seen))
+    between = (seen > BETWEEN[0] * plateau) & (seen < BETWEEN[1] * plateau)
+    start, end = longest(between & (rate < HELD_RATE * rate.max()))
+    if (end - start) * window.dt_s < HELD_S:
+        return None
+    level = float(np.median(seen[start:end]))
+    return (
+        f"the speed is held at {level:.4g} mm/s for {1e3 * (end - start) * window.dt_s:.0f} ms from "
+        f"{_at(window, begin + start)} s, beside its plateau of {plateau:.4g} mm/s"
+    )
+
+
+def _quick_stop(window: Window, begin: int, end: int) -> str | None:
+    """Compare the ramps of the demand: an NC plans both with the same acceleration."""
+    speed = _course(window.demand_mm, window, RAMP_S)
+    reach = max(1, round(RAMP_S / 2 / window.dt_s))
+    if speed is None or end - begin <= 2 * reach or window.stages.accelerate is None or window.stages.brake is None:
+        return None
+    part = speed[max(0, begin - reach) : end + reach]
+    rate = (part[2 * reach :] - part[: -2 * reach]) / (2 * reach * window.dt_s)
+    up, down = float(rate.max()), float(-rate.min())
+    if up <= 0 or down <= HARDER * up:
+        return None
+    return f"the demand brakes with {down * 1e-3:.3g} m/s2 after accelerating with {up * 1e-3:.3g} m/s2"
+
+
+def _left_behind(window: Window, end: int) -> str | None:
+    """Compare where table and demand rest after the move."""
+    demand = window.demand_mm[np.isfinite(window.demand_mm)]
+    if window.stages.brake is None or demand.size == 0 or np.ptp(demand) == 0.0:
+        return None
+    apart = (window.demand_mm - window.position_mm)[end:]
+    apart = apart[np.isfinite(apart)]
+    if apart.size == 0:
+        return None
+    least = float(apart[np.argmin(np.abs(apart))])
+    travel = float(np.ptp(window.position_mm[np.isfinite(window.position_mm)]))
+    if abs(least) <= LEFT_MM + LEFT_SHARE * travel:
+        return None
+    return f"the axis comes to rest {abs(least):.3g} mm from its demand"
+
+
+def _at(window: Window, row: int) -> str:
+    return f"{window.start_s + row * window.dt_s:.3f}"

@@ -1,0 +1,186 @@
+"""Faults of the machine and of the move: loads, friction, backlash, aborts, and what changes between two rapids."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from studies import drives
+from studies.drives import Array, Drive, Rng, log_uniform
+from studies.scenes import Rows, Scene, Spoilt, demand_of, draw_scene, measured, recorded
+from studies.signal_faults import sign
+
+
+def of_machine(change: Callable[[Rng, Scene], tuple[Scene, Array | None, float]]) -> Callable[[Rng], Spoilt]:
+    """Return the maker of rapids of a machine that ``change`` spoils (its scene, a load torque per cycle)."""
+
+    def make(rng: Rng) -> Spoilt:
+        scene, load, severity = change(rng, draw_scene(rng))
+        rows = measured(rng, scene, drives.run(scene.drive, demand_of(scene), scene.dt_s, load))
+        return Spoilt(recorded(scene, rows), severity)
+
+    return make
+
+
+def _peak_torque(scene: Scene) -> float:
+    d = scene.drive
+    per_m = 2 * np.pi / d.pitch_m
+    return float(d.Jt * scene.move.acceleration * per_m + d.Cd + d.ft * scene.move.speed * per_m)
+
+
+def _span(scene: Scene) -> tuple[int, int]:
+    """Return the cycles in which the demand moves."""
+    moving = np.flatnonzero(np.diff(demand_of(scene)))
+    return int(moving[0]), int(moving[-1])
+
+
+def cutting_load(rng: Rng, scene: Scene) -> tuple[Scene, Array, float]:
+    """Share of the peak torque that a load takes for 60 to 300 ms within the move."""
+    share = log_uniform(rng, 0.05, 0.25)
+    load = np.zeros(demand_of(scene).size)
+    a, b = _span(scene)
+    length = int(min(rng.uniform(60, 300), 0.6 * (b - a)))
+    start = int(rng.uniform(a + 0.1 * (b - a), b - length - 0.1 * (b - a)))
+    load[start : start + length] = scene.move.direction * sign(rng) * share * _peak_torque(scene)
+    return scene, load, share
+
+
+def stiff_travel(rng: Rng, scene: Scene) -> tuple[Scene, Array, float]:
+    """Share of the peak torque to which a load grows along the travel: a bent screw, a hose that pulls."""
+    share = log_uniform(rng, 0.06, 0.25)
+    a, b = _span(scene)
+    course = np.clip((np.arange(demand_of(scene).size) - a) / (b - a), 0, 1)
+    return scene, scene.move.direction * share * _peak_torque(scene) * course, share
+
+
+def collision(rng: Rng, scene: Scene) -> tuple[Scene, Array, float]:
+    """Share of the peak torque of a blow of 5 to 20 ms."""
+    share = rng.uniform(0.4, 1.2)
+    a, b = _span(scene)
+    load = np.zeros(demand_of(scene).size)
+    start = int(rng.uniform(a + 0.3 * (b - a), a + 0.7 * (b - a)))
+    load[start : start + int(rng.uniform(5, 20))] = scene.move.direction * share * _peak_torque(scene)
+    return scene, load, share
+
+
+def stribeck(rng: Rng, scene: Scene) -> tuple[Scene, None, float]:
+    """Share of the peak torque that friction has more at standstill, gone beyond 3 to 15 % of the rapid speed."""
+    share = log_uniform(rng, 0.08, 0.25)
+    top = scene.move.speed / scene.drive.pitch_m * 2 * np.pi
+    drive = replace(
+        scene.drive, stribeck=share * _peak_torque(scene), stribeck_speed=log_uniform(rng, 0.03, 0.15) * top
+    )
+    return replace(scene, drive=drive), None, share
+
+
+def backlash(rng: Rng, scene: Scene) -> tuple[Scene, None, float]:
+    """Micrometres of dead band between motor and table, which a move against the last one crosses."""
+    um = log_uniform(rng, 100.0, 400.0)
+    rad = um * 1e-6 / scene.drive.pitch_m * 2 * np.pi
+    drive = replace(scene.drive, backlash_rad=rad, motor_share=rng.uniform(0.3, 0.7))
+    return replace(scene, drive=drive, move=replace(scene.move, direction=-1)), None, um
+
+
+def of_demand(shape: Callable[[Rng, Scene], tuple[Array, float]]) -> Callable[[Rng], Spoilt]:
+    """Return the maker of rapids whose path speed (m/s) ``shape`` gives."""
+
+    def make(rng: Rng) -> Spoilt:
+        scene = draw_scene(rng)
+        rates, severity = shape(rng, scene)
+        demand = demand_of(scene, scene.move.direction * rates)
+        rows = measured(rng, scene, drives.run(scene.drive, demand, scene.dt_s))
+        return Spoilt(recorded(scene, rows), severity)
+
+    return make
+
+
+def no_plateau(rng: Rng, scene: Scene) -> tuple[Array, float]:
+    """Share of the rapid speed that is reached, with less than 100 ms of plateau."""
+    share = rng.uniform(0.4, 1.0)
+    speed = share * scene.move.speed
+    held = rng.uniform(0.0, 0.06)
+    distance = speed * (speed / scene.move.acceleration + held)
+    return drives.rates(replace(scene.move, speed=speed, distance=distance)), share
+
+
+def override_changed(rng: Rng, scene: Scene) -> tuple[Array, float]:
+    """Share by which the feed override falls during the rapid and stays."""
+    drop = rng.uniform(0.2, 0.6)
+    move = replace(scene.move, distance=scene.move.distance + 0.25 * scene.move.speed)
+    t1 = move.speed / move.acceleration + rng.uniform(0.12, 0.2)
+
+    def rate(t: Array) -> Array:
+        return 1 - drop * np.clip((t - t1) / (drop * move.speed / move.acceleration), 0, 1)
+
+    return _trimmed(drives.rates(move, rate)), drop
+
+
+def hold_resumed(rng: Rng, scene: Scene) -> tuple[Array, float]:
+    """Share of the speed that a feed hold takes away before it is released."""
+    drop = rng.uniform(0.2, 0.95)
+    move = replace(scene.move, distance=scene.move.distance + 0.25 * scene.move.speed)
+    t1 = move.speed / move.acceleration + rng.uniform(0.12, 0.2)
+    fall = drop * move.speed / move.acceleration
+    held = rng.uniform(0.03, 0.4)
+
+    def rate(t: Array) -> Array:
+        return 1 - drop * np.clip(np.minimum((t - t1) / fall, (t1 + 2 * fall + held - t) / fall), 0, 1)
+
+    return _trimmed(drives.rates(move, rate)), drop
+
+
+def quick_stop(rng: Rng, scene: Scene) -> tuple[Array, float]:
+    """How many times as hard as it accelerates an aborted rapid brakes."""
+    factor = rng.uniform(2.5, 6.0)
+    rates = drives.rates(scene.move)
+    cut = int(rng.choice(np.flatnonzero(rates > 0.95 * rates.max())[-80:]))
+    fall = rates[cut] - factor * scene.move.acceleration * drives.CYCLE_S * np.arange(1, 1000)
+    return np.concatenate([rates[:cut], np.maximum(fall, 0.0), np.zeros(60)]), factor
+
+
+def _trimmed(rates: Array) -> Array:
+    return rates[: int(np.flatnonzero(rates > 0)[-1]) + 2]
+
+
+def left_behind(rng: Rng) -> Spoilt:
+    """Share of the travel at which the drive stops while the NC's demand goes on."""
+    scene = draw_scene(rng)
+    share = rng.uniform(0.6, 0.95)
+    whole = demand_of(scene)
+    short = replace(scene.move, distance=share * scene.move.distance)
+    stopped = demand_of(scene, short.direction * drives.rates(short))
+    stopped = np.concatenate([stopped, np.full(max(0, whole.size - stopped.size), stopped[-1])])[: whole.size]
+    signals = drives.run(scene.drive, stopped, scene.dt_s)
+    wanted = np.interp(np.arange(signals.demand.size) * scene.dt_s, np.arange(whole.size) * drives.CYCLE_S, whole)
+    rows = measured(rng, scene, replace(signals, demand=wanted))
+    return Spoilt(recorded(scene, rows), share)
+
+
+def moved(rng: Rng) -> Spoilt:
+    """Share by which inertia, resistance or torque constant differs between two rapids of one recording."""
+    scene = draw_scene(rng)
+    name = str(rng.choice(["Jt", "R", "K"]))
+    # a voltage that is sampled slowly tells R to some per cent
+    amount = log_uniform(rng, 0.25, 0.5) if name == "R" else log_uniform(rng, 0.06, 0.25)
+    other = replace(scene.drive, **{name: getattr(scene.drive, name) * (1 + sign(rng) * amount)})
+    return _two(rng, scene, other, lambda rows: rows, amount)
+
+
+def gain_between(rng: Rng) -> Spoilt:
+    """Share by which a sensor's gain differs between two rapids of one recording."""
+    scene = draw_scene(rng)
+    name, factor = str(rng.choice(["voltage", "current"])), 1 + sign(rng) * (amount := log_uniform(rng, 0.04, 0.2))
+    return _two(rng, scene, scene.drive, lambda rows: rows.with_signals(**{name: rows.signals[name] * factor}), amount)
+
+
+def _two(rng: Rng, scene: Scene, other: Drive, spoil: Callable[[Rows], Rows], severity: float) -> Spoilt:
+    there = drives.run(scene.drive, demand_of(scene), scene.dt_s)
+    back = replace(scene, drive=other, move=drives.turned(scene.move))
+    again = spoil(measured(rng, back, drives.run(other, demand_of(back), scene.dt_s)))
+    first = measured(rng, scene, there)
+    shift = float(first.signals["position"][-1] - again.signals["position"][0])
+    again = again.with_signals(position=again.signals["position"] + shift, demand=again.signals["demand"] + shift)
+    joined = {name: np.concatenate([values, again.signals[name]]) for name, values in first.signals.items()}
+    return Spoilt(recorded(scene, first.with_signals(**joined)), severity)

@@ -1,0 +1,134 @@
+"""Random rapids as they are recorded: a drive, its move, and sensors with their noise and resolution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fdhil.records import Recording, VoltageSampling, frozen
+from studies import drives
+from studies.drives import Array, Drive, Move, Rng, Signals, log_uniform
+
+SENSORS = ("voltage", "current", "speed")
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """One drive, its move, and how it is recorded; sizes (voltage, current, speed) are the peaks of the good move."""
+
+    drive: Drive
+    move: Move
+    dt_s: float
+    sampling: VoltageSampling
+    noise: float
+    steps: tuple[float, float, float]
+    position_step_m: float
+    lead_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """What the sensors give, rows dt apart; ``moving`` and ``cruise`` are half-open rows of the true move."""
+
+    dt_s: float
+    signals: dict[str, Array]
+    moving: tuple[int, int]
+    cruise: tuple[int, int]
+
+    def peak(self, name: str) -> float:
+        """Largest magnitude of a signal."""
+        return float(np.abs(self.signals[name]).max())
+
+    def with_signals(self, **signals: Array) -> Rows:
+        """Return the rows with some signals replaced."""
+        return replace(self, signals=self.signals | signals)
+
+
+@dataclass(frozen=True, slots=True)
+class Spoilt:
+    """A recording with its fault: the severity in ``unit``."""
+
+    recording: Recording
+    severity: float = 0.0
+
+
+def draw_scene(rng: Rng) -> Scene:
+    """Draw a drive, a rapid and a recorder."""
+    move = drives.draw_move(rng)
+    return Scene(
+        drive=drives.draw_drive(rng, move.speed, move.acceleration),
+        move=move,
+        dt_s=float(rng.choice([2.5e-4, 5e-4, 1e-3, 1e-3, 1e-3, 2e-3])),
+        sampling="interval_mean" if rng.random() < 0.75 else "instant",
+        noise=log_uniform(rng, 0.001, 0.005),
+        steps=(draw_step(rng), draw_step(rng), draw_step(rng)),
+        position_step_m=float(rng.choice([1e-7, 1e-6, 1e-6, 5e-6])),
+        lead_s=rng.uniform(0.05, 0.4),
+    )
+
+
+def draw_step(rng: Rng) -> float:
+    """Draw a sensor's resolution as a share of its peak."""
+    return float(rng.choice([1e-5, 1e-4, 5e-4, 2e-3]))
+
+
+def demand_of(scene: Scene, *rates: Array) -> Array:
+    """Return the demand of one move (or the given path speeds) between standstills."""
+    moves = list(rates) or [scene.move.direction * drives.rates(scene.move)]
+    parts = [drives.rest(scene.lead_s)]
+    for rate in moves:
+        parts += [rate, drives.rest(0.25)]
+    return drives.demand_of(parts)
+
+
+def measured(rng: Rng, scene: Scene, signals: Signals) -> Rows:
+    """Return what the sensors give of a run: noise, then resolution."""
+    voltage = signals.voltage if scene.sampling == "interval_mean" else signals.voltage_instant
+    out = {}
+    sizes = (0.4, 0.4, 1.0)
+    for name, true, size, step in zip(
+        SENSORS, (voltage, signals.current, signals.speed), sizes, scene.steps, strict=True
+    ):
+        peak = float(np.abs(true).max())
+        noisy = true + scene.noise * size * peak * rng.standard_normal(true.size)
+        out[name] = np.round(noisy / (step * peak)) * step * peak
+    out["position"] = np.round(signals.position / scene.position_step_m) * scene.position_step_m
+    out["demand"] = np.round(signals.demand / 1e-6) * 1e-6
+    speed = np.abs(signals.speed)
+    moving = np.flatnonzero(speed > 0.05 * speed.max())
+    top = np.flatnonzero(speed > 0.95 * np.median(speed[speed > 0.7 * speed.max()]))
+    return Rows(signals.dt_s, out, (int(moving[0]), int(moving[-1])), (int(top[0]), int(top[-1])))
+
+
+def recorded(scene: Scene, rows: Rows, *, says_rapid: bool = True) -> Recording:
+    """Return the rows as a recording; ``says_rapid``: its header holds the rapid speed."""
+    s = rows.signals
+    n = s["speed"].size
+    rapid = scene.move.speed / scene.drive.pitch_m * 2 * np.pi
+    lost = ~np.isfinite(s["speed"]) & ~np.isfinite(s["position"])
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], lost.astype(int), [0]])))
+    return Recording(
+        axis="X",
+        dt_s=rows.dt_s,
+        time_s=frozen(np.arange(n) * rows.dt_s),
+        voltage_v=frozen(s["voltage"]),
+        current_a=frozen(s["current"]),
+        speed_rad_s=frozen(s["speed"]),
+        position_mm=frozen(s["position"] * 1e3),
+        demand_mm=frozen(s["demand"] * 1e3),
+        voltage_sampling=scene.sampling,
+        pitch_mm=scene.drive.pitch_m * 1e3,
+        rapid_speed_rad_s=rapid if says_rapid else None,
+        gaps=tuple((int(a), int(b)) for a, b in edges.reshape(-1, 2)),
+    )
+
+
+def good(rng: Rng) -> Spoilt:
+    """A rapid, or one to and one fro, without any fault."""
+    scene = draw_scene(rng)
+    out = drives.rates(scene.move)
+    ways = [out, -out][: int(rng.integers(1, 3))]
+    demand = demand_of(scene, *[scene.move.direction * way for way in ways])
+    rows = measured(rng, scene, drives.run(scene.drive, demand, scene.dt_s))
+    return Spoilt(recorded(scene, rows, says_rapid=bool(rng.random() < 0.8)))
