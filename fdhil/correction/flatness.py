@@ -43,6 +43,9 @@ def offsets(reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: float
     current = (p.Jt * acceleration + p.ft * demanded + p.Cd * sign) / p.K
     times = np.arange(reference_mm.size) * dt_s
     early = np.interp(times + lead, times, current)
+    # what the drive feeds forward itself is the acceleration of the next row, held: half a cycle ahead as well
+    own = axis.regulators.torque_feedforward * axis.nominal.Jt / axis.nominal.K
+    early -= own * np.interp(times + 0.5 * dt_s, times, acceleration)
     # the drive feeds forward the slope of the cycle that begins: half a cycle ahead of the speed at its row
     ahead = np.diff(reference_mm, append=reference_mm[-1]) / dt_s * 2 * np.pi / axis.screw_pitch_mm
     speed = demanded - axis.regulators.speed_feedforward * ahead

@@ -166,3 +166,11 @@ def test_the_inverse_works_for_every_structure(structure: str, option: str) -> N
     assert correction.refused == ()
     gain = rms(correction.before.contour_um) / rms(correction.after.contour_um)
     assert gain > (3 if (structure, option) == ("double_pi", "all") else 10)
+
+
+def test_flatness_leaves_the_drives_own_torque_to_it() -> None:
+    """A drive that feeds torque forward itself is not fed it twice."""
+    config = bench("p_pi_pi", **OPTIONS["torque"])
+    correction = plan(bench_trajectory(10), nominal_models(config), config, "flatness")
+    assert correction.refused == ()
+    assert rms(correction.before.contour_um) > 5 * rms(correction.after.contour_um)
