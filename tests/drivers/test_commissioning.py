@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -69,6 +70,9 @@ def test_a_good_drive_is_signed_off_and_left_as_it_was(peer: tuple[DrivePeer, Ma
     assert steps[0] == "listen"
     assert steps[-1] == "restore"
     assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
+    deadline = time.monotonic() + 10
+    while drive.drive.nmt != 0x7F and time.monotonic() < deadline:
+        time.sleep(0.01)  # the peer's thread has yet to hear the last command
     assert drive.drive.nmt == 0x7F
     assert drive.drive.dictionary.number(0x60B0) == 0
     assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == consumers
