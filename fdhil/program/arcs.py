@@ -84,7 +84,7 @@ def _check_radii(
 
 
 def radii_agree(begin_mm: float, finish_mm: float, scale: float) -> bool:
-    """Tell whether the radii at both ends of an arc are near enough for one arc, as the reference does in mm or inch."""
+    """Tell whether the radii at both ends of an arc are near enough for one arc (``scale``: mm of a unit)."""
     off, small = abs(begin_mm - finish_mm), _SPIRAL_SMALL[scale]
     return off <= small or off <= min(_SPIRAL_LARGE * small, _SPIRAL_RELATIVE * max(begin_mm, finish_mm))
 

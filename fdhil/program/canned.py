@@ -18,6 +18,7 @@ from fdhil.program.targets import length_mm, plane_axes, target
 from fdhil.program.words import Block
 
 _CLEARANCE_MM = 0.254  # by which a peck stays clear of where the drill was
+_SAME_MM = 1e-9  # levels that differ by rounding alone are one
 _WITH_DWELL = (820, 860, 880, 890)
 _PECKING = (730, 830)
 _TAPPING = {740: -1, 840: 1}  # how the spindle must turn
@@ -62,10 +63,10 @@ def cycle(machine: Machine, block: Block, series: Series, fresh: bool) -> None:
     hole = Hole(machine, block, words, depth, clearance, clearance if modal.retract_to_r else max(old, clearance))
     for _ in range(repeats):
         place = target(modal, block)
-        level = modal.position[normal] if modal.position[normal] > clearance else hole.retract
+        level = modal.position[normal] if modal.position[normal] > clearance + _SAME_MM else hole.retract
         there = {first: place[first], second: place[second], normal: level}
         machine.rapid_to(block, _with(modal.position, there))
-        if modal.position[normal] != clearance:
+        if abs(modal.position[normal] - clearance) > _SAME_MM:
             hole.rapid(clearance)
         hole.work()
 

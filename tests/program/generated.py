@@ -226,6 +226,68 @@ class Writer:
         )
         self.lines += [f"G33 {self.axes('XZ')} K{round(pick.uniform(0.5, 3), 2)}", "G33.1 Z-20 K1.25", "G17 G80"]
 
+    def contour(self) -> None:
+        """A turned contour in a subroutine, roughed and finished; now and then it cannot."""
+        pick = self._random
+        self._labels += 1
+        label = self._labels
+        self.lines += ["G18 G90 G40", f"o{label} sub"]
+        x, z = pick.randint(0, 4), 0
+        self.lines.append(f"G0 X{x} Z{z}")
+        for _ in range(pick.randint(1, 6)):
+            kind = pick.randrange(5)
+            dx, dz = pick.randint(1, 4), pick.randint(1, 6)
+            corner = pick.choice(["", "", "", " A0.4", " C0.5"])
+            if kind == 0:
+                self.lines.append(f"G1 Z{z - dz}{corner}")
+                dx = 0
+            elif kind == 1:
+                self.lines.append(f"G1 X{x + dx}{corner}")
+                dz = 0
+            elif kind == 2:
+                self.lines.append(f"G1 X{x + dx} Z{z - dz}{corner}")
+            elif kind == 3:
+                dz = dx
+                self.lines.append(f"G2 X{x + dx} Z{z - dz} {pick.choice([f'I{dx}', f'R{dx}'])}")
+            else:
+                dz = dx
+                self.lines.append(f"G3 X{x + dx} Z{z - dz} K{-dx}")
+            x, z = x + dx, z - dz
+        start = f"X{x + pick.randint(0, 3)} Z{pick.randint(1, 4)}"
+        self.lines += [f"o{label} endsub", f"G0 {start}"]
+        code = pick.choice(["71", "71", "72", "71.1", "71.2", "72.1", "72.2"])
+        stock = pick.choice([0, 0, 0.2, 0.5])
+        self.lines.append(f"G{code} Q{label} {start} D{stock} I{pick.choice([0.5, 1, 1.7])} R{pick.choice([0.3, 0.5])}")
+        self.lines += [f"G70 Q{label} {start} D0.3 E0 P{pick.randint(1, 3)}", "G17"]
+
+    def series(self) -> None:
+        """Cycle blocks that go on with changed words, levels, planes and retracts."""
+        pick = self._random
+        plane, (first, second, normal) = pick.choice([(17, "XYZ"), (17, "XYZ"), (18, "ZXY"), (19, "YZX")])
+        code = pick.choice(["81", "82", "83", "73", "85", "89"])
+        extra = {"82": " P0.2", "89": " P0.1", "83": " Q1.3", "73": " Q2.1"}.get(code, "")
+        top = pick.randint(0, 6)
+        self.lines += [f"G{plane} G{pick.choice([90, 90, 91])}", f"G0 {normal}{pick.randint(0, 9)}"]
+        self.lines.append(
+            f"G{pick.choice([98, 99])} G{code} {first}{self.number()} {second}1 {normal}{-pick.randint(1, 9)} R{top}{extra}"
+        )
+        for _ in range(pick.randint(1, 5)):
+            words = pick.choice(
+                [
+                    f"{first}{self.number()}",
+                    f"{second}{pick.randint(-9, 9)} R{pick.randint(0, 8)}",
+                    f"G98 {first}3",
+                    f"G99 {second}4",
+                    f"{first}2 L{pick.randint(1, 3)}",
+                    f"{normal}{-pick.randint(1, 9)}",
+                    "M8",
+                    f"G92 {first}{pick.randint(0, 3)}",
+                    f"F{pick.randint(10, 90)} {second}2",
+                ]
+            )
+            self.lines.append(words)
+        self.lines += ["G80 G90 G17"]
+
     def kept(self) -> None:
         self.lines += [
             "M70",
@@ -241,11 +303,13 @@ GROUPS: dict[str, list[Callable[[Writer], None]]] = {
     "arcs": [Writer.straight, Writer.arc, Writer.arc],
     "offsets": [Writer.straight, Writer.straight, Writer.offsets, Writer.offsets, Writer.modes],
     "cycles": [Writer.straight, Writer.cycle, Writer.cycle, Writer.offsets],
+    "series": [Writer.series, Writer.series, Writer.straight],
+    "contours": [Writer.contour],
     "compensation": [Writer.straight, Writer.compensated],
     "lathe": [Writer.straight, Writer.thread, Writer.modes],
     "flow": [Writer.straight, Writer.loop, Writer.subroutine, Writer.parameter, Writer.kept],
 }
-GROUPS["all"] = [step for group in list(GROUPS.values()) for step in group]
+GROUPS["all"] = [step for name, group in GROUPS.items() if name != "contours" for step in group]
 
 
 def program(group: str, seed: int, steps: int = 25) -> str:
