@@ -1,0 +1,64 @@
+"""Faults that have a name and a figure: backlash, drifting sensors, a gain that moved between two rapids."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil.config import Identification
+from fdhil.identification.windows import find_windows
+from fdhil.records import Window, frozen
+from fdhil.validation import analyse, pool
+from fdhil.validation.backlash import dead_band
+from studies import drives
+from studies.scenes import demand_of, measured, recorded
+from tests.identification.recorded import windows
+from tests.validation.test_episodes import DRIVE, SCENE
+
+SETTINGS = Identification()
+
+
+def _with_play(um: float) -> Window:
+    drive = replace(DRIVE, backlash_rad=um * 1e-6 / DRIVE.pitch_m * 2 * np.pi)
+    demand = demand_of(SCENE, -drives.rates(SCENE.move))  # against the flank that it rests on
+    rows = measured(np.random.default_rng(3), SCENE, drives.run(drive, demand, SCENE.dt_s))
+    return find_windows(recorded(SCENE, rows))[0]
+
+
+@pytest.mark.parametrize("um", [0.0, 80.0, 200.0])
+def test_backlash_is_measured_in_micrometres_with_its_interval(um: float) -> None:
+    found = dead_band(_with_play(um))
+    assert found is not None
+    assert 0 < found.std_um < 13
+    assert abs(found.um - um) < 3 * found.std_um
+    texts = [reason.text for reason in analyse(_with_play(um), SETTINGS).verdict.reasons]
+    assert any("backlash" in text for text in texts) == (um > 0)
+
+
+@pytest.mark.parametrize("name", ["voltage", "current", "speed"])
+@pytest.mark.parametrize("fault", ["gain", "zero"])
+def test_a_sensor_that_drifts_is_named_with_its_amount(name: str, fault: str) -> None:
+    window = windows(0.002)[0]
+    field = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}[name]
+    values = np.array(getattr(window, field))
+    course = np.linspace(0.0, 1.0, values.size)
+    wrong = values * (1 + 0.08 * course) if fault == "gain" else values + 0.05 * np.abs(values).max() * course
+    changed: Window = replace(window, **{field: frozen(wrong)})  # type: ignore[arg-type]  # an array of the record
+    reasons = [r for r in analyse(changed, SETTINGS).verdict.reasons if r.code == "CalibrationSuspect"]
+    assert reasons
+    assert all(re.search(r"[-+]?\d", reason.text) for reason in reasons)
+
+
+@pytest.mark.parametrize(("field", "name"), [("voltage_v", "voltage"), ("current_a", "current")])
+def test_a_gain_that_moved_between_rapids_is_named_not_six_parameters(field: str, name: str) -> None:
+    there, back = windows(0.002, moves=2)
+    louder: Window = replace(back, **{field: frozen(1.06 * np.array(getattr(back, field)))})  # type: ignore[arg-type]
+    _, verdict = pool([analyse(there, SETTINGS), analyse(louder, SETTINGS)], SETTINGS)
+    (reason,) = verdict.reasons
+    assert reason.code == "CalibrationSuspect"
+    assert f"the gain of {name} changes by +" in reason.text
+    share = float(re.findall(r"([-+][\d.]+)%", reason.text)[0])
+    assert share == pytest.approx(6.0, abs=0.5)
