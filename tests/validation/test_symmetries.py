@@ -1,0 +1,59 @@
+"""What must not depend on how the bench is looked at: direction, units, the order of windows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fdhil.config import Identification
+from fdhil.records import Window, WindowOutcome, frozen
+from fdhil.validation import analyse, pool
+from tests.identification.recorded import windows
+
+SETTINGS = Identification()
+ELECTRICAL = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0])  # powers of a voltage unit in R, L, K, Jt, ft, Cd
+CURRENT = np.array([-1.0, -1.0, 0.0, 1.0, 1.0, 1.0])
+
+
+def _values(outcome: WindowOutcome) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+    assert outcome.verdict.accepted, outcome.verdict.reasons
+    assert outcome.estimate is not None
+    return np.array(outcome.estimate.values)
+
+
+def _scaled(window: Window, voltage: float = 1.0, current: float = 1.0) -> Window:
+    assert window.voltage_v is not None
+    volts, amperes = frozen(voltage * window.voltage_v), frozen(current * window.current_a)
+    return replace(window, voltage_v=volts, current_a=amperes)
+
+
+@settings(max_examples=6, deadline=None)
+@given(voltage=st.floats(0.2, 5.0), current=st.floats(0.2, 5.0))
+def test_units_scale_the_parameters_and_nothing_else(voltage: float, current: float) -> None:
+    window = windows(0.003)[0]
+    plain, other = _values(analyse(window, SETTINGS)), _values(analyse(_scaled(window, voltage, current), SETTINGS))
+    assert other == pytest.approx(plain * voltage**ELECTRICAL * current**CURRENT, rel=2e-3)
+
+
+def test_the_other_direction_gives_the_same_drive() -> None:
+    window = windows(0.003)[0]
+    turned = replace(_scaled(window, -1.0, -1.0), direction=-window.direction)
+    names = ("speed_rad_s", "position_mm", "demand_mm")
+    turned = replace(turned, **{name: frozen(-getattr(window, name)) for name in names})
+    assert _values(analyse(turned, SETTINGS)) == pytest.approx(_values(analyse(window, SETTINGS)), rel=1e-6)
+
+
+@settings(max_examples=4, deadline=None)
+@given(order=st.permutations(range(4)))
+def test_the_order_of_windows_changes_nothing(order: list[int]) -> None:
+    outcomes = [analyse(window, SETTINGS) for window in windows(0.003, moves=4)]
+    first, _ = pool(outcomes, SETTINGS)
+    again, verdict = pool([outcomes[k] for k in order], SETTINGS)
+    assert verdict.accepted
+    assert first is not None
+    assert again is not None
+    assert again.values == pytest.approx(first.values, rel=2e-3)
