@@ -250,7 +250,7 @@ def _due(found: list[tuple[bool, bool, float]]) -> list[str]:
 def main() -> None:
     """Run the study and write its page."""
     parser = argparse.ArgumentParser(description=__doc__)
-    counts = {"warming": 20, "steps": 60, "quiet": 100, "pools": 100, "due": 30}
+    counts = {"warming": 50, "steps": 100, "quiet": 100, "pools": 200, "due": 60}
     for name, count in counts.items():
         parser.add_argument(f"--{name}", type=int, default=count)
     parser.add_argument("--processes", type=int, default=2)
