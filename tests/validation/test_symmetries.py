@@ -42,8 +42,8 @@ def test_units_scale_the_parameters_and_nothing_else(voltage: float, current: fl
 def test_the_other_direction_gives_the_same_drive() -> None:
     window = windows(0.003)[0]
     turned = replace(_scaled(window, -1.0, -1.0), direction=-window.direction)
-    names = ("speed_rad_s", "position_mm", "demand_mm")
-    turned = replace(turned, **{name: frozen(-getattr(window, name)) for name in names})
+    speed, position, demand = (frozen(-v) for v in (window.speed_rad_s, window.position_mm, window.demand_mm))
+    turned = replace(turned, speed_rad_s=speed, position_mm=position, demand_mm=demand)
     assert _values(analyse(turned, SETTINGS)) == pytest.approx(_values(analyse(window, SETTINGS)), rel=1e-6)
 
 
