@@ -171,8 +171,8 @@ def corner(
         axes.locator_params(nbins=6)
         axes.set_xlabel(f"{names[0]} (mm)")
         axes.set_ylabel(f"{names[1]} (mm)")
-        columns = len(curves) if len(curves) < 4 else 2
-        axes.legend(loc="upper left", bbox_to_anchor=(0.0, 1.1), ncols=columns, columnspacing=1.2)
+        narrow = {"columnspacing": 0.9, "handlelength": 1.2, "handletextpad": 0.4} if len(curves) > 3 else {}
+        axes.legend(loc="upper left", bbox_to_anchor=(0.0, 1.1), ncols=len(curves), **narrow)
     return svg[0]
 
 

@@ -19,6 +19,7 @@ POINTS: Mapping[str, tuple[float, float]] = {
     "A": (0.0, 55.0), "B": (50.0, 55.0), "C": (100.0, 55.0), "D": (150.0, 5.0), "E": (200.0, 55.0), "F": (225.0, 55.0),
     "G": (250.0, 55.0),
 }  # fmt: skip
+ENLARGED = 100  # what the corrections leave is some micrometres
 MAGNIFIED = 10  # a hundred micrometres beside corners that the NC rounds by millimetres
 # [DES] 5.3: the drifts whose effect at E is shown, on X only
 DRIFTS: Sequence[tuple[str, Mapping[str, float]]] = (
@@ -235,12 +236,16 @@ def _drift(parameters: Parameters, change: Mapping[str, float]) -> Parameters:
 
 def _corrected(loop: Loop) -> Section:
     before = loop.cuts[0]
-    measured = [Curve("desired", before.reference_mm), *(Curve(cut.label, cut.table_mm) for cut in loop.cuts[:3])]
+    measured = [
+        Curve("desired", before.reference_mm),
+        *(Curve(cut.label, figures.magnified(cut.reference_mm, cut.table_mm, ENLARGED)) for cut in loop.cuts[:3]),
+    ]
     errors = {cut.label: cut.contour_um for cut in loop.cuts}
     rounded, inverse = (
         plan_correction(loop.programs["rounded"], _models(loop), loop.config, method)
         for method in ("mirror", "inverse")
     )
+    larger = f"errors {ENLARGED} times as large"
     return Section(
         "Cut without and with the correction",
         "Measured by the twin at its own table, with the offsets sent over the bus by the guard and checked there.",
@@ -257,19 +262,19 @@ def _corrected(loop: Loop) -> Section:
                 )
                 for cut in (before, loop.cuts[2])
             ),
-            ("Area A, measured (Figure 17)", figures.corner(measured, POINTS["A"], 0.5)),
-            ("Area B, measured (Figure 18)", figures.corner(measured, (85.0, 55.0), 0.05)),
-            ("Area E, measured", figures.corner(measured, POINTS["E"], 0.5)),
-            ("Rounded path at the end of A, simulated (Figure 20)", _rounded_figure(rounded, inverse)),
+            (f"Area A, measured, {larger} (Figure 17)", figures.corner(measured, POINTS["A"], 6.0)),
+            (f"The straight behind A, measured, {larger} (Figure 18)", figures.corner(measured, (20.0, 55.0), 12.0)),
+            (f"Area E, measured, {larger}", figures.corner(measured, POINTS["E"], 6.0)),
+            (f"Rounded path at the end of A, simulated, {larger} (Figure 20)", _rounded_figure(rounded, inverse)),
         ],
     )
 
 
 def _rounded_figure(mirror: Correction, inverse: Correction) -> str:
-    curves = [
-        Curve("desired", _xy(mirror.before.reference.position_mm)),
-        Curve("uncorrected", _xy(mirror.before.predicted_mm)),
-        Curve("mirror", _xy(mirror.after.predicted_mm)),
-        Curve("inverse", _xy(inverse.after.predicted_mm)),
+    desired = _xy(mirror.before.reference.position_mm)
+    cases = {"uncorrected": mirror.before, "mirror": mirror.after, "inverse": inverse.after}
+    curves = [Curve("desired", desired)]
+    curves += [
+        Curve(label, figures.magnified(desired, _xy(answer.predicted_mm), ENLARGED)) for label, answer in cases.items()
     ]
-    return figures.corner(curves, (20.0, 75.0), 0.6)
+    return figures.corner(curves, (20.0, 75.0), 12.0)
