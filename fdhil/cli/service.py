@@ -59,20 +59,24 @@ def status(config: Path, as_json: bool) -> None:
 
 @click.command()
 @CONFIG
-@click.argument("program", type=click.Path(path_type=Path))
+@click.argument("program", type=click.Path(path_type=Path), required=False)
 @click.option("--method", type=click.Choice(list(tables.CORRECTIONS)), help="Left out: the best there is.")
 @AS_JSON
-def arm(config: Path, program: Path, method: str | None, as_json: bool) -> None:
+def arm(config: Path, program: Path | None, method: str | None, as_json: bool) -> None:
     """Arm the correction of one PROGRAM (or demand CSV) on the machine of CONFIG.
+
+    Without PROGRAM, --method flatness feeds speed and torque forward on line, whatever runs.
 
     Exit 1 with class, cause and next action when it is refused. Nothing is armed again by itself, ever.
     """
+    if program is None and method != "flatness":
+        raise click.UsageError("only --method flatness needs no PROGRAM; name the program to correct")
     machine = machine_config.load(config)
     from fdhil.daemon.token import read_token
 
     request = {
         "request": "arm",
-        "program": str(program.resolve()),
+        "program": None if program is None else str(program.resolve()),
         "method": method,
         "token": read_token(run_directory(machine)),
     }

@@ -15,7 +15,10 @@ import numpy as np
 
 from fdhil import correction
 from fdhil.config import MachineConfig
+from fdhil.correction import online
+from fdhil.drivers.commissioning_feeding import feedforward_object
 from fdhil.drivers.commissioning_record import CommissioningRecord, axis_digest, load_record
+from fdhil.drivers.profile import load_profile
 from fdhil.program import load_trajectory, program_digest
 from fdhil.records import Correction, CorrectionTable, Float, ParameterSet, Reason, Skill
 
@@ -93,11 +96,62 @@ def prepare(
         return Refused(planned.refused)
     if not any(np.any(offset) for offset in planned.offset_um.values()):
         text = f"the method {planned.method} plans no position offset"
-        return Refused((Reason("HarmPredicted", text, "use the method inverse or mirror"),))
+        return Refused((Reason("HarmPredicted", text, "use inverse or mirror; fdhil arm --method flatness needs no program"),))
     digest = program_digest(program)
     table = correction.table(planned, config, digest)
     facts = standing_facts(reference.axes, config, known, promised_um(planned)) | _commissioned(planned, config)
     return Armament(str(program), planned, table, facts)
+
+
+@dataclass(frozen=True, slots=True)
+class Feeding:
+    """The on-line feed-forward ready for the guard: the law of each axis, and the facts."""
+
+    laws: Mapping[str, Mapping[str, Any]]
+    facts: dict[str, bool]
+
+    def summary(self) -> dict[str, Any]:
+        """Return what the operator is told."""
+        return {"program": None, "method": "flatness", "axes": list(self.laws), "facts": dict(self.facts)}
+
+
+def prepare_feeding(config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> Feeding | Refused:
+    """Find the on-line law of every axis from its newest validated parameters. StoreError for a damaged record."""
+    axes = [name for name, axis in config.axis.items() if axis.correction is not None]
+    laws = {}
+    for name in axes:
+        published = known[name].published
+        if config.axis[name].feedforward is None:
+            text = f"axis {name} has no section [axis.{name}.feedforward]: its speed and torque offsets are off"
+            return Refused(
+                (Reason("FeedforwardOff", text, "add the section with its limits, then run fdhil commission"),)
+            )
+        if published is None:
+            text = f"axis {name} has no validated parameters yet"
+            return Refused((Reason("ModelNotValidated", text, "let the machine make a few rapids of this axis"),))
+        laws[name] = online.law(published.parameters, config.axis[name], config.machine.sync_period_s)
+    records = {name: load_record(config.store.directory, name) for name in axes}
+    facts = feeding_facts(axes, config, known) | {
+        "commissioned": all(_valid(record, config, name) for name, record in records.items()),
+        "feedforward_commissioned": all(_feeds(record, config, name) for name, record in records.items()),
+        "model_validated": True,
+        "watchdog_proven": all(r is not None and r.watchdog == "proven" for r in records.values()),
+    }
+    return Feeding(laws, facts)
+
+
+def feeding_facts(axes: Sequence[str], config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> dict[str, bool]:
+    """Return the facts about the models that may be withdrawn while the feed-forward runs."""
+    return {"model_fresh": all(_fresh(known[axis], config) for axis in axes)}
+
+
+def _feeds(record: CommissioningRecord | None, config: MachineConfig, axis: str) -> bool:
+    """Whether the record shows that the drive's RPDO of speed and torque offset was made valid."""
+    profile = load_profile(config.axis[axis].drive.profile)
+    found = profile.find_rpdo(profile.speed_offset)
+    if record is None or found is None:
+        return False
+    return record.options.get(feedforward_object(found[0].number)) == found[0].cob_base + config.node_id(axis)
 
 
 def promised_um(planned: Correction) -> float:

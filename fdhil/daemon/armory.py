@@ -11,7 +11,16 @@ from typing import Any
 
 from fdhil import tables
 from fdhil.config import MachineConfig
-from fdhil.daemon.arming import AxisKnowledge, Refused, Skills, prepare, promised_um, standing_facts
+from fdhil.daemon.arming import (
+    AxisKnowledge,
+    Refused,
+    Skills,
+    feeding_facts,
+    prepare,
+    prepare_feeding,
+    promised_um,
+    standing_facts,
+)
 from fdhil.daemon.control import Answer, refusal
 from fdhil.daemon.guard_link import REST, GuardLink
 from fdhil.daemon.keeping import Keeper, boot_id
@@ -41,7 +50,7 @@ class Armory:
         self._load_changed: set[str] = set()
         self._skills = Skills(list(config.axis))
         self._arming = asyncio.Lock()
-        self._armed: tuple[Correction, Mapping[str, Any]] | None = None
+        self._armed: tuple[Correction | tuple[str, ...], Mapping[str, Any]] | None = None
         self.guard = GuardLink(run_directory)
 
     def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
@@ -101,18 +110,37 @@ class Armory:
         token, program, method = (request.get(key) for key in ("token", "program", "method"))
         if not isinstance(token, str) or not hmac.compare_digest(token.encode(), self._token.encode()):
             return refusal("AuthRequired", "the operator's token is missing or wrong", "use the run directory's token")
-        if not isinstance(program, str) or not (method is None or method in tables.CORRECTIONS):
+        feeding = program is None and method == "flatness"
+        if not (feeding or isinstance(program, str)) or not (method is None or method in tables.CORRECTIONS):
             return refusal("BadRequest", "program or method is no name", f"methods: {', '.join(tables.CORRECTIONS)}")
         if self._arming.locked():
             return refusal("NotOff", "another program is being armed", "wait for its answer")
         async with self._arming:
-            return await self._arm(Path(program), method, token)
+            if feeding:
+                return await self._feed_forward(token)
+            return await self._arm(Path(str(program)), method, token)
+
+    async def _feed_forward(self, token: str) -> Answer:
+        """Switch the on-line feed-forward on: it needs no program."""
+        prepared = await asyncio.to_thread(prepare_feeding, self._config, self._known())
+        if isinstance(prepared, Refused):
+            return _refused(prepared)
+        prepared.facts["journal_writable"] = self._keeper.fault is None
+        try:
+            answer = await asyncio.to_thread(self.guard.feed_forward, prepared, token)
+        except DeviceError as error:
+            return refusal("GuardAbsent", str(error), NO_GUARD)
+        summary = prepared.summary()
+        if not answer["ok"]:
+            return dict(answer) | {"planned": summary}
+        self._armed = (tuple(prepared.laws), summary)
+        text = f"speed and torque of {', '.join(prepared.laws)} are fed forward on line, whatever program runs"
+        return {"ok": True, "state": "FEEDFORWARD", "text": text, **summary}
 
     async def _arm(self, program: Path, method: str | None, token: str) -> Answer:
         prepared = await asyncio.to_thread(prepare, program, method, self._config, self._known())
         if isinstance(prepared, Refused):
-            first, *_ = prepared.reasons
-            return dict(refusal(first.code, first.text, first.advice)) | {"refused": list(map(str, prepared.reasons))}
+            return _refused(prepared)
         prepared.facts["journal_writable"] = self._keeper.fault is None
         try:
             answer = await asyncio.to_thread(self.guard.arm, prepared, token)
@@ -153,7 +181,10 @@ class Armory:
         if self._armed is None:
             return None
         planned = self._armed[0]
-        facts = standing_facts(tuple(planned.offset_um), self._config, self._known(), promised_um(planned))
+        if isinstance(planned, tuple):
+            facts = feeding_facts(planned, self._config, self._known())
+        else:
+            facts = standing_facts(tuple(planned.offset_um), self._config, self._known(), promised_um(planned))
         return facts | {"journal_writable": self._keeper.fault is None}
 
     async def stand_down(self) -> str:
@@ -169,3 +200,8 @@ class Armory:
         state = self.guard.state
         await asyncio.to_thread(self.guard.close)
         return state
+
+
+def _refused(refused: Refused) -> Answer:
+    first, *_ = refused.reasons
+    return dict(refusal(first.code, first.text, first.advice)) | {"refused": list(map(str, refused.reasons))}

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from fdhil.daemon.arming import Armament
+from fdhil.daemon.arming import Armament, Feeding
 from fdhil.errors import DeviceError
 from fdhil.guard.client import GuardClient
 from fdhil.records import Notice
@@ -88,16 +88,27 @@ class GuardLink:
                 table.axes, _rows(table.demand_increments), _rows(table.offset_increments), table.program_digest
             )
             if answer["ok"]:
-                answer = self._ask_to_arm(self._client, armament, token)
+                client = self._client
+                answer = self._ask(client, lambda: client.arm(token, table.program_digest, armament.facts))
+            self._status = self._client.status()
+        return answer
+
+    def feed_forward(self, feeding: Feeding, token: str) -> Mapping[str, Any]:
+        """Switch the on-line feed-forward on (blocking); return the guard's answer. DeviceError without a guard."""
+        with self._lock:
+            if self._client is None:
+                self._client = GuardClient(self._run_directory)
+            client = self._client
+            answer = self._ask(client, lambda: client.feed_forward(token, feeding.laws, feeding.facts))
             self._status = self._client.status()
         return answer
 
     @staticmethod
-    def _ask_to_arm(client: GuardClient, armament: Armament, token: str) -> Mapping[str, Any]:
+    def _ask(client: GuardClient, arm: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
         """Ask until the interlocks have been good for long enough, for a few seconds; any other no is final."""
         for _ in range(SETTLING_TRIES):
             client.alive(None)  # planning took its time: the guard must know us as alive when it is asked
-            answer = client.arm(token, armament.table.program_digest, armament.facts)
+            answer = arm()
             if answer["ok"] or [told["code"] for told in answer.get("refused", [])] != ["NotSettled"]:
                 break
             time.sleep(SETTLING_S)

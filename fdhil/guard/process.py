@@ -294,12 +294,12 @@ class Guard:
 
     def status(self) -> dict[str, Any]:
         """Return what the guard knows, for the daemon's status."""
-        state, path, cause = self.state, self._path, self.state.cause
+        state, path, cause = self.state, self._path, self.state.cause or self.state.feed.cause
         not_good: tuple[Alarm, ...] = (Alarm("SyncLost"),)
         if self._inputs is not None and not self._silent:
             not_good = core.standing(state, self._inputs, self.settings)
         return {
-            "state": state.mode.value,
+            "state": state.mode.value if state.feed.mode is FeedMode.OFF else "FEEDFORWARD",
             "cause": _told(cause) if cause else None,
             "feedforward": {
                 "state": state.feed.mode.value,

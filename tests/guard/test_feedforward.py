@@ -1,0 +1,211 @@
+"""The guard's on-line feed-forward: mute until armed, inside its own limits, zero on whatever is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fdhil.guard.feedforward import SHIFT, Feed, FeedMode, Law, Limits, armed, end, hear, move, parse_law, violates
+from fdhil.guard.interlocks import FEEDFORWARD_FACTS, Alarm
+from fdhil.guard.settings import Feedforward, Pdo, Settings, from_json, to_json
+from fdhil.guard.state import Mode, Request
+from tests.guard import machine
+from tests.guard.machine import Bench, arm_request
+
+ONE = 1 << SHIFT
+LAW = Law(speed=(-200 * ONE,), torque=(2 * ONE, -ONE), pace=(-2 * ONE,), dry=30)
+LIMITS = Limits(speed=40_000, speed_rate=3_000, torque=900, torque_rate=120)
+FACTS = dict.fromkeys(FEEDFORWARD_FACTS, True)
+
+
+def fed_settings() -> Settings:
+    """The bench's settings with an RPDO for both offsets."""
+    made = machine.settings()
+    layout = ((0x60B1, 0, 32, True), (0x60B2, 0, 16, True))
+    axes = [replace(a, feedforward=Feedforward(Pdo(0x400 + a.node_id, layout), LIMITS)) for a in made.axes]
+    return replace(made, axes=tuple(axes))
+
+
+def fed_bench() -> Bench:
+    """The machine with a moving demand, the guard knowing of no program."""
+    bench = machine.bench()
+    return Bench(fed_settings(), None, bench.demand, bench.drives)
+
+
+def request(**changes: Any) -> Request:
+    """A granted request, or one with something changed."""
+    return replace(Request("feedforward", True, "", FACTS, (LAW, LAW)), **changes)
+
+
+def switched_on() -> Bench:
+    """The feed-forward on, faded in, the path running."""
+    bench = fed_bench()
+    bench.settle()
+    assert bench.sync(request()).refused == ()
+    bench.run(120)
+    bench.play()
+    bench.run(150)
+    return bench
+
+
+def test_it_is_mute_until_it_is_asked_for() -> None:
+    """No frame leaves, whatever moves; on, both objects leave every SYNC with the heartbeat beside."""
+    bench = fed_bench()
+    bench.play()
+    bench.settle(300)
+    assert all(output.feed is None and not output.heartbeat for output in bench.outputs)
+    bench = switched_on()
+    assert all(output.feed is not None for output in bench.outputs[-150:])
+    assert all(output.offsets is None for output in bench.outputs)
+    assert any(any(pair) for pair in bench.outputs[-1].feed or ())
+    assert len(bench.heartbeats) >= 13
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [
+        ({"token_valid": False}, "AuthRequired"),
+        ({"laws": (LAW,)}, "FeedforwardOff"),
+        *(({"facts": FACTS | {fact: False}}, code) for fact, code in FEEDFORWARD_FACTS.items()),
+    ],
+)
+def test_what_forbids_it(changes: dict[str, Any], code: str) -> None:
+    """Token, law of every axis, and each fact that the daemon must vouch for."""
+    bench = fed_bench()
+    bench.settle()
+    refused = bench.sync(request(**changes)).refused
+    assert refused is not None
+    assert [alarm.code for alarm in refused] == [code]
+    assert bench.state.feed.mode is FeedMode.OFF
+
+
+def test_never_together_with_a_position_offset() -> None:
+    """One is refused while the other is on."""
+    bench = switched_on()
+    refused = bench.sync(arm_request()).refused
+    assert refused is not None
+    assert "NotOff" in {alarm.code for alarm in refused}
+    other = machine.bench()
+    other = Bench(fed_settings(), other.path, other.demand, other.drives)
+    other.settle()
+    assert other.arm() == ()
+    refused = other.sync(request()).refused
+    assert refused is not None
+    assert "NotOff" in {alarm.code for alarm in refused}
+
+
+def test_without_the_section_it_cannot_be_switched_on() -> None:
+    """A drive that was not set up for it has no RPDO in the settings."""
+    bench = machine.bench()
+    bench.settle()
+    refused = bench.sync(request()).refused
+    assert refused is not None
+    assert [alarm.code for alarm in refused] == ["FeedforwardOff"]
+
+
+def test_disarmed_it_fades_to_zero_and_stops() -> None:
+    """Within the fade both offsets are 0, zeros follow, then nothing is sent."""
+    bench = switched_on()
+    bench.sync(Request("disarm"))
+    bench.run(120)
+    assert bench.state.feed.mode is FeedMode.OFF
+    assert bench.outputs[-1].feed is None
+    last = [output.feed for output in bench.outputs if output.feed is not None][-3:]
+    assert last == [((0, 0), (0, 0))] * 3
+    cause = bench.state.feed.cause
+    assert cause is not None
+    assert cause.code == "Disarmed"
+
+
+def test_a_lost_sync_zeroes_at_once() -> None:
+    """The first step of the local timer sends zeros, without any ramp."""
+    bench = switched_on()
+    assert bench.silence().feed == ((0, 0), (0, 0))
+    for _ in range(5):
+        bench.silence()
+    assert bench.state.feed.mode is FeedMode.OFF
+    assert bench.state.mode is Mode.OFF
+
+
+@pytest.mark.parametrize("what", ["fault", "daemon", "target"])
+def test_a_fault_fades_it_out(what: str) -> None:
+    """A drive's fault, a daemon that is gone, targets that stay away: each with its cause."""
+    bench = switched_on()
+    if what == "fault":
+        bench.drives[0].statusword = 0x0218
+    elif what == "daemon":
+        bench.main_alive = False
+    for _ in range(140):
+        bench.sync(nc=what != "target")
+    assert bench.state.feed.mode is FeedMode.OFF
+    cause = bench.state.feed.cause
+    assert cause is not None
+    assert cause.code == {"fault": "DriveNotEnabled", "daemon": "MainLost", "target": "TargetLost"}[what]
+
+
+def test_a_lost_target_is_bridged() -> None:
+    """One target that does not come is taken to go on as those before it."""
+    bench = switched_on()
+    bench.sync(nc=False)
+    bench.run(30)
+    assert bench.state.feed.mode is FeedMode.ON
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(-(2**31), 2**31 - 1), st.booleans()), min_size=5, max_size=80), st.integers(1, 50)
+)
+def test_limits_hold_for_any_targets(heard: list[tuple[int, bool]], ending: int) -> None:
+    """Amplitude and rate of both offsets, whatever the targets jump to or lack; at the end they are zero."""
+    feed: Feed = armed((LAW,))
+    for k, (target, lost) in enumerate(heard):
+        if k == ending:
+            feed = end(feed, Alarm("Disarmed"))
+        before = feed.applied
+        feed = move(hear(feed, [None if lost else target]), [LIMITS], 20)
+        assert not violates(LIMITS, before[0], feed.applied[0])
+    feed = end(feed, Alarm("Disarmed"))
+    for _ in range(60):
+        feed = move(feed, [LIMITS], 20)
+    assert feed.applied == ((0, 0),)
+    assert feed.mode is FeedMode.OFF
+
+
+def test_at_rest_the_law_says_zero() -> None:
+    """Weights count from the newest target: rounding of the weights cannot leave an offset on an axis at rest."""
+    assert LAW.offsets([123_456] * 3) == (0, 0)
+    assert LAW.offsets([10, 0, -10]) == (2000, -20 + 20 + 30)
+
+
+GOOD = {"speed": [1], "torque": [1], "pace": [1], "dry": 1}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"speed": []},
+        {"speed": [1.5]},
+        {"pace": [True]},
+        {"torque": [1] * 65},
+        {"dry": 1 << 60},
+        {"dry": None},
+        {"pace": 3},
+    ],
+)
+def test_only_a_whole_law_is_taken(change: dict[str, object]) -> None:
+    """Integers of a bounded size, a bounded number of them."""
+    assert parse_law(GOOD) == Law((1,), (1,), (1,), 1)
+    assert parse_law(GOOD | change) is None
+    assert parse_law([GOOD]) is None
+
+
+def test_settings_keep_it() -> None:
+    """Through the settings file, and its COB-IDs are among those that may leave."""
+    made = fed_settings()
+    assert from_json(to_json(made)) == made
+    assert {0x401, 0x402} <= made.sent_ids
+    assert len(made.feeds) == 2
