@@ -9,6 +9,7 @@ import cProfile
 import math
 import os
 import pstats
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -75,13 +76,17 @@ def resident_mb() -> float:
 
 
 def memory(blocks: int) -> tuple[float, float]:
-    """Return MB of this process after a tenth of a program, and the largest value from there on."""
+    """Return MB of this process after a tenth of a program file, and the largest value from there on."""
     early = largest = 0.0
-    for number, _ in enumerate(interpret(simple(blocks))):
-        if number == blocks // 10:
-            early = resident_mb()
-        elif number > blocks // 10 and number % 10_000 == 0:
-            largest = max(largest, resident_mb())
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "long.ngc"
+        with path.open("w", encoding="utf-8") as file:
+            file.writelines(line + "\n" for line in simple(blocks))
+        for number, _ in enumerate(interpret(path)):
+            if number == blocks // 10:
+                early = resident_mb()
+            elif number > blocks // 10 and number % 10_000 == 0:
+                largest = max(largest, resident_mb())
     return early, largest
 
 

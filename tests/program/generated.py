@@ -263,14 +263,14 @@ class Writer:
     def series(self) -> None:
         """Cycle blocks that go on with changed words, levels, planes and retracts."""
         pick = self._random
-        plane, (first, second, normal) = pick.choice([(17, "XYZ"), (17, "XYZ"), (18, "ZXY"), (19, "YZX")])
+        planes = [(17, "X", "Y", "Z"), (17, "X", "Y", "Z"), (18, "Z", "X", "Y"), (19, "Y", "Z", "X")]
+        plane, first, second, normal = pick.choice(planes)
         code = pick.choice(["81", "82", "83", "73", "85", "89"])
         extra = {"82": " P0.2", "89": " P0.1", "83": " Q1.3", "73": " Q2.1"}.get(code, "")
         top = pick.randint(0, 6)
         self.lines += [f"G{plane} G{pick.choice([90, 90, 91])}", f"G0 {normal}{pick.randint(0, 9)}"]
-        self.lines.append(
-            f"G{pick.choice([98, 99])} G{code} {first}{self.number()} {second}1 {normal}{-pick.randint(1, 9)} R{top}{extra}"
-        )
+        place = f"{first}{self.number()} {second}1 {normal}{-pick.randint(1, 9)}"
+        self.lines.append(f"G{pick.choice([98, 99])} G{code} {place} R{top}{extra}")
         for _ in range(pick.randint(1, 5)):
             words = pick.choice(
                 [
