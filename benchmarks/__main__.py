@@ -18,6 +18,7 @@ BENCHMARKS = {
     "interpreter": "Reading programs: blocks per second, where the time goes, memory over a million lines",
     "inverse": "Planning the inverse correction: the whole, and the first block of a stream",
     "planner": "The planner: speed, LinuxCNC's own demand beside it, and what the correction makes of jerky demands",
+    "feedforward": "The on-line feed-forward: what the targets on the bus alone take off the tracking error",
     "acquisition": "A full 1 Mbit/s bus through receive and decode, alone and beside a fit",
     "guard_latency": "From SYNC to the offset frames",
     "whole_machine": "The daemon beside the twin in real time: 60 s of two drives at 1 kHz",
