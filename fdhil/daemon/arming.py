@@ -15,12 +15,13 @@ import numpy as np
 
 from fdhil import correction
 from fdhil.config import MachineConfig
-from fdhil.correction import online
+from fdhil.correction import gate, online
+from fdhil.daemon.streamed import FIRST_BLOCKS, Piece, Stream, worth_streaming
 from fdhil.drivers.commissioning_feeding import feedforward_object
 from fdhil.drivers.commissioning_record import CommissioningRecord, axis_digest, load_record
 from fdhil.drivers.profile import load_profile
 from fdhil.program import load_trajectory, program_digest
-from fdhil.records import Correction, CorrectionTable, Float, ParameterSet, Reason, Skill
+from fdhil.records import Correction, CorrectionTable, Float, Parameters, ParameterSet, Reason, Skill, Trajectory
 
 MODEL_AGE_S = 8 * 3600.0  # a shift: older parameters are of another state of the machine
 MODEL_KELVIN = 3.0
@@ -49,6 +50,26 @@ class Armament:
     table: CorrectionTable
     facts: dict[str, bool]
 
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """The axes that are corrected."""
+        return self.table.axes
+
+    @property
+    def program_digest(self) -> str:
+        """Which program it is for."""
+        return self.table.program_digest
+
+    @property
+    def gain_um(self) -> float:
+        """What is promised."""
+        return promised_um(self.correction)
+
+    def first(self) -> Piece:
+        """Return the rows to arm with: all of them."""
+        demand, offset = self.table.demand_increments, self.table.offset_increments
+        return Piece(0, {a: demand[a].tolist() for a in self.axes}, {a: offset[a].tolist() for a in self.axes}, True)
+
     def summary(self) -> dict[str, Any]:
         """Return what the operator is told."""
         before, after = self.correction.before, self.correction.after
@@ -60,6 +81,50 @@ class Armament:
             "before": {"rms_um": rms(before.contour_um), "max_um": float(before.contour_um.max())},
             "after": {"rms_um": rms(after.contour_um), "max_um": float(after.contour_um.max())},
             "warnings": [str(reason) for reason in self.correction.warnings],
+            "facts": dict(self.facts),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class StreamedArmament:
+    """The first rows of a long program, ready for the guard, and the stream of the others."""
+
+    program: str
+    stream: Stream
+    begin: Piece
+    facts: dict[str, bool]
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """The axes that are corrected."""
+        return self.stream.reference.axes
+
+    @property
+    def program_digest(self) -> str:
+        """Which program it is for."""
+        return self.stream.program_digest
+
+    @property
+    def gain_um(self) -> float:
+        """What is promised, by the first blocks."""
+        return rms(self.stream.before_um) - rms(self.stream.after_um)
+
+    def first(self) -> Piece:
+        """Return the rows to arm with."""
+        return self.begin
+
+    def summary(self) -> dict[str, Any]:
+        """Return what the operator is told; the errors are those of the first blocks."""
+        before, after = self.stream.before_um, self.stream.after_um
+        return {
+            "program": self.program,
+            "program_digest": self.program_digest,
+            "method": "inverse",
+            "rows": int(self.stream.reference.time_s.size),
+            "streamed": True,
+            "before": {"rms_um": rms(before), "max_um": float(before.max())},
+            "after": {"rms_um": rms(after), "max_um": float(after.max())},
+            "warnings": [],
             "facts": dict(self.facts),
         }
 
@@ -78,8 +143,8 @@ def rms(values: Float) -> float:
 
 def prepare(
     program: Path, method: str | None, config: MachineConfig, known: Mapping[str, AxisKnowledge]
-) -> Armament | Refused:
-    """Plan the correction of a program with the newest validated parameters.
+) -> Armament | StreamedArmament | Refused:
+    """Plan the correction of a program with the newest validated parameters; of a long one its first seconds.
 
     ProgramError, RecordingError or ConfigError when the program cannot be used; StoreError for a damaged record.
     """
@@ -91,16 +156,48 @@ def prepare(
             text = f"axis {axis} has no validated parameters yet"
             return Refused((Reason("ModelNotValidated", text, "let the machine make a few rapids of this axis"),))
         models[axis] = published.parameters
+    if worth_streaming(reference, method):
+        return _prepare_stream(program, reference, models, config, known)
     planned = correction.plan(reference, models, config, method)
     if planned.refused:
         return Refused(planned.refused)
     if not any(np.any(offset) for offset in planned.offset_um.values()):
         text = f"the method {planned.method} plans no position offset"
-        return Refused((Reason("HarmPredicted", text, "use inverse or mirror; fdhil arm --method flatness needs no program"),))
+        return Refused((Reason("HarmPredicted", text, "use inverse or mirror; flatness is armed without a program"),))
     digest = program_digest(program)
     table = correction.table(planned, config, digest)
-    facts = standing_facts(reference.axes, config, known, promised_um(planned)) | _commissioned(planned, config)
+    facts = standing_facts(reference.axes, config, known, promised_um(planned))
+    largest_um = max(float(np.abs(offset).max()) for offset in planned.offset_um.values())
+    facts |= _commissioned(tuple(planned.offset_um), largest_um, config)
     return Armament(str(program), planned, table, facts)
+
+
+def _prepare_stream(
+    program: Path,
+    reference: Trajectory,
+    models: Mapping[str, Parameters],
+    config: MachineConfig,
+    known: Mapping[str, AxisKnowledge],
+) -> StreamedArmament | Refused:
+    """Plan the first blocks; what they are refused for refuses the program."""
+    off = gate.writing_off(reference, config)
+    if off:
+        return Refused(off)
+    stream = Stream.of(reference, models, config, program_digest(program))
+    begin = stream.take(FIRST_BLOCKS)
+    if stream.refused:
+        return Refused(stream.refused)
+    gain_um = rms(stream.before_um) - rms(stream.after_um)
+    facts = standing_facts(reference.axes, config, known, gain_um)
+    largest_um = config_largest_um(config, reference.axes)  # what later blocks need is not known yet
+    facts |= _commissioned(reference.axes, largest_um, config)
+    return StreamedArmament(str(program), stream, begin, facts)
+
+
+def config_largest_um(config: MachineConfig, axes: Sequence[str]) -> float:
+    """Return the largest offset that any axis may have."""
+    limits = [config.axis[axis].correction for axis in axes]
+    return max(limit.max_offset_um for limit in limits if limit is not None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,9 +286,8 @@ def _skilled(skills: Sequence[Skill], gain_um: float) -> bool:
     return bool(last) and all(skill.rms_um <= SKILL_SHARE * gain_um for skill in last)
 
 
-def _commissioned(planned: Correction, config: MachineConfig) -> dict[str, bool]:
-    records = {axis: load_record(config.store.directory, axis) for axis in planned.offset_um}
-    largest_um = max(float(np.abs(offset).max()) for offset in planned.offset_um.values())
+def _commissioned(axes: Sequence[str], largest_um: float, config: MachineConfig) -> dict[str, bool]:
+    records = {axis: load_record(config.store.directory, axis) for axis in axes}
     return {
         "commissioned": all(_valid(record, config, axis) for axis, record in records.items()),
         # the plans assume an offset that the feed-forward sees; another drive would be made worse

@@ -12,13 +12,15 @@ from typing import Any
 from fdhil import tables
 from fdhil.config import MachineConfig
 from fdhil.daemon.arming import (
+    Armament,
     AxisKnowledge,
+    Feeding,
     Refused,
     Skills,
+    StreamedArmament,
     feeding_facts,
     prepare,
     prepare_feeding,
-    promised_um,
     standing_facts,
 )
 from fdhil.daemon.control import Answer, refusal
@@ -26,9 +28,10 @@ from fdhil.daemon.guard_link import REST, GuardLink
 from fdhil.daemon.keeping import Keeper, boot_id
 from fdhil.daemon.token import ensure_token
 from fdhil.errors import DeviceError
-from fdhil.records import Correction, Notice, Outcome, ParameterSet, Skill, Temperature
+from fdhil.records import Notice, Outcome, ParameterSet, Skill, Temperature
 from fdhil.store.history import Revision
 
+STREAM_S = 0.05
 ALIVE_S = 0.1  # the guard calls us lost after 0.5 s
 REFRESH_S = 0.5
 STAND_DOWN_S = 3.0  # the longest ramp to zero takes 0.12 s
@@ -50,7 +53,7 @@ class Armory:
         self._load_changed: set[str] = set()
         self._skills = Skills(list(config.axis))
         self._arming = asyncio.Lock()
-        self._armed: tuple[Correction | tuple[str, ...], Mapping[str, Any]] | None = None
+        self._armed: tuple[Armament | StreamedArmament | Feeding, Mapping[str, Any]] | None = None
         self.guard = GuardLink(run_directory)
 
     def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
@@ -133,7 +136,7 @@ class Armory:
         summary = prepared.summary()
         if not answer["ok"]:
             return dict(answer) | {"planned": summary}
-        self._armed = (tuple(prepared.laws), summary)
+        self._armed = (prepared, summary)
         text = f"speed and torque of {', '.join(prepared.laws)} are fed forward on line, whatever program runs"
         return {"ok": True, "state": "FEEDFORWARD", "text": text, **summary}
 
@@ -149,7 +152,7 @@ class Armory:
         summary = prepared.summary()
         if not answer["ok"]:
             return dict(answer) | {"planned": summary}
-        self._armed = (prepared.correction, summary)
+        self._armed = (prepared, summary)
         text = (
             f"armed {program.name} by {summary['method']}: contour error {summary['before']['rms_um']:.1f} um RMS is"
             f" predicted to become {summary['after']['rms_um']:.1f}; start the program"
@@ -176,15 +179,44 @@ class Armory:
             turn += 1
             await asyncio.sleep(ALIVE_S)
 
+    async def stream(self, tell: Tell) -> None:
+        """Hand a long program's rows to the guard as it runs; where that ends early the guard ramps down."""
+        ended: StreamedArmament | None = None
+        while True:
+            await asyncio.sleep(STREAM_S)
+            armed = self._armed[0] if self._armed else None
+            if isinstance(armed, StreamedArmament) and armed is not ended:
+                notices, goes_on = await asyncio.to_thread(self._extend, armed)
+                tell(notices)
+                ended = None if goes_on else armed
+
+    def _extend(self, armed: StreamedArmament) -> tuple[list[Notice], bool]:
+        """Plan and hand on what the guard lacks; return what is to be told, and whether more rows come."""
+        notices = self.guard.refresh()
+        if self.guard.state in REST or not armed.stream.lacks(self.guard.status):
+            return notices, True
+        piece = armed.stream.take()
+        if armed.stream.refused:
+            text = f"{armed.stream.refused[0]}; the correction ends before it"
+            return [*notices, Notice("StreamRefused", "MAJOR", text)], False
+        try:
+            answer = self.guard.extend(armed, piece)
+        except DeviceError as error:
+            return [*notices, Notice("GuardLost", "MAJOR", str(error))], False
+        if answer["ok"]:
+            return notices, True
+        text = f"{answer['text']}; the correction ends before these rows"
+        return [*notices, Notice("StreamRefused", "MAJOR", text)], False
+
     def _facts(self) -> Mapping[str, bool] | None:
         """What is still vouched for while a correction runs; None while none does."""
         if self._armed is None:
             return None
-        planned = self._armed[0]
-        if isinstance(planned, tuple):
-            facts = feeding_facts(planned, self._config, self._known())
+        armed = self._armed[0]
+        if isinstance(armed, Feeding):
+            facts = feeding_facts(tuple(armed.laws), self._config, self._known())
         else:
-            facts = standing_facts(tuple(planned.offset_um), self._config, self._known(), promised_um(planned))
+            facts = standing_facts(armed.axes, self._config, self._known(), armed.gain_um)
         return facts | {"journal_writable": self._keeper.fault is None}
 
     async def stand_down(self) -> str:

@@ -8,9 +8,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from fdhil.daemon.arming import Armament, Feeding
+from fdhil.daemon.arming import Armament, Feeding, StreamedArmament
+from fdhil.daemon.streamed import Piece
 from fdhil.errors import DeviceError
-from fdhil.guard.client import GuardClient
+from fdhil.guard.client import GuardClient, GuardLost
 from fdhil.records import Notice
 
 ABSENT: Mapping[str, Any] = {"state": "absent", "text": "no guard runs: nothing can be armed, nothing is sent"}
@@ -78,18 +79,29 @@ class GuardLink:
             except DeviceError:
                 self._status = {**self._status, "text": "the connection is lost"}
 
-    def arm(self, armament: Armament, token: str) -> Mapping[str, Any]:
+    def arm(self, armament: Armament | StreamedArmament, token: str) -> Mapping[str, Any]:
         """Load the table and arm (blocking); return the guard's answer. DeviceError when there is no guard."""
         with self._lock:
             if self._client is None:
                 self._client = GuardClient(self._run_directory)
-            table = armament.table
-            answer: Mapping[str, Any] = self._client.load(
-                table.axes, _rows(table.demand_increments), _rows(table.offset_increments), table.program_digest
-            )
+            digest = armament.program_digest
+            answer = self._load(self._client, armament, armament.first())
             if answer["ok"]:
                 client = self._client
-                answer = self._ask(client, lambda: client.arm(token, table.program_digest, armament.facts))
+                answer = self._ask(client, lambda: client.arm(token, digest, armament.facts))
+            self._status = self._client.status()
+        return answer
+
+    @staticmethod
+    def _load(client: GuardClient, armament: Armament | StreamedArmament, piece: Piece) -> Mapping[str, Any]:
+        return client.load(armament.axes, piece.demand, piece.offset, armament.program_digest, piece.first, piece.final)
+
+    def extend(self, armament: StreamedArmament, piece: Piece) -> Mapping[str, Any]:
+        """Hand on more rows of a running stream (blocking); DeviceError when there is no guard."""
+        with self._lock:
+            if self._client is None:
+                raise GuardLost("guard", "is gone; the stream has no one to go to")
+            answer = self._load(self._client, armament, piece)
             self._status = self._client.status()
         return answer
 
@@ -127,10 +139,6 @@ class GuardLink:
         """End the connection; a correction that still runs is ramped down by the guard."""
         with self._lock:
             self._drop()
-
-
-def _rows(columns: Mapping[str, Any]) -> dict[str, Any]:
-    return {axis: column.tolist() for axis, column in columns.items()}
 
 
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:

@@ -101,6 +101,7 @@ class Service:
             others = [tasks.create_task(self._work(axis), name=f"axis {axis}") for axis in self._config.axis]
             others.append(tasks.create_task(self._keep_notices(), name="notices"))
             others.append(tasks.create_task(self._armory.attend(self._tell), name="guard"))
+            others.append(tasks.create_task(self._armory.stream(self._tell), name="stream"))
             others.append(tasks.create_task(self._feed_watchdog(), name="watchdog"))
             others.append(tasks.create_task(self._say_ready(), name="ready"))
             await self._stop.wait()

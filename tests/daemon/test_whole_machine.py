@@ -18,6 +18,7 @@ from fdhil.store.windows import list_windows
 from tests.daemon.shop import CORNER, REAL, SHUTTLE, Shop, fdhil, opened
 
 Capture = pytest.CaptureFixture[str]
+LONG = "G21 G90 G94\nG4 P0.5\n" + "G1 X60 F8000\nG1 Y40\nG1 X0\nG1 Y0\n" * 20 + "G4 P0.3\nM2\n"
 pytestmark = pytest.mark.timeout(400)  # four processes, each of which compiles on the very first run
 
 
@@ -39,6 +40,8 @@ def test_from_the_bus_to_the_history_to_a_corrected_cut_and_back(shop: Shop, cap
         _knows_the_drives(told)
         _refuses_a_second_daemon(shop)
         _cuts_corrected(shop, capsys)
+        _cuts_a_program_longer_than_the_ring(shop, capsys)
+        assert fdhil("arm", shop.path, shop.folder / "corner.ngc", capsys=capsys)[0] == 0
         assert daemon.stop() == 0  # disarms first
         assert guard.stop() == 0
     log = (shop.folder / "daemon.log").read_text()
@@ -94,13 +97,28 @@ def _cuts_corrected(shop: Shop, capsys: Capture) -> None:
     corrected = _cut(shop, "corrected")
     assert corrected < 0.2 * plain, (corrected, plain)
     shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
-    assert fdhil("arm", shop.path, shop.folder / "corner.ngc", capsys=capsys)[0] == 0
 
 
-def _cut(shop: Shop, name: str) -> float:
+def _cuts_a_program_longer_than_the_ring(shop: Shop, capsys: Capture) -> None:
+    """30 s: armed with the first 10 s, the rest planned and handed on as it runs, corrected to its end."""
+    plain = _cut(shop, "long_plain", "long.ngc", LONG)
+    code, out, err = fdhil("arm", shop.path, shop.folder / "long.ngc", "--json", capsys=capsys)
+    assert code == 0, (out, err)
+    answer = json.loads(out)
+    assert answer["streamed"] is True
+    assert answer["rows"] > 28_000
+    corrected = _cut(shop, "long_corrected", "long.ngc", LONG)
+    assert corrected < 0.1 * plain, (corrected, plain)
+    shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
+    log = (shop.folder / "daemon.log").read_text()
+    assert "TableStarved" not in log
+    assert log.count("Finished") == 2, log
+
+
+def _cut(shop: Shop, name: str, program: str = "corner.ngc", text: str = CORNER) -> float:
     """Let the NC cut the program; return the RMS of the contour error in um."""
     trace = shop.folder / f"{name}.csv"
-    shop.play("corner.ngc", CORNER, trace=trace)
+    shop.play(program, text, trace=trace)
     rows = np.genfromtxt(trace, delimiter=",", names=True)
     reference = np.column_stack([rows[f"{axis}_reference_mm"] for axis in "XY"])
     table = np.column_stack([rows[f"{axis}_table_mm"] for axis in "XY"])
