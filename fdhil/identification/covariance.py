@@ -77,7 +77,7 @@ def aliasing(sampling: VoltageSampling, dt_s: float) -> Float:
     doubt = np.zeros(6)
     if sampling == "instant":
         coarse = min(2.0, (dt_s / 1e-3) ** 2)
-        doubt[:4] = 0.025 * coarse, 0.2 * max(1.0, coarse**0.5), 0.0015 * coarse, 0.0015 * coarse
+        doubt[:4] = 0.025 * coarse, 0.2, 0.0015 * coarse, 0.0015 * coarse
     return doubt
 
 

@@ -46,13 +46,13 @@ def test_means_are_accepted_and_their_intervals_hold() -> None:
     assert (apart < 3.5).all()
 
 
-def test_instants_tell_all_but_the_inductance() -> None:
+def test_instants_tell_the_inductance_roughly_and_say_so() -> None:
     sampling: VoltageSampling = "instant"
     estimate = maximum_likelihood.estimate(slow_windows(0.010, sampling, delay_s=0.003, noise=0.005), SETTINGS)
-    assert set(estimate.missing) == {"L"}
-    assert "standard deviation of L" in estimate.missing["L"].text
-    known = [0, 2, 3, 4, 5]
-    assert (_errors_percent(estimate.values)[known] < (4.0, 0.4, 0.4, 6.0, 9.0)).all()
+    assert not estimate.missing
+    assert (_errors_percent(estimate.values)[[0, 2, 3, 4, 5]] < (4.0, 0.4, 0.4, 6.0, 9.0)).all()
+    assert estimate.std("L") > 0.15 * estimate.value("L")
+    assert abs(estimate.value("L") - TRUTH[1]) < 2 * estimate.std("L")
 
 
 @pytest.mark.parametrize("delay_s", [0.0065, -0.008])
