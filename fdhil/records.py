@@ -237,7 +237,8 @@ class Estimate:
 
     ``residuals`` maps "electrical" (V) and "mechanical" (A) to their residuals (m,). ``missing`` maps the names that
     are NaN to the reason. ``delay_s`` is the voltage delay that the data show, None when not estimated, and
-    ``delay_std_s`` its standard deviation.
+    ``delay_std_s`` its standard deviation. ``systematic`` (k, q) is that part of the covariance, one standard deviation
+    a column, which is the same in every window of a drive, None when not told.
     """
 
     method: str
@@ -249,6 +250,7 @@ class Estimate:
     missing: Mapping[str, Reason] = field(default_factory=dict)
     delay_s: float | None = None
     delay_std_s: float | None = None
+    systematic: Float | None = None
 
     def value(self, name: str) -> float:
         """Return one parameter's value (NaN when the data cannot tell it)."""

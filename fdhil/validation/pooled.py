@@ -57,24 +57,33 @@ def pool(
 
 
 def weighted(estimates: Sequence[Estimate]) -> Estimate | None:
-    """Return the estimates weighted by their information (inverse covariance); None when one of them lacks a value."""
+    """Return the estimates weighted by their information (inverse covariance); None when one of them lacks a value.
+
+    What is systematic in all windows does not average away: it goes through the same weights.
+    """
     first = np.abs(estimates[0].values)
     scale = np.where(first > 0, first, 1.0)  # the parameters differ by orders of magnitude
     information = np.zeros((len(PARAMETERS), len(PARAMETERS)))
     pull = np.zeros(len(PARAMETERS))
+    shared = np.zeros((len(PARAMETERS), 1))
     for estimate in estimates:
         if not (np.isfinite(estimate.values).all() and np.isfinite(estimate.covariance).all()):
             return None
-        weight = np.linalg.inv(estimate.covariance / np.outer(scale, scale))
+        systematic = np.zeros_like(shared) if estimate.systematic is None else estimate.systematic
+        weight = np.linalg.inv((estimate.covariance - systematic @ systematic.T) / np.outer(scale, scale))
         information += weight
         pull += weight @ (estimate.values / scale)
+        shared = shared + weight @ (systematic / scale[:, None])
     covariance = np.linalg.inv(information)
+    systematic = (covariance @ shared) * scale[:, None]
     return replace(
         estimates[0],
         values=frozen(covariance @ pull * scale),
-        covariance=frozen(covariance * np.outer(scale, scale)),
+        covariance=frozen(covariance * np.outer(scale, scale) + systematic @ systematic.T),
         residuals={},
         delay_s=None,
+        delay_std_s=None,
+        systematic=frozen(systematic),
     )
 
 

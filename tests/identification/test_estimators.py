@@ -9,10 +9,17 @@ import pytest
 
 from fdhil import tables
 from fdhil.config import Identification
-from fdhil.identification.estimators import Estimator, chosen, instrumental_variables, least_squares
+from fdhil.identification.estimators import (
+    Estimator,
+    chosen,
+    instrumental_variables,
+    least_squares,
+    maximum_likelihood,
+)
 from fdhil.identification.windows import find_windows
 from fdhil.records import PARAMETERS, Estimate, Float, Result, Window, frozen
 from fdhil.store.recording_csv import parse_recording
+from fdhil.validation.pooled import weighted
 from studies import bench
 from tests.identification.recorded import signals, windows
 
@@ -151,3 +158,33 @@ def test_instruments_need_a_demand_that_moves() -> None:
     assert estimate.result is not Result.OK
     assert np.isnan(estimate.values).all()
     assert {reason.code for reason in estimate.missing.values()} <= {"RankDeficient", "LowExcitation"}
+
+
+def _late(window: Window, share: float) -> Window:
+    """Return the window with its voltage late by ``share`` of a sample."""
+    assert window.voltage_v is not None
+    row = np.arange(window.n)
+    return replace(window, voltage_v=frozen(np.interp(row - share, row, window.voltage_v)))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.03, -0.03])
+def test_what_may_be_the_voltages_course_is_a_doubt_and_no_delay(share: float) -> None:
+    late = [_late(window, share) for window in windows(0.0002, moves=4)]
+    one = maximum_likelihood.estimate(late[:1], SETTINGS)
+    all_four = maximum_likelihood.estimate(late, SETTINGS)
+    averaged = weighted([maximum_likelihood.estimate([window], SETTINGS) for window in late])
+    assert averaged is not None
+    for estimate in (one, all_four, averaged):
+        assert estimate.delay_s is None
+        apart = np.abs(estimate.values - TRUTH) / np.sqrt(np.diag(estimate.covariance))
+        assert (apart < 3.0).all()
+    # windows in common do not lessen what is common to them
+    assert averaged.std("L") > 0.8 * one.std("L")
+
+
+def test_a_delay_that_is_told_carries_the_doubt_of_the_course() -> None:
+    estimate = maximum_likelihood.estimate([_late(windows(0.0002)[0], 0.2)], SETTINGS)
+    assert estimate.delay_s == pytest.approx(0.2e-3, abs=3e-5)
+    assert estimate.delay_std_s is not None
+    assert 2e-5 < estimate.delay_std_s < 6e-5
+    assert abs(estimate.value("L") / TRUTH[1] - 1) < 3 * estimate.std("L") / TRUTH[1]

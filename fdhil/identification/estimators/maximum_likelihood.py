@@ -10,7 +10,7 @@ information matrix is what remains of the steps.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,7 +35,8 @@ DIFFERENCE = 1e-5
 DELAY_DIFFERENCE_S = 1e-5
 SURE = 5.0  # standard deviations beyond which a delay is believed
 SHAPE_DOUBT = 1.5  # of the back-EMF's ramp within a sample: one standard deviation of the voltage's course
-LEAST_DELAY = 0.02  # of a sample; smaller ones are the voltage's course within a sample
+LEAST_DELAY = 0.05  # of a sample; smaller ones cannot be told from the voltage's course within a sample
+CHANCE = 2.0  # standard deviations of a delay that are chance, not doubt
 SETTLED = 0.01  # squared standard deviations moved by a renewal of the filter
 FLOORS = np.array([1e-4, 0.0, 1e-4, 1e-9])
 LEAST_TIME_CONSTANT_S = 1e-4  # of the winding: noise may drive the starting L below 0
@@ -69,7 +70,10 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """The end of a fit: ``theta`` (7,), information (k, k) of the ``free`` entries, innovations (m,), noises."""
+    """The end of a fit: ``theta`` (7,), information (k, k) of the ``free`` entries, innovations (m,), noises.
+
+    ``delay_doubt_s`` is how much of a delay may be the voltage's course within its samples, or the other way round.
+    """
 
     theta: Float
     information: Float
@@ -78,6 +82,7 @@ class Fit:
     jacobian: Float
     problem: Problem
     converged: bool
+    delay_doubt_s: float = 0.0
 
 
 def pose(motions: Sequence[Motion], theta: Float, noises: Sequence[Noise]) -> Problem:
@@ -181,13 +186,24 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
     if any(w.voltage_delay_s is not None for w in usable):
         return _fit_separate(motions, start, delays)
     start[6] = float(np.median(delays))
-    if start[6] != 0.0:
-        return fit(motions, start, range(7))
-    plain = fit(motions, start, range(6))
-    delay, std = delay_score(plain)
-    if abs(delay) < SURE * std or abs(delay) < LEAST_DELAY * min(m.dt_s for m in motions):
-        return plain
-    return fit(motions, np.append(plain.theta[:6], delay), range(7))
+    return _fit_together(motions, start)
+
+
+def _fit_together(motions: Sequence[Motion], start: Float) -> Fit:
+    """Fit windows whose voltage comes with current and speed, by the drive's own clock.
+
+    Regulators act several times within a sample, which looks like a delay of a few per cent of it, but moves L
+    otherwise. So a small delay is not taken out: what it would change is a doubt, and so it is about a larger one.
+    """
+    least = LEAST_DELAY * min(m.dt_s for m in motions)
+    if start[6] == 0.0:
+        plain = fit(motions, start, range(6))
+        delay, std = delay_score(plain)
+        if abs(delay) < max(SURE * std, least):
+            beyond = np.sqrt(max(0.0, delay**2 - (CHANCE * std) ** 2))
+            return replace(plain, delay_doubt_s=float(beyond))
+        start = np.append(plain.theta[:6], delay)
+    return replace(fit(motions, start, range(7)), delay_doubt_s=least / 2)
 
 
 def _fit_separate(motions: Sequence[Motion], start: Float, delays: Sequence[float]) -> Fit:
@@ -220,10 +236,35 @@ def _fit_slow(windows: Sequence[Window], settings: Identification) -> Fit | None
 
 def delay_score(plain: Fit) -> tuple[float, float]:
     """Return the delay (s) that one Newton step from a fit without delay would add, and its standard deviation."""
-    d = jacobian(plain.problem, plain.theta, plain.residuals, [6], typical(plain.theta, plain.problem.motions))[:, 0]
+    d = delay_direction(plain)
     rest = d - plain.jacobian @ solve(plain.jacobian, d)[0]
     weight = float(rest @ rest)
     return (float(rest @ plain.residuals) / weight, weight**-0.5) if weight > 0 else (0.0, np.inf)
+
+
+def delay_direction(result: Fit) -> Float:
+    """Return minus the derivative (m,) of the innovations by the delay."""
+    if 6 in result.free:
+        return result.jacobian[:, result.free.index(6)]
+    sizes = typical(result.theta, result.problem.motions)
+    return jacobian(result.problem, result.theta, result.residuals, [6], sizes)[:, 0]
+
+
+def doubts(result: Fit, inverse: Float) -> Float:
+    """Return what noise cannot explain: one standard deviation (7, 2) of the six parameters and the delay.
+
+    An interval mean leaves the voltage's course within the sample open: its largest part, the back-EMF's ramp, is
+    known but for the regulators' answer to it (first column); what looks like a delay is the second. Either is the
+    same in all windows of a drive, so that more windows do not lessen it.
+    """
+    columns = np.zeros((7, 2))
+    free = list(result.free)
+    columns[free, 0] = inverse @ (result.jacobian.T @ result.problem.shape_effect(result.theta))
+    if result.delay_doubt_s > 0.0:
+        six = result.jacobian[:, :6]
+        columns[:6, 1] = -result.delay_doubt_s * solve(six, delay_direction(result))[0]
+        columns[6, 1] = result.delay_doubt_s
+    return columns
 
 
 def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
@@ -241,18 +282,19 @@ def finish(result: Fit) -> Estimate:
     """Return the fit as an estimate with its covariance."""
     inverse, condition = inverse_of(result.information)
     k = len(PARAMETERS)
-    # what noise cannot explain: an interval mean leaves the voltage's course within the sample open
-    doubt = (inverse @ (result.jacobian.T @ result.problem.shape_effect(result.theta)))[:k]
     first = result.problem.motions[0]
     alias = aliasing(first.voltage_sampling, first.voltage_period_s)
+    systematic = doubts(result, inverse)
+    late = 6 in result.free
     answer = Estimate(
         method=NAME,
         names=PARAMETERS,
         values=result.theta[:k],
-        covariance=inverse[:k, :k] + np.outer(doubt, doubt) + np.diag(np.square(alias * result.theta[:k])),
+        covariance=inverse[:k, :k] + systematic[:k] @ systematic[:k].T + np.diag(np.square(alias * result.theta[:k])),
         residuals={"electrical": result.residuals[0::2], "mechanical": result.residuals[1::2]},
         result=Result.OK if result.converged else Result.DIVERGED,
-        delay_s=float(result.theta[6]) if 6 in result.free else None,
-        delay_std_s=float(np.sqrt(inverse[6, 6])) if 6 in result.free else None,
+        delay_s=float(result.theta[6]) if late else None,
+        delay_std_s=float(np.sqrt(inverse[6, 6] + systematic[6] @ systematic[6])) if late else None,
+        systematic=systematic[:k],
     )
     return judge(answer, condition, max(float(np.abs(m.speed).max()) for m in result.problem.motions))
