@@ -46,8 +46,8 @@ def magnified(reference_mm: Float, actual_mm: Float, factor: float) -> Float:
 
 
 @contextmanager
-def _drawing(width: float = 6.4, height: float = 3.6) -> Iterator[tuple[Figure, Axes, list[str]]]:
-    """A figure with one pair of axes; on leaving, the list holds its SVG."""
+def _drawing(width: float = 6.4, height: float = 3.6, above: float = 0.35) -> Iterator[tuple[Figure, Axes, list[str]]]:
+    """A figure with one pair of axes, ``above`` them a margin, all in inches; on leaving, the list holds its SVG."""
     from matplotlib import style
     from matplotlib.figure import Figure
 
@@ -55,7 +55,7 @@ def _drawing(width: float = 6.4, height: float = 3.6) -> Iterator[tuple[Figure, 
     with style.context(Path(__file__).with_name("fdhil.mplstyle")):
         figure = Figure(figsize=(width, height))
         # fixed margins: matplotlib's own layout would draw every figure twice
-        yield figure, figure.add_axes((0.8 / width, 0.55 / height, 1 - 1.0 / width, 1 - 0.9 / height)), svg
+        yield figure, figure.add_axes((0.8 / width, 0.55 / height, 1 - 1.0 / width, 1 - (0.55 + above) / height)), svg
         text = io.StringIO()
         figure.savefig(text, format="svg", metadata={"Date": None})
     body = text.getvalue()
@@ -160,7 +160,8 @@ def corner(
     """
     reference = curves[0].path_mm
     centre = reference[np.argmin(np.hypot(*(reference - np.asarray(place_mm)).T))]
-    with _drawing(4.8, 3.6) as (_, axes, svg):
+    columns = len(curves) if len(curves) < 4 else 2
+    with _drawing(4.8, 3.6, 0.35 if len(curves) < 4 else 0.55) as (_, axes, svg):
         for k, curve in enumerate(_near(curves, centre, max(3 * half_width_mm, 1.0))):
             colour, width = (REFERENCE, 3.4) if k == 0 else (COLOURS[(k - 1) % len(COLOURS)], 1.3)
             axes.plot(*curve.path_mm.T, color=colour, lw=width, ls="--" if curve.dashed else "-", label=curve.label)
@@ -171,8 +172,7 @@ def corner(
         axes.locator_params(nbins=6)
         axes.set_xlabel(f"{names[0]} (mm)")
         axes.set_ylabel(f"{names[1]} (mm)")
-        narrow = {"columnspacing": 0.9, "handlelength": 1.2, "handletextpad": 0.4} if len(curves) > 3 else {}
-        axes.legend(loc="upper left", bbox_to_anchor=(0.0, 1.1), ncols=len(curves), **narrow)
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns)
     return svg[0]
 
 
