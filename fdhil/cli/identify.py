@@ -141,12 +141,14 @@ def _show(results: Sequence[FileResult]) -> None:
 
     console = Console()
     for result in results:
-        table = Table(title=f"{result.file}: axis {result.axis}", title_justify="left", box=box.SIMPLE_HEAD)
+        # a terminal of 80 columns holds all of it
+        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+        console.print(f"{result.file}: axis {result.axis}", style="italic", highlight=False, markup=False)
         table.add_column("rapid\ns", no_wrap=True)
         for name in PARAMETERS:
             table.add_column(f"{name}\n{DISPLAY[name][0]}", justify="right", no_wrap=True)
         table.add_column("fit\n%", justify="right", no_wrap=True)
-        table.add_column("validated")
+        table.add_column("valid", no_wrap=True)
         for outcome in result.outcomes:
             window = outcome.window
             first, last = moving_range(window)
