@@ -209,7 +209,7 @@ def _run_plain(p: Array, r: Array, load: Array, every: int) -> tuple[Array, ...]
     theta += p[17] / 2
     sum_s, sum_c, i_demand = 0.0, 0.0, 0.0
     whole = p[17] == 0.0
-    for step in range(n * CYCLE_STEPS):
+    for step in range(rows * every):  # no row is begun that would not be whole
         k = step // CYCLE_STEPS
         s = (step % CYCLE_STEPS) / CYCLE_STEPS
         if step % SPEED_STEPS == 0:
