@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from fdhil.identification import sweeps
+from fdhil.identification.covariance import aliasing
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.innovations import innovations
 from fdhil.identification.motion import Motion
@@ -30,6 +32,7 @@ LAGS = 25
 WHITENESS_BEYOND_CHANCE = 5.0
 PRACTICAL_CORRELATION = 0.25  # smaller ones come from the voltage's course within a sample and do no harm
 NOISE_RATIO = 1.6
+_KINDS = {"current": sweeps.CURRENT, "speed": sweeps.SPEED}
 STRIBECK_SPEEDS = (0.01, 0.03, 0.06, 0.12)  # of the rapid speed
 
 
@@ -76,9 +79,47 @@ class Bench:
         """Largest K |i| of the window, N.m."""
         return float(abs(self.fit.theta[2]) * np.abs(self.motion.current).max())
 
-    def answer(self, motion: Motion, load: Float | None = None) -> Float:
-        """Return minus the change (m,) of the innovations when the window is as in ``motion``, under ``load`` (n,)."""
-        theta, gains = self.fit.theta, self.fit.problem.filters[0]
+    def load_answers(self, loads: Sequence[Float]) -> Float:
+        """Return minus the change (m, q) of the innovations under each of ``loads`` (n,), N.m."""
+        return self._answers(sweeps.LOAD, loads, None)
+
+    def gain_answers(self, name: str, courses: Sequence[Float]) -> Float:
+        """Return minus the change (m, q) of the innovations when the gain of signal ``name`` grows by ``courses``."""
+        motion = self.motion
+        if name != "voltage":
+            return self._answers(_KINDS[name], [getattr(motion, name) * c for c in courses], None)
+        at_samples = [motion.at_voltage(c) for c in courses]
+        rises = [motion.voltage_rise * c for c in at_samples]
+        return self._answers(sweeps.VOLTAGE, [motion.voltage_mean * c for c in at_samples], rises)
+
+    def offset_answers(self, name: str, courses: Sequence[Float]) -> Float:
+        """Return minus the change (m, q) of the innovations when ``courses`` (n,) are added to signal ``name``."""
+        motion = self.motion
+        if name != "voltage":
+            return self._answers(_KINDS[name], courses, None)
+        at_samples = [motion.at_voltage(c) for c in courses]
+        return self._answers(sweeps.VOLTAGE, at_samples, [np.zeros_like(motion.voltage_rise)] * len(courses))
+
+    def _answers(self, kind: int, courses: Sequence[Float], rises: Sequence[Float] | None) -> Float:
+        motion, theta, gains = self.motion, self.fit.theta, self.fit.problem.filters[0]
+        if motion.slow is not None:
+            return np.column_stack([self._slow_answer(kind, course) for course in courses])
+        if rises is not None and theta[6] != 0.0:
+            both = zip(courses, rises, strict=True)
+            courses = [replace(motion, voltage_mean=c, voltage_rise=r).delayed(theta[6]) for c, r in both]
+        answered: Float = -sweeps.answers(motion, theta, gains, kind, courses, rises)
+        return answered
+
+    def _slow_answer(self, kind: int, course: Float) -> Float:
+        """Return minus the change (m,) of the innovations, a slow voltage's among them."""
+        motion, theta, gains = self.motion, self.fit.theta, self.fit.problem.filters[0]
+        if kind == sweeps.VOLTAGE:
+            motion = replace(motion, voltage_mean=motion.voltage_mean + course)
+        elif kind == sweeps.CURRENT:
+            motion = replace(motion, current=motion.current + course)
+        elif kind == sweeps.SPEED:
+            motion = replace(motion, speed=motion.speed + course)
+        load = course if kind == sweeps.LOAD else None
         change: Float = self.fit.residuals - innovations(motion, theta, gains, theta[6], load).ravel()
         return change
 
@@ -96,9 +137,8 @@ class Bench:
         information: Float = directions.T @ directions - shared.T @ self.inverse @ shared
         return score, information
 
-    def best(self, directions: Sequence[Float]) -> tuple[int, float, float]:
-        """Return the direction with the largest statistic: its index, statistic and amplitude."""
-        matrix = np.column_stack(directions)
+    def best(self, matrix: Float) -> tuple[int, float, float]:
+        """Return index, statistic and amplitude of the column of ``matrix`` (m, q) with the largest statistic."""
         score, information = self.scores(matrix)
         whole = (matrix * matrix).sum(axis=0)
         statistic, amplitude = _tested(score, np.diag(information), whole, self.course_scores(matrix))
@@ -132,14 +172,9 @@ def findings(fit: Fit) -> list[Finding]:
 
 def _load(bench: Bench, edges: npt.NDArray[np.int_]) -> Finding:
     """Try a constant torque between every two edges."""
-    motion, unit = bench.motion, 0.01 * bench.peak_torque
-    steps = []
-    for edge in edges[:-1]:
-        load = np.zeros(motion.n)
-        load[edge:] = unit
-        steps.append(bench.answer(motion, load) / unit)
-    steps.append(np.zeros_like(steps[0]))
-    matrix = np.column_stack(steps)
+    motion = bench.motion
+    matrix = bench.load_answers([(np.arange(motion.n) >= edge).astype(np.float64) for edge in edges[:-1]])
+    matrix = np.column_stack([matrix, np.zeros(matrix.shape[0])])
     score, information = bench.scores(matrix)
     # a load from edge a to edge b is the step at a less the step at b
     course = bench.course_scores(matrix)
@@ -168,8 +203,7 @@ def _gain(bench: Bench, name: str, edges: npt.NDArray[np.int_]) -> Finding:
     """Try a gain that steps at one of the inner edges and stays, and one that drifts from the first to the last."""
     courses = [(np.arange(bench.motion.n) >= edge).astype(np.float64) for edge in edges[2:-2:2]]
     courses.append(_drift(bench, edges))
-    directions = [bench.answer(_altered(bench.motion, name, 1.0 + 1e-3 * c, 0.0)) / 1e-3 for c in courses]
-    k, statistic, amplitude = bench.best(directions)
+    k, statistic, amplitude = bench.best(bench.gain_answers(name, courses))
     drifts = k == len(courses) - 1
     at = "over the move" if drifts else f"at {edges[2:-2:2][k] * bench.motion.dt_s:.3f} s of the window"
     text = f"the gain of {name} {'drifts' if drifts else 'changes'} by {{:+.2%}} {at}"
@@ -183,10 +217,8 @@ def _offset(bench: Bench, name: str, unit: str, edges: npt.NDArray[np.int_]) -> 
     """Try an offset that is there throughout, and one that drifts from nothing on over the move."""
     motion = bench.motion
     peak = float(np.abs(motion.voltage_mean if name == "voltage" else getattr(motion, name)).max())
-    step = max(1e-3 * peak, 1e-12)
     courses = (np.ones(motion.n), _drift(bench, edges))
-    directions = [bench.answer(_altered(motion, name, np.ones(motion.n), step * c)) / step for c in courses]
-    k, statistic, amplitude = bench.best(directions)
+    k, statistic, amplitude = bench.best(bench.offset_answers(name, courses))
     text = f"{name} has an offset of {{:+.3g}} {unit}" if k == 0 else f"the zero of {name} drifts by {{:+.3g}} {unit}"
     advice = f"set the zero of the {name} sensor at standstill"
     return Finding("CalibrationSuspect", text, advice, LEAST_OFFSET * peak, statistic, -amplitude)
@@ -198,26 +230,13 @@ def _drift(bench: Bench, edges: npt.NDArray[np.int_]) -> Float:
     return course
 
 
-def _altered(motion: Motion, name: str, factor: Float, offset: Float | float) -> Motion:
-    if name == "voltage":
-        factor, offset = motion.at_voltage(factor), motion.at_voltage(np.broadcast_to(offset, motion.n))
-        mean, rise = motion.voltage_mean * factor + offset, motion.voltage_rise * factor
-        return replace(motion, voltage_mean=mean, voltage_rise=rise)
-    if name == "current":
-        return replace(motion, current=motion.current * factor + offset)
-    return replace(motion, speed=motion.speed * factor + offset)
-
-
 def _low_speed_friction(bench: Bench) -> Finding:
     """Try friction that rises towards standstill, over several ranges of speed."""
-    motion, unit = bench.motion, 0.01 * bench.peak_torque
+    motion = bench.motion
     top = float(np.abs(motion.speed).max())
     moving = np.where(np.abs(motion.mode) == 1, motion.mode, 0)
-    directions = []
-    for share in STRIBECK_SPEEDS:
-        load = unit * np.exp(-((motion.speed / (share * top)) ** 2)) * moving
-        directions.append(bench.answer(motion, load) / unit)
-    k, statistic, amplitude = bench.best(directions)
+    loads = [np.exp(-((motion.speed / (share * top)) ** 2)) * moving for share in STRIBECK_SPEEDS]
+    k, statistic, amplitude = bench.best(bench.load_answers(loads))
     return Finding(
         "ValidationFailed",
         f"friction is {{:+.3g}} N.m higher below {STRIBECK_SPEEDS[k] * top:.3g} rad/s than above (Stribeck)",
@@ -259,9 +278,21 @@ def excess_noise(fit: Fit, window: Window) -> Iterator[Reason]:
         ("speed", "rad/s", fitted.speed_rad_s, window.speed_rad_s),
     ):
         seen = max(_scatter(values), getattr(fit.problem.motions[0].noise, _FIELDS[name]))
+        if name == "voltage":
+            seen = float(np.hypot(seen, _aliased_v(fit, window)))
         if wanted > NOISE_RATIO * seen:
             text = f"the model explains {name} to {wanted:.3g} {unit} only, while it scatters by {seen:.3g} {unit}"
             yield Reason("ValidationFailed", text, "the drive does what the model does not have: look at the residuals")
+
+
+def _aliased_v(fit: Fit, window: Window) -> float:
+    """Return the voltage that instants may miss of the course between them: the same doubt that R and L carry."""
+    motion = fit.problem.motions[0]
+    doubt = aliasing(window.voltage_sampling, motion.voltage_period_s) * np.abs(fit.theta[:6])
+    current = motion.current[np.isfinite(motion.current)]
+    rate = np.gradient(current, motion.dt_s)
+    missed = doubt[0] * np.sqrt(np.mean(current**2)), doubt[1] * np.sqrt(np.mean(rate**2))
+    return float(np.hypot(*missed))
 
 
 _FIELDS = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}
