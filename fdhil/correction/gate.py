@@ -104,8 +104,8 @@ def rms(values: Float) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def result(before: Prediction, after: Prediction) -> tuple[Reason, ...]:
-    """Refuse a correction that is not predicted to help as a whole, or that makes a zone worse."""
+def result(before: Prediction, after: Prediction, untouched: bool = False) -> tuple[Reason, ...]:
+    """Refuse a correction that is not predicted to help as a whole, or (unless ``untouched``) makes a zone worse."""
     then, now = rms(before.contour_um), rms(after.contour_um)
     if then < NOTHING_UM:
         return (Reason("NoGain", f"the path error is {then:.3f} um RMS already", "nothing needs a correction"),)
@@ -113,7 +113,7 @@ def result(before: Prediction, after: Prediction) -> tuple[Reason, ...]:
         text = f"the path error would be {now:.1f} um RMS with the correction, {then:.1f} um without"
         return (Reason("NoGain", text, "try the method inverse, or lower the feed"),)
     worse = np.flatnonzero(worse_rows(before.contour_um, after.contour_um, before.reference.dt_s))
-    if worse.size:
+    if worse.size and not untouched:
         row = int(worse[np.argmax(after.contour_um[worse])])
         text = f"at {before.reference.time_s[row]:.3f} s the error would grow to {after.contour_um[row]:.1f} um"
         return (Reason("HarmPredicted", text, "try the method inverse, or lower the feed"),)

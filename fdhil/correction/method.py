@@ -13,11 +13,13 @@ class Plan:
     """A method's answer: ``offset_um`` (n,) per axis, inside the limits and in whole increments.
 
     ``delay_s`` is the common delay tau that the method aims at, r(t - tau). ``refused`` is what the method itself found
-    to be impossible. The speed and torque offsets (0x60B1, 0x60B2) are empty but for an on-line feed-forward.
+    to be impossible. ``untouched``: the offset is sent as the method gives it, or not at all (mirror). The speed and
+    torque offsets (0x60B1, 0x60B2) are empty but for an on-line feed-forward.
     """
 
     offset_um: Mapping[str, Float]
     delay_s: float = 0.0
     refused: tuple[Reason, ...] = ()
+    untouched: bool = False
     speed_offset_rad_s: Mapping[str, Float] = field(default_factory=dict)
     torque_offset_nm: Mapping[str, Float] = field(default_factory=dict)

@@ -23,7 +23,7 @@ def plan(
     Refused with ``LagTooLarge`` where the error exceeds what an offset may be: a clipped mirror is no mirror.
     """
     wanted = {axis: -error for axis, error in before.error_um.items()}
-    return Plan(fit_all(wanted, config.axis, reference.dt_s), refused=too_large(wanted, config))
+    return Plan(fit_all(wanted, config.axis, reference.dt_s), refused=too_large(wanted, config), untouched=True)
 
 
 def too_large(wanted_um: Mapping[str, Float], config: MachineConfig) -> tuple[Reason, ...]:

@@ -60,7 +60,7 @@ def plan(
         offset, masked = wanted.offset_um, tuple[Reason, ...]()
     else:
         offset, after, masked = _mask_harm(reference, models, config, before, wanted)
-    refused = gate.result(before, after)
+    refused = gate.result(before, after, wanted.untouched)
     if refused:
         return _refuse(name, before, refused, warnings)
     return Correction(
@@ -82,11 +82,16 @@ def _mask_harm(
     before: Prediction,
     wanted: Plan,
 ) -> tuple[Mapping[str, Float], Prediction, tuple[Reason, ...]]:
-    """Leave alone the zones that would get worse; return the offsets, what they leave, and a warning per pass."""
+    """Leave alone the zones that would get worse; return the offsets, what they leave, and a warning.
+
+    What a method wants untouched stays as it is, and the warning says where it harms.
+    """
     offset = wanted.offset_um
     after = predict_corrected(reference, models, config, offset)
     worse = np.zeros(before.contour_um.size, dtype=np.bool_)
-    for _ in range(MASK_PASSES):
+    if wanted.untouched:
+        worse = gate.worse_rows(before.contour_um, after.contour_um, reference.dt_s)
+    for _ in range(0 if wanted.untouched else MASK_PASSES):
         now = gate.worse_rows(before.contour_um, after.contour_um, reference.dt_s)
         if not now.any():
             break
@@ -99,10 +104,9 @@ def _mask_harm(
     if not worse.any():
         return offset, after, ()
     first, last = reference.time_s[np.flatnonzero(worse)[[0, -1]]]
-    text = (
-        f"{worse.sum() * reference.dt_s:.2f} s between {first:.2f} s and {last:.2f} s"
-        " would get worse and are left as they are"
-    )
+    text = f"{worse.sum() * reference.dt_s:.2f} s between {first:.2f} s and {last:.2f} s would get worse"
+    if not wanted.untouched:
+        text += " and are left as they are"
     return offset, after, (Reason("HarmPredicted", text, "try the method inverse, or lower the feed there"),)
 
 

@@ -30,13 +30,15 @@ def changed(**regulators: Any) -> configuration.MachineConfig:
 
 @pytest.mark.parametrize(("feed", "rms_um", "max_um"), [(10, 3.5, 20.3), (20, 7.0, 32.0)])
 def test_mirror_leaves_what_the_bench_says(feed: float, rms_um: float, max_um: float) -> None:
-    """Seven to nine times better on the bench, within the limits, and no zone worse."""
+    """Seven to nine times better on the bench, within the limits; unfiltered, and a warning where that harms."""
     correction = plan(bench_trajectory(feed), MODELS, CONFIG, "mirror")
     assert correction.refused == ()
-    assert rms(correction.after.contour_um) == pytest.approx(rms_um, rel=0.06)
+    assert rms(correction.after.contour_um) == pytest.approx(rms_um, rel=0.02)
+    assert [reason.code for reason in correction.warnings if reason.code != "NearLimit"] == ["HarmPredicted"]
     assert correction.after.contour_um.max() == pytest.approx(max_um, rel=0.02)
     for axis, offset in correction.offset_um.items():
         limits = Limits.of(CONFIG.axis[axis], 0.001)
+        assert np.abs(offset + correction.before.error_um[axis]).max() <= 0.55 * limits.um_per_increment
         increments = offset / limits.um_per_increment
         assert np.allclose(increments, np.rint(increments), atol=1e-6)
         assert check(np.rint(increments).astype(np.int64), limits) == []
