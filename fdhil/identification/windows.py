@@ -16,6 +16,8 @@ from fdhil.records import Bool, Float, Recording, Stages, Window, frozen
 
 RUN_SHARE = 0.02
 RAPID_SHARE = 0.60
+SETTLING_SHARE = 0.2  # of the move's top speed
+SETTLING_S = 0.100
 PLATEAU_S = 0.100
 PLATEAU_BAND = 0.025
 SMOOTHING_S = 0.015
@@ -71,7 +73,9 @@ def find_windows(recording: Recording, rapid_speed_rad_s: float | None = None) -
         if np.abs(speed[run.start : run.end]).max() < RAPID_SHARE * rapid:
             continue
         floor = runs[k - 1].rest_end if k else 0
-        ceiling = runs[k + 1].rest_start if k + 1 < len(runs) else speed.size
+        # a drive that settles is no next move: the window lasts until it rests
+        following = [other for other in runs[k + 1 :] if not _settles(speed, recording.dt_s, run, other)]
+        ceiling = following[0].rest_start if following else speed.size
         windows.append(_cut(recording, speed, run, floor, ceiling, rapid))
     return windows
 
@@ -94,6 +98,13 @@ def _runs(speed: Float, rapid: float, dt: float, noise: float) -> list[Run]:
         end = b + int(after[0]) if after.size else high
         runs.append(Run(a, b, start, end, int(side[a])))
     return runs
+
+
+def _settles(speed: Float, dt: float, run: Run, other: Run) -> bool:
+    """Return whether ``other`` is how ``run`` comes to rest, swinging back or creeping on: at once, short and slow."""
+    at_once = (other.start - run.end) * dt <= EXTENSION_S and (other.end - other.start) * dt <= SETTLING_S
+    slow = np.abs(speed[other.start : other.end]).max() < SETTLING_SHARE * np.abs(speed[run.start : run.end]).max()
+    return at_once and bool(slow)
 
 
 def _cut(recording: Recording, speed: Float, run: Run, floor: int, ceiling: int, rapid: float) -> Window:

@@ -8,17 +8,18 @@ from collections.abc import Iterator
 import numpy as np
 
 from fdhil.identification.motion import noise_levels, resolution
-from fdhil.identification.windows import carried, longest, moving_range, noise_of, smooth
+from fdhil.identification.windows import carried, longest, moving_range, smooth
 from fdhil.records import Bool, Float, Reason, Window
 from fdhil.validation.backlash import backlash
 from fdhil.validation.episode import interruptions
 
-CHANCE = 1e-7  # of a false alarm of one check on one good window
+CHANCE = 1e-5  # of a false alarm of one check on one good window
 TOLERATED_GAP = 3  # rows: a longer gap hides what the drive did
 TOLERATED_LOSS = 0.02
 STUCK_S = 0.003
 RAIL_SAMPLES = 3
 RESOLVED = 0.2  # of a step: noise below it hides in the resolution
+SIDE = 3  # rows beside a run of equal readings that tell of it, in lengths of the run
 QUANTISATION = 1 / 50
 SURE = 6.0
 SCALE_TOLERANCE = 0.005  # of the travel: pitch and speed scale are known to that
@@ -114,28 +115,41 @@ def _stuck(window: Window) -> Iterator[Reason]:
             yield Reason("StuckValue", text, "check the sensor or the object's mapping")
 
 
-def _beyond_chance(part: Float, start: int, end: int) -> bool:
-    """Return whether the repeats from row ``start`` to ``end`` are more than the rows about them make likely."""
-    same = np.diff(part) == 0.0
-    outside = np.concatenate([same[:start], same[end:]])
-    share = (float(outside.sum()) + 1.0) / (outside.size + 2.0)
-    likely = likely_repeat(np.concatenate([part[:start], part[end + 1 :]]))
-    chance: float = same.size * max(share, likely) ** (end - start)
-    return chance < CHANCE
+def _beyond_chance(values: Float, start: int, end: int) -> bool:
+    """Return whether the readings of rows ``start`` to ``end``, all alike, are more than the rows about them explain.
 
-
-def likely_repeat(values: Float) -> float:
-    """Return how likely a constant with this noise repeats its reading at most, in the resolution it is read with.
-
-    The likeliest constant lies in the middle of a step: q of its readings are that step, the rest the two beside it.
+    Either side may explain them: by how often it has that very reading (a constant read coarsely), or by how often it
+    repeats its reading (a signal that creeps through the steps).
     """
-    step = resolution(values[np.isfinite(values)])
-    # the steps themselves show as noise of step / sqrt(12)
-    variance = noise_of(values) ** 2 - step**2 / 12
-    if step == 0.0 or variance < (RESOLVED * step) ** 2:
-        return 1.0 if step else 0.0
-    inside = math.erf(step / math.sqrt(8 * variance))
-    return inside**2 + (1 - inside) ** 2 / 2
+    length = end - start + 1
+    chance = likely_reading(np.concatenate([values[:start], values[end + 1 :]])) ** length
+    same = np.diff(values) == 0.0
+    sides = (slice(max(0, start - SIDE * length), start), slice(end + 1, end + 1 + SIDE * length))
+    for side in sides:
+        if values[side].size >= length:
+            likely = all_within(length, values[side] == values[start]), all_within(length - 1, same[side])
+            chance = max(chance, *likely)
+    return values.size * chance < CHANCE
+
+
+def likely_reading(values: Float) -> float:
+    """Return how likely a constant with this noise is read alike at most: when it lies in the middle of a step."""
+    known = values[np.isfinite(values)]
+    step = resolution(known)
+    # what is read in steps has the steps' own scatter too
+    variance = float(np.mean(np.diff(known, 3) ** 2)) / 20.0 - step**2 / 12 if known.size > 3 else 0.0
+    return math.erf(step / math.sqrt(8 * max(variance, (RESOLVED * step) ** 2))) if step else 0.0
+
+
+def all_within(length: int, others: Bool) -> float:
+    """Return how likely ``length`` given rows all have what these and ``others`` have as often as they do, anywhere.
+
+    Exact for rows that may be exchanged for each other (Fisher): no level of noise is needed.
+    """
+    having, every = int(np.count_nonzero(others)), others.size
+    log = math.lgamma(length + having + 1) - math.lgamma(having + 1)
+    log += math.lgamma(every + 1) - math.lgamma(length + every + 1)
+    return math.exp(log)
 
 
 def _wakes_with_a_jump(part: Float, start: int, end: int) -> bool:

@@ -171,7 +171,7 @@ def findings(fit: Fit) -> list[Finding]:
 
 
 def _load(bench: Bench, edges: npt.NDArray[np.int_]) -> Finding:
-    """Try a constant torque between every two edges."""
+    """Try a constant torque between every two edges, and one that rises over the move."""
     motion = bench.motion
     matrix = bench.load_answers([(np.arange(motion.n) >= edge).astype(np.float64) for edge in edges[:-1]])
     matrix = np.column_stack([matrix, np.zeros(matrix.shape[0])])
@@ -181,14 +181,17 @@ def _load(bench: Bench, edges: npt.NDArray[np.int_]) -> Finding:
     apart, whole = score[:, None] - score[None, :], _apart(matrix.T @ matrix)
     statistic, amplitude = _tested(apart, _apart(information), whole, course[:, None] - course[None, :])
     a, b = np.unravel_index(int(np.argmax(np.abs(np.triu(statistic, 1)))), statistic.shape)
-    span = f"{edges[a] * motion.dt_s:.3f} to {edges[b] * motion.dt_s:.3f} s of the window"
+    span = f"acts from {edges[a] * motion.dt_s:.3f} to {edges[b] * motion.dt_s:.3f} s of the window"
+    found = (float(statistic[a, b]), float(amplitude[a, b]))
+    _, *rising = bench.best(bench.load_answers([_drift(bench, edges)]))
+    if abs(rising[0]) > abs(found[0]):
+        span, found = "rises over the move", (rising[0], rising[1])
     return Finding(
         "LoadDetected",
-        f"a torque of {{:+.3g}} N.m that is no friction acts from {span}",
+        f"a torque of {{:+.3g}} N.m that is no friction {span}",
         "identify from moves without cutting, clamping or collision",
         LEAST_TORQUE * bench.peak_torque,
-        float(statistic[a, b]),
-        float(amplitude[a, b]),
+        *found,
     )
 
 
