@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
-from fdhil.identification.innovations import gains_of, innovations
 from fdhil.identification.motion import Motion, Noise
+from fdhil.identification.sweeps import whiten
 from fdhil.records import Float
 
 ITERATIONS = 12
@@ -15,30 +17,28 @@ ENOUGH = 0.05
 FLOOR = 1e-3  # of a level's own start: below it a noise has no effect that could be seen
 
 
-def noise_likelihood(motion: Motion, theta: Float, noise: Noise, delay_s: float = 0.0) -> float:
-    """Return minus twice the log likelihood (without its constant) of the innovations."""
-    gains = gains_of(motion, theta, noise)
-    e = innovations(motion, theta, gains, delay_s)
-    return gains.logdet + float((e * e).sum())
+def fit_noise(motion: Motion, theta: Float, start: Noise) -> Noise:
+    """Return the noise levels that make the innovations most likely, by Newton steps on their logarithms.
 
-
-def fit_noise(motion: Motion, theta: Float, start: Noise, delay_s: float = 0.0) -> Noise:
-    """Return the noise levels that make the innovations most likely, by Newton steps on their logarithms."""
+    ``theta`` (7,) is [R, L, K, Jt, ft, Cd, delay].
+    """
     lower = np.log(motion.noise.vector()) + np.log(FLOOR)
     x = np.log(start.vector())
 
-    def cost(logs: Float) -> float:
-        value = noise_likelihood(motion, theta, Noise(*np.exp(logs)), delay_s)
-        return value if np.isfinite(value) else np.inf
+    def costs(logs: Float) -> Float:
+        # minus twice the log likelihood (q,), without its constant, for each row of logarithms (q, 3)
+        e, logdet = whiten(motion, np.tile(theta, (len(logs), 1)), np.exp(2 * logs))
+        values = logdet + np.einsum("mq,mq->q", e, e)
+        return np.where(np.isfinite(values), values, np.inf)
 
-    here = cost(x)
+    here = float(costs(x[None])[0])
     for _ in range(ITERATIONS):
-        gradient, curvature = _differences(cost, x, here)
+        gradient, curvature = _differences(costs, x, here)
         step = np.clip(-gradient / np.maximum(curvature, 0.05 * np.abs(gradient) + 1e-9), -LARGEST, LARGEST)
         scale, moved = 1.0, False
         while scale > 0.05 and not moved:
             trial = np.maximum(x + scale * step, lower)
-            there = cost(trial)
+            there = float(costs(trial[None])[0])
             moved = there < here
             scale *= 0.5
         if not moved:
@@ -50,15 +50,9 @@ def fit_noise(motion: Motion, theta: Float, start: Noise, delay_s: float = 0.0) 
     return Noise(*np.exp(x))
 
 
-def _differences(cost: object, x: Float, here: float) -> tuple[Float, Float]:
+def _differences(costs: Callable[[Float], Float], x: Float, here: float) -> tuple[Float, Float]:
     """Return gradient (3,) and diagonal curvature (3,) by central differences."""
-    assert callable(cost)
-    gradient, curvature = np.zeros(3), np.zeros(3)
-    for j in range(3):
-        up, down = x.copy(), x.copy()
-        up[j] += STEP
-        down[j] -= STEP
-        high, low = cost(up), cost(down)
-        gradient[j] = (high - low) / (2 * STEP)
-        curvature[j] = (high + low - 2 * here) / STEP**2
-    return gradient, curvature
+    steps = STEP * np.eye(3)
+    around = costs(np.concatenate([x + steps, x - steps]))
+    high, low = around[:3], around[3:]
+    return (high - low) / (2 * STEP), (high + low - 2 * here) / STEP**2

@@ -1,7 +1,7 @@
-"""Several filters over one window in one pass, and the answer of one filter to several changes of the signals.
+"""Many filters over one window in one call, and the answer of one filter to many changes of the signals.
 
-The filter of :mod:`fdhil.identification.innovations` waits at every row for the row before. Columns that differ in
-parameters, noise or signals wait together: ten of them take little longer than one.
+Derivatives by parameters and noise levels, and the directions of score tests, are wanted for several columns at once.
+Here gain and innovation of a row are made together, and columns of one filter wait together for the row before.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numba import njit
 
-from fdhil.identification.innovations import DIFFUSE, Gains
-from fdhil.identification.motion import BROKEN, UNKNOWN, Motion
+from fdhil.identification.innovations import DIFFUSE, Gains, gains_of, innovations
+from fdhil.identification.motion import BROKEN, UNKNOWN, Motion, Noise
 from fdhil.model.feed_drive import transition
 from fdhil.records import Float
 
@@ -42,6 +42,72 @@ def _coefficients_plain(theta: Float, dt: float, unknown: bool) -> Float:
 _coefficients: Callable[[Float, float, bool], Float] = njit(cache=True, nogil=True)(_coefficients_plain)
 
 
+def _one_plain(
+    theta: Float,
+    variances: Float,
+    dt: float,
+    mode: Float,
+    observed: Float,
+    mean_v: Float,
+    rise_v: Float,
+    share: float,
+    current: Float,
+    speed: Float,
+    walk: float,
+    out: Float,
+) -> float:
+    """Fill ``out`` (n, 2) with the whitened innovations of one filter; return its log determinant."""
+    moving, free = _coefficients(theta, dt, False), _coefficients(theta, dt, True)
+    friction, emf = theta[5], share * theta[2]
+    vu, vi, vw = variances
+    unit = 1.0 / (vi * vw)
+    p11, p12, p22 = DIFFUSE * vi, 0.0, DIFFUSE * vw
+    i, w = current[0], speed[0]
+    logdet, product, counted = 0.0, 1.0, 0
+    for k in range(mode.size):
+        if observed[k]:
+            s11, s22 = p11 + vi, p22 + vw
+            det = s11 * s22 - p12 * p12
+            part = 1.0 / det
+            e1, e2 = current[k] - i, speed[k] - w
+            out[k, 0] = e1 / np.sqrt(s11)
+            out[k, 1] = (s11 * e2 - p12 * e1) * np.sqrt(part / s11)
+            g11, g12 = (p11 * s22 - p12 * p12) * part, p12 * vi * part
+            g21, g22 = p12 * vw * part, (p22 * s11 - p12 * p12) * part
+            i += g11 * e1 + g12 * e2
+            w += g21 * e1 + g22 * e2
+            p11, p12, p22 = g11 * vi, g12 * vw, g22 * vw
+            product *= det * unit
+            counted += 1
+            if counted % LOG_ROWS == 0:
+                logdet += np.log(product)
+                product = 1.0
+        if mode[k] == BROKEN:
+            p11, p12, p22 = DIFFUSE * vi, 0.0, DIFFUSE * vw
+            continue
+        unknown = mode[k] == UNKNOWN
+        f00, f01, f10, f11, b1, b2, t1, t2, r1, r2, v1 = free if unknown else moving
+        q11, q12 = f00 * p11 + f01 * p12, f00 * p12 + f01 * p22
+        q21, q22 = f10 * p11 + f11 * p12, f10 * p12 + f11 * p22
+        p11 = q11 * f00 + q12 * f01 + b1 * b1 * vu
+        p12 = q11 * f10 + q12 * f11 + b1 * b2 * vu
+        p22 = q21 * f10 + q22 * f11 + b2 * b2 * vu
+        if unknown:
+            # the walk of the speed over the interval reaches the current through the back-EMF
+            p11 += v1 * v1 * walk * walk
+            p12 += v1 * walk * walk
+            p22 += walk * walk
+        torque = friction * mode[k]
+        w_next = f10 * i + f11 * w + b2 * mean_v[k] + t2 * torque
+        r = emf * (w_next - w) + (rise_v[k] if rise_v.size else 0.0)
+        i = f00 * i + f01 * w + b1 * mean_v[k] + t1 * torque + r1 * r
+        w = w_next + r2 * r
+    return float(logdet + np.log(product) - counted * np.log(unit))
+
+
+_one: Callable[..., float] = njit(cache=True, nogil=True, error_model="numpy")(_one_plain)
+
+
 def _whiten_plain(
     thetas: Float,
     variances: Float,
@@ -55,75 +121,29 @@ def _whiten_plain(
     speed: Float,
     walk: float,
 ) -> tuple[Float, Float]:
-    """Return whitened innovations (n, 2, q) and log determinants (q,) for the columns of ``thetas`` (q, 7).
+    """Return whitened innovations (q, n, 2) and log determinants (q,) for the rows of ``thetas`` (q, 7).
 
-    ``variances`` (q, 3) as in the single filter; ``mean_v`` (q, n) or, when all columns share it, (1, n).
+    ``variances`` (q, 3) as in the single filter; ``mean_v`` is (q, n) or, when all share it, (1, n).
     """
     n, q = mode.size, thetas.shape[0]
-    out = np.zeros((n, 2, q))
+    out = np.zeros((q, n, 2))
     logdet = np.zeros(q)
-    moving, free = np.empty((11, q)), np.empty((11, q))
     for c in range(q):
-        moving[:, c] = _coefficients(thetas[c], dt, False)
-        free[:, c] = _coefficients(thetas[c], dt, True)
-    friction, emf = thetas[:, 5].copy(), share * thetas[:, 2]
-    vu, vi, vw = variances[:, 0].copy(), variances[:, 1].copy(), variances[:, 2].copy()
-    p11, p12, p22 = DIFFUSE * vi, np.zeros(q), DIFFUSE * vw
-    i, w = np.full(q, current[0]), np.full(q, speed[0])
-    products, counted = np.ones(q), 0
-    for k in range(n):
-        if observed[k]:
-            for c in range(q):
-                s11, s12, s22 = p11[c] + vi[c], p12[c], p22[c] + vw[c]
-                det = s11 * s22 - s12 * s12
-                part = 1.0 / det
-                g11, g12 = (p11[c] * s22 - s12 * s12) * part, s12 * vi[c] * part
-                g21, g22 = s12 * vw[c] * part, (p22[c] * s11 - s12 * s12) * part
-                e1, e2 = current[k] - i[c], speed[k] - w[c]
-                out[k, 0, c] = e1 / np.sqrt(s11)
-                out[k, 1, c] = (s11 * e2 - s12 * e1) * np.sqrt(part / s11)
-                products[c] *= det / (vi[c] * vw[c])
-                i[c] += g11 * e1 + g12 * e2
-                w[c] += g21 * e1 + g22 * e2
-                p11[c], p12[c], p22[c] = g11 * vi[c], g12 * vw[c], g22 * vw[c]
-            counted += 1
-            if counted % LOG_ROWS == 0:
-                logdet += np.log(products)
-                products[:] = 1.0
-        if mode[k] == BROKEN:
-            p11[:], p12[:], p22[:] = DIFFUSE * vi, 0.0, DIFFUSE * vw
-            continue
-        unknown = mode[k] == UNKNOWN
-        h = free if unknown else moving
-        v = walk if unknown else 0.0
-        rise = rise_v[k] if rise_v.size else 0.0
-        own = mean_v.shape[0] > 1
-        for c in range(q):
-            f00, f01, f10, f11 = h[0, c], h[1, c], h[2, c], h[3, c]
-            q11, q12 = f00 * p11[c] + f01 * p12[c], f00 * p12[c] + f01 * p22[c]
-            q21, q22 = f10 * p11[c] + f11 * p12[c], f10 * p12[c] + f11 * p22[c]
-            b1, b2, v1 = h[4, c], h[5, c], h[10, c] * v
-            p11[c] = q11 * f00 + q12 * f01 + b1 * b1 * vu[c] + v1 * v1
-            p12[c] = q11 * f10 + q12 * f11 + b1 * b2 * vu[c] + v1 * v
-            p22[c] = q21 * f10 + q22 * f11 + b2 * b2 * vu[c] + v * v
-            u = mean_v[c, k] if own else mean_v[0, k]
-            torque = friction[c] * mode[k]
-            w_next = f10 * i[c] + f11 * w[c] + b2 * u + h[7, c] * torque
-            r = rise + emf[c] * (w_next - w[c])
-            i[c] = f00 * i[c] + f01 * w[c] + b1 * u + h[6, c] * torque + h[8, c] * r
-            w[c] = w_next + h[9, c] * r
-    return out, logdet + np.log(products) + counted * np.log(vi * vw)
+        mean = mean_v[min(c, mean_v.shape[0] - 1)]
+        logdet[c] = _one(thetas[c], variances[c], dt, mode, observed, mean, rise_v, share, current, speed, walk, out[c])
+    return out, logdet
 
 
 _whiten: Callable[..., tuple[Float, Float]] = njit(cache=True, nogil=True, error_model="numpy")(_whiten_plain)
 
 
 def whiten(motion: Motion, thetas: Float, variances: Float) -> tuple[Float, Float]:
-    """Return the whitened innovations (2 n, q) for the rows of ``thetas`` (q, 7), each by its own filter.
+    """Return the whitened innovations (m, q) for the rows of ``thetas`` (q, 7), each by the filter made for it.
 
-    ``variances`` (q, 3) are those of voltage, current and speed; with them come the log determinants (q,). The
-    window's voltage must come with its rows.
+    ``variances`` (q, 3) are those of voltage, current and speed; with the innovations come the log determinants (q,).
     """
+    if motion.slow is not None:
+        return _whiten_slow(motion, thetas, variances)
     delays = thetas[:, 6]
     together = bool((delays == delays[0]).all())
     voltages = [motion.delayed(float(d)) for d in (delays[:1] if together else delays)]
@@ -141,7 +161,13 @@ def whiten(motion: Motion, thetas: Float, variances: Float) -> tuple[Float, Floa
         motion.speed,
         motion.speed_walk,
     )
-    return white.reshape(2 * motion.n, -1), logdet
+    return white.reshape(len(thetas), -1).T, logdet
+
+
+def _whiten_slow(motion: Motion, thetas: Float, variances: Float) -> tuple[Float, Float]:
+    filters = [gains_of(motion, theta, Noise(*np.sqrt(v))) for theta, v in zip(thetas, variances, strict=True)]
+    columns = [innovations(motion, theta, f, theta[6]) for theta, f in zip(thetas, filters, strict=True)]
+    return np.column_stack(columns), np.array([f.logdet for f in filters])
 
 
 def _answers_plain(

@@ -25,6 +25,7 @@ from fdhil.identification.motion import Motion, Noise, prepare
 from fdhil.identification.noise import fit_noise
 from fdhil.identification.normal import inverse_of, solve
 from fdhil.identification.slow_start import slow_start, with_slope_walk
+from fdhil.identification.sweeps import whiten
 from fdhil.records import PARAMETERS, Estimate, Float, Result, Window
 
 NAME = "maximum_likelihood"
@@ -55,7 +56,13 @@ class Problem:
 
         ``theta`` is [R, L, K, Jt, ft, Cd, delay].
         """
-        return pose(self.motions, theta, self.noises)._all(theta, 1.0)
+        column: Float = self.columns(theta[None])[:, 0]
+        return column
+
+    def columns(self, thetas: Float) -> Float:
+        """Return the whitened innovations (m, q) for each row of ``thetas`` (q, 7)."""
+        pairs = zip(self.motions, self.noises, strict=True)
+        return np.concatenate([whiten(m, thetas, np.tile(s.vector() ** 2, (len(thetas), 1)))[0] for m, s in pairs])
 
     def shape_effect(self, theta: Float) -> Float:
         """Return how the innovations (m,) change with what is not known of the voltage's course within its samples."""
@@ -93,13 +100,11 @@ def pose(motions: Sequence[Motion], theta: Float, noises: Sequence[Noise]) -> Pr
 
 def jacobian(problem: Problem, theta: Float, base: Float, free: Sequence[int], scales: Float) -> Float:
     """Return minus the derivative (m, k) of the innovations by the ``free`` entries of theta, filter included."""
-    columns = []
-    for j in free:
-        step = DELAY_DIFFERENCE_S if j == 6 else DIFFERENCE * scales[j]
-        moved = theta.copy()
-        moved[j] += step
-        columns.append((base - problem.residuals(moved)) / step)
-    return np.column_stack(columns)
+    steps = np.array([DELAY_DIFFERENCE_S if j == 6 else DIFFERENCE * scales[j] for j in free])
+    moved = np.tile(theta, (len(free), 1))
+    moved[np.arange(len(free)), list(free)] += steps
+    changes: Float = (base[:, None] - problem.columns(moved)) / steps
+    return changes
 
 
 def typical(theta: Float, motions: Sequence[Motion]) -> Float:
@@ -154,7 +159,7 @@ def fit(motions: Sequence[Motion], start: Float, free: Sequence[int]) -> Fit:
         moved = theta[list(free)] - before[list(free)]
         if turn and float(moved @ information @ moved) < SETTLED:
             break
-        noises = [fit_noise(m, theta, s, theta[6]) for m, s in zip(motions, noises, strict=True)]
+        noises = [fit_noise(m, theta, s) for m, s in zip(motions, noises, strict=True)]
     return Fit(theta, information, tuple(free), residuals, j, pose(motions, theta, problem.noises), converged)
 
 
