@@ -110,7 +110,9 @@ def _settles(speed: Float, dt: float, run: Run, other: Run) -> bool:
 def _cut(recording: Recording, speed: Float, run: Run, floor: int, ceiling: int, rapid: float) -> Window:
     """Cut one window with its margins of standstill."""
     margin = round(MARGIN_S / recording.dt_s)
-    a, b = max(floor, run.rest_start - margin), min(ceiling, run.rest_end + margin)
+    # the moves beside it may take its margins, never a part of itself
+    a = max(min(floor, run.rest_start), run.rest_start - margin)
+    b = min(max(ceiling, run.rest_end), run.rest_end + margin)
     part = slice(a, b)
     gaps = tuple((max(g, a) - a, min(h, b) - a) for g, h in recording.gaps if g < b and h > a)
     return Window(

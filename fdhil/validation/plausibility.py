@@ -13,12 +13,13 @@ from fdhil.records import Bool, Float, Reason, Window
 from fdhil.validation.backlash import backlash
 from fdhil.validation.episode import interruptions
 
-CHANCE = 1e-5  # of a false alarm of one check on one good window
+CHANCE = 1e-4  # of a false alarm of one check on one good window
 TOLERATED_GAP = 3  # rows: a longer gap hides what the drive did
 TOLERATED_LOSS = 0.02
 STUCK_S = 0.003
 RAIL_SAMPLES = 3
 RESOLVED = 0.2  # of a step: noise below it hides in the resolution
+LEAST_NOISE_ROWS = 20
 SIDE = 3  # rows beside a run of equal readings that tell of it, in lengths of the run
 QUANTISATION = 1 / 50
 SURE = 6.0
@@ -122,9 +123,12 @@ def _beyond_chance(values: Float, start: int, end: int) -> bool:
     repeats its reading (a signal that creeps through the steps).
     """
     length = end - start + 1
-    chance = likely_reading(np.concatenate([values[:start], values[end + 1 :]])) ** length
-    same = np.diff(values) == 0.0
+    chance = 0.0
+    same, step = np.diff(values) == 0.0, resolution(values[np.isfinite(values)])
     sides = (slice(max(0, start - SIDE * length), start), slice(end + 1, end + 1 + SIDE * length))
+    for others in (values[sides[0]], values[sides[1]], np.concatenate([values[:start], values[end + 1 :]])):
+        # the rows beside may lie at the edge of a step, and the run in its middle
+        chance = max(chance, likely_reading(others, step) ** length)
     for side in sides:
         if values[side].size >= length:
             likely = all_within(length, values[side] == values[start]), all_within(length - 1, same[side])
@@ -132,13 +136,15 @@ def _beyond_chance(values: Float, start: int, end: int) -> bool:
     return values.size * chance < CHANCE
 
 
-def likely_reading(values: Float) -> float:
-    """Return how likely a constant with this noise is read alike at most: when it lies in the middle of a step."""
-    known = values[np.isfinite(values)]
-    step = resolution(known)
+def likely_reading(values: Float, step: float) -> float:
+    """Return how likely a constant with the noise of ``values`` is read alike at most: in the middle of a ``step``."""
+    third = np.diff(values, 3)
+    third = third[np.isfinite(third)]
+    if third.size < LEAST_NOISE_ROWS or step == 0.0:
+        return 0.0
     # what is read in steps has the steps' own scatter too
-    variance = float(np.mean(np.diff(known, 3) ** 2)) / 20.0 - step**2 / 12 if known.size > 3 else 0.0
-    return math.erf(step / math.sqrt(8 * max(variance, (RESOLVED * step) ** 2))) if step else 0.0
+    variance = float(np.mean(third**2)) / 20.0 - step**2 / 12
+    return math.erf(step / math.sqrt(8 * max(variance, (RESOLVED * step) ** 2)))
 
 
 def all_within(length: int, others: Bool) -> float:
