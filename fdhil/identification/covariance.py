@@ -9,6 +9,11 @@ import numpy as np
 from fdhil.identification.filtering import through
 from fdhil.records import Float, VoltageSampling
 
+TESTED_LAGS = 25
+SUMMED_LAGS = 50  # rows over which innovations may hang together
+VARIANCE_PARTS = 10
+BEYOND_CHANCE = 5.0  # standard deviations: some seventy figures a window
+
 
 def coloured_meat(blocks: Sequence[Float], gammas: Sequence[Sequence[Float]], lengths: Sequence[int]) -> Float:
     """Return the covariance (k, k) of the stacked scores sum_t phi_t e_t of regressions over the same rows.
@@ -66,6 +71,44 @@ def two_step(
     bread = _bread(phi_1, phi_2, mechanical[:, 0])
     covariance: Float = bread @ coloured_meat([phi_1, phi_2], scaled, lengths) @ bread.T
     return covariance
+
+
+def suspicious(innovations: Float) -> bool:
+    """Return whether innovations (n, 2) are surely neither white nor of even variance along the window."""
+    n = innovations.shape[0]
+    if n < 4 * TESTED_LAGS:
+        return False
+    power = (innovations**2).sum(axis=0)
+    lags = range(1, TESTED_LAGS + 1)
+    correlations = np.array([(innovations[lag:] * innovations[:-lag]).sum(axis=0) for lag in lags]) / power
+    shares = np.array([(part**2).mean(axis=0) for part in np.array_split(innovations, VARIANCE_PARTS)]) * n / power
+    # the mean of m squares of unit normals scatters by sqrt(2 / m)
+    uneven = np.abs(shares - 1.0).max() / np.sqrt(2.0 * VARIANCE_PARTS / n)
+    return bool(max(np.abs(correlations).max() * np.sqrt(n), uneven) > BEYOND_CHANCE)
+
+
+def robust(information: Float, scores: Sequence[Float]) -> Float:
+    """Return the covariance (k, k) of a fit with ``information`` (k, k), whose windows have ``scores`` (n, k) by row.
+
+    The sandwich of Newey and West (1987): inverse information around the long-run covariance of the scores, with
+    Bartlett's weights, widened by what its own scatter costs (Kiefer and Vogelsang 2005, 95 %). No direction is told
+    better than by the information: a lucky sample is not precision.
+    """
+    scale = np.sqrt(np.diag(information))
+    powers, axes = np.linalg.eigh(information / np.outer(scale, scale))
+    kept = powers > powers[-1] * 1e-15
+    root = (axes[:, kept] / np.sqrt(powers[kept])) / scale[:, None]  # root root' is the inverse information
+    meat = np.zeros((root.shape[1], root.shape[1]))
+    for rows in scores:
+        own = rows @ root
+        meat += own.T @ own
+        for lag in range(1, min(SUMMED_LAGS, len(own) // 4) + 1):
+            shifted = own[lag:].T @ own[:-lag]
+            meat += (1.0 - lag / (SUMMED_LAGS + 1)) * (shifted + shifted.T)
+    share = SUMMED_LAGS / sum(len(rows) for rows in scores)
+    ratios, turned = np.linalg.eigh(meat * (1.0 + 2.9694 / 1.96 * min(share, 1.0)) ** 2)
+    sandwich: Float = root @ (turned * np.maximum(ratios, 1.0)) @ turned.T @ root.T
+    return sandwich
 
 
 def aliasing(sampling: VoltageSampling, dt_s: float) -> Float:

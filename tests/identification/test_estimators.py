@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from fdhil import tables
 from fdhil.config import Identification
@@ -16,6 +17,7 @@ from fdhil.identification.estimators import (
     least_squares,
     maximum_likelihood,
 )
+from fdhil.identification.normal import inverse_of
 from fdhil.identification.windows import find_windows
 from fdhil.records import PARAMETERS, Estimate, Float, Result, Window, frozen
 from fdhil.store.recording_csv import parse_recording
@@ -188,3 +190,38 @@ def test_a_delay_that_is_told_carries_the_doubt_of_the_course() -> None:
     assert estimate.delay_std_s is not None
     assert 2e-5 < estimate.delay_std_s < 6e-5
     assert abs(estimate.value("L") / TRUTH[1] - 1) < 3 * estimate.std("L") / TRUTH[1]
+
+
+def _coloured(window: Window, seed: int) -> Window:
+    """Return the noise-free window with white noise on voltage, and noise that lasts some 5 samples on the others."""
+    rng = np.random.default_rng(seed)
+    assert window.voltage_v is not None
+    white = rng.standard_normal((3, window.n + 200))
+    lasting = lfilter([0.6], [1.0, -0.8], white, axis=1)[:, 200:]
+    return replace(
+        window,
+        voltage_v=frozen(window.voltage_v + 0.18 * white[0, 200:]),
+        current_a=frozen(window.current_a + 0.15 * lasting[1]),
+        speed_rad_s=frozen(window.speed_rad_s + 0.45 * lasting[2]),
+    )
+
+
+def test_intervals_hold_where_noise_is_coloured() -> None:
+    clean = windows(0.0)[0]
+    wide, narrow = [], []
+    for seed in range(24):
+        fit = maximum_likelihood.fit_windows([_coloured(clean, seed)], SETTINGS)
+        assert fit is not None
+        estimate = maximum_likelihood.finish(fit)
+        apart = np.abs(estimate.values - TRUTH)
+        wide.append(apart / np.sqrt(np.diag(estimate.covariance)))
+        narrow.append(apart / np.sqrt(np.diag(inverse_of(fit.information)[0])))
+    assert np.mean(np.array(wide) < 1.96) > 0.8
+    assert np.mean(np.array(narrow) < 1.96) < 0.7  # what the information alone would promise
+
+
+def test_white_noise_leaves_the_information_as_it_is() -> None:
+    fit = maximum_likelihood.fit_windows(windows(0.005), SETTINGS)
+    assert fit is not None
+    inverse = inverse_of(fit.information)[0]
+    np.testing.assert_array_equal(maximum_likelihood.robust_inverse(fit, inverse), inverse)

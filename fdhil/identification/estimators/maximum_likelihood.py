@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdhil.config import Identification
-from fdhil.identification.covariance import aliasing
+from fdhil.identification.covariance import aliasing, robust, suspicious
 from fdhil.identification.delay import coarse_delay
 from fdhil.identification.estimators import least_squares
 from fdhil.identification.estimators.least_squares import Signals
 from fdhil.identification.identifiability import judge
 from fdhil.identification.innovations import Gains, gains_of, innovations
-from fdhil.identification.motion import Motion, Noise, prepare
+from fdhil.identification.motion import UNKNOWN, Motion, Noise, prepare
 from fdhil.identification.noise import fit_noise
 from fdhil.identification.normal import inverse_of, solve
 from fdhil.identification.slow_start import slow_start, with_slope_walk
@@ -283,6 +283,20 @@ def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
     return finish(result)
 
 
+def robust_inverse(result: Fit, inverse: Float) -> Float:
+    """Return ``inverse`` (k, k), or the covariance that holds where innovations are coloured or of uneven variance."""
+    motions = result.problem.motions
+    if any(m.slow is not None for m in motions):
+        return inverse  # its rows and its voltage's samples have no common order
+    cuts = np.cumsum([2 * m.n for m in motions])[:-1]
+    parts = [e.reshape(-1, 2) for e in np.split(result.residuals, cuts)]
+    known = [(m.mode != UNKNOWN) & m.observed for m in motions]
+    if not any(suspicious(e[rows]) for e, rows in zip(parts, known, strict=True)):
+        return inverse
+    products = np.split(result.jacobian * result.residuals[:, None], cuts)
+    return robust(result.information, [p.reshape(-1, 2, p.shape[1]).sum(axis=1) for p in products])
+
+
 def finish(result: Fit) -> Estimate:
     """Return the fit as an estimate with its covariance."""
     inverse, condition = inverse_of(result.information)
@@ -290,6 +304,7 @@ def finish(result: Fit) -> Estimate:
     first = result.problem.motions[0]
     alias = aliasing(first.voltage_sampling, first.voltage_period_s)
     systematic = doubts(result, inverse)
+    held = robust_inverse(result, inverse)
     late = 6 in result.free
     answer = Estimate(
         method=NAME,
@@ -299,7 +314,9 @@ def finish(result: Fit) -> Estimate:
         residuals={"electrical": result.residuals[0::2], "mechanical": result.residuals[1::2]},
         result=Result.OK if result.converged else Result.DIVERGED,
         delay_s=float(result.theta[6]) if late else None,
-        delay_std_s=float(np.sqrt(inverse[6, 6] + systematic[6] @ systematic[6])) if late else None,
+        delay_std_s=float(np.sqrt(held[6, 6] + systematic[6] @ systematic[6])) if late else None,
         systematic=systematic[:k],
     )
-    return judge(answer, condition, max(float(np.abs(m.speed).max()) for m in result.problem.motions))
+    # what the data can tell is the information's to say; that residuals are coloured is no lack of excitation
+    judged = judge(answer, condition, max(float(np.abs(m.speed).max()) for m in result.problem.motions))
+    return replace(judged, covariance=judged.covariance + (held - inverse)[:k, :k])
