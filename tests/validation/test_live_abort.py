@@ -1,0 +1,83 @@
+"""A rapid aborted on the running machine: the axis' pipeline cuts its window and refuses it by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil.pipeline import AxisPipeline, Record
+from fdhil.records import AxisSamples, MoveEvent, MoveKind, ParameterSet, TickTimes, WindowOutcome, frozen, frozen_ints
+from studies import drives
+from studies.drives import Array
+from studies.scenes import demand_of, measured
+from tests.daemon.machine import config_of
+from tests.validation.test_episodes import DRIVE, MOVE, SCENE
+
+BLOCK = 40
+
+
+def _live(rates: Array) -> list[Record]:
+    """Return what a driver yields of one rapid with these path speeds: blocks of samples, and the NC's events."""
+    rows = measured(
+        np.random.default_rng(7),
+        SCENE,
+        drives.run(DRIVE, demand_of(SCENE, np.concatenate([rates, drives.rest(0.4)])), SCENE.dt_s),
+    ).signals
+    n, begin = rows["speed"].size, round(SCENE.lead_s / SCENE.dt_s)
+    events = [
+        MoveEvent("X", MoveKind.RAPID, begin, "test"),
+        MoveEvent("X", MoveKind.REST, begin + rates.size + 60, "test"),
+    ]
+    records: list[Record] = []
+    for start in range(0, n, BLOCK):
+        tick = np.arange(start, min(n, start + BLOCK))
+        zeros = np.zeros(tick.size)
+        records.append(TickTimes(frozen_ints(tick), frozen_ints(tick * 1_000_000)))
+        records.append(
+            AxisSamples(
+                "X",
+                frozen_ints(tick),
+                demand_mm=frozen(1e3 * rows["demand"][tick]),
+                position_mm=frozen(1e3 * rows["position"][tick]),
+                speed_rad_s=frozen(rows["speed"][tick]),
+                current_a=frozen(rows["current"][tick]),
+                voltage_v=frozen(rows["voltage"][tick]),
+                offset_mm=frozen(zeros),
+                statusword=frozen_ints(zeros),
+            )
+        )
+        records += [event for event in events if tick[0] <= event.tick <= tick[-1]]
+    return records
+
+
+def _outcomes(folder: Path, rates: Array) -> tuple[list[WindowOutcome], bool]:
+    pipeline = AxisPipeline("X", config_of(folder))
+    told = [outcome for record in _live(rates) for outcome in pipeline.feed(record)]
+    windows = [outcome for outcome in told if isinstance(outcome, WindowOutcome)]
+    return windows, any(isinstance(outcome, ParameterSet) for outcome in told)
+
+
+def test_a_whole_rapid_is_believed_and_published(tmp_path: Path) -> None:
+    (outcome,), published = _outcomes(tmp_path, drives.rates(MOVE))
+    assert outcome.verdict.accepted, outcome.verdict.reasons
+    assert published
+
+
+@pytest.mark.parametrize(
+    "rate",
+    [
+        pytest.param(lambda t: 1 - 0.4 * np.clip((t - 0.3) / 0.05, 0, 1), id="override to 60 %"),
+        pytest.param(
+            lambda t: 1 - 0.7 * np.clip(np.minimum((t - 0.3) / 0.1, (0.7 - t) / 0.1), 0, 1), id="held a while"
+        ),
+    ],
+)
+def test_an_override_turned_during_the_rapid_is_refused_and_nothing_is_published(
+    tmp_path: Path, rate: Callable[[Array], Array]
+) -> None:
+    (outcome,), published = _outcomes(tmp_path, drives.rates(MOVE, rate))
+    assert [reason.code for reason in outcome.verdict.reasons] == ["EpisodeAborted"]
+    assert not published
