@@ -70,6 +70,14 @@ def test_people_get_a_table(shuttle: Path) -> None:
     assert "g.m2" in result.stdout
 
 
+def test_the_table_fits_a_terminal_of_80_columns(shuttle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = _invoke(shuttle).stdout.splitlines()
+    assert max(map(len, lines[1:])) <= 80
+    assert any(line.split()[-1:] == ["valid"] for line in lines)
+    assert not any("\N{HORIZONTAL ELLIPSIS}" in line for line in lines)
+
+
 def test_refused_is_exit_1_with_null_values(tmp_path: Path) -> None:
     path = tmp_path / "still.csv"
     path.write_text(bench.as_csv(bench.run(bench.Plant(), bench.shuttle(distance=0.02, speed=0.1)), 0.003))
