@@ -79,8 +79,9 @@ def suspicious(innovations: Float) -> bool:
     if n < 4 * TESTED_LAGS:
         return False
     power = (innovations**2).sum(axis=0)
-    lags = range(1, TESTED_LAGS + 1)
-    correlations = np.array([(innovations[lag:] * innovations[:-lag]).sum(axis=0) for lag in lags]) / power
+    size = 1 << (n + TESTED_LAGS).bit_length()  # long enough that no lag wraps round
+    spectrum = np.fft.rfft(innovations, size, axis=0)
+    correlations = np.fft.irfft(np.abs(spectrum) ** 2, size, axis=0)[1 : TESTED_LAGS + 1] / power
     shares = np.array([(part**2).mean(axis=0) for part in np.array_split(innovations, VARIANCE_PARTS)]) * n / power
     # the mean of m squares of unit normals scatters by sqrt(2 / m)
     uneven = np.abs(shares - 1.0).max() / np.sqrt(2.0 * VARIANCE_PARTS / n)
