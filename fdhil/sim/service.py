@@ -209,7 +209,10 @@ class SimService:
         for bus in buses:
             readers += bus.readers()
             writers += bus.writers()
-        ready, _, _ = select.select(readers, writers, (), self._timeout_s())
+        timeout_s = self._timeout_s()
+        ready, _, _ = select.select(readers, writers, (), timeout_s)
+        if not ready and timeout_s > 0.0:  # it may have been this process that slept: what came meanwhile comes first
+            ready, _, _ = select.select(readers, writers, (), 0.0)
         if ready:
             self._read(ready)
         now_s = time.monotonic()
