@@ -7,7 +7,7 @@ import hmac
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from fdhil import tables
 from fdhil.config import MachineConfig
@@ -38,6 +38,7 @@ STAND_DOWN_S = 3.0  # the longest ramp to zero takes 0.12 s
 NO_GUARD = "start fdhil-guard with this machine's config"
 
 Tell = Callable[[Sequence[Notice]], None]
+Prepared = TypeVar("Prepared", bound=Armament | StreamedArmament | Feeding)
 
 
 class Armory:
@@ -128,31 +129,35 @@ class Armory:
         prepared = await asyncio.to_thread(prepare_feeding, self._config, self._known())
         if isinstance(prepared, Refused):
             return _refused(prepared)
+        summary = prepared.summary()
+        answer = await self._hand_over(self.guard.feed_forward, prepared, summary, token)
+        if not answer["ok"]:
+            return answer
+        text = f"speed and torque of {', '.join(prepared.laws)} are fed forward on line, whatever program runs"
+        return {"ok": True, "state": "FEEDFORWARD", "text": text, **summary}
+
+    async def _hand_over(
+        self, ask: Callable[[Prepared, str], Answer], prepared: Prepared, summary: Answer, token: str
+    ) -> Answer:
+        """Ask the guard in a thread; what it grants is armed, what it refuses is answered with what was planned."""
         prepared.facts["journal_writable"] = self._keeper.fault is None
         try:
-            answer = await asyncio.to_thread(self.guard.feed_forward, prepared, token)
+            answer = await asyncio.to_thread(ask, prepared, token)
         except DeviceError as error:
             return refusal("GuardAbsent", str(error), NO_GUARD)
-        summary = prepared.summary()
         if not answer["ok"]:
             return dict(answer) | {"planned": summary}
         self._armed = (prepared, summary)
-        text = f"speed and torque of {', '.join(prepared.laws)} are fed forward on line, whatever program runs"
-        return {"ok": True, "state": "FEEDFORWARD", "text": text, **summary}
+        return dict(answer)
 
     async def _arm(self, program: Path, method: str | None, token: str) -> Answer:
         prepared = await asyncio.to_thread(prepare, program, method, self._config, self._known())
         if isinstance(prepared, Refused):
             return _refused(prepared)
-        prepared.facts["journal_writable"] = self._keeper.fault is None
-        try:
-            answer = await asyncio.to_thread(self.guard.arm, prepared, token)
-        except DeviceError as error:
-            return refusal("GuardAbsent", str(error), NO_GUARD)
         summary = prepared.summary()
+        answer = await self._hand_over(self.guard.arm, prepared, summary, token)
         if not answer["ok"]:
-            return dict(answer) | {"planned": summary}
-        self._armed = (prepared, summary)
+            return answer
         text = (
             f"armed {program.name} by {summary['method']}: contour error {summary['before']['rms_um']:.1f} um RMS is"
             f" predicted to become {summary['after']['rms_um']:.1f}; start the program"

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fdhil.guard.frames import Listener
+from fdhil.guard.interlocks import CATALOGUE
 from tests.guard.machine import settings
 
 
@@ -173,4 +174,6 @@ def test_any_traffic_is_taken(frames: list[tuple[int, bytes]]) -> None:
     for cob_id, data in frames:
         heard.take(cob_id, data, 0.0)
         heard.at_sync(data[:1], 0.0, 0.0)
-    heard.in_silence(0.0, True)
+    axes, _ = heard.in_silence(0.0, True)
+    assert len(axes) == len(heard.settings.axes)
+    assert {alarm.code for alarm in heard.alarms()} <= CATALOGUE.keys()
