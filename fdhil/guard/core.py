@@ -49,7 +49,7 @@ def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outpu
     state = state._replace(good_for=0 if alarms else state.good_for + inputs.sync)
     state, refused = _request(state, inputs, alarms, views, settings)
     state = _react(state, inputs, alarms, settings)
-    state = _adopt_at_start(state, inputs, alarms)
+    state = _adopt_at_start(state, inputs, alarms, settings)
     if inputs.sync:
         state = rest(_follow_path(state, inputs, alarms, settings))
     state, output = _move(state, inputs, settings)
@@ -95,7 +95,7 @@ def _request(
         return (state, refused) if refused else (state._replace(feed=feedforward.armed(request.laws)), ())
     if request.kind == "adopt":
         refused = _adopt_refusals(state, request, alarms, settings)
-        return (state, refused) if refused else (_adopting(state), ())
+        return (state, refused) if refused else (_adopting(state, settings), ())
     cause = Alarm("Disarmed" if request.kind == "disarm" else "Stopped")
     if state.mode in IN_CHARGE:
         state = _ramp_down(state, cause)
@@ -161,14 +161,21 @@ def _adopt_refusals(state: State, request: Request, alarms: Alarms, settings: Se
     return tuple(refused)
 
 
-def _adopting(state: State) -> State:
-    """Take over what the drives hold: the first value sent is the value read."""
+def _adopting(state: State, settings: Settings) -> State:
+    """Take over what the drives hold: the first value sent is the value read; speed and torque get zeros."""
+    cause = Alarm("StaleOffset")
     axes = tuple([_at_rest(axis, axis.sent[0] if axis.read_back is None else axis.read_back) for axis in state.axes])
-    return state._replace(mode=Mode.ADOPT, axes=axes, zeros_sent=0, adopt_checked=True, cause=Alarm("StaleOffset"))
+    feed = feedforward.zeroing(len(axes), cause) if _fed(state) and settings.feeds else state.feed
+    return state._replace(mode=Mode.ADOPT, axes=axes, zeros_sent=0, adopt_checked=True, cause=cause, feed=feed)
+
+
+def _fed(state: State) -> bool:
+    """Whether a drive shows a speed or torque offset."""
+    return any(any(axis.fed_back) for axis in state.axes)
 
 
 def _at_rest(axis: AxisState, offset: int) -> AxisState:
-    return AxisState(offset, 0, (offset,) * len(axis.sent), axis.travel, axis.read_back, late_echoes=axis.late_echoes)
+    return axis._replace(offset=offset, rate=0, sent=(offset,) * len(axis.sent), echo_misses=0, zero_shown=False)
 
 
 # --- reactions ---
@@ -212,7 +219,7 @@ def _reaction(alarm: Alarm, settings: Settings) -> Reaction:
     return alarm.reaction
 
 
-def _adopt_at_start(state: State, inputs: Inputs, alarms: Alarms) -> State:
+def _adopt_at_start(state: State, inputs: Inputs, alarms: Alarms, settings: Settings) -> State:
     """Once after the start: a drive that already holds an offset gets it ramped to zero, by us, from its value."""
     if state.adopt_checked or state.mode is not Mode.OFF or not inputs.sync:
         return state
@@ -220,8 +227,8 @@ def _adopt_at_start(state: State, inputs: Inputs, alarms: Alarms) -> State:
         return state
     if any(alarm.reaction is Reaction.FREEZE for alarm in alarms) or any(a.read_back is None for a in state.axes):
         return state
-    if any(axis.read_back for axis in state.axes):
-        return _adopting(state)
+    if any(axis.read_back for axis in state.axes) or _fed(state):
+        return _adopting(state, settings)
     return state._replace(adopt_checked=True)
 
 
@@ -364,12 +371,12 @@ def _feed(state: State, inputs: Inputs, alarms: Alarms, settings: Settings, outp
         return state, output
     own = () if inputs.main_alive is True else (Alarm("MainLost"),)
     feed = feedforward.react(before, (*alarms, *inputs.withdrawn, *own))
-    if inputs.sync:
+    if inputs.sync and feed.mode is not FeedMode.ZEROING:
         feed = feedforward.hear(feed, [axis.target for axis in inputs.axes])
     if inputs.late or not (inputs.sync or feed.mode is FeedMode.ZEROING):
-        return state._replace(feed=feed), output
+        return state._replace(feed=feed.send(feed.applied) if inputs.sync else feed), output
     limits = [axis.limits for axis in settings.feeds]
-    moved = feedforward.move(feed, limits, settings.cycles(FADE_S))
+    moved = feedforward.move(feed, limits, settings.cycles(FADE_S), confirmed=not _fed(state))
     ways = zip(limits, before.applied, moved.applied, strict=True)
     if any(feedforward.violates(*way) for way in ways):
         cause = Alarm("InternalError", detail=f"feed-forward {before.applied} -> {moved.applied}")

@@ -20,6 +20,9 @@ MOST_WEIGHT = 1 << 48
 FADE_S = 0.1
 HOLD_CYCLES = 10
 ZEROS = 3
+ZEROS_UNCONFIRMED = 50
+KEPT = 4
+"""Cycles of what was sent, to compare with what the drives show: one late frame is no mismatch."""
 
 Targets = tuple[int, ...]
 Pair = tuple[int, int]
@@ -97,24 +100,38 @@ class FeedMode(Enum):
 class Feed(NamedTuple):
     """The feed-forward's memory: ``share`` of ``FADE_S`` faded in (cycles), the last targets per axis, newest first.
 
-    ``applied`` are the offsets sent last; ``held`` counts cycles in which something was not as it should be,
-    ``limited`` those in which a limit took something away.
+    ``sent`` are the last offsets of all axes, newest first; ``held`` counts cycles in which something was not as it
+    should be, ``limited`` those in which a limit took something away.
     """
 
     mode: FeedMode = FeedMode.OFF
     laws: tuple[Law, ...] = ()
     share: int = 0
     targets: tuple[Targets, ...] = ()
-    applied: tuple[Pair, ...] = ()
+    sent: tuple[tuple[Pair, ...], ...] = ((),)
     held: int = 0
     limited: int = 0
     zeros: int = 0
     cause: Alarm | None = None
 
+    @property
+    def applied(self) -> tuple[Pair, ...]:
+        """The offsets sent last, per axis."""
+        return self.sent[0]
+
+    def send(self, pairs: tuple[Pair, ...]) -> Feed:
+        """Note what is sent now."""
+        return self._replace(sent=(pairs, *self.sent)[:KEPT])
+
 
 def armed(laws: tuple[Law, ...]) -> Feed:
     """Return the state behind an arming: nothing is sent but zeros until enough targets were heard."""
-    return Feed(FeedMode.ON, laws, applied=((0, 0),) * len(laws), targets=((),) * len(laws))
+    return Feed(FeedMode.ON, laws, targets=((),) * len(laws), sent=(((0, 0),) * len(laws),) * KEPT)
+
+
+def zeroing(axes: int, cause: Alarm) -> Feed:
+    """Return the state that sends zeros to drives that hold something else."""
+    return Feed(FeedMode.ZEROING, sent=(((0, 0),) * axes,), cause=cause)
 
 
 def end(feed: Feed, cause: Alarm) -> Feed:
@@ -147,12 +164,13 @@ def hear(feed: Feed, targets: Sequence[int | None]) -> Feed:
     return feed._replace(targets=tuple(heard))
 
 
-def move(feed: Feed, limits: Sequence[Limits], fade_cycles: int) -> Feed:
-    """Go one cycle on: the next offsets are ``applied``, inside their limits; OFF once zeros were sent."""
+def move(feed: Feed, limits: Sequence[Limits], fade_cycles: int, confirmed: bool = True) -> Feed:
+    """Go one cycle on: the next offsets are ``applied``, inside their limits; OFF once zeros were sent.
+
+    ``confirmed``: no drive shows anything but 0; zeros are sent for longer when one does.
+    """
     if feed.mode is FeedMode.ZEROING:
-        off = feed.zeros >= ZEROS
-        mode = FeedMode.OFF if off else feed.mode
-        return feed._replace(mode=mode, applied=((0, 0),) * len(feed.laws), zeros=feed.zeros + 1)
+        return _landed(feed.send(((0, 0),) * len(feed.applied))._replace(zeros=feed.zeros + 1), confirmed)
     known = all(len(past) == law.depth for law, past in zip(feed.laws, feed.targets, strict=True))
     share = feed.share + 1 if feed.mode is FeedMode.ON else feed.share - 1
     feed = feed._replace(share=clamp(share, 0, fade_cycles) if known else 0)
@@ -161,10 +179,17 @@ def move(feed: Feed, limits: Sequence[Limits], fade_cycles: int) -> Feed:
         speed, torque = law.offsets(past) if known else (0, 0)
         limited = limited or abs(speed) > own.speed or abs(torque) > own.torque
         applied.append(_inside(feed.applied[k], (speed, torque), feed.share, fade_cycles, own))
-    feed = feed._replace(applied=tuple(applied), limited=feed.limited + limited)
+    feed = feed.send(tuple(applied))._replace(limited=feed.limited + limited)
     still = feed.mode is FeedMode.ENDING and feed.share == 0 and not any(map(any, applied))
-    feed = feed._replace(zeros=feed.zeros + 1 if still else 0)
-    return feed._replace(mode=FeedMode.OFF) if feed.zeros > ZEROS else feed
+    return _landed(feed._replace(zeros=feed.zeros + 1 if still else 0), confirmed)
+
+
+def _landed(feed: Feed, confirmed: bool) -> Feed:
+    """OFF after enough zeros that the drives show, or far more of them that a drive does not show."""
+    if feed.zeros <= (ZEROS if confirmed else ZEROS_UNCONFIRMED):
+        return feed
+    cause = feed.cause if confirmed else Alarm("EchoMismatch", detail="no zero was read back")
+    return feed._replace(mode=FeedMode.OFF, cause=cause)
 
 
 def _inside(before: Pair, wanted: Pair, share: int, fade_cycles: int, limits: Limits) -> Pair:

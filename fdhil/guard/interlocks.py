@@ -164,8 +164,8 @@ WITHDRAWABLE = ("model_fresh", "skill_enough", "journal_writable")
 class AxisView(NamedTuple):
     """What is known of one axis at a SYNC. Ages in SYNC cycles, infinite when never heard; NaN and None: unknown.
 
-    ``feedback_age`` is that of the older of statusword and position, in units of its own rate. ``holds_offset``: the
-    drive's offset was last read as another value than what we sent.
+    ``feedback_age`` is that of the older of statusword and position, in units of its own rate. ``echo_misses``: how
+    often in a row the drive showed another offset than ours. ``is_fed``: it shows a speed or torque offset.
     """
 
     name: str
@@ -183,6 +183,7 @@ class AxisView(NamedTuple):
     target_heard: bool = False
     short_frames: int = 0
     long_frames: int = 0
+    is_fed: bool = False
 
 
 class BusView(NamedTuple):
@@ -240,7 +241,7 @@ BUS_INTERLOCKS: tuple[tuple[str, Callable[[BusView], bool]], ...] = (
 )
 # needed to arm only: per axis
 ARMING_INTERLOCKS: tuple[tuple[str, Callable[[AxisView], bool]], ...] = (
-    ("StaleOffset", lambda axis: axis.read_back is None or axis.read_back == 0),
+    ("StaleOffset", lambda axis: not axis.read_back and not axis.is_fed),
     ("PdoMapping", lambda axis: axis.long_frames == 0),
     ("LimitBeyondWindow", lambda axis: axis.largest_offset <= axis.window / 4),
 )

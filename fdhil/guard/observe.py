@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+from fdhil.guard.feedforward import Pair
 from fdhil.guard.interlocks import AxisView
 from fdhil.guard.settings import AxisSettings, Settings
-from fdhil.guard.state import SENDING, AxisInput, AxisState, Inputs, Mode, State
+from fdhil.guard.state import NOT_SHOWN, SENDING, AxisInput, AxisState, Inputs, Mode, Shown, State
 
 
 def observe(state: State, inputs: Inputs, settings: Settings) -> State:
@@ -20,7 +23,7 @@ def observe(state: State, inputs: Inputs, settings: Settings) -> State:
     depth = max([axis.setpoint_delay_cycles for axis in settings.axes]) + 2
     history = (targets, *state.targets)[:depth]
     sampled = [
-        _sampled(axis, seen, setting, k, history)
+        _fed(_sampled(axis, seen, setting, k, history), seen.fed_back, [pairs[k] for pairs in state.feed.sent if pairs])
         for k, (axis, seen, setting) in enumerate(zip(axes, inputs.axes, settings.axes, strict=True))
     ]
     return state._replace(
@@ -65,6 +68,14 @@ def _sampled(
     )
 
 
+def _fed(axis: AxisState, shown: Shown, sent: Sequence[Pair]) -> AxisState:
+    """Compare speed and torque offset in the same way; a frame that was late by a cycle or two is no mismatch."""
+    if shown == NOT_SHOWN:
+        return axis
+    right = len(sent) < 2 or any(all(s in (None, v) for s, v in zip(shown, pair, strict=True)) for pair in sent[1:])
+    return axis._replace(fed_back=shown, feed_misses=0 if right else axis.feed_misses + 1)
+
+
 def view(setting: AxisSettings, seen: AxisInput, axis: AxisState) -> AxisView:
     """Return one axis as the interlocks look at it."""
     return AxisView(
@@ -78,11 +89,12 @@ def view(setting: AxisSettings, seen: AxisInput, axis: AxisState) -> AxisView:
         axis.following_error,
         setting.window,
         setting.limits.offset,
-        axis.echo_misses,
+        max(axis.echo_misses, axis.feed_misses),
         axis.read_back,
         seen.target is not None,
         seen.short_frames,
         seen.long_frames,
+        any(axis.fed_back),
     )
 
 

@@ -14,6 +14,9 @@ from fdhil.guard.path import Path, Place
 from fdhil.guard.settings import Settings
 
 AT_REST = Travel()
+Shown = tuple[int | None, int | None]
+"""What a drive shows of its speed and its torque offset; None where no TPDO does."""
+NOT_SHOWN: Shown = (None, None)
 
 
 class Mode(Enum):
@@ -64,6 +67,7 @@ class AxisInput(NamedTuple):
     heartbeat_age_s: float = float("inf")
     short_frames: int = 0
     long_frames: int = 0
+    fed_back: Shown = NOT_SHOWN
 
 
 class Inputs(NamedTuple):
@@ -89,6 +93,7 @@ class AxisState(NamedTuple):
     """One axis' offset: ``offset`` in force or about to be, moving at ``rate``; ``sent`` the last values, newest first.
 
     ``read_back`` is what the drive last showed (None: never), ``zeros_shown`` whether it showed 0 since we send 0.
+    ``fed_back`` is the same of speed and torque offset.
     """
 
     offset: int = 0
@@ -100,6 +105,8 @@ class AxisState(NamedTuple):
     late_echoes: int = 0
     zero_shown: bool = False
     following_error: float = float("nan")
+    fed_back: Shown = NOT_SHOWN
+    feed_misses: int = 0
 
 
 class State(NamedTuple):

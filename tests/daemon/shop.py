@@ -101,14 +101,14 @@ class Shop:
 
 
 @contextmanager
-def opened(folder: Path) -> Iterator[Shop]:
-    """Start a twin whose tables are heavier than the data sheet says."""
-    (folder / "twin.toml").write_text(f'{BENCH}[bus.can0]\ninterface = "socketcand"\n')
+def opened(folder: Path, bench: str = BENCH) -> Iterator[Shop]:
+    """Start a twin whose tables are heavier than the data sheet says; ``bench`` is the text of its configuration."""
+    (folder / "twin.toml").write_text(f'{bench}[bus.can0]\ninterface = "socketcand"\n')
     with Twin(folder / "twin.toml", folder / "twin.log") as twin:
         bus = twin.ready["buses"]["can0"]
         machine = folder / "machine.toml"
         place = f'channel = "{bus["channel"]}"\nhost = "{bus["host"]}"\nport = {bus["port"]}\n'
-        machine.write_text(f'{BENCH}[bus.can0]\ninterface = "socketcand"\n{place}')
+        machine.write_text(f'{bench}[bus.can0]\ninterface = "socketcand"\n{place}')
         yield Shop(folder, twin, machine, machine_config.load(machine))
 
 

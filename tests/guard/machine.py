@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from fdhil.guard import core
+from fdhil.guard.feedforward import Pair
 from fdhil.guard.frames import Listener
 from fdhil.guard.interlocks import FACTS, Alarm
 from fdhil.guard.limits import Limits
@@ -60,7 +61,10 @@ def settings(axes: Sequence[str] = ("X", "Y"), limits: Limits = LIMITS, **change
 
 @dataclass
 class Drive:
-    """What a drive holds and shows; ``answers`` False: it is silent; ``scale`` 0: it ignores its offset."""
+    """What a drive holds and shows; ``answers`` False: it is silent; ``scale`` 0: it ignores its offset.
+
+    ``fed`` are speed and torque offset in force, in TPDO 1A0 when ``shows_fed``; ``takes_fed``: what it makes of them.
+    """
 
     node_id: int
     statusword: int = ENABLED
@@ -72,6 +76,10 @@ class Drive:
     target: int = 0
     received_target: int = 0
     received_offset: int | None = None
+    fed: Pair = (0, 0)
+    received_fed: Pair | None = None
+    shows_fed: bool = False
+    takes_fed: Callable[[Pair], Pair] = lambda pair: pair
     queue: list[tuple[int, int]] = field(default_factory=list)
 
     def at_sync(self, tick: int) -> list[Frame]:
@@ -79,6 +87,8 @@ class Drive:
         self.target = self.received_target
         if self.received_offset is not None:
             self.offset = round(self.received_offset * self.scale)
+        if self.received_fed is not None:
+            self.fed = self.takes_fed(self.received_fed)
         self.queue = [*self.queue, (self.target, self.offset)][-3:]
         if not self.answers:
             return []
@@ -88,6 +98,8 @@ class Drive:
             (0x180 + n, struct.pack("<ii", followed - self.position_error, 0)),
             (0x280 + n, struct.pack("<Hhh", self.statusword, 0, 0)),
         ]
+        if self.shows_fed:
+            frames.append((0x1A0 + n, struct.pack("<ih", *self.fed)))
         if tick % 10 == 0:
             frames.append((0x380 + n, struct.pack("<ii", followed, self.offset)))
             frames.append((0x480 + n, struct.pack("<Ibh", 0, self.mode, 0)))
@@ -200,6 +212,9 @@ class Bench:
             self.frames.append((self.tick, output.offsets))
             for drive, offset in zip(self.drives, output.offsets, strict=True):
                 drive.received_offset = offset
+        if output.feed is not None:
+            for drive, pair in zip(self.drives, output.feed, strict=True):
+                drive.received_fed = pair
         if output.heartbeat:
             self.heartbeats.append(self.tick)
         if output.transition is not None and output.transition[2] is not None:

@@ -2,14 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.guard.feedforward import SHIFT, Feed, FeedMode, Law, Limits, armed, end, hear, move, parse_law, violates
+from fdhil.guard.feedforward import (
+    SHIFT,
+    Feed,
+    FeedMode,
+    Law,
+    Limits,
+    Pair,
+    armed,
+    end,
+    hear,
+    move,
+    parse_law,
+    violates,
+)
 from fdhil.guard.interlocks import FEEDFORWARD_FACTS, Alarm
 from fdhil.guard.settings import Feedforward, Pdo, Settings, from_json, to_json
 from fdhil.guard.state import Mode, Request
@@ -22,18 +37,27 @@ LIMITS = Limits(speed=40_000, speed_rate=3_000, torque=900, torque_rate=120)
 FACTS = dict.fromkeys(FEEDFORWARD_FACTS, True)
 
 
-def fed_settings() -> Settings:
-    """The bench's settings with an RPDO for both offsets."""
+def fed_settings(shown: bool = False) -> Settings:
+    """The bench's settings with an RPDO for both offsets, ``shown`` with a TPDO for them as well."""
     made = machine.settings()
     layout = ((0x60B1, 0, 32, True), (0x60B2, 0, 16, True))
-    axes = [replace(a, feedforward=Feedforward(Pdo(0x400 + a.node_id, layout), LIMITS)) for a in made.axes]
+    axes = [
+        replace(
+            axis,
+            feedforward=Feedforward(Pdo(0x400 + axis.node_id, layout), LIMITS),
+            tpdos=(*axis.tpdos, Pdo(0x1A0 + axis.node_id, layout)) if shown else axis.tpdos,
+        )
+        for axis in made.axes
+    ]
     return replace(made, axes=tuple(axes))
 
 
-def fed_bench() -> Bench:
+def fed_bench(shown: bool = False) -> Bench:
     """The machine with a moving demand, the guard knowing of no program."""
     bench = machine.bench()
-    return Bench(fed_settings(), None, bench.demand, bench.drives)
+    for drive in bench.drives:
+        drive.shows_fed = shown
+    return Bench(fed_settings(shown), None, bench.demand, bench.drives)
 
 
 def request(**changes: Any) -> Request:
@@ -41,9 +65,9 @@ def request(**changes: Any) -> Request:
     return replace(Request("feedforward", True, "", FACTS, (LAW, LAW)), **changes)
 
 
-def switched_on() -> Bench:
+def switched_on(shown: bool = False) -> Bench:
     """The feed-forward on, faded in, the path running."""
-    bench = fed_bench()
+    bench = fed_bench(shown)
     bench.settle()
     assert bench.sync(request()).refused == ()
     bench.run(120)
@@ -209,3 +233,155 @@ def test_settings_keep_it() -> None:
     assert from_json(to_json(made)) == made
     assert {0x401, 0x402} <= made.sent_ids
     assert len(made.feeds) == 2
+
+
+def mode_of(bench: Bench) -> FeedMode:
+    """Whether the feed-forward acts."""
+    return bench.state.feed.mode
+
+
+def code_of(bench: Bench) -> str | None:
+    """Why the feed-forward went off."""
+    return bench.state.feed.cause and bench.state.feed.cause.code
+
+
+def test_what_the_drives_show_is_what_was_sent() -> None:
+    """Every value comes back a cycle later; frames that were late or did not leave are no mismatch."""
+    bench = switched_on(shown=True)
+    for k in range(200):
+        bench.sync(late=k % 20 == 5)
+    assert any(any(drive.fed) for drive in bench.drives)
+    assert mode_of(bench) is FeedMode.ON
+    assert [axis.feed_misses for axis in bench.state.axes] == [0, 0]
+
+
+@pytest.mark.parametrize(
+    "takes",
+    [
+        lambda pair: (pair[0], 0),
+        lambda pair: (0, pair[1]),
+        lambda pair: (pair[1], pair[0] & 0x7FF),
+        lambda pair: (pair[0], -pair[1]),
+        lambda pair: (pair[0], 10 * pair[1]),
+    ],
+    ids=["no torque", "no speed", "swapped", "sign", "scale"],
+)
+def test_a_drive_that_makes_something_else_of_them_ends_it(takes: Callable[[Pair], Pair]) -> None:
+    """Two readings that are none of the last values sent fade both offsets out, as for a position offset."""
+    bench = switched_on(shown=True)
+    bench.drives[1].takes_fed = takes
+    bench.run(4)
+    assert (bench.state.feed.mode, code_of(bench)) == (FeedMode.ENDING, "EchoMismatch")
+    bench.run(200)
+    assert mode_of(bench) is FeedMode.OFF
+    assert bench.drives[0].fed == (0, 0)
+
+
+def test_one_wrong_reading_is_none() -> None:
+    bench = switched_on(shown=True)
+    bench.drives[0].takes_fed = lambda pair: (pair[0] + 7, pair[1])
+    bench.sync()
+    bench.drives[0].takes_fed = lambda pair: pair
+    bench.run(50)
+    assert mode_of(bench) is FeedMode.ON
+
+
+def test_a_drive_that_keeps_its_torque_is_told() -> None:
+    """Zeros go on for as long as they may help; then the guard gives up and says so, and refuses the next arming."""
+    bench = switched_on(shown=True)
+    bench.drives[0].takes_fed = lambda _pair: (0, 40)
+    bench.run(140)
+    assert mode_of(bench) is FeedMode.ENDING
+    assert bench.outputs[-1].feed == ((0, 0), (0, 0))
+    bench.run(80)
+    assert mode_of(bench) is FeedMode.OFF
+    assert bench.state.feed.cause == Alarm("EchoMismatch", detail="no zero was read back")
+    for wanted in (request(), arm_request()):
+        refused = bench.sync(wanted).refused
+        assert refused is not None
+        assert "StaleOffset" in {alarm.code for alarm in refused}
+    bench.drives[0].takes_fed = lambda pair: pair
+    assert bench.sync(Request("adopt", True)).refused == ()
+    bench.run(20)
+    assert bench.drives[0].fed == (0, 0)
+    assert (bench.mode, bench.state.feed.mode) == (Mode.OFF, FeedMode.OFF)
+
+
+def test_a_drive_that_holds_a_torque_at_start_gets_zeros() -> None:
+    """A guard that comes back finds what another left behind; nothing else is sent."""
+    bench = fed_bench(shown=True)
+    bench.drives[1].fed = (0, -25)
+    bench.settle()
+    assert bench.drives[1].fed == (0, 0)
+    assert {output.feed for output in bench.outputs} == {None, ((0, 0), (0, 0))}
+    assert (bench.mode, bench.state.feed.mode) == (Mode.OFF, FeedMode.OFF)
+    assert bench.sync(request()).refused == ()
+
+
+def test_one_mapped_object_is_enough_to_compare() -> None:
+    """A TPDO with the torque alone: the speed says nothing."""
+    bench = fed_bench(shown=True)
+    layout = ((0x2000, 0, 32, True), (0x60B2, 0, 16, True))
+    axes = [replace(a, tpdos=(*a.tpdos[:-1], Pdo(0x1A0 + a.node_id, layout))) for a in bench.settings.axes]
+    bench = Bench(replace(bench.settings, axes=tuple(axes)), None, bench.demand, bench.drives)
+    bench.settle()
+    assert bench.sync(request()).refused == ()
+    bench.play()
+    bench.run(200)
+    assert mode_of(bench) is FeedMode.ON
+    bench.drives[0].takes_fed = lambda pair: (pair[0], pair[1] + 1)
+    bench.run(4)
+    assert code_of(bench) == "EchoMismatch"
+
+
+def test_a_feed_hold_takes_them_to_zero() -> None:
+    """Targets that stand leave neither speed nor torque: the offsets go to zero within the limits, and stay there."""
+    bench = switched_on()
+    bench.rest = bench.targets()
+    bench.run(60)
+    assert bench.outputs[-1].feed == ((0, 0), (0, 0))
+    sent = [output.feed for output in bench.outputs if output.feed is not None]
+    for before, after in pairwise(sent):
+        assert not any(violates(LIMITS, *way) for way in zip(before, after, strict=True))
+    assert mode_of(bench) is FeedMode.ON
+
+
+@pytest.mark.parametrize("what", ["bus off", "reboot", "not operational"])
+def test_what_stops_the_bus_or_a_drive_zeroes_at_once(what: str) -> None:
+    """No fade: the very next frames are zeros, and nothing follows them."""
+    bench = switched_on()
+    if what == "bus off":
+        bench.listener.error("off")
+    elif what == "reboot":
+        bench.hear(0x701, b"\0")
+    else:
+        bench.hear(0x701, b"\x7f")
+    assert bench.sync().feed == ((0, 0), (0, 0))
+    bench.run(10)
+    assert bench.outputs[-1].feed is None
+    code = {"bus off": "BusOff", "reboot": "NodeRebooted", "not operational": "NmtStateWrong"}[what]
+    assert (bench.state.feed.mode, code_of(bench)) == (FeedMode.OFF, code)
+
+
+def test_beyond_its_limits_it_is_limited_and_counted() -> None:
+    """A demand faster than the largest speed offset: what is sent stays at the limit, and the count says so."""
+    bench = fed_bench()
+    bench.settle()
+    assert bench.sync(request()).refused == ()
+    bench.run(120)
+    assert bench.state.feed.limited == 0
+    bench.play()
+    bench.run(150)
+    assert bench.state.feed.limited > 10
+    sent = [output.feed for output in bench.outputs if output.feed is not None]
+    assert max(abs(pair[0]) for pairs in sent for pair in pairs) == LIMITS.speed
+
+
+def test_a_corrupt_state_sends_zeros() -> None:
+    """Whatever breaks the limits is checked by other formulas than made it: InternalError, zeros, off."""
+    bench = switched_on()
+    broken = bench.state.feed._replace(sent=(((LIMITS.speed + 5_000, 0), (0, 0)), *bench.state.feed.sent[1:]))
+    bench.state = bench.state._replace(feed=broken)
+    assert bench.sync().feed == ((0, 0), (0, 0))
+    bench.run(10)
+    assert (bench.state.feed.mode, code_of(bench)) == (FeedMode.OFF, "InternalError")

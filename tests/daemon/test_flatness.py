@@ -1,0 +1,86 @@
+"""Flatness feed-forward by the real processes: identified from the bus, armed without a program, measured by the twin.
+
+The axes are heavier than their data sheet says, so that only identified parameters help.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil.drivers.commissioning import commission, save_record
+from tests.bench import AXIS, axis_toml
+from tests.daemon.shop import HEAD, SHUTTLE, Shop, fdhil, opened
+from tests.paths import bench_demand
+
+Capture = pytest.CaptureFixture[str]
+pytestmark = pytest.mark.timeout(400)  # four processes, each of which compiles on the very first run
+LIMITS = {"max_torque_nm": 100.0, "max_speed_rad_s": 30.0}
+CASES = {"bench": (1.0, 3.0), "lag": (0.5, 50.0)}
+"""The drive's own speed feed-forward, and by how much the largest tracking error has to shrink."""
+
+
+def bench_of(speed_feedforward: float) -> str:
+    """The configuration of both axes with [axis.X.feedforward]."""
+    regulators = {**AXIS["regulators"], "speed_feedforward": speed_feedforward}
+    axis = axis_toml("X", regulators=regulators, feedforward=LIMITS) + "[sim.axis.X]\nJt = 0.085\n"
+    return HEAD + axis + axis.replace(".X", ".Y")
+
+
+@pytest.fixture(params=list(CASES))
+def case(request: pytest.FixtureRequest) -> str:
+    """The bench, and its variant that lags."""
+    return str(request.param)
+
+
+@pytest.fixture
+def shop(tmp_path: Path, case: str) -> Iterator[Shop]:
+    """The twin, commissioned: the RPDO of speed and torque offset is made valid and read back."""
+    with opened(tmp_path, bench_of(CASES[case][0])) as shop:
+        for axis in shop.config.axis:
+            save_record(commission(shop.config, axis), shop.config.store.directory)
+        yield shop
+
+
+def test_an_identified_machine_follows_without_a_program(shop: Shop, case: str, capsys: Capture) -> None:
+    with shop.guard() as guard, shop.daemon() as daemon:
+        code, _, err = fdhil("arm", shop.path, "--method", "flatness", capsys=capsys)
+        assert (code, "refused: ModelNotValidated" in err) == (1, True), err
+        shop.nc_on()
+        shop.play("shuttle.ngc", SHUTTLE)
+        shop.status_when(lambda s: all(s["axes"][a]["accepted"] >= 4 for a in "XY"))
+        before = largest_error_um(shop, "before")
+        code, out, err = fdhil("arm", shop.path, "--method", "flatness", "--json", capsys=capsys)
+        assert code == 0, (out, err)
+        assert json.loads(out)["state"] == "FEEDFORWARD"
+        shop.status_when(lambda s: s["state"] == "FEEDFORWARD")
+        after = largest_error_um(shop, "after")
+        assert before / after >= CASES[case][1], (before, after)
+        assert fdhil("disarm", shop.path, capsys=capsys)[0] == 0
+        told = shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
+        assert feed_of(told)["applied"] == {"X": [0, 0], "Y": [0, 0]}
+        again = largest_error_um(shop, "again")
+        assert again == pytest.approx(before, rel=0.1)
+        assert daemon.stop() == 0
+        assert guard.stop() == 0
+
+
+def feed_of(status: dict[str, Any]) -> dict[str, Any]:
+    """What the guard says of the feed-forward."""
+    return dict(status["guard"]["feedforward"])
+
+
+def largest_error_um(shop: Shop, name: str) -> float:
+    """Let the NC play the bench's path; return the largest tracking error of both axes, by the twin's own trace."""
+    demand, trace = shop.folder / "path.csv", shop.folder / f"{name}.csv"
+    path = bench_demand(10)
+    lines = [f"{k * 0.001:.3f},{x:.9f},{y:.9f}" for k, (x, y) in enumerate(path)]
+    demand.write_text("time_s,X_mm,Y_mm\n" + "\n".join(lines) + "\n", "utf-8")
+    shop.twin.play(demand, trace=trace)
+    data = np.genfromtxt(trace, delimiter=",", names=True)[: len(path)]
+    return 1e3 * float(max(np.abs(data[f"{axis}_table_mm"] - data[f"{axis}_reference_mm"]).max() for axis in "XY"))
