@@ -17,7 +17,7 @@ from fdhil.cia402 import Mode, NmtCommand, Object, State
 from fdhil.config import CorrectionLimits, MachineConfig
 from fdhil.drivers import commissioning_checks as checks
 from fdhil.drivers.canopen_sdo import NO_OBJECT, NO_SUB_INDEX
-from fdhil.drivers.commissioning_feeding import open_feedforward
+from fdhil.drivers.commissioning_feeding import feedforward_open, prove_feedforward
 from fdhil.drivers.commissioning_master import Master
 from fdhil.drivers.commissioning_record import (
     CommissioningRecord,
@@ -353,21 +353,22 @@ def commission(
     with Master(config, axis) as master:
         report("listen")
         checks.listen(master)
-        feeding = open_feedforward(master)
-        report("compare")
-        found = check_axis(master)
-        report("enable")
-        checks.require_alone(master)
-        with rolled_back(master):
-            prepare(master)
-            enable(master)
-            report("sign test")
-            moved_um = sign_test(master)
-            report("feed-forward test")
-            in_feedforward = tell_feedforward(master)
-            report("watchdog test")
-            watchdog = watchdog_test(master)
-            report("restore")
+        with feedforward_open(master) as feeding:
+            report("compare")
+            found = check_axis(master)
+            report("enable")
+            checks.require_alone(master)
+            with rolled_back(master):
+                prepare(master)
+                prove_feedforward(master)
+                enable(master)
+                report("sign test")
+                moved_um = sign_test(master)
+                report("feed-forward test")
+                in_feedforward = tell_feedforward(master)
+                report("watchdog test")
+                watchdog = watchdog_test(master)
+                report("restore")
     return CommissioningRecord(
         axis=axis,
         **asdict(found.identity),

@@ -54,6 +54,7 @@ class Master:
         self.target: int | None = None
         self.offset = 0
         self.heartbeat = False
+        self.fed: tuple[int, int] | None = None
         self._plan: deque[int] = deque()
         self._sync_counter = 0
         self._sync_overflow: int | None = None
@@ -96,10 +97,12 @@ class Master:
         with self._lock:
             if self._plan:
                 self.offset = self._plan.popleft()
-            target, offset, controlword = self.target, self.offset, self.controlword
+            target, offset, controlword, fed = self.target, self.offset, self.controlword, self.fed
         if target is None:
             return
         values = {self.profile.target: target, self.profile.offset: offset, (0x6040, 0): controlword}
+        if fed is not None:
+            values |= zip((self.profile.speed_offset, self.profile.torque_offset), fed, strict=True)
         for spec in self.profile.rpdos:
             if spec.valid and all((e.index, e.sub) in values for e in spec.entries):
                 data = cia402.pack(spec.entries, [values[e.index, e.sub] for e in spec.entries])

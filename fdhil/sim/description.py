@@ -10,7 +10,8 @@ from fdhil.sim.objects import VOLTAGE_V_PER_COUNT, Ratings
 if TYPE_CHECKING:
     from fdhil.sim.drive import Drive
 
-SYNC_BITS = 47
+OFFSETS = frozenset({0x60B000, 0x60B100, 0x60B200})
+"""Mapped objects of which a position offset or a speed and torque offset are sent, never both."""
 
 
 def units(ratings: Ratings) -> dict[int, tuple[str, float]]:
@@ -64,13 +65,19 @@ def frame_bits(data_bytes: int, *, stuffed: bool = False) -> int:
 def bus_load(drive: Drive, sync_rate_hz: float, bitrate: int = 1_000_000, *, stuffed: bool = False) -> float:
     """Return the share of the bus that the drive's PDOs and heartbeat take at this SYNC rate, without the SYNC itself.
 
-    Event-driven PDOs count as one per SYNC.
+    Event-driven PDOs count as one per SYNC. Of the RPDOs that carry offsets alone only the largest counts: a correction
+    sends either a position offset or speed and torque offsets.
     """
-    bits_per_s = 0.0
+    bits_per_s, corrections = 0.0, [0.0]
     for direction in ("rpdo", "tpdo"):
         for pdo in drive.pdo.configured(direction):
             every = pdo.kind if direction == "tpdo" and 1 <= pdo.kind <= 240 else 1
-            bits_per_s += frame_bits(pdo.codec.size, stuffed=stuffed) * sync_rate_hz / every
+            load = frame_bits(pdo.codec.size, stuffed=stuffed) * sync_rate_hz / every
+            if direction == "rpdo" and pdo.keys and OFFSETS.issuperset(pdo.keys):
+                corrections.append(load)
+            else:
+                bits_per_s += load
+    bits_per_s += max(corrections)
     heartbeat_ms = drive.dictionary.number(0x1017)
     if heartbeat_ms:
         bits_per_s += frame_bits(1, stuffed=stuffed) * 1e3 / heartbeat_ms

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from types import TracebackType
+from typing import Self
 
 import can
 import numpy as np
@@ -29,13 +30,17 @@ class DrivePeer:
             self._send(self.drive.wall_clock(time.monotonic()))
             if message is not None:
                 self.heard.append(message.arbitration_id)
-                self._send(self.drive.receive(message.arbitration_id, bytes(message.data)))
+                self._send(self.take(message.arbitration_id, bytes(message.data)))
+
+    def take(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
+        """Give one frame to the drive and return what it says to that."""
+        return self.drive.receive(can_id, data)
 
     def _send(self, frames: list[tuple[int, bytes]]) -> None:
         for can_id, data in frames:
             self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
 
-    def __enter__(self) -> DrivePeer:
+    def __enter__(self) -> Self:
         self._send(self.drive.power_on())  # before the thread runs: what a test spoils then stays spoilt
         self._thread.start()
         return self

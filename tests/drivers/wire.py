@@ -21,7 +21,7 @@ def machine(
 ) -> MachineConfig:
     """Return the bench's config with these axes; ``drive``, ``voltage`` apply to every axis, others are sections."""
     per_axis: dict[str, object] = {
-        key: sections.pop(key) for key in ("drive", "voltage", "correction") if key in sections
+        key: sections.pop(key) for key in ("drive", "voltage", "correction", "feedforward") if key in sections
     }
     axis = bench_axis(corrected=False, **per_axis)
     document = {

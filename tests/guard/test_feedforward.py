@@ -242,7 +242,8 @@ def mode_of(bench: Bench) -> FeedMode:
 
 def code_of(bench: Bench) -> str | None:
     """Why the feed-forward went off."""
-    return bench.state.feed.cause and bench.state.feed.cause.code
+    cause = bench.state.feed.cause
+    return None if cause is None else cause.code
 
 
 def test_what_the_drives_show_is_what_was_sent() -> None:

@@ -279,3 +279,16 @@ def test_the_default_mapping_of_two_axes_fits_the_bus() -> None:
     load = sum(bus_load(drive, 1000) for drive in drives) + frame_bits(1) * 1000 / 1e6
     assert 0.8 < load < 0.9
     assert bus_load(drives[0], 1000, stuffed=True) == pytest.approx(0.487, abs=0.01)
+
+
+def test_a_position_offset_and_a_feed_forward_never_load_the_bus_together() -> None:
+    """With the RPDO of speed and torque made valid the larger of both corrections counts: 6 bytes instead of 4."""
+    drive = Rig(machine("X")).drive
+    alone, alone_worst = bus_load(drive, 1000), bus_load(drive, 1000, stuffed=True)
+    drive.set_object(0x1402, 1, 0x401)
+    assert len(list(drive.pdo.configured("rpdo"))) == 3
+    assert bus_load(drive, 1000) - alone == pytest.approx((frame_bits(6) - frame_bits(4)) * 1e-3)
+    worst = (frame_bits(6, stuffed=True) - frame_bits(4, stuffed=True)) * 1e-3
+    assert bus_load(drive, 1000, stuffed=True) - alone_worst == pytest.approx(worst)
+    drive.set_object(0x1401, 1, 0x80000301)
+    assert bus_load(drive, 1000) - alone == pytest.approx((frame_bits(6) - frame_bits(4)) * 1e-3)
