@@ -66,8 +66,19 @@ def test_an_identified_machine_follows_without_a_program(shop: Shop, case: str, 
         assert feed_of(told)["applied"] == {"X": [0, 0], "Y": [0, 0]}
         again = largest_error_um(shop, "again")
         assert again == pytest.approx(before, rel=0.1)
+        fades_out_on_an_emergency(shop, capsys)
         assert daemon.stop() == 0
         assert guard.stop() == 0
+
+
+def fades_out_on_an_emergency(shop: Shop, capsys: Capture) -> None:
+    """A drive's emergency ends it by itself, with its class; nothing is armed again."""
+    assert fdhil("arm", shop.path, "--method", "flatness", capsys=capsys)[0] == 0
+    shop.status_when(lambda s: s["state"] == "FEEDFORWARD")
+    shop.twin.command("fault", fault="frame", can_id=0x081, data="1043080000000000")
+    told = shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
+    assert feed_of(told)["cause"]["code"] == "DriveEmergency"
+    assert feed_of(told)["applied"] == {"X": [0, 0], "Y": [0, 0]}
 
 
 def feed_of(status: dict[str, Any]) -> dict[str, Any]:
