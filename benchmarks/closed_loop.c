@@ -1,4 +1,4 @@
-/* The closed-loop kernel of fdhil/model/kernels.py, line by line, for comparison under -O3. */
+/* The closed-loop kernel of fdhil/model/kernels.py, line by line but step by step, for comparison under -O3. */
 #include <math.h>
 #include <stddef.h>
 
@@ -17,17 +17,16 @@ void p_pi_pi(const double *reference, long n, long first, long rows, const doubl
         double r1 = reference[k + 1 < last ? k + 1 : last];
         double r2 = reference[k + 2 < last ? k + 2 : last];
         double rise = r1 - r0, slope = rise / period, bend = (r2 - r1) / period - slope;
-        double peak_current = 0.0, peak_voltage = 0.0;
         long limited = 0;
-        double *o = out + 9 * row;
-        o[3] = i; o[4] = w; o[5] = x; o[6] = speed_integral; o[7] = current_integral; o[8] = demand_a;
+        double *o = out + row;
+        o[rows] = i; o[2 * rows] = w; o[3 * rows] = x;
+        o[4 * rows] = speed_integral; o[5 * rows] = current_integral; o[6 * rows] = demand_a;
         for (long m = 0; m < n_speed; m++) {
             double part = (double)m / (double)n_speed;
             double demand = kv * (r0 + rise * part - x) + kff * (slope + bend * part);
             double error = demand - w;
             double candidate = speed_integral + speed_ki * error;
             double raw = speed_kp * error + candidate;
-            peak_current = high(peak_current, fabs(raw));
             demand_a = low(high(raw, -current_max), current_max);
             int current_limited = demand_a != raw;
             if (!current_limited) speed_integral = candidate;
@@ -36,7 +35,6 @@ void p_pi_pi(const double *reference, long n, long first, long rows, const doubl
                 candidate = current_integral + current_ki * error;
                 raw = current_kp * error + candidate;
                 double u = low(high(raw, -voltage_max), voltage_max);
-                peak_voltage = high(peak_voltage, fabs(raw));
                 if (u == raw) {
                     current_integral = candidate;
                     if (current_limited) limited++;
@@ -56,7 +54,7 @@ void p_pi_pi(const double *reference, long n, long first, long rows, const doubl
                 }
             }
         }
-        o[0] = (double)limited; o[1] = peak_current; o[2] = peak_voltage;
+        o[0] = (double)limited;
     }
     state[0] = i; state[1] = w; state[2] = x; state[3] = speed_integral; state[4] = current_integral; state[5] = demand_a;
 }

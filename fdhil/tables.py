@@ -21,9 +21,9 @@ CORRECTIONS: Mapping[str, str] = {
     "inverse": "fdhil.correction.inverse:plan",
 }
 REGULATORS: Mapping[str, str] = {
-    "p_pi_pi": "fdhil.model.p_pi_pi:simulate",
-    "double_pi": "fdhil.model.double_pi:simulate",
-    "pid": "fdhil.model.pid:simulate",
+    "p_pi_pi": "fdhil.model.p_pi_pi:prepare",
+    "double_pi": "fdhil.model.double_pi:prepare",
+    "pid": "fdhil.model.pid:prepare",
 }
 VOLTAGE_SOURCES: Mapping[str, str] = {
     "drive": "fdhil.drivers.cia402_drive:VoltageObject",

@@ -175,9 +175,8 @@ def _gated(
     around = np.column_stack([values[low:high] for values in path.values()])
     errors = []
     for which in ("before_mm", "after_mm"):
-        actual = around.copy()
-        actual[kept - low : kept - low + rows] = np.column_stack([getattr(p, which) for p in result.values()])
-        errors.append(contour_error_um(around, actual, config.machine.sync_period_s)[kept - low : kept - low + rows])
+        actual = np.column_stack([getattr(p, which) for p in result.values()])
+        errors.append(contour_error_um(around, actual, config.machine.sync_period_s, kept - low))
     refused = [
         Reason(reason.code, f"axis {axis}: {reason.text}", reason.advice)
         for axis, piece in result.items()

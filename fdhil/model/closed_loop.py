@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -23,25 +24,23 @@ from fdhil.records import Float, Parameters
 
 State = npt.NDArray[np.float64]
 
-_EMPTY = np.empty(0)
+_EMPTY: Float = np.empty(0)
 
 
-@dataclass(frozen=True, slots=True)
-class Commands:
+class Commands(NamedTuple):
     """What an axis is told, (n,) each: reference in mm (its offset included), speed and torque offsets or empty."""
 
     reference_mm: Float
-    speed_offset_rad_s: Float
-    torque_offset_nm: Float
+    speed_offset_rad_s: Float = _EMPTY
+    torque_offset_nm: Float = _EMPTY
 
 
 @dataclass(frozen=True, slots=True)
 class Response:
     """What the axis does, (n,) each, at the SYNC instants t_0 .. t_{n-1}.
 
-    ``limited`` is the share of the cycle from that instant on in which the current or voltage limit acts;
-    ``peak_current_a`` and ``peak_voltage_v`` are the largest demands in that cycle before the limits. ``states`` (k, n)
-    is the whole state at those instants, and ``end`` (STATES,) that after the last cycle: another run may
+    ``limited`` is the share of the cycle from that instant on in which the current or voltage limit acts. ``states``
+    (k, n) is the whole state at those instants, and ``end`` (STATES,) that after the last cycle: another run may
     continue from any of them.
     """
 
@@ -49,16 +48,13 @@ class Response:
     speed_rad_s: Float
     current_a: Float
     limited: Float
-    peak_current_a: Float
-    peak_voltage_v: Float
     limited_s: float
     states: Float
     end: State
 
     @staticmethod
-    def from_rows(rows: Float, steps: int, sync_period_s: float, end: State) -> Response:
-        """Take apart what a kernel recorded, (n, 3 + k); ``steps`` current-loop steps make a cycle."""
-        columns = np.ascontiguousarray(rows.T)
+    def from_columns(columns: Float, steps: int, sync_period_s: float, end: State) -> Response:
+        """Take apart what a kernel recorded, (1 + k, n); ``steps`` current-loop steps make a cycle."""
         limited = columns[kernels.ROW_LIMITED] / steps
         states = columns[kernels.ROW_STATE :]
         return Response(
@@ -66,8 +62,6 @@ class Response:
             speed_rad_s=states[kernels.SPEED],
             current_a=states[kernels.CURRENT],
             limited=limited,
-            peak_current_a=columns[kernels.ROW_PEAK_CURRENT],
-            peak_voltage_v=columns[kernels.ROW_PEAK_VOLTAGE],
             limited_s=float(limited.sum() * sync_period_s),
             states=states,
             end=end,
@@ -111,15 +105,24 @@ def simulate(
     if state is None:
         # at rest on the reference, not on the offset reference: an offset at row 0 is a step
         state = start(float(reference_mm[0]))
-    count = commanded.size - first if rows is None else rows
-    return _structure(axis.regulators.structure)(parameters, axis, sync_period_s, commands, state, first, count)
+    return prepare(parameters, axis, sync_period_s).run(commands, state, first, rows)
+
+
+class Ready(Protocol):
+    """A drive of some structure that may be run again and again."""
+
+    def run(self, commands: Commands, state: State, first: int = 0, rows: int | None = None) -> Response:
+        """Run ``rows`` SYNC cycles (left out: all) from row ``first`` on, as :func:`simulate` does, unchecked."""
+
+
+def prepare(parameters: Parameters, axis: Axis, sync_period_s: float) -> Ready:
+    """Return the drive of an axis ready to be run, for those who run it often."""
+    return _structure(axis.regulators.structure)(parameters, axis, sync_period_s)
 
 
 @lru_cache(maxsize=16)
-def _structure(name: str) -> Callable[[Parameters, Axis, float, Commands, State, int, int], Response]:
-    structure: Callable[[Parameters, Axis, float, Commands, State, int, int], Response] = tables.load(
-        tables.REGULATORS, name
-    )
+def _structure(name: str) -> Callable[[Parameters, Axis, float], Ready]:
+    structure: Callable[[Parameters, Axis, float], Ready] = tables.load(tables.REGULATORS, name)
     return structure
 
 

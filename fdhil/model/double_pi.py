@@ -10,4 +10,4 @@ from functools import partial
 
 from fdhil.model import kernels, loops
 
-simulate = partial(loops.run, kernels.CASCADE, kernels.SET_POINT_BEFORE)
+prepare = partial(loops.prepare, kernels.CASCADE, kernels.SET_POINT_BEFORE)

@@ -18,14 +18,18 @@ CURRENT, SPEED, POSITION, SPEED_INTEGRAL, CURRENT_INTEGRAL, CURRENT_DEMAND = ran
 POSITION_INTEGRAL, SET_POINT_BEFORE, POSITION_BEFORE, FILTERED, WAITING = 6, 7, 8, 9, 15
 MOST_WAITING = 4
 STATES = WAITING + MOST_WAITING
-# what a run records at each SYNC instant: the share of the cycle's steps with a limit acting, the peaks, the state
-ROW_LIMITED, ROW_PEAK_CURRENT, ROW_PEAK_VOLTAGE, ROW_STATE = range(4)
+# what a run records at each SYNC instant: how many of the cycle's steps have a limit acting, the state
+ROW_LIMITED, ROW_STATE = range(2)
 # places in the gains, see fdhil.model.loops.gains
 KV, KFF, SPEED_KP, SPEED_KI, CURRENT_MAX, CURRENT_KP, CURRENT_KI, VOLTAGE_MAX, PERIOD, HALF_STEP_MM = range(10)
 POSITION_KI, ACCELERATION, DECAY, RAD_PER_MM, SPEED_CYCLES_PER_S = range(10, 15)
 GAINS = 15
 # the laws from set-point to current demand
 CASCADE, PID = range(2)
+# rows of the leap, see fdhil.model.leap: what a whole speed cycle does to a table that moves or is held, and its bounds
+LEAP_CURRENT, LEAP_SPEED, LEAP_INTEGRAL, LEAP_WAY, LEAP_TURN, LEAP_VOLTAGE = range(6)
+HELD_CURRENT, HELD_INTEGRAL, HELD_BREAK, HELD_VOLTAGE, LEAP_RESISTANCE = range(6, 11)
+LEAP_ROWS, LEAP_COLUMNS = 11, 5
 
 
 def _cascade_plain(place: float, rate: float, state: Float, gains: Float) -> tuple[float, float, float]:
@@ -68,8 +72,8 @@ def _filter_plain(place: float, rate: float, bend: float, order: int, decay: flo
 
 def _current_cycles_plain(
     demand_a: float, limited: bool, plant: Float, gains: Float, n_current: int, delay: int, state: Float
-) -> tuple[int, float]:
-    """Run the current loop and the plant for one speed cycle: return the steps with a limit acting, the peak voltage.
+) -> int:
+    """Run the current loop and the plant for one speed cycle, step by step: return the steps with a limit acting.
 
     ``limited``: the current demand is at its limit. The voltage acts ``delay`` steps after it was computed.
     """
@@ -79,13 +83,11 @@ def _current_cycles_plain(
     kp, ki, voltage_max, half_step_mm = gains[CURRENT_KP], gains[CURRENT_KI], gains[VOLTAGE_MAX], gains[HALF_STEP_MM]
     i, w, x, integral = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL]
     steps = 0
-    peak = 0.0
     for _ in range(n_current):
         error = demand_a - i
         candidate = integral + ki * error
         raw = kp * error + candidate
         u = min(max(raw, -voltage_max), voltage_max)
-        peak = max(peak, abs(raw))
         if u == raw:
             integral = candidate
             if limited:
@@ -113,13 +115,13 @@ def _current_cycles_plain(
             i = phi_ii * i + phi_iw * w + i_u * u + i_t * friction
             w = w_next
     state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL] = i, w, x, integral
-    return steps, peak
+    return steps
 
 
 _cascade: Callable[..., tuple[float, float, float]] = njit(cache=True, nogil=True)(_cascade_plain)
 _pid: Callable[..., tuple[float, float, float]] = njit(cache=True, nogil=True)(_pid_plain)
 _filter: Callable[..., None] = njit(cache=True, nogil=True)(_filter_plain)
-_current_cycles: Callable[..., tuple[int, float]] = njit(cache=True, nogil=True)(_current_cycles_plain)
+_current_cycles: Callable[..., int] = njit(cache=True, nogil=True)(_current_cycles_plain)
 
 
 def _between_plain(values: Float, k: int, part: float) -> float:
@@ -132,6 +134,131 @@ def _between_plain(values: Float, k: int, part: float) -> float:
 _between: Callable[[Float, int, float], float] = njit(cache=True, nogil=True)(_between_plain)
 
 
+def _may_move_plain(i: float, w: float, integral: float, demand_a: float, plant: Float, leap: Float) -> float:
+    """Return the largest voltage that a moving table may be asked for in a speed cycle; inf where it may turn."""
+    net = abs(i - plant[15] / plant[14] if w > 0.0 else i + plant[15] / plant[14])
+    e, q, ai, aw = abs(demand_a - i), abs(integral - leap[LEAP_RESISTANCE, 0] * i - plant[14] * w), abs(i), abs(w)
+    turn = leap[LEAP_TURN, 0] * net + leap[LEAP_TURN, 1] * aw + leap[LEAP_TURN, 2] * e + leap[LEAP_TURN, 3] * q
+    if plant[15] > 0.0 and not aw > turn + leap[LEAP_TURN, 4]:
+        return float(np.inf)
+    peak = leap[LEAP_VOLTAGE, 0] * ai + leap[LEAP_VOLTAGE, 1] * aw + leap[LEAP_VOLTAGE, 2] * e
+    return float(peak + leap[LEAP_VOLTAGE, 3] * q + leap[LEAP_VOLTAGE, 4])
+
+
+def _may_hold_plain(i: float, integral: float, demand_a: float, plant: Float, leap: Float) -> float:
+    """Return the largest voltage that a table held by dry friction may be asked for; inf where it may break loose."""
+    ai, e, q = abs(i), abs(demand_a - i), abs(integral - leap[LEAP_RESISTANCE, 0] * i)
+    if not plant[14] * (ai + leap[HELD_BREAK, 2] * e + leap[HELD_BREAK, 3] * q) <= plant[15]:
+        return float(np.inf)
+    return float(leap[HELD_VOLTAGE, 0] * ai + leap[HELD_VOLTAGE, 2] * e + leap[HELD_VOLTAGE, 3] * q)
+
+
+def _mapped_plain(leap: Float, row: int, i: float, w: float, integral: float, demand_a: float, side: float) -> float:
+    """Return what a row of the leap makes of a state."""
+    moved = leap[row, 0] * i + leap[row, 1] * w + leap[row, 2] * integral
+    return float(moved + leap[row, 3] * demand_a + leap[row, 4] * side)
+
+
+_may_move: Callable[..., float] = njit(cache=True, nogil=True, inline="always")(_may_move_plain)
+_may_hold: Callable[..., float] = njit(cache=True, nogil=True, inline="always")(_may_hold_plain)
+_mapped: Callable[..., float] = njit(cache=True, nogil=True, inline="always")(_mapped_plain)
+
+
+def _leapable_plain(
+    i: float, w: float, integral: float, demand_a: float, plant: Float, leap: Float
+) -> tuple[float, float]:
+    """Return the largest voltage of a speed cycle, inf where it is not linear, and the side: 0 for a held table."""
+    if w == 0.0 and plant[15] > 0.0:
+        return _may_hold(i, integral, demand_a, plant, leap), 0.0
+    return _may_move(i, w, integral, demand_a, plant, leap), 1.0 if w > 0.0 else -1.0
+
+
+def _leapt_plain(
+    i: float, w: float, integral: float, demand_a: float, side: float, leap: Float
+) -> tuple[float, float, float]:
+    """Return current, speed and integral of the current loop after a speed cycle."""
+    if side == 0.0:
+        return (
+            _mapped(leap, HELD_CURRENT, i, w, integral, demand_a, side),
+            0.0,
+            _mapped(leap, HELD_INTEGRAL, i, w, integral, demand_a, side),
+        )
+    return (
+        _mapped(leap, LEAP_CURRENT, i, w, integral, demand_a, side),
+        _mapped(leap, LEAP_SPEED, i, w, integral, demand_a, side),
+        _mapped(leap, LEAP_INTEGRAL, i, w, integral, demand_a, side),
+    )
+
+
+_leapable: Callable[..., tuple[float, float]] = njit(cache=True, nogil=True, inline="always")(_leapable_plain)
+_leapt: Callable[..., tuple[float, float, float]] = njit(cache=True, nogil=True, inline="always")(_leapt_plain)
+
+
+def _run_leaping_plain(
+    reference: Float,
+    first: int,
+    plant: Float,
+    leap: Float,
+    gains: Float,
+    shape: tuple[int, int, int, int, int, int],
+    state: Float,
+    out: Float,
+) -> None:
+    """Run a cascade without filter and delay as :func:`run` does, each speed cycle in one leap where it is linear.
+
+    ``out`` (1 + kept, rows) is written. All that a cycle changes is in plain variables: memory would take most of it.
+    """
+    kept, n_speed, n_current, last = shape[1], shape[2], shape[3], reference.size - 1
+    kv, kff, speed_kp, speed_ki, position_ki = (
+        gains[KV],
+        gains[KFF],
+        gains[SPEED_KP],
+        gains[SPEED_KI],
+        gains[POSITION_KI],
+    )
+    period, current_max, voltage_max = gains[PERIOD], gains[CURRENT_MAX], gains[VOLTAGE_MAX]
+    i, w, x, demand_a = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_DEMAND]
+    speeds, currents, places = state[SPEED_INTEGRAL], state[CURRENT_INTEGRAL], state[POSITION_INTEGRAL]
+    for row in range(out.shape[1]):
+        k = first + row
+        r0, r1, r2 = reference[min(k, last)], reference[min(k + 1, last)], reference[min(k + 2, last)]
+        slope = (r1 - r0) / period
+        bend = (r2 - r1) / period - slope
+        forward = gains[ACCELERATION] * (bend / period)
+        out[ROW_STATE + CURRENT, row], out[ROW_STATE + SPEED, row], out[ROW_STATE + POSITION, row] = i, w, x
+        out[ROW_STATE + SPEED_INTEGRAL, row], out[ROW_STATE + CURRENT_INTEGRAL, row] = speeds, currents
+        out[ROW_STATE + CURRENT_DEMAND, row] = demand_a
+        if kept > POSITION_INTEGRAL:
+            out[ROW_STATE + POSITION_INTEGRAL, row] = places
+        limited = 0
+        for m in range(n_speed):
+            part = m / n_speed
+            lag = r0 + (r1 - r0) * part - x
+            place = places + position_ki * lag
+            error = kv * lag + place + kff * (slope + bend * part) - w
+            candidate = speeds + speed_ki * error
+            raw = speed_kp * error + candidate + forward
+            demand_a = min(max(raw, -current_max), current_max)
+            if demand_a == raw:
+                speeds, places = candidate, place
+            may, side = _leapable(i, w, currents, demand_a, plant, leap)
+            if may <= voltage_max:
+                limited += n_current if demand_a != raw else 0
+                if side != 0.0:
+                    x += _mapped(leap, LEAP_WAY, i, w, currents, demand_a, side)
+                i, w, currents = _leapt(i, w, currents, demand_a, side, leap)
+            else:
+                state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL] = i, w, x, currents
+                limited += _current_cycles(demand_a, demand_a != raw, plant, gains, n_current, 0, state)
+                i, w, x, currents = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL]
+        out[ROW_LIMITED, row] = limited
+    state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_DEMAND] = i, w, x, demand_a
+    state[SPEED_INTEGRAL], state[CURRENT_INTEGRAL], state[POSITION_INTEGRAL] = speeds, currents, places
+
+
+_run_leaping: Callable[..., None] = njit(cache=True, nogil=True)(_run_leaping_plain)
+
+
 def _run_plain(
     reference: Float,
     speed_offset: Float,
@@ -139,20 +266,24 @@ def _run_plain(
     first: int,
     rows: int,
     plant: Float,
+    leap: Float,
     gains: Float,
     shape: tuple[int, int, int, int, int, int],
     state: Float,
 ) -> Float:
-    """Run SYNC cycles ``first`` .. ``first + rows - 1``; return (rows, 3 + kept) as seen at the start of each cycle.
+    """Run SYNC cycles ``first`` .. ``first + rows - 1``; return (1 + kept, rows) as seen at the start of each cycle.
 
     ``reference`` (n,) mm is held beyond its end; ``speed_offset`` rad/s and ``current_offset`` A are (n,) or empty.
-    ``plant`` (16,) and ``gains`` (GAINS,): see :mod:`fdhil.model.loops`. ``shape``: law, states kept of each row, speed
-    cycles per SYNC cycle, current cycles per speed cycle, order of the set-point filter, current cycles of delay.
-    ``state`` (STATES,) is written.
+    ``plant`` (16,), ``leap`` (LEAP_ROWS, LEAP_COLUMNS) or empty, and ``gains`` (GAINS,): see :mod:`fdhil.model.loops`.
+    ``shape``: law, states kept of each row, speed cycles per SYNC cycle, current cycles per speed cycle, order of the
+    set-point filter, current cycles of delay. ``state`` (STATES,) is written.
     """
     law, kept, n_speed, n_current, order, delay = shape
     last = reference.size - 1
-    out = np.empty((rows, ROW_STATE + kept))
+    out = np.empty((ROW_STATE + kept, rows))
+    if law == CASCADE and order + delay + leap.size + speed_offset.size + current_offset.size == leap.size > 0:
+        _run_leaping(reference, first, plant, leap, gains, shape, state, out)
+        return out
     kff, period, current_max = gains[KFF], gains[PERIOD], gains[CURRENT_MAX]
     for row in range(rows):
         k = first + row
@@ -160,9 +291,9 @@ def _run_plain(
         rise = r1 - r0
         slope = rise / period
         bend = (r2 - r1) / period - slope
-        peak_current, peak_voltage, limited = 0.0, 0.0, 0
+        limited = 0
         for n in range(kept):
-            out[row, ROW_STATE + n] = state[n]
+            out[ROW_STATE + n, row] = state[n]
         for m in range(n_speed):
             part = m / n_speed
             place, rate, acceleration = r0 + rise * part, slope + bend * part, bend / period
@@ -178,19 +309,12 @@ def _run_plain(
             raw += gains[ACCELERATION] * acceleration
             if current_offset.size > 0:
                 raw += _between(current_offset, k, part)
-            peak_current = max(peak_current, abs(raw))
             demand_a = min(max(raw, -current_max), current_max)
             if demand_a == raw:  # all integrals stand while the limit acts
                 state[SPEED_INTEGRAL], state[POSITION_INTEGRAL] = speed_integral, position_integral
             state[CURRENT_DEMAND] = demand_a
-            steps, peak = _current_cycles(demand_a, demand_a != raw, plant, gains, n_current, delay, state)
-            limited += steps
-            peak_voltage = max(peak_voltage, peak)
-        out[row, ROW_LIMITED], out[row, ROW_PEAK_CURRENT], out[row, ROW_PEAK_VOLTAGE] = (
-            limited,
-            peak_current,
-            peak_voltage,
-        )
+            limited += _current_cycles(demand_a, demand_a != raw, plant, gains, n_current, delay, state)
+        out[ROW_LIMITED, row] = limited
     return out
 
 

@@ -1,4 +1,4 @@
-"""What every regulator structure shares: the plant's exact step, the gains as the kernel takes them, one run.
+"""What every regulator structure shares: the plant's exact step, the kernel's gains, a drive ready to run.
 
 Each PI integrates first: candidate = integral + ki h e, output = clip(kp e + candidate); where the clip acts, the old
 integral is kept. Three options go with every structure: acceleration fed forward as current, a filter on the
@@ -8,6 +8,7 @@ set-point (with the speed and acceleration that are fed forward), and a delay of
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -15,6 +16,7 @@ import numpy as np
 from fdhil.config import Axis
 from fdhil.model import kernels
 from fdhil.model.closed_loop import Commands, Response, State
+from fdhil.model.leap import leap
 from fdhil.records import Float, Parameters
 
 
@@ -78,18 +80,39 @@ def gains(axis: Axis, sync_period_s: float) -> Float:
     return values
 
 
-def run(
-    law: int,
-    places: int,
-    parameters: Parameters,
-    axis: Axis,
-    sync_period_s: float,
-    commands: Commands,
-    state: State,
-    first: int,
-    rows: int,
-) -> Response:
-    """Run ``rows`` SYNC cycles from row ``first`` on with a law of the kernel that uses ``places`` of the state."""
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """One axis ready to be run: what its kernel takes, found once."""
+
+    plant: Float
+    leap: Float
+    gains: Float
+    shape: tuple[int, int, int, int, int, int]
+    sync_period_s: float
+    nominal_k: float
+
+    def run(self, commands: Commands, state: State, first: int = 0, rows: int | None = None) -> Response:
+        """Run ``rows`` SYNC cycles (left out: all) from row ``first`` on; ``state`` (STATES,) is not written."""
+        end = state.copy()
+        torque = commands.torque_offset_nm
+        out = kernels.run(
+            commands.reference_mm,
+            commands.speed_offset_rad_s,
+            torque / self.nominal_k if torque.size else torque,
+            first,
+            commands.reference_mm.size - first if rows is None else rows,
+            self.plant,
+            self.leap,
+            self.gains,
+            self.shape,
+            end,
+        )
+        _, _, n_speed, n_current, _, _ = self.shape
+        return Response.from_columns(out, n_speed * n_current, self.sync_period_s, end)
+
+
+def prepare(law: int, places: int, parameters: Parameters, axis: Axis, sync_period_s: float) -> Drive:
+    """Make an axis ready, with a law of the kernel that uses ``places`` of the state."""
     g = axis.regulators
     n_speed = round(sync_period_s / g.speed_period_s)
     n_current = round(g.speed_period_s / g.current_period_s)
@@ -98,16 +121,12 @@ def run(
         places = kernels.WAITING
     if g.current_delay_cycles:
         places = kernels.WAITING + g.current_delay_cycles
-    end = np.array(state, dtype=np.float64)
-    out = kernels.run(
-        commands.reference_mm,
-        commands.speed_offset_rad_s,
-        commands.torque_offset_nm / axis.nominal.K,
-        first,
-        rows,
-        plant_step(parameters, axis.screw_pitch_mm, g.current_period_s),
-        gains(axis, sync_period_s),
+    plant, values = plant_step(parameters, axis.screw_pitch_mm, g.current_period_s), gains(axis, sync_period_s)
+    return Drive(
+        plant,
+        leap(plant, values[kernels.CURRENT_KP], values[kernels.CURRENT_KI], n_current),
+        values,
         (law, places, n_speed, n_current, order, g.current_delay_cycles),
-        end,
+        sync_period_s,
+        axis.nominal.K,
     )
-    return Response.from_rows(out, n_speed * n_current, sync_period_s, end)

@@ -6,4 +6,4 @@ from functools import partial
 
 from fdhil.model import kernels, loops
 
-simulate = partial(loops.run, kernels.CASCADE, kernels.POSITION_INTEGRAL)
+prepare = partial(loops.prepare, kernels.CASCADE, kernels.POSITION_INTEGRAL)

@@ -14,4 +14,4 @@ from functools import partial
 
 from fdhil.model import kernels, loops
 
-simulate = partial(loops.run, kernels.PID, kernels.FILTERED)
+prepare = partial(loops.prepare, kernels.PID, kernels.FILTERED)

@@ -10,13 +10,17 @@ from fdhil.records import Float
 WINDOW_S = 0.4
 
 
-def contour_error_um(reference_mm: Float, actual_mm: Float, dt_s: float) -> Float:
+def contour_error_um(reference_mm: Float, actual_mm: Float, dt_s: float, first: int | None = None) -> Float:
     """Return (n,) >= 0, the distance of each actual point (n, d) to the polyline of the reference (n, d) within 0.4 s.
 
-    ValueError when the two differ in shape.
+    With ``first`` the actual rows (m, d) belong to the rows of the reference from there on. ValueError when the two do
+    not fit each other.
     """
     reference = np.ascontiguousarray(reference_mm, dtype=np.float64)
     actual = np.ascontiguousarray(actual_mm, dtype=np.float64)
-    if reference.shape != actual.shape or reference.ndim != 2:
+    fits = actual.shape == reference.shape
+    if first is not None and actual.ndim == 2:
+        fits = actual.shape[1:] == reference.shape[1:] and 0 <= first <= len(reference) - len(actual)
+    if not fits or reference.ndim != 2:
         raise ValueError(f"reference {reference.shape} and actual path {actual.shape} must both be (n, d)")
-    return kernels.contour(reference, actual, round(WINDOW_S / dt_s)) * 1e3
+    return kernels.contour(reference, actual, round(WINDOW_S / dt_s), first or 0) * 1e3

@@ -29,11 +29,53 @@ def _segment_plain(path: Float, j: int, point: Float) -> float:
 _segment: Callable[[Float, int, Float], float] = njit(cache=True, nogil=True)(_segment_plain)
 
 
-def _contour_plain(path: Float, actual: Float, half_window: int) -> Float:
-    """Return (n,) the distance of each row of ``actual`` (n, d) to the polyline of ``path`` rows within the window.
+def _beyond_plain(arc: Float, reach: float, low: int, high: int) -> int:
+    """Return the first row above ``low`` at which ``arc`` (n,) exceeds ``reach``, high + 1 if none; it never falls."""
+    if low >= high or arc[high] <= reach:
+        return high + 1
+    step = 1
+    at = low + 1
+    while at < high and arc[at] <= reach:  # gallop, then halve
+        low = at
+        step *= 2
+        at = min(low + step, high)
+    while at - low > 1:
+        middle = (low + at) // 2
+        if arc[middle] <= reach:
+            low = middle
+        else:
+            at = middle
+    return at
 
-    A stretch of the path is passed over only where its length proves that no point of it can be nearer than the best
-    one found, so the result is that of the full search.
+
+def _before_plain(arc: Float, reach: float, low: int, high: int) -> int:
+    """Return the last row below ``high`` at which ``arc`` (n,) is less than ``reach``; low - 1 if none."""
+    if high <= low or arc[low] >= reach:
+        return low - 1
+    step = 1
+    at = high - 1
+    while at > low and arc[at] >= reach:
+        high = at
+        step *= 2
+        at = max(high - step, low)
+    while high - at > 1:
+        middle = (at + high) // 2
+        if arc[middle] >= reach:
+            high = middle
+        else:
+            at = middle
+    return at
+
+
+_beyond: Callable[[Float, float, int, int], int] = njit(cache=True, nogil=True)(_beyond_plain)
+_before: Callable[[Float, float, int, int], int] = njit(cache=True, nogil=True)(_before_plain)
+
+
+def _contour_plain(path: Float, actual: Float, half_window: int, first: int) -> Float:
+    """Return (m,) the distance of each row of ``actual`` (m, d) to the polyline of ``path`` (n, d) within the window.
+
+    Row k of ``actual`` belongs to row ``first`` + k. A stretch of the path is passed over only where its length proves
+    that no point of it can be nearer than the best one found, so the result is that of the full search.
     """
     n, d = path.shape
     arc = np.zeros(n)
@@ -42,9 +84,10 @@ def _contour_plain(path: Float, actual: Float, half_window: int) -> Float:
         for a in range(d):
             square += (path[k, a] - path[k - 1, a]) ** 2
         arc[k] = arc[k - 1] + np.sqrt(square)
-    out = np.empty(n)
-    for k in range(n):
-        point = actual[k]
+    out = np.empty(len(actual))
+    for row in range(len(actual)):
+        k = first + row
+        point = actual[row]
         low = max(0, k - half_window)
         high = min(n - 1, k + half_window)
         here = 0.0
@@ -55,20 +98,15 @@ def _contour_plain(path: Float, actual: Float, half_window: int) -> Float:
         while j < high:
             distance = _segment(path, j, point)
             best = min(best, distance)
-            reach = arc[j] + distance - best
-            j += 1
-            while j < high and arc[j + 1] < reach:
-                j += 1
+            # on to the segment that holds the first point of the path that may be nearer
+            j = _beyond(arc, arc[j] + (distance - best), j + 1, high) - 1
         j = k - 1
         while j >= low:
             distance = _segment(path, j, point)
             best = min(best, distance)
-            reach = arc[j + 1] - (distance - best)
-            j -= 1
-            while j >= low and arc[j] > reach:
-                j -= 1
-        out[k] = best
+            j = _before(arc, arc[j + 1] - (distance - best), low, j)
+        out[row] = best
     return out
 
 
-contour: Callable[[Float, Float, int], Float] = njit(cache=True, nogil=True)(_contour_plain)
+contour: Callable[[Float, Float, int, int], Float] = njit(cache=True, nogil=True)(_contour_plain)

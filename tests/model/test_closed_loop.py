@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from fdhil.model import closed_loop
+from fdhil.config import parse
+from fdhil.model import closed_loop, loops
 from fdhil.records import Float, Parameters
-from tests.bench import bench_config
+from tests.bench import bench_config, bench_document
 from tests.model.slow_drive import SlowDrive
 from tests.paths import smooth
 
@@ -88,6 +91,32 @@ def test_axes_in_threads_give_the_same_bits() -> None:
     for axis, demand in demands.items():
         alone = closed_loop.simulate(models[axis], config.axis[axis], PERIOD, demand)
         assert np.array_equal(both[axis].position_mm, alone.position_mm)
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("structure", ["p_pi_pi", "double_pi"])
+def test_leaps_give_what_steps_give(structure: str, seed: int) -> None:
+    """Speed cycles taken at once are those taken step by step: moving, held, turning, clipped, frictionless."""
+    random = np.random.default_rng(seed)
+    demand = random_demand(seed) + (np.arange(450) > 300) * random.choice([0.0, 3.0])  # a jump clips
+    document = bench_document("X")
+    document["axis"]["X"]["regulators"] |= {
+        "structure": structure,
+        "position_ki_per_s2": 200.0 * (structure == "double_pi"),
+    }
+    axis = parse(document).axis["X"]
+    model = replace(NOMINAL, Cd=0.0 if seed == 7 else NOMINAL.Cd, Jt=NOMINAL.Jt * random.uniform(0.7, 1.4))
+    drive = closed_loop.prepare(model, axis, PERIOD)
+    assert isinstance(drive, loops.Drive)
+    stepping = replace(drive, leap=np.empty((0, drive.leap.shape[1])))
+    commands = closed_loop.Commands(demand)
+    one, other = (d.run(commands, closed_loop.start(demand[0])) for d in (drive, stepping))
+    # without friction the first step from rest counts as held when it is taken alone
+    apart = 1.0 if model.Cd else 100.0
+    assert np.abs(one.position_mm - other.position_mm).max() < 1e-9 * apart
+    assert np.abs(one.current_a - other.current_a).max() < 1e-6 * apart
+    assert np.array_equal(one.limited, other.limited)
+    assert np.allclose(one.end, other.end, atol=1e-6 * apart)
 
 
 @pytest.mark.parametrize("demand", [[], [0.0, np.nan], [[0.0, 1.0]], [0.0, np.inf]])

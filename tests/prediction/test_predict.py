@@ -104,10 +104,20 @@ def test_contour_error_is_that_of_the_full_search(seed: int, d: int, noise: floa
     )
 
 
-def test_contour_error_wants_equal_shapes() -> None:
-    """Different numbers of rows cannot be compared."""
+def test_contour_error_of_some_rows_is_theirs_among_all() -> None:
+    """Asked for rows 40 to 69 alone, the path before and behind them counts as before."""
+    random = np.random.default_rng(3)
+    reference = np.cumsum(random.normal(0, 1, (120, 2)), axis=0)
+    actual = reference + random.normal(0, 1, (120, 2))
+    whole = contour_error_um(reference, actual, 0.02)
+    assert np.array_equal(contour_error_um(reference, actual[40:70], 0.02, 40), whole[40:70])
+
+
+@pytest.mark.parametrize("first", [None, -1, 2])
+def test_contour_error_wants_shapes_that_fit(first: int | None) -> None:
+    """Different numbers of rows cannot be compared, nor rows beyond the path."""
     with pytest.raises(ValueError, match="must both be"):
-        contour_error_um(np.zeros((3, 2)), np.zeros((4, 2)), 0.001)
+        contour_error_um(np.zeros((4, 2)), np.zeros((3, 2)), 0.001, first)
 
 
 def test_skill_of_a_perfect_model_is_perfect_and_finds_a_delay() -> None:

@@ -1,0 +1,91 @@
+"""One whole speed cycle of the current loop and the plant at once.
+
+While the current demand is constant, no voltage is clipped and the table neither turns nor breaks loose, the steps of
+the current loop are one linear map. The kernel takes it where bounds on what happens in between prove that it may; all
+else goes step by step.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from fdhil.model import kernels
+from fdhil.records import Float
+
+_I, _W, _J, _D, _S, _X = range(6)  # current, speed, integral, demand, friction's side, way
+
+
+@lru_cache(maxsize=64)
+def _leap(plant: tuple[float, ...], kp: float, ki: float, steps: int) -> Float:
+    torque_constant, dry = plant[14], plant[15]
+    resistance = (1.0 - plant[12]) / plant[13]
+    moving = _one_step(np.array(plant[:12]), kp, ki, dry)
+    still = np.array([plant[12], *([0.0] * 5), plant[13], *([0.0] * 5)])
+    held = _one_step(still, kp, ki, 0.0)
+    held[_W] = held[_X] = 0.0  # nothing turns
+    out = np.zeros((kernels.LEAP_ROWS, kernels.LEAP_COLUMNS))
+    through, whole = _courses(moving, steps)
+    out[kernels.LEAP_CURRENT : kernels.LEAP_WAY + 1] = whole[[_I, _W, _J, _X], :5]
+    turned = through[:, _W, :5] - np.eye(6)[_W, :5]
+    turned[:, _S] += (turned[:, _I] + turned[:, _D] + resistance * turned[:, _J]) * (dry / torque_constant)
+    out[kernels.LEAP_TURN] = _bound(turned[1:], resistance, torque_constant)
+    voltages = _voltages(through[:-1], kp, ki)
+    out[kernels.LEAP_VOLTAGE] = _bound(voltages, resistance, torque_constant)
+    through, whole = _courses(held, steps)
+    out[kernels.HELD_CURRENT : kernels.HELD_INTEGRAL + 1] = whole[[_I, _J], :5]
+    changed = through[:-1, _I, :5] - np.eye(6)[_I, :5]
+    out[kernels.HELD_BREAK] = _bound(changed, resistance, torque_constant)
+    out[kernels.HELD_VOLTAGE] = _bound(_voltages(through[:-1], kp, ki), resistance, torque_constant)
+    out[kernels.LEAP_RESISTANCE, 0] = resistance
+    out.setflags(write=False)
+    return out
+
+
+def leap(plant: Float, kp: float, ki: float, steps: int) -> Float:
+    """Return the kernel's (LEAP_ROWS, LEAP_COLUMNS) for ``steps`` current-loop steps of gains ``kp`` V/A, ``ki`` V/A.
+
+    ``plant`` (16,) is the exact step of :func:`fdhil.model.loops.plant_step`. Maps act on current, speed, integral,
+    demand and the side of the friction; bounds on |current|, |speed|, |demand - current|, |integral - R i - K w|, 1. Of
+    the bound on the speed's change the first is on the current less what the dry friction takes.
+    """
+    return _leap(tuple(plant.tolist()), kp, ki, steps)
+
+
+def _one_step(plant: Float, kp: float, ki: float, dry: float) -> Float:
+    """Return (6, 6) one step of [i, w, integral, demand, side, way]."""
+    step = np.eye(6)
+    integral = np.array([-ki, 0.0, 1.0, ki, 0.0, 0.0])
+    voltage = integral + np.array([-kp, 0.0, 0.0, kp, 0.0, 0.0])
+    own = {_I: (plant[0], plant[1]), _W: (plant[2], plant[3]), _X: (plant[4], plant[5])}
+    for row, on_u, on_t in ((_I, plant[6], plant[9]), (_W, plant[7], plant[10]), (_X, plant[8], plant[11])):
+        step[row] = on_u * voltage
+        step[row, [_I, _W]] += own[row]
+        step[row, _S] -= on_t * dry
+    step[_X, _X] = 1.0
+    step[_J] = integral
+    return step
+
+
+def _courses(step: Float, steps: int) -> tuple[Float, Float]:
+    """Return the powers 0 .. ``steps`` of a step (steps + 1, 6, 6), and the last."""
+    powers = [np.eye(6)]
+    for _ in range(steps):
+        powers.append(step @ powers[-1])
+    return np.array(powers), powers[-1]
+
+
+def _voltages(through: Float, kp: float, ki: float) -> Float:
+    """Return (k, 5) the voltage asked for at each step."""
+    error = through[:, _D, :5] - through[:, _I, :5]
+    return np.asarray(through[:, _J, :5] + (kp + ki) * error)
+
+
+def _bound(rows: Float, resistance: float, torque_constant: float) -> Float:
+    """Return (5,) the largest of each coefficient, with demand and integral told by how far they are from steady."""
+    i, w, integral, demand, side = rows.T
+    apart = np.column_stack(
+        [i + demand + resistance * integral, w + torque_constant * integral, demand, integral, side]
+    )
+    return np.asarray(np.abs(apart).max(axis=0, initial=0.0))
