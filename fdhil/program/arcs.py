@@ -17,6 +17,7 @@ _MIN_RADIUS_MM = 1e-6
 _SPIRAL_SMALL = {1.0: math.sqrt(8.0) * 0.01, MM_PER_INCH: math.sqrt(8.0) * 0.001 * MM_PER_INCH}  # mm, by the units
 _SPIRAL_LARGE = 100.0  # times the small one
 _SPIRAL_RELATIVE = 0.001
+_CHORD_ERROR_MM = 0.001
 _CHORD_RELATIVE = 0.001  # by how much half the chord may exceed the radius of an R arc
 
 
@@ -39,11 +40,36 @@ def arc(machine: Machine, block: Block) -> None:
         _check_radii(block, modal, centre, end, first, second)
     turns = _turns(block)
     turns = -turns if clockwise else turns
+    axes = (first, second, normal)
+    angle, length = _extent(modal.position, end, centre, turns, axes)
+    feed = feed_mm_min(modal, block, length)
     if modal.rotation_deg and normal != 2:
-        what = "an arc outside the XY plane cannot follow a system that is turned about Z"
-        raise ProgramError(block.line, f"G{modal.motion / 10:g}", what)
-    angle, length = _extent(modal.position, end, centre, turns, (first, second, normal))
-    machine.arc_to(block, end, centre, turns, feed_mm_min(modal, block, length), angle)
+        _tilted(machine, block, end, centre, angle, axes, feed)
+    else:
+        machine.arc_to(block, end, centre, turns, feed, angle)
+
+
+def _tilted(
+    machine: Machine, block: Block, end: list[float], centre: tuple[float, float], angle: float,
+    axes: tuple[int, int, int], feed: float,
+) -> None:  # fmt: skip
+    """Order an arc whose plane is turned about Z with its system: chords, since it lies in none of the planes."""
+    first, second, _ = axes
+    if machine.compensation is not None:
+        what = "an arc outside the XY plane of a turned system cannot be compensated; end compensation by G40 first"
+        raise ProgramError(block.line, f"G{machine.modal.motion / 10:g}", what)
+    begin = list(machine.modal.position)
+    radii = [math.hypot(p[first] - centre[0], p[second] - centre[1]) for p in (begin, end)]
+    from_rad = math.atan2(begin[second] - centre[1], begin[first] - centre[0])
+    step = 2.0 * math.acos(max(0.0, 1.0 - _CHORD_ERROR_MM / max(radii)))
+    chords = min(math.ceil(abs(angle) / step), machine.budget.max_motions_per_block)
+    for number in range(1, chords):
+        share = number / chords
+        place = [a + (b - a) * share for a, b in zip(begin, end, strict=True)]
+        radius, turned = radii[0] + (radii[1] - radii[0]) * share, from_rad + angle * share
+        place[first], place[second] = centre[0] + radius * math.cos(turned), centre[1] + radius * math.sin(turned)
+        machine.feed_at(block, place, feed)
+    machine.feed_at(block, end, feed)
 
 
 def _turns(block: Block) -> int:

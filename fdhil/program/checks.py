@@ -58,8 +58,10 @@ def check_machine_words(block: Block) -> None:
 
 
 def _check_signal(block: Block, code: int) -> None:
-    """M62 to M65 name an output by P, M67 and M68 by E; M66 an input by one of them."""
+    """M62 to M65 name an output by P (LinuxCNC takes any), M67 and M68 by E; M66 an input by one of them."""
     words = block.words
+    if code in (62, 63, 64, 65) and "p" in words:
+        return
     wanted = {67: "e", 68: "e"}.get(code, "p")
     given = [letter for letter in ("pe" if code == 66 else wanted) if words.get(letter, -1.0) >= 0.0]
     if len(given) != 1:

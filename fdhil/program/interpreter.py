@@ -13,11 +13,10 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from fdhil.errors import ProgramError
-from fdhil.program import arcs, canned, curves, lathe, modes, nurbs, offsets, roughing, targets
+from fdhil.program import arcs, canned, curves, lathe, modes, nurbs, offsets, probing, roughing, targets
 from fdhil.program.budget import Budget
 from fdhil.program.checks import CYCLES, check_machine_words, check_readers, one_reader_of_axes
 from fdhil.program.commands import Command
-from fdhil.program.compensation import Compensation
 from fdhil.program.flow import Flow
 from fdhil.program.machine import Machine
 from fdhil.program.modal import INDEX, NO_MOTION, Modal
@@ -34,9 +33,6 @@ _SIMPLE = re.compile(
     re.IGNORECASE,
 )
 _STOPS = (2, 30)
-_PROBES = (382, 383, 384, 385)
-_MIN_PROBE_MM = 0.254
-_PROBED_FIRST, _PROBE_HIT = 5061, 5070
 
 
 def interpret(
@@ -80,20 +76,14 @@ class Interpreter:
 
     def run(self) -> Iterator[Motion]:
         """Yield the motions until the program ends."""
-        flow, machine = self._flow, self._machine
+        machine = self._machine
         try:
             while not self._ended:
-                raw = flow.source.next()
-                if raw is None:
-                    flow.at_end()
+                found = self._next_line()
+                if found is None:
                     self._check_end()
                     break
-                line = flow.source.line
-                self._count(line)
-                if flow.skipping:
-                    self._variables.line = line
-                    flow.skip_over(raw, line)
-                    continue
+                raw, line = found
                 motion = self._simple(raw, line)
                 if motion is not None:
                     self._idle = 0
@@ -107,18 +97,33 @@ class Interpreter:
             machine.end_compensation()
             yield from machine.out
         finally:
-            flow.close()
+            self._flow.close()
 
-    def _count(self, line: int) -> None:
+    def _next_line(self) -> tuple[str, int] | None:
+        """Return the next line to execute and its number, None after the last one; what is skipped is counted too."""
+        flow = self._flow
+        while True:
+            raw = flow.source.next()
+            if raw is None:
+                flow.at_end()
+                return None
+            line = flow.source.line
+            self._count(raw, line)
+            if not flow.skipping:
+                return raw, line
+            self._variables.line = line
+            flow.skip_over(raw, line)
+
+    def _count(self, raw: str, line: int) -> None:
         self._blocks += 1
         if self._blocks > self._budget.max_blocks:
             what = f"more than {self._budget.max_blocks} blocks were executed; is a loop endless?"
-            raise ProgramError(line, "", what)
+            raise ProgramError(line, raw.strip()[:24], what)
         if self._flow.repeats:
             self._idle += 1
             if self._idle > self._budget.max_idle_blocks:
                 what = f"{self._idle} blocks were executed without a motion; is a loop endless?"
-                raise ProgramError(line, "", what)
+                raise ProgramError(line, raw.strip()[:24], what)
 
     def _simple(self, raw: str, line: int) -> Motion | None:
         """Execute a block of G0, G1, X, Y, Z, F alone; None leaves it to the long way."""
@@ -265,35 +270,11 @@ class Interpreter:
     def _coordinates(self, block: Block) -> None:
         modal, g = self._machine.modal, block.g
         if "cutter compensation" in g:
-            self._compensate(block, g["cutter compensation"])
+            modes.compensate(self._machine, block, self._tool)
         if "tool length" in g:
             offsets.set_tool_length(modal, block)
         if "co-ordinate system" in g:
             offsets.select_system(modal, self._variables, offsets.SYSTEMS[g["co-ordinate system"]])
-
-    def _compensate(self, block: Block, code: int) -> None:
-        """G40 turns cutter compensation off, G41 (left) and G42 (right) on; the .1 forms have the diameter as D."""
-        machine, modal = self._machine, self._machine.modal
-        modal.compensation = code
-        if code == 400:
-            machine.end_compensation()
-            return
-        if machine.compensation is not None:
-            raise ProgramError(block.line, f"G{code / 10:g}", "compensation is on already; end it by G40 first")
-        diameter = block.words.get("d")
-        if modal.plane >= 2:
-            what = f"does not work in the {modal.plane_name} plane; use G17 or G18"
-            raise ProgramError(block.line, f"G{code / 10:g}", what)
-        if code % 10 == 0:
-            if diameter or self._tool:
-                what = "fdhil has no tool table, so the radius is not known; give the diameter by G41.1 or G42.1 D"
-                raise ProgramError(block.line, f"G{code / 10:g}", what)
-            diameter = 0.0
-        if diameter is None:
-            raise ProgramError(block.line, f"G{code / 10:g}", "wants the tool's diameter as D")
-        radius = diameter / 2.0 * modal.scale
-        side = (1 if code in (410, 411) else -1) * (1 if radius >= 0.0 else -1)
-        machine.start_compensation(Compensation(abs(radius), side, _orientation(modal, block)))
 
     def _set(self, block: Block) -> bool:
         """Do a one-shot code; True when one was done that uses the axis words."""
@@ -336,8 +317,8 @@ class Interpreter:
             arcs.arc(machine, block)
         elif code in CYCLES:
             canned.cycle(machine, block, self._series, before != code)
-        elif code in _PROBES:
-            self._probe(block)
+        elif code in probing.CODES:
+            probing.probe(machine, self._variables, block)
         elif code in (330, 331):
             lathe.synchronised(machine, block)
         elif code == 760:
@@ -364,16 +345,10 @@ class Interpreter:
         contour = roughing.Drawn(modal, before, start)
         depth = flow.depth
         while flow.depth >= depth:
-            raw = flow.source.next()
-            if raw is None:
-                flow.at_end()
+            found = self._next_line()
+            if found is None:
                 break
-            line = flow.source.line
-            self._count(line)
-            if flow.skipping:
-                self._variables.line = line
-                flow.skip_over(raw, line)
-                continue
+            raw, line = found
             drawn = self._fetch(raw, line)
             if drawn is not None:
                 contour.add(drawn)
@@ -382,34 +357,10 @@ class Interpreter:
         roughing.work(self._machine, block, contour, start)
         modal.motion = contour.motion
 
-    def _probe(self, block: Block) -> None:
-        """G38.2 to G38.5: not listed; the probe is taken to reach its target without a touch, as in the reference."""
-        modal = self._machine.modal
-        code = f"G{modal.motion / 10:g}"
-        if modal.feed_mode == 930 or modal.feed_mm_min <= 0.0:
-            raise ProgramError(block.line, code, "wants a feed rate per minute; give F")
-        end = targets.target(modal, block)
-        if not targets.axis_words(block):
-            raise ProgramError(block.line, code, "wants the axis words of its target")
-        if targets.straight_length(modal.position, end) < _MIN_PROBE_MM:
-            raise ProgramError(block.line, code, "starts too near to its target to probe")
-        self._machine.stand_at(block, end)
-        for axis, value in enumerate(end):
-            self._variables.store(_PROBED_FIRST + axis, value / (modal.scale if axis not in (3, 4, 5) else 1.0))
-        self._variables.store(_PROBE_HIT, 0.0)
-
 
 def unknown(block: Block, code: int) -> ProgramError:
     """Return the error for a G code (times ten) that fdhil does not know."""
     return ProgramError(block.line, f"G{code / 10:g}", "is a G code that fdhil does not know; see the list of codes")
-
-
-def _orientation(modal: Modal, block: Block) -> int:
-    """Return L of G41.1 and G42.1: where the tip of a turning tool lies about the centre of its nose."""
-    value = block.words.get("l", 0.0)
-    if value < 0.0 or abs(value - round(value)) > 1e-4 or (value and modal.plane != 1):
-        raise block.fault("l", "is no orientation of a turning tool; L must be 0 to 9, in the XZ plane (G18)")
-    return round(value)
 
 
 def _axis_letter(block: Block) -> str | None:

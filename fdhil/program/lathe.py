@@ -31,7 +31,7 @@ def synchronised(machine: Machine, block: Block) -> None:
 
 
 def _synchronous_feed(modal: Modal, block: Block, pitch_mm: float) -> float:
-    if modal.spindle_turns == 0 or modal.spindle_rpm <= 0.0:
+    if modal.spindle_turns == 0:
         code = f"G{modal.motion / 10:g}"
         raise ProgramError(block.line, code, "wants a turning spindle; give S and M3 or M4 first")
     return pitch_mm * modal.spindle_rpm

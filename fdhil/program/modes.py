@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from fdhil.errors import ProgramError
-from fdhil.program import arcs, roughing
+from fdhil.program import arcs, nurbs, roughing
+from fdhil.program.compensation import Compensation
 from fdhil.program.machine import Machine
 from fdhil.program.modal import MM_PER_INCH, NO_MOTION, PLANE_CODES, Modal
 from fdhil.program.words import Block
@@ -34,6 +35,7 @@ def set_spindle(modal: Modal, block: Block) -> None:
         modal.spindle_turns = {3: 1, 4: -1}.get(block.m["spindle"], 0)
 
 
+_NO_DWELL = -1.0
 _OVERRIDES = {50: "feed_override", 51: "speed_override", 52: "adaptive_feed", 53: "feed_hold"}
 
 
@@ -50,10 +52,11 @@ def set_switches(modal: Modal, block: Block) -> None:
 
 
 def dwell(machine: Machine, block: Block) -> None:
-    seconds = block.words.get("p")
-    if seconds is None or seconds < 0.0:
+    """G4: LinuxCNC takes P-1 for a P that is missing, and lets any other negative dwell end at once."""
+    seconds = block.words.get("p", _NO_DWELL)
+    if seconds == _NO_DWELL:
         raise ProgramError(block.line, "G4", "a dwell wants its seconds as P, not negative")
-    machine.dwell(block, seconds)
+    machine.dwell(block, max(0.0, seconds))
 
 
 def set_units(modal: Modal, block: Block) -> None:
@@ -81,7 +84,7 @@ def set_distance(modal: Modal, block: Block) -> None:
 
 
 _GROUPS_REFUSED = ("co-ordinate system", "tool length", "machine co-ordinates", "path control")
-_ORIGINS = (280, 281, 300, 301, 520, 920, 921, 922, 923)
+_ORIGINS = (280, 281, 300, 301, 520, 920, 923)
 
 
 def check_compensated(modal: Modal, block: Block) -> None:
@@ -99,7 +102,43 @@ def check_compensated(modal: Modal, block: Block) -> None:
     if m.get("tool") == 6:
         refused.append("M6")
     motion = g.get("motion", modal.motion)
-    if motion not in (0, 10, *arcs.CODES, roughing.FINISH, NO_MOTION):
+    if motion not in (0, 10, *arcs.CODES, nurbs.BEGIN, roughing.FINISH, NO_MOTION):
         refused.append(f"G{motion / 10:g}")
     if refused:
         raise ProgramError(block.line, refused[0], "cannot be used with cutter compensation on; end it by G40 first")
+
+
+def compensate(machine: Machine, block: Block, tool: bool) -> None:
+    """G40 turns cutter compensation off, G41 (left) and G42 (right) on; the .1 forms have the diameter as D.
+
+    ``tool`` tells whether a tool was changed in, whose radius fdhil, without a tool table, does not know.
+    """
+    modal, code = machine.modal, block.g["cutter compensation"]
+    modal.compensation = code
+    if code == 400:
+        machine.end_compensation()
+        return
+    if machine.compensation is not None:
+        raise ProgramError(block.line, f"G{code / 10:g}", "compensation is on already; end it by G40 first")
+    diameter = block.words.get("d")
+    if modal.plane >= 2:
+        what = f"does not work in the {modal.plane_name} plane; use G17 or G18"
+        raise ProgramError(block.line, f"G{code / 10:g}", what)
+    if code % 10 == 0:
+        if diameter or tool:
+            what = "fdhil has no tool table, so the radius is not known; give the diameter by G41.1 or G42.1 D"
+            raise ProgramError(block.line, f"G{code / 10:g}", what)
+        diameter = 0.0
+    if diameter is None:
+        raise ProgramError(block.line, f"G{code / 10:g}", "wants the tool's diameter as D")
+    radius = diameter / 2.0 * modal.scale
+    side = (1 if code in (410, 411) else -1) * (1 if radius >= 0.0 else -1)
+    machine.start_compensation(Compensation(abs(radius), side, _orientation(modal, block)))
+
+
+def _orientation(modal: Modal, block: Block) -> int:
+    """Return L of G41.1 and G42.1: where the tip of a turning tool lies about the centre of its nose."""
+    value = block.words.get("l", 0.0)
+    if value < 0.0 or abs(value - round(value)) > 1e-4 or (value and modal.plane != 1):
+        raise block.fault("l", "is no orientation of a turning tool; L must be 0 to 9, in the XZ plane (G18)")
+    return round(value)

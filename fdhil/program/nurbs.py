@@ -37,8 +37,6 @@ class Nurbs:
         modal, words = machine.modal, block.words
         if modal.plane != 0:
             raise ProgramError(block.line, "G5.2", "works in the XY plane; give G17 first")
-        if machine.compensation is not None:
-            raise ProgramError(block.line, "G5.2", "cannot be used with cutter compensation on")
         axes = axis_words(block)
         feed_mm_min(modal, block, 0.0)
         weight = words.get("p", None if self.points else 1.0)
@@ -75,9 +73,10 @@ class Nurbs:
 
 def _order(block: Block) -> int:
     value = block.words.get("l", float(_USUAL_ORDER))
-    if abs(value - round(value)) > 1e-4 or not 2 <= value <= 20:
+    if abs(value - round(value)) > 1e-4 or not 1 <= value <= 20:
         raise block.fault("l", "is no order of a curve; L must be a whole number from 2 to 20")
-    return round(value)
+    order = round(value)
+    return order if order > 1 else _USUAL_ORDER  # as LinuxCNC does
 
 
 def _chords(points: list[tuple[float, float, float]], order: int) -> Iterator[Point]:

@@ -203,7 +203,7 @@ def _add_g(block: Block, value: float) -> None:
     group = G_GROUPS.get(code) if abs(value * 10.0 - code) < 1e-3 else None
     if group is None:
         raise ProgramError(block.line, f"G{value:g}", "is a G code that fdhil does not know; see the list of codes")
-    if group in block.g:
+    if group in block.g and group != "cycle end":
         other = f"G{block.g[group] / 10:g}"
         raise ProgramError(block.line, f"G{value:g}", f"contradicts {other} in the same block; keep one of them")
     block.g[group] = code

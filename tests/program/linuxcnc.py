@@ -17,8 +17,10 @@ from pathlib import Path
 from fdhil.program import Arc, Dwell, Feed, Motion, Rapid
 from fdhil.program.motions import PLANE_AXES
 
+CASES = Path(__file__).parent / "differential.txt"
 RS274 = shutil.which("rs274")
-_CALL = re.compile(r"^\s*\d+\s+N\S+\s+([A-Z0-9_]+)\((.*)\)\s*$")
+# a line number of nine digits fills its column, so that the call follows without a blank
+_CALL = re.compile(r"^\s*\d+\s+N(?:\.+\s+|\s*\d+\s*)([A-Z0-9_]+)\((.*)\)\s*$")
 
 
 @dataclass
@@ -60,7 +62,7 @@ class _Canon:
 
     def tap(self, values: list[float]) -> None:
         self.motions.append(Feed(0, self.machine(values[:3]), self.mm_min()))
-        self.motions.append(Feed(0, self.machine(self.at), self.mm_min()))
+        self.motions.append(Feed(0, self.machine(self.at), math.nan))  # the speed of the way back (I) is not told
 
     def arc(self, values: list[float]) -> None:
         first, second, normal = PLANE_AXES[self.plane]
@@ -84,7 +86,7 @@ class _Canon:
         elif name == "STRAIGHT_PROBE":
             self.at = numbers()[:3]
         elif name == "DWELL":
-            self.motions.append(Dwell(0, float(text)))
+            self.motions.append(Dwell(0, max(0.0, float(text))))  # a negative one ends at once
         elif name == "USE_LENGTH_UNITS":
             self.units(25.4 if "INCHES" in text else 1.0)
         elif name == "SET_G5X_OFFSET":
@@ -129,6 +131,20 @@ def ask(program: Path, limit_s: float = 20.0) -> Answer:
     return Answer(canon.motions, "\n".join(told) if done.returncode else "")
 
 
+def cases() -> list[tuple[str, str]]:
+    """Return the written programs, and why they differ ("" where they must not)."""
+    found, why = [], ""
+    for line in CASES.read_text("utf-8").splitlines():
+        if line.startswith("~"):
+            why = line[1:].strip()
+        elif line and line != "#" and not line.startswith("# "):
+            text = line.replace("|", "\n")
+            ends = "M2" in text.upper() or "M30" in text.upper() or "%" in text
+            found.append((text + ("\n" if ends else "\nM2\n"), why))
+            why = ""
+    return found
+
+
 def difference(ours: list[Motion], theirs: list[Motion], tolerance_mm: float = 3e-4) -> str:
     """Say where two lists of motions first differ, "" when they agree within the reference's decimals."""
     for number, (a, b) in enumerate(zip(ours, theirs, strict=False)):
@@ -156,4 +172,4 @@ def _figures(motion: Motion) -> list[float]:
 
 
 def _near(ours: list[float], theirs: list[float], tolerance: float) -> bool:
-    return all(abs(a - b) <= tolerance + 1e-6 * abs(b) for a, b in zip(ours, theirs, strict=True))
+    return all(math.isnan(b) or abs(a - b) <= tolerance + 1e-6 * abs(b) for a, b in zip(ours, theirs, strict=True))

@@ -10,7 +10,7 @@ import pytest
 from fdhil.errors import ProgramError
 from fdhil.program import Motion, interpret
 from tests.program.generated import GROUPS, program
-from tests.program.linuxcnc import Answer, ask, difference
+from tests.program.linuxcnc import Answer, ask, cases, difference
 
 pytestmark = pytest.mark.debian
 
@@ -26,7 +26,6 @@ OTHERWISE = {
 }
 # seeds whose path has a cusp where one of both sees an inside corner, the other an outside one
 CUSPS = {("compensation", seed) for seed in (140, 243, 287, 289, 290)}
-CASES = Path(__file__).parent / "differential.txt"
 ROUNDING_MM = 5e-4
 ROUNDING_INCH_MM = 2e-2
 
@@ -79,20 +78,6 @@ def test_the_examples_of_the_package_give_the_motions_of_the_reference() -> None
         else:
             agreed += 1
     assert not differing, f"{agreed} agree"
-
-
-def cases() -> list[tuple[str, str]]:
-    """Return the written programs, and why they differ ("" where they must not)."""
-    found, why = [], ""
-    for line in CASES.read_text("utf-8").splitlines():
-        if line.startswith("~"):
-            why = line[1:].strip()
-        elif line and line != "#" and not line.startswith("# "):
-            text = line.replace("|", "\n")
-            ends = "M2" in text.upper() or "M30" in text.upper() or "%" in text
-            found.append((text + ("\n" if ends else "\nM2\n"), why))
-            why = ""
-    return found
 
 
 def test_written_programs_give_the_motions_of_the_reference_or_are_refused_by_both(tmp_path: Path) -> None:

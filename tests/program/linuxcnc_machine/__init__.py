@@ -55,10 +55,10 @@ TOOL_TABLE = {folder}/machine.tbl
 [HAL]
 HALFILE = machine.hal
 [KINS]
-KINEMATICS = trivkins coordinates=xyz
-JOINTS = 3
+KINEMATICS = trivkins coordinates={axes}
+JOINTS = {joints}
 [TRAJ]
-COORDINATES = X Y Z
+COORDINATES = {axes}
 LINEAR_UNITS = mm
 ANGULAR_UNITS = degree
 NO_FORCE_HOMING = 1
@@ -69,14 +69,20 @@ MAX_LINEAR_ACCELERATION = {acceleration}
 """
 
 
-def demand(program: str, speed_mm_s: float = 500.0, acceleration_mm_s2: float = 2000.0) -> Float:
+def demand(
+    program: str,
+    speed_mm_s: float = 500.0,
+    acceleration_mm_s2: float = 2000.0,
+    axes: str = "XYZ",
+    limit_s: float = 60.0,
+) -> Float:
     """Return the commanded X, Y, Z (n, 3) in mm of each servo cycle of a program, from its first motion to its last.
 
     AssertionError with LinuxCNC's own words when it did not run, or a cycle was not recorded.
     """
     with tempfile.TemporaryDirectory(prefix="fdhil-linuxcnc-") as name:
         folder = Path(name)
-        _write(folder, program, speed_mm_s, acceleration_mm_s2)
+        _write(folder, program, speed_mm_s, acceleration_mm_s2, axes)
         command = ["linuxcnc", str(folder / "machine.ini")]
         if os.geteuid() == 0:  # it refuses to run as root
             for path in (folder, *folder.iterdir()):
@@ -84,6 +90,7 @@ def demand(program: str, speed_mm_s: float = 500.0, acceleration_mm_s2: float = 
             command = ["setpriv", f"--reuid={_NOBODY}", f"--regid={_NOBODY}", "--clear-groups", *command]
         environment = os.environ | {
             "HOME": name, "PROGRAM": str(folder / "program.ngc"), "DEMAND": str(folder / "demand.txt"),
+            "JOINTS": str(len(axes)), "LIMIT_S": str(limit_s),
         }  # fmt: skip
         environment.pop("DISPLAY", None)
         done = subprocess.run(
@@ -100,14 +107,16 @@ def demand(program: str, speed_mm_s: float = 500.0, acceleration_mm_s2: float = 
     return np.asarray(table[moving[0] : moving[-1] + 2, 1:])
 
 
-def _write(folder: Path, program: str, speed_mm_s: float, acceleration_mm_s2: float) -> None:
+def _write(folder: Path, program: str, speed_mm_s: float, acceleration_mm_s2: float, axes: str) -> None:
     for file in ("nobody_at_the_panel.py", "machine.hal"):
         shutil.copy(HERE / file, folder)
     (folder / "nobody_at_the_panel.py").chmod(0o755)
-    ini = _MACHINE.format(folder=folder, speed=speed_mm_s, acceleration=acceleration_mm_s2)
+    hal = folder / "machine.hal"
+    hal.write_text(hal.read_text().replace("=xyz", f"={axes}").replace("num_joints=3", f"num_joints={len(axes)}"))
+    ini = _MACHINE.format(folder=folder, speed=speed_mm_s, acceleration=acceleration_mm_s2, axes=axes, joints=len(axes))
     ini += "".join(
         _AXIS.format(letter=letter, number=number, speed=speed_mm_s, acceleration=acceleration_mm_s2)
-        for number, letter in enumerate("XYZ")
+        for number, letter in enumerate(axes)
     )
     (folder / "machine.ini").write_text(ini)
     (folder / "machine.tbl").touch()

@@ -16,8 +16,8 @@ from typing import Any
 
 import linuxcnc  # type: ignore[import-not-found]  # the package's own module, for the system's Python alone
 
-JOINTS = 3
-LIMIT_S = float(os.environ.get("LIMIT_S", "60"))
+JOINTS = int(os.environ["JOINTS"])
+LIMIT_S = float(os.environ["LIMIT_S"])
 
 
 def order(command: Any, what: Callable[..., None], *arguments: Any) -> None:

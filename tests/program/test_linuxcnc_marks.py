@@ -1,0 +1,62 @@
+"""The programs on which ``rs274`` alone differs: what a whole LinuxCNC, a machine in mm, does with them."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from fdhil.errors import ProgramError
+from fdhil.program import Arc, Dwell, interpret
+from fdhil.records import Float
+from tests.program.linuxcnc import cases
+from tests.program.linuxcnc_machine import demand
+
+pytestmark = pytest.mark.debian
+
+MARKED = [(text, why) for text, why in cases() if why]
+NEAR_MM = 0.01  # LinuxCNC follows a spline by arcs of its own, some micrometres beside it
+LIMIT_S = 8.0
+
+
+def ends(text: str) -> Float:
+    """Where fdhil's motions end, the machine's zero first; a curve is chords by then."""
+    motions = [motion for motion in interpret(text.splitlines()) if not isinstance(motion, Dwell)]
+    assert not any(isinstance(motion, Arc) for motion in motions)
+    return np.array([(0.0, 0.0, 0.0), *(motion.end for motion in motions)])
+
+
+def apart_mm(places: Float, path: Float) -> float:
+    """Largest distance of places from a path through corners."""
+    parts = [np.linspace(a, b, 2 + int(np.linalg.norm(b - a) / 0.005)) for a, b in pairwise(path)]
+    return float(np.max(cKDTree(np.concatenate(parts)).query(places)[0]))
+
+
+@pytest.mark.parametrize(("text", "why"), [m for m in MARKED if m[1].startswith("machine:")])
+def test_the_machine_moves_as_fdhil_says(text: str, why: str) -> None:
+    """G61, so that the path is the programmed one; faster, since none of these programs is about the feed."""
+    corners = ends(text)
+    axes = "XYZUVW" if "U1" in text else "XYZ"
+    moved = demand("G61\n" + text.replace("F100", "F1000"), axes=axes)
+    assert apart_mm(corners, moved) <= NEAR_MM
+    if "G38" not in text:  # fdhil does not list the probe's own move
+        assert apart_mm(moved, corners) <= NEAR_MM
+    assert moved[-1] == pytest.approx(corners[-1], abs=1e-3)
+
+
+@pytest.mark.parametrize(("text", "why"), [m for m in MARKED if m[1].startswith("machine refuses")])
+def test_the_machine_refuses_too(text: str, why: str) -> None:
+    with pytest.raises(ProgramError):
+        list(interpret(text.splitlines()))
+    with pytest.raises(AssertionError, match="nothing moved"):
+        demand(text, limit_s=LIMIT_S)
+
+
+@pytest.mark.parametrize(("text", "why"), [m for m in MARKED if m[1].startswith("machine goes astray")])
+def test_the_machine_ends_elsewhere_than_programmed(text: str, why: str) -> None:
+    """A NURBS to X3 Y3 in the XZ plane."""
+    with pytest.raises(ProgramError, match="XY plane"):
+        list(interpret(text.splitlines()))
+    assert np.linalg.norm(demand(text)[-1] - [3.0, 3.0, 0.0]) > 1.0
