@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,8 +14,14 @@ from fdhil.cli.prediction import FILE, inputs
 
 if TYPE_CHECKING:
     from fdhil.config import MachineConfig
-    from fdhil.prediction.advise import Advice, Source
+    from fdhil.prediction.advise import Advice, Held
+    from fdhil.prediction.feeds import Source
     from fdhil.records import Float, Parameters, Trajectory
+
+BRACKETED = (
+    "the averages of [nc] smoothing_s did not make this demand: the lower feed holds where the NC keeps its smoothing,"
+    " the higher one if its accelerations fell with the square of the feed"
+)
 
 
 @click.command()
@@ -37,10 +44,10 @@ def advise(
     tolerance_um: float,
     as_json: bool,
 ) -> int:
-    """Tell for each line of a PROGRAM (NC program or demand CSV) the highest feed within a tolerance.
+    """Tell the highest feed within a tolerance for each line of a PROGRAM (NC program), or zone of a demand CSV.
 
-    Only lines that leave the tolerance as programmed are listed: where and why, and the highest feed without and with
-    the inverse correction. A demand CSV has no lines: it is played slower, and its zones are listed.
+    Only what leaves the tolerance as programmed is listed: where and why, and the highest feed without and with the
+    inverse correction. All these feeds together were predicted to keep the tolerance.
 
     Exit codes: 0 every line can be held by some feed, 1 some line cannot, 2 wrong option, model or configuration, 3 a
     file cannot be read.
@@ -49,72 +56,129 @@ def advise(
     from fdhil.prediction import advise as advising
 
     corrects = all(config.axis[axis].correction is not None for axis in reference.axes)
-    advice = advising.advise(
-        _source(program, reference, config),
-        models,
-        config,
-        tolerance_um,
-        (lambda slower: _corrected(slower, models, config)) if corrects else None,
-    )
+    sure, hopeful = _sources(program, reference, models, config, tolerance_um)
+    judge = (lambda slower: _corrected(slower, models, config)) if corrects else None
+    advice = advising.advise(sure, models, config, tolerance_um, judge)
+    most: dict[float, Advice] | None = None
+    if hopeful:
+        most = {a.start_s: a for a in advising.advise(hopeful, models, config, tolerance_um, judge)}
     if as_json:
         document = {"schema": "fdhil-advise-1", "program": str(program), "tolerance_um": tolerance_um}
-        click.echo(json.dumps(document | {"lines": [_entry(a) for a in advice]}, allow_nan=False))
+        lines = [_entry(a, most) for a in advice]
+        click.echo(json.dumps(document | {"lines": lines}, allow_nan=False))
     else:
-        _show(advice, tolerance_um, corrects)
-    return 1 if any(a.share is None and a.corrected_share is None for a in advice) else 0
+        _show(advice, most, tolerance_um, corrects)
+    return 1 if any(a.plain.share is None and (a.corrected is None or a.corrected.share is None) for a in advice) else 0
 
 
-def _source(program: Path, reference: Trajectory, config: MachineConfig) -> Source:
-    from fdhil.prediction import advise as advising
+def _sources(
+    program: Path,
+    reference: Trajectory,
+    models: Mapping[str, Parameters],
+    config: MachineConfig,
+    tolerance_um: float,
+) -> tuple[Source, Source | None]:
+    from fdhil.prediction.feeds import program_source
+    from fdhil.prediction.retime import demand_sources
     from fdhil.program import Budget, interpret
 
     if program.suffix.lower() == ".csv":
-        return advising.demand_source(reference)
-    return advising.program_source(list(interpret(program, Budget.of(config.nc))), config)
+        return demand_sources(reference, models, config, tolerance_um)
+    return program_source(list(interpret(program, Budget.of(config.nc))), config), None
 
 
-def _corrected(reference: Trajectory, models: dict[str, Parameters], config: MachineConfig) -> Float:
-    """Contour error (n,) with the correction; that without it where it is refused."""
+def _corrected(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> Float:
+    """Contour error (n,) with the correction; where it is refused, inf in the rows at fault, the others unknown."""
+    import numpy as np
+
     from fdhil import correction
+    from fdhil.prediction import load
 
-    return correction.plan(reference, models, config).after.contour_um
+    planned = correction.plan(reference, models, config)
+    if not planned.refused:
+        return planned.after.contour_um
+    before, fault = planned.before, np.zeros(reference.time_s.size, dtype=np.bool_)
+    for zone in before.zones:
+        if zone.cause == "saturation":
+            fault |= (reference.time_s >= zone.start_s) & (reference.time_s < zone.end_s)
+    for axis in reference.axes:
+        asked = load.required(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s)
+        limits = config.axis[axis].correction
+        room_um = limits.max_offset_um if limits else 0.0
+        fault |= (np.maximum(*asked) > 1.0) | (np.abs(before.error_um[axis]) > room_um)
+    return np.where(fault, np.inf, np.nan) if fault.any() else before.contour_um
 
 
-def _entry(advice: Advice) -> dict[str, Any]:
-    demand = advice.demand
-    return {
+def _entry(advice: Advice, most: Mapping[float, Advice] | None) -> dict[str, Any]:
+    axis, what, share = advice.load
+    asked = {"axis": axis, "what": what, "share": share}
+    entry = {
         "line": advice.line,
+        "start_s": round(advice.start_s, 6),
+        "end_s": round(advice.end_s, 6),
         "where": advice.where,
         "cause": advice.cause,
+        "axis": advice.axis,
         "error_um": advice.error_um,
-        "beyond": None if demand is None else dict(zip(("axis", "what", "share"), demand, strict=True)),
+        "load": asked,
+        "beyond": asked if share > 1.0 else None,
         "feed_mm_min": advice.feed_mm_min,
-        "feed_share": advice.share,
-        "advised_feed_mm_min": _feed(advice, advice.share),
-        "corrected_feed_share": advice.corrected_share,
-        "corrected_feed_mm_min": _feed(advice, advice.corrected_share),
+        **_held("", advice.plain, advice.feed_mm_min),
+        **_held("corrected_", advice.corrected, advice.feed_mm_min),
+    }
+    if most is not None:
+        other = most.get(advice.start_s, advice)
+        entry["hopeful_feed_mm_min"] = _feed(other.plain, advice.feed_mm_min)
+        entry["corrected_hopeful_feed_mm_min"] = _feed(other.corrected, advice.feed_mm_min)
+    return entry
+
+
+def _held(name: str, held: Held | None, feed_mm_min: float) -> dict[str, float | None]:
+    return {
+        f"{name}feed_share": None if held is None else held.share,
+        f"{name or 'advised_'}feed_mm_min": _feed(held, feed_mm_min),
+        f"{name}tried_feed_mm_min": None if held is None else held.tried * feed_mm_min,
+        f"{name}left_um": None if held is None or not math.isfinite(held.left_um) else held.left_um,
     }
 
 
-def _feed(advice: Advice, share: float | None) -> float | None:
-    return None if share is None else share * advice.feed_mm_min
+def _feed(held: Held | None, feed_mm_min: float) -> float | None:
+    return None if held is None or held.share is None else held.share * feed_mm_min
 
 
-def _show(advice: Sequence[Advice], tolerance_um: float, corrects: bool) -> None:
+def _show(advice: Sequence[Advice], most: Mapping[float, Advice] | None, tolerance_um: float, corrects: bool) -> None:
     if not advice:
         click.echo(f"the whole path stays within {tolerance_um:g} um as programmed")
     for a in advice:
-        name = f"line {a.line}" if a.line else "the demand"
-        click.echo(f"{name}: {a.error_um:.1f} um at {a.where} ({a.cause}) at {a.feed_mm_min:.0f} mm/min")
-        if a.demand:
-            axis, what, share = a.demand
+        name = f"line {a.line}" if a.line else f"{a.start_s:.2f} s .. {a.end_s:.2f} s"
+        click.echo(
+            f"{name}: {a.error_um:.1f} um at {a.where} ({a.cause}, most of it axis {a.axis})"
+            f" at {a.feed_mm_min:.0f} mm/min"
+        )
+        axis, what, share = a.load
+        if share > 1.0:
             click.echo(f"  the drive of axis {axis} is asked for {share * 100:.0f} % of its {what} limit")
-        click.echo(f"  {_told(_feed(a, a.share), 'without correction')}")
-        if corrects:
-            click.echo(f"  {_told(_feed(a, a.corrected_share), 'with the correction')}")
+        other = (most or {}).get(a.start_s, a)
+        click.echo(f"  without correction: {_told(a.plain, other.plain, a.feed_mm_min)}")
+        if a.corrected:
+            click.echo(f"  with the correction: {_told(a.corrected, other.corrected, a.feed_mm_min)}")
+    if most:
+        click.echo(BRACKETED)
     if advice and not corrects:
         click.echo("the correction was not tried: an axis has no section [axis.X.correction]")
 
 
-def _told(feed_mm_min: float | None, how: str) -> str:
-    return f"{how}: " + (f"at most {feed_mm_min:.0f} mm/min" if feed_mm_min else "no feed that was tried holds it")
+def _told(held: Held, most: Held | None, feed_mm_min: float) -> str:
+    feed = _feed(held, feed_mm_min)
+    if feed is None:
+        left = f": {held.left_um:.1f} um are left there" if math.isfinite(held.left_um) else ""
+        return f"no feed down to {_rounded(held.tried * feed_mm_min)} mm/min holds it{left}"
+    reach = _feed(most, feed_mm_min)
+    more = f", perhaps {_rounded(reach)}" if reach and reach > 1.02 * feed else ""
+    return f"at most {_rounded(feed)} mm/min{more}"
+
+
+def _rounded(feed_mm_min: float) -> str:
+    """A feed cut to three digits: rounded up it would not be held."""
+    unit = 10.0 ** (math.floor(math.log10(feed_mm_min)) - 2) if feed_mm_min > 0.0 else 1.0
+    return f"{math.floor(feed_mm_min / unit * (1 + 1e-9)) * unit:g}"

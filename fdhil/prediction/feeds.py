@@ -1,0 +1,217 @@
+"""The highest feed of each stretch of a path at which it keeps a tolerance, found by running the whole path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d
+
+from fdhil.config import MachineConfig
+from fdhil.program import Arc, Feed, Motion
+from fdhil.program import plan as plan_program
+from fdhil.records import Float, Int, Trajectory
+
+AFTER_S = 0.2  # an error belongs to what was ordered up to so long before it: the loops need to settle
+RAPID, REST = -1, -2  # rows of no stretch: not judged at all, and judged for the stretch before
+NARROW = 1.02  # two shares nearer than this are not parted further
+LEAST_FALL, MOST_FALL, RISE = 0.97, 0.25, 1.05  # of a share, from one trial to the next
+POWERS = (0.3, 3.0)  # of the share, that an error may go with
+AIM, FULL = 0.996, 0.99  # of the tolerance: what is aimed at, and what is near enough
+EDGE = 0.1  # of a bracket, in logarithms: a trial keeps away from its ends
+LOWEST = 1e-3  # share of the feed that is tried
+STILL = 0.9  # an error that keeps this much of itself while its feed falls to half does not come from the feed
+SLACK, MOST_RISES = 0.97, 3  # of the tolerance: what leaves more room is tried at a higher feed, so many times
+MOST_TRIALS = 80
+LONGEST_S, LONGEST_SHARE = 600.0, 10.0  # a path that lasts longer than both, the latter times its own, is not slowed
+
+# contour error (n,) um of a reference; inf where the drives cannot do it, NaN where that leaves the error unknown
+Judge = Callable[[Trajectory], Float]
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A path that can be had with every stretch at its own share of the feed (1 where none is given).
+
+    The ``line`` of its references is the stretch of a row, 0 for a rest; ``line`` and ``feed_mm_min`` tell of a stretch
+    what the user calls it. Errors up to ``after_s`` behind a stretch are its own.
+    """
+
+    at: Callable[[Mapping[int, float]], Trajectory]
+    line: Callable[[int], int]
+    feed_mm_min: Callable[[int], float]
+    after_s: float = AFTER_S
+
+
+def at_shares(motions: Sequence[Motion], share: Callable[[int], float]) -> list[Motion]:
+    """Return the motions with every programmed feed times the share of its line; rapids and dwells stay."""
+    return [replace(m, feed=m.feed * share(m.line)) if isinstance(m, Feed | Arc) else m for m in motions]
+
+
+def program_source(motions: Sequence[Motion], config: MachineConfig) -> Source:
+    """Return a program as a source: its stretches are its lines."""
+    feeds: dict[int, float] = {}
+    for motion in motions:
+        if isinstance(motion, Feed | Arc):
+            feeds[motion.line] = max(motion.feed, feeds.get(motion.line, 0.0))
+    return Source(
+        at=lambda shares: plan_program(at_shares(motions, lambda line: shares.get(line, 1.0)), config),
+        line=lambda stretch: stretch,
+        feed_mm_min=lambda stretch: feeds.get(stretch, 0.0),
+    )
+
+
+def stretches(reference: Trajectory) -> Int:
+    """Return (n,) the stretch that each row belongs to, RAPID or REST."""
+    # rows without a line are a rest: what remains of the line before
+    return np.where(reference.rapid, RAPID, np.where(reference.line > 0, reference.line, REST))
+
+
+def worst_rows(stretch: Int, contour_um: Float, dt_s: float, after_s: float) -> dict[int, tuple[float, int]]:
+    """Return for each stretch the largest error in it and ``after_s`` behind it, and its row; -1 where it is NaN."""
+    judged = np.where(stretch != RAPID, np.nan_to_num(contour_um, nan=-1.0, posinf=np.inf), 0.0)
+    size = round(after_s / dt_s) + 1
+    ahead = maximum_filter1d(judged, size, origin=-((size - 1) // 2), mode="constant") if size > 1 else judged
+    rows = np.flatnonzero(stretch >= 0)
+    order = rows[np.argsort(ahead[rows], kind="stable")]
+    # the last one of a stretch in the order of the errors is its largest
+    last = {int(stretch[row]): row for row in order.tolist()}
+    return {k: (float(ahead[row]), row + int(np.argmax(judged[row : row + size]))) for k, row in last.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class Feeds:
+    """The share of the feed of each stretch, the largest error there, and which of them are held at it."""
+
+    share: Mapping[int, float]
+    left_um: Mapping[int, float]
+    held: frozenset[int]
+
+
+def highest(source: Source, over: Mapping[int, float], judge: Judge, tolerance_um: float) -> Feeds:
+    """Return the highest shares at which ``over`` (stretch -> its error as programmed, um) keep the tolerance.
+
+    Every trial runs the whole path with each stretch at its own share; a stretch that leaves the tolerance because of
+    its neighbours joins. The shares returned were run together and held, but for those that no share holds.
+    """
+    search = _Search(source, judge, tolerance_um, over)
+    search.settle()
+    for _ in range(MOST_RISES):
+        if not search.rises():
+            break
+        search.settle()
+    return search.feeds()
+
+
+@dataclass(slots=True)
+class _Stretch:
+    """What is known of one stretch: ``low`` holds, ``high`` does not; it is ``lost`` when no share is worth a trial."""
+
+    share: float = 1.0
+    low: float | None = None
+    high: float | None = None
+    lost: bool = False
+    tried: list[tuple[float, float]] = field(default_factory=list)
+
+    def learn(self, share: float, error_um: float, holds: bool) -> None:
+        """Take in a trial."""
+        self.tried.append((share, error_um))
+        if holds:
+            self.low, self.lost = share, False
+            if self.high is not None and self.high <= share:  # a neighbour has changed since
+                self.high = None
+        else:
+            self.high = share if self.high is None else min(share, self.high)
+            if self.low is not None and self.low >= share:
+                self.low = None
+
+    def next_share(self, tolerance_um: float) -> float:
+        """Return the share to try next, ``low`` when there is nothing more to tell."""
+        share, error = self.tried[-1]
+        if self.low is None and self._is_lost(share, error):
+            self.lost = True
+            return share
+        if self.low is not None and (self.low >= 1.0 or (share == self.low and error > FULL * tolerance_um)):
+            return self.low
+        if self.low is not None and self.high is not None and self.high / self.low <= NARROW:
+            return self.low
+        wanted = share * (AIM * tolerance_um / error) ** (1.0 / self._power()) if 0.0 < error < np.inf else 0.0
+        if self.low is None:
+            return max(LOWEST, float(np.clip(wanted, MOST_FALL * share, LEAST_FALL * share)))
+        if self.high is None:
+            return min(1.0, max(wanted, RISE * self.low))
+        margin = (self.high / self.low) ** EDGE
+        return float(np.clip(wanted, self.low * margin, self.high / margin))
+
+    def _is_lost(self, share: float, error_um: float) -> bool:
+        faster = [e for s, e in self.tried if np.isfinite(e) and s >= 2.0 * share]
+        return self.lost or share <= LOWEST or bool(faster and error_um > STILL * faster[-1])
+
+    def _power(self) -> float:
+        """Return p of error ~ share ** p as the last trials have it: 2 for inertia, near 0 for dry friction."""
+        known = [(s, e) for s, e in self.tried if 0.0 < e < np.inf]
+        if len(known) < 2 or known[-1][0] == known[-2][0]:
+            return 2.0
+        (s0, e0), (s1, e1) = known[-2:]
+        return float(np.clip(np.log(e1 / e0) / np.log(s1 / s0), *POWERS))
+
+
+class _Search:
+    """Brackets of all stretches at once."""
+
+    def __init__(self, source: Source, judge: Judge, tolerance_um: float, over: Mapping[int, float]) -> None:
+        self._source, self._judge, self._tolerance_um = source, judge, tolerance_um
+        self._open = {k: _Stretch() for k in over}
+        self._trials = 0
+        self._longest_s = LONGEST_S
+        self._kept: dict[int, tuple[float, float]] = {}
+
+    def settle(self) -> None:
+        """Run trials until the shares hold together and no higher ones are worth a trial."""
+        while self._trials < MOST_TRIALS:
+            shares = {k: s.share for k, s in self._open.items()}
+            bad = self._run(shares)
+            for k, stretch in self._open.items():
+                if stretch.tried and stretch.tried[-1][0] == shares.get(k):
+                    stretch.share = stretch.next_share(self._tolerance_um)
+            if not bad - {k for k, s in self._open.items() if s.lost}:
+                self._kept = {k: s.tried[-1] for k, s in self._open.items() if s.tried}
+            if shares == {k: s.share for k, s in self._open.items()}:
+                return
+
+    def rises(self) -> bool:
+        """Return whether some stretch has room left, its bracket being from when its neighbours were faster."""
+        slack = [
+            s
+            for k, s in self._open.items()
+            if s.low is not None and s.low < 1.0 and self._kept.get(k, (0.0, np.inf))[1] < SLACK * self._tolerance_um
+        ]
+        for stretch in slack:
+            stretch.high = None
+            stretch.share = stretch.next_share(self._tolerance_um)
+        return bool(slack)
+
+    def feeds(self) -> Feeds:
+        """Return the last shares that held together."""
+        known = {k: self._kept.get(k, s.tried[-1] if s.tried else (s.share, np.inf)) for k, s in self._open.items()}
+        held = frozenset(k for k, (_, error_um) in self._kept.items() if error_um <= self._tolerance_um)
+        return Feeds({k: share for k, (share, _) in known.items()}, {k: um for k, (_, um) in known.items()}, held)
+
+    def _run(self, shares: Mapping[int, float]) -> set[int]:
+        """Run the path; return the stretches that leave the tolerance."""
+        reference = self._source.at(shares)
+        found = worst_rows(stretches(reference), self._judge(reference), reference.dt_s, self._source.after_s)
+        seconds = float(reference.time_s[-1] - reference.time_s[0])
+        if self._trials == 0:
+            self._longest_s = max(LONGEST_S, LONGEST_SHARE * seconds)
+        self._trials += 1
+        bad = {k for k, (error, _) in found.items() if error > self._tolerance_um}
+        for k in bad - self._open.keys():
+            self._open[k] = _Stretch()
+        for k, stretch in self._open.items():
+            error = found.get(k, (0.0, 0))[0]
+            if error >= 0.0:
+                stretch.learn(shares.get(k, 1.0), error, k not in bad)
+                stretch.lost |= seconds > self._longest_s and k in bad and stretch.low is None
+        return bad

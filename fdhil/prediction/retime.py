@@ -1,0 +1,165 @@
+"""A recorded demand at other feeds: it has no lines, and what the NC would make of another feed is not in it.
+
+Where the NC is an interpolator of the configured averages (``[nc] smoothing_s``), these can be taken off the demand,
+the path under them run at another speed, and the averages put on again: the demand is then what the NC would order. A
+demand that was not made so shows it, see ``unsmoothed``, and the truth lies between two rules: that the averages, or
+the acceleration, stay (cautious), and that time itself is stretched, so that accelerations fall with the square of the
+feed (hopeful).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+
+from fdhil.config import MachineConfig
+from fdhil.prediction.feeds import Source
+from fdhil.prediction.predict import predict
+from fdhil.program.planner.smoothing import Smoother
+from fdhil.records import Bool, Float, Int, Parameters, Trajectory, frozen, frozen_ints
+
+APART_S = 0.1  # an error that swings through 0 makes several peaks of one corner
+EXACT_MM = 5e-3  # what rounding to 9 decimals makes of a minute under two averages; other averages leave far more
+RESTING_MM = 1e-7  # a step below it is the rounding of a file
+TOO_FAST = 1.05  # of the rapid speed: no NC ordered that
+
+# path (n, d), stretch and share of the feed of each row (n,) -> path (m, d) and stretch (m,) at those feeds
+Rule = Callable[[Float, Int, Float], tuple[Float, Int]]
+
+
+def demand_sources(
+    reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, tolerance_um: float
+) -> tuple[Source, Source | None]:
+    """Return a demand as a source; where two rules bracket the truth, the cautious and the hopeful one.
+
+    Its stretches reach from half way behind one place that leaves the tolerance to half way before the next.
+    """
+    contour = predict(reference, models, config).contour_um
+    stretch = stretches_around(contour > tolerance_um, round(APART_S / reference.dt_s))
+    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    averages = Averages(config.nc.smoothing_s, reference.dt_s)
+    if config.nc.profile != "fir":
+        return _source(reference, path, stretch, averages.capped), _source(reference, path, stretch, averages.stretched)
+    fastest = [TOO_FAST * config.axis[axis].rapid_speed_mm_s * reference.dt_s for axis in reference.axes]
+    under = averages.taken_off(path)
+    if under is not None and bool(np.all(np.abs(np.diff(under, axis=0)) <= fastest)):
+        return _source(reference, under, stretch, averages.smoothed), None
+    return _source(reference, path, stretch, averages.scaled), _source(reference, path, stretch, averages.stretched)
+
+
+def stretches_around(over: Bool, apart: int) -> Int:
+    """Return (n,) numbers from 1 on, a new one half way between rows that are ``over`` and more than ``apart``."""
+    rows = np.flatnonzero(over)
+    gaps = np.flatnonzero(np.diff(rows) > apart)
+    begins = np.zeros(over.size, dtype=np.int64)
+    begins[(rows[gaps] + rows[gaps + 1]) // 2] = 1
+    return 1 + np.cumsum(begins)
+
+
+def _source(reference: Trajectory, path: Float, stretch: Int, rule: Rule) -> Source:
+    positions = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    speeds = np.linalg.norm(np.diff(positions, axis=0, append=positions[-1:]), axis=1) * 60.0 / reference.dt_s
+    fastest = np.zeros(int(stretch[-1]) + 1)
+    np.maximum.at(fastest, stretch, speeds)
+
+    def at(shares: Mapping[int, float]) -> Trajectory:
+        per_stretch = np.array([shares.get(k, 1.0) for k in range(fastest.size)])
+        as_it_is = bool((per_stretch == 1.0).all())
+        moved, lines = (positions, stretch) if as_it_is else rule(path, stretch, per_stretch[stretch])
+        rapid = np.zeros(lines.size, dtype=np.bool_)
+        rapid.setflags(write=False)
+        return replace(
+            reference,
+            time_s=frozen(reference.time_s[0] + np.arange(lines.size) * reference.dt_s),
+            position_mm={axis: frozen(moved[:, a]) for a, axis in enumerate(reference.axes)},
+            rapid=rapid,
+            line=frozen_ints(lines),
+        )
+
+    # a stretch ends where all is quiet: what is behind it is not its own
+    return Source(at, line=lambda _: 0, feed_mm_min=lambda k: float(fastest[k]), after_s=0.0)
+
+
+class Averages:
+    """The rules of one NC, and the moving averages that it puts on each axis' demand."""
+
+    def __init__(self, smoothing_s: Sequence[float], dt_s: float) -> None:
+        self._smoothing_s, self._dt_s = smoothing_s, dt_s
+        self._lengths = [max(1, math.floor(average / dt_s + 0.5)) for average in smoothing_s]
+
+    def taken_off(self, path: Float) -> Float | None:
+        """Return the path (n, d) that these averages turn into ``path``; None where none does.
+
+        Of an average over m rows, x[k] = x[k - m] + m (y[k] - y[k - 1]). What was not made so does not come to rest.
+        """
+        moving = np.flatnonzero(np.any(np.abs(np.diff(path, axis=0)) > RESTING_MM, axis=1))
+        under = path
+        for m in self._lengths:
+            steps = m * np.diff(under, axis=0, prepend=under[:1])
+            padded = np.concatenate([steps, np.zeros((-len(steps) % m, steps.shape[1]))])
+            sums = np.cumsum(padded.reshape(-1, m, steps.shape[1]), axis=0)
+            under = path[0] + sums.reshape(-1, steps.shape[1])[: len(path)]
+        if moving.size == 0:
+            return path
+        arrived = max(0, int(moving[-1]) + 2 - sum(m - 1 for m in self._lengths))
+        return under if np.abs(under[arrived:] - path[-1]).max() <= EXACT_MM else None
+
+    def _on(self, rows: Float) -> Float:
+        """Put the averages on rows (n, d) that rest at both ends."""
+        smoother = Smoother(self._smoothing_s, self._dt_s)
+        return smoother(np.concatenate([rows, np.repeat(rows[-1:], smoother.settle_rows, axis=0)]))
+
+    def smoothed(self, path: Float, stretch: Int, share: Float) -> tuple[Float, Int]:
+        """The path under the averages at other speeds, and the averages on again."""
+        rows = _rows(1.0 / share)
+        moved = self._on(_between(path, rows))
+        return moved, _held(stretch, rows, len(moved))
+
+    def _faded(self, values: Float) -> Float:
+        """Values (n,) that change from one to the next as an averaged demand does."""
+        return self._on(values[:, None])[: values.size, 0]
+
+    def stretched(self, path: Float, stretch: Int, share: Float) -> tuple[Float, Int]:
+        """Time stretched: speeds fall with the share, accelerations with its square."""
+        rows = _rows(1.0 / self._faded(share))
+        return _along(path, rows), stretch[rows.astype(np.int64)]
+
+    def scaled(self, path: Float, stretch: Int, share: Float) -> tuple[Float, Int]:
+        """Each move shorter by the share: speeds and accelerations fall with it, as where averages stay."""
+        steps = np.diff(path, axis=0) * self._faded(share)[:-1, None]
+        return path[0] + np.concatenate([np.zeros((1, path.shape[1])), np.cumsum(steps, axis=0)]), stretch
+
+    def capped(self, path: Float, stretch: Int, share: Float) -> tuple[Float, Int]:
+        """The speed held below a share of the stretch's fastest: accelerations stay, as where they are the limit."""
+        speed = np.linalg.norm(np.diff(path, axis=0, append=path[-1:]), axis=1)
+        fastest = np.zeros(int(stretch[-1]) + 1)
+        np.maximum.at(fastest, stretch, speed)
+        most = self._faded(np.where(share < 1.0, share * fastest[stretch], speed.max()))
+        rows = _rows(np.maximum(1.0, speed / np.maximum(most, 1e-12)))
+        return _along(path, rows), stretch[rows.astype(np.int64)]
+
+
+def _rows(lasts: Float) -> Float:
+    """Return the row reached after 0, 1, 2 .. cycles where row k lasts ``lasts`` (n,) cycles."""
+    begins = np.concatenate([[0.0], np.cumsum(lasts[:-1])])
+    rows = np.arange(lasts.size, dtype=np.float64)
+    return np.asarray(np.interp(np.arange(math.ceil(begins[-1]) + 1), begins, rows))
+
+
+def _between(path: Float, rows: Float) -> Float:
+    grid = np.arange(len(path), dtype=np.float64)
+    return np.column_stack([np.interp(rows, grid, column) for column in path.T])
+
+
+def _along(path: Float, rows: Float) -> Float:
+    """A demand between its rows: smooth, or the kinks at each row would ask for twice the acceleration."""
+    return np.asarray(CubicSpline(np.arange(len(path)), path)(rows))
+
+
+def _held(stretch: Int, rows: Float, n: int) -> Int:
+    found = stretch[rows.astype(np.int64)]
+    return np.concatenate([found, np.full(n - found.size, found[-1])])
