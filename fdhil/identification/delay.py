@@ -19,19 +19,17 @@ def coarse_delay(signals: Signals, dt_s: float) -> float:
     business of the maximum-likelihood fit that starts here.
     """
     reach = min(max(3, round(SPAN_S / dt_s)), signals.speed.size // 8)
-    rows = np.flatnonzero(signals.usable & np.isfinite(derivative(signals.current, dt_s)))
-    rows = rows[(rows >= reach) & (rows < signals.speed.size - reach)]
-    if rows.size < 32:
-        return 0.0
     slope = derivative(signals.current, dt_s)
-    phi = np.column_stack([slope, signals.current, signals.speed])[rows]
-    inverse, _ = inverse_gram(phi)
+    inside = slice(reach, signals.speed.size - reach)
+    kept = (signals.usable & np.isfinite(slope))[inside]
+    if np.count_nonzero(kept) < 32:
+        return 0.0
+    phi = np.where(kept, np.stack([slope, signals.current, signals.speed])[:, inside], 0.0)
+    inverse, _ = inverse_gram(phi.T)
     shifts = np.arange(-reach, reach + 1)
-    costs = np.empty(shifts.size)
-    for k, shift in enumerate(shifts):
-        u = signals.voltage[rows + shift]
-        pull = phi.T @ u
-        costs[k] = u @ u - pull @ inverse @ pull
+    pulls = np.stack([np.correlate(signals.voltage, column, "valid") for column in phi])
+    power = np.correlate(signals.voltage**2, kept.astype(np.float64), "valid")
+    costs = power - (pulls * (inverse @ pulls)).sum(axis=0)
     best = int(np.argmin(costs))
     if not np.isfinite(costs).all() or costs[reach] <= IMPROVEMENT * max(costs[best], 0.0) or abs(shifts[best]) < 1:
         return 0.0

@@ -30,10 +30,32 @@ def zero_phase(values: Float, lowpass_hz: float, dt_s: float) -> Float:
     before = 2 * values[..., :1] - values[..., pad:0:-1]
     after = 2 * values[..., -1:] - values[..., -2 : -pad - 2 : -1]
     extended = np.concatenate([before, values, after], axis=-1)
-    size = extended.shape[-1]
-    spectrum = np.fft.rfft(extended) * _gain(size, lowpass_hz, dt_s)
+    size = quick_size(extended.shape[-1])
+    spectrum = np.fft.rfft(_lengthened(extended, size)) * _gain(size, lowpass_hz, dt_s)
     filtered: Float = np.fft.irfft(spectrum, size)[..., pad : pad + n]
     return filtered
+
+
+def _lengthened(values: Float, size: int) -> Float:
+    """Return ``values`` (..., m) led on to ``size`` by a line back to their begin: the transform goes round."""
+    missing = size - values.shape[-1]
+    share = np.linspace(0.0, 1.0, missing + 2)[1:-1]
+    bridge = values[..., -1:] * (1.0 - share) + values[..., :1] * share
+    return np.concatenate([values, bridge], axis=-1)
+
+
+@lru_cache(maxsize=256)
+def quick_size(least: int) -> int:
+    """Return the smallest size from ``least`` on of which a transform is quick: no prime factor above 5."""
+    size = least
+    while True:
+        rest = size
+        for prime in (2, 3, 5):
+            while rest % prime == 0:
+                rest //= prime
+        if rest == 1:
+            return size
+        size += 1
 
 
 @lru_cache(maxsize=64)
@@ -68,21 +90,24 @@ def moving_mean(values: Float, width: int) -> Float:
     """Return the mean (n,) over ``width`` (odd) rows about each row; the ends are continued by their last value."""
     if width <= 1 or values.size == 0:
         return values.copy()
-    padded = np.pad(values, width // 2, mode="edge")
+    half = width // 2
+    padded = np.concatenate([np.full(half, values[0]), values, np.full(half, values[-1])])
     return np.convolve(padded, np.full(width, 1.0 / width), "valid")
 
 
 def all_about(flags: Bool, width: int, beyond: bool) -> Bool:
     """Return where (n,) all ``width`` (odd) rows about a row are set; rows past the ends count as ``beyond``."""
-    padded = np.pad(flags, width // 2, constant_values=beyond)
-    together: Bool = np.convolve(padded, np.ones(width), "valid") > width - 0.5
+    half = width // 2
+    ends = np.full(half, beyond)
+    missing = np.concatenate([[0], np.cumsum(~np.concatenate([ends, flags, ends]))])
+    together: Bool = missing[width:] == missing[:-width]
     return together
 
 
 def through(columns: Float, kernel: Float) -> Float:
     """Return each column (m, k) convolved with ``kernel`` (odd length), centred on its rows."""
     rows, half = columns.shape[0], kernel.size // 2
-    size = rows + kernel.size - 1
+    size = quick_size(rows + kernel.size - 1)
     spectrum = np.fft.rfft(columns, size, axis=0) * np.fft.rfft(kernel, size)[:, None]
     passed: Float = np.fft.irfft(spectrum, size, axis=0)[half : half + rows]
     return passed

@@ -166,8 +166,11 @@ def _level(values: Float | None, share: float) -> float:
 
 def resolution(values: Float) -> float:
     """Return the smallest step between different values, 0 when there is only one."""
-    steps = np.diff(np.unique(values))
-    steps = steps[steps > 1e-9 * max(1.0, float(np.abs(values).max(initial=0.0)))]
+    if values.size < 2:
+        return 0.0
+    ordered = np.sort(values)
+    steps = ordered[1:] - ordered[:-1]
+    steps = steps[steps > 1e-9 * max(1.0, float(np.abs(ordered[[0, -1]]).max()))]
     return float(steps.min()) if steps.size else 0.0
 
 

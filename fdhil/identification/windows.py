@@ -53,9 +53,15 @@ def carried(values: Float) -> Float:
 
 def noise_of(values: Float) -> float:
     """Return the standard deviation of white noise on a smooth signal, from its third differences (robust)."""
-    d = np.diff(values, 3)
+    if values.size < 4:
+        return 0.0
+    d = np.abs(values[3:] - values[:-3] - 3.0 * (values[2:-1] - values[1:-2]))
     d = d[np.isfinite(d)]
-    return float(1.4826 * np.median(np.abs(d)) / np.sqrt(20.0)) if d.size else 0.0
+    if not d.size:
+        return 0.0
+    middle = (d.size - 1) // 2, d.size // 2
+    ordered = np.partition(d, middle)  # a library's median takes five times longer
+    return float(1.4826 * (ordered[middle[0]] + ordered[middle[1]]) / 2 / np.sqrt(20.0))
 
 
 def find_windows(recording: Recording, rapid_speed_rad_s: float | None = None) -> list[Window]:
