@@ -8,23 +8,14 @@ path, the motion of the offset, and a check of the frame by other formulas than 
 from __future__ import annotations
 
 from fdhil.guard import feedforward
+from fdhil.guard.conditions import View, failing, not_ready, withheld
 from fdhil.guard.feedforward import FADE_S, FeedMode
-from fdhil.guard.interlocks import FEEDFORWARD_FACTS, Alarm, AxisView, Reaction, failing, not_ready, withheld
+from fdhil.guard.interlocks import FACTS, FEEDFORWARD_FACTS, Alarm, Reaction
 from fdhil.guard.limits import brake, follow, violation
-from fdhil.guard.observe import behind, observe, view
+from fdhil.guard.observe import behind, observe
 from fdhil.guard.path import Path
 from fdhil.guard.settings import AxisSettings, Settings
-from fdhil.guard.state import (
-    IN_CHARGE,
-    LANDING,
-    SENDING,
-    AxisState,
-    Inputs,
-    Mode,
-    Output,
-    Request,
-    State,
-)
+from fdhil.guard.state import IN_CHARGE, LANDING, SENDING, AxisState, Inputs, Mode, Output, Request, State
 from fdhil.guard.tracking import await_start, rest, track
 
 SETTLED_CYCLES = 100
@@ -36,7 +27,7 @@ FAILED_SENDS = 3
 ZEROS = 3
 ZEROS_UNCONFIRMED = 50
 
-Views = tuple[AxisView, ...]
+Views = tuple[View, ...]
 Alarms = tuple[Alarm, ...]
 
 
@@ -44,7 +35,7 @@ def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outpu
     """Decide what leaves the guard now. ``inputs.sync`` False is the local timer's step, taken when SYNC is silent."""
     before = state.mode
     state = observe(state, inputs, settings)
-    views = tuple(map(view, settings.axes, inputs.axes, state.axes))
+    views = tuple(zip(settings.axes, inputs.axes, state.axes, strict=True))
     alarms = _alarms(state, inputs, views)
     state = state._replace(good_for=0 if alarms else state.good_for + inputs.sync)
     state, refused = _request(state, inputs, alarms, views, settings)
@@ -73,7 +64,7 @@ def _alarms(state: State, inputs: Inputs, views: Views) -> Alarms:
 
 def standing(state: State, inputs: Inputs, settings: Settings) -> Alarms:
     """Return what was not good at the step that took ``inputs``, what forbids arming included; for the status."""
-    views = tuple(map(view, settings.axes, inputs.axes, state.axes))
+    views = tuple(zip(settings.axes, inputs.axes, state.axes, strict=True))
     return (*_alarms(state, inputs, views), *not_ready(views))
 
 
@@ -87,12 +78,12 @@ def _request(
     request = inputs.request
     if request is None:
         return state, None
-    if request.kind == "arm":
-        refused = _refusals(state, inputs, request, alarms, views)
-        return (state, refused) if refused else (_armed(state, inputs), ())
-    if request.kind == "feedforward":
-        refused = _feed_refusals(state, inputs, request, alarms, views, settings)
-        return (state, refused) if refused else (state._replace(feed=feedforward.armed(request.laws)), ())
+    if request.kind in ("arm", "feedforward"):
+        refused = _refusals(state, inputs, request, alarms, views, settings)
+        if refused:
+            return state, refused
+        fed = state._replace(feed=feedforward.armed(request.laws))
+        return fed if request.kind == "feedforward" else _armed(state, inputs), ()
     if request.kind == "adopt":
         refused = _adopt_refusals(state, request, alarms, settings)
         return (state, refused) if refused else (_adopting(state, settings), ())
@@ -102,8 +93,10 @@ def _request(
     return state._replace(feed=feedforward.end(state.feed, cause)), ()
 
 
-def _forbidding(state: State, inputs: Inputs, request: Request, alarms: Alarms, views: Views) -> list[Alarm]:
-    """What forbids arming anything, but for what the daemon vouches for."""
+def _refusals(
+    state: State, inputs: Inputs, request: Request, alarms: Alarms, views: Views, settings: Settings
+) -> Alarms:
+    """All that forbids arming; an empty answer is the only way from OFF to ARMED, or to the on-line feed-forward."""
     refused: list[Alarm] = []
     if state.mode is not Mode.OFF or state.feed.mode is not FeedMode.OFF:
         refused.append(Alarm("NotOff", detail=state.mode.value))
@@ -114,22 +107,12 @@ def _forbidding(state: State, inputs: Inputs, request: Request, alarms: Alarms, 
     refused += [*alarms, *not_ready(views)]
     if not alarms and not state.good_for >= SETTLED_CYCLES:
         refused.append(Alarm("NotSettled", detail=f"{state.good_for} so far"))
-    return refused
-
-
-def _feed_refusals(
-    state: State, inputs: Inputs, request: Request, alarms: Alarms, views: Views, settings: Settings
-) -> Alarms:
-    """All that forbids the on-line feed-forward; an empty answer is the only way to switch it on."""
-    refused = [*_forbidding(state, inputs, request, alarms, views), *withheld(request.facts, FEEDFORWARD_FACTS)]
-    if not settings.feeds or len(request.laws) != len(settings.axes):
-        refused.append(Alarm("FeedforwardOff"))
-    return tuple(refused)
-
-
-def _refusals(state: State, inputs: Inputs, request: Request, alarms: Alarms, views: Views) -> Alarms:
-    """All that forbids arming; an empty answer is the only way from OFF to ARMED."""
-    refused = [*_forbidding(state, inputs, request, alarms, views), *withheld(request.facts)]
+    if request.kind == "feedforward":
+        refused += withheld(request.facts, FEEDFORWARD_FACTS)
+        if not settings.feeds or len(request.laws) != len(settings.axes):
+            refused.append(Alarm("FeedforwardOff"))
+        return tuple(refused)
+    refused += withheld(request.facts, FACTS)
     path = inputs.path
     if path is None or not request.program_digest or path.program_digest != request.program_digest or path.first:
         refused.append(Alarm("ProgramMismatch"))

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from statistics import median
 
 from fdhil.cia402 import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SYNC, Nmt, NmtCommand, PdoEntry, pdo_length, unpack
-from fdhil.guard.interlocks import Alarm, BusView
+from fdhil.guard.interlocks import Alarm
 from fdhil.guard.settings import AxisSettings, Pdo, Settings
-from fdhil.guard.state import AxisInput
+from fdhil.guard.state import AxisInput, BusView
 
 INF = float("inf")
 NEVER = 1 << 30

@@ -1,25 +1,10 @@
-"""What must hold before and while an offset is sent: each interlock its own class, with cause, reaction and action.
-
-Every comparison is written ``not (it is good)``: what is unknown (None, NaN) is never good.
-"""
+"""The interlocks by name: each its own class, with reaction, cause and next action; what the daemon must vouch for."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple
-
-from fdhil.cia402 import (
-    STATUS_FOLLOWING_ERROR,
-    STATUS_FOLLOWS_DEMAND,
-    STATUS_INTERNAL_LIMIT,
-    Mode,
-    Nmt,
-    State,
-    state_of,
-)
 
 
 class Reaction(IntEnum):
@@ -159,105 +144,3 @@ FEEDFORWARD_FACTS: Mapping[str, str] = {
 }
 # those that the daemon may withdraw while a correction runs
 WITHDRAWABLE = ("model_fresh", "skill_enough", "journal_writable")
-
-
-class AxisView(NamedTuple):
-    """What is known of one axis at a SYNC. Ages in SYNC cycles, infinite when never heard; NaN and None: unknown.
-
-    ``feedback_age`` is that of the older of statusword and position, in units of its own rate. ``echo_misses``: how
-    often in a row the drive showed another offset than ours. ``is_fed``: it shows a speed or torque offset.
-    """
-
-    name: str
-    feedback_age: float = math.inf
-    heartbeat_age_s: float = math.inf
-    heartbeat_timeout_s: float = 0.0
-    nmt: int | None = None
-    statusword: int | None = None
-    mode: int | None = None
-    following_error: float = math.nan
-    window: int = 0
-    largest_offset: int = 0
-    echo_misses: int = 0
-    read_back: int | None = None
-    target_heard: bool = False
-    short_frames: int = 0
-    long_frames: int = 0
-    is_fed: bool = False
-
-
-class BusView(NamedTuple):
-    """What is known of the bus at a SYNC."""
-
-    state: str = "active"
-    sync_regular: bool = False
-    silent: bool = True
-    lost_frames: int = 0
-
-
-def _operational(axis: AxisView) -> bool:
-    return axis.nmt is None or axis.nmt == Nmt.OPERATIONAL
-
-
-def _heartbeat(axis: AxisView) -> bool:
-    return axis.heartbeat_timeout_s == 0 or axis.heartbeat_age_s <= axis.heartbeat_timeout_s
-
-
-def _status(bit: int, wanted: bool) -> Callable[[AxisView], bool]:
-    return lambda axis: axis.statusword is not None and bool(axis.statusword & bit) is wanted
-
-
-def _enabled(axis: AxisView) -> bool:
-    return axis.statusword is not None and state_of(axis.statusword) is State.OPERATION_ENABLED
-
-
-def _following(axis: AxisView) -> bool:
-    bit_clear = axis.statusword is None or not axis.statusword & STATUS_FOLLOWING_ERROR
-    return bit_clear and abs(axis.following_error) <= axis.window / 2
-
-
-# (class, what must be true): evaluated per axis and SYNC, in this order
-AXIS_INTERLOCKS: tuple[tuple[str, Callable[[AxisView], bool]], ...] = (
-    ("StaleData", lambda axis: axis.feedback_age <= 3),
-    ("HeartbeatLost", _heartbeat),
-    ("NmtStateWrong", _operational),
-    ("FollowingError", _following),
-    ("DriveNotEnabled", _enabled),
-    ("NotFollowing", _status(STATUS_FOLLOWS_DEMAND, True)),
-    ("LimitActive", _status(STATUS_INTERNAL_LIMIT, False)),
-    ("NotCsp", lambda axis: axis.mode == Mode.CYCLIC_SYNC_POSITION),
-    ("EchoMismatch", lambda axis: axis.echo_misses < 2),
-    ("PdoLength", lambda axis: axis.short_frames < 3),
-    ("TargetLost", lambda axis: axis.target_heard),
-    ("FeedbackGap", lambda axis: axis.feedback_age <= 1),
-)
-BUS_INTERLOCKS: tuple[tuple[str, Callable[[BusView], bool]], ...] = (
-    ("BusDown", lambda bus: bus.state != "down"),
-    ("BusOff", lambda bus: bus.state != "off"),
-    ("ErrorPassive", lambda bus: bus.state != "passive"),
-    ("SyncLost", lambda bus: not bus.silent),
-    ("SyncJitter", lambda bus: bus.sync_regular),
-    ("RxOverflow", lambda bus: bus.lost_frames == 0),
-)
-# needed to arm only: per axis
-ARMING_INTERLOCKS: tuple[tuple[str, Callable[[AxisView], bool]], ...] = (
-    ("StaleOffset", lambda axis: not axis.read_back and not axis.is_fed),
-    ("PdoMapping", lambda axis: axis.long_frames == 0),
-    ("LimitBeyondWindow", lambda axis: axis.largest_offset <= axis.window / 4),
-)
-
-
-def failing(bus: BusView, axes: tuple[AxisView, ...]) -> tuple[Alarm, ...]:
-    """Return an alarm for every interlock that is not good at this SYNC."""
-    of_bus = [Alarm(code) for code, good in BUS_INTERLOCKS if not good(bus)]
-    return (*of_bus, *[Alarm(code, axis.name) for axis in axes for code, good in AXIS_INTERLOCKS if not good(axis)])
-
-
-def not_ready(axes: tuple[AxisView, ...]) -> tuple[Alarm, ...]:
-    """Return an alarm for everything about the drives that forbids arming beyond ``failing``."""
-    return tuple(Alarm(code, a.name) for a in axes for code, good in ARMING_INTERLOCKS if not good(a))
-
-
-def withheld(facts: Mapping[str, object], needed: Mapping[str, str] = FACTS) -> tuple[Alarm, ...]:
-    """Return an alarm for every needed fact that the daemon does not vouch for; only a true ``True`` counts."""
-    return tuple(Alarm(code) for fact, code in needed.items() if facts.get(fact) is not True)

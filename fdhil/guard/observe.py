@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from fdhil.guard.feedforward import Pair
-from fdhil.guard.interlocks import AxisView
 from fdhil.guard.settings import AxisSettings, Settings
 from fdhil.guard.state import NOT_SHOWN, SENDING, AxisInput, AxisState, Inputs, Mode, Shown, State
 
@@ -74,28 +73,6 @@ def _fed(axis: AxisState, shown: Shown, sent: Sequence[Pair]) -> AxisState:
         return axis
     right = len(sent) < 2 or any(all(s in (None, v) for s, v in zip(shown, pair, strict=True)) for pair in sent[1:])
     return axis._replace(fed_back=shown, feed_misses=0 if right else axis.feed_misses + 1)
-
-
-def view(setting: AxisSettings, seen: AxisInput, axis: AxisState) -> AxisView:
-    """Return one axis as the interlocks look at it."""
-    return AxisView(
-        setting.name,
-        seen.feedback_age,
-        seen.heartbeat_age_s,
-        setting.heartbeat_timeout_s,
-        seen.nmt,
-        seen.statusword,
-        seen.mode,
-        axis.following_error,
-        setting.window,
-        setting.limits.offset,
-        max(axis.echo_misses, axis.feed_misses),
-        axis.read_back,
-        seen.target is not None,
-        seen.short_frames,
-        seen.long_frames,
-        any(axis.fed_back),
-    )
 
 
 def behind(state: State) -> State:

@@ -8,7 +8,7 @@ from enum import Enum
 from typing import Literal, NamedTuple
 
 from fdhil.guard.feedforward import Feed, FeedMode, Law, Pair
-from fdhil.guard.interlocks import Alarm, BusView
+from fdhil.guard.interlocks import Alarm
 from fdhil.guard.limits import Travel
 from fdhil.guard.path import Path, Place
 from fdhil.guard.settings import Settings
@@ -53,7 +53,8 @@ class AxisInput(NamedTuple):
     """One axis at a SYNC: what its frames said since the SYNC before.
 
     ``target`` is the 0x607A that this SYNC latched, ``position`` and ``read_back`` what was sampled at the SYNC before
-    (None when no frame came). Ages as in :class:`interlocks.AxisView`.
+    (None when no frame came). Ages are infinite when never heard;
+    ``feedback_age`` is that of the older of statusword and position, in units of its own rate.
     """
 
     target: int | None = None
@@ -68,6 +69,15 @@ class AxisInput(NamedTuple):
     short_frames: int = 0
     long_frames: int = 0
     fed_back: Shown = NOT_SHOWN
+
+
+class BusView(NamedTuple):
+    """What is known of the bus at a SYNC."""
+
+    state: str = "active"
+    sync_regular: bool = False
+    silent: bool = True
+    lost_frames: int = 0
 
 
 class Inputs(NamedTuple):

@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 
 from fdhil.guard import core
-from fdhil.guard.interlocks import CATALOGUE, FACTS, Alarm, AxisView, BusView, Reaction, failing, not_ready
-from fdhil.guard.state import AxisInput, Inputs, Mode
-from tests.guard.machine import DIGEST, FACTS_GIVEN, Bench, arm_request, bench
+from fdhil.guard.conditions import View, failing, not_ready
+from fdhil.guard.interlocks import CATALOGUE, FACTS, Alarm, Reaction
+from fdhil.guard.state import AxisInput, AxisState, BusView, Inputs, Mode
+from tests.guard.machine import DIGEST, FACTS_GIVEN, Bench, arm_request, axis_settings, bench
 
 Change = Callable[[AxisInput], AxisInput]
 # one change per interlock, that breaks it and no other
@@ -133,7 +134,24 @@ def test_not_twice_and_not_by_itself() -> None:
     assert machine.arm() == ()
 
 
-GOOD = AxisView("X", 1, 0.0, 0.0, 5, 0x1237, 8, 0.0, 32768, 819, 0, 0, True)
+GOOD: View = (
+    replace(axis_settings("X", 1), heartbeat_timeout_s=0.5),
+    AxisInput(target=0, statusword=0x1237, mode=8, nmt=5, feedback_age=1, heartbeat_age_s=0.0),
+    AxisState(following_error=0.0, read_back=0),
+)
+
+
+def changed(change: dict[str, Any]) -> View:
+    """The good view with one field of any of its three records changed."""
+    own, seen, axis = GOOD
+    ((name, value),) = change.items()
+    if name in AxisState._fields:
+        axis = axis._replace(**change)
+    elif name in AxisInput._fields:
+        seen = seen._replace(**change)
+    else:
+        own = replace(own, **{name: value})
+    return own, seen, axis
 
 
 @pytest.mark.parametrize(
@@ -145,19 +163,21 @@ GOOD = AxisView("X", 1, 0.0, 0.0, 5, 0x1237, 8, 0.0, 32768, 819, 0, 0, True)
         ({"following_error": float("nan")}, "FollowingError"),
         ({"following_error": float("inf")}, "FollowingError"),
         ({"following_error": -16385.0}, "FollowingError"),
-        ({"heartbeat_timeout_s": 0.5, "heartbeat_age_s": float("nan")}, "HeartbeatLost"),
+        ({"heartbeat_age_s": float("nan")}, "HeartbeatLost"),
+        ({"heartbeat_age_s": 0.501}, "HeartbeatLost"),
         ({"statusword": None}, "DriveNotEnabled"),
         ({"mode": None}, "NotCsp"),
         ({"nmt": 0}, "NmtStateWrong"),
         ({"echo_misses": 2}, "EchoMismatch"),
-        ({"target_heard": False}, "TargetLost"),
+        ({"feed_misses": 2}, "EchoMismatch"),
+        ({"target": None}, "TargetLost"),
         ({"short_frames": 3}, "PdoLength"),
     ],
 )
 def test_unknown_is_never_good(change: dict[str, Any], code: str) -> None:
     bus = BusView(sync_regular=True, silent=False)
     assert failing(bus, (GOOD,)) == ()
-    bad = failing(bus, (GOOD._replace(**change),))
+    bad = failing(bus, (changed(change),))
     assert code in {alarm.code for alarm in bad}
 
 
@@ -165,13 +185,14 @@ def test_unknown_is_never_good(change: dict[str, Any], code: str) -> None:
     ("change", "code"),
     [
         ({"read_back": 5}, "StaleOffset"),
+        ({"fed_back": (0, 3)}, "StaleOffset"),
         ({"long_frames": 1}, "PdoMapping"),
         ({"window": 4 * 819 - 1}, "LimitBeyondWindow"),
     ],
 )
 def test_what_forbids_arming_alone(change: dict[str, Any], code: str) -> None:
     assert not_ready((GOOD,)) == ()
-    assert [a.code for a in not_ready((GOOD._replace(**change),))] == [code]
+    assert [a.code for a in not_ready((changed(change),))] == [code]
 
 
 @pytest.mark.parametrize("code", CATALOGUE)

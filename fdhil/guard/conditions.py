@@ -1,0 +1,89 @@
+"""What must hold before and while an offset is sent, as predicates over what is known of the bus and of an axis.
+
+Every comparison says what is good: what is unknown (None, NaN) is never good.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+
+from fdhil.cia402 import (
+    STATUS_FOLLOWING_ERROR,
+    STATUS_FOLLOWS_DEMAND,
+    STATUS_INTERNAL_LIMIT,
+    Mode,
+    Nmt,
+    State,
+    state_of,
+)
+from fdhil.guard.interlocks import Alarm
+from fdhil.guard.settings import AxisSettings
+from fdhil.guard.state import AxisInput, AxisState, BusView
+
+View = tuple[AxisSettings, AxisInput, AxisState]
+"""One axis: what it is set to, what it showed, and what is remembered of it."""
+Good = Callable[[AxisSettings, AxisInput, AxisState], bool]
+
+
+def _status(bit: int, wanted: bool) -> Good:
+    return lambda _own, seen, _axis: seen.statusword is not None and bool(seen.statusword & bit) is wanted
+
+
+def _enabled(_own: AxisSettings, seen: AxisInput, _axis: AxisState) -> bool:
+    return seen.statusword is not None and state_of(seen.statusword) is State.OPERATION_ENABLED
+
+
+def _following(own: AxisSettings, seen: AxisInput, axis: AxisState) -> bool:
+    bit_clear = seen.statusword is None or not seen.statusword & STATUS_FOLLOWING_ERROR
+    return bit_clear and abs(axis.following_error) <= own.window / 2
+
+
+def _heartbeat(own: AxisSettings, seen: AxisInput, _axis: AxisState) -> bool:
+    return own.heartbeat_timeout_s == 0 or seen.heartbeat_age_s <= own.heartbeat_timeout_s
+
+
+# (class, what must be true): evaluated per axis and SYNC, in this order
+AXIS_INTERLOCKS: tuple[tuple[str, Good], ...] = (
+    ("StaleData", lambda _own, seen, _axis: seen.feedback_age <= 3),
+    ("HeartbeatLost", _heartbeat),
+    ("NmtStateWrong", lambda _own, seen, _axis: seen.nmt is None or seen.nmt == Nmt.OPERATIONAL),
+    ("FollowingError", _following),
+    ("DriveNotEnabled", _enabled),
+    ("NotFollowing", _status(STATUS_FOLLOWS_DEMAND, True)),
+    ("LimitActive", _status(STATUS_INTERNAL_LIMIT, False)),
+    ("NotCsp", lambda _own, seen, _axis: seen.mode == Mode.CYCLIC_SYNC_POSITION),
+    ("EchoMismatch", lambda _own, _seen, axis: axis.echo_misses < 2 and axis.feed_misses < 2),
+    ("PdoLength", lambda _own, seen, _axis: seen.short_frames < 3),
+    ("TargetLost", lambda _own, seen, _axis: seen.target is not None),
+    ("FeedbackGap", lambda _own, seen, _axis: seen.feedback_age <= 1),
+)
+BUS_INTERLOCKS: tuple[tuple[str, Callable[[BusView], bool]], ...] = (
+    ("BusDown", lambda bus: bus.state != "down"),
+    ("BusOff", lambda bus: bus.state != "off"),
+    ("ErrorPassive", lambda bus: bus.state != "passive"),
+    ("SyncLost", lambda bus: not bus.silent),
+    ("SyncJitter", lambda bus: bus.sync_regular),
+    ("RxOverflow", lambda bus: bus.lost_frames == 0),
+)
+# needed to arm only: per axis
+ARMING_INTERLOCKS: tuple[tuple[str, Good], ...] = (
+    ("StaleOffset", lambda _own, _seen, axis: not axis.read_back and not any(axis.fed_back)),
+    ("PdoMapping", lambda _own, seen, _axis: seen.long_frames == 0),
+    ("LimitBeyondWindow", lambda own, _seen, _axis: own.limits.offset <= own.window / 4),
+)
+
+
+def failing(bus: BusView, views: Iterable[View]) -> tuple[Alarm, ...]:
+    """Return an alarm for every interlock that is not good at this SYNC."""
+    of_bus = [Alarm(code) for code, good in BUS_INTERLOCKS if not good(bus)]
+    return (*of_bus, *[Alarm(code, v[0].name) for v in views for code, good in AXIS_INTERLOCKS if not good(*v)])
+
+
+def not_ready(views: Iterable[View]) -> tuple[Alarm, ...]:
+    """Return an alarm for everything about the drives that forbids arming beyond ``failing``."""
+    return tuple([Alarm(code, v[0].name) for v in views for code, good in ARMING_INTERLOCKS if not good(*v)])
+
+
+def withheld(facts: Mapping[str, object], needed: Mapping[str, str]) -> tuple[Alarm, ...]:
+    """Return an alarm for every needed fact that the daemon does not vouch for; only a true ``True`` counts."""
+    return tuple(Alarm(code) for fact, code in needed.items() if facts.get(fact) is not True)
