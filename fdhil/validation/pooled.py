@@ -8,11 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from fdhil.config import Identification
+from fdhil.identification.covariance import aliasing
 from fdhil.identification.estimators import chosen
 from fdhil.identification.identifiability import unphysical
-from fdhil.records import PARAMETERS, Estimate, Float, Reason, Verdict, WindowOutcome, frozen
+from fdhil.records import PARAMETERS, Estimate, Float, Reason, Verdict, Window, WindowOutcome, frozen
 
 BEYOND_CHANCE = 5.0
+# of a doubt that windows of one drive share, what may still differ between them: its size depends on the regulators,
+# which are the same, and a little on the move
+UNSHARED = 0.2
 MODEL_SHARE = 0.003  # how well equal drives agree at any noise: the voltage's course within a sample is not known
 UNEXPLAINED = 30.0  # chi-square of 5 degrees of freedom: 2e-5 by chance
 GAINS: Mapping[str, Float] = {  # powers of R, L, K, Jt, ft, Cd
@@ -52,7 +56,7 @@ def pool(
             False, None, (Reason("SolverFailed", f"the solver gave up ({error})", "look at the windows"),)
         )
     reasons = list({r.text: r for r in estimate.missing.values()}.values()) + unphysical(estimate)
-    reasons += _moved([o.estimate for o in accepted if o.estimate is not None])
+    reasons += _moved([(o.window, o.estimate) for o in accepted if o.estimate is not None])
     return estimate, Verdict(not reasons, min(fits, default=None), tuple(reasons))
 
 
@@ -87,7 +91,7 @@ def weighted(estimates: Sequence[Estimate]) -> Estimate | None:
     )
 
 
-def _moved(estimates: Sequence[Estimate]) -> list[Reason]:
+def _moved(told: Sequence[tuple[Window, Estimate]]) -> list[Reason]:
     """Return a reason for each parameter that differs between windows beyond chance and by enough to matter.
 
     One sensor's gain moves several parameters at once, each in its own proportion: where that explains all of it, the
@@ -95,35 +99,58 @@ def _moved(estimates: Sequence[Estimate]) -> list[Reason]:
     """
     reasons: list[Reason] = []
     worst = (0, 0)
-    for name in PARAMETERS:
+    estimates = [estimate for _, estimate in told]
+    for k, name in enumerate(PARAMETERS):
         values = np.array([e.value(name) for e in estimates])
-        stds = np.array([e.std(name) for e in estimates])
         low, high = int(np.nanargmin(values)), int(np.nanargmax(values))
         apart = float(values[high] - values[low])
-        chance = BEYOND_CHANCE * float(np.hypot(stds[low], stds[high]))
+        chance = BEYOND_CHANCE * float(np.sqrt(difference_covariance(told[low], told[high])[k, k]))
         if apart > max(chance, LEAST_CHANGE[name] * abs(float(np.nanmedian(values)))):
             worst = worst if reasons else (min(low, high), max(low, high))
             code = "LoadChanged" if name == "Jt" else "ParameterJump"
             text = f"{name} moves from {values[low]:.4g} to {values[high]:.4g} between the windows"
             reasons.append(Reason(code, text, "identify the windows before and after the change apart"))
-    sensor = gain_change(estimates[worst[0]], estimates[worst[1]]) if len(reasons) > 1 else None
+    sensor = gain_change(told[worst[0]], told[worst[1]]) if len(reasons) > 1 else None
     return [sensor] if sensor is not None else reasons
 
 
-def gain_change(before: Estimate, after: Estimate) -> Reason | None:
+def difference_covariance(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) -> Float:
+    """Return the covariance (6, 6) of the difference between what two windows of one drive tell.
+
+    What is not known of the voltage's course within its samples is the regulators' doing and the same in both: with s
+    and t what it does to either estimate, it moves their difference by s - t only, and hides no change of the drive.
+    """
+    (own, systematic, alias), (its_own, its_systematic, its_alias) = _parts(*one), _parts(*other)
+    apart = systematic - its_systematic
+    unshared = systematic @ systematic.T + its_systematic @ its_systematic.T + np.diag(alias**2 + its_alias**2)
+    covariance: Float = own + its_own + apart @ apart.T + np.diag((alias - its_alias) ** 2) + UNSHARED**2 * unshared
+    return covariance
+
+
+def _parts(window: Window, estimate: Estimate) -> tuple[Float, Float, Float]:
+    """Return the covariance (6, 6) of a window's own chance, and the doubts (6, 2) and (6,) that it shares."""
+    size = len(PARAMETERS)
+    systematic = np.zeros((size, 2)) if estimate.systematic is None else estimate.systematic
+    slow = window.slow_voltage
+    period = window.dt_s if slow is None else slow.period_s
+    alias = aliasing(window.voltage_sampling, period) * np.abs(estimate.values)
+    return estimate.covariance - systematic @ systematic.T - np.diag(alias**2), systematic, alias
+
+
+def gain_change(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) -> Reason | None:
     """Return the reason when one sensor's gain explains all that differs between two estimates; None when none does.
 
     With g the factor of a sensor's gain, [1] and [2] hold again for parameters times g to the powers of ``GAINS``.
     """
+    before, after = one[1], other[1]
     names = [name for name in PARAMETERS if min(before.value(name), after.value(name)) > 0]
     if len(names) < len(PARAMETERS) - 1:  # friction may be nil
         return None
     rows = [PARAMETERS.index(name) for name in names]
     moved = np.log(after.values[rows] / before.values[rows])
-    spread = np.diag(np.full(len(rows), MODEL_SHARE**2))
-    for estimate in (before, after):
-        spread += (estimate.covariance / np.outer(estimate.values, estimate.values))[np.ix_(rows, rows)]
-    weight = np.linalg.inv(spread)
+    apart = difference_covariance(one, other) / np.outer(before.values, after.values)
+    spread = apart[np.ix_(rows, rows)] + np.diag(np.full(len(rows), MODEL_SHARE**2))
+    weight: Float = np.asarray(np.linalg.inv(spread), dtype=np.float64)
     singles = np.eye(len(rows))
     patterns = {name: powers[rows] for name, powers in GAINS.items()}
     left = {name: _unexplained(moved, weight, pattern)[1] for name, pattern in patterns.items()}

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from fdhil.identification import sweeps
 from fdhil.identification.covariance import aliasing
 from fdhil.identification.estimators.maximum_likelihood import Fit
+from fdhil.identification.filtering import moving_mean
 from fdhil.identification.innovations import innovations
 from fdhil.identification.motion import Motion
 from fdhil.identification.normal import inverse_of
@@ -32,6 +33,7 @@ LAGS = 25
 WHITENESS_BEYOND_CHANCE = 5.0
 PRACTICAL_CORRELATION = 0.25  # smaller ones come from the voltage's course within a sample and do no harm
 NOISE_RATIO = 1.6
+SLOPE_S = 0.005  # over which the acceleration is taken
 _KINDS = {"current": sweeps.CURRENT, "speed": sweeps.SPEED}
 STRIBECK_SPEEDS = (0.01, 0.03, 0.06, 0.12)  # of the rapid speed
 
@@ -67,7 +69,21 @@ class Bench:
 
     fit: Fit
     inverse: Float
-    course: Float
+    basis: Float
+    imitated: Float
+    coloured: float = 1.0
+
+    @classmethod
+    def of(cls, fit: Fit) -> Bench:
+        """Return the bench for a window's fit: ``basis`` (m, k + 1 + c) is jacobian, innovations and courses.
+
+        ``imitated`` (k, 1 + c) is what the parameters make of the last two.
+        """
+        inverse = inverse_of(fit.information)[0]
+        others = np.column_stack([fit.residuals, courses(fit)])
+        coloured = 1.0 + 2.0 * max(0.0, expected_correlation(fit)[0])
+        imitated = inverse @ (fit.jacobian.T @ others)
+        return cls(fit, inverse, np.column_stack([fit.jacobian, others]), imitated, coloured)
 
     @property
     def motion(self) -> Motion:
@@ -123,43 +139,82 @@ class Bench:
         change: Float = self.fit.residuals - innovations(motion, theta, gains, theta[6], load).ravel()
         return change
 
-    def course_scores(self, directions: Float) -> Float:
-        """Return the scores (q,) that the voltage's unknown course within its samples may give ``directions``."""
-        jacobian, course = self.fit.jacobian, self.course
-        seen: Float = directions.T @ course - (directions.T @ jacobian) @ (self.inverse @ (jacobian.T @ course))
-        return seen
+    def scores(self, directions: Float) -> tuple[Float, Float, Float]:
+        """Return score (q,) and course scores (q, c) of ``directions`` (m, q), and (k, q) their share in the jacobian.
 
-    def scores(self, directions: Float) -> tuple[Float, Float]:
-        """Return score (q,) and information (q, q) of ``directions`` (m, q) beyond what the parameters imitate."""
-        jacobian, e = self.fit.jacobian, self.fit.residuals
-        shared = jacobian.T @ directions
-        score: Float = directions.T @ e - shared.T @ (self.inverse @ (jacobian.T @ e))
-        information: Float = directions.T @ directions - shared.T @ self.inverse @ shared
-        return score, information
+        Scores are those beyond what the parameters imitate; the course's are what the voltage's unknown course within
+        its samples may give.
+        """
+        seen = self.basis.T @ directions
+        shared, beyond = np.split(seen, [len(self.inverse)])
+        beyond = beyond - self.imitated.T @ shared
+        return beyond[0], beyond[1:].T, shared
 
     def best(self, matrix: Float) -> tuple[int, float, float]:
         """Return index, statistic and amplitude of the column of ``matrix`` (m, q) with the largest statistic."""
-        score, information = self.scores(matrix)
-        whole = (matrix * matrix).sum(axis=0)
-        statistic, amplitude = _tested(score, np.diag(information), whole, self.course_scores(matrix))
+        score, course, shared = self.scores(matrix)
+        whole = np.einsum("mq,mq->q", matrix, matrix)
+        weight = whole - np.einsum("kq,kq->q", shared, self.inverse @ shared)
+        statistic, amplitude = self.tested(score, weight, whole, course)
         k = int(np.argmax(np.abs(statistic)))
         return k, float(statistic[k]), float(amplitude[k])
 
+    def tested(self, score: Float, weight: Float, whole: Float, course: Float) -> tuple[Float, Float]:
+        """Return statistics and amplitudes; 0 where the parameters imitate all but rounding of ``whole``.
 
-def _tested(score: Float, weight: Float, whole: Float, course: Float) -> tuple[Float, Float]:
-    """Return statistics and amplitudes; 0 where the parameters imitate all but rounding of a direction's ``whole``.
+        The variance of a score is its ``weight``, more where innovations hang together, and the squares of what one
+        standard deviation of each of the voltage's ``course`` (..., c) within the samples gives.
+        """
+        seen = weight > IMITATED * whole
+        safe = np.where(seen, weight, 1.0)
+        variance = self.coloured * safe + (course**2).sum(axis=-1)
+        return np.where(seen, score / np.sqrt(variance), 0.0), np.where(seen, score / safe, 0.0)
 
-    The variance of a score is its ``weight``, and the square of what one standard deviation of the voltage's ``course``
-    within the samples gives.
+
+def courses(fit: Fit) -> Float:
+    """Return how the innovations (m, c) answer one standard deviation of what is not known between voltage samples.
+
+    Interval means leave the course within a sample open. Instants, taken in step with a regulator that answers a rising
+    back-EMF, are off in proportion to the acceleration too; what they are off in proportion to current and its slope,
+    R and L imitate.
     """
-    seen = weight > IMITATED * whole
-    safe = np.where(seen, weight, 1.0)
-    return np.where(seen, score / np.sqrt(safe + course**2), 0.0), np.where(seen, score / safe, 0.0)
+    shape = fit.problem.shape_effect(fit.theta)[:, None]
+    motion, theta = fit.problem.motions[0], fit.theta
+    doubt = aliasing(motion.voltage_sampling, motion.voltage_period_s)[0]
+    if motion.slow is not None or doubt == 0.0:
+        return shape
+    rate = np.gradient(moving_mean(motion.speed, 2 * round(SLOPE_S / 2 / motion.dt_s) + 1), motion.dt_s)
+    missed = doubt * theta[0] * theta[3] / theta[2] * rate
+    answer = sweeps.answers(motion, theta, fit.problem.filters[0], sweeps.VOLTAGE, [missed], [np.zeros(motion.n)])
+    return np.column_stack([shape, answer])
+
+
+def expected_correlation(fit: Fit) -> Float:
+    """Return the autocorrelation (LAGS,) of the current's innovations that instants of a noisy voltage give.
+
+    Two neighbouring intervals share the noise of the instant between them, which a filter for white noise does not
+    know: with h the answer to one volt over one interval, noise of variance q gives q/2 (h h at one lag less and more).
+    """
+    motion, gains = fit.problem.motions[0], fit.problem.filters[0]
+    known = np.flatnonzero(np.abs(motion.mode) == 1)
+    if motion.voltage_sampling != "instant" or motion.slow is not None or known.size <= 3 * LAGS:
+        return np.zeros(LAGS)
+    row = int(known[known.size // 2])
+    pulse = np.zeros(motion.n)
+    # what the fit needs beyond the sensor's noise is the regulators' doing, and is not shared in that way
+    pulse[row] = min(fit.problem.noises[0].voltage_v, motion.noise.voltage_v)
+    answer = sweeps.answers(motion, fit.theta, gains, sweeps.VOLTAGE, [pulse], [np.zeros(motion.n)])
+    h = np.zeros(3 * LAGS)
+    part = answer.reshape(-1, 2)[row : row + h.size, 0]
+    h[: part.size] = part
+    powers = np.array([float(h[lag:] @ h[: h.size - lag]) for lag in range(LAGS + 2)])
+    expected: Float = 0.5 * (powers[:-2] + powers[2:]) / (1.0 + powers[1])
+    return expected
 
 
 def findings(fit: Fit) -> list[Finding]:
     """Return what the fit of one window shows beyond the model, the most significant first."""
-    bench = Bench(fit, inverse_of(fit.information)[0], fit.problem.shape_effect(fit.theta))
+    bench = Bench.of(fit)
     rows = np.flatnonzero(np.abs(bench.motion.mode) == 1)
     if rows.size < 2 * EDGES:
         return []
@@ -175,11 +230,12 @@ def _load(bench: Bench, edges: npt.NDArray[np.int_]) -> Finding:
     motion = bench.motion
     matrix = bench.load_answers([(np.arange(motion.n) >= edge).astype(np.float64) for edge in edges[:-1]])
     matrix = np.column_stack([matrix, np.zeros(matrix.shape[0])])
-    score, information = bench.scores(matrix)
+    score, course, shared = bench.scores(matrix)
+    gram = matrix.T @ matrix
+    information = gram - shared.T @ bench.inverse @ shared
     # a load from edge a to edge b is the step at a less the step at b
-    course = bench.course_scores(matrix)
-    apart, whole = score[:, None] - score[None, :], _apart(matrix.T @ matrix)
-    statistic, amplitude = _tested(apart, _apart(information), whole, course[:, None] - course[None, :])
+    apart, whole = score[:, None] - score[None, :], _apart(gram)
+    statistic, amplitude = bench.tested(apart, _apart(information), whole, course[:, None] - course[None, :])
     a, b = np.unravel_index(int(np.argmax(np.abs(np.triu(statistic, 1)))), statistic.shape)
     span = f"acts from {edges[a] * motion.dt_s:.3f} to {edges[b] * motion.dt_s:.3f} s of the window"
     found = (float(statistic[a, b]), float(amplitude[a, b]))
@@ -263,6 +319,9 @@ def whiteness(fit: Fit) -> Iterator[Reason]:
             continue  # a slow voltage does not foretell the current from row to row
         power = float(e[:, k] @ e[:, k])
         correlations = np.array([e[lag:, k] @ e[:-lag, k] for lag in range(1, LAGS + 1)]) / power
+        if name == "current":  # noise levels may be fitted so as to hide a part of what is expected
+            expected = expected_correlation(fit)
+            correlations = correlations - np.clip(correlations, np.minimum(expected, 0.0), np.maximum(expected, 0.0))
         worst = int(np.argmax(np.abs(correlations)))
         if abs(correlations[worst]) > limit:
             text = (
@@ -273,16 +332,23 @@ def whiteness(fit: Fit) -> Iterator[Reason]:
 
 
 def excess_noise(fit: Fit, window: Window) -> Iterator[Reason]:
-    """Yield a reason where the fit needs more noise than the signal's own scatter from row to row shows."""
+    """Yield a reason where the fit needs more noise than the signal's own scatter from row to row shows.
+
+    What the voltage's course within its samples may add, and the parameters do not imitate, is no reason.
+    """
     fitted = fit.problem.noises[0]
-    for name, unit, wanted, values in (
-        ("voltage", "V", fitted.voltage_v, window.voltage_v),
-        ("current", "A", fitted.current_a, window.current_a),
-        ("speed", "rad/s", fitted.speed_rad_s, window.speed_rad_s),
+    course = fit.problem.shape_effect(fit.theta)
+    course = course - fit.jacobian @ (inverse_of(fit.information)[0] @ (fit.jacobian.T @ course))
+    missed = np.sqrt(np.mean(course[: 2 * fit.problem.motions[0].n].reshape(-1, 2) ** 2, axis=0))
+    for name, unit, wanted, values, shape in (
+        ("voltage", "V", fitted.voltage_v, window.voltage_v, 0.0),
+        ("current", "A", fitted.current_a, window.current_a, float(missed[0])),
+        ("speed", "rad/s", fitted.speed_rad_s, window.speed_rad_s, float(missed[1])),
     ):
         seen = max(_scatter(values), getattr(fit.problem.motions[0].noise, _FIELDS[name]))
         if name == "voltage":
             seen = float(np.hypot(seen, _aliased_v(fit, window)))
+        seen = float(np.hypot(seen, shape * wanted))
         if wanted > NOISE_RATIO * seen:
             text = f"the model explains {name} to {wanted:.3g} {unit} only, while it scatters by {seen:.3g} {unit}"
             yield Reason("ValidationFailed", text, "the drive does what the model does not have: look at the residuals")

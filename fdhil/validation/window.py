@@ -18,6 +18,7 @@ from fdhil.records import Estimate, Float, Parameters, Reason, Result, Verdict, 
 from fdhil.validation.plausibility import implausibilities
 from fdhil.validation.rest import rest_faults
 from fdhil.validation.structure import excess_noise, findings, whiteness
+from fdhil.validation.timing import timing_faults
 
 LEAST_FIT_PERCENT = 80.0
 EXCESS = 1.5  # of the variance that noise explains
@@ -83,7 +84,7 @@ def _doubts(
         fit = maximum_likelihood.fit(fit.problem.motions, np.append(fit.theta[:6], 0.0), range(6))
     if np.isfinite(fit.residuals).all() and np.isfinite(fit.information).all():
         found = [*_structure(fit, window), *rest_faults(window, fit)]
-        reasons += found or ([late] if late is not None else [])
+        reasons += found or ([late] if late is not None else list(timing_faults(window, fit)))
     elif late is not None:
         reasons.append(late)
     least = expected_fit_percent(window, fit)

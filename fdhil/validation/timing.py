@@ -1,0 +1,139 @@
+"""Do voltage and current belong to the same instants as the rest? Their delays, from the fitted window's innovations.
+
+A delay is told by what it does to the smooth part of a signal: differences between neighbouring rows hold more noise
+than signal where rows are fine, which hides a delay of several of them. Resistance and inductance imitate most of a
+late voltage, and not in proportion to the delay, so that its size is searched for with the others fitted anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fdhil.identification import sweeps
+from fdhil.identification.estimators import maximum_likelihood
+from fdhil.identification.estimators.maximum_likelihood import Fit
+from fdhil.identification.filtering import moving_mean
+from fdhil.identification.normal import inverse_of
+from fdhil.records import Float, Reason, Window
+from fdhil.validation.structure import courses, expected_correlation
+
+SMOOTHING_S = 0.010  # of the jerk-limited course of a rapid nothing is lost over this time
+LARGEST = 1.0  # samples: a recorder may assign a value to the SYNC before or after it
+DOUBTFUL = 0.5  # samples: a delay that may be larger is searched for
+SURE = 4.5  # standard deviations: two tests a window
+SEARCH = 6  # fits: each takes away most of what is left
+REACH = 16.0  # samples: longer ones show in whole samples, see identification.delay
+FOUND = 0.1  # samples
+INSTANT = (
+    0.25  # samples, one standard deviation: what a regulator does within a sample moves an instant's apparent time
+)
+SHARED = 0.1  # a correlation above it, by instants whose noise two intervals share, misleads the search
+
+
+@dataclass(frozen=True, slots=True)
+class Shift:
+    """By how many samples the voltage or current of a window is late (early: negative), and the standard deviation."""
+
+    samples: float
+    std: float
+
+    @property
+    def sure(self) -> bool:
+        """Return whether it is beyond chance and more than a sample."""
+        return abs(self.samples) > max(LARGEST, SURE * self.std)
+
+
+def timing_faults(window: Window, fit: Fit) -> Iterator[Reason]:
+    """Yield the signal that is late or early by more than a sample, with the figure."""
+    if fit.problem.motions[0].slow is not None:
+        return  # there the delay is one of the parameters
+    voltage, current = shifts(fit)
+    if current.sure and abs(current.samples) * voltage.std > abs(voltage.samples) * current.std:
+        yield _reason("current", "voltage and speed", current, window.dt_s)
+        return
+    if abs(voltage.samples) + voltage.std > DOUBTFUL and expected_correlation(fit)[0] < SHARED:
+        voltage = searched(fit, voltage)
+    if voltage.sure:
+        yield _reason("voltage", "current and speed", voltage, window.dt_s)
+
+
+def _reason(name: str, others: str, shift: Shift, dt_s: float) -> Reason:
+    text = (
+        f"{name} is {1e3 * abs(shift.samples) * dt_s:.2f} ms {'late' if shift.samples > 0 else 'early'} against "
+        f"{others}, more than a sample of {1e3 * dt_s:g} ms"
+    )
+    return Reason("SampleTiming", text, "take voltage, current and speed from one SYNC, or enter the sensor's delay")
+
+
+def shifts(fit: Fit) -> tuple[Shift, Shift]:
+    """Return the delay of voltage and of current that the innovations show, each as if it alone were there."""
+    motion, gains = fit.problem.motions[0], fit.problem.filters[0]
+    width = 2 * round(SMOOTHING_S / 2 / motion.dt_s) + 1
+    found = []
+    jacobian = fit.jacobian[:, :6]
+    inverse, e = inverse_of(jacobian.T @ jacobian)[0], fit.residuals
+    coloured = 1.0 + 2.0 * max(0.0, float(expected_correlation(fit)[0]))
+    whole = np.column_stack([e, courses(fit)])
+    whole = whole - jacobian @ (inverse @ (jacobian.T @ whole))
+    for kind, values in ((sweeps.VOLTAGE, motion.delayed(float(fit.theta[6]))), (sweeps.CURRENT, motion.current)):
+        slope = np.gradient(moving_mean(values, width))
+        answer = sweeps.answers(motion, fit.theta, gains, kind, [slope], _no_rise(kind, motion.n))[:, 0]
+        rest = answer - jacobian @ (inverse @ (jacobian.T @ answer))
+        power = float(rest @ rest)
+        if not power > 0.0:
+            return Shift(0.0, np.inf), Shift(0.0, np.inf)
+        score, *unsure = (rest @ whole) / power
+        about = INSTANT if kind == sweeps.VOLTAGE and motion.voltage_sampling == "instant" else 0.0
+        found.append(Shift(-float(score), float(np.linalg.norm([*unsure, np.sqrt(coloured / power), about]))))
+    voltage, current = found
+    return replace(voltage, samples=voltage.samples + float(fit.theta[6]) / motion.dt_s), current
+
+
+def _no_rise(kind: int, n: int) -> list[Float] | None:
+    return [np.zeros(n)] if kind == sweeps.VOLTAGE else None
+
+
+def searched(fit: Fit, first: Shift) -> Shift:
+    """Return the voltage's delay at which, with the other parameters fitted to it, the innovations show none beyond."""
+    motion = fit.problem.motions[0]
+    begun = float(fit.theta[6]) / motion.dt_s
+    theta, std = fit.theta, first.std
+
+    def left(delay: float) -> float:
+        nonlocal theta, std
+        moved = maximum_likelihood.fit([motion], np.append(theta[:6], delay * motion.dt_s), range(6))
+        if not (np.isfinite(moved.residuals).all() and np.isfinite(moved.information).all()):
+            return float("nan")
+        theta = moved.theta
+        shift, _ = shifts(moved)
+        std = shift.std
+        return shift.samples - delay
+
+    found = _root(left, begun, first.samples - begun)
+    return first if found is None else Shift(found, std)
+
+
+def _root(left: Callable[[float], float], begun: float, rest: float) -> float | None:
+    """Return where ``left`` vanishes, by secants that stay within the bracket once there is one; None when lost."""
+    known = [(begun, rest)]
+    here = begun + 2.0 * rest  # what is left shows smaller than it is
+    for _ in range(SEARCH):
+        here = float(np.clip(here, -REACH, REACH))
+        value = left(here)
+        if not np.isfinite(value):
+            return None
+        before, was = known[-1]
+        known.append((here, value))
+        if abs(value) < FOUND:
+            break
+        slope = (value - was) / (here - before) if here != before else 0.0
+        above, below = [x for x, y in known if y > 0], [x for x, y in known if y <= 0]
+        following = here - value / slope if slope < 0 else here + 2.0 * value
+        if above and below:
+            low, high = max(above), min(below)
+            following = following if low < following < high else (low + high) / 2
+        here = following
+    return known[-1][0] + known[-1][1]
