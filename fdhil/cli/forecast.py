@@ -1,4 +1,6 @@
-"""What ``fdhil predict --from-history`` adds: when a zone leaves a tolerance, and what a step of a parameter costs."""
+"""What ``fdhil predict --from-history`` adds: what a step of a parameter costs, what became of each zone since the last
+time, and when it leaves a tolerance.
+"""
 
 from __future__ import annotations
 
@@ -12,29 +14,164 @@ import click
 from fdhil.errors import FdhilError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from fdhil.config import MachineConfig
-    from fdhil.prediction.forecast import Step
-    from fdhil.records import Parameters, Prediction
-    from fdhil.store.history import Revision
+    from fdhil.prediction.forecast import Step, ZoneChange
+    from fdhil.records import Float, Parameters, Prediction
+    from fdhil.store.history import Comparison, Revision, Stamp
 
 DAY_S = 86400.0
 FAR_DAYS = 36500.0
-RECENT = 64  # revisions of an axis that are looked at
+RECENT = 64  # revisions of an axis, or comparisons of a program, that are looked at
+BEYOND_CHANCE = 2.0  # standard deviations
+TOLD_UM = 0.1  # a smaller change is listed by --json only
+MANY_CHANGES = 12
+KEPT = ("start_s", "end_s", "where", "line", "max_um", "cause", "std_um")
 
 
 @dataclass(frozen=True, slots=True)
 class Past:
-    """The recent revisions of each axis, oldest first."""
+    """The recent revisions of each axis, oldest first, and what was predicted of a program, newest first."""
 
     revisions: Mapping[str, Sequence[Revision]]
+    comparisons: Sequence[tuple[Stamp, Comparison]]
 
     @staticmethod
-    def read(config: MachineConfig) -> Past:
+    def read(config: MachineConfig, program_digest: str) -> Past:
         """Read the machine's history; StoreError when there is none."""
         from fdhil.store.history import History
 
         with History.read(config.store.directory) as history:
-            return Past({axis: history.revisions(axis, RECENT) for axis in config.axis})
+            revisions = {axis: history.revisions(axis, RECENT) for axis in config.axis}
+            return Past(revisions, history.comparisons(program_digest, RECENT))
+
+
+def comparison(
+    program: Path,
+    digest: str,
+    past: Past,
+    predicted: Prediction,
+    models: Mapping[str, Parameters],
+    config: MachineConfig,
+    zones: Sequence[Mapping[str, Any]],
+) -> Comparison:
+    """Return this prediction as the store keeps it; ``zones`` as JSON has them."""
+    from fdhil.store.history import Comparison, UsedParameters
+
+    newest = {axis: found[-1].set.revision for axis, found in past.revisions.items() if found}
+    return Comparison(
+        program=digest,
+        name=program.name,
+        config_digest=config.digest,
+        used={axis: UsedParameters(newest.get(axis, 0), models[axis]) for axis in predicted.reference.axes},
+        rms_um=float((predicted.contour_um @ predicted.contour_um / predicted.contour_um.size) ** 0.5),
+        zones=tuple({key: zone[key] for key in KEPT} for zone in zones),
+    )
+
+
+def remember(past: Past, now: Comparison, config: MachineConfig) -> None:
+    """Store this prediction, unless it is the last one again; a store that takes nothing is told, and no more."""
+    if past.comparisons and _same(past.comparisons[0][1], now):
+        return
+    import time
+
+    from fdhil.daemon.keeping import boot_id
+    from fdhil.errors import StoreError
+    from fdhil.store.history import History, Stamp
+
+    try:
+        with History.open(config.store.directory) as history:
+            history.add_comparison(now, Stamp(time.time(), boot_id(), time.monotonic_ns()))
+    except StoreError as error:
+        click.echo(f"this prediction is not kept for the next one to compare with: {error}", err=True)
+
+
+def _same(one: Comparison, other: Comparison) -> bool:
+    return one.used == other.used and one.config_digest == other.config_digest
+
+
+def compared(
+    past: Past, now: Comparison, predicted: Prediction, std_um: Float, config: MachineConfig
+) -> dict[str, Any] | None:
+    """Return as JSON has it what became of each zone since the program was last predicted otherwise than now.
+
+    None when it was not predicted before, or always with these parameters and this configuration.
+    """
+    from fdhil.prediction import forecast
+    from fdhil.records import Zone
+
+    before = next(((stamp, old) for stamp, old in past.comparisons if not _same(old, now)), None)
+    if before is None:
+        return None
+    stamp, old = before
+    recorded = [(Zone(z["start_s"], z["end_s"], z["where"], z["max_um"], z["cause"]), z["std_um"]) for z in old.zones]
+    models = {axis: used.parameters for axis, used in now.used.items()}
+    earlier = {axis: used.parameters for axis, used in old.used.items() if axis in models}
+    same_settings = old.config_digest == now.config_digest
+    changes = forecast.zone_changes(predicted, models, earlier, std_um, recorded, config, same_settings)
+    return {
+        "at": datetime.datetime.fromtimestamp(stamp.wall_s, datetime.UTC).isoformat(timespec="seconds"),
+        "revisions": {axis: used.revision for axis, used in old.used.items()},
+        "configuration_changed": not same_settings,
+        "rms_um": {"before": old.rms_um, "now": now.rms_um},
+        "zones": [_change_entry(change, earlier, models) for change in changes],
+    }
+
+
+def _change_entry(
+    change: ZoneChange, earlier: Mapping[str, Parameters], models: Mapping[str, Parameters]
+) -> dict[str, Any]:
+    return {
+        "line": change.line,
+        "where": change.where,
+        "cause": change.cause,
+        "before_um": change.before_um,
+        "now_um": change.now_um,
+        "change_um": change.now_um - change.before_um,
+        "std_um": change.std_um,
+        "by": [
+            {
+                "axis": axis,
+                "parameter": name,
+                "before": getattr(earlier[axis], name),
+                "now": getattr(models[axis], name),
+                "um": um,
+            }
+            for axis, name, um in change.by
+        ],
+        "settings_um": change.settings_um,
+    }
+
+
+def show_compared(found: Mapping[str, Any] | None) -> None:
+    """Print the zones that have changed beyond chance, the most changed of them, and what caused it."""
+    if found is None:
+        return
+    revisions = ", ".join(f"{axis} {revision}" for axis, revision in found["revisions"].items())
+    since = f"since this program was predicted on {found['at'][:10]} (revisions {revisions})"
+    beyond = [z for z in found["zones"] if abs(z["change_um"]) > max(TOLD_UM, BEYOND_CHANCE * z["std_um"])]
+    if not beyond:
+        click.echo(f"nothing has changed beyond chance {since}")
+        return
+    rms = found["rms_um"]
+    click.echo(f"{since}: {rms['before']:.1f} -> {rms['now']:.1f} um RMS")
+    for zone in sorted(beyond, key=lambda z: -abs(z["change_um"]))[:MANY_CHANGES]:
+        line = f"line {zone['line']}, " if zone["line"] else ""
+        click.echo(
+            f"  {zone['change_um']:+.1f} +- {2 * zone['std_um']:.1f} um at {line}{zone['where']} ({zone['cause']},"
+            f" {zone['before_um']:.1f} -> {zone['now_um']:.1f}){_because(zone)}"
+        )
+    if len(beyond) > MANY_CHANGES:
+        click.echo(f"  and {len(beyond) - MANY_CHANGES} zones that changed less (--json lists them all)")
+
+
+def _because(zone: Mapping[str, Any]) -> str:
+    by = zone["by"][0] if zone["by"] else None
+    settings_um = zone["settings_um"] or 0.0
+    if by is not None and abs(by["um"]) >= abs(settings_um):
+        return f": {by['um']:+.1f} by {by['parameter']} of axis {by['axis']}, {by['before']:.4g} -> {by['now']:.4g}"
+    return f": {settings_um:+.1f} by the configuration" if settings_um else ""
 
 
 def steps(

@@ -70,46 +70,76 @@ def predict(
     done, 2 wrong option, model or configuration, 3 a file cannot be read or written.
 
     With --from-history the contour error has its standard deviation, from the parameters' covariance, and a step of an
-    axis' inertia or friction is told with what it costs: since REVISION, or since before the last step.
+    axis' inertia or friction is told with what it costs: since REVISION, or since before the last step. The prediction
+    is kept in the store, and the next one of the same program tells what became of each zone, and by which parameter.
     """
     if not from_history and (tolerance_um is not None or since is not None):
         raise click.UsageError("--tolerance-um and --since look at the history: give --from-history too")
     reference, models, config = inputs(program, config_path, model_path, from_history)
     from fdhil import prediction
-    from fdhil.cli import forecast
 
     predicted = prediction.predict(reference, models, config)
     columns = _prediction_columns(predicted)
     document = {"schema": "fdhil-predict-1", "program": str(program), **_prediction_document(predicted)}
-    zones = document["zones"]
-    steps: Sequence[Step] = ()
+    told = None
     if sensitivity or tolerance_um is not None:
         told = prediction.sensitivity_um(predicted, models, config)
-        for zone, per_axis in zip(zones, told, strict=True):
+        for zone, per_axis in zip(document["zones"], told, strict=True):
             zone["um_per_percent"] = per_axis
+    steps: Sequence[Step] = ()
     if from_history:
-        past = forecast.Past.read(config)
-        std = prediction.contour_std_um(reference, models, _covariances(reference, past), config)
-        columns["contour_std_um"] = (std, 4)
-        document["contour"]["max_std_um"] = float(std.max())
-        for zone, row in zip(zones, _peak_rows(predicted), strict=True):
-            zone["std_um"] = float(std[row])
-        steps = forecast.steps(past, predicted, models, config, since)
-        document["steps"] = forecast.step_entries(steps)
-        if tolerance_um is not None:
-            document["tolerance_um"] = tolerance_um
-            for zone, when in zip(zones, forecast.crossings(past, predicted, told, models, tolerance_um), strict=True):
-                zone["crosses"] = when
+        std_um, steps = _with_history(document, program, predicted, models, config, since, told, tolerance_um)
+        columns["contour_std_um"] = (std_um, 4)
     if out is not None:
         _write(out, columns)
     if report is not None:
         _report(report, program, config, predicted)
     if as_json:
         click.echo(json.dumps(document, allow_nan=False))
-    else:
-        _show_prediction(predicted, zones, tolerance_um)
-        forecast.show_steps(steps)
+        return 0
+    from fdhil.cli import forecast
+
+    _show_prediction(predicted, document["zones"], tolerance_um)
+    forecast.show_steps(steps)
+    forecast.show_compared(document.get("compared"))
     return 0
+
+
+def _with_history(
+    document: dict[str, Any],
+    program: Path,
+    predicted: Prediction,
+    models: Mapping[str, Parameters],
+    config: MachineConfig,
+    since: int | None,
+    told: Sequence[Mapping[str, Mapping[str, float]]] | None,
+    tolerance_um: float | None,
+) -> tuple[Float, Sequence[Step]]:
+    """Add to the document what the history says, and this prediction to the history.
+
+    Return the standard deviation of the contour error (n,) um, and the steps.
+    """
+    from fdhil import prediction
+    from fdhil.cli import forecast
+    from fdhil.program import program_digest
+
+    digest = program_digest(program)
+    past = forecast.Past.read(config, digest)
+    reference, zones = predicted.reference, document["zones"]
+    std_um = prediction.contour_std_um(reference, models, _covariances(reference, past), config)
+    document["contour"]["max_std_um"] = float(std_um.max())
+    for zone, row in zip(zones, _peak_rows(predicted), strict=True):
+        zone["std_um"] = float(std_um[row])
+    steps = forecast.steps(past, predicted, models, config, since)
+    document["steps"] = forecast.step_entries(steps)
+    now = forecast.comparison(program, digest, past, predicted, models, config, zones)
+    document["compared"] = forecast.compared(past, now, predicted, std_um, config)
+    forecast.remember(past, now, config)
+    if tolerance_um is not None and told is not None:
+        document["tolerance_um"] = tolerance_um
+        for zone, when in zip(zones, forecast.crossings(past, predicted, told, models, tolerance_um), strict=True):
+            zone["crosses"] = when
+    return std_um, steps
 
 
 @click.command()

@@ -37,6 +37,24 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True)
+class ZoneChange:
+    """What became of one zone since a program was last compared: its largest contour error ``before`` and ``now``, um.
+
+    ``by`` is what each parameter that changed did to it: (axis, symbol, um), the most first; putting one back alone
+    would undo so much. ``settings_um`` is what a changed configuration did, None where it is the same.
+    """
+
+    line: int
+    where: str
+    cause: str
+    before_um: float
+    now_um: float
+    std_um: float
+    by: tuple[tuple[str, str, float], ...]
+    settings_um: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class Crossing:
     """When a zone leaves the tolerance if the parameters go on as they did: days from the newest ones, 95 % interval.
 
@@ -112,6 +130,56 @@ def step_costs(
                 )
             )
     return tuple(sorted(steps, key=lambda step: -abs(step.cost_um)))
+
+
+def zone_changes(
+    prediction: Prediction,
+    models: Mapping[str, Parameters],
+    earlier: Mapping[str, Parameters],
+    std_um: Float,
+    recorded: Sequence[tuple[Zone, float]],
+    config: MachineConfig,
+    same_settings: bool,
+) -> tuple[ZoneChange, ...]:
+    """Return per zone what became of it since ``earlier`` parameters were used, the zones that are gone included.
+
+    ``std_um`` (n,) is of the present prediction; ``recorded`` are the zones as they were told then, each with its
+    standard deviation: where the configuration has changed since, they say what that did.
+    """
+    reference = prediction.reference
+    then = predict(reference, {**models, **earlier}, config)
+    without = {
+        (axis, name): predict(reference, {**models, axis: replace(models[axis], **{name: old})}, config).contour_um
+        for axis in earlier
+        for name, old in earlier[axis].as_dict().items()
+        if old != getattr(models[axis], name)
+    }
+    gone = [zone for zone in then.zones if not any(_meet(zone, other) for other in prediction.zones)]
+    changes = []
+    for zone in sorted((*prediction.zones, *gone), key=lambda zone: zone.start_s):
+        rows = slice(*(round((s - float(reference.time_s[0])) / reference.dt_s) for s in (zone.start_s, zone.end_s)))
+        peak = rows.start + int(np.argmax(np.maximum(prediction.contour_um, then.contour_um)[rows]))
+        now_um, before_um = float(prediction.contour_um[rows].max()), float(then.contour_um[rows].max())
+        by = ((axis, name, now_um - float(other[rows].max())) for (axis, name), other in without.items())
+        told = [(other.max_um, std) for other, std in recorded if _meet(zone, other)]
+        settings_um = before_um - max(told)[0] if told and not same_settings else None
+        std_then = max(told)[1] if told else float(std_um[peak])
+        change = ZoneChange(
+            line=int(reference.line[peak]),
+            where=zone.where,
+            cause=zone.cause,
+            before_um=before_um - (settings_um or 0.0),
+            now_um=now_um,
+            std_um=float(np.hypot(std_um[peak], std_then)),
+            by=tuple(sorted(by, key=lambda item: -abs(item[2]))),
+            settings_um=settings_um,
+        )
+        changes.append(change)
+    return tuple(changes)
+
+
+def _meet(zone: Zone, other: Zone) -> bool:
+    return zone.start_s < other.end_s and zone.end_s > other.start_s
 
 
 def _rms(values: Float) -> float:

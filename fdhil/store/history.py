@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,11 +22,11 @@ from fdhil.errors import StoreError
 from fdhil.records import PARAMETERS, Float, Notice, Parameters, ParameterSet, Skill, WindowOutcome, frozen
 
 FILE_NAME = "history.sqlite"
-SCHEMA_VERSION = 1
 KEEP_NOTICES = 100_000
+KEEP_COMPARISONS = 10_000
 _CODES = {"SQLITE_FULL": "DiskFull", "SQLITE_READONLY": "ReadOnlyStore", "SQLITE_CANTOPEN": "ReadOnlyStore"}
 _STAMP = "wall_s REAL NOT NULL, boot TEXT NOT NULL, monotonic_ns INTEGER NOT NULL"
-_SCHEMA = f"""
+_FIRST = f"""
 CREATE TABLE windows (id INTEGER PRIMARY KEY AUTOINCREMENT, axis TEXT NOT NULL, file TEXT NOT NULL,
   start_tick INTEGER NOT NULL, direction INTEGER NOT NULL, accepted INTEGER NOT NULL, fit_percent REAL,
   reasons TEXT NOT NULL, method TEXT, result TEXT, parameters TEXT, temperature_c REAL, {_STAMP});
@@ -40,8 +40,15 @@ CREATE TABLE notices (id INTEGER PRIMARY KEY AUTOINCREMENT, axis TEXT NOT NULL, 
   severity TEXT NOT NULL, text TEXT NOT NULL, tick INTEGER NOT NULL, {_STAMP});
 CREATE INDEX windows_axis ON windows (axis, id);
 CREATE INDEX revisions_axis ON revisions (axis, id);
-PRAGMA user_version = {SCHEMA_VERSION};
 """
+_COMPARISONS = f"""
+CREATE TABLE comparisons (id INTEGER PRIMARY KEY AUTOINCREMENT, program TEXT NOT NULL, name TEXT NOT NULL,
+  config_digest TEXT NOT NULL, parameters TEXT NOT NULL, rms_um REAL NOT NULL, zones TEXT NOT NULL, {_STAMP});
+CREATE INDEX comparisons_program ON comparisons (program, id);
+"""
+# what leads from each schema to the next, in order: a new one is added at the end, an old one never changes
+_STEPS = (_FIRST, _COMPARISONS)
+SCHEMA_VERSION = len(_STEPS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +87,26 @@ class StoredWindow:
     stamp: Stamp
 
 
+@dataclass(frozen=True, slots=True)
+class UsedParameters:
+    """An axis' parameters as a prediction used them: ``revision`` 0 where none was published."""
+
+    revision: int
+    parameters: Parameters
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """What was predicted of a program: ``program`` is its digest, ``zones`` as ``fdhil predict --json`` has them."""
+
+    program: str
+    name: str
+    config_digest: str
+    used: Mapping[str, UsedParameters]
+    rms_um: float
+    zones: tuple[Mapping[str, Any], ...]
+
+
 class History:
     """The history of one store directory. Every method raises StoreError when the database refuses."""
 
@@ -101,9 +128,8 @@ class History:
             try:
                 db.execute("PRAGMA journal_mode = WAL")
                 db.execute("PRAGMA synchronous = FULL")
-                if _version(db) == 0:
-                    db.executescript(f"BEGIN;{_SCHEMA}COMMIT;")
                 _check_version(db, path)
+                _bring_up(db)
             except (sqlite3.Error, StoreError):
                 db.close()
                 raise
@@ -119,7 +145,7 @@ class History:
             for flags in ("mode=ro", "mode=ro&immutable=1"):  # without a shared-memory file only the latter opens
                 db = sqlite3.connect(f"{path.resolve().as_uri()}?{flags}", uri=True, timeout=5.0)
                 try:
-                    _check_version(db, path)
+                    _check_version(db, path, least=1)
                 except sqlite3.OperationalError:
                     db.close()
                     continue
@@ -199,6 +225,29 @@ class History:
             with _told(self._path):
                 self._db.execute("DELETE FROM notices WHERE id <= ?", (number - KEEP_NOTICES,))
         return number
+
+    def add_comparison(self, found: Comparison, stamp: Stamp) -> int:
+        """Store what was predicted of a program; the oldest beyond ``KEEP_COMPARISONS`` go."""
+        used = {axis: {"revision": u.revision, **u.parameters.as_dict()} for axis, u in found.used.items()}
+        row = {
+            "program": found.program,
+            "name": found.name,
+            "config_digest": found.config_digest,
+            "parameters": json.dumps(used),
+            "rms_um": found.rms_um,
+            "zones": json.dumps(list(found.zones)),
+        }
+        number = self._insert("comparisons", row, stamp)
+        with _told(self._path):
+            self._db.execute("DELETE FROM comparisons WHERE id <= ?", (number - KEEP_COMPARISONS,))
+        return number
+
+    def comparisons(self, program: str, limit: int) -> list[tuple[Stamp, Comparison]]:
+        """Return what was predicted of a program (its digest), newest first."""
+        if _version(self._db) <= _STEPS.index(_COMPARISONS):
+            return []  # a reader does not bring an older store up
+        query = "SELECT * FROM comparisons WHERE program = ? ORDER BY id DESC LIMIT ?"
+        return [(_stamp(row), _comparison(row)) for row in self._select(query, (program, limit))]
 
     def revisions(self, axis: str | None = None, limit: int | None = None) -> list[Revision]:
         """Return the published parameter sets, oldest first; with ``limit`` the newest so many."""
@@ -286,9 +335,20 @@ def _version(db: sqlite3.Connection) -> int:
     return int(db.execute("PRAGMA user_version").fetchone()[0])
 
 
-def _check_version(db: sqlite3.Connection, path: Path) -> None:
+def _bring_up(db: sqlite3.Connection) -> None:
+    """Take an older schema, or an empty file, to the present one: every step is whole or not made at all."""
+    while (version := _version(db)) < SCHEMA_VERSION:
+        try:
+            db.executescript(f"BEGIN IMMEDIATE;{_STEPS[version]}PRAGMA user_version = {version + 1};COMMIT;")
+        except sqlite3.OperationalError:
+            db.rollback()
+            if _version(db) == version:  # else another process made the same step in between
+                raise
+
+
+def _check_version(db: sqlite3.Connection, path: Path, least: int = 0) -> None:
     version = _version(db)
-    if version != SCHEMA_VERSION:
+    if not least <= version <= SCHEMA_VERSION:
         text = f"{path} has schema {version}, this fdhil knows {SCHEMA_VERSION}; use the fdhil that wrote it"
         raise StoreError(text, "SchemaVersion")
 
@@ -309,6 +369,16 @@ def _revision(row: sqlite3.Row) -> Revision:
         row["config_digest"],
     )  # fmt: skip
     return Revision(row["id"], published, tuple(json.loads(row["window_ids"])), _stamp(row))
+
+
+def _comparison(row: sqlite3.Row) -> Comparison:
+    used = {
+        axis: UsedParameters(int(u["revision"]), Parameters(*(float(u[name]) for name in PARAMETERS)))
+        for axis, u in json.loads(row["parameters"]).items()
+    }
+    return Comparison(
+        row["program"], row["name"], row["config_digest"], used, row["rms_um"], tuple(json.loads(row["zones"]))
+    )
 
 
 def _stored_window(row: sqlite3.Row) -> StoredWindow:

@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from fdhil.cli.main import cli, run_safely
+from fdhil.errors import StoreError
 from fdhil.program import write_demand_csv
 from fdhil.records import Parameters, ParameterSet, frozen
 from fdhil.store.history import History, Stamp
@@ -95,15 +96,19 @@ def test_history_gives_parameters_and_their_uncertainty(bench: Path) -> None:
 
 
 def remember(folder: Path, revisions: list[dict[str, float]]) -> None:
-    """Store equal revisions of X and Y, one a day, known to 0.3 %, with some values other than nominal."""
+    """Store equal revisions of X and Y, one a day, with some values other than nominal."""
+    for number, changed in enumerate(revisions, 1):
+        for axis in "XY":
+            publish(folder, axis, number, **changed)
+
+
+def publish(folder: Path, axis: str, number: int, **changed: float) -> None:
+    """Store one more revision of an axis, known to 0.3 %."""
     nominal = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
     covariance = np.diag([(0.003 * value) ** 2 for value in nominal.values()])
     with History.open(folder / "fdhil-data") as history:
-        for number, changed in enumerate(revisions, 1):
-            for axis in "XY":
-                values = Parameters(**nominal | changed)
-                known = ParameterSet(axis, number, values, frozen(covariance), 3, 0, None, "digest")
-                history.add_revision(known, [], Stamp(86400.0 * number, "boot", 0))
+        known = ParameterSet(axis, number, Parameters(**nominal | changed), frozen(covariance), 3, 0, None, "digest")
+        history.add_revision(known, [], Stamp(86400.0 * number, "boot", 0))
 
 
 def test_history_tells_what_a_fixture_costs(bench: Path) -> None:
@@ -120,6 +125,71 @@ def test_history_tells_what_a_fixture_costs(bench: Path) -> None:
     assert json.loads(invoke(*arguments, "--since", 3, "--json").stdout)["steps"] == []
     assert invoke(*arguments, "--since", 99).exit_code != 0
     assert invoke("predict", program, "--config", bench / "bench.toml", "--since", 1).exit_code == 2
+
+
+def test_the_next_prediction_of_a_program_tells_what_became_of_it(bench: Path) -> None:
+    """A fixture on X between two predictions: each zone's change in um, the parameter that caused it, and the text; the
+    same again says it again, another program nothing."""
+    program = bench / "corner.ngc"
+    program.write_text("G21 G90 G64\nG1 X0 Y30 F10000\nG1 X40\nG1 Y60\nM2\n")
+    arguments = ["predict", program, "--config", bench / "bench.toml", "--from-history"]
+    remember(bench, [{}])
+    first = json.loads(invoke(*arguments, "--json").stdout)
+    assert first["compared"] is None
+    assert "since this program" not in invoke(*arguments).stdout
+    publish(bench, "X", 2, Jt=0.085, L=0.00501)
+    for _ in range(2):
+        document = json.loads(invoke(*arguments, "--json").stdout)
+        found = document["compared"]
+        assert found["revisions"] == {"X": 1, "Y": 1}
+        assert found["configuration_changed"] is False
+        zone = max(found["zones"], key=lambda zone: abs(zone["change_um"]))
+        assert zone["line"] in (3, 4)
+        assert zone["change_um"] > 5
+        cause, other = zone["by"]
+        assert (cause["axis"], cause["parameter"], cause["before"], cause["now"]) == ("X", "Jt", 0.075, 0.085)
+        assert cause["um"] == pytest.approx(zone["change_um"], abs=0.2)
+        assert abs(other["um"]) < 0.1
+        assert 0 < zone["std_um"] < 5
+        told = {z["where"]: z["max_um"] for z in first["zones"]}
+        assert any(z["before_um"] == pytest.approx(told.get(z["where"], -1.0)) for z in found["zones"])
+        assert found["rms_um"]["before"] == pytest.approx(first["contour"]["rms_um"])
+    text = invoke(*arguments).stdout
+    assert "since this program was predicted on 20" in text
+    assert "by Jt of axis X, 0.075 -> 0.085" in text
+    program.write_text(program.read_text() + "(another program)\n")
+    assert json.loads(invoke(*arguments, "--json").stdout)["compared"] is None
+
+
+def test_a_changed_configuration_is_told_apart_from_the_drives(bench: Path) -> None:
+    """Less position gain: what that did is not blamed on a parameter; nothing changed, nothing is told."""
+    remember(bench, [{}])
+    config = bench / "bench.toml"
+    arguments = ["predict", bench / "demand.csv", "--config", config, "--from-history"]
+    invoke(*arguments)
+    publish(bench, "X", 2, Cd=5.0001)
+    assert "nothing has changed beyond chance since" in invoke(*arguments).stdout
+    config.write_text(config.read_text().replace("position_gain_per_s = 50.0", "position_gain_per_s = 40.0"))
+    found = json.loads(invoke(*arguments, "--json").stdout)["compared"]
+    assert found["configuration_changed"] is True
+    largest = max(found["zones"], key=lambda zone: abs(zone["change_um"]))
+    assert largest["settings_um"] == pytest.approx(largest["change_um"], abs=0.1)
+    assert abs(largest["change_um"]) > 5
+    assert "by the configuration" in invoke(*arguments).stdout
+
+
+def test_a_store_that_takes_nothing_is_told(bench: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The prediction itself is not lost."""
+    remember(bench, [{}])
+
+    def full(_directory: Path) -> History:
+        raise StoreError("the disk is full", "DiskFull")
+
+    monkeypatch.setattr(History, "open", full)
+    result = invoke("predict", bench / "demand.csv", "--config", bench / "bench.toml", "--from-history", "--json")
+    assert result.exit_code == 0
+    assert "not kept for the next one to compare with: the disk is full" in result.stderr
+    assert json.loads(result.stdout)["compared"] is None
 
 
 def test_history_tells_when_a_zone_leaves_the_tolerance(bench: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fdhil.prediction import predict, sensitivity_um
-from fdhil.prediction.forecast import crossing, last_step, slopes_per_day, step_costs
+from fdhil.prediction.forecast import crossing, last_step, slopes_per_day, step_costs, zone_changes
 from fdhil.prediction.models import nominal_models
 from fdhil.records import PARAMETERS, Parameters, ParameterSet, Trajectory, frozen, frozen_ints
 from tests.bench import bench_config
@@ -44,6 +44,28 @@ def test_a_fixture_costs_what_the_prediction_without_it_says() -> None:
     assert step.cost_um == pytest.approx(float(rise.max()))
     assert step.cost_um > 5
     assert step.line == reference.line[int(np.argmax(rise))]
+
+
+def test_zones_that_came_and_went_are_told_with_what_did_it() -> None:
+    """Half the dry friction and more inertia on X: each zone's change is that of the two predictions; putting back what
+    is said to have caused most of it undoes most of it. A zone that is gone is listed too."""
+    reference = with_lines(bench_trajectory(10))
+    earlier = {"X": NOMINAL, "Y": replace(NOMINAL, Cd=9.0)}
+    models = {"X": replace(NOMINAL, Jt=0.085), "Y": NOMINAL}
+    predicted, then = predict(reference, models, CONFIG), predict(reference, earlier, CONFIG)
+    std = np.full(reference.time_s.size, 0.3)
+    recorded = [(zone, 0.4) for zone in then.zones]
+    changes = zone_changes(predicted, models, earlier, std, recorded, CONFIG, same_settings=True)
+    assert len(changes) >= len(predicted.zones)
+    assert {(axis, name) for change in changes for axis, name, _ in change.by} == {("X", "Jt"), ("Y", "Cd")}
+    assert all(change.settings_um is None for change in changes)
+    assert {change.by[0][:2] for change in changes} == {("X", "Jt"), ("Y", "Cd")}
+    largest = max(changes, key=lambda change: abs(change.now_um - change.before_um))
+    assert largest.by[0][2] == pytest.approx(largest.now_um - largest.before_um, rel=0.3)
+    assert largest.std_um == pytest.approx(0.5)
+    gone = [z for z in then.zones if all(z.end_s <= o.start_s or z.start_s >= o.end_s for o in predicted.zones)]
+    assert {zone.where for zone in gone} <= {change.where for change in changes}
+    assert gone
 
 
 def test_a_change_to_the_better_saves() -> None:

@@ -11,7 +11,16 @@ import pytest
 
 from fdhil.errors import StoreError
 from fdhil.records import Notice, Parameters, Skill
-from fdhil.store.history import FILE_NAME, History, Stamp, latest_parameters
+from fdhil.store import history as history_module
+from fdhil.store.history import (
+    FILE_NAME,
+    SCHEMA_VERSION,
+    Comparison,
+    History,
+    Stamp,
+    UsedParameters,
+    latest_parameters,
+)
 from tests.store.made import BENCH, STAMP, outcome, published
 
 DRIFTED = Parameters(0.5, 0.005, 0.8, 0.075, 0.01 + 1e-17, 1.0 / 3.0)
@@ -96,6 +105,73 @@ def test_another_schema_is_refused_and_left_as_it_is(tmp_path: Path) -> None:
         with pytest.raises(StoreError, match="schema 99") as error:
             opened(tmp_path)
         assert error.value.code == "SchemaVersion"
+
+
+def first_schema(folder: Path) -> None:
+    """A store as the first release wrote it, with one revision."""
+    with History.open(folder) as history:
+        history.add_revision(published(), [4], STAMP)
+    db = sqlite3.connect(folder / FILE_NAME)
+    db.executescript("DROP TABLE comparisons; PRAGMA user_version = 1;")
+    db.close()
+
+
+def test_an_older_schema_is_brought_up_by_the_writer_and_read_as_it_is(tmp_path: Path) -> None:
+    """Nothing of it is lost; a reader changes nothing and misses what was not kept then."""
+    first_schema(tmp_path)
+    with History.read(tmp_path) as history:
+        assert [r.set.revision for r in history.revisions()] == [1]
+        assert history.comparisons("a" * 64, 5) == []
+    with History.open(tmp_path) as history:
+        assert [r.window_ids for r in history.revisions()] == [(4,)]
+        history.add_comparison(comparison(), STAMP)
+    db = sqlite3.connect(tmp_path / FILE_NAME)
+    assert db.execute("PRAGMA user_version").fetchone() == (SCHEMA_VERSION,)
+    db.close()
+
+
+def test_a_step_that_another_process_made_meanwhile_is_not_made_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two writers see the old schema; the second one finds the step done."""
+    first_schema(tmp_path)
+    seen = history_module._version
+    late = iter([True])
+
+    def slow(db: sqlite3.Connection) -> int:
+        found = seen(db)
+        if next(late, False):
+            History.open(tmp_path).close()
+        return found
+
+    monkeypatch.setattr(history_module, "_check_version", lambda *_: None)
+    monkeypatch.setattr(history_module, "_version", slow)
+    with History.open(tmp_path) as history:
+        assert history.comparisons("a" * 64, 5) == []
+
+
+def comparison(rms_um: float = 24.2, program: str = "a" * 64) -> Comparison:
+    """What was predicted of a program."""
+    zone = {"start_s": 0.1, "end_s": 0.3, "where": "X 1.0", "line": 2, "max_um": 98.5, "cause": "corner", "std_um": 0.5}
+    used = {"X": UsedParameters(7, BENCH), "Y": UsedParameters(0, DRIFTED)}
+    return Comparison(program, "part.ngc", "0123456789abcdef", used, rms_um, (zone,))
+
+
+def test_comparisons_of_a_program_come_back_newest_first(tmp_path: Path) -> None:
+    with History.open(tmp_path) as history:
+        for rms_um in (1.0, 2.0, 3.0):
+            history.add_comparison(comparison(rms_um), STAMP)
+        history.add_comparison(comparison(4.0, "b" * 64), STAMP)
+        assert history.comparisons("a" * 64, 2) == [(STAMP, comparison(3.0)), (STAMP, comparison(2.0))]
+        assert history.comparisons("c" * 64, 2) == []
+
+
+def test_the_oldest_comparisons_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(history_module, "KEEP_COMPARISONS", 2)
+    with History.open(tmp_path) as history:
+        for rms_um in (1.0, 2.0, 3.0):
+            history.add_comparison(comparison(rms_um), STAMP)
+        assert [c.rms_um for _, c in history.comparisons("a" * 64, 9)] == [3.0, 2.0]
 
 
 @pytest.mark.parametrize(
