@@ -146,27 +146,21 @@ _residuals: Callable[..., Float] = njit(cache=True, nogil=True)(_residuals_plain
 class Gains:
     """The filter's gains (n, 4), whiteners (n, 3), and log determinant, for fixed parameters and noise.
 
-    With a slow voltage they belong to the ``events`` (e, 3) at ``times_s`` (e,), in order for a voltage that is late by
-    ``delay_s``.
+    With a slow voltage the filter is made anew from the noise's ``variances`` (3,), and the rest is empty.
     """
 
     gains: Float
     whiteners: Float
     logdet: float
-    events: slow_voltage.Events = field(default_factory=lambda: np.zeros((0, 3), np.int64))
-    times_s: Float = field(default_factory=lambda: np.zeros(0))
-    delay_s: float = 0.0
+    variances: Float = field(default_factory=lambda: np.zeros(0))
 
 
 def gains_of(motion: Motion, theta: Float, noise: Noise) -> Gains:
     """Return the filter's gains for ``theta`` (7,) = [R, L, K, Jt, ft, Cd, delay]."""
     variances = noise.vector() ** 2
     if motion.slow is not None:
-        delay = float(theta[6])
-        events, times = slow_voltage.events_of(motion.slow, motion.voltage_sampling, motion.n, motion.dt_s, delay)
-        walks = (motion.speed_walk, motion.slope_walk, motion.slow.period_s)
-        made = slow_voltage.gains(theta, motion.dt_s, motion.mode, motion.observed, variances, *walks, events, times)
-        return Gains(*made, events, times, delay)
+        made = slow_voltage.innovations_of(motion, theta, variances, float(theta[6]))
+        return Gains(NOTHING, NOTHING, made.logdet, variances)
     return Gains(*_gains(theta, motion.dt_s, motion.mode, motion.observed, variances, motion.speed_walk))
 
 
@@ -186,23 +180,11 @@ def innovations(
     of an interval mean within its sample only the back-EMF's ramp is certain (``emf_share`` of it is taken): what the
     current regulator adds depends on the drive, and to take it from neighbouring means biases L.
     """
-    load = NOTHING if load_nm is None else load_nm
     if motion.slow is not None:
-        return slow_voltage.residuals(
-            theta,
-            motion.mode,
-            motion.observed,
-            load,
-            motion.current,
-            motion.speed,
-            motion.voltage_mean,
-            motion.slow.period_s,
-            gains.events,
-            gains.times_s,
-            delay_s - gains.delay_s,
-            gains.gains,
-            gains.whiteners,
-        )
+        late = np.append(theta[:6], delay_s)
+        made = slow_voltage.innovations_of(motion, late, gains.variances, delay_s, load_nm)
+        return made.whitened
+    load = NOTHING if load_nm is None else load_nm
     means = motion.voltage_sampling == "interval_mean"
     return _residuals(
         theta,

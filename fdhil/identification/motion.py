@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -42,7 +43,8 @@ class Motion:
     ``voltage_mean`` and ``voltage_rise`` (n,) describe the voltage over each interval; ``current`` and ``speed`` (n,)
     are instants, ``observed`` (n,) marks the rows that were measured. ``speed_walk`` is the standard deviation of the
     speed's change over an interval of unknown friction. Where the voltage is ``slow``, ``voltage_mean`` (m,) are its
-    samples, and ``slope_walk`` is the variance that the current's slope gains per second, (A/s)^2/s.
+    samples, and ``slope_walk`` (n,) is the variance that the current's slope gains per second, (A/s)^2/s,
+    and ``shape_variance`` (m,), V^2, what the voltage's course within a row adds to its noise.
     """
 
     dt_s: float
@@ -56,12 +58,18 @@ class Motion:
     speed_walk: float
     voltage_sampling: VoltageSampling = "interval_mean"
     slow: SlowVoltage | None = None
-    slope_walk: float = 0.0
+    slope_walk: Float = field(default_factory=lambda: np.zeros(0))
+    shape_variance: Float = field(default_factory=lambda: np.zeros(0))
 
     @property
     def n(self) -> int:
         """Number of rows."""
         return int(self.speed.size)
+
+    @property
+    def samples(self) -> int:
+        """Number of samples of a slow voltage."""
+        return 0 if self.slow is None else int(self.slow.voltage_v.size)
 
     @property
     def voltage_period_s(self) -> float:
@@ -148,8 +156,12 @@ def _majority(side: Modes, sure: Bool) -> Modes:
     return result
 
 
+@lru_cache(maxsize=8)
 def noise_levels(window: Window) -> Noise:
-    """Return the noise of the three signals as their third differences show it, never below their resolution."""
+    """Return the noise of the three signals as their third differences show it, never below their resolution.
+
+    Estimator and checks ask for it several times a window.
+    """
     voltage = window.slow_voltage.voltage_v if window.slow_voltage is not None else window.voltage_v
     signals = (voltage, window.current_a, window.speed_rad_s)
     levels = [_level(s, share) for s, share in zip(signals, SHAPE_SHARE, strict=True)]

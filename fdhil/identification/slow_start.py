@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from fdhil.config import Identification
+from fdhil.identification.covariance import aliasing
 from fdhil.identification.estimators.least_squares import mechanical_signals
-from fdhil.identification.filtering import zero_phase
-from fdhil.identification.innovations import gains_of, innovations
+from fdhil.identification.filtering import moving_mean, zero_phase
 from fdhil.identification.motion import Motion, prepare
 from fdhil.identification.normal import solve
+from fdhil.identification.slow_voltage import CORNER_ROWS, innovations_of
 from fdhil.identification.windows import carried
 from fdhil.records import Float, Window
 
@@ -21,7 +22,8 @@ SPAN_SAMPLES = 3
 SHIFTS_PER_SAMPLE = 4
 IMPROVEMENT = 1.5  # the residual's power must fall by this factor before a shift is believed
 LEAST_SAMPLES = 16
-WALKS = 10.0 ** np.arange(-1.0, 4.01, 0.5)  # of what the low-passed current's slope changes by
+BEYOND_NOISE = 3.0  # of the variance that noise gives: what five rows rarely exceed by chance
+FLOORS = 10.0 ** np.arange(-6.0, 1.01, 0.5)  # of the variance of the current's second difference that is noise
 
 
 def slow_start(windows: Sequence[Window], settings: Identification) -> tuple[Float, list[float], list[Motion]] | None:
@@ -80,14 +82,31 @@ def _coarse_shift(window: Window, lowpass_hz: float) -> float:
     return float(shifts[best])
 
 
-def with_slope_walk(motion: Motion, theta: Float, lowpass_hz: float) -> Motion:
-    """Return the motion with the most likely walk of the current's slope, on a coarse scale."""
-    slope = np.gradient(zero_phase(motion.current, lowpass_hz, motion.dt_s), motion.dt_s)
-    walk = max(float(np.mean(np.diff(slope) ** 2)) / motion.dt_s, 1e-12)
-    trials = [replace(motion, slope_walk=walk * share) for share in WALKS]
+def with_course(motion: Motion, theta: Float) -> Motion:
+    """Return the motion with what is known of its signals between the rows, for ``theta`` (7,).
+
+    The current's slope walks: a rapid's current has corners where the acceleration begins and ends, and is smooth
+    between. A walk as strong everywhere as the corners need would follow noise, and a weaker one would take them for
+    the voltage's delay. The share of the walk that noise hides is the most likely one.
+    """
+    sampled = replace(motion, shape_variance=_shape_variance(motion, theta))
+    second = np.pad(np.diff(motion.current, 2), 1, mode="edge")
+    chance = 6.0 * motion.noise.current_a**2  # the variance that white noise gives a second difference
+    shown = np.maximum(moving_mean(second**2, CORNER_ROWS) - BEYOND_NOISE * chance, 0.0)
+    trials = [replace(sampled, slope_walk=(shown + share * chance) / motion.dt_s**3) for share in FLOORS]
     costs = []
     for trial in trials:
-        gains = gains_of(trial, theta, trial.noise)
-        e = innovations(trial, theta, gains, float(theta[6]))
-        costs.append(gains.logdet + float(e @ e))
-    return trials[int(np.nanargmin(costs))] if np.isfinite(costs).any() else trials[WALKS.size // 2]
+        made = innovations_of(trial, theta, trial.noise.vector() ** 2, float(theta[6]))
+        costs.append(made.logdet + float(made.whitened @ made.whitened))
+    return trials[int(np.nanargmin(costs))] if np.isfinite(costs).any() else trials[FLOORS.size // 2]
+
+
+def _shape_variance(motion: Motion, theta: Float) -> Float:
+    """Return by how much (m,), V^2, an instant may be off [1] for what the regulators do within a row; a mean is not.
+
+    What they do to L di/dt is the same wherever the current is on its way, and so is taken for L.
+    """
+    share = aliasing(motion.voltage_sampling, motion.dt_s)[0]
+    course = motion.aligned(float(theta[6])).at_voltage(moving_mean(motion.current, CORNER_ROWS))
+    doubt: Float = (share * theta[0] * course) ** 2
+    return doubt

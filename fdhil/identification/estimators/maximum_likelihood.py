@@ -24,7 +24,8 @@ from fdhil.identification.innovations import Gains, gains_of, innovations
 from fdhil.identification.motion import UNKNOWN, Motion, Noise, prepare
 from fdhil.identification.noise import fit_noise
 from fdhil.identification.normal import inverse_of, solve
-from fdhil.identification.slow_start import slow_start, with_slope_walk
+from fdhil.identification.slow_start import slow_start, with_course
+from fdhil.identification.slow_voltage import course_effect, in_order
 from fdhil.identification.sweeps import whiten
 from fdhil.records import PARAMETERS, Estimate, Float, Result, Window
 
@@ -32,6 +33,9 @@ NAME = "maximum_likelihood"
 RENEWALS = 3
 STEPS = 16
 CONVERGED = 1e-3  # of a standard deviation
+ROUGH = 0.3  # of a standard deviation: near enough to tell the noise levels
+KEPT = 0.2  # of the step before: as long as steps shorten by more, their jacobian is good enough
+SLACK = 1e-6  # of the squares' sum, by which a step may miss the bottom
 DIFFERENCE = 1e-5
 DELAY_DIFFERENCE_S = 1e-5
 SURE = 5.0  # standard deviations beyond which a delay is believed
@@ -39,6 +43,9 @@ SHAPE_DOUBT = 1.5  # of the back-EMF's ramp within a sample: one standard deviat
 LEAST_DELAY = 0.05  # of a sample; smaller ones cannot be told from the voltage's course within a sample
 CHANCE = 2.0  # standard deviations of a delay that are chance, not doubt
 SETTLED = 0.01  # squared standard deviations moved by a renewal of the filter
+INSTANT_DELAY = 0.5  # of a row
+SLOW_CONVERGED = 0.03  # where a mark passes a row, steps are not quite smooth
+SLOW_SLACK = 0.1  # with a slow voltage the equations' root is not where the squares are least
 FLOORS = np.array([1e-4, 0.0, 1e-4, 1e-9])
 LEAST_TIME_CONSTANT_S = 1e-4  # of the winding: noise may drive the starting L below 0
 
@@ -59,13 +66,22 @@ class Problem:
         column: Float = self.columns(theta[None])[:, 0]
         return column
 
-    def columns(self, thetas: Float) -> Float:
-        """Return the whitened innovations (m, q) for each row of ``thetas`` (q, 7)."""
+    @property
+    def slow(self) -> bool:
+        """Whether the voltage comes more slowly than the drive's rows."""
+        return any(m.slow is not None for m in self.motions)
+
+    def columns(self, thetas: Float, about: Float | None = None) -> Float:
+        """Return the whitened innovations (m, q) for each row of ``thetas`` (q, 7), small variations ``about`` one."""
         pairs = zip(self.motions, self.noises, strict=True)
-        return np.concatenate([whiten(m, thetas, np.tile(s.vector() ** 2, (len(thetas), 1)))[0] for m, s in pairs])
+        every = len(thetas)
+        return np.concatenate([whiten(m, thetas, np.tile(s.vector() ** 2, (every, 1)), about)[0] for m, s in pairs])
 
     def shape_effect(self, theta: Float) -> Float:
         """Return how the innovations (m,) change with what is not known of the voltage's course within its samples."""
+        if self.slow:
+            pairs = zip(self.motions, self.noises, strict=True)
+            return np.concatenate([course_effect(m, theta, s.vector() ** 2) for m, s in pairs])
         return self._all(theta, 1.0 + SHAPE_DOUBT) - self._all(theta, 1.0)
 
     def _all(self, theta: Float, emf_share: float) -> Float:
@@ -103,7 +119,7 @@ def jacobian(problem: Problem, theta: Float, base: Float, free: Sequence[int], s
     steps = np.array([DELAY_DIFFERENCE_S if j == 6 else DIFFERENCE * scales[j] for j in free])
     moved = np.tile(theta, (len(free), 1))
     moved[np.arange(len(free)), list(free)] += steps
-    changes: Float = (base[:, None] - problem.columns(moved)) / steps
+    changes: Float = (base[:, None] - problem.columns(moved, theta)) / steps
     return changes
 
 
@@ -122,39 +138,57 @@ def admissible(theta: Float) -> bool:
     return bool(np.isfinite(theta).all() and (theta[:4] > 0).all())
 
 
-def descend(problem: Problem, theta: Float, free: Sequence[int]) -> tuple[Float, Float, Float, bool]:
-    """Take Gauss-Newton steps; return theta, innovations (m,), jacobian (m, k), and success."""
+def descend(
+    problem: Problem, theta: Float, free: Sequence[int], enough: float = CONVERGED
+) -> tuple[Float, Float, Float, bool]:
+    """Take Gauss-Newton steps until one is below ``enough`` standard deviations.
+
+    Return theta, innovations (m,), jacobian (m, k), and success. The jacobian hardly changes near the bottom, and costs
+    as much as all else: it is kept while each step is much shorter than the one before.
+    """
     residuals = problem.residuals(theta)
+    last, j, inverse, norms = 0.0, *_slopes(problem, theta, residuals, free)
     for _ in range(STEPS):
-        j = jacobian(problem, theta, residuals, free, typical(theta, problem.motions))
-        norms = np.sqrt((j * j).sum(axis=0))
+        step = inverse @ (j.T @ residuals)
+        size = float(np.abs(step * norms).max())
+        if last and (problem.slow or size > KEPT * last):
+            j, inverse, norms = _slopes(problem, theta, residuals, free)
+            step = inverse @ (j.T @ residuals)
+            size = float(np.abs(step * norms).max())
         if not np.isfinite(norms).all() or (norms == 0).any():
             return theta, residuals, j, False
-        step = solve(j, residuals)[0]
-        share, cost = 1.0, float(residuals @ residuals)
+        share, ceiling = 1.0, float(residuals @ residuals) * (1 + (SLOW_SLACK if problem.slow else SLACK))
         while share > 1e-3:
             trial = theta.copy()
             trial[list(free)] += share * step
             if admissible(trial):
                 moved = problem.residuals(trial)
-                if np.isfinite(moved).all() and float(moved @ moved) <= cost * (1 + 1e-12):
+                if np.isfinite(moved).all() and float(moved @ moved) <= ceiling:
                     theta, residuals = trial, moved
                     break
             share *= 0.5
         else:
             return theta, residuals, j, True  # nothing lower along the step: this is the bottom, to rounding
-        if float(np.abs(step * norms).max()) < CONVERGED:
+        if size < (SLOW_CONVERGED if problem.slow else enough):
             return theta, residuals, j, True
+        last = size
     return theta, residuals, j, False
+
+
+def _slopes(problem: Problem, theta: Float, residuals: Float, free: Sequence[int]) -> tuple[Float, Float, Float]:
+    """Return the jacobian (m, k), the inverse (k, k) of its Gram matrix, and the lengths (k,) of its columns."""
+    j = jacobian(problem, theta, residuals, free, typical(theta, problem.motions))
+    gram = j.T @ j
+    return j, inverse_of(gram)[0], np.sqrt(np.diag(gram))
 
 
 def fit(motions: Sequence[Motion], start: Float, free: Sequence[int]) -> Fit:
     """Alternate between the parameters and the noise levels, from ``start`` (7,)."""
     theta, noises = start.copy(), [m.noise for m in motions]
     for turn in range(RENEWALS):
-        problem = pose(motions, theta, noises)
+        problem = Problem(tuple(motions), tuple(noises), ())
         before = theta
-        theta, residuals, j, converged = descend(problem, theta, free)
+        theta, residuals, j, converged = descend(problem, theta, free, CONVERGED if turn else ROUGH)
         information = j.T @ j
         moved = theta[list(free)] - before[list(free)]
         if turn and float(moved @ information @ moved) < SETTLED:
@@ -220,9 +254,18 @@ def _fit_separate(motions: Sequence[Motion], start: Float, delays: Sequence[floa
     """
     alone = [fit([m], np.append(start[:6], delay), range(7)) for m, delay in zip(motions, delays, strict=True)]
     if len(motions) == 1:
-        return alone[0]
+        return replace(alone[0], delay_doubt_s=instant_doubt(motions[0]))
     aligned = [m.aligned(f.theta[6]) if f.converged else m for m, f in zip(motions, alone, strict=True)]
-    return fit(aligned, np.append(alone[0].theta[:6], 0.0), range(7))
+    together = fit(aligned, np.append(alone[0].theta[:6], 0.0), range(7))
+    return replace(together, delay_doubt_s=instant_doubt(motions[0]))
+
+
+def instant_doubt(motion: Motion) -> float:
+    """Return one standard deviation (s) of a delay told by instants of a slow voltage, taken in step with regulators.
+
+    What the regulators do within a row puts an instant off by some of the voltage's rise over the row, always alike.
+    """
+    return INSTANT_DELAY * motion.dt_s if motion.slow is not None and motion.voltage_sampling == "instant" else 0.0
 
 
 def _fit_slow(windows: Sequence[Window], settings: Identification) -> Fit | None:
@@ -232,10 +275,7 @@ def _fit_slow(windows: Sequence[Window], settings: Identification) -> Fit | None
         return None
     theta, delays, motions = begun
     theta[1] = max(theta[1], LEAST_TIME_CONSTANT_S * theta[0])
-    walking = [
-        with_slope_walk(m, np.append(theta[:6], delay), settings.lowpass_hz)
-        for m, delay in zip(motions, delays, strict=True)
-    ]
+    walking = [with_course(m, np.append(theta[:6], delay)) for m, delay in zip(motions, delays, strict=True)]
     return _fit_separate(walking, theta, delays)
 
 
@@ -286,15 +326,16 @@ def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
 def robust_inverse(result: Fit, inverse: Float) -> Float:
     """Return ``inverse`` (k, k), or the covariance that holds where innovations are coloured or of uneven variance."""
     motions = result.problem.motions
-    if any(m.slow is not None for m in motions):
-        return inverse  # its rows and its voltage's samples have no common order
-    cuts = np.cumsum([2 * m.n for m in motions])[:-1]
-    parts = [e.reshape(-1, 2) for e in np.split(result.residuals, cuts)]
+    cuts = np.cumsum([2 * m.n + m.samples for m in motions])[:-1]
+    parts = np.split(result.residuals, cuts)
     known = [(m.mode != UNKNOWN) & m.observed for m in motions]
-    if not any(suspicious(e[rows]) for e, rows in zip(parts, known, strict=True)):
+    rows = [e[: 2 * m.n].reshape(-1, 2)[where] for m, e, where in zip(motions, parts, known, strict=True)]
+    sampled = [e[2 * m.n :, None] for m, e in zip(motions, parts, strict=True)]
+    if not any(suspicious(e) for e in (*rows, *sampled)):
         return inverse
     products = np.split(result.jacobian * result.residuals[:, None], cuts)
-    return robust(result.information, [p.reshape(-1, 2, p.shape[1]).sum(axis=1) for p in products])
+    delay = float(result.theta[6])
+    return robust(result.information, [in_order(m, delay, p) for m, p in zip(motions, products, strict=True)])
 
 
 def finish(result: Fit) -> Estimate:
