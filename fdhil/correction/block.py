@@ -9,6 +9,7 @@ current to the middle of the dry friction's band and keeps the position loop sil
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -16,13 +17,12 @@ from fdhil.config import Axis
 from fdhil.correction.limits import Limits, check, fit
 from fdhil.correction.linear import Inverse
 from fdhil.correction.resting import Resting
-from fdhil.model import closed_loop
-from fdhil.model.closed_loop import Response, State
+from fdhil.model.closed_loop import Commands, Ready, Response, State
 from fdhil.records import Bool, Float, Parameters
 
-ITERATIONS = 6
-GOOD_ENOUGH_UM, PEAK_UM = 0.15, 0.5  # RMS and largest: half an increment, one and a half
-LEAST_PROGRESS = 0.75  # what an iteration may leave of the best so far; two that leave more end it
+ITERATIONS = 8
+GOOD_ENOUGH_UM, PEAK_UM = 0.05, 0.15  # RMS and largest: below what the drive's increments (0.3 um) can tell
+LEAST_PROGRESS = 0.85  # what an iteration may leave of the best so far; two that leave more end it
 STILL_MM_S = 1e-3
 SHORTEST_REST_S = 0.03
 LEAD_S = 0.02  # before an axis starts again the offset is free
@@ -41,6 +41,7 @@ class AxisLoop:
     axis: Axis
     sync_period_s: float
     limits: Limits
+    drive: Ready
     inverse: Inverse
     resting: Resting
 
@@ -191,9 +192,7 @@ def _simulate(loop: AxisLoop, reference_mm: Float, offset: Float, state: State, 
     # a cycle looks two rows ahead and no further
     ahead = min(stop + 2, reference_mm.size)
     commanded = reference_mm[first:ahead] + offset[first:ahead] * loop.increment_mm
-    return closed_loop.simulate(
-        loop.parameters, loop.axis, loop.sync_period_s, commanded, state=state, rows=stop - first
-    )
+    return loop.drive.run(Commands(commanded), state, 0, stop - first)
 
 
 def _stuck(loop: AxisLoop, response: Response, target_mm: Float, first: int) -> int | None:
@@ -221,5 +220,13 @@ def _hold(loop: AxisLoop, reference_mm: Float, offset: Float, state: State, row:
 
 def _fade(rows: int, sync_period_s: float) -> Float:
     """A smooth factor (rows,) from 1 down to 0 within ``FADE_S``."""
-    share = np.minimum(np.arange(1, rows + 1) * sync_period_s / FADE_S, 1.0)
+    factor = np.zeros(rows)
+    begin = _beginning(sync_period_s)[:rows]
+    factor[: begin.size] = begin
+    return factor
+
+
+@lru_cache(maxsize=4)
+def _beginning(sync_period_s: float) -> Float:
+    share = np.minimum(np.arange(1, np.ceil(FADE_S / sync_period_s) + 1) * sync_period_s / FADE_S, 1.0)
     return np.asarray(0.5 * (1 + np.cos(np.pi * share)))

@@ -21,6 +21,7 @@ from fdhil.correction.method import Plan
 from fdhil.correction.mirror import lag_reason
 from fdhil.correction.resting import Resting
 from fdhil.model import closed_loop
+from fdhil.model.closed_loop import Commands
 from fdhil.records import Float, Parameters, Prediction, Reason, Trajectory
 
 BLOCK_S = 2.0
@@ -105,6 +106,7 @@ def axis_loop(parameters: Parameters, config: MachineConfig, axis: str) -> AxisL
         drive,
         period,
         limits,
+        closed_loop.prepare(parameters, drive, period),
         linear.inverse(parameters, drive, period, rows),
         Resting(parameters, drive, period, limits.um_per_increment * 1e-3),
     )
@@ -135,13 +137,7 @@ def first_carry(position_mm: float) -> Carry:
 
 def following(loop: AxisLoop, reference_mm: Float, solution: Solution, carry: Carry, block: int) -> Carry:
     """Return what the block after the first ``block`` rows of this one starts from."""
-    head = closed_loop.simulate(
-        loop.parameters,
-        loop.axis,
-        loop.sync_period_s,
-        reference_mm,
-        solution.offset * loop.increment_mm,
-        state=carry.state,
-        rows=block,
-    )
+    ahead = min(block + 2, reference_mm.size)
+    commanded = reference_mm[:ahead] + solution.offset[:ahead] * loop.increment_mm
+    head = loop.drive.run(Commands(commanded), carry.state, 0, block)
     return Carry(head.end, solution.offset[block : block + 2], solution.guess[block:])

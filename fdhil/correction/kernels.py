@@ -234,6 +234,31 @@ def _project_plain(wanted: Float, limits: Float, start: Float) -> Float:
 project: Callable[[Float, Float, Float], Float] = njit(cache=True, nogil=True)(_project_plain)
 
 
+def _extent_plain(offset: Float, start: Float, acceleration: float, window: int) -> tuple[float, ...]:
+    """Return the largest |value|, |first| and |second difference|, reach if it brakes, travel within ``window`` rows.
+
+    ``start`` = [o before, o before that]; the travel before the first row counts as none.
+    """
+    highest, fastest, hardest, farthest, longest = 0.0, 0.0, 0.0, 0.0, 0.0
+    one, two = start[0], start[1]
+    travel = 0.0
+    past = np.zeros(window)  # of the last rows, what each travelled
+    for k in range(offset.size):
+        rate = offset[k] - one
+        highest, fastest = max(highest, abs(offset[k])), max(fastest, abs(rate))
+        hardest = max(hardest, abs(rate - (one - two)))
+        outward = max(rate * np.sign(offset[k]), 0.0)
+        farthest = max(farthest, abs(offset[k]) + outward * outward / (2.0 * acceleration))
+        travel += abs(rate) - past[k % window]
+        past[k % window] = abs(rate)
+        longest = max(longest, travel)
+        two, one = one, offset[k]
+    return highest, fastest, hardest, farthest, longest
+
+
+extent: Callable[[Float, Float, float, int], tuple[float, ...]] = njit(cache=True, nogil=True)(_extent_plain)
+
+
 def _rounded_plain(exact: Float, settled: int, uneven: float) -> Float:
     """Round (n,) with the error carried on; from row ``settled`` on change the increment as seldom as it can be.
 

@@ -75,20 +75,20 @@ def check(offset_increments: Int, limits: Limits, before: tuple[float, float] = 
 
     ``before``: the two offsets ahead of the first row, the nearer one first. Rounding to increments is allowed for.
     """
-    o = offset_increments.astype(np.float64)
-    rate = np.diff(o, prepend=before[0])
-    acceleration = np.diff(rate, prepend=before[0] - before[1])
     um = limits.um_per_increment
+    _, fast, hard, reach, travel = kernels.extent(
+        offset_increments.astype(np.float64),
+        np.array(before),
+        limits.acceleration + ROUNDING_ACCELERATION,
+        limits.window,
+    )
     reasons = []
-    reach = braking_reach(o, rate, limits.acceleration + ROUNDING_ACCELERATION)
-    if not reach.max(initial=0.0) <= limits.offset + 0.5:
-        text = f"the offset reaches {reach.max() * um:.0f} um, braking included; {limits.offset * um:.0f} are allowed"
+    if not reach <= limits.offset + 0.5:
+        text = f"the offset reaches {reach * um:.0f} um, braking included; {limits.offset * um:.0f} are allowed"
         reasons.append(Reason("OffsetLimit", text, "plan the correction inside the limits"))
-    fast, hard = np.abs(rate).max(initial=0.0), np.abs(acceleration).max(initial=0.0)
     if not fast <= limits.rate + ROUNDING_RATE or not hard <= limits.acceleration + ROUNDING_ACCELERATION:
         text = f"the offset moves {fast * um:.1f} um and changes that by {hard * um:.1f} um in a cycle"
         reasons.append(Reason("OffsetRate", text, "plan the correction inside the limits"))
-    travel = variation(rate, limits.window).max(initial=0.0)
     if not travel <= limits.variation:
         text = f"the offset travels {travel * um * 1e-3:.1f} mm in one second; {VARIATION_MM:.0f} are allowed"
         reasons.append(Reason("OffsetEnergy", text, "plan a smoother correction"))
@@ -116,11 +116,11 @@ def fit(wanted: Float, limits: Limits, before: tuple[float, float] = (0.0, 0.0))
     planned = goal
     for _ in range(_PASSES):
         planned = _projected(goal, replace(curve, offset=amplitude), before)
-        rate = np.diff(planned, prepend=before[0])
-        excess = float(braking_reach(planned, rate, curve.acceleration).max(initial=0.0)) - curve.offset
-        travel = variation(rate, curve.window)
-        if excess <= 1e-6 * curve.offset and travel.max(initial=0.0) <= 0.98 * curve.variation:
+        _, _, _, reach, longest = kernels.extent(planned, np.array(before), curve.acceleration, curve.window)
+        excess = reach - curve.offset
+        if excess <= 1e-6 * curve.offset and longest <= 0.98 * curve.variation:
             return planned
+        travel = variation(np.diff(planned, prepend=before[0]), curve.window)
         if excess > 1e-6 * curve.offset:
             amplitude = max(amplitude - 1.05 * excess, 0.2 * amplitude)
         goal = goal * _calm(travel, 0.95 * curve.variation, curve.window)
@@ -135,9 +135,10 @@ def fit(wanted: Float, limits: Limits, before: tuple[float, float] = (0.0, 0.0))
 
 def _projected(goal: Float, limits: Limits, before: tuple[float, float]) -> Float:
     """Project onto rate, acceleration and amplitude; far from what breaks them the goal stays as it is."""
-    broken = np.flatnonzero(_breaks(goal, limits, before))
-    if broken.size == 0:
+    high, fast, hard, _, _ = kernels.extent(goal, np.array(before), limits.acceleration, limits.window)
+    if high <= limits.offset and fast <= limits.rate and hard <= limits.acceleration:
         return goal
+    broken = np.flatnonzero(_breaks(goal, limits, before))
     result = goal.copy()
     bounds = np.array([limits.offset, limits.rate, limits.acceleration])
     apart = np.flatnonzero(np.diff(broken) > 2 * _NEAR) + 1

@@ -16,7 +16,7 @@ from scipy.linalg.lapack import dposv
 from fdhil.config import Axis
 from fdhil.correction import kernels
 from fdhil.model import closed_loop
-from fdhil.model.closed_loop import Response, State
+from fdhil.model.closed_loop import Commands, Response, State
 from fdhil.model.kernels import CURRENT_DEMAND, POSITION
 from fdhil.records import Float, Parameters
 
@@ -25,7 +25,7 @@ WATCHED_S = 0.06  # behind it, in which the current must have come to rest
 STEADINESS = 3.0  # A per increment a cycle^2: how smooth the offset is to be, against how small the current
 AGAIN_S = 0.4
 UNEVEN = 20.0  # increments times cycles of rounding error after which the other neighbour is taken
-PASSES = 4
+PASSES = 3
 KNOT_ROWS = 8
 EVERY = 3  # of the cycles says enough: the current cannot change faster than the spline
 RIDGE = 1e-6  # for splines that lie behind a short rest but for their tail
@@ -36,13 +36,13 @@ class Resting:
     """The rests of one axis: what depends on its drive alone is found once."""
 
     def __init__(self, parameters: Parameters, axis: Axis, sync_period_s: float, increment_mm: float) -> None:
-        self._held = _held(parameters, axis)
+        self._held = closed_loop.prepare(*_held(parameters, axis), sync_period_s)
         self._period_s, self._increment_mm = sync_period_s, increment_mm
         self._free, self._again = round(FREE_S / sync_period_s), round(AGAIN_S / sync_period_s)
         impulse = np.zeros(round((FREE_S + WATCHED_S) / sync_period_s))
         impulse[2] = increment_mm
-        self._answer_a = _demand(closed_loop.simulate(*self._held, sync_period_s, impulse))
-        self._lead = _Lead.of(self._answer_a, self._free)
+        self._answer_a = _demand(self._held.run(Commands(impulse), closed_loop.start(0.0)))
+        self._lead = _Lead(self._answer_a, self._free)
 
     def quiet(self, reference_mm: Float, fixed: Float, state: State) -> Float:
         """Return the offset (n,) in whole increments for a rest (n,) of ``reference_mm`` that begins in ``state``.
@@ -67,7 +67,7 @@ class Resting:
     def _simulate(self, rest_mm: Float, offset: Float, state: State, rows: int) -> Response:
         ahead = min(rows + 2, rest_mm.size)  # a cycle looks two rows ahead and no further
         commanded = rest_mm[:ahead] + offset[:ahead] * self._increment_mm
-        return closed_loop.simulate(*self._held, self._period_s, commanded, state=state, rows=rows)
+        return self._held.run(Commands(commanded), state, 0, rows)
 
 
 def _held(parameters: Parameters, axis: Axis) -> tuple[Parameters, Axis]:
@@ -82,6 +82,16 @@ def _demand(response: Response) -> Float:
 
 
 @dataclass(frozen=True, slots=True)
+class _Length:
+    """What depends on a rest's length alone: which of the splines count, and how stiff they are."""
+
+    effect: Float
+    spline: Float
+    bend_first: Float
+    bend_second: Float
+    stiffness: Float
+
+
 class _Lead:
     """What an offset d from row 2 on does, as a cubic spline of knots ``step`` rows apart.
 
@@ -89,45 +99,47 @@ class _Lead:
     asks for, in A. A rest of less than n rows uses their first rows.
     """
 
-    free: int
-    step: float
-    spline: Float
-    bends: Float
-    effect: Float
-
-    @staticmethod
-    def of(answer_a: Float, free: int) -> _Lead:
+    def __init__(self, answer_a: Float, free: int) -> None:
         """Prepare for rests of up to ``free`` rows and longer; ``answer_a`` (n,): what an offset of 1 in row 2 does."""
         pieces = max(1, round(free / KNOT_ROWS))
-        step = free / pieces
-        knots = np.arange(-3, pieces + 5) * step
-        spline = np.asarray(BSpline.design_matrix(np.arange(0.0, free + step), knots, 3).toarray())
-        size = 2 * max(answer_a.size, len(spline))
-        spectrum = np.fft.rfft(answer_a, size)[:, None] * np.fft.rfft(spline, size, axis=0)
-        effect = np.ascontiguousarray(np.fft.irfft(spectrum, size, axis=0)[: answer_a.size])
-        return _Lead(free, step, spline, np.diff(np.pad(spline, ((2, 0), (0, 0))), 2, axis=0), effect)
+        self._free, self._step = free, free / pieces
+        knots = np.arange(-3, pieces + 5) * self._step
+        self._spline = np.asarray(BSpline.design_matrix(np.arange(0.0, free + self._step), knots, 3).toarray())
+        size = 2 * max(answer_a.size, len(self._spline))
+        spectrum = np.fft.rfft(answer_a, size)[:, None] * np.fft.rfft(self._spline, size, axis=0)
+        self._effect = np.ascontiguousarray(np.fft.irfft(spectrum, size, axis=0)[: answer_a.size])
+        self._bends = np.diff(np.pad(self._spline, ((2, 0), (0, 0))), 2, axis=0)
+        self._smooth = (STEADINESS**2 / EVERY) * self._bends.T
+        self._stiffness = self._smooth @ self._bends
+        self._long = self._of_length(answer_a.size)  # most rests end beyond the look
+
+    def _of_length(self, n: int) -> _Length:
+        free = min(n - 2, self._free)
+        goes_on = n > free + 2
+        columns = round(self._free / self._step) if goes_on else int(np.ceil(free / self._step)) + 3
+        seen = n if goes_on else n - 2  # the last cycles of a rest look at rows behind it
+        rows = free + 2 if goes_on else free
+        # of the first columns nothing but the last few has bends behind these rows
+        behind = slice(rows, rows + round(4 * self._step) + 2)
+        stiffness = self._stiffness[:columns, :columns] - (
+            self._smooth[:columns, behind] @ self._bends[behind, :columns]
+        )
+        stiffness[np.diag_indices(columns)] += RIDGE
+        first, second = self._smooth[:columns, 0], self._smooth[:columns, 1]
+        effect = np.ascontiguousarray(self._effect[:seen:EVERY, :columns])
+        return _Length(effect, self._spline[:free, :columns], first, second if rows > 1 else 0 * second, stiffness)
 
     def away(self, base_a: Float, before: Float) -> Float:
         """Return d (free,): least squares of the current base (n,) + effect and of d's bends.
 
         d ends in 0 with its slope, unless the rest ends first. ``before`` (2,) are its values in rows 0 and 1.
         """
-        n = base_a.size
-        free = min(n - 2, self.free)
-        goes_on = n > free + 2
-        columns = round(self.free / self.step) if goes_on else int(np.ceil(free / self.step)) + 3
-        spline = self.spline[:free, :columns]
-        seen = n if goes_on else n - 2  # the last cycles of a rest look at rows behind it
-        effect, base_a = self.effect[:seen:EVERY, :columns], base_a[:seen:EVERY]
-        bends = self.bends[: free + 2 if goes_on else free, :columns]
-        smooth = (STEADINESS**2 / EVERY) * bends.T
-        bent = smooth[:, 0] * (before[0] - 2 * before[1])
-        if len(bends) > 1:
-            bent = bent + smooth[:, 1] * before[1]
-        stiffness = smooth @ bends
-        stiffness[np.diag_indices(columns)] += RIDGE
-        weighted, found = effect.T, np.zeros(columns)
+        length = self._long if base_a.size == len(self._effect) else self._of_length(base_a.size)
+        effect = length.effect
+        base_a = base_a[: EVERY * len(effect) : EVERY]
+        bent = length.bend_first * (before[0] - 2 * before[1]) + length.bend_second * before[1]
+        weighted, found = effect.T, np.zeros(len(bent))
         for _ in range(PASSES):  # the largest currents weigh most: it is they that break the table loose
-            found = dposv(weighted @ effect + stiffness, -(weighted @ base_a) - bent)[1]
+            found = dposv(weighted @ effect + length.stiffness, -(weighted @ base_a) - bent)[1]
             weighted = effect.T * (1.0 + (base_a + effect @ found) ** 2)
-        return np.asarray(spline @ found)
+        return np.asarray(length.spline @ found)

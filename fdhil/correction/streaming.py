@@ -20,7 +20,7 @@ from fdhil.correction.inverse import BLOCK_S, LOOK_AHEAD_S, axis_loop, choose_de
 from fdhil.correction.limits import check
 from fdhil.correction.mirror import lag_reason
 from fdhil.model import closed_loop
-from fdhil.model.closed_loop import State
+from fdhil.model.closed_loop import Commands, State
 from fdhil.prediction.contour import WINDOW_S, contour_error_um
 from fdhil.records import Float, Parameters, Reason
 
@@ -136,7 +136,7 @@ def _solve(axis: _Axis, path: Float, kept: int, rows: int, delay_rows: float, en
     reference = np.ascontiguousarray(path[kept:])
     target = np.ascontiguousarray(delayed(path, delay_rows)[kept:])
     loop = axis.loop
-    free = closed_loop.simulate(loop.parameters, loop.axis, loop.sync_period_s, reference, state=axis.free, rows=rows)
+    free = loop.drive.run(Commands(reference), axis.free, 0, rows)
     axis.free = free.end
     solution = solve(loop, reference, target, axis.carry, ends)
     refused = _refused(loop, solution, free.limited_s, rows)

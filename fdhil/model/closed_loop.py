@@ -48,24 +48,28 @@ class Response:
     speed_rad_s: Float
     current_a: Float
     limited: Float
-    limited_s: float
+    sync_period_s: float
     states: Float
     end: State
 
     @staticmethod
     def from_columns(columns: Float, steps: int, sync_period_s: float, end: State) -> Response:
         """Take apart what a kernel recorded, (1 + k, n); ``steps`` current-loop steps make a cycle."""
-        limited = columns[kernels.ROW_LIMITED] / steps
         states = columns[kernels.ROW_STATE :]
         return Response(
             position_mm=states[kernels.POSITION],
             speed_rad_s=states[kernels.SPEED],
             current_a=states[kernels.CURRENT],
-            limited=limited,
-            limited_s=float(limited.sum() * sync_period_s),
+            limited=columns[kernels.ROW_LIMITED] / steps,
+            sync_period_s=sync_period_s,
             states=states,
             end=end,
         )
+
+    @property
+    def limited_s(self) -> float:
+        """For how long a limit acts in all."""
+        return float(self.limited.sum() * self.sync_period_s)
 
     def state_at(self, row: int) -> State:
         """Return the state at the start of a row's cycle."""

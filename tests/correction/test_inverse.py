@@ -12,7 +12,7 @@ from fdhil.cli.guard import limits_of
 from fdhil.correction import Limits, check, mirror, plan
 from fdhil.correction.inverse import BLOCK_S
 from fdhil.correction.linear import delay_s, inverse
-from fdhil.guard.limits import check_rows
+from fdhil.guard.table import check_rows
 from fdhil.model import closed_loop
 from fdhil.prediction import predict, predict_corrected
 from fdhil.prediction.models import nominal_models
