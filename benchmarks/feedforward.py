@@ -14,7 +14,8 @@ import numpy as np
 from benchmarks.inverse import scattered
 from fdhil.config import MachineConfig
 from fdhil.correction.online import law
-from fdhil.guard.feedforward import Law, parse_law
+from fdhil.guard.feedforward import Law
+from fdhil.guard.requests import parse_law
 from fdhil.model import closed_loop
 from fdhil.prediction.models import nominal_models
 from fdhil.records import Float

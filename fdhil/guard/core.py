@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from fdhil.guard import feedforward
 from fdhil.guard.conditions import View, failing, not_ready, withheld
-from fdhil.guard.feedforward import FADE_S, FeedMode
+from fdhil.guard.feedforward import FeedMode
+from fdhil.guard.feeding import go_on, is_fed
 from fdhil.guard.interlocks import FACTS, FEEDFORWARD_FACTS, Alarm, Reaction
 from fdhil.guard.limits import brake, follow, violation
 from fdhil.guard.observe import behind, observe
@@ -44,7 +45,7 @@ def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outpu
     if inputs.sync:
         state = rest(_follow_path(state, inputs, alarms, settings))
     state, output = _move(state, inputs, settings)
-    state, output = _feed(state, inputs, alarms, settings, output)
+    state, output = go_on(state, inputs, alarms, settings, output)
     moved = None if state.mode is before else (before, state.mode, state.cause)
     return state, output._replace(refused=refused, transition=moved)
 
@@ -148,13 +149,8 @@ def _adopting(state: State, settings: Settings) -> State:
     """Take over what the drives hold: the first value sent is the value read; speed and torque get zeros."""
     cause = Alarm("StaleOffset")
     axes = tuple([_at_rest(axis, axis.sent[0] if axis.read_back is None else axis.read_back) for axis in state.axes])
-    feed = feedforward.zeroing(len(axes), cause) if _fed(state) and settings.feeds else state.feed
+    feed = feedforward.zeroing(len(axes), cause) if is_fed(state) and settings.feeds else state.feed
     return state._replace(mode=Mode.ADOPT, axes=axes, zeros_sent=0, adopt_checked=True, cause=cause, feed=feed)
-
-
-def _fed(state: State) -> bool:
-    """Whether a drive shows a speed or torque offset."""
-    return any(any(axis.fed_back) for axis in state.axes)
 
 
 def _at_rest(axis: AxisState, offset: int) -> AxisState:
@@ -206,11 +202,10 @@ def _adopt_at_start(state: State, inputs: Inputs, alarms: Alarms, settings: Sett
     """Once after the start: a drive that already holds an offset gets it ramped to zero, by us, from its value."""
     if state.adopt_checked or state.mode is not Mode.OFF or not inputs.sync:
         return state
-    if any(alarm.code in ("SyncJitter", "OffsetHijack", "BusLocked") for alarm in alarms):
+    unsafe = any(a.code in ("SyncJitter", "OffsetHijack", "BusLocked") or a.reaction is Reaction.FREEZE for a in alarms)
+    if unsafe or any(axis.read_back is None for axis in state.axes):
         return state
-    if any(alarm.reaction is Reaction.FREEZE for alarm in alarms) or any(a.read_back is None for a in state.axes):
-        return state
-    if any(axis.read_back for axis in state.axes) or _fed(state):
+    if any(axis.read_back for axis in state.axes) or is_fed(state):
         return _adopting(state, settings)
     return state._replace(adopt_checked=True)
 
@@ -342,29 +337,3 @@ def _arrived(state: State, path: Path | None, settings: Settings) -> State:
     if sent > ZEROS_UNCONFIRMED:
         return state._replace(mode=Mode.FROZEN, cause=Alarm("EchoMismatch", detail="no zero was read back"))
     return state._replace(zeros_sent=sent)
-
-
-# --- the on-line feed-forward ---
-
-
-def _feed(state: State, inputs: Inputs, alarms: Alarms, settings: Settings, output: Output) -> tuple[State, Output]:
-    """Go on with the feed-forward; on a lost SYNC its zeros are sent all the same."""
-    before = state.feed
-    if before.mode is FeedMode.OFF:
-        return state, output
-    own = () if inputs.main_alive is True else (Alarm("MainLost"),)
-    feed = feedforward.react(before, (*alarms, *inputs.withdrawn, *own))
-    if inputs.sync and feed.mode is not FeedMode.ZEROING:
-        feed = feedforward.hear(feed, [axis.target for axis in inputs.axes])
-    if inputs.late or not (inputs.sync or feed.mode is FeedMode.ZEROING):
-        return state._replace(feed=feed.send(feed.applied) if inputs.sync else feed), output
-    limits = [axis.limits for axis in settings.feeds]
-    moved = feedforward.move(feed, limits, settings.cycles(FADE_S), confirmed=not _fed(state))
-    ways = zip(limits, before.applied, moved.applied, strict=True)
-    if any(feedforward.violates(*way) for way in ways):
-        cause = Alarm("InternalError", detail=f"feed-forward {before.applied} -> {moved.applied}")
-        moved = feedforward.move(feedforward.react(before, (cause,)), limits, settings.cycles(FADE_S))
-    heartbeat = output.heartbeat or state.tick % settings.heartbeat_cycles == 0
-    changed = None if moved.mode is before.mode else (before.mode, moved.mode)
-    state = state._replace(feed=moved)
-    return state, output._replace(feed=moved.applied, heartbeat=heartbeat, feed_transition=changed)

@@ -7,16 +7,14 @@ Zero is always the safer value: whatever freezes a position offset sets these of
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from fdhil.guard.interlocks import Alarm, Reaction
 from fdhil.guard.limits import clamp
 
 SHIFT = 24
-MOST_WEIGHTS = 64
-MOST_WEIGHT = 1 << 48
 FADE_S = 0.1
 HOLD_CYCLES = 10
 ZEROS = 3
@@ -68,24 +66,6 @@ def _sum(weights: Sequence[int], ways: Sequence[int]) -> int:
 def _whole(value: int) -> int:
     """Divide by 2^24, to the nearest."""
     return (value + (1 << SHIFT - 1)) >> SHIFT
-
-
-def parse_law(document: object) -> Law | None:
-    """Return the law that a request carries, None when it is none."""
-    if not isinstance(document, Mapping):
-        return None
-    parts: list[tuple[int, ...]] = []
-    for key in ("speed", "torque", "pace"):
-        weights = document.get(key)
-        if not isinstance(weights, list) or not 0 < len(weights) <= MOST_WEIGHTS or not all(map(_fits, weights)):
-            return None
-        parts.append(tuple(weights))
-    dry = document.get("dry")
-    return Law(parts[0], parts[1], parts[2], dry) if _fits(dry) and isinstance(dry, int) else None
-
-
-def _fits(value: Any) -> bool:
-    return type(value) is int and abs(value) <= MOST_WEIGHT
 
 
 class FeedMode(Enum):

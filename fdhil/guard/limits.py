@@ -6,7 +6,6 @@ The check of a frame (``violation``) shares no formula with the motion (``follow
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isqrt
 
@@ -107,32 +106,6 @@ def violation(limits: Limits, before: int, rate: int, offset: int) -> str | None
     if not (offset * speed <= 0 or abs(offset) + stopping(abs(speed), limits.hard_acceleration) <= limits.offset):
         return "OffsetLimit"
     return None
-
-
-def check_rows(limits: Limits, offsets: Sequence[int], start: int, stop: int) -> str | None:
-    """Check rows [start, stop) of a table's offsets, with what lies before ``start``; return the class or None.
-
-    The row before the first is taken to be at rest at the first row's value: the fade-in brings the offset there.
-    """
-    for row in range(start, stop):
-        before = offsets[max(row - 1, 0)]
-        if not abs(offsets[row]) <= limits.offset:
-            return "OffsetLimit"
-        broken = violation(limits, before, before - offsets[max(row - 2, 0)], offsets[row])
-        if broken is not None:
-            return broken
-    return "OffsetEnergy" if not _variation_fits(limits, offsets, start, stop) else None
-
-
-def _variation_fits(limits: Limits, offsets: Sequence[int], start: int, stop: int) -> bool:
-    first = max(1, start - limits.window + 1)
-    moves = [abs(offsets[row] - offsets[row - 1]) for row in range(first, stop)]
-    travelled = 0
-    for k, move in enumerate(moves):
-        travelled += move - (moves[k - limits.window] if k >= limits.window else 0)
-        if not travelled <= limits.variation:
-            return False
-    return True
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,6 @@ At a SYNC the offset frames leave in the same turn and before anything else is d
 
 from __future__ import annotations
 
-import hashlib
-import hmac
 import select
 import signal
 import socket
@@ -19,11 +17,12 @@ from fdhil.cia402 import COB_HEARTBEAT, COB_SYNC, Nmt, pack
 from fdhil.guard import core, table
 from fdhil.guard.can_socket import ERROR, BusDown, CanSocket
 from fdhil.guard.control import Client, Control
-from fdhil.guard.feedforward import FeedMode, Law, parse_law
+from fdhil.guard.feedforward import FeedMode
 from fdhil.guard.frames import Listener
 from fdhil.guard.interlocks import FACTS, WITHDRAWABLE, Alarm
 from fdhil.guard.journal import Journal, Notifier
 from fdhil.guard.path import Path
+from fdhil.guard.requests import parse_request
 from fdhil.guard.settings import Settings
 from fdhil.guard.state import SENDING, Inputs, Mode, Output, Request, initial
 
@@ -141,7 +140,7 @@ class Guard:
     def _bus_down(self, error: BusDown) -> None:
         self._listener.error("down")
         self._journal.write("bus_down", text=str(error))
-        self._step(sync=False, late=False, now_s=time.monotonic(), silent=True)
+        self._in_silence(time.monotonic())
 
     def _sync(self, data: bytes, stamp_s: float, now_s: float, late: bool) -> None:
         self._last_sync_s, self._silent = now_s, False
@@ -158,7 +157,7 @@ class Guard:
             self._listener.forget_sync()
         busy = self.state.sending or self._requests
         if busy and now_s - self._stepped_s >= self.settings.sync_period_s:
-            self._step(sync=False, late=False, now_s=now_s, silent=True)
+            self._in_silence(now_s)
 
     def _frames_wait(self) -> bool:
         """Whether it was this process that slept, and not the bus: then its frames are waiting."""
@@ -168,26 +167,18 @@ class Guard:
         poll.register(self._can, select.POLLIN)
         return bool(poll.poll(0))
 
-    def _step(self, sync: bool, late: bool, now_s: float, silent: bool) -> None:
-        axes, bus = self._listener.in_silence(now_s, silent)
-        self._advance(Inputs(sync, axes, bus), late, now_s)
+    def _in_silence(self, now_s: float) -> None:
+        """A step without SYNC."""
+        axes, bus = self._listener.in_silence(now_s, silent=True)
+        self._advance(Inputs(False, axes, bus), late=False, now_s=now_s)
 
     def _advance(self, seen: Inputs, late: bool, now_s: float) -> None:
         """Run one step of the core and send what it says; answer and journal after that."""
         client, document, request = self._requests.popleft() if self._requests and not late else (None, {}, None)
         arming = request is not None and request.kind in ("arm", "feedforward")
-        inputs = Inputs(
-            seen.sync,
-            seen.axes,
-            seen.bus,
-            late,
-            self._transmitted,
-            _alive(client if arming else self._owner, now_s),
-            self._listener.alarms(),
-            self._withdrawn,
-            self._path,
-            request,
-        )
+        alive, alarms = _alive(client if arming else self._owner, now_s), self._listener.alarms()
+        told = (late, self._transmitted, alive, alarms, self._withdrawn, self._path, request)
+        inputs = Inputs(seen.sync, seen.axes, seen.bus, *told)
         self.state, output = core.step(self.state, inputs, self.settings)
         self._transmitted = self._send(output)
         self._inputs, self._stepped_s = inputs, now_s
@@ -255,29 +246,10 @@ class Guard:
             elif kind == "table":
                 self._begin_loading(client, document)
             elif kind in ("arm", "feedforward", "disarm", "adopt"):
-                self._requests.append((client, document, self._request(kind, document)))
+                self._requests.append((client, document, parse_request(kind, document, self.settings)))
             else:
-                client.reply(
-                    document,
-                    ok=False,
-                    code="BadRequest",
-                    text=f"{kind!r} is no request",
-                    advice="use status, alive, table, arm, disarm or adopt",
-                )
-
-    def _request(self, kind: Any, document: dict[str, Any]) -> Request:
-        facts = document.get("facts")
-        digest = hashlib.sha256(str(document.get("token", "")).encode()).hexdigest()
-        wanted = self.settings.token_sha256
-        valid = bool(wanted) and hmac.compare_digest(digest, wanted)
-        program = str(document.get("program_digest", ""))
-        return Request(kind, valid, program, facts if isinstance(facts, dict) else {}, self._laws(document))
-
-    def _laws(self, document: dict[str, Any]) -> tuple[Law, ...]:
-        """The feed-forward's law of every axis, in the guard's order; empty when one is missing or none."""
-        given = document.get("laws")
-        laws = [parse_law(given.get(axis.name)) for axis in self.settings.axes] if isinstance(given, dict) else []
-        return tuple([law for law in laws if law is not None]) if None not in laws else ()
+                text, advice = f"{kind!r} is no request", "use status, alive, table, arm, disarm or adopt"
+                client.reply(document, ok=False, code="BadRequest", text=text, advice=advice)
 
     def _withdraw(self, client: Client, document: dict[str, Any]) -> None:
         """The daemon's keep-alive; what it no longer vouches for ends the correction."""

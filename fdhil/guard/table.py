@@ -19,7 +19,7 @@ from pathlib import Path as FilePath
 from typing import Any, Protocol
 
 from fdhil.errors import StoreError
-from fdhil.guard.limits import Limits, check_rows
+from fdhil.guard.limits import Limits, violation
 from fdhil.guard.path import Path
 
 MAGIC = b"FDHT"
@@ -93,12 +93,7 @@ def decode(body: bytes, sequence: int = 0) -> tuple[tuple[str, ...], Path]:
         axes, rows, first = tuple(map(str, head["axes"])), int(head["rows"]), int(head["first"])
         columns = _columns(body[4 + length :], rows, 2 * len(axes))
         path = Path(
-            first,
-            columns[: len(axes)],
-            columns[len(axes) :],
-            head["final"] is True,
-            str(head["program"]),
-            sequence,
+            first, columns[: len(axes)], columns[len(axes) :], head["final"] is True, str(head["program"]), sequence
         )
     except (struct.error, ValueError, KeyError, TypeError) as error:
         raise TableRefused("CorruptFile", f"the correction table cannot be read ({error}); plan it again") from None
@@ -199,6 +194,32 @@ def _body(descriptor: int, slot: int, slot_bytes: int) -> bytes | None:
         return None
     body = os.pread(descriptor, length, slot * slot_bytes + _HEADER.size)
     return body if len(body) == length and _crc(body, sequence) == crc else None
+
+
+def check_rows(limits: Limits, offsets: Sequence[int], start: int, stop: int) -> str | None:
+    """Check rows [start, stop) of a table's offsets, with what lies before ``start``; return the class or None.
+
+    The row before the first is taken to be at rest at the first row's value: the fade-in brings the offset there.
+    """
+    for row in range(start, stop):
+        before = offsets[max(row - 1, 0)]
+        if not abs(offsets[row]) <= limits.offset:
+            return "OffsetLimit"
+        broken = violation(limits, before, before - offsets[max(row - 2, 0)], offsets[row])
+        if broken is not None:
+            return broken
+    return "OffsetEnergy" if not _variation_fits(limits, offsets, start, stop) else None
+
+
+def _variation_fits(limits: Limits, offsets: Sequence[int], start: int, stop: int) -> bool:
+    first = max(1, start - limits.window + 1)
+    moves = [abs(offsets[row] - offsets[row - 1]) for row in range(first, stop)]
+    travelled = 0
+    for k, move in enumerate(moves):
+        travelled += move - (moves[k - limits.window] if k >= limits.window else 0)
+        if not travelled <= limits.variation:
+            return False
+    return True
 
 
 @dataclass(slots=True)

@@ -10,8 +10,8 @@ import pytest
 from fdhil.config import FeedforwardLimits, MachineConfig
 from fdhil.daemon.arming import MODEL_AGE_S, Feeding, Refused, feeding_facts, prepare_feeding
 from fdhil.drivers.commissioning_record import axis_digest, save_record
-from fdhil.guard.feedforward import parse_law
 from fdhil.guard.interlocks import FEEDFORWARD_FACTS
+from fdhil.guard.requests import parse_law
 from tests.daemon.machine import config_of
 from tests.daemon.test_arming import known, record_of
 

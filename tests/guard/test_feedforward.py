@@ -22,10 +22,10 @@ from fdhil.guard.feedforward import (
     end,
     hear,
     move,
-    parse_law,
     violates,
 )
 from fdhil.guard.interlocks import FEEDFORWARD_FACTS, Alarm
+from fdhil.guard.requests import parse_law
 from fdhil.guard.settings import Feedforward, Pdo, Settings, from_json, to_json
 from fdhil.guard.state import Mode, Request
 from tests.guard import machine

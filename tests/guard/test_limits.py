@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdhil.guard.limits import Limits, Travel, approach, brake, check_rows, follow, stopping, violation
+from fdhil.guard.limits import Limits, Travel, approach, brake, follow, stopping, violation
+from fdhil.guard.table import check_rows
 
 SMALL = Limits(offset=40, rate=9, acceleration=2, variation=400, window=100)
 

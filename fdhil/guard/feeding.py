@@ -1,0 +1,39 @@
+"""The on-line feed-forward's part of a step: what stops it, what it sends, and the check of that. Pure."""
+
+from __future__ import annotations
+
+from fdhil.guard import feedforward
+from fdhil.guard.feedforward import FADE_S, FeedMode
+from fdhil.guard.interlocks import Alarm
+from fdhil.guard.settings import Settings
+from fdhil.guard.state import Inputs, Output, State
+
+Alarms = tuple[Alarm, ...]
+
+
+def is_fed(state: State) -> bool:
+    """Whether a drive shows a speed or torque offset."""
+    return any(any(axis.fed_back) for axis in state.axes)
+
+
+def go_on(state: State, inputs: Inputs, alarms: Alarms, settings: Settings, output: Output) -> tuple[State, Output]:
+    """Go on with the feed-forward; on a lost SYNC its zeros are sent all the same."""
+    before = state.feed
+    if before.mode is FeedMode.OFF:
+        return state, output
+    own = () if inputs.main_alive is True else (Alarm("MainLost"),)
+    feed = feedforward.react(before, (*alarms, *inputs.withdrawn, *own))
+    if inputs.sync and feed.mode is not FeedMode.ZEROING:
+        feed = feedforward.hear(feed, [axis.target for axis in inputs.axes])
+    if inputs.late or not (inputs.sync or feed.mode is FeedMode.ZEROING):
+        return state._replace(feed=feed.send(feed.applied) if inputs.sync else feed), output
+    limits = [axis.limits for axis in settings.feeds]
+    moved = feedforward.move(feed, limits, settings.cycles(FADE_S), confirmed=not is_fed(state))
+    ways = zip(limits, before.applied, moved.applied, strict=True)
+    if any(feedforward.violates(*way) for way in ways):
+        cause = Alarm("InternalError", detail=f"feed-forward {before.applied} -> {moved.applied}")
+        moved = feedforward.move(feedforward.react(before, (cause,)), limits, settings.cycles(FADE_S))
+    heartbeat = output.heartbeat or state.tick % settings.heartbeat_cycles == 0
+    changed = None if moved.mode is before.mode else (before.mode, moved.mode)
+    state = state._replace(feed=moved)
+    return state, output._replace(feed=moved.applied, heartbeat=heartbeat, feed_transition=changed)

@@ -1,0 +1,50 @@
+"""From the JSON of a request to the record that the core decides on; what is none becomes one that is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+from collections.abc import Mapping
+from typing import Any
+
+from fdhil.guard.feedforward import Law
+from fdhil.guard.settings import Settings
+from fdhil.guard.state import Request
+
+MOST_WEIGHTS = 64
+MOST_WEIGHT = 1 << 48
+
+
+def parse_request(kind: Any, document: Mapping[str, Any], settings: Settings) -> Request:
+    """Return the request; the token is compared by its hash alone."""
+    facts = document.get("facts")
+    digest = hashlib.sha256(str(document.get("token", "")).encode()).hexdigest()
+    valid = bool(settings.token_sha256) and hmac.compare_digest(digest, settings.token_sha256)
+    program = str(document.get("program_digest", ""))
+    return Request(
+        kind, valid, program, facts if isinstance(facts, dict) else {}, _laws(document.get("laws"), settings)
+    )
+
+
+def _laws(given: object, settings: Settings) -> tuple[Law, ...]:
+    """The feed-forward's law of every axis, in the guard's order; empty when one is missing or none."""
+    laws = [parse_law(given.get(axis.name)) for axis in settings.axes] if isinstance(given, dict) else []
+    return tuple([law for law in laws if law is not None]) if None not in laws else ()
+
+
+def parse_law(document: object) -> Law | None:
+    """Return the law that a request carries, None when it is none."""
+    if not isinstance(document, Mapping):
+        return None
+    parts: list[tuple[int, ...]] = []
+    for key in ("speed", "torque", "pace"):
+        weights = document.get(key)
+        if not isinstance(weights, list) or not 0 < len(weights) <= MOST_WEIGHTS or not all(map(_fits, weights)):
+            return None
+        parts.append(tuple(weights))
+    dry = document.get("dry")
+    return Law(parts[0], parts[1], parts[2], dry) if _fits(dry) and isinstance(dry, int) else None
+
+
+def _fits(value: Any) -> bool:
+    return type(value) is int and abs(value) <= MOST_WEIGHT
