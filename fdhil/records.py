@@ -149,7 +149,7 @@ class Stages:
     brake: tuple[int, int] | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Window:
     """One G0 of one axis on a uniform grid of ``dt_s``, from rest to rest, with its stages and gaps.
 
@@ -158,7 +158,7 @@ class Window:
     value at t_k; ``voltage_delay_s`` (what is left after alignment by counters, None when not known) has not been
     taken out. ``slow_voltage`` stands in its place where a sensor samples more slowly than the drive.
     ``start_s`` is the time of row 0 in its recording or since the first tick. ``offset_mm`` is the position
-    offset in force, None where it was 0 throughout or is not known.
+    offset in force, None where it was 0 throughout or is not known. Two windows are equal when they are the same one.
     """
 
     axis: str
