@@ -47,7 +47,7 @@ def test_a_fixture_costs_what_the_prediction_without_it_says() -> None:
 
 
 def test_zones_that_came_and_went_are_told_with_what_did_it() -> None:
-    """More inertia on X, more of it and of dry friction on Y: at the largest change, what each is said to have done adds
+    """More inertia on X, more of it and of dry friction on Y: at the largest change, what each is said to do adds
     up to it. A zone that is gone is listed too."""
     reference = with_lines(bench_trajectory(10))
     earlier = {"X": NOMINAL, "Y": replace(NOMINAL, Cd=1.0, Jt=0.06)}
