@@ -68,8 +68,8 @@ class Carry:
 class Solution:
     """A block's ``offset`` (n,) in increments, the position (n,) in mm that it leads to, and the unrounded guess.
 
-    ``rms_um`` is what is left; ``needed_um`` the largest offset that the linear loop asks for: where it exceeds the
-    limit, the block was not solved.
+    ``rms_um`` is what is left; ``needed_um`` the largest offset that the linear loop asks for, in row ``needed_at``:
+    where it exceeds the limit, the block was not solved.
     """
 
     offset: Float
@@ -77,6 +77,7 @@ class Solution:
     guess: Float
     rms_um: float
     needed_um: float
+    needed_at: int = 0
 
 
 def rests(reference_mm: Float, target_mm: Float, sync_period_s: float, ends: bool) -> list[tuple[int, int]]:
@@ -132,7 +133,7 @@ def solve(loop: AxisLoop, reference_mm: Float, target_mm: Float, carry: Carry, e
         if iteration == 0:  # before the limits act, the linear loop says what the path needs
             needed_um = float(np.abs(guess).max()) * loop.limits.um_per_increment
             if needed_um > loop.limits.offset * loop.limits.um_per_increment:
-                return replace(best, needed_um=needed_um)
+                return replace(best, needed_um=needed_um, needed_at=int(np.argmax(np.abs(guess))))
     assert best is not None
     return replace(best, needed_um=needed_um)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from fdhil.correction.inverse import BLOCK_S, LOOK_AHEAD_S, axis_loop, choose_de
 from fdhil.correction.limits import check
 from fdhil.correction.mirror import lag_reason
 from fdhil.model import closed_loop
-from fdhil.model.closed_loop import Commands, State
+from fdhil.model.closed_loop import Commands, Response, State
 from fdhil.prediction.contour import WINDOW_S, contour_error_um
 from fdhil.records import Float, Parameters, Reason
 
@@ -31,8 +32,8 @@ LIMITED_S = 0.02  # a limit that acts longer than this within a block is no sett
 class StreamBlock:
     """The settled rows from ``first_row`` on: offsets per axis in um, contour error (n,) without and with them.
 
-    ``refused`` is not empty where the gate does not let the block through; the stream ends there, and the guard, which
-    then lacks rows, ramps down.
+    ``refused`` is not empty where the gate does not let the block through: its offsets are 0 then, and the stream ends
+    there unless it is told to go on. ``at`` holds the row of each refusal in the whole.
     """
 
     first_row: int
@@ -41,12 +42,21 @@ class StreamBlock:
     after_um: Float
     final: bool
     refused: tuple[Reason, ...] = ()
+    at: tuple[int, ...] = ()
+
+
+class _Refusal(NamedTuple):
+    """A reason, and the row of the block that it is about."""
+
+    row: int
+    reason: Reason
 
 
 @dataclass(slots=True)
 class _Axis:
     """One axis between two blocks; ``free`` is the state that it would have without any offset."""
 
+    name: str
     loop: AxisLoop
     carry: Carry
     free: State
@@ -59,15 +69,20 @@ class _Piece:
     offset_um: Float
     before_mm: Float
     after_mm: Float
-    refused: tuple[Reason, ...]
+    refused: tuple[_Refusal, ...]
 
 
 def stream(
-    pieces: Iterable[Mapping[str, Float]], models: Mapping[str, Parameters], config: MachineConfig
+    pieces: Iterable[Mapping[str, Float]],
+    models: Mapping[str, Parameters],
+    config: MachineConfig,
+    *,
+    goes_on: bool = False,
 ) -> Iterator[StreamBlock]:
     """Correct a reference that comes in pieces (mm per axis, (m,), in order, of any length); yield blocks of it.
 
-    ValueError when an axis may not be written. The result is that of the whole reference planned at once.
+    ``goes_on``: also behind a refused block, to learn of them all. ValueError when an axis may not be written. The
+    result is that of the whole reference planned at once.
     """
     period = config.machine.sync_period_s
     block, ahead = round(BLOCK_S / period), round(LOOK_AHEAD_S / period)
@@ -94,8 +109,9 @@ def stream(
                 ended = length <= block + ahead
                 rows = length if ended else block
                 result = _block(pool, axes, path, kept, min(length, block + ahead), rows, delay / period, ended)
-                yield _gated(result, path, kept, rows, row, ended, config, window)
-                if any(piece_.refused for piece_ in result.values()):
+                gated = _gated(result, path, kept, rows, row, ended, config, window)
+                yield gated
+                if gated.refused and not goes_on:
                     return
                 drop = max(0, kept + rows - window)
                 path = {axis: values[drop:] for axis, values in path.items()}
@@ -103,7 +119,7 @@ def stream(
 
 
 def _axis(parameters: Parameters, config: MachineConfig, name: str, start_mm: float) -> _Axis:
-    return _Axis(axis_loop(parameters, config, name), first_carry(start_mm), closed_loop.start(start_mm))
+    return _Axis(name, axis_loop(parameters, config, name), first_carry(start_mm), closed_loop.start(start_mm))
 
 
 def _delay(models: Mapping[str, Parameters], config: MachineConfig, axes: Mapping[str, _Axis]) -> float:
@@ -139,25 +155,31 @@ def _solve(axis: _Axis, path: Float, kept: int, rows: int, delay_rows: float, en
     free = loop.drive.run(Commands(reference), axis.free, 0, rows)
     axis.free = free.end
     solution = solve(loop, reference, target, axis.carry, ends)
-    refused = _refused(loop, solution, free.limited_s, rows)
+    refused = _refused(axis.name, loop, solution, free, rows)
     if not ends:
         axis.carry = following(loop, reference, solution, axis.carry, rows)
     offset = solution.offset[:rows] * loop.limits.um_per_increment
     return _Piece(offset, free.position_mm, solution.position_mm[:rows], refused)
 
 
-def _refused(loop: AxisLoop, solution: Solution, limited_s: float, rows: int) -> tuple[Reason, ...]:
+def _refused(name: str, loop: AxisLoop, solution: Solution, free: Response, rows: int) -> tuple[_Refusal, ...]:
     """What one axis alone can say against a block: lag, a drive at its limit, an offset that breaks a limit."""
     um = loop.limits.um_per_increment
-    reasons = []
-    if limited_s > LIMITED_S:
-        text = f"a current or voltage limit acts for {limited_s * 1e3:.0f} ms of this block: no offset can help"
-        reasons.append(Reason("DemandTooHigh", text, "lower the feed, or smooth more"))
+    refused = []
+    if free.limited_s > LIMITED_S:
+        text = (
+            f"axis {name} has a current or voltage limit acting for {free.limited_s * 1e3:.0f} ms: no offset can help"
+        )
+        reason = Reason("DemandTooHigh", text, "lower the feed, or smooth more")
+        refused.append(_Refusal(int(np.argmax(free.limited > 0.0)), reason))
     if solution.needed_um > loop.limits.offset * um:
         feedforward = loop.axis.regulators.speed_feedforward
-        reasons.append(lag_reason("", solution.needed_um, loop.limits.offset * um, feedforward))
-    whole = solution.offset[2:rows].astype(np.int64)
-    return (*reasons, *check(whole, loop.limits, (float(solution.offset[1]), float(solution.offset[0]))))
+        reason = lag_reason(name, solution.needed_um, loop.limits.offset * um, feedforward)
+        refused.append(_Refusal(min(solution.needed_at, rows - 1), reason))
+    before = float(solution.offset[1]), float(solution.offset[0])
+    broken = check(solution.offset[2:rows].astype(np.int64), loop.limits, before)
+    refused += [_Refusal(0, Reason(one.code, f"axis {name}: {one.text}", one.advice)) for one in broken]
+    return tuple(refused)
 
 
 def _gated(
@@ -177,13 +199,13 @@ def _gated(
     for which in ("before_mm", "after_mm"):
         actual = np.column_stack([getattr(p, which) for p in result.values()])
         errors.append(contour_error_um(around, actual, config.machine.sync_period_s, kept - low))
-    refused = [
-        Reason(reason.code, f"axis {axis}: {reason.text}", reason.advice)
-        for axis, piece in result.items()
-        for reason in piece.refused
-    ]
-    if gate.worse_rows(errors[0], errors[1], config.machine.sync_period_s).any():
-        text = f"rows {row} to {row + rows} would get worse: {errors[0].max():.1f} um to {errors[1].max():.1f} um"
-        refused.append(Reason("HarmPredicted", text, "lower the feed, or identify again"))
+    refused = [refusal for piece in result.values() for refusal in piece.refused]
+    before_um, after_um = errors
+    worse = np.flatnonzero(gate.worse_rows(before_um, after_um, config.machine.sync_period_s))
+    if worse.size:
+        at = int(worse[np.argmax(after_um[worse])])
+        text = f"the contour error would grow to {after_um[at]:.1f} um; without offsets it is {before_um.max():.1f} um"
+        refused.append(_Refusal(at, Reason("HarmPredicted", text, "lower the feed, or identify again")))
     offsets = {axis: np.zeros(rows) if refused else piece.offset_um for axis, piece in result.items()}
-    return StreamBlock(row, offsets, errors[0], errors[1], ended, tuple(refused))
+    reasons, places = tuple(refusal.reason for refusal in refused), tuple(row + refusal.row for refusal in refused)
+    return StreamBlock(row, offsets, before_um, after_um, ended, reasons, places)

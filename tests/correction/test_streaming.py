@@ -79,6 +79,23 @@ def test_saturation_ends_the_stream() -> None:
     assert "DemandTooHigh" in {reason.code for reason in blocks[-1].refused}
 
 
+def test_a_stream_that_goes_on_names_every_place() -> None:
+    """Two moves of four ask more of the drive than it has: each is refused at its row, what lies between is planned."""
+    calm = bench_demand(10)
+    shift, hard = calm[-1] - calm[0], bench_demand(20, (0.030, 0.015))
+    between = np.concatenate([calm, calm[::-1], calm]) + 2 * shift
+    path = np.concatenate([calm, hard + shift, between, hard + 3 * shift])
+    starts = np.cumsum([0, len(calm), len(hard), len(between)])
+    blocks = list(stream(pieces(path, 500), MODELS, CONFIG, goes_on=True))
+    assert sum(block.before_um.size for block in blocks) == len(path)
+    places = [row for block in blocks for row, reason in zip(block.at, block.refused, strict=True)]
+    assert all(starts[1] <= row < starts[2] or starts[3] <= row for row in places)
+    assert any(row < starts[2] for row in places)
+    assert any(row >= starts[3] for row in places)
+    assert any(not block.refused and block.first_row > starts[1] for block in blocks)
+    assert next(stream(pieces(path, 500), MODELS, CONFIG)).refused == ()
+
+
 def test_seams_do_not_show() -> None:
     """Near a seam the error is no larger than it is there when the seams lie elsewhere, to 0.05 um."""
     there = bench_demand(10)
