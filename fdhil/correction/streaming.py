@@ -33,7 +33,8 @@ class StreamBlock:
     """The settled rows from ``first_row`` on: offsets per axis in um, contour error (n,) without and with them.
 
     ``refused`` is not empty where the gate does not let the block through: its offsets are 0 then, and the stream ends
-    there unless it is told to go on. ``at`` holds the row of each refusal in the whole.
+    there unless it is told to go on. ``at`` holds the row of each refusal in the whole, which may be one of the rows
+    that were only looked at.
     """
 
     first_row: int
@@ -172,10 +173,10 @@ def _refused(name: str, loop: AxisLoop, solution: Solution, free: Response, rows
         )
         reason = Reason("DemandTooHigh", text, "lower the feed, or smooth more")
         refused.append(_Refusal(int(np.argmax(free.limited > 0.0)), reason))
-    if solution.needed_um > loop.limits.offset * um:
+    elif solution.needed_um > loop.limits.offset * um:
         feedforward = loop.axis.regulators.speed_feedforward
         reason = lag_reason(name, solution.needed_um, loop.limits.offset * um, feedforward)
-        refused.append(_Refusal(min(solution.needed_at, rows - 1), reason))
+        refused.append(_Refusal(solution.needed_at, reason))
     before = float(solution.offset[1]), float(solution.offset[0])
     broken = check(solution.offset[2:rows].astype(np.int64), loop.limits, before)
     refused += [_Refusal(0, Reason(one.code, f"axis {name}: {one.text}", one.advice)) for one in broken]
