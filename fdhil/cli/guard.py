@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 SETTINGS_NAME = "guard.json"
 VARIATION_MM = 3.0
 CONNECT_S = 5.0
+SPEED_STEPS = 2.0  # times the motor's power: room for the load's own inertia and for the sensor's noise
 HEARTBEATS_AWAITED = 2.0  # periods of the drive's heartbeat until it counts as lost
 
 
@@ -108,7 +109,8 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
     from fdhil.drivers.profile import load_profile  # late: the drivers' room is heavy, --help is not
 
     profile = load_profile(axis.drive.profile)
-    node_id = machine.node_id(name)
+    node_id, period_s = machine.node_id(name), machine.machine.sync_period_s
+    per_rad = axis.drive.increments_per_rev / (2 * math.pi)
     target, offset = _rpdo(profile, profile.target, name), _rpdo(profile, profile.offset, name)
     if len(offset.entries) != 1:
         fault = ConfigFault(
@@ -123,12 +125,20 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
         tpdos=tuple(_pdo(spec, node_id) for spec in profile.tpdos if spec.valid),
         increments_per_mm=axis.scaling.increments_per_mm,
         sign=axis.drive.sign,
-        limits=limits_of(axis, machine.machine.sync_period_s),
+        limits=limits_of(axis, period_s),
         window=round(axis.drive.following_error_window_mm * axis.scaling.increments_per_mm),
         setpoint_delay_cycles=axis.drive.setpoint_delay_cycles,
         heartbeat_timeout_s=heartbeat_timeout_s(machine, name),
         feedforward=_feedforward(profile, machine, name, axis),
+        speed_count=abs(profile.speed_rad_s_per_count(axis)) * per_rad * period_s,
+        speed_step=SPEED_STEPS * _largest_acceleration_rad_s2(axis) * per_rad * period_s**2,
     )
+
+
+def _largest_acceleration_rad_s2(axis: Axis) -> float:
+    """What the motor can do at its current limit, or what the NC asks for where that is more."""
+    of_the_motor = axis.regulators.current_limit_a * axis.nominal.K / axis.nominal.Jt
+    return max(of_the_motor, axis.max_acceleration_mm_s2 * 2 * math.pi / axis.screw_pitch_mm)
 
 
 def _feedforward(profile: DriveProfile, machine: MachineConfig, name: str, axis: Axis) -> Feedforward | None:

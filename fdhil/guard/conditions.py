@@ -53,6 +53,7 @@ AXIS_INTERLOCKS: tuple[tuple[str, Good], ...] = (
     ("LimitActive", _status(STATUS_INTERNAL_LIMIT, False)),
     ("NotCsp", lambda _own, seen, _axis: seen.mode == Mode.CYCLIC_SYNC_POSITION),
     ("EchoMismatch", lambda _own, _seen, axis: axis.echo_misses < 2 and axis.feed_misses < 2),
+    ("Implausible", lambda _own, _seen, axis: axis.implausible < 2),
     ("PdoLength", lambda _own, seen, _axis: seen.short_frames < 3),
     ("TargetLost", lambda _own, seen, _axis: seen.target is not None),
     ("FeedbackGap", lambda _own, seen, _axis: seen.feedback_age <= 1),

@@ -21,7 +21,7 @@ NEVER = 1 << 30
 INTERVALS = 32
 FOREIGN_CYCLES = 3
 TARGET, POSITION, READ_BACK, STATUSWORD, MODE, FOLLOWING = 0x607A, 0x6064, 0x60B0, 0x6041, 0x6061, 0x60F4
-SPEED_OFFSET, TORQUE_OFFSET = 0x60B1, 0x60B2
+SPEED_OFFSET, TORQUE_OFFSET, SPEED = 0x60B1, 0x60B2, 0x606C
 
 
 @dataclass(slots=True)
@@ -245,6 +245,7 @@ class Listener:
             max([pdo.short for pdo in tpdos], default=0),
             max([pdo.long for pdo in tpdos], default=0),
             (_fresh(tpdos, SPEED_OFFSET), _fresh(tpdos, TORQUE_OFFSET)),
+            _fresh(tpdos, SPEED),
         )
 
 

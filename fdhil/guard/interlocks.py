@@ -81,6 +81,11 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     "FollowingError": (_R, "the following error exceeds half its window", "check load, gains and 0x6065"),
     "NotCsp": (_R, "the drive does not show cyclic synchronous position mode", "set 0x6060 to 8"),
     "EchoMismatch": (_R, "the drive's offset is not the one that was sent", "check the PDO mapping and the scaling"),
+    "Implausible": (
+        _R,
+        "position and speed contradict each other",
+        "check the drive's mapping, look for a second sender",
+    ),
     "DriveEmergency": (_R, "the drive sent an emergency", "read its error code and clear it"),
     "PdoLength": (_R, "a PDO is shorter than its mapping", "compare the drive's mapping with the profile"),
     "PdoMapping": (_N, "a PDO is longer than its mapping", "compare the drive's mapping with the profile"),

@@ -22,7 +22,11 @@ def observe(state: State, inputs: Inputs, settings: Settings) -> State:
     depth = max([axis.setpoint_delay_cycles for axis in settings.axes]) + 2
     history = (targets, *state.targets)[:depth]
     sampled = [
-        _fed(_sampled(axis, seen, setting, k, history), seen.fed_back, [pairs[k] for pairs in state.feed.sent if pairs])
+        _fed(
+            _believed(_sampled(axis, seen, setting, k, history), seen, setting, state.tick),
+            seen.fed_back,
+            [pairs[k] for pairs in state.feed.sent if pairs],
+        )
         for k, (axis, seen, setting) in enumerate(zip(axes, inputs.axes, settings.axes, strict=True))
     ]
     return state._replace(
@@ -65,6 +69,24 @@ def _sampled(
         late_echoes=axis.late_echoes + late,
         zero_shown=axis.zero_shown or (seen.read_back == 0 and not any(axis.sent[:2])),
     )
+
+
+def _believed(axis: AxisState, seen: AxisInput, setting: AxisSettings, tick: int) -> AxisState:
+    """Compare position and speed with the last that were believed: what the motor's power allows, and each other.
+
+    The table may part from its motor by the largest offset: with more lost motion no correction makes sense. A sample
+    that is not believed is no reference for the next, which has more time to have got there.
+    """
+    if not setting.speed_step or seen.position is None or seen.speed is None:
+        return axis
+    speed = seen.speed * setting.speed_count
+    position, before, then = axis.believed or (seen.position, speed, tick)
+    cycles = tick - then
+    step = setting.speed_step * cycles
+    apart = abs(seen.position - position - 0.5 * (speed + before) * cycles)
+    if abs(speed - before) <= step and apart <= step * cycles + setting.limits.offset:
+        return axis._replace(believed=(seen.position, speed, tick), implausible=0)
+    return axis._replace(implausible=axis.implausible + 1)
 
 
 def _fed(axis: AxisState, shown: Shown, sent: Sequence[Pair]) -> AxisState:

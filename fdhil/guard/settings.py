@@ -48,6 +48,8 @@ class AxisSettings:
     """One axis: ``target`` is the NC's RPDO with 0x607A, ``offset`` our own RPDO with 0x60B0 alone.
 
     ``window`` is the drive's following error window (0x6065) in increments; ``limits`` in increments per SYNC cycle.
+    ``speed_count`` is one count of 0x606C in increments per SYNC cycle, ``speed_step`` by how much of that the motor's
+    speed can change in one cycle; 0: not judged.
     ``heartbeat_timeout_s`` 0: the drive has no heartbeat, and its PDOs alone show that it is Operational.
     """
 
@@ -63,6 +65,8 @@ class AxisSettings:
     setpoint_delay_cycles: int
     heartbeat_timeout_s: float = 0.0
     feedforward: Feedforward | None = None
+    speed_count: float = 0.0
+    speed_step: float = 0.0
 
     @property
     def reads_back(self) -> bool:
@@ -191,5 +195,7 @@ def _check_axis(axis: AxisSettings) -> None:
         raise ValueError(
             f"axis {axis.name}: {axis.offset.cob_id:#x} is no RPDO, or the window is no number of increments"
         )
+    if not 0.0 <= axis.speed_step < 2**31 or not 0.0 <= axis.speed_count < 2**31:
+        raise ValueError(f"axis {axis.name}: speed_count or speed_step is out of range")
     if type(axis.setpoint_delay_cycles) is not int or not 0 <= axis.setpoint_delay_cycles <= 16:
         raise ValueError(f"axis {axis.name}: setpoint_delay_cycles is out of range")

@@ -69,6 +69,7 @@ class AxisInput(NamedTuple):
     short_frames: int = 0
     long_frames: int = 0
     fed_back: Shown = NOT_SHOWN
+    speed: int | None = None
 
 
 class BusView(NamedTuple):
@@ -103,7 +104,8 @@ class AxisState(NamedTuple):
     """One axis' offset: ``offset`` in force or about to be, moving at ``rate``; ``sent`` the last values, newest first.
 
     ``read_back`` is what the drive last showed (None: never), ``zeros_shown`` whether it showed 0 since we send 0.
-    ``fed_back`` is the same of speed and torque offset.
+    ``fed_back`` is the same of speed and torque offset. ``believed`` are the last position, speed (increments per
+    cycle) and tick that agreed with those before, ``implausible`` the samples since then that did not.
     """
 
     offset: int = 0
@@ -117,6 +119,8 @@ class AxisState(NamedTuple):
     following_error: float = float("nan")
     fed_back: Shown = NOT_SHOWN
     feed_misses: int = 0
+    believed: tuple[int, float, int] | None = None
+    implausible: int = 0
 
 
 class State(NamedTuple):

@@ -80,6 +80,7 @@ class Drive:
     received_fed: Pair | None = None
     shows_fed: bool = False
     takes_fed: Callable[[Pair], Pair] = lambda pair: pair
+    followed: int | None = None
     queue: list[tuple[int, int]] = field(default_factory=list)
 
     def at_sync(self, tick: int) -> list[Frame]:
@@ -92,10 +93,12 @@ class Drive:
         self.queue = [*self.queue, (self.target, self.offset)][-3:]
         if not self.answers:
             return []
-        followed = sum(self.queue[0])
+        followed, before = sum(self.queue[0]), self.followed
+        self.followed = followed
+        speed = 0 if before is None else (followed - before) * 1000
         n = self.node_id
         frames = [
-            (0x180 + n, struct.pack("<ii", followed - self.position_error, 0)),
+            (0x180 + n, struct.pack("<ii", followed - self.position_error, speed)),
             (0x280 + n, struct.pack("<Hhh", self.statusword, 0, 0)),
         ]
         if self.shows_fed:

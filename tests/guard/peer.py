@@ -35,6 +35,7 @@ class Peer(threading.Thread):
         self.latched: list[tuple[int, tuple[int, ...], tuple[int, ...]]] = []
         self.tick = self.row = 0
         self.playing = False
+        self.pause_s = 0.0
         self.lockstep = self.syncing = True
         self.ended = threading.Event()
         self._inbox = b""
@@ -80,6 +81,7 @@ class Peer(threading.Thread):
             self._client.sendall(encode(list(frames)))
 
     def _cycle(self) -> None:
+        time.sleep(self.pause_s)
         self.tick += 1
         sampled = [frame for drive in self.drives for frame in drive.at_sync(self.tick)]
         self.latched.append((self.tick, tuple(d.target for d in self.drives), tuple(d.offset for d in self.drives)))
