@@ -17,6 +17,9 @@ from fdhil.records import Notice
 ABSENT: Mapping[str, Any] = {"state": "absent", "text": "no guard runs: nothing can be armed, nothing is sent"}
 SETTLING_TRIES = 25
 SETTLING_S = 0.2
+CHARGED = {"ARMED", "RAMPING", "ACTIVE", "HOLD", "FEEDFORWARD"}
+ORDERED = {"Disarmed", "Finished", "Stopped"}
+TRIPPED = "GuardTripped"
 REST = {"OFF", "FROZEN", "absent"}
 
 
@@ -142,7 +145,7 @@ class GuardLink:
 
 
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
-    """Say when the guard came, or changed its state, and why."""
+    """Say when the guard came, or changed its state, and why; a correction that something ended is a trip."""
     if before["state"] == now["state"]:
         return []
     cause = now.get("cause") or {}
@@ -150,4 +153,8 @@ def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
     if before["state"] == "absent":
         return [Notice("GuardFound", "info", f"the guard runs, in state {now['state']}{why}")]
     severity: Any = "MAJOR" if now["state"] == "FROZEN" else "info"
-    return [Notice("GuardState", severity, f"{before['state']} -> {now['state']}{why}", cause.get("axis", ""))]
+    notice = Notice("GuardState", severity, f"{before['state']} -> {now['state']}{why}", cause.get("axis", ""))
+    tripped = before["state"] in CHARGED and now["state"] not in CHARGED and cause.get("code") not in ORDERED
+    if not tripped:
+        return [notice]
+    return [notice, Notice(TRIPPED, "MAJOR", f"{cause.get('code')}: {cause.get('text')}", cause.get("axis", ""))]

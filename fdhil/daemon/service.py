@@ -16,9 +16,10 @@ from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
 from fdhil.config import MachineConfig
-from fdhil.daemon import journal
+from fdhil.daemon import blackbox, journal
 from fdhil.daemon.armory import Armory
 from fdhil.daemon.control import SOCKET_NAME, Answer, ControlServer, refusal
+from fdhil.daemon.guard_link import TRIPPED
 from fdhil.daemon.keeping import Keeper
 from fdhil.daemon.lock import sole_owner
 from fdhil.daemon.notify import notify
@@ -44,6 +45,9 @@ class Source(Protocol):
 
     def counters(self) -> Mapping[str, Any]:
         """Return frames received, lost and the like."""
+
+    def black_box(self) -> Mapping[str, str]:
+        """Return the frames of the last seconds of each bus, as the lines of a log."""
 
 
 OpenSource = Callable[[MachineConfig], AbstractAsyncContextManager[Source]]
@@ -207,6 +211,9 @@ class Service:
         while True:
             notice = await self._notices.get()
             self._say(await asyncio.to_thread(self._keeper.keep, [notice]))
+            if notice.code == TRIPPED and self._source is not None:
+                code, store = notice.text.partition(":")[0], self._config.store.directory
+                self._say([await asyncio.to_thread(blackbox.dump, store, code, self._source.black_box)])
             self._notices.task_done()
 
     def _say(self, outcomes: Sequence[Outcome]) -> list[Outcome]:

@@ -17,6 +17,7 @@ from fdhil.config import MachineConfig
 from fdhil.drivers.bus_decoder import BusDecoder
 from fdhil.drivers.canopen_bus import CanBus
 from fdhil.drivers.cia402_drive import InputSamples
+from fdhil.drivers.frame_history import FrameHistory, candump
 from fdhil.drivers.modbus_link import BUSY, ModbusRefused
 from fdhil.drivers.modbus_voltage import ModbusVoltage
 from fdhil.drivers.temperature import ModbusTemperature
@@ -77,6 +78,7 @@ class BusSource:
         self.ticks = TickClock(config.machine.sync_period_s)
         event_source: Callable[[str, MachineConfig], EventSource] = tables.load(tables.EVENT_SOURCES, config.g0.source)
         self._events = [event_source(axis, config) for axis in self.decoder.axes]
+        self.history = FrameHistory()
         self._silent = False
         self._frames_before = 0
         self._overflow_told = 0
@@ -95,6 +97,7 @@ class BusSource:
         if self._bus is None:
             return []
         frames = self._bus.drain()
+        self.history.add(frames)
         out: list[Record] = []
         for record in self.decoder.feed(frames, now_ns):
             if isinstance(record, TickTimes):
@@ -298,6 +301,10 @@ class MachineSource:
         for axis, sensor in self._sensors.items():
             flat |= {f"modbus.{axis}.{key}": value for key, value in sensor.counters().items()}
         return flat
+
+    def black_box(self) -> dict[str, str]:
+        """Return the frames of the last 10 s of each bus, as the lines of a candump log."""
+        return {name: candump(name, bus.history.frames()) for name, bus in self._buses.items()}
 
     async def close(self) -> None:
         """Stop all sources and release buses and sensors."""

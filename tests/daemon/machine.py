@@ -105,6 +105,10 @@ class Machine:
             self.taken += 1
             yield record
 
+    def black_box(self) -> dict[str, str]:
+        """Return what was on the bus."""
+        return {"can0": "(1.000000) can0 080#\n"}
+
     def counters(self) -> dict[str, int]:
         """Return frames received and lost."""
         return {"frames": self.taken, "lost": 0}

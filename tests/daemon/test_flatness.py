@@ -78,6 +78,10 @@ def fades_out_on_an_emergency(shop: Shop, capsys: Capture) -> None:
     shop.twin.command("fault", fault="frame", can_id=0x081, data="1043080000000000")
     told = shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
     assert feed_of(told)["cause"]["code"] == "DriveEmergency"
+    boxes = shop.config.store.directory / "blackbox"
+    shop.wait(lambda: any(boxes.glob("*-DriveEmergency.log")))
+    (box,) = boxes.glob("*-DriveEmergency.log")
+    shop.wait(lambda: "can0 081#1043080000000000" in box.read_text())
     assert feed_of(told)["applied"] == {"X": [0, 0], "Y": [0, 0]}
 
 

@@ -1,0 +1,82 @@
+"""The black box: the frames before a trip are kept, in a form that other tools read, and never in the way."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil.daemon import blackbox
+from fdhil.daemon.guard_link import TRIPPED, _changes
+from fdhil.drivers.frame_history import FrameHistory, candump
+from fdhil.drivers.frames import ERROR_FLAG, frames_of
+
+
+def status(state: str, code: str = "") -> dict[str, Any]:
+    cause = {"code": code, "text": "why", "axis": "X"} if code else None
+    return {"state": state, "cause": cause}
+
+
+@pytest.mark.parametrize("before", ["ARMED", "RAMPING", "ACTIVE", "HOLD", "FEEDFORWARD"])
+@pytest.mark.parametrize("after", ["RAMP_DOWN", "OFF", "FROZEN"])
+def test_what_ends_a_correction_is_a_trip(before: str, after: str) -> None:
+    told = _changes(status(before), status(after, "EchoMismatch"))
+    assert [notice.code for notice in told] == ["GuardState", TRIPPED]
+    assert (told[1].severity, told[1].axis, told[1].text) == ("MAJOR", "X", "EchoMismatch: why")
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        (status("ACTIVE"), status("RAMP_DOWN", "Disarmed")),
+        (status("ACTIVE"), status("OFF", "Finished")),
+        (status("ARMED"), status("RAMP_DOWN", "Stopped")),
+        (status("RAMP_DOWN", "EchoMismatch"), status("OFF", "EchoMismatch")),
+        (status("OFF"), status("ADOPT", "StaleOffset")),
+        (status("HOLD", "FeedHold"), status("RAMPING")),
+        (status("absent"), status("OFF", "EchoMismatch")),
+    ],
+)
+def test_what_was_ordered_or_goes_on_is_none(before: dict[str, Any], after: dict[str, Any]) -> None:
+    assert [notice.code for notice in _changes(before, after) if notice.code == TRIPPED] == []
+
+
+def test_a_history_keeps_ten_seconds_and_no_more() -> None:
+    history = FrameHistory(kept_s=10.0)
+    history.add(frames_of([]))
+    for k in range(400):
+        history.add(frames_of([(k * 50_000_000 + 1, 0x80, bytes([k % 240])), (k * 50_000_000 + 2, 0x181, b"\x01")]))
+    kept = history.frames()
+    stamps = kept["t_ns"]
+    assert 10.0 <= (int(stamps[-1]) - int(stamps[0])) * 1e-9 <= 10.1
+    assert kept.size == pytest.approx(402, abs=4)
+    assert FrameHistory().frames().size == 0
+
+
+def test_the_log_is_candumps() -> None:
+    frames = frames_of(
+        [(1_500_000_250, 0x080, b""), (2_000_001_000, 0x301, b"\x01\xff"), (3, ERROR_FLAG | 0x40, bytes(8))]
+    )
+    assert candump("can0", frames).splitlines() == [
+        "(1.500000) can0 080#",
+        "(2.000001) can0 301#01FF",
+        "(0.000000) can0 20000040#0000000000000000",
+    ]
+
+
+def test_a_dump_is_one_file_and_the_oldest_go(tmp_path: Path) -> None:
+    for _ in range(11):
+        told = blackbox.dump(tmp_path, "SyncLost", lambda: {"can0": "(1.000000) can0 080#\n", "can1": ""})
+    assert told.code == "BlackBox"
+    files = sorted((tmp_path / "blackbox").glob("*.log"))
+    assert len(files) == blackbox.KEPT_FILES
+    assert files[-1].read_text() == "(1.000000) can0 080#\n"
+    assert files[-1].name.endswith("-SyncLost.log")
+    assert str(files[-1]) in told.text
+
+
+def test_a_disk_that_refuses_is_told(tmp_path: Path) -> None:
+    (tmp_path / "blackbox").write_text("in the way")
+    told = blackbox.dump(tmp_path, "SyncLost", dict)
+    assert (told.code, told.severity) == ("StoreFault", "minor")
