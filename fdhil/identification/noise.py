@@ -13,7 +13,7 @@ from fdhil.records import Float
 ITERATIONS = 12
 STEP = 0.05
 LARGEST = 1.0
-ENOUGH = 0.05
+ENOUGH = 0.15  # what such a step leaves is less than the data can tell
 FLOOR = 1e-3  # of a level's own start: below it a noise has no effect that could be seen
 
 

@@ -1,7 +1,7 @@
 """Many filters over one window in one call, and the answer of one filter to many changes of the signals.
 
 Derivatives by parameters and noise levels, and the directions of score tests, are wanted for several columns at once.
-Here gain and innovation of a row are made together, and columns of one filter wait together for the row before.
+Here gain and innovation of a row are made together.
 """
 
 from __future__ import annotations
@@ -22,25 +22,29 @@ LOG_ROWS = 16  # determinants, at most DIFFUSE^2 of the measurement's, that are 
 NOTHING: Float = np.zeros((0, 0))
 
 
-def _coefficients_plain(theta: Float, dt: float, unknown: bool) -> Float:
-    """Return [phi (4), mean u to i and w, mean f to i and w, ramp u to i and w, walk to i] (11,) of an interval."""
+def _coefficients_plain(theta: Float, dt: float, unknown: bool, share: float) -> Float:
+    """Return [phi (4), mean u to i and w, mean f to i and w, rise of u to i and w, walk to i] (11,) of an interval.
+
+    ``share`` of the back-EMF's own rise over it, which is linear in the same quantities, is part of them.
+    """
     a = np.array([[-theta[0] / theta[1], -theta[2] / theta[1]], [theta[2] / theta[3], -theta[4] / theta[3]]])
     if unknown:
         a[1, :] = 0.0
     phi, mean, ramp = transition(a, dt)
     u = 1.0 / theta[1]
+    f = 0.0 if unknown else -1.0 / theta[3]  # there the friction torque is whatever keeps the speed on its walk
+    to_i = np.array([phi[0, 0], phi[0, 1], mean[0, 0] * u, mean[0, 1] * f])
+    to_w = np.array([phi[1, 0], phi[1, 1], mean[1, 0] * u, mean[1, 1] * f])
+    rise = share * theta[2] * (to_w - np.array([0.0, 1.0, 0.0, 0.0]))
+    to_i, to_w = to_i + ramp[0, 0] * u * rise, to_w + ramp[1, 0] * u * rise
     out = np.empty(11)
-    out[0], out[1], out[2], out[3] = phi[0, 0], phi[0, 1], phi[1, 0], phi[1, 1]
-    out[4], out[5] = mean[0, 0] * u, mean[1, 0] * u
-    out[6], out[7] = -mean[0, 1] / theta[3], -mean[1, 1] / theta[3]
-    if unknown:  # there the friction torque is whatever keeps the speed on its walk
-        out[6], out[7] = 0.0, 0.0
-    out[8], out[9] = ramp[0, 0] * u, ramp[1, 0] * u
-    out[10] = mean[0, 1] / dt
+    out[0], out[1], out[4], out[6] = to_i[0], to_i[1], to_i[2], to_i[3]
+    out[2], out[3], out[5], out[7] = to_w[0], to_w[1], to_w[2], to_w[3]
+    out[8], out[9], out[10] = ramp[0, 0] * u, ramp[1, 0] * u, mean[0, 1] / dt
     return out
 
 
-_coefficients: Callable[[Float, float, bool], Float] = njit(cache=True, nogil=True)(_coefficients_plain)
+_coefficients: Callable[[Float, float, bool, float], Float] = njit(cache=True, nogil=True)(_coefficients_plain)
 
 
 def _one_plain(
@@ -58,15 +62,16 @@ def _one_plain(
     out: Float,
 ) -> float:
     """Fill ``out`` (n, 2) with the whitened innovations of one filter; return its log determinant."""
-    moving, free = _coefficients(theta, dt, False), _coefficients(theta, dt, True)
-    friction, emf = theta[5], share * theta[2]
+    moving, free = _coefficients(theta, dt, False, share), _coefficients(theta, dt, True, share)
     vu, vi, vw = variances
     unit = 1.0 / (vi * vw)
     p11, p12, p22 = DIFFUSE * vi, 0.0, DIFFUSE * vw
     i, w = current[0], speed[0]
     logdet, product, counted = 0.0, 1.0, 0
     for k in range(mode.size):
-        if observed[k]:
+        if not observed[k]:
+            out[k] = 0.0
+        else:
             s11, s22 = p11 + vi, p22 + vw
             det = s11 * s22 - p12 * p12
             part = 1.0 / det
@@ -98,11 +103,11 @@ def _one_plain(
             p11 += v1 * v1 * walk * walk
             p12 += v1 * walk * walk
             p22 += walk * walk
-        torque = friction * mode[k]
-        w_next = f10 * i + f11 * w + b2 * mean_v[k] + t2 * torque
-        r = emf * (w_next - w) + (rise_v[k] if rise_v.size else 0.0)
-        i = f00 * i + f01 * w + b1 * mean_v[k] + t1 * torque + r1 * r
-        w = w_next + r2 * r
+        u, torque, r = mean_v[k], theta[5] * mode[k], rise_v[k] if rise_v.size else 0.0
+        i, w = (
+            f00 * i + f01 * w + (b1 * u + t1 * torque + r1 * r),
+            f10 * i + f11 * w + (b2 * u + t2 * torque + r2 * r),
+        )
     return float(logdet + np.log(product) - counted * np.log(unit))
 
 
@@ -127,7 +132,7 @@ def _whiten_plain(
     ``variances`` (q, 3) as in the single filter; ``mean_v`` is (q, n) or, when all share it, (1, n).
     """
     n, q = mode.size, thetas.shape[0]
-    out = np.zeros((q, n, 2))
+    out = np.empty((q, n, 2))
     logdet = np.zeros(q)
     for c in range(q):
         mean = mean_v[min(c, mean_v.shape[0] - 1)]
@@ -183,48 +188,70 @@ def _whiten_slow(motion: Motion, thetas: Float, variances: Float, about: Float |
     return np.column_stack(columns), np.array([one.logdet for one in made])
 
 
+def _answer_plain(
+    moving: Float,
+    free: Float,
+    kind: int,
+    mode: Float,
+    observed: Float,
+    course: Float,
+    rise: Float,
+    gains: Float,
+    white: Float,
+    out: Float,
+) -> None:
+    """Fill ``out`` (n, 2) with the change of the innovations when one signal changes by ``course`` (n,)."""
+    on_f, on_u = 1.0 * (kind == LOAD), 1.0 * (kind == VOLTAGE)
+    on_i, on_w = 1.0 * (kind == CURRENT), 1.0 * (kind == SPEED)
+    i, w = on_i * course[0], on_w * course[0]
+    f00, f01, f10, f11, b1, b2, t1, t2, r1, r2, _ = moving
+    last, begin = 1, 0
+    while begin < mode.size and course[begin] == 0.0 and (rise.size == 0 or rise[begin] == 0.0):
+        begin += 1
+    out[:begin] = 0.0
+    for k in range(begin, mode.size):
+        if not observed[k]:
+            out[k] = 0.0
+        else:
+            e1, e2 = on_i * course[k] - i, on_w * course[k] - w
+            out[k, 0] = white[k, 0] * e1
+            out[k, 1] = white[k, 1] * e1 + white[k, 2] * e2
+            i += gains[k, 0] * e1 + gains[k, 1] * e2
+            w += gains[k, 2] * e1 + gains[k, 3] * e2
+        if mode[k] == BROKEN:
+            continue
+        if mode[k] != last:
+            f00, f01, f10, f11, b1, b2, t1, t2, r1, r2, _ = free if mode[k] == UNKNOWN else moving
+            last = mode[k]
+        u, torque, r = on_u * course[k], on_f * course[k], rise[k] if rise.size else 0.0
+        i, w = (
+            f00 * i + f01 * w + (b1 * u + t1 * torque + r1 * r),
+            f10 * i + f11 * w + (b2 * u + t2 * torque + r2 * r),
+        )
+
+
+_answer: Callable[..., None] = njit(cache=True, nogil=True, error_model="numpy")(_answer_plain)
+
+
 def _answers_plain(
     theta: Float,
     dt: float,
     mode: Float,
     observed: Float,
     kind: int,
-    course: Float,
-    rise: Float,
+    courses: Float,
+    rises: Float,
     share: float,
     gains: Float,
     white: Float,
 ) -> Float:
-    """Return the change (n, 2, q) of the innovations when one signal changes by the columns of ``course`` (n, q)."""
-    n, q = course.shape
-    out = np.zeros((n, 2, q))
-    moving, free = _coefficients(theta, dt, False), _coefficients(theta, dt, True)
-    emf = share * theta[2]
-    on_f, on_u = 1.0 * (kind == LOAD), 1.0 * (kind == VOLTAGE)
-    on_i, on_w = 1.0 * (kind == CURRENT), 1.0 * (kind == SPEED)
-    i, w = on_i * course[0], on_w * course[0]
-    for k in range(n):
-        if observed[k]:
-            g11, g12, g21, g22 = gains[k]
-            w11, w21, w22 = white[k]
-            for c in range(q):
-                e1, e2 = on_i * course[k, c] - i[c], on_w * course[k, c] - w[c]
-                out[k, 0, c] = w11 * e1
-                out[k, 1, c] = w21 * e1 + w22 * e2
-                i[c] += g11 * e1 + g12 * e2
-                w[c] += g21 * e1 + g22 * e2
-        if mode[k] == BROKEN:
-            continue
-        h = free if mode[k] == UNKNOWN else moving
-        f00, f01, f10, f11, u0, u1, t0, t1, r0, r1, _ = h
-        for c in range(q):
-            u, torque = on_u * course[k, c], on_f * course[k, c]
-            w_next = f10 * i[c] + f11 * w[c] + u1 * u + t1 * torque
-            r = emf * (w_next - w[c])
-            if rise.size:
-                r += rise[k, c]
-            i[c] = f00 * i[c] + f01 * w[c] + u0 * u + t0 * torque + r0 * r
-            w[c] = w_next + r1 * r
+    """Return the change (q, n, 2) of the innovations when one signal changes by the rows of ``courses`` (q, n)."""
+    moving, free = _coefficients(theta, dt, False, share), _coefficients(theta, dt, True, share)
+    out = np.empty((courses.shape[0], mode.size, 2))
+    none = np.zeros(0)
+    for c in range(courses.shape[0]):
+        rise = rises[c] if rises.size else none
+        _answer(moving, free, kind, mode, observed, courses[c], rise, gains, white, out[c])
     return out
 
 
@@ -236,10 +263,10 @@ def answers(
     theta: Float,
     gains: Gains,
     kind: int,
-    courses: Sequence[Float],
-    rises: Sequence[Float] | None = None,
+    courses: Float | Sequence[Float],
+    rises: Float | Sequence[Float] | None = None,
 ) -> Float:
-    """Return the change (2 n, q) of the innovations when a signal changes by each of ``courses`` (n,).
+    """Return the change (2 n, q) of the innovations when a signal changes by each of ``courses`` (q, n).
 
     ``kind`` names the signal: ``LOAD`` (N.m against the positive direction), ``VOLTAGE`` (V, over each interval with
     ``rises`` within them), ``CURRENT`` (A) or ``SPEED`` (rad/s). The innovations are linear in all of them. The
@@ -252,10 +279,10 @@ def answers(
         motion.mode,
         motion.observed,
         kind,
-        np.column_stack(courses),
-        NOTHING if means or rises is None else np.column_stack(rises),
+        np.asarray(courses),
+        NOTHING if means or rises is None else np.asarray(rises),
         1.0 if means else 0.0,
         gains.gains,
         gains.whiteners,
     )
-    return changed.reshape(2 * motion.n, -1)
+    return changed.reshape(len(courses), -1).T

@@ -8,7 +8,7 @@ both beyond chance and large enough to matter refuses a window. Whiteness over l
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,34 +95,33 @@ class Bench:
         """Largest K |i| of the window, N.m."""
         return float(abs(self.fit.theta[2]) * np.abs(self.motion.current).max())
 
-    def load_answers(self, loads: Sequence[Float]) -> Float:
-        """Return minus the change (m, q) of the innovations under each of ``loads`` (n,), N.m."""
+    def load_answers(self, loads: Float) -> Float:
+        """Return minus the change (m, q) of the innovations under each of ``loads`` (q, n), N.m."""
         return self._answers(sweeps.LOAD, loads, None)
 
-    def gain_answers(self, name: str, courses: Sequence[Float]) -> Float:
-        """Return minus the change (m, q) of the innovations when the gain of signal ``name`` grows by ``courses``."""
+    def gain_answers(self, name: str, courses: Float) -> Float:
+        """Return minus the change (m, q) of innovations when the gain of ``name`` grows by ``courses`` (q, n)."""
         motion = self.motion
         if name != "voltage":
-            return self._answers(_KINDS[name], [getattr(motion, name) * c for c in courses], None)
-        at_samples = [motion.at_voltage(c) for c in courses]
-        rises = [motion.voltage_rise * c for c in at_samples]
-        return self._answers(sweeps.VOLTAGE, [motion.voltage_mean * c for c in at_samples], rises)
+            return self._answers(_KINDS[name], getattr(motion, name) * courses, None)
+        at_samples = np.array([motion.at_voltage(c) for c in courses])
+        return self._answers(sweeps.VOLTAGE, motion.voltage_mean * at_samples, motion.voltage_rise * at_samples)
 
-    def offset_answers(self, name: str, courses: Sequence[Float]) -> Float:
-        """Return minus the change (m, q) of the innovations when ``courses`` (n,) are added to signal ``name``."""
+    def offset_answers(self, name: str, courses: Float) -> Float:
+        """Return minus the change (m, q) of the innovations when ``courses`` (q, n) are added to signal ``name``."""
         motion = self.motion
         if name != "voltage":
             return self._answers(_KINDS[name], courses, None)
-        at_samples = [motion.at_voltage(c) for c in courses]
-        return self._answers(sweeps.VOLTAGE, at_samples, [np.zeros_like(motion.voltage_rise)] * len(courses))
+        at_samples = np.array([motion.at_voltage(c) for c in courses])
+        return self._answers(sweeps.VOLTAGE, at_samples, np.zeros_like(at_samples))
 
-    def _answers(self, kind: int, courses: Sequence[Float], rises: Sequence[Float] | None) -> Float:
+    def _answers(self, kind: int, courses: Float, rises: Float | None) -> Float:
         motion, theta, gains = self.motion, self.fit.theta, self.fit.problem.filters[0]
         if motion.slow is not None:
             return np.column_stack([self._slow_answer(kind, course) for course in courses])
         if rises is not None and theta[6] != 0.0:
             both = zip(courses, rises, strict=True)
-            courses = [replace(motion, voltage_mean=c, voltage_rise=r).delayed(theta[6]) for c, r in both]
+            courses = np.array([replace(motion, voltage_mean=c, voltage_rise=r).delayed(theta[6]) for c, r in both])
         answered: Float = -sweeps.answers(motion, theta, gains, kind, courses, rises)
         return answered
 
@@ -185,7 +184,9 @@ def courses(fit: Fit) -> Float:
         return shape
     rate = np.gradient(moving_mean(motion.speed, 2 * round(SLOPE_S / 2 / motion.dt_s) + 1), motion.dt_s)
     missed = doubt * theta[0] * theta[3] / theta[2] * rate
-    answer = sweeps.answers(motion, theta, fit.problem.filters[0], sweeps.VOLTAGE, [missed], [np.zeros(motion.n)])
+    answer = sweeps.answers(
+        motion, theta, fit.problem.filters[0], sweeps.VOLTAGE, missed[None], np.zeros((1, motion.n))
+    )
     return np.column_stack([shape, answer])
 
 
@@ -203,7 +204,7 @@ def expected_correlation(fit: Fit) -> Float:
     pulse = np.zeros(motion.n)
     # what the fit needs beyond the sensor's noise is the regulators' doing, and is not shared in that way
     pulse[row] = min(fit.problem.noises[0].voltage_v, motion.noise.voltage_v)
-    answer = sweeps.answers(motion, fit.theta, gains, sweeps.VOLTAGE, [pulse], [np.zeros(motion.n)])
+    answer = sweeps.answers(motion, fit.theta, gains, sweeps.VOLTAGE, pulse[None], np.zeros((1, motion.n)))
     h = np.zeros(3 * LAGS)
     part = answer.reshape(-1, 2)[row : row + h.size, 0]
     h[: part.size] = part
@@ -219,29 +220,37 @@ def findings(fit: Fit) -> list[Finding]:
     if rows.size < 2 * EDGES:
         return []
     edges = np.unique(np.linspace(rows[0], rows[-1] + 1, EDGES + 1).astype(int))
-    found = [_load(bench, edges), _low_speed_friction(bench)]
+    drift = np.clip((np.arange(bench.motion.n) - edges[0]) / max(1, edges[-1] - edges[0]), 0.0, 1.0)
+    found = [_load(bench, edges, drift), _low_speed_friction(bench)]
     for name, unit in (("voltage", "V"), ("current", "A"), ("speed", "rad/s")):
-        found += [_gain(bench, name, edges), _offset(bench, name, unit, edges)]
+        found += [_gain(bench, name, edges[2:-2:2], drift), _offset(bench, name, unit, drift)]
     return sorted(found, key=lambda f: -abs(f.statistic))
 
 
-def _load(bench: Bench, edges: npt.NDArray[np.int_]) -> Finding:
+def _steps_and_drift(edges: npt.NDArray[np.int_], drift: Float) -> Float:
+    """Return courses (q + 1, n) that step from 0 to 1 at each of ``edges`` (q,), and last the ``drift`` (n,)."""
+    return np.vstack([np.arange(drift.size) >= edges[:, None], drift])
+
+
+def _load(bench: Bench, edges: npt.NDArray[np.int_], drift: Float) -> Finding:
     """Try a constant torque between every two edges, and one that rises over the move."""
     motion = bench.motion
-    matrix = bench.load_answers([(np.arange(motion.n) >= edge).astype(np.float64) for edge in edges[:-1]])
-    matrix = np.column_stack([matrix, np.zeros(matrix.shape[0])])
+    matrix = bench.load_answers(_steps_and_drift(edges[:-1], drift))
     score, course, shared = bench.scores(matrix)
     gram = matrix.T @ matrix
     information = gram - shared.T @ bench.inverse @ shared
-    # a load from edge a to edge b is the step at a less the step at b
+    rising = bench.tested(score[-1:], information[-1:, -1], gram[-1:, -1], course[-1:])
+    # a load from edge a to edge b is the step at a less the step at b; none begins at the last
+    for part in (score, course, gram, information):
+        part[-1] = 0.0
+    gram[:, -1] = information[:, -1] = 0.0
     apart, whole = score[:, None] - score[None, :], _apart(gram)
     statistic, amplitude = bench.tested(apart, _apart(information), whole, course[:, None] - course[None, :])
     a, b = np.unravel_index(int(np.argmax(np.abs(np.triu(statistic, 1)))), statistic.shape)
     span = f"acts from {edges[a] * motion.dt_s:.3f} to {edges[b] * motion.dt_s:.3f} s of the window"
     found = (float(statistic[a, b]), float(amplitude[a, b]))
-    _, *rising = bench.best(bench.load_answers([_drift(bench, edges)]))
-    if abs(rising[0]) > abs(found[0]):
-        span, found = "rises over the move", (rising[0], rising[1])
+    if abs(rising[0][0]) > abs(found[0]):
+        span, found = "rises over the move", (float(rising[0][0]), float(rising[1][0]))
     return Finding(
         "LoadDetected",
         f"a torque of {{:+.3g}} N.m that is no friction {span}",
@@ -258,13 +267,11 @@ def _apart(gram: Float) -> Float:
     return distances
 
 
-def _gain(bench: Bench, name: str, edges: npt.NDArray[np.int_]) -> Finding:
-    """Try a gain that steps at one of the inner edges and stays, and one that drifts from the first to the last."""
-    courses = [(np.arange(bench.motion.n) >= edge).astype(np.float64) for edge in edges[2:-2:2]]
-    courses.append(_drift(bench, edges))
-    k, statistic, amplitude = bench.best(bench.gain_answers(name, courses))
-    drifts = k == len(courses) - 1
-    at = "over the move" if drifts else f"at {edges[2:-2:2][k] * bench.motion.dt_s:.3f} s of the window"
+def _gain(bench: Bench, name: str, edges: npt.NDArray[np.int_], drift: Float) -> Finding:
+    """Try a gain that steps at one of ``edges`` and stays, and one that drifts."""
+    k, statistic, amplitude = bench.best(bench.gain_answers(name, _steps_and_drift(edges, drift)))
+    drifts = k == edges.size
+    at = "over the move" if drifts else f"at {edges[k] * bench.motion.dt_s:.3f} s of the window"
     text = f"the gain of {name} {'drifts' if drifts else 'changes'} by {{:+.2%}} {at}"
     # what is tried is the correction of the signal, so the sensor's own change has the other sign
     return Finding(
@@ -272,21 +279,14 @@ def _gain(bench: Bench, name: str, edges: npt.NDArray[np.int_]) -> Finding:
     )
 
 
-def _offset(bench: Bench, name: str, unit: str, edges: npt.NDArray[np.int_]) -> Finding:
+def _offset(bench: Bench, name: str, unit: str, drift: Float) -> Finding:
     """Try an offset that is there throughout, and one that drifts from nothing on over the move."""
     motion = bench.motion
     peak = float(np.abs(motion.voltage_mean if name == "voltage" else getattr(motion, name)).max())
-    courses = (np.ones(motion.n), _drift(bench, edges))
-    k, statistic, amplitude = bench.best(bench.offset_answers(name, courses))
+    k, statistic, amplitude = bench.best(bench.offset_answers(name, np.vstack([np.ones(motion.n), drift])))
     text = f"{name} has an offset of {{:+.3g}} {unit}" if k == 0 else f"the zero of {name} drifts by {{:+.3g}} {unit}"
     advice = f"set the zero of the {name} sensor at standstill"
     return Finding("CalibrationSuspect", text, advice, LEAST_OFFSET * peak, statistic, -amplitude)
-
-
-def _drift(bench: Bench, edges: npt.NDArray[np.int_]) -> Float:
-    """Return a course (n,) that rises from 0 at the first edge to 1 at the last."""
-    course: Float = np.clip((np.arange(bench.motion.n) - edges[0]) / max(1, edges[-1] - edges[0]), 0.0, 1.0)
-    return course
 
 
 def _low_speed_friction(bench: Bench) -> Finding:
@@ -294,7 +294,7 @@ def _low_speed_friction(bench: Bench) -> Finding:
     motion = bench.motion
     top = float(np.abs(motion.speed).max())
     moving = np.where(np.abs(motion.mode) == 1, motion.mode, 0)
-    loads = [np.exp(-((motion.speed / (share * top)) ** 2)) * moving for share in STRIBECK_SPEEDS]
+    loads = np.exp(-np.square(motion.speed / (top * np.array(STRIBECK_SPEEDS)[:, None]))) * moving
     k, statistic, amplitude = bench.best(bench.load_answers(loads))
     return Finding(
         "ValidationFailed",
