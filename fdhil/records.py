@@ -19,7 +19,18 @@ Int = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 PARAMETERS = ("R", "L", "K", "Jt", "ft", "Cd")
-UNITS: Mapping[str, str] = {"R": "ohm", "L": "H", "K": "N.m/A", "Jt": "kg.m2", "ft": "N.m.s", "Cd": "N.m"}
+UNITS: Mapping[str, str] = {
+    "R": "ohm",
+    "L": "H",
+    "K": "N.m/A",
+    "Jt": "kg.m2",
+    "ft": "N.m.s",
+    "Cd": "N.m",
+    # what current and speed alone tell
+    "Jt/K": "A.s2/rad",
+    "ft/K": "A.s/rad",
+    "Cd/K": "A",
+}
 
 
 def frozen(values: npt.ArrayLike) -> Float:
@@ -190,7 +201,10 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """A whole recorded file of one axis before windows are cut: arrays (n,), lost samples NaN, ``gaps`` half-open."""
+    """A whole recorded file of one axis before windows are cut: arrays (n,), lost samples NaN, ``gaps`` half-open.
+
+    ``slow_voltage``, counted from row 0, stands in the place of ``voltage_v`` where a sensor is slower than the rows.
+    """
 
     axis: str
     dt_s: float
@@ -206,6 +220,7 @@ class Recording:
     temperature_c: float | None = None
     gaps: tuple[tuple[int, int], ...] = ()
     headers: Mapping[str, str] = field(default_factory=dict)
+    slow_voltage: SlowVoltage | None = None
 
 
 class Result(Enum):

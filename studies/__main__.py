@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 
-STUDIES = ("estimators", "comparison", "drift", "verdicts")
+STUDIES = ("estimators", "comparison", "drift", "verdicts", "slow_sensor")
 
 
 def main() -> None:

@@ -104,6 +104,7 @@ def _window_document(outcome: WindowOutcome) -> dict[str, Any]:
 
     window = outcome.window
     first, last = moving_range(window)
+    delay = _delay(outcome.estimate)
     return {
         "start_s": round(window.start_s + first * window.dt_s, 6),
         "end_s": round(window.start_s + last * window.dt_s, 6),
@@ -112,7 +113,16 @@ def _window_document(outcome: WindowOutcome) -> dict[str, Any]:
         "validated": outcome.verdict.accepted,
         "fit_percent": outcome.verdict.fit_percent,
         "reasons": [str(reason) for reason in outcome.verdict.reasons],
-    }
+    } | ({"delay_s": delay} if delay is not None else {})
+
+
+def _delay(estimate: Estimate | None) -> dict[str, Any] | None:
+    """Return by how much the voltage is late against current and speed; None where that was not estimated."""
+    if estimate is None or estimate.delay_s is None or estimate.delay_std_s is None:
+        return None
+    if not (math.isfinite(estimate.delay_s) and math.isfinite(estimate.delay_std_s)):
+        return None
+    return {"value": estimate.delay_s, "std": estimate.delay_std_s, "unit": "s"}
 
 
 def _parameters(estimate: Estimate | None, verdict: Verdict) -> dict[str, Any]:
@@ -181,6 +191,12 @@ def _show_reasons(console: Any, result: FileResult) -> None:
 
     told = [r for outcome in result.outcomes for r in outcome.verdict.reasons] + list(result.verdict.reasons)
     told += [r for outcome in result.outcomes for r in warnings_of(outcome.window)]
+    for outcome in result.outcomes:
+        delay = _delay(outcome.estimate) if outcome.window.slow_voltage is not None else None
+        if delay is not None:
+            at = outcome.window.start_s
+            text = f"  voltage is late by {1e3 * delay['value']:.3f} ± {1e3 * delay['std']:.3f} ms from {at:.2f} s on"
+            console.print(text, highlight=False, markup=False)
     for reason in dict.fromkeys(told):
         advice = f"; {reason.advice}" if reason.advice else ""
         console.print(f"  {reason}{advice}", highlight=False, markup=False)

@@ -66,4 +66,14 @@ def _window(outcome: WindowOutcome) -> dict[str, Any]:
         "reasons": [str(reason) for reason in verdict.reasons],
         "method": outcome.estimate and outcome.estimate.method,
         "parameters": {name: told | {"unit": UNITS[name]} for name, told in described(outcome).items()},
+        "delay_s": _delay(outcome),
     }
+
+
+def _delay(outcome: WindowOutcome) -> dict[str, Any] | None:
+    """Return by how much the voltage is late against current and speed; None where that was not estimated."""
+    estimate = outcome.estimate
+    if estimate is None or estimate.delay_s is None or not math.isfinite(estimate.delay_s):
+        return None
+    std = estimate.delay_std_s
+    return {"value": estimate.delay_s, "std": std if std is not None and math.isfinite(std) else None, "unit": "s"}

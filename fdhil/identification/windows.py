@@ -6,13 +6,14 @@ peak stays below 60 % of the rapid speed is a feed move and is not listed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
 from fdhil.identification.filtering import moving_mean
-from fdhil.records import Bool, Float, Recording, Stages, Window, frozen
+from fdhil.records import Bool, Float, Recording, SlowVoltage, Stages, Window, frozen
 
 RUN_SHARE = 0.02
 RAPID_SHARE = 0.60
@@ -130,7 +131,7 @@ def _cut(recording: Recording, speed: Float, run: Run, floor: int, ceiling: int,
         position_mm=frozen(recording.position_mm[part]),
         speed_rad_s=frozen(recording.speed_rad_s[part]),
         current_a=frozen(recording.current_a[part]),
-        voltage_v=frozen(recording.voltage_v[part]),
+        voltage_v=frozen(recording.voltage_v[part]) if recording.slow_voltage is None else None,
         voltage_sampling=recording.voltage_sampling,
         stages=_stages(speed, run, a, recording.dt_s),
         direction=run.direction,
@@ -138,7 +139,20 @@ def _cut(recording: Recording, speed: Float, run: Run, floor: int, ceiling: int,
         pitch_mm=recording.pitch_mm,
         gaps=gaps,
         temperature_c=recording.temperature_c,
+        slow_voltage=_slow_part(recording, a, b),
     )
+
+
+def _slow_part(recording: Recording, a: int, b: int) -> SlowVoltage | None:
+    """Return the samples of a slow sensor that lie wholly between rows ``a`` and ``b`` - 1; None without any."""
+    slow = recording.slow_voltage
+    if slow is None:
+        return None
+    begin, last = a * recording.dt_s, (b - 1) * recording.dt_s
+    first = max(0, math.ceil((begin - slow.begin_s) / slow.period_s - 1e-9))
+    end = math.floor((last - slow.begin_s) / slow.period_s + 1e-9)
+    moved = slow.begin_s + first * slow.period_s - begin
+    return replace(slow, begin_s=moved, voltage_v=frozen(slow.voltage_v[first:end])) if end > first else None
 
 
 def _stages(speed: Float, run: Run, offset: int, dt: float) -> Stages:

@@ -7,7 +7,6 @@ closed-loop model by every recorded move. A replayed window takes the very same 
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass, replace
 
@@ -29,7 +28,6 @@ from fdhil.records import (
     ParameterSet,
     Recording,
     Skill,
-    SlowVoltage,
     Temperature,
     TickTimes,
     Verdict,
@@ -194,6 +192,7 @@ class AxisPipeline:
             pitch_mm=axis.screw_pitch_mm,
             rapid_speed_rad_s=axis.rapid_speed_rad_s,
             gaps=stretch.gaps,
+            slow_voltage=stretch.slow_voltage,
         )
 
     def _placed(self, window: Window, stretch: Stretch, source: str, first_tick: int) -> Window:
@@ -206,7 +205,6 @@ class AxisPipeline:
             voltage_v=None if stretch.voltage_v is None else window.voltage_v,
             offset_mm=_offset(stretch, window),
             voltage_delay_s=stretch.voltage_delay_s,
-            slow_voltage=_slow_part(stretch, window, self._period_s),
             temperature_c=None if self._temperature is None else self._temperature.celsius,
             source=source,
         )
@@ -283,18 +281,6 @@ def _listed(verdict: Verdict) -> str:
 
 def _settings(config: MachineConfig, method: str | None) -> Identification:
     return config.identification if method is None else config.identification.model_copy(update={"method": method})
-
-
-def _slow_part(stretch: Stretch, window: Window, period_s: float) -> SlowVoltage | None:
-    """Return the samples of a slow sensor that lie wholly inside a window whose ticks count from its stretch."""
-    slow = stretch.slow_voltage
-    if slow is None:
-        return None
-    begin, last = window.start_tick * period_s, (window.start_tick + window.n - 1) * period_s
-    first = max(0, math.ceil((begin - slow.begin_s) / slow.period_s - 1e-9))
-    end = math.floor((last - slow.begin_s) / slow.period_s + 1e-9)
-    moved = slow.begin_s + first * slow.period_s - begin
-    return replace(slow, begin_s=moved, voltage_v=frozen(slow.voltage_v[first:end])) if end > first else None
 
 
 def _offset(stretch: Stretch, window: Window) -> Float | None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from fdhil.errors import RecordingError
-from fdhil.records import Window
+from fdhil.records import Float, SlowVoltage, Window
 from fdhil.store.atomic import write_file
 
 COLUMNS = "time_s,voltage_V,current_A,speed_rad_per_s,position_m,demand_m"
@@ -18,8 +18,13 @@ COLUMNS = "time_s,voltage_V,current_A,speed_rad_per_s,position_m,demand_m"
 def csv_lines(window: Window) -> Iterator[str]:
     """Yield the lines of a recording without line ends; a lost sample is a missing row, which readers see as a gap.
 
-    RecordingError when the window has no voltage.
+    The samples of a voltage sensor slower than the rows stand in headers, on their own grid and to the last bit; their
+    column holds the sample under way, for programs that know no other. RecordingError when there is no voltage.
     """
+    slow = window.slow_voltage
+    voltage = _held(window, slow) if slow is not None else window.voltage_v
+    if voltage is None:
+        raise RecordingError("this window has no voltage, which a recording needs; see why the sensor gave none")
     rapid_m_s = window.rapid_speed_rad_s / (2 * math.pi) * window.pitch_mm / 1000
     headers = {
         "format": "fdhil-recording-1",
@@ -32,15 +37,34 @@ def csv_lines(window: Window) -> Iterator[str]:
         "voltage_delay_s": None if window.voltage_delay_s is None else repr(window.voltage_delay_s),
         "start_tick": str(window.start_tick),
         "source": window.source or None,
-    }
+    } | (_samples(slow) if slow is not None else {})
     yield from (f"# {key}: {value}" for key, value in headers.items() if value is not None)
     yield COLUMNS
-    if window.voltage_v is None:
-        raise RecordingError("this window has no voltage, which a recording needs; see why the sensor gave none")
     path_m = (window.position_mm / 1000, window.demand_mm / 1000)
-    rows = np.column_stack((window.voltage_v, window.current_a, window.speed_rad_s, *path_m))
+    rows = np.column_stack((voltage, window.current_a, window.speed_rad_s, *path_m))
     for k in np.flatnonzero(np.isfinite(rows).all(axis=1)):
         yield f"{k * window.dt_s:.9g}," + ",".join(repr(float(value)) for value in rows[k])
+
+
+def _samples(slow: SlowVoltage) -> dict[str, str]:
+    """Return the headers that hold a slow sensor's samples; times are those of the rows, the first at 0 s."""
+    return {
+        "voltage_begin_s": repr(slow.begin_s),
+        "voltage_period_s": repr(slow.period_s),
+        "voltage_error_s": repr(slow.error_s),
+        "voltage_samples_V": " ".join(repr(float(value)) for value in slow.voltage_v),
+    }
+
+
+def _held(window: Window, slow: SlowVoltage) -> Float:
+    """Return the sample (n,) under way at each row, the nearest known one where there is none."""
+    known = np.flatnonzero(np.isfinite(slow.voltage_v))
+    if known.size == 0:
+        raise RecordingError("every voltage sample of this window is lost; see why the sensor gave none")
+    running = np.floor((np.arange(window.n) * window.dt_s - slow.begin_s) / slow.period_s)
+    at = np.searchsorted(known, running, side="right") - 1
+    held: Float = slow.voltage_v[known[np.maximum(at, 0)]]
+    return held
 
 
 def export_csv(window: Window, path: Path) -> None:

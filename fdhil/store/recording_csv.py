@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fdhil.errors import RecordingError
-from fdhil.records import Float, Recording, VoltageSampling, frozen
+from fdhil.records import Float, Recording, SlowVoltage, VoltageSampling, frozen
 
 FORMAT = "fdhil-recording-1"
 COLUMNS = ("time_s", "voltage_V", "current_A", "speed_rad_per_s", "position_m", "demand_m")
@@ -60,7 +60,30 @@ def parse_recording(text: str, source: str = "recording") -> Recording:
         temperature_c=_optional(headers, "temperature_C", source),
         gaps=gaps,
         headers=headers,
+        slow_voltage=_slow_voltage(headers, float(table[0, 0]), source),
     )
+
+
+def _slow_voltage(headers: dict[str, str], start_s: float, source: str) -> SlowVoltage | None:
+    """Return the samples of a voltage sensor that is slower than the rows, where the headers hold them.
+
+    Sample j begins ``voltage_begin_s`` + j ``voltage_period_s`` on the time axis of the rows, whose first is at
+    ``start_s``; a lost one is ``nan`` among ``voltage_samples_V``.
+    """
+    if "voltage_samples_V" not in headers:
+        return None
+    period, begin = _positive(headers, "voltage_period_s", source), _optional(headers, "voltage_begin_s", source)
+    try:
+        told = np.array(headers["voltage_samples_V"].split(), dtype=np.float64)
+    except ValueError:
+        raise RecordingError(f"{source} has a voltage sample that is no number: copy or export it again") from None
+    if begin is None or not told.size or np.isinf(told).any() or np.isnan(told).all():
+        raise RecordingError(
+            f"{source} has voltage samples of a slower sensor without voltage_begin_s or without a finite value: "
+            "export it again"
+        )
+    error = _optional(headers, "voltage_error_s", source) or 0.0
+    return SlowVoltage(begin - start_s, period, abs(error), frozen(told))
 
 
 def _split(text: str, source: str) -> tuple[dict[str, str], int, list[str]]:

@@ -11,7 +11,9 @@ from click.testing import CliRunner, Result
 
 from fdhil.cli.identify import identify
 from fdhil.cli.main import cli, run_safely
+from fdhil.store.export import export_csv
 from studies import bench
+from studies.slow_sensor import slow_windows
 from tests.bench import bench_toml
 from tests.identification.recorded import signals
 
@@ -56,6 +58,18 @@ def test_json_holds_every_window_and_the_pool(shuttle: Path) -> None:
         assert entry["value"] == pytest.approx(truth[name], rel=0.02)
         assert 0 < entry["std"] < 0.05 * truth[name]
     assert pooled["parameters"]["L"]["unit"] == "H"
+
+
+def test_the_delay_of_a_slow_sensor_is_told_with_its_deviation(tmp_path: Path) -> None:
+    path = tmp_path / "slow.csv"
+    export_csv(slow_windows(0.005, delay_s=0.0012)[0], path)
+    result = _invoke(path, "--json")
+    assert result.return_value == 0
+    (window,) = _document(result)["files"][0]["windows"]
+    assert set(window["delay_s"]) == {"value", "std", "unit"}
+    assert window["delay_s"]["unit"] == "s"
+    assert abs(window["delay_s"]["value"] - 0.0012) < 4 * window["delay_s"]["std"] < 2e-4
+    assert "voltage is late by 1.2" in _invoke(path).stdout
 
 
 @pytest.mark.parametrize("method", ["least_squares", "maximum_likelihood"])

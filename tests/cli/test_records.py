@@ -12,11 +12,13 @@ import pytest
 from click.testing import CliRunner, Result
 
 from fdhil.cli.main import cli
+from fdhil.cli.records import read_windows
 from fdhil.daemon.keeping import Keeper
 from fdhil.daemon.warm import nominal_rapid
 from fdhil.records import frozen
 from fdhil.store.recording_csv import read_recording
 from fdhil.store.windows import encode_window
+from studies.slow_sensor import slow_windows
 from tests.daemon.machine import config_of
 from tests.daemon.shop import BENCH, fdhil
 from tests.store.made import outcome, published, window
@@ -77,6 +79,31 @@ def test_an_export_is_a_recording_that_replays(rapid: Path, tmp_path: Path, caps
     assert code == 2
     assert "is the recording itself" in err
     assert rapid.read_bytes() == before
+
+
+def test_an_export_keeps_a_slow_sensors_samples_to_the_last_bit(tmp_path: Path, capsys: Any) -> None:
+    stored, out = tmp_path / "w00000001-X.parquet", tmp_path / "out.csv"
+    made = slow_windows(0.005, delay_s=0.0012)[0]
+    before = made.slow_voltage
+    assert before is not None
+    told = np.array(before.voltage_v)
+    told[70] = np.nan
+    made = replace(made, slow_voltage=replace(before, voltage_v=frozen(told)))
+    stored.write_bytes(encode_window(made, ""))
+    assert fdhil("export", stored, "--out", out, capsys=capsys) == (0, "", "")
+    (window,) = read_windows(out)
+    assert window.voltage_v is None
+    slow = window.slow_voltage
+    assert slow is not None
+    assert (slow.begin_s, slow.period_s, slow.error_s) == (before.begin_s, 0.005, 0.0002)
+    assert np.array_equal(slow.voltage_v, told, equal_nan=True)
+    documents = [json.loads(fdhil("replay", "--json", path, capsys=capsys)[1]) for path in (stored, out)]
+    one, other = (document["files"][0]["outcomes"][0] for document in documents)
+    assert other["parameters"]["L"]["value"] == pytest.approx(one["parameters"]["L"]["value"], rel=1e-3)
+    assert other["delay_s"]["value"] == pytest.approx(one["delay_s"]["value"], abs=1e-6)
+    assert (one["delay_s"]["unit"], one["validated"], other["validated"]) == ("s", True, True)
+    # any other program finds the sample under way in each row
+    assert np.isfinite(read_recording(out).voltage_v).all()
 
 
 @pytest.mark.parametrize("command", [["replay"], ["export", "--out", "out.csv"]])

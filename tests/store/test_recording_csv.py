@@ -103,3 +103,34 @@ def test_a_file_that_is_no_text_or_not_there(tmp_path: Path) -> None:
     binary.write_bytes(b"\xff\xfe\x00\x80" * 40)
     with pytest.raises(RecordingError, match="no text file"):
         read_recording(binary)
+
+
+SLOW = {"voltage_begin_s": "0.0017", "voltage_period_s": "0.005", "voltage_samples_V": "1.5 nan -2"}
+
+
+def test_samples_of_a_slow_sensor_stand_in_headers_on_the_rows_time_axis() -> None:
+    slow = parse_recording(_text(40, **SLOW)).slow_voltage
+    assert slow is not None
+    assert (slow.begin_s, slow.period_s, slow.error_s) == (0.0017, 0.005, 0.0)
+    np.testing.assert_array_equal(slow.voltage_v, [1.5, np.nan, -2.0])
+    first, second = _text(40, **SLOW).split("\n0.000000,", 1)
+    cut = parse_recording(first + "\n" + second.split("\n", 1)[1]).slow_voltage
+    assert cut is not None
+    assert cut.begin_s == pytest.approx(0.0007)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("voltage_samples_V", "1.5 two"),
+        ("voltage_samples_V", "nan nan"),
+        ("voltage_samples_V", "1.5 inf"),
+        ("voltage_period_s", "0"),
+        ("voltage_period_s", ""),
+        ("voltage_begin_s", "soon"),
+        ("voltage_error_s", "nan"),
+    ],
+)
+def test_damaged_samples_of_a_slow_sensor_are_refused(key: str, value: str) -> None:
+    with pytest.raises(RecordingError):
+        parse_recording(_text(40, **(SLOW | {key: value})))
