@@ -1,8 +1,10 @@
 """Backlash: how far the motor turns before the table follows, in micrometres at the table.
 
 While the table stands still, the integral of the motor's speed is the dead band that is being crossed. It is measured
-from standstill up to the row in which the table surely moves, less what the table has moved by then; its standard
-deviation is that of the integral, with the uncertainty of the speed's zero.
+from the row in which the current leaves its level of standstill up to the row in which the table surely moves, less
+what the table has moved by then; its standard deviation is that of the integral, with the uncertainty of the speed's
+zero. When the motor brakes, the table runs on through the same dead band to its other flank: a second measurement,
+which a screw's wind-up disturbs too, so that it may confirm the first but not stand alone.
 """
 
 from __future__ import annotations
@@ -12,15 +14,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fdhil.identification.filtering import moving_mean
 from fdhil.identification.motion import noise_levels, resolution
 from fdhil.identification.windows import carried, moving_range
-from fdhil.records import Reason, Window
+from fdhil.records import Float, Reason, Window
 
-CHANCE_DEVIATIONS = 5.5
-LEAST_UM = 20.0  # what a correction of some tens of um must not leave unexplained
+SURE = 4.5  # standard deviations: one test a window, 3e-6 by chance
+LIKELY = 2.0  # of the first measurement, which the second may confirm
+LEAST_UM = 20.0  # a screw's wind-up before the table starts, which is no play
+WOUND_UP_UM = 60.0  # a screw's wind-up as it unwinds and winds up again from driving to braking
 LEAST_ROWS = 8
-AFTER_S = 0.010  # the table follows by now, and the play it had is taken up
+AFTER_S = 0.003  # the table follows by now, and the play it had is taken up
 LONGEST_S = 0.060  # before the table moves: a longer integral gathers more noise than dead band
+SMOOTHING_S = 0.002
+CHANGED = 5.0  # standard deviations by which a current leaves its level of standstill
+BEYOND_NOISE = 3.0  # standard deviations of the noise in a drop of the speed
+CROSSED_UM = 150.0  # what the table may have run on by when the second measurement ends
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +42,7 @@ class DeadBand:
     @property
     def sure(self) -> bool:
         """Return whether it is beyond chance."""
-        return abs(self.um) > CHANCE_DEVIATIONS * self.std_um
+        return abs(self.um) > SURE * self.std_um
 
     def reason(self) -> Reason:
         """Return it as the reason of a refusal."""
@@ -41,36 +50,133 @@ class DeadBand:
         return Reason("ValidationFailed", text, "check screw, nut, coupling and bearings for play")
 
 
+@dataclass(frozen=True, slots=True)
+class _Course:
+    """The move in its own direction: position (mm) and speed (mm/s) at the table (n,), and the current (n,)."""
+
+    position_mm: Float
+    speed_mm_s: Float
+    current: Float
+    dt_s: float
+    quantum_mm: float
+    noise_mm: float  # of the speed's integral over one row
+    width: int  # rows over which the current is smoothed
+    current_noise: float  # before that
+
+    def parted_um(self, a: int, b: int, zero_mm_s: float) -> float:
+        """Return by how much the motor turns more than the table moves from row ``a`` to ``b``."""
+        turned = float(((self.speed_mm_s[a:b] + self.speed_mm_s[a + 1 : b + 1]) / 2 - zero_mm_s).sum()) * self.dt_s
+        return 1e3 * (turned - float(self.position_mm[b] - self.position_mm[a]))
+
+    def std_um(self, a: int, b: int, zero_rows: float) -> float:
+        """Return its standard deviation, with a zero that is the mean of ``zero_rows``.
+
+        The row in which the flanks meet may lie anywhere between two samples of the speed, which drops there.
+        """
+        rows = b - a
+        chance = self.noise_mm * math.sqrt(rows + rows**2 / zero_rows)
+        drop = float(np.abs(np.diff(self.speed_mm_s[a : b + 1])).max()) * self.dt_s - BEYOND_NOISE * self.noise_mm
+        return 1e3 * math.hypot(chance, max(drop, 0.0) / math.sqrt(12), self.quantum_mm / math.sqrt(6))
+
+
+def _course(window: Window) -> _Course | None:
+    position = window.direction * carried(window.position_mm)
+    quantum = resolution(position)
+    if quantum == 0.0 or not np.isfinite(window.current_a).any():
+        return None
+    to_mm = window.pitch_mm / (2 * math.pi)
+    levels = noise_levels(window)
+    width = 2 * round(SMOOTHING_S / 2 / window.dt_s) + 1
+    current = window.direction * moving_mean(carried(window.current_a), width)
+    speed = window.direction * to_mm * carried(window.speed_rad_s)
+    noise = levels.speed_rad_s * window.dt_s * to_mm
+    return _Course(position, speed, current, window.dt_s, quantum, noise, width, levels.current_a)
+
+
 def dead_band(window: Window) -> DeadBand | None:
     """Return what the motor turns before the table follows; None where position or standstill are not recorded."""
-    position, speed = carried(window.position_mm), carried(window.speed_rad_s)
     begin, end = moving_range(window)
-    quantum = resolution(position)
-    if window.stages.accelerate is None or quantum == 0.0 or begin < LEAST_ROWS:
+    course = _course(window)
+    if course is None or window.stages.accelerate is None or begin < LEAST_ROWS:
         return None
     # the table moves for sure from this row on
-    limit = 3 * quantum + 1e-3
-    moves = np.flatnonzero(np.abs(position[:end] - position[0]) > limit)
+    limit = 3 * course.quantum_mm + 1e-3
+    moves = np.flatnonzero(np.abs(course.position_mm[:end] - course.position_mm[0]) > limit)
     if moves.size == 0:
         return None
-    to_um = 1e3 * window.pitch_mm / (2 * math.pi) * window.direction
     first = int(moves[0])
     start = max(LEAST_ROWS, first - round(LONGEST_S / window.dt_s))
-    stop = min(first + round(AFTER_S / window.dt_s), end, position.size - 1)
+    stop = min(first + max(1, round(AFTER_S / window.dt_s)), end, window.n - 1)
     if not np.isfinite(window.speed_rad_s[:stop]).all() or start >= stop:
         return None
-    # the axis may still settle from its last move: that is no offset of the speed
-    crept = float(position[start] - position[0]) / (start * window.dt_s) / (to_um * 1e-3 * window.direction)
-    zero = float(speed[:start].mean()) - crept
-    turned = float(((speed[start:stop] + speed[start + 1 : stop + 1]) / 2 - zero).sum()) * window.dt_s * to_um
-    moved = 1e3 * window.direction * float(position[stop] - position[start])
-    rows = stop - start
-    noise = noise_levels(window).speed_rad_s * window.dt_s * abs(to_um)
-    std = math.hypot(noise * math.sqrt(rows + rows**2 / start), 1e3 * quantum / math.sqrt(6))
-    return DeadBand(turned - moved, std)
+    start = _torque_changes(course, start, first)
+    # the axis may still settle from its last move, which is no offset of the speed; after the move it may do so unseen,
+    # within its play
+    return DeadBand(course.parted_um(start, stop, _zero(course, 0, start)), course.std_um(start, stop, start))
+
+
+def _zero(course: _Course, a: int, b: int) -> float:
+    """Return what the speed reads (mm/s) beyond the table's own motion from row ``a`` to ``b``."""
+    moved = float(course.position_mm[b] - course.position_mm[a]) / ((b - a) * course.dt_s)
+    return float(course.speed_mm_s[a:b].mean()) - moved
+
+
+def _torque_changes(course: _Course, start: int, first: int) -> int:
+    """Return the last row from ``start`` to ``first`` with the current of standstill: no motor turns yet."""
+    still, noise = course.current[:start], course.current_noise
+    if still.size < 2 * course.width or float(np.ptp(still)) > 2 * CHANGED * noise:
+        return start  # it still settles from the last move
+    allowed = CHANGED * noise * math.sqrt(1 / course.width + 1 / still.size)
+    same = np.flatnonzero(np.abs(course.current[start:first] - float(still.mean())) <= allowed)
+    return start + (int(same[-1]) if same.size else 0)
+
+
+def overrun(window: Window) -> DeadBand | None:
+    """Return what the table moves more than the motor turns when braking begins; None where that is not seen.
+
+    The force on the table reverses with the motor's torque: from there on the table would coast, and runs ahead of the
+    motor by the second integral of what brakes the motor, until its other flank is reached.
+    """
+    course = _course(window)
+    stages = window.stages
+    if course is None or stages.accelerate is None or stages.cruise is None or stages.brake is None:
+        return None
+    (a, b), (_, end) = stages.cruise, stages.brake
+    last = min(end, window.n - 1)
+    if not np.isfinite(window.speed_rad_s[a:last]).all():
+        return None
+    driven = np.flatnonzero(course.current[a:last] >= 0.0)
+    gain = _gain(course, *stages.accelerate, float(np.median(course.current[a:b])))
+    braking = np.flatnonzero(course.current[max(a, b - round(LONGEST_S / window.dt_s)) : last] < 0.0)
+    if driven.size == 0 or braking.size == 0 or not gain > 0.0:
+        return None
+    start = max(a, b - round(LONGEST_S / window.dt_s)) + int(braking[0])
+    ahead = np.cumsum(np.cumsum(np.maximum(-course.current[start:last], 0.0))) * gain * window.dt_s**2
+    crossed = np.flatnonzero(ahead > 1e-3 * CROSSED_UM)
+    if crossed.size == 0 or crossed[0] * window.dt_s > LONGEST_S or start - a < LEAST_ROWS:
+        return None
+    stop = min(start + int(crossed[0]) + 1, last)
+    # gain and zero of the speed are those of the cruise before
+    zero = _zero(course, a, start)
+    return DeadBand(-course.parted_um(start, stop, zero), course.std_um(start, stop, start - a))
+
+
+def _gain(course: _Course, a: int, b: int, cruising: float) -> float:
+    """Return the acceleration (mm/s2) a unit of current gives the whole drive, friction taken from the cruise."""
+    pushed = float((course.current[a:b] - cruising).sum()) * course.dt_s
+    return float(course.speed_mm_s[b - 1] - course.speed_mm_s[a]) / pushed if pushed > 0.0 else 0.0
 
 
 def backlash(window: Window) -> DeadBand | None:
-    """Return the dead band where it is beyond chance and larger than what a correction may leave open."""
+    """Return the dead band where it is beyond chance and larger than what a screw's wind-up explains."""
     found = dead_band(window)
-    return found if found is not None and found.sure and found.um > LEAST_UM else None
+    if found is None or found.um <= LEAST_UM:
+        return None
+    if found.sure:
+        return found
+    second = overrun(window)
+    if found.um <= LIKELY * found.std_um or second is None or second.um <= WOUND_UP_UM:
+        return None
+    weights = found.std_um**-2, second.std_um**-2
+    both = DeadBand((found.um * weights[0] + second.um * weights[1]) / sum(weights), sum(weights) ** -0.5)
+    return both if both.sure else None
