@@ -23,6 +23,7 @@ from fdhil.guard.limits import Limits
 from fdhil.guard.settings import AxisSettings, Feedforward, Layout, Pdo, Settings, to_json
 
 if TYPE_CHECKING:
+    from fdhil.drivers.commissioning_record import CommissioningRecord
     from fdhil.drivers.profile import DriveProfile, PdoSpec
 
 SETTINGS_NAME = "guard.json"
@@ -117,6 +118,7 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
             f"axis.{name}.drive.profile", "its offset RPDO maps more than 0x60B0", "give it its own RPDO"
         )
         raise ConfigError(profile.name, [fault])
+    record = _record(machine, name)
     return AxisSettings(
         name=name,
         node_id=node_id,
@@ -132,6 +134,7 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
         feedforward=_feedforward(profile, machine, name, axis),
         speed_count=abs(profile.speed_rad_s_per_count(axis)) * per_rad * period_s,
         speed_step=SPEED_STEPS * _largest_acceleration_rad_s2(axis) * per_rad * period_s**2,
+        travel=None if record is None else record.travel,
     )
 
 
@@ -171,15 +174,20 @@ def heartbeat_timeout_s(machine: MachineConfig, axis: str) -> float:
     0, never: without a record that can be read (nothing is armed then), for a drive that sends none, and where time is
     the count of SYNC, which says nothing about heartbeats of the wall clock.
     """
-    from fdhil.drivers.commissioning_record import load_record  # late, as above
-
-    try:
-        record = load_record(machine.store.directory, axis)
-    except StoreError:
-        return 0.0
+    record = _record(machine, axis)
     if record is None or machine.guard.clock == "sync":
         return 0.0
     return HEARTBEATS_AWAITED * record.options.get("1017", 0) * 1e-3
+
+
+def _record(machine: MachineConfig, axis: str) -> CommissioningRecord | None:
+    """The axis' commissioning; None without one that can be read."""
+    from fdhil.drivers.commissioning_record import load_record  # late, as above
+
+    try:
+        return load_record(machine.store.directory, axis)
+    except StoreError:
+        return None
 
 
 def _rpdo(profile: DriveProfile, key: tuple[int, int], axis: str) -> PdoSpec:

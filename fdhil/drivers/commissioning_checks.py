@@ -14,12 +14,15 @@ from fdhil.cia402 import Mode, Object
 from fdhil.config import CorrectionLimits
 from fdhil.drivers.canopen_sdo import NO_OBJECT, NO_SUB_INDEX
 from fdhil.drivers.commissioning_master import Master
+from fdhil.drivers.commissioning_record import SOFTWARE_LIMIT_KEYS
 from fdhil.drivers.profile import DriveProfile, PdoSpec
 from fdhil.errors import ConnectError, DriveFault, ProtocolError, SdoAbort
 
 LISTEN_S = 2.0
 INVALID_COB_ID = 1 << 31
 NO_WINDOW = 0xFFFFFFFF
+SOFTWARE_LIMIT = 0x607D
+NO_SOFTWARE_LIMIT = (-(2**31), 2**31 - 1)
 OPTIONS = (
     (Object.ABORT_CONNECTION_OPTION, True),
     (Object.QUICK_STOP_OPTION, True),
@@ -277,8 +280,11 @@ def compare_rating(master: Master) -> Iterator[Finding]:
 
 
 def read_options(master: Master) -> dict[str, int]:
-    """Read option codes, following-error window and heartbeat; an object that is not there is left out."""
+    """Read option codes, window, heartbeat and software limits (607D01, 607D02); what is not there is left out."""
     values = {f"{index:04X}": read_optional(master, index, signed=signed) for index, signed in OPTIONS}
+    low, high = (read_optional(master, SOFTWARE_LIMIT, sub, signed=True) for sub in (1, 2))
+    if low is not None and high is not None and low < high and (low, high) != NO_SOFTWARE_LIMIT:
+        values |= dict(zip(SOFTWARE_LIMIT_KEYS, (low, high), strict=True))
     return {key: value for key, value in values.items() if value is not None}
 
 

@@ -15,6 +15,7 @@ from fdhil.errors import StoreError
 
 SCHEMA = "fdhil-commissioning-1"
 MAX_RECORD_BYTES = 64 * 1024
+SOFTWARE_LIMIT_KEYS = ("607D01", "607D02")
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,8 +23,8 @@ class CommissioningRecord:
     """What was found and proven on one drive.
 
     ``config_digest`` is :func:`axis_digest`. ``options`` holds 0x6007, 0x605A, 0x605E, 0x6065, 0x6085 and 0x1017 by
-    their hexadecimal index, as far as the drive has them, and the COB-ID of the feed-forward's RPDO where it was made
-    valid. ``offset_in_feedforward`` None: could not be told.
+    their hexadecimal index, as far as the drive has them, its software limits, and the COB-ID of the feed-forward's
+    RPDO where it was made valid. ``offset_in_feedforward`` None: could not be told.
     ``watchdog`` is ``proven`` when the drive stopped after our heartbeat did.
     """
 
@@ -41,6 +42,12 @@ class CommissioningRecord:
     readback_ok: bool
     watchdog: str
     created_utc: str
+
+    @property
+    def travel(self) -> tuple[int, int] | None:
+        """The drive's software limits in its own increments; None where it has none."""
+        low, high = (self.options.get(key) for key in SOFTWARE_LIMIT_KEYS)
+        return None if low is None or high is None else (low, high)
 
     @property
     def digest(self) -> str:

@@ -309,7 +309,8 @@ class Guard:
             keep = self.state.places[0].row - 2 if running and self.state.places else 0
             names = [axis.name for axis in self.settings.axes]
             limits = tuple(axis.limits for axis in self.settings.axes)
-            loading = table.begin(found[1], found[0], names, limits, loaded, keep)
+            travel = tuple(axis.travel for axis in self.settings.axes)
+            loading = table.begin(found[1], found[0], names, limits, loaded, keep, travel)
             if running and loading.joined.first == 0 and loading.next_row == 0:
                 raise table.TableRefused("TableBusy", Alarm("TableBusy").cause)
         except table.TableRefused as refusal:

@@ -50,6 +50,7 @@ class AxisSettings:
     ``window`` is the drive's following error window (0x6065) in increments; ``limits`` in increments per SYNC cycle.
     ``speed_count`` is one count of 0x606C in increments per SYNC cycle, ``speed_step`` by how much of that the motor's
     speed can change in one cycle; 0: not judged.
+    ``travel`` are the drive's software limits (0x607D), None: it has none.
     ``heartbeat_timeout_s`` 0: the drive has no heartbeat, and its PDOs alone show that it is Operational.
     """
 
@@ -67,6 +68,7 @@ class AxisSettings:
     feedforward: Feedforward | None = None
     speed_count: float = 0.0
     speed_step: float = 0.0
+    travel: tuple[int, int] | None = None
 
     @property
     def reads_back(self) -> bool:
@@ -162,6 +164,10 @@ def _axis(document: dict[str, Any]) -> AxisSettings:
     tpdos = tuple(_pdo(pdo) for pdo in document.pop("tpdos"))
     target, offset = _pdo(document.pop("target")), _pdo(document.pop("offset"))
     limits, feed = Limits(**document.pop("limits")), document.pop("feedforward")
+    travel = document.pop("travel")
+    if travel is not None:
+        low, high = map(int, travel)
+        document["travel"] = (low, high)
     if feed is not None:
         feed = Feedforward(_pdo(feed["pdo"]), feedforward.Limits(*map(int, feed["limits"])))
     return AxisSettings(target=target, offset=offset, tpdos=tpdos, limits=limits, feedforward=feed, **document)

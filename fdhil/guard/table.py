@@ -39,6 +39,8 @@ class Array(Protocol):
 
 
 Column = Sequence[int] | Array
+Travel = tuple[int, int] | None
+"""The software limits of an axis, in increments."""
 
 
 class TableRefused(Exception):
@@ -222,6 +224,12 @@ def _variation_fits(limits: Limits, offsets: Sequence[int], start: int, stop: in
     return True
 
 
+def near_no_end(travel: tuple[int, int], limits: Limits, demand: Sequence[int]) -> bool:
+    """Whether these rows keep twice the largest offset away from both software limits."""
+    low, high = travel
+    return not demand or (low + 2 * limits.offset <= min(demand) and max(demand) <= high - 2 * limits.offset)
+
+
 @dataclass(slots=True)
 class Loading:
     """A table on its way in: its rows are checked a piece at a time, so that no SYNC waits for it.
@@ -231,6 +239,7 @@ class Loading:
 
     joined: Path
     limits: tuple[Limits, ...]
+    travel: tuple[Travel, ...] = ()
     next_row: int = field(default=0)
 
     @property
@@ -242,6 +251,11 @@ class Loading:
         """Check the next rows of all axes; TableRefused with the class of the first limit that is broken."""
         first = self.joined.first
         stop = min(self.next_row + rows, self.joined.end)
+        for limits, travel, demand in zip(self.limits, self.travel, self.joined.demand, strict=False):
+            rows_now = demand[self.next_row - first : stop - first]
+            if travel is not None and not near_no_end(travel, limits, rows_now):
+                text = "the path comes nearer to a software limit of the drive than twice the largest offset"
+                raise TableRefused("SoftwareLimit", f"{text}; lower max_offset_um, or move the work away from the end")
         for limits, offsets in zip(self.limits, self.joined.offset, strict=True):
             broken = check_rows(limits, offsets, self.next_row - first, stop - first)
             if broken is not None:
@@ -252,7 +266,13 @@ class Loading:
 
 
 def begin(
-    body: bytes, sequence: int, axes: Sequence[str], limits: tuple[Limits, ...], loaded: Path | None, keep_from: int
+    body: bytes,
+    sequence: int,
+    axes: Sequence[str],
+    limits: tuple[Limits, ...],
+    loaded: Path | None,
+    keep_from: int,
+    travel: tuple[Travel, ...] = (),
 ) -> Loading:
     """Decode a new body and join it to what is loaded; rows before ``keep_from`` are let go.
 
@@ -264,7 +284,7 @@ def begin(
     if path.first == 0 or loaded is None:
         if path.first != 0:
             raise TableRefused("ProgramMismatch", "a streamed table must begin with row 0; plan it again")
-        return Loading(path, limits)
+        return Loading(path, limits, travel)
     if path.first != loaded.end or path.program_digest != loaded.program_digest or loaded.final:
         raise TableRefused("ProgramMismatch", f"row {path.first} does not continue the loaded table; load it anew")
     cut = max(0, min(keep_from, loaded.end - limits[0].window - 3) - loaded.first)
@@ -276,7 +296,7 @@ def begin(
         path.program_digest,
         sequence,
     )
-    return Loading(joined, limits, next_row=loaded.end)
+    return Loading(joined, limits, travel, next_row=loaded.end)
 
 
 def _join(old: Sequence[Sequence[int]], new: Sequence[Sequence[int]], cut: int) -> tuple[Sequence[int], ...]:

@@ -22,7 +22,7 @@ from fdhil.config import CanBus, CorrectionLimits
 from fdhil.drivers.commissioning_record import CommissioningRecord, save_record
 from fdhil.errors import ConnectError, DeviceError, ProtocolError
 from fdhil.guard.limits import Limits
-from fdhil.guard.settings import load
+from fdhil.guard.settings import from_json, load, to_json
 from tests.guard.machine import DEMAND_AT_REST
 from tests.guard.peer import Peer, write_config
 
@@ -91,6 +91,15 @@ def test_the_drives_heartbeat_is_watched_as_it_was_commissioned(tmp_path: Path) 
     assert heartbeat_timeout_s(config, "X") == 0  # the drive has none
     path.write_text("changed by hand")
     assert heartbeat_timeout_s(config, "X") == 0  # and nothing is armed with such a record
+
+
+def test_the_software_limits_are_those_of_the_commissioning(tmp_path: Path) -> None:
+    config = machine_config.load(write_config(tmp_path, 1))
+    assert [axis.travel for axis in settings_of(config, "can0", tmp_path, "").axes] == [None, None]
+    save_record(replace(RECORD, options={"607D01": -1000, "607D02": 820_000}), config.store.directory)
+    made = settings_of(config, "can0", tmp_path, "")
+    assert [axis.travel for axis in made.axes] == [(-1000, 820_000), None]
+    assert from_json(to_json(made)) == made
 
 
 def test_without_a_correction_section_writing_is_off(

@@ -78,6 +78,18 @@ def test_a_good_drive_is_signed_off_and_left_as_it_was(peer: tuple[DrivePeer, Ma
     assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == consumers
 
 
+def test_software_limits_are_kept_where_the_drive_has_them(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    with Master(settings, "X") as master:
+        assert not {"607D01", "607D02"} & commissioning_checks.read_options(master).keys()
+        drive.drive.set_object(0x607D, 1, -1000)
+        drive.drive.set_object(0x607D, 2, 820_000)
+        found = commissioning_checks.read_options(master)
+        assert (found["607D01"], found["607D02"]) == (-1000, 820_000)
+        drive.drive.set_object(0x607D, 2, -1000)  # both equal: switched off (CiA 402-2)
+        assert "607D01" not in commissioning_checks.read_options(master)
+
+
 def test_an_offset_kept_out_of_the_feedforward_is_noticed() -> None:
     settings = config(sim={"axis": {"X": {"offset_in_feedforward": False}}})
     with DrivePeer(settings), Master(settings, "X") as master, rolled_back(master):

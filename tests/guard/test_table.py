@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from fdhil.errors import StoreError
 from fdhil.guard import table
 from fdhil.guard.limits import Limits
+from fdhil.guard.path import Path
 from fdhil.guard.table import TableRefused
 from tests.guard.machine import LIMITS
 
@@ -154,3 +155,28 @@ def test_rows_beyond_a_limit_are_refused_wherever_they_are(row: int, value: int,
         load(loading, 7)
     assert refusal.value.code == code
     assert f"rows {row // 7 * 7} to" in str(refusal.value)
+
+
+TINY = Limits(offset=10, rate=5, acceleration=2, variation=1000, window=100)
+
+
+def loaded_within(travel: tuple[int, int] | None, demand: list[int]) -> Path:
+    """Load a resting table of one axis with these software limits."""
+    body = table.encode("X", {"X": demand}, {"X": [0] * len(demand)}, "p")
+    loading = table.begin(body, 1, ["X"], (TINY,), None, 0, (travel,))
+    while not loading.done:
+        loading.check(3)
+    return loading.joined
+
+
+@pytest.mark.parametrize("demand", [[-80, 0, 80], [-80] * 7, list(range(-80, 81))])
+def test_a_path_keeps_twice_the_largest_offset_from_the_software_limits(demand: list[int]) -> None:
+    assert list(loaded_within((-100, 100), demand).demand[0]) == demand
+    assert list(loaded_within(None, [10**6, *demand]).demand[0]) == [10**6, *demand]
+
+
+@pytest.mark.parametrize("demand", [[0, 0, 0, 0, 81], [-81, 0], [0] * 50 + [120], [-(2**31)]])
+def test_a_path_that_comes_nearer_is_no_table(demand: list[int]) -> None:
+    with pytest.raises(TableRefused, match="software limit") as caught:
+        loaded_within((-100, 100), demand)
+    assert caught.value.code == "SoftwareLimit"
