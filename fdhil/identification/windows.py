@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import islice, pairwise
 
 import numpy as np
 
@@ -81,8 +81,9 @@ def find_windows(recording: Recording, rapid_speed_rad_s: float | None = None) -
             continue
         floor = runs[k - 1].rest_end if k else 0
         # a drive that settles is no next move: the window lasts until it rests
-        following = [other for other in runs[k + 1 :] if not _settles(speed, recording.dt_s, run, other)]
-        ceiling = following[0].rest_start if following else speed.size
+        later = (other for other in islice(runs, k + 1, None) if not _settles(speed, recording.dt_s, run, other))
+        following = next(later, None)
+        ceiling = speed.size if following is None else following.rest_start
         windows.append(_cut(recording, speed, run, floor, ceiling, rapid))
     return windows
 

@@ -118,7 +118,7 @@ def _numbers(lines: list[str], first_row: int, source: str) -> Float:
     if len(rows) > MAX_ROWS:
         raise RecordingError(f"{source} has {len(rows)} rows, more than {MAX_ROWS}: cut it into parts")
     try:
-        table = np.array([row.split(",") for row in rows], dtype=np.float64)
+        table = np.loadtxt(rows, delimiter=",", comments=None, ndmin=2)
     except ValueError:
         raise _bad_row(lines, first_row, len(names), source) from None
     if table.shape[1] != len(names) or not np.isfinite(table).all():
