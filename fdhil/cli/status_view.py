@@ -31,6 +31,9 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
     out.print(
         f"correction: {escape(status['state'])}, guard {escape(str(guard.get('state', 'absent')))}{escape(loads)}"
     )
+    if guard.get("shadow_um"):
+        would = ", ".join(f"{axis} {offset:+.1f} um" for axis, offset in guard["shadow_um"].items())
+        out.print(escape(f"in shadow, not sent: {would}"))
     if status["store"]["fault"]:
         out.print(f"[red]store: {escape(status['store']['fault'])}[/red], in shadow")
     out.print(_axes_table(status["axes"]))

@@ -24,6 +24,7 @@ from fdhil.guard.journal import Journal, Notifier
 from fdhil.guard.path import Path
 from fdhil.guard.requests import parse_request
 from fdhil.guard.settings import Settings
+from fdhil.guard.shadow import Shadow
 from fdhil.guard.state import SENDING, Inputs, Mode, Output, Request, initial
 
 TABLE_NAME = "guard.table"
@@ -53,6 +54,7 @@ class Guard:
         self._withdrawn: tuple[Alarm, ...] = ()
         self._transmitted = True
         self._inputs: Inputs | None = None
+        self._shadow = Shadow()
         self._last_sync_s = time.monotonic()
         self._stepped_s = 0.0
         self._silent = True
@@ -182,6 +184,8 @@ class Guard:
         self.state, output = core.step(self.state, inputs, self.settings)
         self._transmitted = self._send(output)
         self._inputs, self._stepped_s = inputs, now_s
+        if inputs.sync:
+            self._shadow.follow(self.state, self._path)
         if arming and not output.refused:
             self._owner, self._withdrawn = client, ()
         if output.refused is not None and client is not None:
@@ -230,8 +234,11 @@ class Guard:
 
     def _offsets_um(self) -> dict[str, float]:
         """What is applied per axis as far as is known, in the axis' direction."""
-        pairs = zip(self.settings.axes, self.state.axes, strict=True)
-        return {s.name: round(s.sign * axis.offset / s.increments_per_mm * 1e3, 3) for s, axis in pairs}
+        return self._in_um(tuple([axis.offset for axis in self.state.axes]))
+
+    def _in_um(self, offsets: tuple[int, ...]) -> dict[str, float]:
+        pairs = zip(self.settings.axes, offsets, strict=True)
+        return {s.name: round(s.sign * offset / s.increments_per_mm * 1e3, 3) for s, offset in pairs}
 
     # --- the daemon ---
 
@@ -267,6 +274,7 @@ class Guard:
     def status(self) -> dict[str, Any]:
         """Return what the guard knows, for the daemon's status."""
         state, path, cause = self.state, self._path, self.state.cause or self.state.feed.cause
+        shadow = self._shadow.offsets()
         not_good: tuple[Alarm, ...] = (Alarm("SyncLost"),)
         if self._inputs is not None and not self._silent:
             not_good = core.standing(state, self._inputs, self.settings)
@@ -287,6 +295,7 @@ class Guard:
             "table_sequence": path.sequence if path else 0,
             "program_digest": path.program_digest if path else "",
             "offset_um": self._offsets_um(),
+            "shadow_um": None if shadow is None else self._in_um(shadow),
             "missed_cycles": state.missed,
             "late_frames": {s.name: a.late_echoes for s, a in zip(self.settings.axes, state.axes, strict=True)},
             "emergencies": self._listener.emergencies,
