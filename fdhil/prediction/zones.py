@@ -18,6 +18,8 @@ CORNER_S = 0.045  # a corner turns within twice this time; a turn that goes on i
 ASIDE_S = 0.07  # what lies further away than this is not the corner's own turn
 SHARP = 0.6
 CORNER_RAD = np.deg2rad(20.0)
+BACK_RAD = np.deg2rad(179.0)  # in one row: the path goes back along its own line, which is a reversal
+PAUSE_S = 0.01  # a rest that is shorter is no stop
 MERGE_S = 0.03
 SHORTEST_S = 0.003
 
@@ -41,7 +43,9 @@ def geometry(reference: Trajectory) -> Geometry:
     velocity[:-1] = np.diff(path, axis=0) / dt
     speed = np.linalg.norm(velocity, axis=1)
     moving = speed > 1e-3 * max(float(speed.max()), 1e-9)
-    step = np.diff(moving.astype(np.int8), prepend=0, append=0)
+    # where an axis turns around it stands still for an instant: that is no stop
+    going = moving | (_near(moving, PAUSE_S, 0.0, dt) & _near(moving, 0.0, PAUSE_S, dt))
+    step = np.diff(going.astype(np.int8), prepend=0, append=0)
     start, stop = step[:-1] == 1, np.zeros(len(path), dtype=np.bool_)
     stop[np.clip(np.flatnonzero(step == -1), 0, len(path) - 1)] = True
     turn_rate = _turn_rate(velocity, speed, moving, dt)
@@ -70,6 +74,7 @@ def _turn_rate(velocity: Float, speed: Float, moving: Bool, dt: float) -> Float:
 def _corners(turn_rate: Float, dt: float) -> Bool:
     """Rows in the middle of a turn that is over within 2 ``CORNER_S``: more turns there than on both sides of it."""
     half, gap = max(1, round(CORNER_S / dt)), max(1, round(ASIDE_S / dt))
+    turn_rate = np.where(turn_rate * dt > BACK_RAD, 0.0, turn_rate)
     total = np.concatenate([[0.0], np.cumsum(turn_rate) * dt])
     rows = np.arange(turn_rate.size)
 
@@ -119,7 +124,8 @@ def _causes(shape: Geometry, limited: Float, dt: float) -> Int:
     Where several events are near, the more violent one explains the error.
     """
     cause = np.full(shape.speed.size, CAUSES.index("straight"), dtype=np.int64)
-    turning = shape.turn_rate > 0.05 * max(float(shape.turn_rate.max()), 1e-9)
+    rate = np.where(shape.turn_rate * dt > BACK_RAD, 0.0, shape.turn_rate)
+    turning = rate > 0.05 * max(float(rate.max()), 1e-9)
     cause[_near(turning, 0.0, 0.1, dt)] = CAUSES.index("circular lag")
     for name in ("reversal", "stop", "start", "corner"):
         near = _near(shape.events[name], BEFORE_S, AFTER_S, dt)

@@ -6,6 +6,7 @@ Figure numbers in the docstrings are those of [DES] (Desforges, Habbadi, Dessein
 from __future__ import annotations
 
 import io
+import math
 import re
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,10 +23,19 @@ from fdhil.records import Float, Parameters, Window
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 PIECES = 600  # of a coloured path
+LONGEST_PIECE = 60  # rows: a longer one would hide where in it the error is
+POINTS = 300  # of a picture of a long path
 MOST_POINTS = 6000
+FAR_APART = 20.0  # errors that differ by more are not seen on one linear scale
+LEAST_UM = 0.01
+WIDTH = 4.8  # inches
+TALL = 0.71  # of its width, an enlarged place
 INK, REFERENCE = "#1d2733", "#9aa5b1"
 # colours that stay apart in print and for colour-blind readers (Okabe and Ito)
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
@@ -161,13 +171,14 @@ def corner(
     reference = curves[0].path_mm
     centre = reference[np.argmin(np.hypot(*(reference - np.asarray(place_mm)).T))]
     columns = len(curves) if len(curves) < 4 else 2
-    with _drawing(4.8, 3.6, 0.35 if len(curves) < 4 else 0.55) as (_, axes, svg):
+    above = 0.35 if len(curves) < 4 else 0.55
+    with _drawing(WIDTH, (WIDTH - 1.0) * TALL + 0.55 + above, above) as (_, axes, svg):
         for k, curve in enumerate(_near(curves, centre, max(3 * half_width_mm, 1.0))):
             colour, width = (REFERENCE, 3.4) if k == 0 else (COLOURS[(k - 1) % len(COLOURS)], 1.3)
             axes.plot(*curve.path_mm.T, color=colour, lw=width, ls="--" if curve.dashed else "-", label=curve.label)
         x, y = centre
         axes.set_xlim(x - half_width_mm, x + half_width_mm)
-        axes.set_ylim(y - 0.75 * half_width_mm, y + 0.75 * half_width_mm)
+        axes.set_ylim(y - TALL * half_width_mm, y + TALL * half_width_mm)
         axes.ticklabel_format(useOffset=False)
         axes.locator_params(nbins=6)
         axes.set_xlabel(f"{names[0]} (mm)")
@@ -184,22 +195,73 @@ def _near(curves: Sequence[Curve], centre_mm: Float, distance_mm: float) -> Iter
 
 
 def contour_errors(dt_s: float, cases: Mapping[str, Float]) -> str:
-    """Contour error (um) along the path on a grid of ``dt_s``, one curve a case."""
-    with _drawing(6.4, 3.2) as (_, axes, svg):
+    """Contour error (um) along the path on a grid of ``dt_s``, one curve a case.
+
+    Where one is far smaller than another the scale is logarithmic; what is longer than the picture is wide is drawn by
+    its largest values.
+    """
+    largest = [float(error_um.max()) for error_um in cases.values()]
+    far_apart = max(largest) > FAR_APART * max(min(largest), LEAST_UM)
+    with _drawing(4.8, 3.2) as (_, axes, svg):
         for (label, error_um), colour in zip(cases.items(), COLOURS, strict=False):
-            axes.plot(np.arange(error_um.size) * dt_s, error_um, label=label, color=colour, lw=1.1)
+            time_s, peaks = _peaks(error_um, dt_s)
+            drawn = np.maximum(peaks, LEAST_UM) if far_apart else peaks
+            axes.plot(time_s, drawn, label=label, color=colour, lw=1.1)
         axes.set_xlabel("time (s)")
         axes.set_ylabel("contour error (um)")
-        axes.set_ylim(bottom=0)
-        axes.legend()
+        if far_apart:
+            axes.set_yscale("log")
+            axes.yaxis.set_major_formatter("{x:g}")
+        axes.set_ylim(bottom=LEAST_UM if far_apart else 0.0, top=None if max(largest) > LEAST_UM else LEAST_UM)
+        if len(cases) > 1:
+            axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3)
+    return svg[0]
+
+
+def _peaks(values: Float, dt_s: float) -> tuple[Float, Float]:
+    """Return times and values (m,), the largest of each stretch where there are more than can be drawn."""
+    per = -(-values.size // MOST_POINTS)
+    peaks: Float = np.maximum.reduceat(values, np.arange(0, values.size, per))
+    return np.asarray(np.arange(peaks.size) * (per * dt_s)), peaks
+
+
+def axis_errors(time_s: Float, cases: Mapping[str, Float], axis: str) -> str:
+    """A place of one axis enlarged: its position less the desired one over time, um, one curve a case."""
+    with _drawing(4.8, 3.6) as (_, axes, svg):
+        axes.axhline(0.0, color=REFERENCE, lw=3.4, label="desired")
+        for (label, error_um), colour in zip(cases.items(), COLOURS, strict=False):
+            axes.plot(time_s, error_um, label=label, color=colour)
+        axes.set_xlabel("time (s)")
+        axes.set_ylabel(f"{axis} ahead of the desired (um)")
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3)
     return svg[0]
 
 
 def error_map(path_mm: Float, error_um: Float, largest_um: float, names: tuple[str, str] = ("X", "Y")) -> str:
     """The path (n, 2) coloured by its contour error, from 0 to ``largest_um``.
 
-    It is drawn in at most ``PIECES`` pieces, each in the colour of its largest error; the larger lie on top.
+    It is drawn in at most ``PIECES`` pieces, each in the colour of its largest error, the larger on top; a longer path
+    by points, each in the colour of the largest error there.
     """
+    across, along = np.maximum(np.ptp(path_mm, axis=0), 1e-9)
+    height = float(np.clip(3.2 * along / across, 1.4, 4.6)) + 0.9  # of the picture: the path fills it
+    with _drawing(WIDTH, height) as (figure, axes, svg):
+        if len(path_mm) > PIECES * LONGEST_PIECE:
+            drawn: ScalarMappable = _as_points(axes, path_mm, error_um)
+        else:
+            drawn = _as_lines(axes, path_mm, error_um)
+        drawn.set_cmap("viridis")
+        drawn.set_clim(0, max(largest_um, LEAST_UM))
+        left, bottom, _, tall = axes.get_position().bounds
+        axes.set_position((left, bottom, 1 - left - 0.9 / WIDTH, tall))
+        beside = figure.add_axes((1 - 0.7 / WIDTH, bottom, 0.13 / WIDTH, tall))
+        figure.colorbar(drawn, cax=beside)
+        beside.set_title("um", fontsize=8.5)
+        _equal(axes, names)
+    return svg[0]
+
+
+def _as_lines(axes: Axes, path_mm: Float, error_um: Float) -> LineCollection:
     from matplotlib.collections import LineCollection
 
     edges = np.unique(np.linspace(0, len(path_mm) - 1, PIECES + 1).round().astype(np.int64))
@@ -209,19 +271,27 @@ def error_map(path_mm: Float, error_um: Float, largest_um: float, names: tuple[s
     lines = [path_mm[pieces[k][0] : pieces[k][1] + 1][:: max(1, len(path_mm) // MOST_POINTS)] for k in order]
     ends = [path_mm[pieces[k][1]] for k in order]
     joined = [np.vstack([line, end]) for line, end in zip(lines, ends, strict=True)]
-    across, along = np.maximum(np.ptp(path_mm, axis=0), 1e-9)
-    height = float(np.clip(4.6 * along / across, 1.6, 5.0)) + 0.9  # of the picture: the path fills it
-    with _drawing(6.4, height) as (figure, axes, svg):
-        drawn = LineCollection(joined, array=worst[order], cmap="viridis", lw=3.5, capstyle="round")
-        drawn.set_clim(0, max(largest_um, 1e-3))
-        axes.add_collection(drawn)
-        axes.autoscale()
-        left, bottom, _, tall = axes.get_position().bounds
-        axes.set_position((left, bottom, 1 - left - 1.15 / 6.4, tall))
-        beside = figure.add_axes((1 - 0.95 / 6.4, bottom, 0.15 / 6.4, tall))
-        figure.colorbar(drawn, cax=beside, label="contour error (um)")
-        _equal(axes, names)
-    return svg[0]
+    drawn = LineCollection(joined, array=worst[order], lw=3.5, capstyle="round")
+    axes.add_collection(drawn)
+    axes.autoscale()
+    return drawn
+
+
+def _as_points(axes: Axes, path_mm: Float, error_um: Float) -> AxesImage:
+    """Draw a picture of ``POINTS`` points along the longer side: as large a file however long the path is."""
+    low = path_mm.min(axis=0)
+    size_mm = max(float(np.ptp(path_mm, axis=0).max()), 1e-9) / POINTS
+    columns, rows = (np.ptp(path_mm, axis=0) / size_mm).astype(np.int64) + 1
+    # a step longer than a point leaves points between its rows
+    between = math.ceil(float(np.abs(np.diff(path_mm, axis=0)).max()) / size_mm) + 1
+    largest = np.full((rows, columns), -1.0)
+    for part in np.arange(between) / between:
+        at = path_mm[:-1] + part * np.diff(path_mm, axis=0)
+        column, row = ((at - low) / size_mm).astype(np.int64).T
+        np.maximum.at(largest, (row, column), np.maximum(error_um[:-1], error_um[1:]))
+    right, top = low + size_mm * np.array([columns, rows])
+    seen = np.ma.masked_less(largest, 0.0)
+    return axes.imshow(seen, origin="lower", extent=(low[0], right, low[1], top), interpolation="nearest", zorder=2)
 
 
 def _equal(axes: Axes, names: tuple[str, str] = ("X", "Y")) -> None:

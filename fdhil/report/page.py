@@ -40,6 +40,11 @@ class Page:
     sections: Sequence[Section] = field(default_factory=tuple)
 
 
+def _is_word(table: Table, column: int) -> bool:
+    """Whether a column holds words, which begin at one edge, not numbers, which end at one."""
+    return any(row[column][:1].isalpha() for row in table.rows)
+
+
 def require() -> None:
     """Raise FdhilError where what draws and renders a report is not installed."""
     if any(find_spec(name) is None for name in ("jinja2", "matplotlib")):
@@ -53,7 +58,7 @@ def write(page: Page, path: Path) -> None:
 
     template = files("fdhil.report").joinpath("page.html.j2").read_text("utf-8")
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    text = environment.from_string(template).render(page=page)
+    text = environment.from_string(template).render(page=page, is_word=_is_word)
     part = path.with_suffix(path.suffix + ".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

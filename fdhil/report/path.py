@@ -11,11 +11,13 @@ from fdhil.report import figures
 from fdhil.report.figures import Curve
 from fdhil.report.page import Page, Section, Table
 
-MOST_PLACES = 8
+MOST_PLACES, FEW_PLACES = 8, 4
 APART_MM = 3.0  # places nearer to each other are one picture
 FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 SEEN = 0.25  # of the picture's half width that the largest error may take
-LEAST_HALF_MM, MOST_HALF_MM = 0.5, 8.0
+LEAST_HALF_MM, MOST_HALF_MM = 0.5, 20.0
+BEFORE_S, ASIDE_S = 0.05, 0.25  # what led to a zone is shown too, and no other pass over the same place
+MOST_ROWS = 50
 
 
 def prediction_page(name: str, machine: str, predicted: Prediction) -> Page:
@@ -58,6 +60,8 @@ def _rms(predicted: Prediction) -> float:
 
 def _um(value: float) -> str:
     """Three digits, and no exponent."""
+    if value < 0.001:
+        return "below 0.001 um"
     return f"{value:.3g} um" if value < 999.5 else f"{value:.0f} um"
 
 
@@ -108,17 +112,25 @@ def _along(cases: Sequence[tuple[str, Prediction]]) -> Section:
 
 
 def worst_places(predicted: Prediction) -> list[tuple[Zone, int]]:
-    """Return the zones with the largest errors and the row of each, far enough from each other, in the path's order."""
+    """Return the largest zone of each cause and size, then others up to ``FEW_PLACES``, and the row of each.
+
+    They are apart from each other and in the path's order; of equal ones the first is taken.
+    """
     reference = predicted.reference
     path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    of_kinds: dict[tuple[str, str], Zone] = {}
+    for zone in sorted(predicted.zones, key=lambda zone: (-float(f"{zone.max_um:.2g}"), zone.start_s)):
+        of_kinds.setdefault((zone.cause, f"{zone.max_um:.2g}"), zone)
+    causes = {zone.cause: zone for zone in reversed(of_kinds.values())}
+    others = sorted(predicted.zones, key=lambda zone: -zone.max_um)
     found: list[tuple[Zone, int]] = []
-    for zone in sorted(predicted.zones, key=lambda zone: -zone.max_um):
-        first, last = _rows(reference, zone)
-        row = first + int(np.argmax(predicted.contour_um[first:last]))
-        if all(np.linalg.norm(path[row] - path[other]) > APART_MM for _, other in found):
-            found.append((zone, row))
-        if len(found) == MOST_PLACES:
-            break
+    for most, zones in ((MOST_PLACES, [*causes.values(), *of_kinds.values()]), (FEW_PLACES, others)):
+        for zone in zones:
+            first, last = _rows(reference, zone)
+            row = first + int(np.argmax(predicted.contour_um[first:last]))
+            apart = all(np.linalg.norm(path[row] - path[other]) > APART_MM for _, other in found)
+            if apart and len(found) < most:
+                found.append((zone, row))
     return sorted(found, key=lambda place: place[1])
 
 
@@ -129,39 +141,53 @@ def _rows(reference: Trajectory, zone: Zone) -> tuple[int, int]:
 
 def _places(cases: Sequence[tuple[str, Prediction]]) -> Section:
     before = cases[0][1]
-    reference = before.reference
-    pictures = []
-    for zone, row in worst_places(before):
-        first, last = _rows(reference, zone)
-        found = planes(reference, slice(max(0, first - 50), last + 50))
-        if not found:
-            continue
-        plane = found[0]
-        path = _flat(reference, None, plane)
-        half = float(np.clip(0.75 * np.ptp(path[first:last], axis=0).max(), LEAST_HALF_MM, MOST_HALF_MM))
-        factor = max(f for f in FACTORS if f == 1 or f * zone.max_um * 1e-3 <= SEEN * half)
-        curves = [Curve("desired", path)]
-        curves += [
-            Curve(label, figures.magnified(path, _flat(reference, predicted, plane), factor))
-            for label, predicted in cases
-        ]
-        larger = f", errors {factor} times as large" if factor > 1 else ""
-        line = f"line {reference.line[row]}, " if reference.line[row] else ""
-        caption = f"{line}{zone.where}: {zone.cause}, {zone.max_um:.1f} um{larger}"
-        centre = (float(path[row, 0]), float(path[row, 1]))
-        pictures.append((caption, figures.corner(curves, centre, half, plane)))
+    pictures = [_place(cases, zone, row) for zone, row in worst_places(before)]
     text = "The largest zones, in the order of the path (paper: Figures 11 to 20)."
     return Section("Its worst places enlarged", text if pictures else "No zone stands out.", figures=pictures)
 
 
+def _place(cases: Sequence[tuple[str, Prediction]], zone: Zone, row: int) -> tuple[str, str]:
+    """Return caption and picture of one zone: in the plane of its motion, or over time where one axis moves alone."""
+    reference = cases[0][1].reference
+    first, last = _rows(reference, zone)
+    before, aside = round(BEFORE_S / reference.dt_s), round(ASIDE_S / reference.dt_s)
+    rows = slice(max(0, first - aside), last + aside)
+    line = f"line {reference.line[row]}, " if reference.line[row] else ""
+    caption = f"{line}{zone.where}: {zone.cause}, {zone.max_um:.1f} um"
+    found = planes(reference, rows)
+    if not found:
+        axis = max(reference.axes, key=lambda a: float(np.ptp(reference.position_mm[a][rows])))
+        errors = {label: predicted.error_um[axis][rows] for label, predicted in cases}
+        return caption, figures.axis_errors(reference.time_s[rows], errors, axis)
+    plane = found[0]
+    path = _flat(reference, None, plane)
+    seen = path[max(0, first - before) : last]
+    wide, tall = np.ptp(seen, axis=0)
+    half = float(np.clip(0.6 * max(wide, tall / figures.TALL), LEAST_HALF_MM, MOST_HALF_MM))
+    factor = max(f for f in FACTORS if f == 1 or f * zone.max_um * 1e-3 <= SEEN * half)
+    curves = [Curve("desired", path[rows])]
+    curves += [
+        Curve(label, figures.magnified(path, _flat(reference, predicted, plane), factor)[rows])
+        for label, predicted in cases
+    ]
+    across, along = (seen.min(axis=0) + seen.max(axis=0)) / 2
+    larger = f", errors {factor} times as large" if factor > 1 else ""
+    return caption + larger, figures.corner(curves, (float(across), float(along)), half, plane)
+
+
 def _zones(before: Prediction, after: Prediction | None) -> Section:
     reference = before.reference
+    largest = sorted(before.zones, key=lambda zone: -zone.max_um)[:MOST_ROWS]
     rows = []
-    for zone in before.zones:
+    for zone in sorted(largest, key=lambda zone: zone.start_s):
         first, last = _rows(reference, zone)
         row = first + int(np.argmax(before.contour_um[first:last]))
         cells = [f"{zone.start_s:.2f} - {zone.end_s:.2f}", str(reference.line[row] or ""), zone.where, zone.cause]
         cells.append(f"{zone.max_um:.1f}")
         rows.append(cells if after is None else [*cells, f"{after.contour_um[first:last].max():.2f}"])
+    if not rows:
+        return Section("Zones", "No zone stands out.")
+    left_out = len(before.zones) - len(rows)
+    text = f"The {MOST_ROWS} largest; {left_out} smaller ones are left out (--json lists them)." if left_out else ""
     head = ["time s", "line", "where", "cause", "max um"]
-    return Section("Zones", tables=[Table(head if after is None else [*head, "corrected, max um"], rows)])
+    return Section("Zones", text, [Table(head if after is None else [*head, "corrected, max um"], rows)])

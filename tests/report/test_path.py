@@ -14,10 +14,10 @@ from fdhil.correction import plan
 from fdhil.prediction import predict
 from fdhil.prediction.models import nominal_models
 from fdhil.records import Correction, frozen
-from fdhil.report import write
+from fdhil.report import figures, write
 from fdhil.report.path import APART_MM, correction_page, planes, prediction_page, worst_places
 from tests.bench import bench_config
-from tests.paths import bench_trajectory, trajectory
+from tests.paths import bench_trajectory, smooth, trajectory
 
 CONFIG = bench_config()
 MODELS = nominal_models(CONFIG)
@@ -75,11 +75,63 @@ def test_planes_of_three_axes_and_of_one() -> None:
     assert planes(alone) == []
     page = prediction_page("up.ngc", "bench", predict(alone, MODELS, CONFIG))
     assert [caption for caption, _ in page.sections[0].figures] == ["Contour error over time"]
-    assert page.sections[1].figures == []
+
+
+def test_one_axis_alone_is_enlarged_over_time() -> None:
+    """There and back: the place is a reversal, drawn as what the axis is ahead of the desired."""
+    there = np.linspace(0.0, 60.0, 360)
+    path = smooth(np.concatenate([there, there[::-1], np.zeros(300)])[:, None], (0.060, 0.030), 0.001)
+    page = prediction_page("up.ngc", "bench", predict(trajectory(path, "Y"), MODELS, CONFIG))
+    (caption, svg), *_ = page.sections[1].figures
+    assert "reversal" in caption
+    assert "Y ahead of the desired (um)" in svg
+    assert page.sections[2].tables[0].rows
+
+
+def test_a_long_path_is_drawn_by_points_and_its_zones_are_cut(tmp_path: Path) -> None:
+    """Each place in the colour of its own error, whatever the length; other passes over a place are not in its picture;
+    equal places are shown a few times."""
+    once = np.column_stack([bench_trajectory(10).position_mm[axis] for axis in "XY"])
+    both = np.concatenate([once, once[::-1]])
+    path = np.concatenate([both + np.array([0.0, 0.5 * k]) for k in range(14)])
+    predicted = predict(trajectory(path), MODELS, CONFIG)
+    assert len(predicted.zones) > 50
+    page = prediction_page("long.ngc", "bench", predicted)
+    along, places, zones = page.sections
+    assert "<image" in along.figures[0][1]
+    assert len(places.figures) <= 8
+    assert len(zones.tables[0].rows) == 50
+    assert "smaller ones are left out" in zones.text
+    write(page, tmp_path / "long.html")
+    assert (tmp_path / "long.html").stat().st_size < 1_000_000
+
+
+def test_points_hold_the_largest_error_of_each_place() -> None:
+    """A single bad row in ten minutes of path is seen, at its place."""
+    n = 120_000
+    angle = np.linspace(0, 60 * np.pi, n)
+    circle = 50 * np.column_stack([np.cos(angle), np.sin(angle)])
+    error = np.ones(n)
+    error[n // 7] = 80.0
+    with figures._drawing() as (_, axes, _svg):
+        seen = figures._as_points(axes, circle, error).get_array()
+    assert seen is not None
+    row, column = np.unravel_index(int(np.argmax(seen)), seen.shape)
+    at = circle.min(axis=0) + (np.array([column, row]) + 0.5) * np.ptp(circle, axis=0).max() / figures.POINTS
+    assert seen.max() == 80.0
+    assert np.linalg.norm(at - circle[n // 7]) < 1.0
+
+
+def test_a_small_error_beside_a_large_one_is_seen() -> None:
+    """On one linear scale it would be a line at 0."""
+    both = figures.contour_errors(0.001, {"before": np.full(9, 100.0), "after": np.full(9, 0.2)})
+    assert ">0.1<" in both
+    assert ">0.1<" not in figures.contour_errors(0.001, {"before": np.full(9, 100.0)})
 
 
 def test_a_path_without_error_has_a_page() -> None:
     """Nothing stands out, nothing is enlarged."""
     still = trajectory(np.zeros((300, 2)))
     page = prediction_page("nothing.ngc", "bench", predict(still, MODELS, CONFIG))
-    assert page.sections[1].text == "No zone stands out."
+    assert page.sections[1].text == page.sections[2].text == "No zone stands out."
+    assert ("predicted, largest", "below 0.001 um") in page.headline
