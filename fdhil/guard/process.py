@@ -268,7 +268,7 @@ class Guard:
         if not refused:
             client.reply(document, ok=True, state=self.state.mode.value)
             return
-        told = [_told(alarm) for alarm in refused]
+        told = list(map(_told, refused))
         client.reply(document, ok=False, state=self.state.mode.value, **told[0], refused=told)
 
     def status(self) -> dict[str, Any]:
@@ -316,10 +316,9 @@ class Guard:
             if self._loading is not None or (running and len(found[1]) > MAX_RUNNING_PIECE_BYTES):
                 raise table.TableRefused("TableBusy", Alarm("TableBusy").cause)
             keep = self.state.places[0].row - 2 if running and self.state.places else 0
-            names = [axis.name for axis in self.settings.axes]
-            limits = tuple(axis.limits for axis in self.settings.axes)
-            travel = tuple(axis.travel for axis in self.settings.axes)
-            loading = table.begin(found[1], found[0], names, limits, loaded, keep, travel)
+            axes = self.settings.axes
+            limits, travel = tuple(axis.limits for axis in axes), tuple(axis.travel for axis in axes)
+            loading = table.begin(found[1], found[0], [axis.name for axis in axes], limits, loaded, keep, travel)
             if running and loading.joined.first == 0 and loading.next_row == 0:
                 raise table.TableRefused("TableBusy", Alarm("TableBusy").cause)
         except table.TableRefused as refusal:
