@@ -143,14 +143,13 @@ def _whiten_plain(
 _whiten: Callable[..., tuple[Float, Float]] = njit(cache=True, nogil=True, error_model="numpy")(_whiten_plain)
 
 
-def whiten(motion: Motion, thetas: Float, variances: Float, about: Float | None = None) -> tuple[Float, Float]:
+def whiten(motion: Motion, thetas: Float, variances: Float) -> tuple[Float, Float]:
     """Return the whitened innovations (m, q) for the rows of ``thetas`` (q, 7), each by the filter made for it.
 
     ``variances`` (q, 3) are those of voltage, current and speed; with the innovations come the log determinants (q,).
-    ``about`` (7,) is what the rows are small variations of: see :func:`_whiten_slow`.
     """
     if motion.slow is not None:
-        return _whiten_slow(motion, thetas, variances, about)
+        return _whiten_slow(motion, thetas, variances)
     delays = thetas[:, 6]
     together = bool((delays == delays[0]).all())
     voltages = [motion.delayed(float(d)) for d in (delays[:1] if together else delays)]
@@ -171,21 +170,10 @@ def whiten(motion: Motion, thetas: Float, variances: Float, about: Float | None 
     return white.reshape(len(thetas), -1).T, logdet
 
 
-def _whiten_slow(motion: Motion, thetas: Float, variances: Float, about: Float | None) -> tuple[Float, Float]:
-    """As :func:`whiten`; variations ``about`` parameters keep their order of rows and their standard deviations.
-
-    With the deviations held, the derivative of an innovation depends on the past alone, to which it is orthogonal: the
-    Gauss-Newton equations are unbiased, while those with deviations that follow L would have them large.
-    """
-    made = [
-        innovations_of(motion, theta, v, float((theta if about is None else about)[6]))
-        for theta, v in zip(thetas, variances, strict=True)
-    ]
-    columns = [one.whitened for one in made]
-    if about is not None:
-        deviation = np.sqrt(innovations_of(motion, about, variances[0], float(about[6])).variance)
-        columns = [one.values / deviation for one in made]
-    return np.column_stack(columns), np.array([one.logdet for one in made])
+def _whiten_slow(motion: Motion, thetas: Float, variances: Float) -> tuple[Float, Float]:
+    pairs = zip(thetas, variances, strict=True)
+    made = [innovations_of(motion, theta, v, float(theta[6])) for theta, v in pairs]
+    return np.column_stack([one.whitened for one in made]), np.array([one.logdet for one in made])
 
 
 def _answer_plain(

@@ -24,6 +24,7 @@ from fdhil.identification.innovations import Gains, gains_of, innovations
 from fdhil.identification.motion import UNKNOWN, Motion, Noise, prepare
 from fdhil.identification.noise import fit_noise
 from fdhil.identification.normal import inverse_of, solve
+from fdhil.identification.slow_descent import Likelihood, ascend
 from fdhil.identification.slow_start import slow_start, with_course
 from fdhil.identification.slow_voltage import course_effect, in_order
 from fdhil.identification.sweeps import whiten
@@ -44,8 +45,6 @@ LEAST_DELAY = 0.05  # of a sample; smaller ones cannot be told from the voltage'
 CHANCE = 2.0  # standard deviations of a delay that are chance, not doubt
 SETTLED = 0.25  # squared standard deviations moved: for less, no noise level changes by a thousandth
 INSTANT_DELAY = 0.5  # of a row
-SLOW_CONVERGED = 0.03  # where a mark passes a row, steps are not quite smooth
-SLOW_SLACK = 0.1  # with a slow voltage the equations' root is not where the squares are least
 FLOORS = np.array([1e-4, 0.0, 1e-4, 1e-9])
 LEAST_TIME_CONSTANT_S = 1e-4  # of the winding: noise may drive the starting L below 0
 
@@ -71,11 +70,10 @@ class Problem:
         """Whether the voltage comes more slowly than the drive's rows."""
         return any(m.slow is not None for m in self.motions)
 
-    def columns(self, thetas: Float, about: Float | None = None) -> Float:
-        """Return the whitened innovations (m, q) for each row of ``thetas`` (q, 7), small variations ``about`` one."""
+    def columns(self, thetas: Float) -> Float:
+        """Return the whitened innovations (m, q) for each row of ``thetas`` (q, 7)."""
         pairs = zip(self.motions, self.noises, strict=True)
-        every = len(thetas)
-        return np.concatenate([whiten(m, thetas, np.tile(s.vector() ** 2, (every, 1)), about)[0] for m, s in pairs])
+        return np.concatenate([whiten(m, thetas, np.tile(s.vector() ** 2, (len(thetas), 1)))[0] for m, s in pairs])
 
     def shape_effect(self, theta: Float) -> Float:
         """Return how the innovations (m,) change with what is not known of the voltage's course within its samples."""
@@ -119,7 +117,7 @@ def jacobian(problem: Problem, theta: Float, base: Float, free: Sequence[int], s
     steps = np.array([DELAY_DIFFERENCE_S if j == 6 else DIFFERENCE * scales[j] for j in free])
     moved = np.tile(theta, (len(free), 1))
     moved[np.arange(len(free)), list(free)] += steps
-    changes: Float = (base[:, None] - problem.columns(moved, theta)) / steps
+    changes: Float = (base[:, None] - problem.columns(moved)) / steps
     return changes
 
 
@@ -151,13 +149,13 @@ def descend(
     for _ in range(STEPS):
         step = inverse @ (j.T @ residuals)
         size = float(np.abs(step * norms).max())
-        if last and (problem.slow or size > KEPT * last):
+        if last and size > KEPT * last:
             j, inverse, norms = _slopes(problem, theta, residuals, free)
             step = inverse @ (j.T @ residuals)
             size = float(np.abs(step * norms).max())
         if not np.isfinite(norms).all() or (norms == 0).any():
             return theta, residuals, j, False
-        share, ceiling = 1.0, float(residuals @ residuals) * (1 + (SLOW_SLACK if problem.slow else SLACK))
+        share, ceiling = 1.0, float(residuals @ residuals) * (1 + SLACK)
         while share > 1e-3:
             trial = theta.copy()
             trial[list(free)] += share * step
@@ -169,7 +167,7 @@ def descend(
             share *= 0.5
         else:
             return theta, residuals, j, True  # nothing lower along the step: this is the bottom, to rounding
-        if size < (SLOW_CONVERGED if problem.slow else enough):
+        if size < enough:
             return theta, residuals, j, True
         last = size
     return theta, residuals, j, False
@@ -188,7 +186,11 @@ def fit(motions: Sequence[Motion], start: Float, free: Sequence[int]) -> Fit:
     for turn in range(RENEWALS):
         problem = Problem(tuple(motions), tuple(noises), ())
         before = theta
-        theta, residuals, j, converged = descend(problem, theta, free, CONVERGED if turn else ROUGH)
+        if problem.slow:
+            likelihood = Likelihood(problem.motions, problem.noises)
+            theta, residuals, j, converged = ascend(likelihood, theta, free, typical(theta, motions))
+        else:
+            theta, residuals, j, converged = descend(problem, theta, free, CONVERGED if turn else ROUGH)
         information = j.T @ j
         moved = theta[list(free)] - before[list(free)]
         if turn and float(moved @ information @ moved) < SETTLED:

@@ -1,0 +1,104 @@
+"""The most likely parameters of windows with a slow voltage: Fisher's scoring on the likelihood of all innovations.
+
+How sure an innovation is depends on the parameters too: half of what a slow voltage is off by is the current at the
+ends of its samples, times L / T. So the likelihood is taken whole, determinant and all; its steps are those of the
+innovations' squares, and of their variances beside them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdhil.identification.motion import Motion, Noise
+from fdhil.identification.normal import inverse_of
+from fdhil.identification.slow_voltage import innovations_of
+from fdhil.records import Float
+
+STEPS = 20
+CONVERGED = 0.01  # of a standard deviation
+DIFFERENCE = 1e-5  # of a parameter's typical size
+DELAY_DIFFERENCE_S = 1e-6
+LEAST_SHARE = 1e-3
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """The innovations (m,) of all windows for one set of parameters, and their variances (m,)."""
+
+    values: Float
+    variance: Float
+
+    @property
+    def whitened(self) -> Float:
+        """The innovations in standard deviations."""
+        white: Float = self.values / np.sqrt(self.variance)
+        return white
+
+    @property
+    def cost(self) -> float:
+        """Minus twice the logarithm of the likelihood, but for its constant; infinite where it is none."""
+        value = float(self.whitened @ self.whitened + np.log(self.variance).sum())
+        return value if np.isfinite(value) else np.inf
+
+
+@dataclass(frozen=True, slots=True)
+class Likelihood:
+    """Windows with a slow voltage and their noise levels."""
+
+    motions: tuple[Motion, ...]
+    noises: tuple[Noise, ...]
+
+    def at(self, theta: Float, ordered_for_s: float) -> Point:
+        """Return the innovations for ``theta`` (7,), rows and samples in the order of a delay of ``ordered_for_s``."""
+        pairs = zip(self.motions, self.noises, strict=True)
+        made = [innovations_of(m, theta, s.vector() ** 2, ordered_for_s) for m, s in pairs]
+        return Point(np.concatenate([one.values for one in made]), np.concatenate([one.variance for one in made]))
+
+    def slopes(self, here: Point, theta: Float, free: Sequence[int], sizes: Float) -> tuple[Float, Float]:
+        """Return minus the derivatives (m, k) of innovations by ``free``, in deviations, and of half the log variance.
+
+        The order of rows and samples is held: an innovation must stay the same row's.
+        """
+        deviation, order = np.sqrt(here.variance), float(theta[6])
+        of_mean, of_variance = np.empty((here.values.size, len(free))), np.empty((here.values.size, len(free)))
+        for k, j in enumerate(free):
+            moved = theta.copy()
+            moved[j] += DELAY_DIFFERENCE_S if j == 6 else DIFFERENCE * sizes[j]
+            there, change = self.at(moved, order), moved[j] - theta[j]
+            of_mean[:, k] = (here.values - there.values) / deviation / change
+            of_variance[:, k] = (np.log(here.variance) - np.log(there.variance)) / 2 / change
+        return of_mean, of_variance
+
+
+def ascend(likelihood: Likelihood, theta: Float, free: Sequence[int], sizes: Float) -> tuple[Float, Float, Float, bool]:
+    """Step from ``theta`` (7,) until a step is nothing; return theta, innovations (m,), jacobian (m, k), and success.
+
+    ``sizes`` (7,) are the parameters' typical ones. A step that is not more likely is halved.
+    """
+    here = likelihood.at(theta, float(theta[6]))
+    for _ in range(STEPS):
+        white = here.whitened
+        mean, variance = likelihood.slopes(here, theta, free, sizes)
+        information = mean.T @ mean + 2 * variance.T @ variance
+        if not np.isfinite(information).all() or (np.diag(information) == 0).any():
+            return theta, white, mean, False
+        step = inverse_of(information)[0] @ (mean.T @ white + variance.T @ (1.0 - white**2))
+        if float(np.abs(step * np.sqrt(np.diag(information))).max()) < CONVERGED:
+            return theta, white, mean, True
+        share = 1.0
+        while share > LEAST_SHARE:
+            trial = theta.copy()
+            trial[list(free)] += share * step
+            possible = bool(np.isfinite(trial).all() and (trial[:4] > 0).all())
+            there = likelihood.at(trial, float(trial[6])) if possible else here
+            if possible and there.cost <= here.cost + ROUNDING * abs(here.cost):
+                break
+            share *= 0.5
+        else:
+            return theta, white, mean, True  # nothing more likely along the step: this is the top, to rounding
+        theta, here = trial, there
+    return theta, here.whitened, mean, False
