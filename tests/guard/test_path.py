@@ -1,0 +1,168 @@
+"""Where on the path: the exact bounds of what is still this row, this place, this rate."""
+
+from __future__ import annotations
+
+import pytest
+
+from fdhil.guard.path import EPS, SEARCH, Path, Place, advance, around, rate_between
+from fdhil.guard.state import Mode, State, initial
+from fdhil.guard.tracking import STILL_CYCLES, await_start, rest, track
+from tests.guard import machine
+
+FIRST = 100
+X = [0, 0, 0, *range(50, 50 * 61, 50)]
+Y = [0, 0, 0, *range(-30, -30 * 61, -30)]
+PATH = Path(FIRST, (X, Y), ([0] * len(X), [0] * len(X)), True, "p")
+END = FIRST + len(X)
+
+
+def at(row: int, dx: int = 0, dy: int = 0) -> tuple[int, int]:
+    """The targets of a row, off it by so much."""
+    return X[row - FIRST] + dx, Y[row - FIRST] + dy
+
+
+def test_rows_have_their_number_to_the_last() -> None:
+    assert (PATH.end, END) == (163, 163)
+    assert [PATH.has(row) for row in (FIRST - 1, FIRST, END - 1, END)] == [False, True, True, False]
+    assert PATH.standing_rows() == FIRST + 2
+    assert [PATH.mismatch(row, (0, 0)) for row in (FIRST - 1, END)] == [None, None]
+
+
+@pytest.mark.parametrize(("dx", "dy"), [(EPS, 0), (-EPS, 0), (0, EPS), (EPS, -EPS)])
+def test_a_target_within_eps_is_its_row(dx: int, dy: int) -> None:
+    assert PATH.mismatch(130, at(130, dx, dy)) == EPS
+    assert [place.row for place in advance(PATH, (Place(129),), at(130, dx, dy))] == [130]
+    assert [place.row for place in around(PATH, 125, at(130, dx, dy))] == [130]
+
+
+@pytest.mark.parametrize(("dx", "dy"), [(EPS + 1, 0), (-EPS - 1, 0), (0, EPS + 1), (0, -EPS - 1)])
+def test_a_target_beyond_eps_on_any_axis_is_none(dx: int, dy: int) -> None:
+    assert advance(PATH, (Place(129),), at(130, dx, dy)) == ()
+    assert around(PATH, 130, at(130, dx, dy)) == ()
+
+
+def test_a_place_is_looked_for_eight_rows_to_either_side() -> None:
+    for row in (140 - SEARCH, 140 + SEARCH):
+        assert [place.row for place in around(PATH, 140, at(row))] == [row]
+    for row in (140 - SEARCH - 1, 140 + SEARCH + 1):
+        assert around(PATH, 140, at(row)) == ()
+
+
+def test_costs_add_up_and_the_cheapest_is_first() -> None:
+    flat = Path(0, ([0, 1, 2, 3, 4, 5, 6],), ([0] * 7,), True, "p")
+    places = around(flat, 3, (3,))
+    assert [(place.row, place.cost) for place in places] == [(3, 0), (2, 1), (4, 1), (1, 2), (5, 2)]
+    assert [(place.row, place.cost) for place in advance(flat, places, (4,))] == [
+        (4, 0),
+        (3, 2),
+        (5, 2),
+        (2, 4),
+        (6, 4),
+    ]
+    assert advance(flat, places, None) == tuple(Place(place.row + 1, place.cost) for place in places)
+    assert advance(flat, (Place(6),), (6,)) == ()
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.1, 0.5, 1.0, 1.5])
+def test_the_rate_is_read_off_the_way_along_the_path(rate: float) -> None:
+    last, now = 130.2, 130.2 + rate
+    assert rate_between(PATH, 130, _between(last), _between(now)) == pytest.approx(rate, abs=0.05)
+
+
+def test_off_the_path_there_is_no_rate() -> None:
+    here = _between(130.5)
+    for dx, dy, known in ((0, 2 * EPS, True), (0, 2 * EPS + 1, False), (0, -2 * EPS - 1, False)):
+        found = rate_between(PATH, 130, here, (here[0] + dx, here[1] + dy))
+        assert (found is not None) is known, (dx, dy)
+    assert rate_between(PATH, 130, _between(130.5), (10**6, 0)) is None
+    assert rate_between(PATH, 130, (10**6, 0), _between(130.5)) is None
+
+
+@pytest.mark.parametrize(("row", "known"), [(138, True), (139, False), (115, True), (114, False)])
+def test_a_rate_is_looked_for_near_the_place_alone(row: int, known: bool) -> None:
+    """Fifteen rows before and eight behind: farther away it is another place."""
+    assert (rate_between(PATH, 130, _between(row + 0.5), _between(row + 0.5)) is not None) is known
+
+
+def _between(place: float) -> tuple[int, int]:
+    row, part = int(place), place - int(place)
+    (x0, y0), (x1, y1) = at(row), at(row + 1)
+    return round(x0 + part * (x1 - x0)), round(y0 + part * (y1 - y0))
+
+
+# --- tracking ---
+
+
+def state_at(row: int, *targets: tuple[int, int] | None, **changes: object) -> State:
+    """An active state whose last targets were these, newest first."""
+    made = initial(machine.settings())
+    made = made._replace(mode=Mode.ACTIVE, places=(Place(row),), anchor=row, targets=targets)
+    return made._replace(**changes)  # type: ignore[arg-type] # fields of State
+
+
+def test_the_start_is_the_first_target_that_leaves_ten_cycles_of_rest() -> None:
+    waiting = initial(machine.settings())._replace(mode=Mode.ARMED, start_row=FIRST + 2)
+    for rested, started in ((STILL_CYCLES - 1, False), (STILL_CYCLES, True)):
+        state = waiting._replace(rest=(0, 0), rested_for=rested, targets=(at(FIRST + 3),))
+        state, alarm = await_start(state, PATH)
+        assert alarm is None
+        assert (state.mode is Mode.RAMPING) is started
+        assert [place.row for place in state.places] == ([FIRST + 3] if started else [])
+    for stood, started in (((EPS, 0), True), ((EPS + 1, 0), False), ((0, -EPS - 1), False)):
+        state = waiting._replace(rest=stood, rested_for=50, targets=(at(FIRST + 3),))
+        assert (await_start(state, PATH)[0].mode is Mode.RAMPING) is started, stood
+    state = waiting._replace(rest=(0, 0), rested_for=50, targets=((7, 7),))
+    state, alarm = await_start(state, PATH)
+    assert alarm is not None
+    assert (state.mode, alarm.code) == (Mode.ARMED, "Misaligned")
+
+
+def test_rest_is_counted_from_the_target_that_stands() -> None:
+    state = initial(machine.settings())
+    counts = []
+    for target in ((5, 5), (5, 5), (5, 5), None, (5, 5), (5, 6), (5, 6)):
+        state = rest(state._replace(targets=(target,)))
+        counts.append(state.rested_for)
+    assert counts == [0, 1, 2, 2, 3, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("rate", "code"),
+    [(0.5, "OverrideChanged"), (1.5, "OverrideChanged"), (1.64, "Misaligned"), (0.9, "OverrideChanged")],
+)
+def test_another_rate_is_told_from_another_path(rate: float, code: str) -> None:
+    last, now = _between(130.0), _between(130.0 + rate)
+    _, alarm = track(state_at(130, now, last), PATH)
+    assert alarm is not None
+    assert alarm.code == code
+
+
+def test_targets_that_stand_at_the_last_row_are_a_feed_hold() -> None:
+    state, alarm = track(state_at(130, at(130, EPS), at(130, EPS)), PATH)
+    assert alarm is not None
+    assert (alarm.code, state.places, state.resuming) == ("FeedHold", (Place(130),), True)
+    _, alarm = track(state_at(130, at(130, EPS + 1), at(130, EPS + 1)), PATH)
+    assert alarm is not None
+    assert alarm.code != "FeedHold"
+    _, alarm = track(state_at(130, at(130), at(129)), PATH)
+    assert alarm is not None
+    assert alarm.code != "FeedHold"
+
+
+def test_after_a_feed_hold_the_place_is_looked_for_anew() -> None:
+    held = state_at(130, at(133), at(130), resuming=True)
+    state, alarm = track(held, PATH)
+    assert alarm is None
+    assert (state.places[0].row, state.anchor, state.resuming) == (133, 133, False)
+    state, alarm = track(held._replace(resuming=False), PATH)
+    assert alarm is not None
+    assert state.places[0].row == 131  # time alone moves it, for as long as a hold lasts
+
+
+def test_without_targets_time_alone_moves_the_place_and_the_anchor_stays() -> None:
+    state, alarm = track(state_at(130, None, at(130)), PATH)
+    assert alarm is None
+    assert (state.places, state.anchor) == ((Place(131),), 130)
+    state, alarm = track(state_at(131, at(132), None, anchor=130), PATH)
+    assert alarm is None
+    assert (state.places[0].row, state.anchor) == (132, 132)
