@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
-from fdhil.records import Estimate, Recording, Verdict, WindowOutcome
+from fdhil.records import Estimate, Verdict, Window, WindowOutcome
 from fdhil.store.recording_csv import read_recording
 from fdhil.validation import analyse, pool
 
 MANY_FILES = 16  # from here on further processes pay for their start
 MANY_WINDOWS = 48
 CHUNK = 8
+# the matrices of a window are small: the libraries' own threads would only stand in the processes' way
+ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,38 +36,71 @@ class FileResult:
     verdict: Verdict
 
 
+def unseen(share: float) -> None:
+    """Tell nobody how far the work is."""
+
+
 def analyse_files(
-    paths: Sequence[Path], settings: Identification, rapid_speeds_rad_s: dict[str, float]
+    paths: Sequence[Path],
+    settings: Identification,
+    rapid_speeds_rad_s: dict[str, float],
+    progress: Progress = unseen,
 ) -> Iterator[FileResult]:
     """Yield the result of each recording in order; RecordingError at the first that cannot be read.
 
     ``rapid_speeds_rad_s`` maps an axis to the machine's rapid speed, for recordings that do not say theirs.
+    ``progress`` is told the share of a file that each step was: a window of it, or the whole.
     """
-    work = partial(analyse_file, settings=settings, rapid_speeds_rad_s=rapid_speeds_rad_s)
-    if len(paths) < MANY_FILES or (os.cpu_count() or 1) < 2:
-        yield from map(work, paths)
+    if len(paths) < MANY_FILES or _cores() < 2:
+        for path in paths:
+            yield analyse_file(path, settings, rapid_speeds_rad_s, progress)
         return
+    work = partial(analyse_file, settings=settings, rapid_speeds_rad_s=rapid_speeds_rad_s)
     with _processes() as executor:
-        yield from executor.map(work, paths, chunksize=CHUNK)
+        for result in executor.map(work, paths, chunksize=CHUNK):
+            progress(1.0)
+            yield result
 
 
-def analyse_file(path: Path, settings: Identification, rapid_speeds_rad_s: dict[str, float]) -> FileResult:
+def analyse_file(
+    path: Path, settings: Identification, rapid_speeds_rad_s: dict[str, float], progress: Progress = unseen
+) -> FileResult:
     """Return the windows of one recording analysed, and their pool; RecordingError as :func:`read_recording`."""
     recording = read_recording(path)
-    outcomes = _outcomes(recording, settings, rapid_speeds_rad_s.get(recording.axis))
+    outcomes = []
+    windows = find_windows(recording, rapid_speeds_rad_s.get(recording.axis))
+    for outcome in _outcomes(windows, settings):
+        outcomes.append(outcome)
+        progress(1.0 / (len(windows) + 1))
     estimate, verdict = pool(outcomes, settings)
-    return FileResult(str(path), recording.axis, outcomes, estimate, verdict)
+    progress(1.0 / (len(windows) + 1))
+    return FileResult(str(path), recording.axis, tuple(outcomes), estimate, verdict)
 
 
-def _outcomes(recording: Recording, settings: Identification, rapid: float | None) -> tuple[WindowOutcome, ...]:
-    windows = find_windows(recording, rapid)
+def _outcomes(windows: Sequence[Window], settings: Identification) -> Iterator[WindowOutcome]:
     work = partial(analyse, settings=settings)
-    if len(windows) < MANY_WINDOWS or (os.cpu_count() or 1) < 2 or multiprocessing.parent_process() is not None:
-        return tuple(map(work, windows))
+    if len(windows) < MANY_WINDOWS or _cores() < 2 or multiprocessing.parent_process() is not None:
+        yield from map(work, windows)
+        return
     with _processes() as executor:
-        return tuple(executor.map(work, windows, chunksize=CHUNK))
+        yield from executor.map(work, windows, chunksize=CHUNK)
 
 
-def _processes() -> ProcessPoolExecutor:
-    # spawned, not forked: a progress display has threads
-    return ProcessPoolExecutor(os.cpu_count(), mp_context=multiprocessing.get_context("spawn"))
+def _cores() -> int:
+    return os.cpu_count() or 1
+
+
+@contextmanager
+def _processes() -> Iterator[ProcessPoolExecutor]:
+    """Yield processes that are spawned, not forked (a progress display has threads), each on one thread."""
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
+    try:
+        with ProcessPoolExecutor(_cores(), mp_context=multiprocessing.get_context("spawn")) as executor:
+            yield executor
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

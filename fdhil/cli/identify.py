@@ -6,6 +6,7 @@ import json
 import math
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -64,19 +65,16 @@ def _settings(path: Path | None, method: str | None) -> tuple[Identification, di
 def _analyse(paths: Sequence[Path], settings: Identification, speeds: dict[str, float]) -> list[FileResult]:
     """Analyse the files, with a progress bar on stderr when that is a terminal."""
     from rich.console import Console
-    from rich.progress import Progress
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
     from fdhil.cli.batch import analyse_files
 
     if not sys.stderr.isatty():
         return list(analyse_files(paths, settings, speeds))
-    results = []
-    with Progress(console=Console(stderr=True), transient=True) as progress:
+    columns = (TextColumn("identifying"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("identifying", total=len(paths))
-        for result in analyse_files(paths, settings, speeds):
-            results.append(result)
-            progress.advance(task)
-    return results
+        return list(analyse_files(paths, settings, speeds, partial(progress.advance, task)))
 
 
 def _file_document(result: FileResult) -> dict[str, Any]:
