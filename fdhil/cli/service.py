@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +36,16 @@ def run(config: Path, method: str | None) -> None:
     service.run(machine, open_machine, method)
 
 
-def _ask(config: Path, request: Mapping[str, Any], timeout_s: float = 10.0) -> dict[str, Any]:
+def _ask(
+    config: Path,
+    request: Mapping[str, Any],
+    timeout_s: float = 10.0,
+    progress: Callable[[Mapping[str, Any]], None] | None = None,
+) -> dict[str, Any]:
     machine = machine_config.load(config)
     from fdhil.daemon.control import SOCKET_NAME, ask
 
-    return ask(run_directory(machine) / SOCKET_NAME, request, timeout_s)
+    return ask(run_directory(machine) / SOCKET_NAME, request, timeout_s, progress)
 
 
 @click.command()
@@ -67,6 +72,9 @@ def arm(config: Path, program: Path | None, method: str | None, as_json: bool) -
 
     Without PROGRAM, --method flatness feeds speed and torque forward on line, whatever runs.
 
+    A program longer than 10 s is checked as a whole first; how far that is goes to stderr (with --json one JSON object
+    per line). Ctrl-C abandons it. What was checked is not checked again until program, parameters or config change.
+
     Exit 1 with class, cause and next action when it is refused. Nothing is armed again by itself, ever.
     """
     if program is None and method != "flatness":
@@ -80,7 +88,34 @@ def arm(config: Path, program: Path | None, method: str | None, as_json: bool) -
         "method": method,
         "token": read_token(run_directory(machine)),
     }
-    _tell(_ask(config, request, timeout_s=600.0), as_json)
+    shown = _Shown(as_json)
+    answer = _ask(config, request, 600.0, shown)
+    shown.end()
+    _tell(answer, as_json)
+
+
+class _Shown:
+    """The progress of a check on stderr: one line that is written over, or JSON lines."""
+
+    def __init__(self, as_json: bool) -> None:
+        self._as_json, self._open = as_json, False
+
+    def __call__(self, told: Mapping[str, Any]) -> None:
+        if self._as_json:
+            click.echo(json.dumps({"progress": told}), err=True)
+            return
+        minutes, seconds = divmod(int(told["checked_s"]), 60)
+        text = f"checked {minutes}:{seconds:02d} of the program, line {told['line']}"
+        text += f", {told['times_real_time']:.0f} x real time"
+        if told["refused"]:
+            text += f", {told['refused']} places refused"
+        click.echo(f"\r{text:<78}", err=True, nl=False)
+        self._open = True
+
+    def end(self) -> None:
+        """Begin a new line where one is open."""
+        if self._open:
+            click.echo(err=True)
 
 
 @click.command()
@@ -100,5 +135,8 @@ def _tell(answer: Mapping[str, Any], as_json: bool) -> None:
     else:
         advice = f"; {answer['advice']}" if answer.get("advice") else ""
         click.echo(f"refused: {answer['code']}: {answer['text']}{advice}", err=True)
+        for more in answer.get("refused", [])[1:]:
+            if isinstance(more, str):
+                click.echo(f"also: {more}", err=True)
     if not answer["ok"]:
         click.get_current_context().exit(1)

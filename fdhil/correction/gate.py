@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d
@@ -19,7 +19,7 @@ ZONE_S = 0.1  # errors this near to each other are one zone
 MASK_S, FADE_S = 0.04, 0.06  # what is left alone around a row that gets worse, and how far the fade reaches
 
 
-def writing_off(reference: Trajectory, config: MachineConfig) -> tuple[Reason, ...]:
+def writing_off(axes: Sequence[str], config: MachineConfig) -> tuple[Reason, ...]:
     """Refuse axes without limits: writing is off by default."""
     return tuple(
         Reason(
@@ -27,7 +27,7 @@ def writing_off(reference: Trajectory, config: MachineConfig) -> tuple[Reason, .
             f"axis {axis} has no section [axis.{axis}.correction]: writing to its drive is off",
             f"add [axis.{axis}.correction] with max_offset_um, max_speed_mm_s and max_acceleration_mm_s2",
         )
-        for axis in reference.axes
+        for axis in axes
         if axis not in config.axis or config.axis[axis].correction is None
     )
 
@@ -104,14 +104,21 @@ def rms(values: Float) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
+def gains(then_um: float, now_um: float) -> tuple[Reason, ...]:
+    """Refuse a correction whose contour error's RMS is not predicted to shrink as a whole."""
+    if then_um < NOTHING_UM:
+        return (Reason("NoGain", f"the path error is {then_um:.3f} um RMS already", "nothing needs a correction"),)
+    if not now_um * LEAST_GAIN <= then_um:
+        text = f"the path error would be {now_um:.1f} um RMS with the correction, {then_um:.1f} um without"
+        return (Reason("NoGain", text, "try the method inverse, or lower the feed"),)
+    return ()
+
+
 def result(before: Prediction, after: Prediction, untouched: bool = False) -> tuple[Reason, ...]:
     """Refuse a correction that is not predicted to help as a whole, or (unless ``untouched``) makes a zone worse."""
-    then, now = rms(before.contour_um), rms(after.contour_um)
-    if then < NOTHING_UM:
-        return (Reason("NoGain", f"the path error is {then:.3f} um RMS already", "nothing needs a correction"),)
-    if not now * LEAST_GAIN <= then:
-        text = f"the path error would be {now:.1f} um RMS with the correction, {then:.1f} um without"
-        return (Reason("NoGain", text, "try the method inverse, or lower the feed"),)
+    none = gains(rms(before.contour_um), rms(after.contour_um))
+    if none:
+        return none
     worse = np.flatnonzero(worse_rows(before.contour_um, after.contour_um, before.reference.dt_s))
     if worse.size and not untouched:
         row = int(worse[np.argmax(after.contour_um[worse])])

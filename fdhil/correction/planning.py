@@ -45,7 +45,7 @@ def plan(
     name = method or default_method()
     factory = tables.load(tables.CORRECTIONS, name)
     before = predict(reference, models, config)
-    refused = gate.writing_off(reference, config)
+    refused = gate.writing_off(reference.axes, config)
     if refused:
         return _refuse(name, before, refused, ())
     refused, warnings = gate.demand(reference, models, config, before)

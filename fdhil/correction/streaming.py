@@ -203,7 +203,7 @@ def _gated(
     refused = [refusal for piece in result.values() for refusal in piece.refused]
     before_um, after_um = errors
     worse = np.flatnonzero(gate.worse_rows(before_um, after_um, config.machine.sync_period_s))
-    if worse.size:
+    if worse.size and not refused:  # what a limit does to a block that was not solved says nothing more
         at = int(worse[np.argmax(after_um[worse])])
         text = f"the contour error would grow to {after_um[at]:.1f} um; without offsets it is {before_um.max():.1f} um"
         refused.append(_Refusal(at, Reason("HarmPredicted", text, "lower the feed, or identify again")))

@@ -16,12 +16,12 @@ import numpy as np
 from fdhil import correction
 from fdhil.config import MachineConfig
 from fdhil.correction import gate, online
-from fdhil.daemon.streamed import FIRST_BLOCKS, Piece, Stream, worth_streaming
+from fdhil.daemon.streamed import FIRST_S, Checked, Piece, Stream, longer_than_ring
 from fdhil.drivers.commissioning_feeding import feedforward_object
 from fdhil.drivers.commissioning_record import CommissioningRecord, axis_digest, load_record
 from fdhil.drivers.profile import load_profile
 from fdhil.program import load_trajectory, program_digest
-from fdhil.records import Correction, CorrectionTable, Float, Parameters, ParameterSet, Reason, Skill, Trajectory
+from fdhil.records import Correction, CorrectionTable, Float, Parameters, ParameterSet, Reason, Skill
 
 MODEL_AGE_S = 8 * 3600.0  # a shift: older parameters are of another state of the machine
 MODEL_KELVIN = 3.0
@@ -87,7 +87,7 @@ class Armament:
 
 @dataclass(frozen=True, slots=True)
 class StreamedArmament:
-    """The first rows of a long program, ready for the guard, and the stream of the others."""
+    """A long program that passed the gate as a whole: its first rows, ready for the guard, and the others' stream."""
 
     program: str
     stream: Stream
@@ -97,7 +97,7 @@ class StreamedArmament:
     @property
     def axes(self) -> tuple[str, ...]:
         """The axes that are corrected."""
-        return self.stream.reference.axes
+        return self.stream.axes
 
     @property
     def program_digest(self) -> str:
@@ -106,27 +106,35 @@ class StreamedArmament:
 
     @property
     def gain_um(self) -> float:
-        """What is promised, by the first blocks."""
-        return rms(self.stream.before_um) - rms(self.stream.after_um)
+        """What is promised."""
+        return self.stream.checked.gain_um
 
     def first(self) -> Piece:
         """Return the rows to arm with."""
         return self.begin
 
     def summary(self) -> dict[str, Any]:
-        """Return what the operator is told; the errors are those of the first blocks."""
-        before, after = self.stream.before_um, self.stream.after_um
+        """Return what the operator is told."""
         return {
             "program": self.program,
             "program_digest": self.program_digest,
             "method": "inverse",
-            "rows": int(self.stream.reference.time_s.size),
+            "rows": self.stream.rows,
             "streamed": True,
-            "before": {"rms_um": rms(before), "max_um": float(before.max())},
-            "after": {"rms_um": rms(after), "max_um": float(after.max())},
+            "before": dict(self.stream.checked.header["before"]),
+            "after": dict(self.stream.checked.header["after"]),
             "warnings": [],
             "facts": dict(self.facts),
         }
+
+
+@dataclass(frozen=True, slots=True)
+class Long:
+    """A program longer than the guard's ring: it is to be checked as a whole, by itself, before it is armed."""
+
+    program: Path
+    program_digest: str
+    models: Mapping[str, Parameters]
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,28 +151,29 @@ def rms(values: Float) -> float:
 
 def prepare(
     program: Path, method: str | None, config: MachineConfig, known: Mapping[str, AxisKnowledge]
-) -> Armament | StreamedArmament | Refused:
-    """Plan the correction of a program with the newest validated parameters; of a long one its first seconds.
+) -> Armament | Long | Refused:
+    """Plan the correction of a program with the newest validated parameters; a long one is only recognised.
 
     ProgramError, RecordingError or ConfigError when the program cannot be used; StoreError for a damaged record.
     """
-    reference = load_trajectory(program, config)
     models = {}
-    for axis in reference.axes:
+    for axis in config.axis:
         published = known[axis].published if axis in known else None
         if published is None:
             text = f"axis {axis} has no validated parameters yet"
             return Refused((Reason("ModelNotValidated", text, "let the machine make a few rapids of this axis"),))
         models[axis] = published.parameters
-    if worth_streaming(reference, method):
-        return _prepare_stream(program, reference, models, config, known)
+    digest = program_digest(program)
+    if method in (None, "inverse") and longer_than_ring(program, config):
+        off = gate.writing_off(list(config.axis), config)
+        return Refused(off) if off else Long(program, digest, models)
+    reference = load_trajectory(program, config)
     planned = correction.plan(reference, models, config, method)
     if planned.refused:
         return Refused(planned.refused)
     if not any(np.any(offset) for offset in planned.offset_um.values()):
         text = f"the method {planned.method} plans no position offset"
         return Refused((Reason("HarmPredicted", text, "use inverse or mirror; flatness is armed without a program"),))
-    digest = program_digest(program)
     table = correction.table(planned, config, digest)
     facts = standing_facts(reference.axes, config, known, promised_um(planned))
     largest_um = max(float(np.abs(offset).max()) for offset in planned.offset_um.values())
@@ -172,32 +181,14 @@ def prepare(
     return Armament(str(program), planned, table, facts)
 
 
-def _prepare_stream(
-    program: Path,
-    reference: Trajectory,
-    models: Mapping[str, Parameters],
-    config: MachineConfig,
-    known: Mapping[str, AxisKnowledge],
-) -> StreamedArmament | Refused:
-    """Plan the first blocks; what they are refused for refuses the program."""
-    off = gate.writing_off(reference, config)
-    if off:
-        return Refused(off)
-    stream = Stream.of(reference, models, config, program_digest(program))
-    begin = stream.take(FIRST_BLOCKS)
-    if stream.refused:
-        return Refused(stream.refused)
-    gain_um = rms(stream.before_um) - rms(stream.after_um)
-    facts = standing_facts(reference.axes, config, known, gain_um)
-    largest_um = config_largest_um(config, reference.axes)  # what later blocks need is not known yet
-    facts |= _commissioned(reference.axes, largest_um, config)
-    return StreamedArmament(str(program), stream, begin, facts)
-
-
-def config_largest_um(config: MachineConfig, axes: Sequence[str]) -> float:
-    """Return the largest offset that any axis may have."""
-    limits = [config.axis[axis].correction for axis in axes]
-    return max(limit.max_offset_um for limit in limits if limit is not None)
+def prepare_stream(
+    long: Long, checked: Checked, config: MachineConfig, known: Mapping[str, AxisKnowledge]
+) -> StreamedArmament:
+    """Make a checked program ready with the rows that it is armed with. StoreError when its rows cannot be read."""
+    stream = Stream(checked, long.program_digest, config.machine.sync_period_s)
+    facts = standing_facts(stream.axes, config, known, checked.gain_um)
+    facts |= _commissioned(stream.axes, float(checked.header["largest_um"]), config)
+    return StreamedArmament(str(long.program), stream, stream.take(FIRST_S), facts)
 
 
 @dataclass(frozen=True, slots=True)

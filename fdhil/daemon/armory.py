@@ -15,19 +15,22 @@ from fdhil.daemon.arming import (
     Armament,
     AxisKnowledge,
     Feeding,
+    Long,
     Refused,
     Skills,
     StreamedArmament,
     feeding_facts,
     prepare,
     prepare_feeding,
+    prepare_stream,
     standing_facts,
 )
+from fdhil.daemon.checking import Check
 from fdhil.daemon.control import Answer, refusal
 from fdhil.daemon.guard_link import REST, GuardLink
 from fdhil.daemon.keeping import Keeper, boot_id
 from fdhil.daemon.token import ensure_token
-from fdhil.errors import DeviceError
+from fdhil.errors import DeviceError, StoreError
 from fdhil.records import Notice, Outcome, ParameterSet, Skill, Temperature
 from fdhil.store.history import Revision
 
@@ -55,6 +58,7 @@ class Armory:
         self._skills = Skills(list(config.axis))
         self._arming = asyncio.Lock()
         self._armed: tuple[Armament | StreamedArmament | Feeding, Mapping[str, Any]] | None = None
+        self._check = Check(config)
         self.guard = GuardLink(run_directory)
 
     def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
@@ -151,7 +155,8 @@ class Armory:
         return dict(answer)
 
     async def _arm(self, program: Path, method: str | None, token: str) -> Answer:
-        prepared = await asyncio.to_thread(prepare, program, method, self._config, self._known())
+        found = await asyncio.to_thread(prepare, program, method, self._config, self._known())
+        prepared = await self._checked(found) if isinstance(found, Long) else found
         if isinstance(prepared, Refused):
             return _refused(prepared)
         summary = prepared.summary()
@@ -164,13 +169,31 @@ class Armory:
         )
         return {"ok": True, "state": answer.get("state", "ARMED"), "text": text, **summary}
 
+    async def _checked(self, long: Long) -> StreamedArmament | Refused:
+        """Have a long program checked as a whole; only then it is armed with its first rows."""
+        checked = await self._check.run(long.program, long.program_digest, long.models)
+        if isinstance(checked, tuple):
+            return Refused(checked)
+        return await asyncio.to_thread(prepare_stream, long, checked, self._config, self._known())
+
+    @property
+    def checking(self) -> Mapping[str, Any] | None:
+        """How far the check of a long program is; None while none runs."""
+        return self._check.progress
+
+    def abandon(self) -> None:
+        """End the check of a long program, if one runs: who asked for it is gone."""
+        self._check.abandon()
+
     async def disarm(self) -> Answer:
-        """Have the guard ramp to zero."""
+        """Have the guard ramp to zero; a program that is still being checked is not armed."""
+        abandoned = self._check.abandon()
         try:
             answer = await asyncio.to_thread(self.guard.disarm)
         except DeviceError as error:
             return refusal("GuardAbsent", str(error), NO_GUARD)
-        return dict(answer) | ({"text": f"guard: {self.guard.state}"} if answer["ok"] else {})
+        text = f"guard: {self.guard.state}" + ("; the check was abandoned" if abandoned else "")
+        return dict(answer) | ({"text": text} if answer["ok"] else {})
 
     async def attend(self, tell: Tell) -> None:
         """Tell the guard that this loop turns and what is still vouched for, and the log what the guard does."""
@@ -196,16 +219,14 @@ class Armory:
                 ended = None if goes_on else armed
 
     def _extend(self, armed: StreamedArmament) -> tuple[list[Notice], bool]:
-        """Plan and hand on what the guard lacks; return what is to be told, and whether more rows come."""
+        """Hand on what the guard lacks; return what is to be told, and whether more rows come."""
         notices = self.guard.refresh()
         if self.guard.state in REST or not armed.stream.lacks(self.guard.status):
             return notices, True
-        piece = armed.stream.take()
-        if armed.stream.refused:
-            text = f"{armed.stream.refused[0]}; the correction ends before it"
-            return [*notices, Notice("StreamRefused", "MAJOR", text)], False
         try:
-            answer = self.guard.extend(armed, piece)
+            answer = self.guard.extend(armed, armed.stream.take())
+        except StoreError as error:
+            return [*notices, Notice(error.code, "MAJOR", f"{error}; the correction ends before these rows")], False
         except DeviceError as error:
             return [*notices, Notice("GuardLost", "MAJOR", str(error))], False
         if answer["ok"]:
@@ -226,6 +247,7 @@ class Armory:
 
     async def stand_down(self) -> str:
         """Have a running correction ramped to zero and wait for it; return the state that was reached."""
+        self._check.abandon()
         if self.guard.connected and self.guard.state not in REST:
             await self.disarm()
             for _ in range(round(STAND_DOWN_S / ALIVE_S)):

@@ -1,7 +1,9 @@
 """The control socket: one JSON object per line and request, one per answer, over a UNIX socket.
 
 A request is {"request": "status" | "arm" | "disarm" | "stop", ...}; an answer is {"ok": true, ...} or
-{"ok": false, "code", "text", "advice"}. The socket is mode 0600: who may open it may read; arming needs the token.
+{"ok": false, "code", "text", "advice"}. With "progress": true lines {"progress": {...}} come before an answer that
+takes its time; who closes the connection meanwhile abandons what is checked for him. The socket is mode 0600: who may
+open it may read; arming needs the token.
 """
 
 from __future__ import annotations
@@ -22,9 +24,11 @@ SOCKET_NAME = "daemon.sock"
 MAX_LINE = 64 * 1024
 MAX_CLIENTS = 16
 IDLE_S = 60.0
+PROGRESS_S = 0.5
 
 Answer = Mapping[str, Any]
 Handler = Callable[[Mapping[str, Any]], Awaitable[Answer]]
+Progress = Callable[[], Mapping[str, Any] | None]
 
 
 def refusal(code: str, text: str, advice: str = "") -> Answer:
@@ -35,8 +39,9 @@ def refusal(code: str, text: str, advice: str = "") -> Answer:
 class ControlServer:
     """Serves requests to ``handle``; each client has its own task, a slow or dead one delays nobody else."""
 
-    def __init__(self, handle: Handler) -> None:
-        self._handle = handle
+    def __init__(self, handle: Handler, progress: Progress, abandon: Callable[[], None]) -> None:
+        """``progress`` tells how far what takes long is, ``abandon`` ends it."""
+        self._handle, self._progress, self._abandon = handle, progress, abandon
         self._clients: set[asyncio.Task[None]] = set()
         self.refused_clients = 0
 
@@ -85,15 +90,29 @@ class ControlServer:
 
     async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         while line := await asyncio.wait_for(reader.readline(), IDLE_S):
-            answer = await self._answer(line)
+            answer = await self._attended(line, reader, writer)
             writer.write(json.dumps(answer).encode() + b"\n")
             await asyncio.wait_for(writer.drain(), IDLE_S)
 
-    async def _answer(self, line: bytes) -> Answer:
+    async def _attended(self, line: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Answer:
+        """Answer a request; tell its progress meanwhile where that is wanted."""
         try:
             request = json.loads(line)
         except (ValueError, RecursionError):
             return refusal("BadRequest", "the request is no JSON", "send one JSON object per line")
+        answering = asyncio.ensure_future(self._answer(request))
+        wanted = isinstance(request, dict) and request.get("progress") is True
+        try:
+            while wanted and not (await asyncio.wait([answering], timeout=PROGRESS_S))[0]:
+                if reader.at_eof():
+                    self._abandon()
+                elif told := self._progress():
+                    writer.write(json.dumps({"progress": told}).encode() + b"\n")
+            return await answering
+        finally:
+            answering.cancel()
+
+    async def _answer(self, request: Any) -> Answer:
         if not isinstance(request, dict) or not isinstance(request.get("request"), str):
             return refusal("BadRequest", "the request has no text under 'request'", "status, arm, disarm or stop")
         try:
@@ -102,8 +121,15 @@ class ControlServer:
             return refusal(type(error).__name__, str(error))
 
 
-def ask(path: Path, request: Mapping[str, Any], timeout_s: float = 10.0) -> dict[str, Any]:
+def ask(
+    path: Path,
+    request: Mapping[str, Any],
+    timeout_s: float = 10.0,
+    progress: Callable[[Mapping[str, Any]], None] | None = None,
+) -> dict[str, Any]:
     """Send one request to a running daemon and return its answer (blocking; for the command line).
+
+    With ``progress`` the daemon is asked to tell how far it is, and each of its tellings goes there.
 
     ConnectError when no daemon listens, DeviceTimeout when it does not answer.
     """
@@ -111,9 +137,13 @@ def ask(path: Path, request: Mapping[str, Any], timeout_s: float = 10.0) -> dict
         client.settimeout(timeout_s)
         try:
             client.connect(str(path))
-            client.sendall(json.dumps(request).encode() + b"\n")
+            wanted = {"progress": True} if progress else {}
+            client.sendall(json.dumps({**request, **wanted}).encode() + b"\n")
             with client.makefile("rb") as lines:
                 line = lines.readline()
+                while progress and line.startswith(b'{"progress"'):
+                    progress(json.loads(line)["progress"])
+                    line = lines.readline()
         except TimeoutError:
             text = f"did not answer within {timeout_s:.0f} s; see its log"
             raise DeviceTimeout("daemon", text) from None

@@ -99,8 +99,8 @@ class Service:
     async def _serve(self) -> None:
         self._say(await asyncio.to_thread(self._keeper.open))
         await asyncio.to_thread(self._prepare)
-        control = ControlServer(self._handle).serving(self._run_directory / SOCKET_NAME)
-        async with control, asyncio.TaskGroup() as tasks:
+        control = ControlServer(self._handle, lambda: self._armory.checking, self._armory.abandon)
+        async with control.serving(self._run_directory / SOCKET_NAME), asyncio.TaskGroup() as tasks:
             acquiring = tasks.create_task(self._acquire(), name="acquire")
             others = [tasks.create_task(self._work(axis), name=f"axis {axis}") for axis in self._config.axis]
             others.append(tasks.create_task(self._keep_notices(), name="notices"))
@@ -282,6 +282,7 @@ class Service:
             "dropped": self._dropped,
             "guard": dict(guard.status),
             "armed": self._armory.armed,
+            "checking": self._armory.checking,
             "store": store,
         }
 

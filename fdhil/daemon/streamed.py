@@ -1,25 +1,29 @@
-"""A program longer than the guard's ring: armed with its first seconds, the rest is planned and handed on as it runs.
+"""A program longer than the guard's ring: armed with its first seconds, the rest is handed on as it runs.
 
-Each block passed limits and gate alone. When the stream falls behind, or a block is refused, no more rows come: the
-guard then ramps to zero by itself (``TableStarved``), with a second of reserve left.
+All of it was checked before; what is handed on are the very rows of the check, so nothing is computed while it runs.
+When the daemon falls behind all the same, the guard ramps to zero by itself (``TableStarved``), with a second of
+reserve left.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from itertools import islice
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.correction.streaming import StreamBlock, stream
-from fdhil.records import Float, Int, Parameters, Reason, Trajectory
+from fdhil.daemon.program_check import HEADER, ROWS, SCHEMA, reference_blocks
+from fdhil.errors import StoreError
 
 RING_S = 10.0  # of rows that the guard is given ahead of where the machine is; it ramps down below 1 s
-FIRST_BLOCKS = 5
-PIECE_ROWS = 500
+FIRST_S = 10.0
+NEXT_S = 2.0
 
 Rows = dict[str, list[int]]
 
@@ -33,77 +37,83 @@ class Piece(NamedTuple):
     final: bool
 
 
-@dataclass(slots=True)
-class Stream:
-    """The blocks of one program in the guard's increments; ``end`` is one past the last row handed out.
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """A program that passed the gate as a whole: where its rows are, and what the check found."""
 
-    ``before_um`` and ``after_um`` are the contour errors of the first blocks. ``refused`` is why no more blocks come.
-    """
-
-    reference: Trajectory
-    config: MachineConfig
-    program_digest: str
-    blocks: Iterator[StreamBlock]
-    end: int = 0
-    final: bool = False
-    refused: tuple[Reason, ...] = ()
-    before_um: Float = field(default_factory=lambda: np.empty(0))
-    after_um: Float = field(default_factory=lambda: np.empty(0))
-    largest_um: float = 0.0
+    rows_file: Path
+    header: Mapping[str, Any]
 
     @staticmethod
-    def of(
-        reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, program_digest: str
-    ) -> Stream:
-        """Begin to plan; nothing is solved yet."""
-        rows = reference.time_s.size
-        pieces = (
-            {axis: path[first : first + PIECE_ROWS] for axis, path in reference.position_mm.items()}
-            for first in range(0, rows, PIECE_ROWS)
-        )
-        return Stream(reference, config, program_digest, stream(pieces, models, config))
+    def find(folder: Path, key: str) -> Checked | None:
+        """Return what was checked under ``key``; None when nothing was, or its rows are not those of the check."""
+        rows_file = folder / (key + ROWS)
+        try:
+            header = json.loads((folder / (key + HEADER)).read_bytes())
+            with rows_file.open("rb") as body:
+                digest = hashlib.file_digest(body, "sha256").hexdigest()
+            os.utime(folder / (key + HEADER))  # what is used is not the oldest
+        except (OSError, ValueError):
+            return None
+        whole = isinstance(header, dict) and header.get("schema") == SCHEMA and header.get("sha256") == digest
+        return Checked(rows_file, header) if whole and not header.get("refused") else None
 
-    def take(self, count: int = 1) -> Piece:
-        """Return the rows of the next ``count`` blocks; none when none is left."""
-        first = self.end
-        offsets: dict[str, list[Float]] = {axis: [] for axis in self.reference.axes}
-        for block in islice(self.blocks, count):
-            if block.refused:
-                self.refused = block.refused
-                break
-            for axis, values in block.offset_um.items():
-                offsets[axis].append(np.asarray(values))
-                self.largest_um = max(self.largest_um, float(np.abs(values).max(initial=0.0)))
-            if first == 0:
-                self.before_um = np.append(self.before_um, block.before_um)
-                self.after_um = np.append(self.after_um, block.after_um)
-            self.end += block.before_um.size
-            self.final = block.final
-        demand = {axis: self._counts(axis, self.reference.position_mm[axis][first : self.end]) for axis in offsets}
-        offset = {
-            axis: self._counts(axis, np.concatenate(parts) * 1e-3) if parts else [] for axis, parts in offsets.items()
-        }
-        return Piece(first, demand, offset, self.final)
+    @property
+    def gain_um(self) -> float:
+        """By how much the contour error's RMS is predicted to shrink."""
+        return float(self.header["before"]["rms_um"] - self.header["after"]["rms_um"])
 
-    def _counts(self, axis: str, mm: Float) -> list[int]:
-        scaling = self.config.axis[axis].scaling
-        whole: Int = np.rint(mm * scaling.sign * scaling.increments_per_mm).astype(np.int64)
-        counts: list[int] = whole.tolist()
-        return counts
+
+class Stream:
+    """The rows of one checked program in the guard's increments; ``end`` is one past the last row handed out."""
+
+    def __init__(self, checked: Checked, program_digest: str, sync_period_s: float) -> None:
+        """Begin at the first row; nothing is read yet."""
+        self.checked, self.program_digest = checked, program_digest
+        self.axes: tuple[str, ...] = tuple(checked.header["axes"])
+        self.rows = int(checked.header["rows"])
+        self.end = 0
+        self._period_s = sync_period_s
+
+    def take(self, seconds: float = NEXT_S) -> Piece:
+        """Return the rows of the next ``seconds``; none when none is left. StoreError when they are not there."""
+        first, columns, file = self.end, 2 * len(self.axes), self.checked.rows_file
+        count = min(round(seconds / self._period_s), self.rows - first)
+        try:
+            with file.open("rb") as body:
+                body.seek(4 * columns * first)
+                content = body.read(4 * columns * count)
+        except OSError as error:
+            raise StoreError(f"{file} cannot be read ({error.strerror}); arm again", "StoreFault") from None
+        if len(content) != 4 * columns * count:
+            raise StoreError(f"{file} ends too early; check the disk, then arm again", "CorruptFile")
+        self.end += count
+        counts: list[list[int]] = np.frombuffer(content, "<i4").reshape(count, columns).T.tolist()
+        size = len(self.axes)
+        demand = dict(zip(self.axes, counts[:size], strict=True))
+        return Piece(first, demand, dict(zip(self.axes, counts[size:], strict=True)), self.done)
 
     @property
     def done(self) -> bool:
         """Whether no more rows come."""
-        return self.final or bool(self.refused)
+        return self.end == self.rows
 
     def lacks(self, status: Mapping[str, Any]) -> bool:
         """Whether the guard, by its status, holds less than the ring ahead of the machine."""
         if self.done or not status.get("rows"):
             return False
         ahead = int(status["rows"][1]) - int(status.get("row") or 0)
-        return ahead * self.reference.dt_s < RING_S
+        return ahead * self._period_s < RING_S
 
 
-def worth_streaming(reference: Trajectory, method: str | None) -> bool:
-    """Whether a program is longer than what the guard is given at first; only the inverse can be streamed."""
-    return method in (None, "inverse") and float(reference.time_s[-1]) > RING_S
+def longer_than_ring(program: Path, config: MachineConfig) -> bool:
+    """Whether a program is longer than what the guard is given at first; no more of it is read than that takes.
+
+    ProgramError, RecordingError or ConfigError when what was read cannot be used.
+    """
+    rows = 0
+    for block in reference_blocks(program, config):
+        rows += block.time_s.size
+        if rows * config.machine.sync_period_s > FIRST_S:
+            return True
+    return False

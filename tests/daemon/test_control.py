@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from fdhil.daemon import journal
-from fdhil.daemon.control import ask
+from fdhil.daemon.control import ControlServer, ask
 from fdhil.daemon.journal import BURST, FloodGate, line_of, printable
 from fdhil.daemon.lock import BusLocked, sole_owner
 from fdhil.daemon.notify import notify
@@ -53,6 +55,31 @@ def test_a_daemon_that_hangs_up_or_talks_nonsense_is_told(tmp_path: Path, listen
         with pytest.raises(ConnectError, match=r"without an answer|no answer of a daemon"):
             ask(tmp_path / "s", {"request": "status"})
         thread.join()
+
+
+async def test_what_takes_its_time_tells_its_progress_and_ends_when_nobody_waits(tmp_path: Path) -> None:
+    """The daemon's side and the command line's: two tellings, then the answer; who hangs up abandons it."""
+    turn = {"count": 0}
+    free, abandoned = asyncio.Event(), asyncio.Event()
+
+    async def handle(request: Mapping[str, Any]) -> Mapping[str, Any]:
+        await (free if request["request"] == "arm" else abandoned).wait()
+        return {"ok": True}
+
+    def progress() -> Mapping[str, Any]:
+        turn["count"] += 1
+        if turn["count"] == 2:
+            free.set()
+        return {"checked_s": turn["count"]}
+
+    told: list[Mapping[str, Any]] = []
+    async with ControlServer(handle, progress, abandoned.set).serving(tmp_path / "c"):
+        answer = await asyncio.to_thread(ask, tmp_path / "c", {"request": "arm"}, 10.0, told.append)
+        assert answer == {"ok": True}
+        assert told == [{"checked_s": 1}, {"checked_s": 2}]
+        with pytest.raises(DeviceTimeout):
+            await asyncio.to_thread(ask, tmp_path / "c", {"request": "wait", "progress": True}, 0.01)
+        await asyncio.wait_for(abandoned.wait(), 30.0)
 
 
 @pytest.mark.parametrize("abstract", [False, True])

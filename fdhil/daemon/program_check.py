@@ -1,0 +1,240 @@
+"""A whole program through the planner, the correction and the gate, block by block, before anything is armed.
+
+A process of its own (``python -m fdhil.daemon.program_check``, one JSON request on stdin): it may take minutes for an
+hour's program, at low priority, without holding up what the daemon listens to, and can be ended at any moment. What it
+leaves is a file of the rows as the guard will get them, and a header that vouches for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from fdhil.config import MachineConfig
+from fdhil.correction import gate
+from fdhil.correction.streaming import StreamBlock, stream
+from fdhil.errors import FdhilError, StoreError
+from fdhil.program import Budget, interpret
+from fdhil.program.demand_csv import read_demand_csv
+from fdhil.program.planner import stream as planned
+from fdhil.records import Float, Parameters, Reason, Trajectory
+from fdhil.store.atomic import store_error, sync_folder, write_file
+
+SCHEMA = "fdhil-check-1"
+ROWS = ".rows"
+HEADER = ".json"
+KEPT = 4  # checked programs; an hour of two axes takes 58 MB
+PIECE_ROWS = 2000
+MOST_REFUSED = 20  # places that are listed
+TELL_S = 0.5
+NICENESS = 10
+
+Tell = Callable[[Mapping[str, Any]], None]
+
+
+def reference_blocks(program: Path, config: MachineConfig) -> Iterator[Trajectory]:
+    """Yield what the NC will order, in blocks; ProgramError, RecordingError or ConfigError where it cannot be used."""
+    if program.suffix.lower() == ".csv":
+        yield read_demand_csv(program, config)
+        return
+    yield from planned(interpret(program, Budget.of(config.nc)), config, PIECE_ROWS)
+
+
+class _Path:
+    """The path as it comes, kept until its blocks are planned; after them only the lines that a refusal may name."""
+
+    def __init__(self, source: Iterator[Trajectory]) -> None:
+        self._source = source
+        self._parts: deque[tuple[int, Trajectory]] = deque()
+        self._end = 0
+
+    def pieces(self) -> Iterator[Mapping[str, Float]]:
+        """Yield the positions of each part, mm per axis."""
+        for part in self._source:
+            self._parts.append((self._end, part))
+            self._end += part.time_s.size
+            yield part.position_mm
+
+    def positions(self, first: int, stop: int) -> dict[str, Float]:
+        """Return the rows from ``first`` to ``stop``, and forget what lies before them."""
+        while self._parts and self._parts[0][0] + self._parts[0][1].time_s.size <= first:
+            self._parts.popleft()
+        found: dict[str, list[Float]] = {axis: [] for axis in self._parts[0][1].axes}
+        for start, part in self._parts:
+            for axis, values in part.position_mm.items():
+                found[axis].append(np.asarray(values[max(0, first - start) : max(0, stop - start)]))
+        return {axis: np.concatenate(parts) for axis, parts in found.items()}
+
+    def line(self, row: int) -> int:
+        """Return the source line of a row that is still kept, 0 where there is none."""
+        for start, part in self._parts:
+            if start <= row < start + part.time_s.size:
+                return int(part.line[row - start])
+        return 0
+
+
+@dataclass(slots=True)
+class _Findings:
+    """What is known of the blocks so far."""
+
+    rows: int = 0
+    before_square: float = 0.0
+    after_square: float = 0.0
+    before_max: float = 0.0
+    after_max: float = 0.0
+    largest_um: float = 0.0
+    refused: list[Reason] = field(default_factory=list)
+    named: set[tuple[str, ...]] = field(default_factory=set)
+
+    def take(self, block: StreamBlock) -> None:
+        """Add a block's errors and offsets."""
+        self.rows += block.before_um.size
+        self.before_square += float(block.before_um @ block.before_um)
+        self.after_square += float(block.after_um @ block.after_um)
+        self.before_max = max(self.before_max, float(block.before_um.max()))
+        self.after_max = max(self.after_max, float(block.after_um.max()))
+        self.largest_um = max(self.largest_um, *(float(np.abs(o).max()) for o in block.offset_um.values()))
+
+    def refuse(self, block: StreamBlock, path: _Path, dt_s: float) -> None:
+        """Add a block's refusals with their line and time; the same one in the same line is told once."""
+        for row, reason in sorted(zip(block.at, block.refused, strict=True), key=lambda told: told[0]):
+            line = path.line(row)
+            name = (reason.code, *reason.text.split()[:2], str(line or row))
+            if name not in self.named:
+                self.named.add(name)
+                place = f"line {line}, at {row * dt_s:.2f} s" if line else f"at {row * dt_s:.2f} s"
+                self.refused.append(Reason(reason.code, f"{place}: {reason.text}", reason.advice))
+
+    def header(self) -> dict[str, Any]:
+        """Return the figures of the whole; what it gains is asked last."""
+        then, now = (math.sqrt(square / max(1, self.rows)) for square in (self.before_square, self.after_square))
+        refused = self.refused or list(gate.gains(then, now))
+        return {
+            "rows": self.rows,
+            "before": {"rms_um": then, "max_um": self.before_max},
+            "after": {"rms_um": now, "max_um": self.after_max},
+            "largest_um": self.largest_um,
+            "refused": [{"code": r.code, "text": r.text, "advice": r.advice} for r in refused[:MOST_REFUSED]],
+        }
+
+
+def check(
+    program: Path, models: Mapping[str, Parameters], config: MachineConfig, body: BinaryIO, tell: Tell
+) -> dict[str, Any]:
+    """Run the whole program through correction and gate; write its rows to ``body``, return the header.
+
+    A row is the demand of each axis, then the offset of each, int32 in the guard's increments. ``tell`` hears now and
+    then how far it is. ProgramError, RecordingError or ConfigError when the program cannot be used.
+    """
+    dt_s, begun_s, told_s = config.machine.sync_period_s, time.monotonic(), -math.inf
+    path, findings, digest = _Path(reference_blocks(program, config)), _Findings(), hashlib.sha256()
+    for block in stream(path.pieces(), models, config, goes_on=True):
+        demand = path.positions(block.first_row, block.first_row + block.before_um.size)
+        findings.take(block)
+        findings.refuse(block, path, dt_s)
+        if len(findings.refused) >= MOST_REFUSED:
+            break
+        if not findings.refused:
+            rows = encoded(demand, block.offset_um, config)
+            digest.update(rows)
+            body.write(rows)
+        now_s = time.monotonic()
+        if now_s - told_s >= TELL_S:
+            told_s, checked_s = now_s, findings.rows * dt_s
+            tell(
+                {
+                    "checked_s": round(checked_s, 3),
+                    "line": path.line(findings.rows - 1),
+                    "times_real_time": round(checked_s / max(1e-3, now_s - begun_s), 1),
+                    "refused": len(findings.refused),
+                }
+            )
+    return {"schema": SCHEMA, "axes": list(config.axis), "sha256": digest.hexdigest()} | findings.header()
+
+
+def encoded(demand_mm: Mapping[str, Float], offset_um: Mapping[str, Float], config: MachineConfig) -> bytes:
+    """Return rows of demand and offset in increments, in the drives' own sign."""
+    columns = []
+    for values, per_mm in ((demand_mm, 1.0), (offset_um, 1e-3)):
+        for axis, settings in config.axis.items():
+            scale = settings.scaling.sign * settings.scaling.increments_per_mm * per_mm
+            columns.append(np.rint(values[axis] * scale))
+    return np.column_stack(columns).astype("<i4").tobytes()
+
+
+def keep(folder: Path, key: str, request: Callable[[BinaryIO], dict[str, Any]]) -> dict[str, Any]:
+    """Have the rows written, then make them and their header durable under ``key``; the oldest programs go.
+
+    StoreError when that fails. A refused program leaves nothing.
+    """
+    part = folder / f".{key}.part"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for left in folder.glob(".*.part"):  # by a check that was ended
+            left.unlink()
+        with part.open("wb") as body:
+            header = request(body)
+            body.flush()
+            os.fsync(body.fileno())
+        if header["refused"]:
+            return header
+        part.rename(folder / (key + ROWS))
+        write_file(folder / (key + HEADER), json.dumps(header).encode())
+        newest = sorted(folder.glob("*" + HEADER), key=lambda file: file.stat().st_mtime, reverse=True)
+        for file in newest[KEPT:]:
+            file.unlink()
+            file.with_suffix(ROWS).unlink(missing_ok=True)
+        sync_folder(folder)
+    except OSError as error:
+        raise store_error(part, error) from None
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+    return header
+
+
+def _end_with_the_daemon() -> None:
+    sys.stdin.buffer.read()  # the daemon's end of the pipe is closed when it is gone
+    os._exit(1)
+
+
+def main() -> None:
+    """Answer the one request; each line that is written is a JSON object, the last one is the answer."""
+    with contextlib.suppress(OSError):  # a sandbox may forbid even this; then the check competes
+        os.nice(NICENESS)
+    request = json.loads(sys.stdin.buffer.readline())
+    threading.Thread(target=_end_with_the_daemon, daemon=True).start()
+
+    def say(answer: Mapping[str, Any]) -> None:
+        sys.stdout.write(json.dumps(answer) + "\n")
+        sys.stdout.flush()
+
+    config = MachineConfig.model_validate(request["config"])
+    models = {axis: Parameters(**values) for axis, values in request["models"].items()}
+
+    def run(body: BinaryIO) -> dict[str, Any]:
+        return check(Path(request["program"]), models, config, body, lambda told: say({"progress": dict(told)}))
+
+    try:
+        say({"header": keep(Path(request["folder"]), request["key"], run)})
+    except StoreError as error:
+        say({"error": {"code": error.code, "text": str(error), "advice": "free the disk, then arm again"}})
+    except FdhilError as error:
+        say({"error": {"code": type(error).__name__, "text": str(error), "advice": "mend the program, then arm again"}})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,219 @@
+"""A long program is checked as a whole before it is armed: what is sent was checked, what is refused is named."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import io
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil import correction
+from fdhil.config import MachineConfig
+from fdhil.daemon.arming import Long, StreamedArmament, prepare, prepare_stream
+from fdhil.daemon.checking import FOLDER, Check
+from fdhil.daemon.program_check import KEPT, check, keep
+from fdhil.daemon.streamed import Checked, Stream
+from fdhil.errors import StoreError
+from fdhil.prediction.models import nominal_models
+from fdhil.program import load_trajectory, program_digest
+from fdhil.records import Reason
+from tests.daemon.machine import config_of
+from tests.daemon.test_arming import known, save_records
+
+SQUARE = "G1 X40 F6000\nG1 Y30\nG1 X0\nG1 Y0\n"
+HEAD = "G21 G90 G94\nG4 P0.5\n"
+LONG = HEAD + SQUARE * 10 + "G4 P0.3\nM2\n"
+HARD_LINES = (15, 24)  # in the third square and in the fifth
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> MachineConfig:
+    """The bench, two axes, writing allowed."""
+    return config_of(tmp_path, ("X", "Y"))
+
+
+def written(folder: Path, text: str) -> Path:
+    """A program on disk."""
+    path = folder / "program.ngc"
+    path.write_text(text)
+    return path
+
+
+def checked(program: Path, config: MachineConfig) -> tuple[dict[str, Any], bytes, list[Mapping[str, Any]]]:
+    """Check a program in this process; return header, rows and what was told."""
+    body, told = io.BytesIO(), list[Mapping[str, Any]]()
+    header = check(program, nominal_models(config), config, body, told.append)
+    return header, body.getvalue(), told
+
+
+def test_the_rows_are_those_of_the_whole_plan(config: MachineConfig, tmp_path: Path) -> None:
+    program = written(tmp_path, LONG)
+    header, body, told = checked(program, config)
+    planned = correction.plan(load_trajectory(program, config), nominal_models(config), config, "inverse")
+    table = correction.table(planned, config, "digest")
+    rows = np.frombuffer(body, "<i4").reshape(-1, 4)
+    for column, values in enumerate((*table.demand_increments.values(), *table.offset_increments.values())):
+        assert np.array_equal(rows[:, column], values)
+    assert header["refused"] == []
+    assert header["rows"] == len(rows)
+    assert header["before"]["rms_um"] == pytest.approx(np.sqrt(np.mean(planned.before.contour_um**2)))
+    assert header["after"]["max_um"] == pytest.approx(planned.after.contour_um.max(), abs=1e-6)
+    assert told[0].keys() == {"checked_s", "line", "times_real_time", "refused"}
+
+
+def hard_program() -> str:
+    """Two lines of a program ask more of the drives than they have."""
+    lines = LONG.splitlines()
+    for number in HARD_LINES:
+        lines[number - 1] = lines[number - 1].split(" F")[0] + " F30000"
+        lines[number] += " F6000"
+    return "\n".join(lines) + "\n"
+
+
+def test_every_place_is_named_with_line_axis_figure_and_advice(config: MachineConfig, tmp_path: Path) -> None:
+    sharp = config.model_copy(update={"nc": config.nc.model_copy(update={"smoothing_s": (0.02, 0.01)})})
+    header, _, _ = checked(written(tmp_path, hard_program()), sharp)
+    demand = [told for told in header["refused"] if told["code"] == "DemandTooHigh"]
+    told = " | ".join(reason["text"] for reason in demand)
+    for number in HARD_LINES:
+        assert f"line {number}," in told or f"line {number + 1}," in told, told
+    assert all("axis X has" in one["text"] or "axis Y has" in one["text"] for one in demand)
+    assert all(" ms: no offset can help" in one["text"] and one["advice"] for one in demand)
+
+
+def test_a_program_without_an_error_gains_nothing(config: MachineConfig, tmp_path: Path) -> None:
+    header, _, _ = checked(written(tmp_path, "G4 P12\nM2\n"), config)
+    assert [told["code"] for told in header["refused"]] == ["NoGain"]
+
+
+def test_a_checked_program_is_armed_with_its_first_rows_and_goes_on(config: MachineConfig, tmp_path: Path) -> None:
+    program = written(tmp_path, LONG)
+    save_records(config)
+    found = prepare(program, None, config, known(config))
+    assert isinstance(found, Long)
+    first, again = asyncio.run(_twice(config, found))
+    assert isinstance(first, Checked)
+    assert isinstance(again, Checked)
+    armament = prepare_stream(found, first, config, known(config))
+    assert isinstance(armament, StreamedArmament)
+    assert all(armament.facts.values()), armament.facts
+    assert armament.program_digest == program_digest(program)
+    stream, pieces = armament.stream, [armament.first()]
+    assert len(pieces[0].demand["X"]) == 10_000
+    assert stream.lacks({"rows": [0, 10_000], "row": 1})
+    assert not stream.lacks({"rows": [0, 10_000], "row": 0})
+    while not stream.done:
+        pieces.append(stream.take())
+    assert [piece.final for piece in pieces] == [False] * (len(pieces) - 1) + [True]
+    assert [piece.first for piece in pieces[1:]] == list(range(10_000, stream.rows, 2000))
+    body = np.frombuffer(first.rows_file.read_bytes(), "<i4").reshape(-1, 4)
+    assert np.array_equal(np.concatenate([piece.offset["Y"] for piece in pieces]), body[:, 3])
+    assert not stream.lacks({"rows": [0, 10_000], "row": 9_999})
+
+
+async def _twice(config: MachineConfig, found: Long) -> list[Checked | tuple[Reason, ...]]:
+    """Check in a process; the second time nothing is started."""
+    check, heard = Check(config), list[Mapping[str, Any]]()
+
+    async def listen() -> None:
+        while True:
+            if check.progress is not None:
+                heard.append(check.progress)
+            await asyncio.sleep(0.01)
+
+    listening = asyncio.create_task(listen())
+    first = await check.run(found.program, found.program_digest, found.models)
+    before = len(heard)
+    again = await check.run(found.program, found.program_digest, found.models)
+    listening.cancel()
+    assert heard[-1]["program"] == str(found.program)
+    assert len(heard) == before
+    return [first, again]
+
+
+async def test_an_abandoned_check_says_so_and_leaves_nothing(config: MachineConfig, tmp_path: Path) -> None:
+    program = written(tmp_path, HEAD + SQUARE * 2000 + "M2\n")
+    check = Check(config)
+    running = asyncio.create_task(check.run(program, program_digest(program), nominal_models(config)))
+    async with asyncio.timeout(100):
+        while not (check.progress or {}).get("checked_s"):  # noqa: ASYNC110 - what another process says has no event
+            await asyncio.sleep(0.05)
+    assert check.abandon()
+    refused = await running
+    assert isinstance(refused, tuple)
+    assert refused[0].code == "Abandoned"
+    assert check.progress is None
+    assert not check.abandon()
+    assert not list((config.store.directory / FOLDER).glob("*.json"))
+
+
+async def test_a_broken_program_is_refused_with_its_line(config: MachineConfig, tmp_path: Path) -> None:
+    program = written(tmp_path, HEAD + SQUARE * 10 + "G1 X[1/0]\nM2\n")
+    refused = await Check(config).run(program, program_digest(program), nominal_models(config))
+    assert isinstance(refused, tuple)
+    assert refused[0].code == "ProgramError"
+    assert "43" in refused[0].text
+
+
+def made(folder: Path, key: str) -> Path:
+    """Keep eight rows under a key; return their file."""
+
+    def rows(body: Any) -> dict[str, Any]:
+        content = np.arange(32, dtype="<i4").tobytes()
+        body.write(content)
+        digest = hashlib.sha256(content).hexdigest()
+        whole = {"rms_um": 2.0, "max_um": 3.0}
+        return {"schema": "fdhil-check-1", "axes": ["X", "Y"], "rows": 8, "sha256": digest, "refused": [],
+                "before": whole, "after": {"rms_um": 0.5, "max_um": 1.0}, "largest_um": 1.0}  # fmt: skip
+
+    keep(folder, key, rows)
+    return folder / f"{key}.rows"
+
+
+def test_what_was_checked_is_only_believed_whole(tmp_path: Path) -> None:
+    file = made(tmp_path, "a")
+    found = Checked.find(tmp_path, "a")
+    assert found is not None
+    assert found.gain_um == 1.5
+    assert Checked.find(tmp_path, "b") is None
+    stream = Stream(found, "digest", 0.001)
+    content = bytearray(file.read_bytes())
+    content[17] ^= 1
+    file.write_bytes(content)
+    assert Checked.find(tmp_path, "a") is None
+    file.write_bytes(content[:40])
+    with pytest.raises(StoreError, match="ends too early"):
+        stream.take()
+    file.unlink()
+    assert Checked.find(tmp_path, "a") is None
+    with pytest.raises(StoreError, match="cannot be read"):
+        stream.take()
+
+
+def test_a_refused_program_is_not_kept_and_old_ones_go(tmp_path: Path) -> None:
+    (tmp_path / ".left.part").write_bytes(b"half")
+    refused: dict[str, Any] = {"refused": [{"code": "NoGain", "text": "", "advice": ""}]}
+    assert keep(tmp_path, "no", lambda body: refused if body.write(b"rows") else {}) == refused
+    assert list(tmp_path.iterdir()) == []
+    for number in range(KEPT + 2):
+        file = made(tmp_path, f"k{number}")
+        for path in (file, file.with_suffix(".json")):
+            os.utime(path, (number, number))
+    made(tmp_path, "newest")
+    names = {path.stem for path in tmp_path.glob("*.json")}
+    assert names == {"newest", *(f"k{n}" for n in range(3, KEPT + 2))}
+    assert {path.stem for path in tmp_path.glob("*.rows")} == names
+    assert all(json.loads(path.read_bytes())["rows"] == 8 for path in tmp_path.glob("*.json"))
+
+
+def test_a_store_that_refuses_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(StoreError):
+        made(tmp_path / "file" / "folder", "a")
