@@ -15,6 +15,7 @@ ROOT = Path(__file__).resolve().parent.parent
 BENCHMARKS = {
     "closed_loop": "The closed-loop kernel against the same kernel in C -O3, and against real time",
     "identification": "From the last sample of a rapid to validated parameters",
+    "reanalysis": "A thousand recorded rapids identified again by `fdhil identify`",
     "interpreter": "Reading programs: blocks per second, where the time goes, memory over a million lines",
     "inverse": "Planning the inverse correction: the whole, and the first block of a stream",
     "planner": "The planner: speed, LinuxCNC's own demand beside it, and what the correction makes of jerky demands",
