@@ -19,6 +19,7 @@ ASIDE_S = 0.07  # what lies further away than this is not the corner's own turn
 SHARP = 0.6
 CORNER_RAD = np.deg2rad(20.0)
 BACK_RAD = np.deg2rad(179.0)  # in one row: the path goes back along its own line, which is a reversal
+CHANGE = 1e-6  # of the largest speed, from one row to the next: less is none
 PAUSE_S = 0.01  # a rest that is shorter is no stop
 MERGE_S = 0.03
 SHORTEST_S = 0.003
@@ -48,6 +49,9 @@ def geometry(reference: Trajectory) -> Geometry:
     step = np.diff(going.astype(np.int8), prepend=0, append=0)
     start, stop = step[:-1] == 1, np.zeros(len(path), dtype=np.bool_)
     stop[np.clip(np.flatnonzero(step == -1), 0, len(path) - 1)] = True
+    change = np.diff(speed, append=0.0)
+    start |= _leading_to(start[::-1], change[::-1] > CHANGE * speed.max())[::-1]
+    stop |= _leading_to(stop, change < -CHANGE * speed.max())
     turn_rate = _turn_rate(velocity, speed, moving, dt)
     return Geometry(
         speed,
@@ -59,6 +63,16 @@ def geometry(reference: Trajectory) -> Geometry:
             "reversal": np.any([_reversals(velocity[:, a]) for a in range(path.shape[1])], axis=0),
         },
     )
+
+
+def _leading_to(events: Bool, changing: Bool) -> Bool:
+    """Rows of the unbroken change of speed that leads to an event: an axis that brakes errs before it stops."""
+    here = changing | events | np.roll(events, -1)
+    run = np.cumsum(np.diff(here.astype(np.int8), prepend=0) == 1)  # the number of the last run that has begun
+    last = np.zeros(int(run[-1]) + 1, dtype=np.int64)
+    rows = np.flatnonzero(events)
+    last[run[rows]] = rows  # the last event of a run is the last to be written
+    return np.asarray(here & (np.arange(events.size) <= last[run]))
 
 
 def _turn_rate(velocity: Float, speed: Float, moving: Bool, dt: float) -> Float:
