@@ -27,10 +27,6 @@ SURE = 4.5  # standard deviations: two tests a window
 SEARCH = 6  # fits: each takes away most of what is left
 REACH = 16.0  # samples: longer ones show in whole samples, see identification.delay
 FOUND = 0.1  # samples
-INSTANT = (
-    0.25  # samples, one standard deviation: what a regulator does within a sample moves an instant's apparent time
-)
-SHARED = 0.1  # a correlation above it, by instants whose noise two intervals share, misleads the search
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,17 +48,17 @@ def timing_faults(window: Window, fit: Fit) -> Iterator[Reason]:
         return  # there the delay is one of the parameters
     voltage, current = shifts(fit)
     if current.sure and abs(current.samples) * voltage.std > abs(voltage.samples) * current.std:
-        yield _reason("current", "voltage and speed", current, window.dt_s)
+        yield _reason("current", "voltage and speed", current.samples, window.dt_s)
         return
-    if abs(voltage.samples) + voltage.std > DOUBTFUL and expected_correlation(fit)[0] < SHARED:
-        voltage = searched(fit, voltage)
-    if voltage.sure:
-        yield _reason("voltage", "current and speed", voltage, window.dt_s)
+    if abs(voltage.samples) + voltage.std > DOUBTFUL:
+        samples = searched(fit, voltage.samples)
+        if samples is not None and abs(samples) > LARGEST:
+            yield _reason("voltage", "current and speed", samples, window.dt_s)
 
 
-def _reason(name: str, others: str, shift: Shift, dt_s: float) -> Reason:
+def _reason(name: str, others: str, samples: float, dt_s: float) -> Reason:
     text = (
-        f"{name} is {1e3 * abs(shift.samples) * dt_s:.2f} ms {'late' if shift.samples > 0 else 'early'} against "
+        f"{name} is {1e3 * abs(samples) * dt_s:.2f} ms {'late' if samples > 0 else 'early'} against "
         f"{others}, more than a sample of {1e3 * dt_s:g} ms"
     )
     return Reason("SampleTiming", text, "take voltage, current and speed from one SYNC, or enter the sensor's delay")
@@ -86,8 +82,7 @@ def shifts(fit: Fit) -> tuple[Shift, Shift]:
         if not power > 0.0:
             return Shift(0.0, np.inf), Shift(0.0, np.inf)
         score, *unsure = (rest @ whole) / power
-        about = INSTANT if kind == sweeps.VOLTAGE and motion.voltage_sampling == "instant" else 0.0
-        found.append(Shift(-float(score), float(np.linalg.norm([*unsure, np.sqrt(coloured / power), about]))))
+        found.append(Shift(-float(score), float(np.linalg.norm([*unsure, np.sqrt(coloured / power)]))))
     voltage, current = found
     return replace(voltage, samples=voltage.samples + float(fit.theta[6]) / motion.dt_s), current
 
@@ -96,24 +91,29 @@ def _no_rise(kind: int, n: int) -> list[Float] | None:
     return [np.zeros(n)] if kind == sweeps.VOLTAGE else None
 
 
-def searched(fit: Fit, first: Shift) -> Shift:
-    """Return the voltage's delay at which, with the other parameters fitted to it, the innovations show none beyond."""
+def searched(fit: Fit, first: float) -> float | None:
+    """Return the samples of the voltage's delay beyond which, all else fitted to it, the innovations show no more.
+
+    ``first`` is what they show to begin with. The delay must make the window likelier by as much as a sure finding:
+    what regulators do within a sample shifts the innovations too, but that gets no likelier by it. None otherwise.
+    """
     motion = fit.problem.motions[0]
-    begun = float(fit.theta[6]) / motion.dt_s
-    theta, std = fit.theta, first.std
+    begun, last = float(fit.theta[6]) / motion.dt_s, fit
 
     def left(delay: float) -> float:
-        nonlocal theta, std
-        moved = maximum_likelihood.fit([motion], np.append(theta[:6], delay * motion.dt_s), range(6))
-        if not (np.isfinite(moved.residuals).all() and np.isfinite(moved.information).all()):
+        nonlocal last
+        last = maximum_likelihood.fit([motion], np.append(last.theta[:6], delay * motion.dt_s), range(6))
+        if not (np.isfinite(last.residuals).all() and np.isfinite(last.information).all()):
             return float("nan")
-        theta = moved.theta
-        shift, _ = shifts(moved)
-        std = shift.std
-        return shift.samples - delay
+        return shifts(last)[0].samples - delay
 
-    found = _root(left, begun, first.samples - begun)
-    return first if found is None else Shift(found, std)
+    found = _root(left, begun, first - begun)
+    return found if found is not None and _deviance(fit) - _deviance(last) > SURE**2 else None
+
+
+def _deviance(fit: Fit) -> float:
+    """Return minus twice the log likelihood, without its constant."""
+    return float(fit.residuals @ fit.residuals) + fit.problem.filters[0].logdet
 
 
 def _root(left: Callable[[float], float], begun: float, rest: float) -> float | None:
