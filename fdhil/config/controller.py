@@ -13,8 +13,8 @@ from fdhil.config.section import NotNegative, Positive, Section, listed
 class Nc(Section):
     """[nc]: what the numerical controller makes of a program."""
 
-    profile: Literal["fir", "trapezoidal", "jerk_limited"] = Field(
-        "fir", description="fir: smoothed feed; trapezoidal, jerk_limited: look-ahead within the axes' limits"
+    profile: Literal["fir", "trapezoidal", "jerk_limited", "linuxcnc"] = Field(
+        "fir", description="fir: smoothed feed; trapezoidal, jerk_limited: look-ahead; linuxcnc: as its own planner"
     )
     smoothing_s: tuple[NotNegative, ...] = Field(
         (0.060, 0.030), max_length=4, description="fir: moving averages over each axis' demand"

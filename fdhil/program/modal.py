@@ -60,6 +60,7 @@ class Modal:
     compensation: int = 400
     path_control: int = 640
     path_tolerance_mm: float = 0.0
+    joining_mm: float = 0.0
 
     @property
     def plain(self) -> bool:
@@ -71,7 +72,9 @@ class Modal:
         """How the motion at hand may be left, by the path control in force."""
         if self.path_control != 640:
             return _EXACT[self.path_control]
-        return Corner("blend", self.path_tolerance_mm) if self.path_tolerance_mm > 0.0 else BLEND
+        if not (self.path_tolerance_mm > 0.0 or self.joining_mm > 0.0):
+            return BLEND
+        return Corner("blend", self.path_tolerance_mm or math.inf, self.joining_mm)
 
     @property
     def plane_name(self) -> str:

@@ -75,6 +75,7 @@ def set_distance(modal: Modal, block: Block) -> None:
     if "path control" in g:
         modal.path_control = g["path control"]
         modal.path_tolerance_mm = block.words.get("p", 0.0) * modal.scale
+        modal.joining_mm = block.words.get("q", block.words.get("p", 0.0)) * modal.scale
     if "distance" in g:
         modal.absolute = g["distance"] == 900
     if "arc distance" in g:

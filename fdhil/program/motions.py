@@ -17,11 +17,13 @@ PLANE_AXES = {"XY": (0, 1, 2), "XZ": (2, 0, 1), "YZ": (1, 2, 0)}
 class Corner:
     """How a motion's end may be left: G61 on the exact path, G61.1 from an exact stop, G64 by a blend.
 
-    ``tolerance_mm`` is how far a blend may be off the path (P); infinite where the program gives none.
+    ``tolerance_mm`` is how far a blend may be off the path (P); infinite where the program gives none. ``joining_mm``
+    is how far short lines may be off the one that they are joined to (Q).
     """
 
     mode: Literal["exact_path", "exact_stop", "blend"] = "blend"
     tolerance_mm: float = math.inf
+    joining_mm: float = 0.0
 
 
 BLEND = Corner()

@@ -15,7 +15,7 @@ Reading = Callable[[], float]
 _KEPT = (
     "scale", "plane", "absolute", "arc_absolute", "diameter", "feed_mode", "feed_word", "feed_mm_min", "spindle_rpm",
     "spindle_turns", "surface_speed", "flood", "mist", "feed_override", "speed_override", "adaptive_feed", "feed_hold",
-    "retract_to_r", "path_control", "path_tolerance_mm", "system",
+    "retract_to_r", "path_control", "path_tolerance_mm", "joining_mm", "system",
 )  # fmt: skip
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.program.motions import Motion
+from fdhil.program.planner import linuxcnc
 from fdhil.program.planner.look_ahead import LookAhead
 from fdhil.program.planner.smoothing import Smoother
 from fdhil.program.planner.timeline import Timeline
@@ -53,7 +54,7 @@ def stream(
     row = 0
     kept: list[Part] = []
     waiting = 0
-    parts = _smoothed if config.nc.profile == "fir" else _looked_ahead
+    parts = {"fir": _smoothed, "linuxcnc": _cycle_by_cycle}.get(config.nc.profile, _looked_ahead)
     for part in parts(motions, config, block_rows, max_rows):
         kept.append(part)
         waiting += part[1].size
@@ -87,6 +88,12 @@ def _looked_ahead(motions: Iterable[Motion], config: MachineConfig, block_rows: 
             smooth = smoother(path[:, None])[:, 0]
             yield ahead.curve.at(smooth), line, rapid
             ahead.curve.forget(float(smooth[-1]))
+
+
+def _cycle_by_cycle(
+    motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float
+) -> Iterator[Part]:
+    return linuxcnc.Planner(config, max_rows).parts(motions, block_rows)
 
 
 def _spans(first_row: int, end_row: int, block_rows: int) -> Iterator[Int]:

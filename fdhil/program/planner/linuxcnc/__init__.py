@@ -1,0 +1,136 @@
+"""The planner of LinuxCNC (2.8 and later), cycle by cycle: profile ``linuxcnc``.
+
+Built from its documentation and from the demand it orders each millisecond: trapezoidal speeds with the acceleration
+that corners and arcs leave, arcs or parabolas at corners within P, short lines joined within Q, and a look-ahead of
+fifty segments. Parabolas come from the overlap of two segments: the next one speeds up while the last one brakes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+
+from fdhil.config import MachineConfig
+from fdhil.errors import ProgramError
+from fdhil.program.motions import Arc, Dwell, Feed, Motion, Point, Rapid
+from fdhil.program.planner.limits import AxisLimits, check_dwell
+from fdhil.program.planner.linuxcnc.blends import Machine, join
+from fdhil.program.planner.linuxcnc.cycles import Cycles
+from fdhil.program.planner.linuxcnc.joining import joined
+from fdhil.program.planner.linuxcnc.segments import STOP, TANGENT, Segment, segment
+from fdhil.records import Float, Int
+
+_DEPTH = 50
+_UNSETTLED = 3  # of the newest segments the limits have just changed
+_TICK_TOLERANCE = 1e-6
+_INTERPOLATED_ROWS = 2
+Row = tuple[float, float, float, int, bool]
+
+
+class Planner:
+    """Turns motions into rows; ProgramError when they last longer than ``max_rows``."""
+
+    def __init__(self, config: MachineConfig, max_rows: float = math.inf) -> None:
+        self._dt_s = config.machine.sync_period_s
+        self._max_rows = max_rows
+        self._limits = AxisLimits.of(config)
+        self._machine = Machine(self._limits.speed, self._limits.acceleration, self._dt_s)
+        self._stop_always = config.nc.corner == "exact_stop"
+        self._settle_rows = math.ceil(config.nc.settle_s / self._dt_s - _TICK_TOLERANCE)
+        self._end_rows = math.ceil(config.nc.end_rest_s / self._dt_s - _TICK_TOLERANCE)
+        self._queue: deque[Segment] = deque()
+        self._cycles = Cycles(self._queue, self._dt_s)
+        self._at: Point = (0.0, 0.0, 0.0)
+        self._line = 0
+        self._count = 0
+
+    def parts(self, motions: Iterable[Motion], block_rows: int) -> Iterator[tuple[Float, Int, Int]]:
+        """Yield position (n, 3) in mm, source line (n,) and rapid (n,) 0 or 1 in blocks; the first row is the rest."""
+        rows: list[Row] = []
+        past = np.zeros((2, 3))
+        for row in self._rows(motions):
+            rows.append(row)
+            if len(rows) >= block_rows:
+                part, past = _part(rows, past)
+                yield part
+                rows = []
+        if rows:
+            yield _part(rows, past)[0]
+
+    def _rows(self, motions: Iterable[Motion]) -> Iterator[Row]:
+        yield (*self._at, 0, False)
+        for motion in joined(motions):
+            if isinstance(motion, Dwell):
+                check_dwell(motion, self._dt_s)
+                yield from self._run(0)
+                self._line = motion.line
+                yield from self._rest(math.ceil(motion.seconds / self._dt_s - _TICK_TOLERANCE))
+            else:
+                self._take(motion)
+                yield from self._run(_DEPTH)
+        yield from self._run(0)
+        yield from self._rest(self._end_rows + _INTERPOLATED_ROWS)
+
+    def _take(self, motion: Rapid | Feed | Arc) -> None:
+        self._limits.check(motion, self._at)
+        new = segment(motion, self._at, self._limits)
+        self._at = motion.end
+        if new is None:
+            return
+        if self._stop_always:
+            new.ending = STOP
+        if self._queue:
+            for ready in join(self._queue.pop(), new, self._machine):
+                ready.settle(self._dt_s)
+                self._queue.append(ready)
+        self._queue.append(new)
+        self._look_back()
+
+    def _look_back(self) -> None:
+        """Give the newest segments the speeds at which they may end, since there is one more to brake in."""
+        queue = self._queue
+        number = len(queue) - 1
+        for place in range(number, max(0, number - _DEPTH), -1):
+            here, before = queue[place], queue[place - 1]
+            if before.ending != TANGENT:
+                return
+            reach = math.sqrt(here.end_speed**2 + 2.0 * here.along * here.shape.length)
+            speed = min(reach, here.target, before.target, before.kink_speed)
+            if speed == before.end_speed and place < number - _UNSETTLED:
+                return
+            before.end_speed = speed
+
+    def _run(self, left: int) -> Iterator[Row]:
+        """Run cycles until no more than ``left`` segments wait."""
+        queue, cycles = self._queue, self._cycles
+        while len(queue) > left + 1 or (not left and queue):
+            here = queue[0]
+            self._line = here.line
+            x, y, z = cycles.step()
+            self._check()
+            yield (x, y, z, here.line, here.rapid)
+            if self._settle_rows and here.ending == STOP and (not queue or queue[0] is not here):
+                yield from self._rest(self._settle_rows)
+
+    def _rest(self, rows: int) -> Iterator[Row]:
+        self._check(rows)
+        row = (*self._cycles.at, self._line, False)
+        for _ in range(rows):
+            yield row
+
+    def _check(self, rows: int = 1) -> None:
+        self._count += rows
+        if self._count > self._max_rows:
+            hours = self._count * self._dt_s / 3600
+            raise ProgramError(self._line, "", f"by here the program lasts {hours:.3g} h; split it")
+
+
+def _part(rows: list[Row], past: Float) -> tuple[tuple[Float, Int, Int], Float]:
+    """Return a block of rows and its last two points: the joints' cubic interpolation weighs three points in a row."""
+    table = np.array(rows)
+    points = np.concatenate([past, table[:, :3]])
+    smooth = points[1:-1] + (points[:-2] - 2.0 * points[1:-1] + points[2:]) / 6.0
+    return (smooth, table[:, 3].astype(np.int64), table[:, 4].astype(np.int64)), points[-2:]

@@ -1,0 +1,249 @@
+"""How two segments meet: straight through, with a stop, by a parabola, or by an arc that touches both.
+
+What LinuxCNC's planner does, as its demand shows: a kink so slight that its step takes less than a tenth of the axes'
+acceleration is passed; under G64 the better of an arc and a parabola is taken, a parabola counting half, since both of
+its neighbours accelerate at half beside it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from fdhil.program.motions import Point
+from fdhil.program.planner.linuxcnc.segments import (
+    ALONG_SHARE,
+    EXACT,
+    NORMAL_SHARE,
+    STOP,
+    TANGENT,
+    Segment,
+)
+from fdhil.program.planner.linuxcnc.shapes import Led, Line, Turn, cross, dot, minus, plus, unit
+
+_KINK_SHARE = 0.1
+_KINK_SHARE_OF_ARC = 0.5
+_TOLERANCE_SHARE = 0.25  # of a segment's length, where the program gives none
+_LENGTH_SHARE = 0.5  # of a segment's length that one blend may take
+_GAP_CYCLES = 4.0
+_LEAST_ANGLE_RAD = 1e-6
+_LEAST_RADIUS_MM = 1e-6
+_ROUNDING_MM = 1e-9
+_TRIES = 12
+_SMALLER = 0.8
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """What blends keep: the axes' limits and the period of a cycle."""
+
+    speed: Point
+    acceleration: Point
+    dt_s: float
+
+
+def join(before: Segment, after: Segment, machine: Machine) -> tuple[Segment, ...]:
+    """Decide how ``before`` goes over into ``after``; return what stands for ``before`` from then on.
+
+    That is itself, with an arc behind it where one is put between them, or the arc alone where that takes it in.
+    """
+    if before.rapid != after.rapid:
+        before.ending = STOP
+    if before.ending == STOP or _passed(before, after, machine) or before.ending == EXACT:
+        return (before,)
+    arc = _arc(before, after, machine)
+    parabola = blend_speeds(before, after, probing=True)[2] / 2.0
+    if arc is not None and arc.segment.top >= max(parabola, before.kink_speed):
+        _forget_kink(before, after)
+        before.ending = TANGENT
+        return arc.put_between(before, after, machine.dt_s)
+    if before.kink_speed > parabola:
+        before.ending = TANGENT
+    else:
+        _forget_kink(before, after)
+        after.after_parabola = True
+    return (before,)
+
+
+def _forget_kink(before: Segment, after: Segment) -> None:
+    before.kink_speed, before.kept_back, after.kept_back_before = math.inf, 0.0, 0.0
+
+
+def _passed(before: Segment, after: Segment, machine: Machine) -> bool:
+    """Tell whether the kink may be passed at full speed; else what speed it allows is kept."""
+    t1, t2 = before.shape.tangent(before.shape.length), after.shape.tangent(0.0)
+    speed = min(before.free, after.free)
+    step = speed / machine.dt_s + after.acceleration
+    share = max(abs(b - a) * step / limit for a, b, limit in zip(t1, t2, machine.acceleration, strict=True))
+    if isinstance(before.shape, Turn) or isinstance(after.shape, Turn):
+        share /= _KINK_SHARE_OF_ARC
+    kept = min(share, _KINK_SHARE)
+    before.kink_speed = speed if share < _KINK_SHARE else speed * _KINK_SHARE / share
+    before.kept_back = after.kept_back_before = kept
+    if share < _KINK_SHARE:
+        before.ending = TANGENT
+    return share < _KINK_SHARE
+
+
+def blend_speeds(before: Segment, after: Segment, probing: bool = False) -> tuple[float, float, float]:
+    """Return the speeds at which a parabola begins in ``before`` and ends in ``after``, and that across the corner.
+
+    With ``probing`` a parabola is assumed that is not decided yet.
+    """
+    t1, t2 = before.shape.tangent(before.shape.length), after.shape.tangent(0.0)
+    kept = after.after_parabola
+    after.after_parabola = kept or probing
+    a1, a2, v1, v2 = before.along, after.along, before.reachable, after.reachable
+    after.after_parabola = kept
+    l1, l2 = before.shape.length, after.shape.length
+    span = min(l1 / v1, l2 / v2, max(v1 / a1, v2 / a2))
+    v1, v2 = min(v1, span * a1), min(v2, span * a2)
+    half = math.acos(max(-1.0, min(1.0, -dot(t1, t2)))) / 2.0  # pi / 2 where the path goes straight on
+    if before.tolerance > 0.0 and math.cos(half) > 1e-4:
+        within = 2.0 * math.sqrt(a1 * before.tolerance / math.cos(half))
+        v1, v2 = min(v1, within), min(v2, within)
+    # measured: the next segment speeds up with all it has while this one brakes
+    return v1, v1 / a1 * a2, math.sin(half) * (v1 + v2) / 2.0
+
+
+@dataclass(slots=True)
+class _Arc:
+    segment: Segment
+    taken: tuple[float, float]  # mm off the end of the one before and off the start of the one after
+
+    def put_between(self, before: Segment, after: Segment, dt_s: float) -> tuple[Segment, ...]:
+        """Shorten both neighbours; what is left of a line for less than four cycles goes with the arc."""
+        one, two, arc = before.shape, after.shape, self.segment
+        assert not isinstance(one, Led)
+        assert not isinstance(two, Led)
+        assert isinstance(arc.shape, Turn)
+        one.cut(0.0, self.taken[0])
+        two.cut(self.taken[1], 0.0)
+        if not isinstance(one, Line) or one.length >= _GAP_CYCLES * dt_s * arc.top:
+            return before, arc
+        if one.length > 0.0:
+            arc.shape = Led(one, arc.shape)
+        arc.nominal = arc.shape.length
+        arc.after_parabola, arc.kept_back_before = before.after_parabola, before.kept_back_before
+        return (arc,)
+
+
+def _arc(before: Segment, after: Segment, machine: Machine) -> _Arc | None:
+    """Return the arc that touches both, None where none fits: they are to lie in one plane."""
+    one, two = before.shape, after.shape
+    if isinstance(one, Led) or isinstance(two, Led):
+        return None
+    t1, t2 = one.tangent(one.length), two.tangent(0.0)
+    normal = unit(cross(t1, t2))
+    half = math.acos(max(-1.0, min(1.0, -dot(t1, t2)))) / 2.0
+    if dot(normal, normal) == 0.0 or half < _LEAST_ANGLE_RAD or half > math.pi / 2.0 - _LEAST_ANGLE_RAD:
+        return None
+    if not (_in_plane(one, normal) and _in_plane(two, normal)):
+        return None
+    limit = _within_plane(machine.acceleration, normal)
+    tolerance = min(_tolerance(before), _tolerance(after))
+    lengths = min(one.length, before.nominal * _LENGTH_SHARE), two.length * _LENGTH_SHARE
+    reach = min(*lengths, math.cos(half) * tolerance / (1.0 - math.sin(half)))
+    goal = min(max(before.free, after.free), _fastest(before, after, half, machine, normal))
+    widest = math.tan(half) * reach
+    speed = min(math.sqrt(NORMAL_SHARE * limit * widest), goal)
+    # measured: where there is room, the arc lasts as long as half of the acceleration needs for its speed
+    longest = speed * speed / (ALONG_SHARE * limit) / (math.pi - 2.0 * half)
+    radius = min(widest, max(speed * speed / (NORMAL_SHARE * limit), longest))
+    for _ in range(_TRIES):  # beside arcs the widest may not fit
+        found = _touching(one, two, radius, normal, math.tan(half))
+        if found is not None and found[1] <= lengths[0] + _ROUNDING_MM and found[2] <= lengths[1] + _ROUNDING_MM:
+            break
+        radius *= _SMALLER
+    else:
+        return None
+    speed = min(speed, math.sqrt(NORMAL_SHARE * limit * radius))
+    turn, taken = found[0], (min(found[1], one.length), found[2])
+    wanted = max(before.wanted, after.wanted)
+    segment = Segment(before.line, before.rapid, turn, wanted, speed, limit, turn.radius,
+                      before.tolerance, TANGENT, turn.length, between=True)  # fmt: skip
+    return _Arc(segment, taken)
+
+
+def _tolerance(segment: Segment) -> float:
+    return segment.tolerance or segment.nominal * _TOLERANCE_SHARE
+
+
+def _in_plane(shape: Line | Turn, normal: Point) -> bool:
+    if isinstance(shape, Line):
+        return True
+    return shape.flat and abs(abs(dot(cross(shape.u, shape.v), normal)) - 1.0) < 1e-6
+
+
+def _within_plane(limits: Point, normal: Point) -> float:
+    """Return the largest acceleration or speed that may point anywhere in a plane."""
+    scales = [math.sqrt(max(0.0, 1.0 - n * n)) for n in normal]
+    return min(limit / scale for limit, scale in zip(limits, scales, strict=True) if scale > 1e-9)
+
+
+def _fastest(before: Segment, after: Segment, half: float, machine: Machine, normal: Point) -> float:
+    """Return the speed at which the axes' speeds are kept along the whole of an arc from one way to the other."""
+    plane = _within_plane(machine.speed, normal)
+    turned = min(math.pi - 2.0 * half, 0.49 * math.pi)
+    most = plane / math.cos(turned)
+    v1, v2 = (min(most, one.top if isinstance(one.shape, Line) else plane) for one in (before, after))
+    base = math.sqrt(v1 * v1 + v2 * v2 - 2.0 * v1 * v2 * math.cos(turned))
+    altitude = v1 * v2 * math.sin(turned) / base if base > 0.0 else v1
+    return altitude if altitude > 0.0 else min(v1, v2)
+
+
+def _touching(
+    one: Line | Turn, two: Line | Turn, radius: float, normal: Point, steep: float
+) -> tuple[Turn, float, float] | None:
+    """Return the arc of a radius inside the corner, and the lengths that it takes of both."""
+    corner = two.at(0.0)
+    t1 = one.tangent(one.length)
+    reach = radius / steep
+    centre = plus(plus(corner, t1, -reach), cross(normal, t1), radius)
+    for _ in range(30):  # from the centre between the tangents: bring its distance from both to the radius
+        (way1, d1, p1), (way2, d2, p2) = _nearest(one, centre), _nearest(two, centre)
+        off1, off2 = radius - d1, radius - d2
+        if abs(off1) + abs(off2) < 1e-10:
+            break
+        across = dot(cross(way1, way2), normal)
+        if abs(across) < 1e-9:
+            return None
+        shift1, shift2 = cross(way2, normal), cross(normal, way1)
+        centre = plus(plus(centre, shift1, off1 / across), shift2, off2 / across)
+    else:
+        return None
+    u = unit(minus(p1, centre))
+    v = cross(normal, u)
+    last = unit(minus(p2, centre))
+    angle = math.atan2(dot(last, v), dot(last, u)) % (2.0 * math.pi)
+    if not 0.0 < angle < math.pi:
+        return None
+    taken1, taken2 = _length_to(one, p1, True), _length_to(two, p2, False)
+    if taken1 < 0.0 or taken2 < 0.0:
+        return None
+    return Turn(centre, u, v, radius, 0.0, angle, (0.0, 0.0, 0.0), radius * angle), taken1, taken2
+
+
+def _nearest(shape: Line | Turn, place: Point) -> tuple[Point, float, Point]:
+    """Return the way from the nearest point of a shape to a place, its length, and the point."""
+    if isinstance(shape, Line):
+        foot = plus(shape.start, shape.way, dot(minus(place, shape.start), shape.way))
+    else:
+        foot = plus(shape.centre, unit(minus(place, shape.centre)), shape.radius)
+    way = minus(place, foot)
+    return unit(way), math.sqrt(dot(way, way)), foot
+
+
+def _length_to(shape: Line | Turn, point: Point, at_end: bool) -> float:
+    """Return the length from a point on a shape to its end, or from its start to the point; negative beyond."""
+    if isinstance(shape, Line):
+        along = dot(minus(point, shape.start), shape.way)
+    else:
+        out = minus(point, shape.centre)
+        turned = math.atan2(dot(out, shape.v), dot(out, shape.u))
+        if turned < -math.pi / 2.0 or (at_end and turned < 0.0):
+            turned += 2.0 * math.pi
+        if at_end:
+            turned += 2.0 * math.pi * round((shape.angle - turned) / (2.0 * math.pi))
+        along = turned * shape.radius
+    return shape.length - along if at_end else along

@@ -1,0 +1,158 @@
+"""The servo cycles: each one moves the segment under way, and beside a parabola the next one too."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+from fdhil.program.motions import Point
+from fdhil.program.planner.linuxcnc.blends import blend_speeds
+from fdhil.program.planner.linuxcnc.segments import PARABOLA, TANGENT, Segment
+from fdhil.program.planner.linuxcnc.shapes import minus, plus
+
+_AT_END_MM = 1e-12
+_SPEED = 1e-8
+_LEAST_S = 1e-12
+_RAMP_S = 0.01  # segments that last no longer change their speed evenly
+
+
+class Cycles:
+    """Runs the segments of a queue; ``at`` is where the axes are ordered to be."""
+
+    def __init__(self, queue: deque[Segment], dt_s: float) -> None:
+        self._queue = queue
+        self._dt_s = dt_s
+        self.at: Point = (0.0, 0.0, 0.0)
+        self._begun: Segment | None = None
+        self._target = self._target_next = self._end_speed = 0.0
+        self._along = self._along_next = 0.0
+        self._ramp = False
+        self._braking = False
+        self._blend_from = 0.0  # speed at which the blend under way began, 0 for none
+        self._speeds = (0.0, 0.0)
+        self._left_s = 0.0  # of a cycle within which the segment under way ends
+        self._left_over = self._end = 0.0
+
+    def step(self) -> Point:
+        """Run one cycle and return the point that it orders."""
+        queue = self._queue
+        here = queue[0]
+        if here is not self._begun:
+            self._begin(here)
+        if self._left_s:
+            here = self._over()
+            self._move(here, self._dt_s - self._left_over, self._along)
+            self.at = here.shape.at(here.place)
+        else:
+            self._move(here, self._dt_s, self._along)
+            self.at = here.shape.at(here.place)
+            if here.ending == PARABOLA and len(queue) > 1:
+                self._blend(here, queue[1])
+        self._check_end(here)
+        return self.at
+
+    def _begin(self, here: Segment) -> None:
+        """Take the limits of a segment that becomes the one under way."""
+        self._begun, self._along, self._target = here, here.along, here.target
+        self._target_next = self._queue[1].target if len(self._queue) > 1 else 0.0
+        self._end_speed = min(here.end_speed, self._target, self._target_next) if here.ending == TANGENT else 0.0
+        self._blend_from = 0.0
+        length = here.shape.length
+        self._ramp = False
+        if here.ending == TANGENT and not here.rapid:
+            mean = here.speed + min(here.end_speed, self._target)
+            self._ramp = mean > 0.0 and 2.0 * length / mean < _RAMP_S
+        if here.ending == PARABOLA and len(self._queue) > 1:
+            after = self._queue[1]
+            self._speeds = blend_speeds(here, after)[:2]
+            self._along_next = after.along
+
+    def _move(self, here: Segment, dt: float, along: float) -> None:
+        if not (self._ramp and self._ramped(here, dt, along, self._end_speed)):
+            self._braking = _advance(here, dt, along, self._end_speed, self._target)
+
+    def _ramped(self, here: Segment, dt: float, along: float, end: float) -> bool:
+        """Change the speed evenly up to the end of the segment; False where that asks for too much."""
+        to_go = here.shape.length - here.place
+        mean = (here.speed + end) / 2.0
+        if mean <= _SPEED or to_go <= 0.0:
+            return False
+        rate = (end - here.speed) * mean / to_go
+        if abs(rate) > along:
+            return False
+        speed = here.speed + rate * dt
+        here.place = min(here.shape.length, here.place + (here.speed + speed) / 2.0 * dt)
+        here.speed = speed
+        self._braking = rate < 0.0
+        return True
+
+    def _blend(self, here: Segment, after: Segment) -> None:
+        """Speed the next segment up as far as this one has slowed down."""
+        if not self._blend_from:
+            if not (self._braking and here.speed < self._speeds[0]):
+                return
+            self._blend_from = max(here.speed, _SPEED)
+        done = min(1.0, max(0.0, (self._blend_from - here.speed) / self._blend_from))
+        target = done * self._speeds[1] * self._blend_from / self._speeds[0]
+        _advance(after, self._dt_s, self._along_next, 0.0, min(target, self._target_next))
+        self.at = plus(self.at, minus(after.shape.at(after.place), after.shape.at(0.0)))
+
+    def _check_end(self, here: Segment) -> None:
+        """Go on to the next segment at the end of this one; within a cycle where it does not stop."""
+        to_go = here.shape.length - here.place
+        if to_go <= _AT_END_MM:
+            self._pass_on(here, here.speed)
+            return
+        if here.ending != TANGENT or len(self._queue) < 2:
+            return
+        end = self._end_speed
+        mean = (here.speed + end) / 2.0
+        if mean <= _SPEED:
+            return
+        left = to_go / mean
+        rate = (end - here.speed) / left
+        if abs(rate) > self._along:
+            rate = math.copysign(self._along, rate)
+            root = math.sqrt(max(0.0, (here.speed / rate) ** 2 + 2.0 * to_go / rate))
+            left = -here.speed / rate + math.copysign(root, rate)
+            end = here.speed + left * rate
+        if left < _LEAST_S:
+            self._pass_on(here, end)
+        elif left < self._dt_s:
+            self._left_s, self._end = left, end
+
+    def _over(self) -> Segment:
+        """Leave the segment under way for the next, in the midst of a cycle."""
+        self._left_over, self._left_s = self._left_s, 0.0
+        self._pass_on(self._queue[0], self._end)
+        here = self._queue[0]
+        self._begin(here)
+        return here
+
+    def _pass_on(self, here: Segment, speed: float) -> None:
+        self._queue.popleft()
+        if self._queue and here.ending == TANGENT:
+            self._queue[0].speed = speed
+
+
+def _advance(here: Segment, dt: float, along: float, end: float, target: float) -> bool:
+    """Move a segment by one cycle toward ``target``, so that it can still end at ``end``.
+
+    The speed is the highest from which it can brake in whole cycles; True while it brakes for that.
+    """
+    speed = here.speed
+    to_go = here.shape.length - here.place
+    half = along * dt / 2.0
+    root = end * end + along * (2.0 * to_go - speed * dt) + half * half
+    highest = math.sqrt(root) - half if root > half * half else -half
+    wanted = min(highest, target)
+    rate = min(along, max(-along, (wanted - speed) / dt))
+    new = speed + rate * dt
+    if new < 0.0:
+        new = 0.0
+        if to_go < speed * dt:
+            here.place = here.shape.length
+    else:
+        here.place = min(here.shape.length, here.place + (new + speed) / 2.0 * dt)
+    here.speed = new
+    return abs(highest - new) < _SPEED and rate < 0.0

@@ -1,0 +1,48 @@
+"""Joining short lines within Q (G64 P Q): feeds one behind the other become one where none of their ends is far off.
+
+As LinuxCNC does before it plans: a feed is joined to those before it while every end between stays within Q of the
+line from where the first began to where the last ends, and no more than a hundred are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from fdhil.program.motions import Feed, Motion, Point
+from fdhil.program.planner.linuxcnc.shapes import dot, minus, plus
+
+_MOST = 100
+
+
+def joined(motions: Iterable[Motion], start: Point = (0.0, 0.0, 0.0)) -> Iterator[Motion]:
+    """Yield motions with the feeds joined that their corner's ``joining_mm`` allows."""
+    chain: list[Feed] = []
+    at = start
+    for motion in motions:
+        if chain and not (isinstance(motion, Feed) and _linkable(at, chain, motion)):
+            yield chain[-1]
+            at = chain[-1].end
+            chain.clear()
+        if isinstance(motion, Feed) and motion.corner.mode == "blend":
+            if motion.end != at or chain:
+                chain.append(motion)
+            continue
+        yield motion
+        at = getattr(motion, "end", at)
+    if chain:
+        yield chain[-1]
+
+
+def _linkable(at: Point, chain: list[Feed], motion: Feed) -> bool:
+    last = chain[-1]
+    if motion.corner != last.corner or motion.feed != last.feed or len(chain) > _MOST or motion.end == at:
+        return False
+    way = minus(motion.end, at)
+    square = dot(way, way)
+    for feed in chain:
+        off = minus(feed.end, at)
+        share = min(1.0, max(0.0, dot(way, off) / square))
+        beside = minus(off, plus((0.0, 0.0, 0.0), way, share))
+        if dot(beside, beside) > last.corner.joining_mm**2:
+            return False
+    return True

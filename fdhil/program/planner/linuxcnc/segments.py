@@ -1,0 +1,131 @@
+"""Segments: one motion each as LinuxCNC's planner queues it, with its limits and how it goes over into the next."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from fdhil.program.motions import Arc, Feed, Point, Rapid
+from fdhil.program.planner.limits import AxisLimits
+from fdhil.program.planner.linuxcnc import shapes
+from fdhil.program.planner.linuxcnc.shapes import Shape, Turn
+
+STOP, EXACT, PARABOLA, TANGENT = range(4)  # how a segment ends
+NORMAL_SHARE = math.sqrt(0.75)  # of the acceleration that turning may take
+ALONG_SHARE = 0.5  # what is left along the path then
+_SHORTEST_CYCLES = 3.0
+_LEAST_RADIUS_MM = 1e-6
+_ENDS = {"exact_stop": STOP, "exact_path": EXACT, "blend": PARABOLA}
+
+
+@dataclass(slots=True)
+class Segment:
+    """A piece of path with its limits: ``wanted`` mm/s as programmed, ``top`` mm/s, ``acceleration`` mm/s2.
+
+    ``bent`` is the radius of its curvature, infinite for a line; ``kink_speed`` is what its end may be passed with
+    without a blend, at the price of ``kept_back`` and ``kept_back_before`` of the acceleration.
+    """
+
+    line: int
+    rapid: bool
+    shape: Shape
+    wanted: float
+    top: float
+    acceleration: float
+    bent: float
+    tolerance: float
+    ending: int
+    nominal: float
+    kink_speed: float = math.inf
+    kept_back: float = 0.0
+    kept_back_before: float = 0.0
+    after_parabola: bool = False
+    end_speed: float = 0.0
+    place: float = 0.0
+    speed: float = 0.0
+    between: bool = False  # an arc put between two motions
+    settled: bool = False  # its end will not move any more
+
+    @property
+    def free(self) -> float:
+        """Speed that it may reach as long as nothing is known of its neighbours."""
+        return min(self.wanted, self.top)
+
+    @property
+    def target(self) -> float:
+        """Speed that it may reach."""
+        speed = self.free
+        if self.bent < math.inf:
+            speed = min(speed, math.sqrt(NORMAL_SHARE * self._left * self.bent))
+        return speed
+
+    @property
+    def _left(self) -> float:
+        """Acceleration in all: halved beside a parabola, since both neighbours accelerate there."""
+        left = self.acceleration * (1.0 - max(self.kept_back, self.kept_back_before))
+        return left * 0.5 if self.ending == PARABOLA or self.after_parabola else left
+
+    @property
+    def along(self) -> float:
+        """Acceleration along the path: what turning at the top speed leaves over, and at least half."""
+        left = self._left
+        turning = self.top * self.top / self.bent
+        if turning <= 0.0:
+            return left
+        if self.between or turning >= NORMAL_SHARE * left:
+            return left * ALONG_SHARE
+        return math.sqrt(left * left - turning * turning)
+
+    @property
+    def reachable(self) -> float:
+        """Speed that it reaches from rest to rest; half of a segment may still go to a blend."""
+        length = self.shape.length if self.settled else self.shape.length / 2.0
+        return min(self.target, math.sqrt(self.along * length))
+
+    def settle(self, dt_s: float) -> None:
+        """Take as long as three cycles at least, now that its length is final."""
+        self.settled = True
+        self.top = min(self.top, self.shape.length / (_SHORTEST_CYCLES * dt_s))
+
+
+def segment(motion: Rapid | Feed | Arc, start: Point, limits: AxisLimits) -> Segment | None:
+    """Return the segment of a motion, None where it has no length."""
+    if isinstance(motion, Arc):
+        return _turn(motion, shapes.turn(motion, start), limits)
+    shape = shapes.line(start, motion.end)
+    if shape.length <= 0.0:
+        return None
+    top, acceleration = (
+        min(limit / abs(part) for limit, part in zip(axes, shape.way, strict=True) if part)
+        for axes in (limits.speed, limits.acceleration)
+    )
+    return _segment(motion, shape, top, acceleration, math.inf)
+
+
+def _segment(motion: Rapid | Feed | Arc, shape: Shape, top: float, acceleration: float, bent: float) -> Segment:
+    rapid = isinstance(motion, Rapid)
+    corner = motion.corner
+    wanted = top if isinstance(motion, Rapid) else motion.feed / 60.0
+    tolerance = corner.tolerance_mm if math.isfinite(corner.tolerance_mm) else 0.0
+    ending = _ENDS[corner.mode]
+    return Segment(motion.line, rapid, shape, wanted, top, acceleration, bent, tolerance, ending, shape.length)
+
+
+def _turn(motion: Arc, shape: Turn, limits: AxisLimits) -> Segment | None:
+    if shape.length <= 0.0:
+        return None
+    turning = (shape.radius + shape.growth / 2.0) * shape.angle
+    rise = [abs(part) for part in shape.rise]
+    plane = [axis for axis in range(3) if shape.u[axis] or shape.v[axis]]
+    bounds = []
+    for axes in (limits.speed, limits.acceleration):
+        longest = turning / min(axes[axis] for axis in plane)
+        longest = max([longest, *(rise[axis] / axes[axis] for axis in range(3) if rise[axis])])
+        bounds.append(shape.length / longest)
+    top, acceleration = bounds
+    radius = min(shape.radius, shape.radius + shape.growth)
+    steep = shape.length / turning
+    top = min(top, math.sqrt(NORMAL_SHARE * acceleration * steep * radius))
+    # measured: of a helix the whole rise counts, not that of a radian, so that it keeps more along the path
+    bent = radius + sum(rise) ** 2 / radius if radius else _LEAST_RADIUS_MM
+    return _segment(motion, shape, top, acceleration, bent)
