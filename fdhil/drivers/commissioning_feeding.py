@@ -48,7 +48,8 @@ def feedforward_open(master: Master) -> Iterator[dict[str, int]]:
             master.sdo.write_int(parameter, 1, before, 4)
             _write_zeros(master, spec)
         except DeviceError as left:
-            text = f"{str(error).removeprefix(f'{master.device}: ')}; 60B1, 60B2 or their RPDO stay as they are ({left}); power the drive off and on again"
+            cause = str(error).removeprefix(f"{master.device}: ")
+            text = f"{cause}; 60B1, 60B2 or their RPDO stay as they are ({left}); power the drive off and on again"
             raise ProtocolError(master.device, text) from error
         raise
 

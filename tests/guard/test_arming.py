@@ -204,3 +204,50 @@ def test_each_class_has_cause_effect_and_action(code: str) -> None:
     assert alarm.action.strip()
     assert "\n" not in sentence
     assert isinstance(alarm.reaction, Reaction)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"feedback_age": 1.0},
+        {"heartbeat_age_s": 0.5},
+        {"following_error": 16384.0},
+        {"following_error": -16384.0},
+        {"echo_misses": 1},
+        {"feed_misses": 1},
+        {"implausible": 1},
+        {"short_frames": 2},
+        {"nmt": None},
+        {"read_back": None},
+        {"fed_back": (None, 0)},
+        {"window": 4 * 819},
+    ],
+)
+def test_the_last_good_value_is_good(change: dict[str, Any]) -> None:
+    """One step before each bound nothing is refused and nothing stops."""
+    bus = BusView(sync_regular=True, silent=False)
+    assert failing(bus, (changed(change),)) == ()
+    assert not_ready((changed(change),)) == ()
+
+
+@pytest.mark.parametrize(
+    ("bus", "codes"),
+    [
+        (BusView(), {"SyncLost", "SyncJitter"}),
+        (BusView("warning", True, False), set()),
+        (BusView("down", True, False), {"BusDown"}),
+        (BusView("off", True, False), {"BusOff"}),
+        (BusView("passive", True, False), {"ErrorPassive"}),
+        (BusView("active", False, False), {"SyncJitter"}),
+        (BusView("active", True, True), {"SyncLost"}),
+        (BusView("active", True, False, 1), {"RxOverflow"}),
+    ],
+)
+def test_what_the_bus_alone_forbids(bus: BusView, codes: set[str]) -> None:
+    assert {alarm.code for alarm in failing(bus, (GOOD,))} == codes
+
+
+def test_feedback_that_is_three_old_is_a_gap_four_is_stale() -> None:
+    bus = BusView(sync_regular=True, silent=False)
+    assert {alarm.code for alarm in failing(bus, (changed({"feedback_age": 3.0}),))} == {"FeedbackGap"}
+    assert {alarm.code for alarm in failing(bus, (changed({"feedback_age": 3.5}),))} == {"FeedbackGap", "StaleData"}

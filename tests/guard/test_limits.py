@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fdhil.guard.limits import Limits, Travel, approach, brake, follow, stopping, violation
@@ -155,6 +155,8 @@ def test_total_variation_is_that_of_any_second() -> None:
     assert set(pieces[11:]) == {"OffsetEnergy"}
 
 
+@example([9] * 350)
+@example([k % 19 - 9 for k in range(350)])
 @given(st.lists(st.integers(-9, 9), min_size=1, max_size=350))
 def test_travel_lies_between_nine_tenths_of_a_second_and_a_whole_one(moves: list[int]) -> None:
     travel = Travel()

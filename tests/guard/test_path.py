@@ -61,6 +61,7 @@ def test_costs_add_up_and_the_cheapest_is_first() -> None:
     ]
     assert advance(flat, places, None) == tuple(Place(place.row + 1, place.cost) for place in places)
     assert advance(flat, (Place(6),), (6,)) == ()
+    assert advance(flat, (Place(3), Place(5)), (6,)) == (Place(6, 0), Place(4, 2))
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.1, 0.5, 1.0, 1.5])
