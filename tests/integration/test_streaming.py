@@ -1,4 +1,4 @@
-"""A program longer than the guard's ring: planned, handed on and applied while the machine runs."""
+"""A program longer than the guard's ring: checked as a whole, handed on and applied while the machine runs."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdhil.daemon.streamed import FIRST_BLOCKS, Stream
+from fdhil.daemon.program_check import check, keep
+from fdhil.daemon.streamed import FIRST_S, Checked, Stream
 from fdhil.daemon.token import read_token
 from fdhil.guard.client import GuardClient
 from fdhil.guard.interlocks import FACTS
@@ -21,7 +22,7 @@ from fdhil.prediction.models import nominal_models
 from fdhil.records import Float
 from tests.integration.conftest import PATIENCE_S, Bench
 from tests.integration.test_guard import DIGEST, client, sections
-from tests.paths import bench_demand, rms, trajectory
+from tests.paths import bench_demand, rms
 
 pytestmark = pytest.mark.timeout(300)
 __all__ = ["client", "sections"]
@@ -76,8 +77,12 @@ def test_a_program_longer_than_the_ring(bench: Bench, client: GuardClient, tmp_p
     )
     bench.command('{"command": "nc", "on": true}')
     bench.event("nc")
-    stream = Stream.of(trajectory(path), nominal_models(bench.config), bench.config, DIGEST)
-    piece = stream.take(FIRST_BLOCKS)
+    models = nominal_models(bench.config)
+    keep(tmp_path, "key", lambda body: check(demand, models, bench.config, body, lambda told: None))
+    checked = Checked.find(tmp_path, "key")
+    assert checked is not None
+    stream = Stream(checked, DIGEST, 0.001)
+    piece = stream.take(FIRST_S)
     assert client.load("XY", piece.demand, piece.offset, DIGEST, piece.first, piece.final)["ok"]
     run = bench.config.store.run_directory
     assert run is not None
@@ -101,13 +106,12 @@ def test_a_program_longer_than_the_ring(bench: Bench, client: GuardClient, tmp_p
                 assert answer["ok"], answer
             else:
                 time.sleep(0.01)
-    # one process plans here and runs the twin: it may sleep longer than the twin waits, a few cycles of 30,000
+    # one process hands on here and runs the twin: it may sleep longer than the twin waits, a few cycles of 30,000
     assert max(bench.event("finished")["late_rpdo"].values()) < 10
-    assert stream.final
+    assert stream.done
     assert states <= {"RAMPING", "ACTIVE"}
     assert held < 15_000  # the ring, not the program
     cause = client.status()["cause"]
     assert cause["code"] == "Finished"
-    before = np.concatenate([stream.before_um])
     after = contour_um(trace, len(path))[400:]
-    assert rms(before) > 20 * rms(after)
+    assert checked.header["before"]["rms_um"] > 20 * rms(after)
