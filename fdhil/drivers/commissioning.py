@@ -16,7 +16,6 @@ from fdhil import cia402
 from fdhil.cia402 import Mode, NmtCommand, Object, State
 from fdhil.config import CorrectionLimits, MachineConfig
 from fdhil.drivers import commissioning_checks as checks
-from fdhil.drivers.canopen_sdo import NO_OBJECT, NO_SUB_INDEX
 from fdhil.drivers.commissioning_feeding import feedforward_open, prove_feedforward
 from fdhil.drivers.commissioning_master import Master
 from fdhil.drivers.commissioning_record import (
@@ -26,7 +25,8 @@ from fdhil.drivers.commissioning_record import (
     record_path,
     save_record,
 )
-from fdhil.errors import DeviceError, DriveFault, ProtocolError, SdoAbort
+from fdhil.drivers.commissioning_watchdog import watchdog_test
+from fdhil.errors import DeviceError, DriveFault, ProtocolError
 
 __all__ = [
     "CommissioningRecord",
@@ -45,12 +45,7 @@ AVERAGE_CYCLES = 200
 RAMPS = 8
 RAMP_CYCLES = 20
 EARLY_CYCLES = 8
-FEEDING_TRIES = 4
 FEEDFORWARD_TRIES = 3
-FEEDING_S = 0.3
-STARVE_TIMEOUT_S = 1.0
-HEARTBEATS_MISSED = 3
-EMCY_HEARTBEAT = 0x8130
 
 
 def prepare(master: Master) -> None:
@@ -80,7 +75,7 @@ def enable(master: Master) -> None:
             )
         if master.state() is State.FAULT:
             if reset_tried:
-                raise _faulted(master, "it is in fault")
+                raise checks.faulted(master, "it is in fault")
             master.controlword, reset_tried = 0, True
             master.wait_cycles(10)
         word = cia402.controlword_toward_enabled(master.state())
@@ -96,18 +91,7 @@ def enable(master: Master) -> None:
             "it does not take the mode cyclic synchronous position; check 0x6060 and 0x6502",
         )
     master.wait_cycles(SETTLE_CYCLES)
-    _require_enabled(master)
-
-
-def _faulted(master: Master, what: str) -> DriveFault:
-    code = checks.read_optional(master, 0x603F)
-    shown = "no error code" if code is None else f"error code {code:04X}"
-    return DriveFault(master.device, f"{what} ({shown}); remove the cause and start again")
-
-
-def _require_enabled(master: Master) -> None:
-    if master.state() is not State.OPERATION_ENABLED:
-        raise _faulted(master, f"it fell from Operation enabled to {master.state().value}")
+    checks.require_enabled(master)
 
 
 def disable(master: Master) -> None:
@@ -170,7 +154,7 @@ def sign_test(master: Master) -> float:
     table = master.average(profile.position, AVERAGE_CYCLES)
     ramp(master, step, 1)
     master.wait_cycles(SETTLE_CYCLES)
-    _require_enabled(master)
+    checks.require_enabled(master)
     held = master.sdo.read_int(*profile.offset, signed=True)
     if held != step:
         raise DriveFault(
@@ -214,7 +198,7 @@ def feedforward_test(master: Master) -> bool | None:
         excess += _early_excess(master, goal, step, gain)
         master.wait_cycles(SETTLE_CYCLES // 2)
     ramp(master, 0, 1)
-    _require_enabled(master)
+    checks.require_enabled(master)
     if len(excess) < RAMPS:
         return None
     mean = sum(excess) / len(excess)
@@ -263,77 +247,6 @@ def _early_excess(master: Master, goal: int, step: int, gain_per_s: float) -> li
     return excess
 
 
-def watchdog_test(master: Master) -> str:
-    """Feed the drive our heartbeat, then starve it: it must stop by itself. Returns ``proven``; else DriveFault."""
-    node_id, period_s = master.config.guard.node_id, master.config.guard.heartbeat_s
-    entry = node_id << 16 | round(HEARTBEATS_MISSED * period_s * 1e3)
-    with contextlib.ExitStack() as undo:
-        sub, before = _consumer_slot(master, node_id)
-        master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, 0, 4)
-        undo.callback(master.sdo.write_int, Object.CONSUMER_HEARTBEAT, sub, before, 4)
-        undo.callback(setattr, master, "heartbeat", False)
-        _feed(master, sub, entry)
-        told = len(master.heard.emergencies)
-        master.heartbeat = False
-        with contextlib.suppress(DeviceError):
-            master.wait(lambda: master.state() is not State.OPERATION_ENABLED, STARVE_TIMEOUT_S, "")
-        master.check()
-        if master.state() is State.OPERATION_ENABLED:
-            raise DriveFault(
-                master.device,
-                "it went on although our heartbeat stopped: its watchdog does not work; check 0x1016 and 0x6007",
-            )
-        codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[told:]]
-        if EMCY_HEARTBEAT not in codes:
-            shown = ", ".join(f"{code:04X}" for code in codes) or "none"
-            raise DriveFault(
-                master.device, f"it stopped with the EMCY {shown} instead of 8130; find out what else stops it"
-            )
-    return "proven"
-
-
-def _feed(master: Master, sub: int, entry: int) -> None:
-    """Have the drive watch our heartbeat, and keep it content for a while; DriveFault when that cannot be done.
-
-    A busy computer sends a heartbeat late now and then, and the drive is right to stop then; that is tried again.
-    """
-    for _ in range(FEEDING_TRIES):
-        master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, entry, 4)
-        if master.sdo.read_int(Object.CONSUMER_HEARTBEAT, sub) != entry:
-            raise DriveFault(master.device, "it does not keep 0x1016; it cannot watch over fdhil and must not be armed")
-        told = len(master.heard.emergencies)
-        master.heartbeat = True
-        master.wait_cycles(round(FEEDING_S / master.period_s))
-        if master.state() is State.OPERATION_ENABLED:
-            return
-        codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[told:]]
-        if EMCY_HEARTBEAT not in codes:
-            _require_enabled(master)
-        master.heartbeat = False
-        master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, 0, 4)
-        enable(master)
-    raise DriveFault(
-        master.device,
-        f"it missed our heartbeat {FEEDING_TRIES} times; take load off this computer and try again",
-    )
-
-
-def _consumer_slot(master: Master, node_id: int) -> tuple[int, int]:
-    """Return a sub-index of 0x1016 that is free or ours, and its value."""
-    try:
-        count = master.sdo.read_int(Object.CONSUMER_HEARTBEAT, 0)
-        for sub in range(1, count + 1):
-            value = master.sdo.read_int(Object.CONSUMER_HEARTBEAT, sub)
-            if value & 0xFFFF == 0 or value >> 16 & 0x7F == node_id:
-                return sub, value
-    except SdoAbort as abort:
-        if abort.code not in (NO_OBJECT, NO_SUB_INDEX):
-            raise
-        text = "it has no heartbeat consumer (0x1016), so it cannot notice when fdhil dies; it must not be armed"
-        raise DriveFault(master.device, text) from None
-    raise DriveFault(master.device, "all entries of 0x1016 are taken; free one with the drive's tool")
-
-
 def check_axis(master: Master) -> checks.Survey:
     """All that can be checked without moving; DriveFault for the first point that differs."""
     found = checks.survey(master)
@@ -367,7 +280,7 @@ def commission(
                 report("feed-forward test")
                 in_feedforward = tell_feedforward(master)
                 report("watchdog test")
-                watchdog = watchdog_test(master)
+                watchdog = watchdog_test(master, enable)
                 report("restore")
     return CommissioningRecord(
         axis=axis,

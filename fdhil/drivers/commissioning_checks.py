@@ -10,7 +10,7 @@ import hashlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
-from fdhil.cia402 import Mode, Object
+from fdhil.cia402 import Mode, Object, State
 from fdhil.config import CorrectionLimits
 from fdhil.drivers.canopen_sdo import NO_OBJECT, NO_SUB_INDEX
 from fdhil.drivers.commissioning_master import Master
@@ -328,3 +328,16 @@ def compare_window(master: Master, options: Mapping[str, int], window_um: float)
     same = abs(window_um - wanted) <= 0.01 * wanted
     other = f"{cause} where the config has {wanted:g}"
     yield Finding(point, expected, f"{window_um:g} um", same, other, "correct drive.following_error_window_mm")
+
+
+def faulted(master: Master, what: str) -> DriveFault:
+    """Return what to raise for a drive in fault, with its error code."""
+    code = read_optional(master, 0x603F)
+    shown = "no error code" if code is None else f"error code {code:04X}"
+    return DriveFault(master.device, f"{what} ({shown}); remove the cause and start again")
+
+
+def require_enabled(master: Master) -> None:
+    """Raise DriveFault when the drive is not in Operation enabled any more."""
+    if master.state() is not State.OPERATION_ENABLED:
+        raise faulted(master, f"it fell from Operation enabled to {master.state().value}")

@@ -12,9 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdhil.config import MachineConfig, Nominal, Regulators, SimAxis
-from fdhil.errors import ConfigError, ConfigFault
-from fdhil.records import Parameters
+from fdhil.config import MachineConfig, SimAxis
 from fdhil.sim import monitor
 from fdhil.sim.dictionary import Dictionary
 from fdhil.sim.feedback import Feedback, clip16
@@ -22,7 +20,7 @@ from fdhil.sim.monitor import Emergencies, HeartbeatConsumer, HeartbeatProducer
 from fdhil.sim.motion import Motion, Source
 from fdhil.sim.objects import NO_WINDOW, Ratings, drive_objects
 from fdhil.sim.pdo import Frame, PdoEngine
-from fdhil.sim.physics import Physics
+from fdhil.sim.physics import Physics, check_structure, true_parameters
 from fdhil.sim.power import PowerStage, State
 from fdhil.sim.rules import Stored, register_rules
 from fdhil.sim.sdo import SdoServer
@@ -32,8 +30,6 @@ from fdhil.sim.trace import TraceBuffer
 
 __all__ = ["Drive", "DriveFaults", "Frame", "SignalFault"]
 
-# what regulators other than these would need, this drive does not have
-_PLAIN = {"structure": "p_pi_pi", "torque_feedforward": 0.0, "setpoint_filter_s": 0.0, "current_delay_cycles": 0}
 OFF, STOPPED, OPERATIONAL, PRE_OPERATIONAL = -1, 0x04, 0x05, 0x7F
 
 
@@ -47,7 +43,7 @@ class Drive:
 
     def __init__(self, axis: str, config: MachineConfig, rng: np.random.Generator) -> None:
         section = config.axis[axis]
-        _check_structure(axis, section.regulators)
+        check_structure(axis, section.regulators)
         twin = config.sim.axis.get(axis, SimAxis())
         self.axis = axis
         self.ratings = Ratings.of(config, axis)
@@ -56,7 +52,7 @@ class Drive:
         self._mm_per_rad = self.ratings.sign * section.screw_pitch_mm / (2 * math.pi)
         self._reference_c = self._celsius = config.sim.thermal.ambient_c
         self._per_kelvin = (twin.ft_per_kelvin, twin.Cd_per_kelvin)
-        self._parameters = _true_parameters(section.nominal, twin)
+        self._parameters = true_parameters(section.nominal, twin)
         self.physics = Physics(
             self._parameters,
             section.regulators,
@@ -382,24 +378,3 @@ class Drive:
     def late_rpdos(self) -> dict[int, int]:
         """Per RPDO number, the cycles of enabled CSP in which it was missing after a cycle in which it was there."""
         return self.pdo.late
-
-
-def _true_parameters(nominal: Nominal, twin: SimAxis) -> Parameters:
-    """Return the plant's parameters: the nominal values where the twin names none."""
-    return Parameters(
-        *(
-            float(getattr(nominal if getattr(twin, name) is None else twin, name))
-            for name in ("R", "L", "K", "Jt", "ft", "Cd")
-        )
-    )
-
-
-def _check_structure(axis: str, regulators: Regulators) -> None:
-    """Raise ConfigError for regulators that the simulated drive does not have: it would run others silently."""
-    faults = [
-        ConfigFault(f"axis.{axis}.regulators.{key}", "the simulated drive does not have it", f"leave it at {plain!r}")
-        for key, plain in _PLAIN.items()
-        if getattr(regulators, key) != plain
-    ]
-    if faults:
-        raise ConfigError("sim", faults)

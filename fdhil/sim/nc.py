@@ -7,7 +7,6 @@ runs its set-point ``delay`` cycles late, follows r[k] at SYNC k. All its times 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Any, NamedTuple
 
@@ -17,7 +16,7 @@ from fdhil.config import MachineConfig
 from fdhil.records import Trajectory
 from fdhil.sim.hub import Frame
 from fdhil.sim.nc_link import ENABLED, SHUTDOWN, BusFrame, Link, Request
-from fdhil.sim.path import Player, Rate, rapid_rows
+from fdhil.sim.path import Job, Pause, Player, Rate, Stage, rapid_rows
 from fdhil.sim.power import State
 
 Event = dict[str, Any]
@@ -49,29 +48,6 @@ class Row(NamedTuple):
     position_mm: list[float]
     rapid: bool
     playing: bool
-
-
-@dataclass(slots=True)
-class _Pause:
-    """Rest for a number of cycles."""
-
-    cycles: int
-
-    @property
-    def ended(self) -> bool:
-        return self.cycles <= 0
-
-
-@dataclass(slots=True)
-class _Stage:
-    motion: Player | _Pause
-    playing: bool = False
-
-
-@dataclass(slots=True)
-class _Job:
-    file: str
-    trajectory: Trajectory
 
 
 class Nc:
@@ -107,9 +83,9 @@ class Nc:
         slope = min(a / v for a, v in zip(self._accelerations, self._speeds, strict=True))
         self._rate = Rate(min(slope, 0.5 / period), period)
         self._rows: deque[Row] = deque(maxlen=self._delay + 1)
-        self._stages: deque[_Stage] = deque()
+        self._stages: deque[Stage] = deque()
         self._requests: deque[Request] = deque()
-        self._job: _Job | None = None
+        self._job: Job | None = None
         self._position = [0.0] * len(self._links)
         self._counter = 0
         self._waited = 0
@@ -137,7 +113,7 @@ class Nc:
         if refusal:
             self._complain(f"{file} cannot be played: {refusal}")
             return
-        self._job = _Job(file, trajectory)
+        self._job = Job(file, trajectory)
         self._played, self._given_up = 0, False
         if self.phase is Phase.READY:
             self._start_job()
@@ -320,10 +296,10 @@ class Nc:
             self._position, rows[0], self._speeds, self._accelerations, self._smoothing_s, self._period_s
         )
         if len(rapid):
-            self._stages.append(_Stage(Player(rapid, np.ones(len(rapid), dtype=bool))))
-            self._stages.append(_Stage(_Pause(round(_SETTLE_S / self._period_s))))
-        self._stages.append(_Stage(Player(rows, trajectory.rapid), playing=True))
-        self._stages.append(_Stage(_Pause(round(TAIL_S / self._period_s)), playing=True))
+            self._stages.append(Stage(Player(rapid, np.ones(len(rapid), dtype=bool))))
+            self._stages.append(Stage(Pause(round(_SETTLE_S / self._period_s))))
+        self._stages.append(Stage(Player(rows, trajectory.rapid), playing=True))
+        self._stages.append(Stage(Pause(round(TAIL_S / self._period_s)), playing=True))
 
     def _stream(self) -> list[BusFrame]:
         self._supervise()
@@ -353,7 +329,7 @@ class Nc:
             self._at_rest()
             return Row(self._position, False, False)
         stage = self._stages[0]
-        if isinstance(stage.motion, _Pause):
+        if isinstance(stage.motion, Pause):
             stage.motion.cycles -= 1
             return Row(self._position, False, stage.playing)
         self._position, rapid = stage.motion.step(rate)

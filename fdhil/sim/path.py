@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from fdhil.records import Bool, Float
+from fdhil.records import Bool, Float, Trajectory
 
 NEGLIGIBLE_MM = 1e-9  # far below an increment of any drive
 
@@ -112,3 +113,31 @@ class Player:
             p1 + 0.5 * part * (p2 - p0 + part * (2 * p0 - 5 * p1 + 4 * p2 - p3 + part * (3 * (p1 - p2) + p3 - p0)))
             for p0, p1, p2, p3 in zip(before, here, after, beyond, strict=True)
         ]
+
+
+@dataclass(slots=True)
+class Pause:
+    """Rest for a number of cycles."""
+
+    cycles: int
+
+    @property
+    def ended(self) -> bool:
+        """Whether it is over."""
+        return self.cycles <= 0
+
+
+@dataclass(slots=True)
+class Stage:
+    """Something to do along the path: a motion or a rest, and whether it is part of the played file."""
+
+    motion: Player | Pause
+    playing: bool = False
+
+
+@dataclass(slots=True)
+class Job:
+    """A file that is to be played, and the demand that it holds."""
+
+    file: str
+    trajectory: Trajectory

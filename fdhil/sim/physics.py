@@ -17,9 +17,12 @@ import math
 import numba
 import numpy as np
 
-from fdhil.config import Regulators
+from fdhil.config import Nominal, Regulators, SimAxis
+from fdhil.errors import ConfigError, ConfigFault
 from fdhil.records import Float, Parameters
 
+# what regulators other than these would need, this drive does not have
+_PLAIN = {"structure": "p_pi_pi", "torque_feedforward": 0.0, "setpoint_filter_s": 0.0, "current_delay_cycles": 0}
 # places in the state vector
 CURRENT, SPEED, ANGLE, TABLE, SPEED_INTEGRAL, CURRENT_INTEGRAL, FRICTION_WORK = range(7)
 # places in the loops vector
@@ -254,3 +257,24 @@ class Physics:
         self.current_a, self.speed_rad_s, self.angle_rad, self.table_rad, _, _, self.friction_work_j = (
             self._state.tolist()
         )
+
+
+def true_parameters(nominal: Nominal, twin: SimAxis) -> Parameters:
+    """Return the plant's parameters: the nominal values where the twin names none."""
+    return Parameters(
+        *(
+            float(getattr(nominal if getattr(twin, name) is None else twin, name))
+            for name in ("R", "L", "K", "Jt", "ft", "Cd")
+        )
+    )
+
+
+def check_structure(axis: str, regulators: Regulators) -> None:
+    """Raise ConfigError for regulators that the simulated drive does not have: it would run others silently."""
+    faults = [
+        ConfigFault(f"axis.{axis}.regulators.{key}", "the simulated drive does not have it", f"leave it at {plain!r}")
+        for key, plain in _PLAIN.items()
+        if getattr(regulators, key) != plain
+    ]
+    if faults:
+        raise ConfigError("sim", faults)

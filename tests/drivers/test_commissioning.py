@@ -14,7 +14,7 @@ import pytest
 
 from fdhil.cia402 import Object, State
 from fdhil.config import MachineConfig
-from fdhil.drivers import canopen_sdo, commissioning, commissioning_checks
+from fdhil.drivers import canopen_sdo, commissioning, commissioning_checks, commissioning_watchdog
 from fdhil.drivers.commissioning import (
     CommissioningRecord,
     check_axis,
@@ -27,9 +27,9 @@ from fdhil.drivers.commissioning import (
     rolled_back,
     save_record,
     sign_test,
-    watchdog_test,
 )
 from fdhil.drivers.commissioning_master import Master
+from fdhil.drivers.commissioning_watchdog import watchdog_test
 from fdhil.errors import ConnectError, DeviceError, DriveFault, ProtocolError, StoreError
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
@@ -105,6 +105,11 @@ def test_a_drive_that_counts_against_the_axis_passes() -> None:
         prepare(master)
         enable(master)
         assert sign_test(master) == pytest.approx(10.0, abs=3.0)
+
+
+def watchdog(master: Master) -> str:
+    """The step as a commissioning runs it."""
+    return watchdog_test(master, enable)
 
 
 def run_steps(master: Master, last: Callable[[Master], object]) -> None:
@@ -189,7 +194,7 @@ def test_a_watchdog_that_does_nothing_is_refused(peer: tuple[DrivePeer, MachineC
     drive, settings = peer
     drive.drive.faults.no_heartbeat_consumer = True
     with Master(settings, "X") as master, pytest.raises(DriveFault, match="watchdog does not work"):
-        run_steps(master, watchdog_test)
+        run_steps(master, watchdog)
     assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
 
 
@@ -212,42 +217,37 @@ class LateMaster(Master):
             super()._send_heartbeat()
 
 
-def test_a_feeding_that_this_computer_missed_is_tried_again(
-    peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(commissioning, "FEEDING_S", 0.15)
+@pytest.fixture
+def fed(peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch) -> Iterator[LateMaster]:
+    """A master that feeds the drive for a short time; afterwards the drive watches nobody any more, and is off."""
+    monkeypatch.setattr(commissioning_watchdog, "FEEDING_S", 0.15)
     drive, settings = peer
     with LateMaster(settings, "X") as master:
-        master.late = 2
-        run_steps(master, lambda m: watchdog_test(m) == "proven" or pytest.fail("not proven"))
-        assert 2 < master.feedings <= commissioning.FEEDING_TRIES  # this computer may be late once by itself
+        yield master
+    assert drive.drive.power.state.name in ("SWITCH_ON_DISABLED", "FAULT")
     assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
 
 
-def test_a_computer_that_is_always_late_is_told(
-    peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(commissioning, "FEEDING_S", 0.15)
-    drive, settings = peer
-    with LateMaster(settings, "X") as master:
-        master.late = 99
-        with pytest.raises(DriveFault, match="missed our heartbeat 4 times; take load off this computer"):
-            run_steps(master, watchdog_test)
-        assert master.feedings == commissioning.FEEDING_TRIES
-    assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
-    assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
+def test_a_feeding_that_this_computer_missed_is_tried_again(fed: LateMaster) -> None:
+    fed.late = 2
+    run_steps(fed, lambda m: watchdog(m) == "proven" or pytest.fail("not proven"))
+    assert 2 < fed.feedings <= commissioning_watchdog.FEEDING_TRIES  # this computer may be late once by itself
+
+
+def test_a_computer_that_is_always_late_is_told(fed: LateMaster) -> None:
+    fed.late = 99
+    with pytest.raises(DriveFault, match="missed our heartbeat 4 times; take load off this computer"):
+        run_steps(fed, watchdog)
+    assert fed.feedings == commissioning_watchdog.FEEDING_TRIES
 
 
 def test_a_drive_that_trips_while_it_is_fed_is_not_tried_again(
-    peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
+    fed: LateMaster, peer: tuple[DrivePeer, MachineConfig]
 ) -> None:
-    monkeypatch.setattr(commissioning, "FEEDING_S", 0.15)
-    drive, settings = peer
-    with LateMaster(settings, "X") as master:
-        master.trip = lambda: drive.drive.trip(0x3210)
-        with pytest.raises(DriveFault, match="it fell from Operation enabled to Fault"):
-            run_steps(master, watchdog_test)
-        assert master.feedings == 1
+    fed.trip = lambda: peer[0].drive.trip(0x3210)
+    with pytest.raises(DriveFault, match="it fell from Operation enabled to Fault"):
+        run_steps(fed, watchdog)
+    assert fed.feedings == 1
 
 
 class SlowReader(Master):
@@ -299,7 +299,7 @@ def test_full_heartbeat_consumers_are_refused(peer: tuple[DrivePeer, MachineConf
     for sub in (1, 2, 3, 4):
         drive.drive.set_object(0x1016, sub, (10 + sub) << 16 | 500)
     with Master(settings, "X") as master, pytest.raises(DriveFault, match="all entries of 0x1016 are taken"):
-        watchdog_test(master)
+        watchdog(master)
 
 
 def test_an_nc_on_the_bus_is_left_alone(peer: tuple[DrivePeer, MachineConfig]) -> None:
