@@ -1,0 +1,236 @@
+"""Codes one by one: motions worked out by hand or by geometry, without another interpreter."""
+
+from __future__ import annotations
+
+import math
+import tracemalloc
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil import config as configuration
+from fdhil.errors import ProgramError
+from fdhil.program import Budget, Dwell, Feed, Motion, interpret
+from fdhil.program.motions import BLEND, Corner
+from fdhil.records import Float
+from tests.bench import bench_document
+
+ALMOST = 1e-9
+
+
+def run(*lines: str) -> list[Motion]:
+    return list(interpret(lines))
+
+
+def ends(*lines: str) -> Float:
+    """Where motions end, dwells left out."""
+    return np.array([motion.end for motion in run(*lines) if not isinstance(motion, Dwell)])
+
+
+def kinds(*lines: str) -> str:
+    """R, F, A and D for the motions."""
+    return "".join(type(motion).__name__[0] for motion in run(*lines))
+
+
+def test_a_nurbs_with_the_weights_of_a_circle_is_a_quarter_of_it() -> None:
+    """Quadratic, three points, the middle one weighs cos 45 degrees."""
+    motions = run("G0 X10", "F300 G5.2 P1 L3", f"X10 Y10 P{math.sqrt(0.5):.15f}", "X0 Y10 P1", "G5.3")
+    places = np.array([m.end for m in motions if isinstance(m, Feed)])
+    assert np.hypot(places[:, 0], places[:, 1]) == pytest.approx(10.0, abs=1e-6)
+    assert places[-1] == pytest.approx([0.0, 10.0, 0.0], abs=ALMOST)
+    corners = np.concatenate([[[10.0, 0.0, 0.0]], places])
+    middles = (corners[1:] + corners[:-1]) / 2.0
+    assert np.hypot(middles[:, 0], middles[:, 1]).min() >= 10.0 - 0.001
+    assert {m.feed for m in motions if isinstance(m, Feed)} == {300.0}
+
+
+def test_a_nurbs_of_order_two_is_the_line_through_its_points() -> None:
+    places = ends("F100 G5.2 X0 Y1 P1 L2", "X2 Y2 P1", "X2 Y0 P3", "G5.3")
+    for corner in ([0.0, 1.0, 0.0], [2.0, 2.0, 0.0]):
+        assert np.linalg.norm(places - corner, axis=1).min() < ALMOST
+    assert places[-1] == pytest.approx([2.0, 0.0, 0.0])
+    first = places[places[:, 1] <= 1.0][:-1]
+    assert first[first[:, 0] < 1.0][:, 0] == pytest.approx(0.0, abs=ALMOST)
+
+
+def test_a_nurbs_of_order_three_is_a_parabola_between_the_middles_of_its_points() -> None:
+    """Uniform inner knots: the curve passes the middle of two inner control points along the line between them."""
+    places = ends("F100 G5.2 X0 Y4 P1 L3", "X8 Y4 P1", "X8 Y0 P1", "G5.3")
+    assert np.linalg.norm(places - [4.0, 4.0, 0.0], axis=1).min() < ALMOST
+    assert places[:, 1].max() == pytest.approx(4.0, abs=ALMOST)
+    assert places[:, 0].max() == pytest.approx(8.0, abs=ALMOST)
+
+
+@pytest.mark.parametrize("lines", [
+    ("F1 G5.2 X1 Y1 P1 L3", "G5.3"), ("G5.2 X1 Y1 P1 L3", "X2 Y2 P1", "G5.3"), ("F1 G5.2 X1 P1 L3",),
+    ("F1 G5.2 X1 Y1 P-1 L3",), ("F1 G5.2 X1 Y1 P1 L21",), ("F1 G18", "G5.2 X1 Y1 P1 L3"),
+])  # fmt: skip
+def test_what_makes_no_nurbs_is_refused(lines: tuple[str, ...]) -> None:
+    with pytest.raises(ProgramError, match=r"'(G5|P|L|G18)"):
+        run(*lines)
+
+
+STEP = ("F100 G18", "O100 sub", "G0 X2 Z0", "G1 Z-10", "X10", "O100 endsub", "G0 X10 Z2")
+
+
+def test_g71_cuts_along_z_in_steps_of_i_down_to_the_contour() -> None:
+    """A shaft of radius 2 and 10 long, out of one of radius 10: cuts at 10, 8, 6 and 4, then along the contour."""
+    motions = run(*STEP, "G71 Q100 X10 Z2 D0 I2 R0.5")
+    cuts = [m for m in motions if isinstance(m, Feed)]
+    at_wall = [m.end for m in cuts if m.end[2] == pytest.approx(-10.0, abs=1e-3)]
+    assert [round(x, 3) for x, _, _ in at_wall] == [10.0, 8.0, 6.0, 4.0, 2.0, 10.0]
+    assert all(m.end[0] >= 2.0 - ALMOST and m.end[2] >= -10.0 - ALMOST for m in motions if not isinstance(m, Dwell))
+    assert {m.feed for m in cuts} == {100.0}
+
+
+def test_g71_leaves_d_for_finishing_and_g72_cuts_along_x() -> None:
+    left = [m.end for m in run(*STEP, "G71 Q100 X10 Z2 D0.5 I2 R0.5") if isinstance(m, Feed)]
+    assert min(x for x, _, _ in left) == pytest.approx(2.5, abs=1e-6)
+    assert min(z for _, _, z in left) == pytest.approx(-9.5, abs=1e-6)
+    face = ("F100 G18", "O100 sub", "G0 Z-6", "G1 X2", "Z2", "O100 endsub", "G0 X10 Z2")
+    cuts = [m.end for m in run(*face, "G72 Q100 X10 Z2 D0 I2 R0.5") if isinstance(m, Feed)]
+    assert [round(z, 3) for x, _, z in cuts if x == pytest.approx(2.0, abs=1e-3)] == [2.0, 0.0, -2.0, -4.0, -6.0, 2.0]
+
+
+def test_g70_follows_the_contour_from_d_to_e_in_p_passes() -> None:
+    motions = run(*STEP, "G70 Q100 X10 Z2 D1 E0 P2")
+    turned = [m.end[0] for m in motions if isinstance(m, Feed) and m.end[2] < -5.0 and m.end[0] < 5.0]
+    assert turned == pytest.approx([2.5, 2.0])
+
+
+@pytest.mark.parametrize("line", ["G71 X1", "G71 Q7 X10 Z2", "G71 Q100 X10 Z2 I0", "G17 G71 Q100 X10 Z2"])
+def test_what_makes_no_roughing_is_refused(line: str) -> None:
+    with pytest.raises(ProgramError):
+        run(*STEP, line)
+
+
+def test_an_arc_of_a_turned_system_outside_its_xy_plane_becomes_chords() -> None:
+    """A half circle in XZ, turned by 30 degrees about Z: all of it lies in the turned plane, 5 mm from its centre."""
+    places = ends("G10 L2 P1 R30", "F100 G18", "G2 X10 Z0 I5")
+    way = np.array([math.cos(math.radians(30.0)), math.sin(math.radians(30.0)), 0.0])
+    assert places[-1] == pytest.approx(10.0 * way, abs=1e-9)
+    assert places @ [way[1], -way[0], 0.0] == pytest.approx(0.0, abs=1e-9)
+    assert np.linalg.norm(places - 5.0 * way, axis=1) == pytest.approx(5.0, abs=1e-9)
+    assert np.abs(np.diff(places[:, 2])).max() < 0.3
+    assert places[:, 2].min() == pytest.approx(-5.0, abs=1e-2)  # clockwise as seen from +Y, where Z points right, X up
+
+
+def test_homes_go_by_way_of_their_words() -> None:
+    assert ends("G0 X1 Y2 Z3", "G28.1", "G0 X5", "G28 Z9", "G30").tolist() == [
+        [1, 2, 3], [5, 2, 3], [5, 2, 9], [5, 2, 3], [5, 2, 3], [0, 0, 0]
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("lines", "last"), [
+    (("G52 X5", "G0 X1"), [6, 0, 0]),
+    (("G10 L20 P1 X5", "G0 X0"), [-5, 0, 0]),
+    (("G10 L2 P9 X3", "G59.3", "G0 X1"), [4, 0, 0]),
+    (("G43.1 Z2", "G0 Z1"), [0, 0, 1]),
+    (("G92 X5", "G0 X7", "G92.1", "G0 X7"), [7, 0, 0]),
+    (("G92 X5", "G92.2", "G0 X7", "G92.3", "G0 X7"), [2, 0, 0]),
+    (("G7 G0 X10",), [5, 0, 0]),
+    (("G7 G0 X10", "G8 X10"), [10, 0, 0]),
+    (("G20 G0 X1", "G21 X1"), [1, 0, 0]),
+    (("G91 G0 X1", "X1", "G90 X1.5"), [1.5, 0, 0]),
+    (("G0 @10 ^90",), [0, 10, 0]),
+    (("M70", "G91", "M72", "G0 X1", "X1"), [1, 0, 0]),
+    (("G80 G80", "G0 X1"), [1, 0, 0]),
+    (("#5221=10", "G0 X1", "G55", "G54", "G0 X3"), [13, 0, 0]),
+])  # fmt: skip
+def test_where_the_axes_end(lines: tuple[str, ...], last: list[float]) -> None:
+    assert ends(*lines)[-1] == pytest.approx(last, abs=ALMOST)
+
+
+def test_path_control_goes_with_each_motion() -> None:
+    text = ("G0 X1", "G61 X2", "G61.1 X3", "G64 P0.1 X4", "G64 P0.1 Q0.02 X5", "G64 X6", "G20 G64 P0.01 X1")
+    assert [getattr(motion, "corner", None) for motion in run(*text)] == [
+        BLEND, Corner("exact_path", 0.0), Corner("exact_stop", 0.0), Corner("blend", 0.1, 0.1),
+        Corner("blend", 0.1, 0.02), BLEND, Corner("blend", 0.254, 0.254),
+    ]  # fmt: skip
+
+
+def test_a_feed_that_follows_the_spindle() -> None:
+    assert run("M3 S100", "G33 Z-5 K1.5") == [Feed(2, (0.0, 0.0, -5.0), 150.0)]
+    assert run("M3 S0", "G33 Z-5 K1") == [Feed(2, (0.0, 0.0, -5.0), 0.0)]  # a spindle that stands; no plan takes it
+    assert [m.feed for m in run("M3 S100", "G33.1 Z-5 K1 I2") if isinstance(m, Feed)] == [100.0, 200.0]
+    with pytest.raises(ProgramError, match="spindle"):
+        run("G33 Z-5 K1")
+
+
+@pytest.mark.parametrize(("line", "expected"), [
+    ("G81 X1 Z-3 R2", "RRFR"), ("G82 X1 Z-3 R2 P1", "RRFDR"), ("G85 X1 Z-3 R2", "RRFFR"), ("G86 X1 Z-3 R2 P1", "RRFDR"),
+    ("G89 X1 Z-3 R2 P1", "RRFDF"), ("G83 X1 Z-3 R2 Q3", "RRFRRFR"), ("G73 X1 Z-3 R2 Q3", "RRFRFR"),
+    ("G81 X1 Z-3 R2 L2", "RRFRRFR"),
+])  # fmt: skip
+def test_what_a_cycle_is_made_of(line: str, expected: str) -> None:
+    """From Z5: to R over the place, down by feed, a dwell, and back by rapid, or by feed and a rapid of no length."""
+    assert kinds("F100 M3 S100 G99", "G0 Z5", line)[1:] == expected
+
+
+def test_a_negative_dwell_takes_no_time_but_one_of_minus_one_is_a_missing_one() -> None:
+    assert run("G4 P-0.5") == [Dwell(1, 0.0)]
+    with pytest.raises(ProgramError, match="'G4'"):
+        run("G4 P-1")
+
+
+def test_g92_1_stands_beside_a_tool_radius() -> None:
+    assert ends("F100 G41.1 D2", "G1 X10", "G92.1", "Y10", "G40", "X5").tolist() == [[9, 1, 0], [9, 10, 0], [5, 10, 0]]
+
+
+def test_outputs_of_any_number_order_no_motion() -> None:
+    assert run("M62 P-1", "M64 P3", "M67 E0 Q1", "M66 P0 L0", "M66 E0 L0") == []
+
+
+@pytest.mark.parametrize(("text", "line", "word"), [
+    ("O1 while [1]\nO1 endwhile", 1, "O1 while"), ("O1 do\n#1=1\nO1 while [1]", 2, "#1=1"),
+    ("O1 repeat [1e9]\nO1 endrepeat", 1, "O1"), ("O1 sub\nO1 call\nO1 endsub\nO1 call", 2, "O<1>"),
+    ("M98 P1\nM2\nO1\nM98 P1\nM99", 4, "O<1>"), ("G0 X[1e9]", 1, "X"), ("G0 X99999999", 1, "X"),
+    ("G0 X[" + "9" * 400 + "]", 1, ""), ("F1 G2 I5 P2000000", 1, "P"), ("G0 X" + "[" * 200 + "1" + "]" * 200, 1, ""),
+])  # fmt: skip
+def test_budgets_of_the_configuration_name_line_and_word(text: str, line: int, word: str) -> None:
+    document = bench_document()
+    document["nc"] = {"max_blocks": 3000, "max_call_depth": 7}
+    budget = Budget.of(configuration.parse(document).nc)
+    with pytest.raises(ProgramError) as caught:
+        list(interpret(text.splitlines(), budget))
+    assert caught.value.line > 0
+    assert caught.value.word
+
+
+def test_calls_may_nest_as_deep_as_the_configuration_says() -> None:
+    lines = ["O1 sub", "#1=[#1-1]", "O2 if [#1 gt 0]", "O1 call [#1]", "O2 endif", "O1 endsub"]
+    assert not list(interpret([*lines, "O1 call [7]"], Budget(max_call_depth=7)))
+    with pytest.raises(ProgramError, match="deeper than 7"):
+        list(interpret([*lines, "O1 call [8]"], Budget(max_call_depth=7)))
+
+
+LINES = 1_000_000
+
+
+def test_a_million_lines_are_read_in_flat_memory(tmp_path: Path) -> None:
+    """A file of 20 Mbyte: what is held after twenty thousand lines is what was held after five hundred."""
+    path = tmp_path / "long.ngc"
+    thousand = "".join(f"G1 X{number} Y{number % 89} F600\n" for number in range(1000))
+    path.write_text(thousand * (LINES // 1000))
+    motions = interpret(path)
+    held = []
+    tracemalloc.start()
+    for count in (500, 2000, 18_000):
+        tracemalloc.reset_peak()
+        assert sum(1 for _ in islice(motions, count)) == count
+        held.append(tracemalloc.get_traced_memory()[1])
+    tracemalloc.stop()
+    assert held[2] < held[0] + 20_000
+    assert held[2] < 1_000_000
+
+
+def test_lines_that_are_made_as_they_are_read_are_kept_in_four_megabytes_at_most() -> None:
+    """They might be needed again by a loop: beyond 4 Mbyte they go to the disk."""
+    motions = interpret(f"G1 X{number % 997} F600 ({'x' * 3900})" for number in range(1500))
+    tracemalloc.start()
+    assert sum(1 for _ in motions) == 1500
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 10_000_000
