@@ -12,7 +12,7 @@ from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.records import Window, frozen
 from fdhil.validation import analyse, pool
-from fdhil.validation.backlash import dead_band
+from fdhil.validation.backlash import backlash, dead_band, overrun
 from studies import drives
 from studies.scenes import demand_of, measured, recorded
 from tests.identification.recorded import windows
@@ -62,3 +62,21 @@ def test_a_gain_that_moved_between_rapids_is_named_not_six_parameters(field: str
     assert f"the gain of {name} changes by +" in reason.text
     share = float(re.findall(r"([-+][\d.]+)%", reason.text)[0])
     assert share == pytest.approx(6.0, abs=0.5)
+
+
+def test_a_small_dead_band_is_confirmed_by_the_table_that_runs_on_when_the_motor_brakes() -> None:
+    noisy = replace(SCENE, noise=0.005, dt_s=2e-3, drive=replace(DRIVE, pitch_m=0.04), position_step_m=5e-6)
+    believed = 0
+    for seed in range(6):
+        for um in (0.0, 100.0):
+            drive = replace(noisy.drive, backlash_rad=um * 1e-6 / noisy.drive.pitch_m * 2 * np.pi)
+            demand = demand_of(noisy, -drives.rates(noisy.move))
+            rows = measured(np.random.default_rng(seed), noisy, drives.run(drive, demand, noisy.dt_s))
+            (window,) = find_windows(recorded(noisy, rows))
+            second = overrun(window)
+            assert second is not None
+            assert abs(second.um - um) < 4 * second.std_um
+            found = backlash(window)
+            assert (found is None) or um > 0.0
+            believed += found is not None
+    assert believed >= 5

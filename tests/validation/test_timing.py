@@ -1,0 +1,74 @@
+"""A voltage or current that is late by some rows is refused with its delay, also where rows are fine."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil.config import Identification
+from fdhil.identification.estimators import maximum_likelihood
+from fdhil.identification.windows import find_windows
+from fdhil.records import VoltageSampling, Window
+from fdhil.validation import analyse
+from fdhil.validation.structure import expected_correlation
+from fdhil.validation.timing import searched, shifts
+from studies import drives, faults
+from studies.scenes import demand_of, measured, recorded
+from tests.validation.test_episodes import SCENE
+
+FINE_S = 2.5e-4
+SETTINGS = Identification()
+
+
+def _window(late: dict[str, int], sampling: VoltageSampling = "interval_mean", dt_s: float = FINE_S) -> Window:
+    """Return a rapid whose short winding and noisy, coarse voltage hide a delay where rows are fine."""
+    drive = replace(SCENE.drive, L=SCENE.drive.R * 0.0045)
+    scene = replace(SCENE, drive=drive, dt_s=dt_s, noise=0.0045, sampling=sampling, steps=(2e-3, 1e-5, 1e-4))
+    rows = measured(np.random.default_rng(5), scene, drives.run(drive, demand_of(scene), dt_s))
+    moved = {name: np.roll(rows.signals[name], k) for name, k in late.items()}  # it begins and ends at rest
+    return find_windows(recorded(scene, rows.with_signals(**moved)))[0]
+
+
+@pytest.mark.parametrize("sampling", ["interval_mean", "instant"])
+@pytest.mark.parametrize(("name", "rows"), [("voltage", 3), ("voltage", 6), ("current", 2)])
+def test_a_late_signal_is_refused_with_its_delay(sampling: VoltageSampling, name: str, rows: int) -> None:
+    reasons = analyse(_window({name: rows}, sampling), SETTINGS).verdict.reasons
+    told = [reason.text for reason in reasons if reason.code == "SampleTiming"]
+    assert told, reasons
+    late = "late" in told[0] if name in told[0].split()[0] else "early" in told[0]  # of the other signal
+    assert late, told
+    ms = float(re.findall(r"is ([\d.]+) ms", told[0])[0])
+    # what a regulator does within a sample makes an instant seem early
+    assert ms == pytest.approx(1e3 * FINE_S * rows, abs=1e3 * FINE_S * (0.6 if sampling == "interval_mean" else 1.6))
+
+
+@pytest.mark.parametrize("sampling", ["interval_mean", "instant"])
+def test_signals_of_one_instant_are_accepted(sampling: VoltageSampling) -> None:
+    verdict = analyse(_window({}, sampling), SETTINGS).verdict
+    assert verdict.accepted, verdict.reasons
+
+
+def test_a_shift_without_a_gain_in_likelihood_is_not_believed() -> None:
+    fit = maximum_likelihood.fit_windows([_window({})], SETTINGS)
+    assert fit is not None
+    voltage, current = shifts(fit)
+    assert not voltage.sure
+    assert not current.sure
+    found = searched(fit, 1.2)  # as if the innovations had shown it
+    assert found is None or abs(found) < 1.0
+
+
+@pytest.mark.parametrize("seed", [7, 714])
+def test_instants_share_the_noise_of_the_voltage_between_intervals(seed: int) -> None:
+    (window,) = find_windows(faults.good(np.random.default_rng([7, 1, seed])).recording)
+    fit = maximum_likelihood.fit_windows([window], SETTINGS)
+    assert fit is not None
+    moving = np.abs(fit.problem.motions[0].mode) == 1
+    e = fit.residuals.reshape(-1, 2)[moving, 0]
+    seen = float(e[1:] @ e[:-1] / (e @ e))
+    assert seen > 0.3
+    assert expected_correlation(fit)[0] == pytest.approx(seen, abs=0.15)
+    assert analyse(window, SETTINGS).verdict.accepted
