@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 import json
 import signal
@@ -18,13 +19,29 @@ import can
 import pytest
 
 from fdhil.cli.main import cli, run_safely
-from fdhil.drivers import bus_scan, canopen_sdo, commissioning, commissioning_checks, config_check
 from fdhil.drivers.commissioning_record import load_record
 from fdhil.sim.hub import Hub
 from tests.sim.hub_thread import HubThread
 from tests.sim.twin_process import TwinProcess, write_config
 
-COMMAND = [sys.executable, "-m", "fdhil"]
+# shorter waits than on a real machine: module, name, value
+WAITS: tuple[tuple[str, str, float], ...] = (
+    ("bus_scan", "LISTEN_S", 0.3),
+    ("config_check", "LISTEN_S", 0.3),
+    ("commissioning_checks", "LISTEN_S", 0.3),
+    ("commissioning", "SETTLE_CYCLES", 120),
+    ("commissioning", "AVERAGE_CYCLES", 60),
+    ("canopen_sdo", "RESPONSE_TIMEOUT_S", 0.3),
+    ("canopen_sdo", "QUIET_S", 0.1),
+)
+# fdhil as a process of its own with these waits
+QUICK = f"""
+import importlib
+for module, name, value in {WAITS!r}:
+    setattr(importlib.import_module("fdhil.drivers." + module), name, value)
+from fdhil.cli.main import main
+main()
+"""
 
 
 @dataclass
@@ -73,16 +90,8 @@ Said = Callable[..., tuple[int, str, str]]
 @pytest.fixture
 def fdhil(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Said:
     """Run a command in this process, with shorter waits than on a real machine: exit code, stdout and stderr."""
-    for module, name, value in (
-        (bus_scan, "LISTEN_S", 0.3),
-        (config_check, "LISTEN_S", 0.3),
-        (commissioning_checks, "LISTEN_S", 0.3),
-        (commissioning, "SETTLE_CYCLES", 120),
-        (commissioning, "AVERAGE_CYCLES", 60),
-        (canopen_sdo, "RESPONSE_TIMEOUT_S", 0.3),
-        (canopen_sdo, "QUIET_S", 0.1),
-    ):
-        monkeypatch.setattr(module, name, value)
+    for module, name, value in WAITS:
+        monkeypatch.setattr(importlib.import_module(f"fdhil.drivers.{module}"), name, value)
 
     def run(*arguments: object, said: str = "") -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["fdhil", *map(str, arguments)])
@@ -281,7 +290,7 @@ def test_a_drive_that_must_not_be_used_is_refused(fdhil: Said, bench: Bench) -> 
 
 
 def test_a_stopped_commissioning_leaves_the_drive_off(fdhil: Said, bench: Bench) -> None:
-    command = [*COMMAND, "commission", str(bench.config("stopped.toml")), "--axis", "X", "--yes"]
+    command = [sys.executable, "-c", QUICK, "commission", str(bench.config("stopped.toml")), "--axis", "X", "--yes"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for line in process.stdout:
@@ -344,13 +353,14 @@ def test_help_tells_what_is_sent(fdhil: Said, command: str) -> None:
     assert "Exit codes" in " ".join(out.split())
 
 
-@pytest.fixture(scope="module")
-def cut(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    """A machine whose NC runs the bus."""
-    folder = tmp_path_factory.mktemp("nc")
-    with TwinProcess(write_config(folder, sim="nc = true")) as twin:
-        twin.event("nc")
-        yield Bench(twin, folder)
+@pytest.fixture
+def cut(bench: Bench) -> Iterator[Bench]:
+    """The machine while its NC runs the bus."""
+    bench.twin.command("nc", on=True)
+    assert bench.twin.event("nc")["on"]
+    yield bench
+    bench.twin.command("nc", on=False)
+    assert not bench.twin.event("nc")["on"]
 
 
 def undisturbed(fdhil: Said, cut: Bench, *arguments: object, code: int = 0) -> str:
