@@ -72,11 +72,14 @@ def offset_drift(rng: Rng, rows: Rows) -> tuple[Rows, float]:
 
 
 def stuck(rng: Rng, rows: Rows) -> tuple[Rows, float]:
-    """Seconds for which a sensor repeats one value."""
+    """Seconds for which a sensor repeats one value that would have changed in the meantime."""
     name, seconds = _sensor(rng), rng.uniform(0.02, 0.1)
     values = rows.signals[name].copy()
     length = round(seconds / rows.dt_s)
     start = int(rng.uniform(rows.moving[0], rows.moving[1] - length))
+    # where all readings are alike anyway, the recording is a good one, to the last bit
+    while np.ptp(values[start : start + length]) == 0.0:
+        start = int(rng.uniform(rows.moving[0], rows.moving[1] - length))
     values[start : start + length] = values[start]
     return rows.with_signals(**{name: values}), seconds
 

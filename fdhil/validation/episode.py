@@ -26,6 +26,7 @@ HELD_S = 0.040
 HELD_RATE = 0.2  # of the steepest ramp: a speed that changes more slowly is held
 BETWEEN = (0.1, 0.92)  # of the plateau: a ramp with limited jerk is slow only beyond them
 HARDER = 2.0
+MOVES_ON = 0.03  # of the plateau: a demand that rests, or turns, is slower in some row
 LEFT_MM = 1.0
 LEFT_SHARE = 0.01
 
@@ -40,7 +41,12 @@ def interruptions(window: Window) -> Iterator[Reason]:
     if plateau <= 0:
         return
     seen = np.clip(speed[a:b], 0.0, plateau)
-    reason = _left_behind(window, b) or _dip(window, seen, plateau, a) or _held(window, seen, plateau, a)
+    reason = (
+        _left_behind(window, b)
+        or _moves_on(window, b, plateau)
+        or _dip(window, seen, plateau, a)
+        or _held(window, seen, plateau, a)
+    )
     reason = reason or _quick_stop(window, a, b)
     if reason is not None:
         yield Reason(CODE, reason, ADVICE)
@@ -122,6 +128,17 @@ def _left_behind(window: Window, end: int) -> str | None:
     if abs(least) <= LEFT_MM + LEFT_SHARE * travel:
         return None
     return f"the axis comes to rest {abs(least):.3g} mm from its demand"
+
+
+def _moves_on(window: Window, end: int, plateau: float) -> str | None:
+    """Tell whether the drive only swings through rest after a drop of the speed that its demand does not end."""
+    speed = _course(window.demand_mm, window, RAMP_S)
+    if speed is None or window.stages.brake is None:
+        return None
+    least = float(speed[max(0, end - max(1, round(RAMP_S / window.dt_s))) :].min())
+    if least <= MOVES_ON * plateau:
+        return None
+    return f"the demand moves on with {least:.4g} mm/s where the drive passes through rest"
 
 
 def _at(window: Window, row: int) -> str:

@@ -1,4 +1,4 @@
-"""What must hold of the signals before any fit is believed: finite, not stuck, not clipped, no hidden gap."""
+"""What must hold of the signals before any fit is believed: finite, not clipped, no hidden gap."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from fdhil.validation.episode import interruptions
 CHANCE = 1e-4  # of a false alarm of one check on one good window
 TOLERATED_GAP = 3  # rows: a longer gap hides what the drive did
 TOLERATED_LOSS = 0.02
-STUCK_S = 0.003
 RAIL_SAMPLES = 3
 RESOLVED = 0.2  # of a step: noise below it hides in the resolution
 LEAST_NOISE_ROWS = 20
@@ -33,7 +32,6 @@ def implausibilities(window: Window) -> list[Reason]:
     if window.n < 32 or any(reason.code == "NotFinite" for reason in reasons):
         return reasons
     reasons += list(_gaps(window))
-    reasons += list(_stuck(window))
     reasons += list(_clipped(window))
     play = backlash(window)
     parted = list(_position(window, play.um if play is not None else 0.0))
@@ -44,7 +42,7 @@ def implausibilities(window: Window) -> list[Reason]:
 def warnings_of(window: Window) -> list[Reason]:
     """Return what does not refuse the window but widens its intervals: coarse quantisation."""
     found = []
-    for name, unit, values in _signals(window):
+    for name, unit, values in signals_of(window):
         finite = values[np.isfinite(values)]
         span = float(np.ptp(finite)) if finite.size else 0.0
         step = resolution(finite)
@@ -54,7 +52,8 @@ def warnings_of(window: Window) -> list[Reason]:
     return found
 
 
-def _signals(window: Window) -> Iterator[tuple[str, str, Float]]:
+def signals_of(window: Window) -> Iterator[tuple[str, str, Float]]:
+    """Yield name, unit and values (n,) of each signal that the window has."""
     if window.voltage_v is not None:
         yield "voltage", "V", window.voltage_v
     yield "current", "A", window.current_a
@@ -71,12 +70,12 @@ def _lost(window: Window) -> Bool:
 
 def _not_finite(window: Window) -> Iterator[Reason]:
     lost = _lost(window)
-    for name, _, values in _signals(window):
+    for name, _, values in signals_of(window):
         bad = ~np.isfinite(values) & ~lost
         if bad.any():
             text = f"{name} is not finite in {int(bad.sum())} rows, first at {_time(window, int(np.argmax(bad))):.3f} s"
             yield Reason("NotFinite", text, "check the sensor and its scaling")
-    largest = max((float(np.abs(v[np.isfinite(v)]).max(initial=0.0)) for _, _, v in _signals(window)), default=0.0)
+    largest = max((float(np.abs(v[np.isfinite(v)]).max(initial=0.0)) for _, _, v in signals_of(window)), default=0.0)
     if largest > 1e9:
         yield Reason("NotFinite", f"a signal reaches {largest:.3g}, which no drive does", "check the scaling")
 
@@ -98,25 +97,7 @@ def _gaps(window: Window) -> Iterator[Reason]:
         yield Reason("StaleData", text, "find where frames are lost: bus load, receive buffer")
 
 
-def _stuck(window: Window) -> Iterator[Reason]:
-    a, b = moving_range(window)
-    for name, unit, values in _signals(window):
-        part = values[a:b]
-        same = np.diff(part) == 0.0
-        start, end = longest(same)
-        least = max(2, round(STUCK_S / window.dt_s))
-        at_rail = end > start and part[start] in (np.nanmax(values), np.nanmin(values))
-        if end - start < least or at_rail:
-            continue
-        if _beyond_chance(part, start, end) or _wakes_with_a_jump(part, start, end):
-            text = (
-                f"{name} repeats {part[start]:.6g} {unit} for {(end - start + 1) * window.dt_s * 1e3:.0f} ms "
-                f"from {_time(window, a + start):.3f} s while the axis moves"
-            )
-            yield Reason("StuckValue", text, "check the sensor or the object's mapping")
-
-
-def _beyond_chance(values: Float, start: int, end: int) -> bool:
+def beyond_chance(values: Float, start: int, end: int) -> bool:
     """Return whether the readings of rows ``start`` to ``end``, all alike, are more than the rows about them explain.
 
     Either side may explain them: by how often it has that very reading (a constant read coarsely), or by how often it
@@ -158,7 +139,7 @@ def all_within(length: int, others: Bool) -> float:
     return math.exp(log)
 
 
-def _wakes_with_a_jump(part: Float, start: int, end: int) -> bool:
+def wakes_with_a_jump(part: Float, start: int, end: int) -> bool:
     """Return whether the signal goes on after a run of repeats by more than it ever changes otherwise."""
     change = np.abs(np.diff(part))
     if end >= change.size:
@@ -169,11 +150,11 @@ def _wakes_with_a_jump(part: Float, start: int, end: int) -> bool:
 
 
 def _clipped(window: Window) -> Iterator[Reason]:
-    for name, unit, values in _signals(window):
+    for name, unit, values in signals_of(window):
         for rail, side in ((np.nanmax(values), "upper"), (np.nanmin(values), "lower")):
             at_rail = values == rail
             start, end = longest(at_rail)
-            if rail == 0.0 or end - start < RAIL_SAMPLES or not _beyond_chance(values, start, end - 1):
+            if rail == 0.0 or end - start < RAIL_SAMPLES or not beyond_chance(values, start, end - 1):
                 continue
             text = (
                 f"{name} stays at its {side} extreme {rail:.6g} {unit} for {end - start} samples "

@@ -18,6 +18,7 @@ from fdhil.records import Estimate, Float, Parameters, Reason, Result, Verdict, 
 from fdhil.validation.plausibility import implausibilities
 from fdhil.validation.rest import rest_faults
 from fdhil.validation.structure import excess_noise, findings, whiteness
+from fdhil.validation.stuck import stuck_values
 from fdhil.validation.timing import timing_faults
 
 LEAST_FIT_PERCENT = 80.0
@@ -44,8 +45,8 @@ def analyse(window: Window, settings: Identification) -> WindowOutcome:
     except (np.linalg.LinAlgError, FloatingPointError, ZeroDivisionError, OverflowError) as error:
         reasons.append(Reason("SolverFailed", f"the solver gave up ({error})", "look at the window's signals"))
         missing = empty_estimate(chosen(settings)[0], Result.DIVERGED, reasons[-1])
-        return WindowOutcome(window, missing, Verdict(False, None, tuple(reasons)))
-    reasons += doubts
+        return WindowOutcome(window, missing, Verdict(False, None, (*reasons, *stuck_values(window, None))))
+    reasons += [*stuck_values(window, fit), *doubts]
     return WindowOutcome(window, estimate, Verdict(not reasons, fit_percent, tuple(reasons)))
 
 
@@ -55,6 +56,7 @@ def _without_voltage(window: Window, settings: Identification, reasons: list[Rea
     if window.n < 32 or any(reason.code in UNFIT for reason in reasons):
         estimate = empty_estimate(chosen(settings)[0], Result.NOT_FINITE, reasons[0])
     else:
+        reasons += stuck_values(window, None)
         estimate = estimate_ratios([window], settings)
     return WindowOutcome(window, estimate, Verdict(False, None, tuple(reasons)))
 

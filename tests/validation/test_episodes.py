@@ -84,6 +84,13 @@ def test_a_drive_that_stops_while_the_demand_goes_on_is_refused_with_the_distanc
     assert reason.endswith(" mm from its demand")
 
 
+def test_a_drive_that_swings_through_rest_while_its_demand_goes_on_has_not_arrived() -> None:
+    held = faults.KINDS["feed hold"].make(np.random.default_rng([7, 2, 2049]))  # falls to 14 %, and swings through 0
+    texts = [[str(r) for r in analyse(w, Identification()).verdict.reasons] for w in find_windows(held.recording)]
+    assert [len(reasons) > 0 for reasons in texts] == [True, True]
+    assert texts[0] == ["EpisodeAborted: the demand moves on with 42 mm/s where the drive passes through rest"]
+
+
 def test_a_feed_hold_to_rest_leaves_two_whole_moves() -> None:
     half = drives.rates(Move(0.2, 0.5, 4.0, 0.02, 1))
     outcomes = _judged(_rows(half, half))

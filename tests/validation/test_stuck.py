@@ -1,0 +1,116 @@
+"""A sensor that sticks is told from a steady signal that is read coarsely: by how likely the repeats were."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil.config import Identification
+from fdhil.identification.windows import find_windows
+from fdhil.records import Float, Window, frozen
+from fdhil.validation import analyse
+from fdhil.validation.readings import log_chance
+from fdhil.validation.stuck import noise_steps, stuck_values
+from studies import drives, signal_faults
+from studies.scenes import demand_of, measured, recorded
+from tests.identification.recorded import windows
+from tests.validation.test_episodes import SCENE
+
+SETTINGS = Identification()
+FIELDS = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}
+
+
+def _coarse(seed: int, **steps: float) -> Window:
+    """A rapid with little noise, sensors in steps that are shares of their peaks."""
+    sizes = tuple(steps.get(name, 1e-4) for name in FIELDS)
+    scene = replace(SCENE, noise=0.001, steps=(sizes[0], sizes[1], sizes[2]))
+    rows = measured(np.random.default_rng(seed), scene, drives.run(scene.drive, demand_of(scene), scene.dt_s))
+    return find_windows(recorded(scene, rows))[0]
+
+
+def _stuck(window: Window, name: str, start: int, length: int) -> Window:
+    values = np.array(getattr(window, FIELDS[name]))
+    values[start : start + length] = values[start]
+    changed: Window = replace(window, **{FIELDS[name]: frozen(values)})  # type: ignore[arg-type]  # one of its arrays
+    return changed
+
+
+def _codes(window: Window) -> list[str]:
+    return [reason.code for reason in analyse(window, SETTINGS).verdict.reasons]
+
+
+@pytest.mark.parametrize(("level", "noise"), [(0.0, 0.5), (0.35, 0.3), (0.2, 1.0)])
+def test_the_chance_of_equal_readings_is_that_of_the_true_level_and_noise(level: float, noise: float) -> None:
+    rng = np.random.default_rng(4)
+    readings = np.round(level + noise * rng.standard_normal(440))
+    start, last = 200, 219
+    readings[start : last + 1] = 0.0
+
+    def below(x: float) -> float:
+        return 0.5 * math.erfc(-(x - level) / noise / math.sqrt(2))
+
+    exact = (last - start) * math.log(below(0.5) - below(-0.5))
+    told = log_chance(readings, start, last, 200, 200, 0, 2 * noise)
+    assert told == pytest.approx(exact, rel=0.2, abs=0.3)
+
+
+@pytest.mark.parametrize("noise", [0.7, 3.0, 40.0])
+def test_noise_in_steps_is_seen_beside_a_corner(noise: float) -> None:
+    course = np.maximum(0.0, np.arange(2000.0) - 1000.0) * 3
+    readings = np.round(course + noise * np.random.default_rng(1).standard_normal(course.size))
+    assert noise_steps(readings) == pytest.approx(noise, rel=0.15)
+
+
+@pytest.mark.parametrize("name", ["voltage", "current"])
+def test_a_steady_signal_read_coarsely_repeats_itself_and_is_believed(name: str) -> None:
+    longest = 0
+    for seed in range(3):
+        window = _coarse(seed, **{name: 0.002})
+        same = np.diff(np.flatnonzero(np.diff(getattr(window, FIELDS[name])[150:450]) != 0.0))
+        longest = max(longest, int(same.max()))
+        assert "StuckValue" not in _codes(window)
+    assert longest > 15  # as long as a sensor may stick
+
+
+@pytest.mark.parametrize("name", list(FIELDS))
+def test_a_sensor_that_sticks_on_the_plateau_is_seen_by_its_missing_noise(name: str) -> None:
+    window = windows(0.002)[0]
+    begin, end = window.stages.cruise or (0, 0)
+    assert _codes(window) == []
+    assert "StuckValue" in _codes(_stuck(window, name, (begin + end) // 2, 20))
+
+
+def test_a_coarse_sensor_that_sticks_is_told_by_its_neighbours() -> None:
+    refused = 0
+    for seed in range(4):
+        window = _coarse(seed, current=0.002)
+        values = window.current_a
+        # a level near the edge of its step changes its reading often
+        rows = range(220, 380)
+        changes = [np.count_nonzero(np.diff(values[k : k + 60])) for k in rows]
+        start = rows[int(np.argmax(changes))]
+        assert max(changes) > 10
+        found = list(stuck_values(_stuck(window, "current", start, 60), None))
+        refused += any("current repeats" in reason.text for reason in found)
+    assert refused == 4
+
+
+def test_a_coarse_sensor_that_sticks_while_it_should_move_is_told_by_the_others() -> None:
+    window = _coarse(3, current=0.002)
+    begin, _ = window.stages.cruise or (0, 0)  # the current falls from accelerating to steady
+    assert "StuckValue" in _codes(_stuck(window, "current", begin - 25, 30))
+
+
+def test_the_fault_of_the_study_changes_the_recording() -> None:
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        rows = measured(rng, SCENE, drives.run(SCENE.drive, demand_of(SCENE), SCENE.dt_s))
+        coarse: dict[str, Float] = {
+            name: np.round(values / np.abs(values).max() / 0.02) for name, values in rows.signals.items()
+        }
+        before = rows.with_signals(**coarse)
+        after, _ = signal_faults.stuck(rng, before)
+        assert any((after.signals[name] != before.signals[name]).any() for name in FIELDS)
