@@ -14,7 +14,8 @@ import numpy as np
 
 from fdhil.correction import mirror, plan
 from fdhil.correction.streaming import stream
-from fdhil.prediction import predict, predict_corrected
+from fdhil.model import closed_loop, kernels
+from fdhil.prediction import contour_error_um, predict, predict_corrected
 from fdhil.prediction.models import nominal_models
 from fdhil.records import Float, Parameters
 from tests.bench import bench_config
@@ -143,6 +144,24 @@ def gains(demand: Float) -> tuple[Float, tuple[float, float]]:
     return np.array(rows), (rms(correction.before.contour_um), rms(correction.after.contour_um))
 
 
+def held_at_start(share: float) -> tuple[float, float]:
+    """Return RMS and largest error (um) when each axis rests at the start with that share of its dry friction in use.
+
+    The plan takes the regulators as empty there: what the last move before the program left in them it cannot know.
+    """
+    demand = bench_demand(10)
+    offsets = plan(trajectory(demand), MODELS, CONFIG, "inverse").offset_um
+    places = []
+    for a, name in enumerate("XY"):
+        model, state = MODELS[name], closed_loop.start(float(demand[0, a]))
+        state[[kernels.CURRENT, kernels.SPEED_INTEGRAL, kernels.CURRENT_DEMAND]] = share * model.Cd / model.K
+        state[kernels.CURRENT_INTEGRAL] = model.R * state[kernels.CURRENT]
+        commanded = demand[:, a] + offsets[name] * 1e-3
+        places.append(closed_loop.simulate(model, CONFIG.axis[name], 0.001, commanded, state=state).position_mm)
+    errors = contour_error_um(demand, np.column_stack(places), 0.001)
+    return rms(errors), float(errors.max())
+
+
 def _print_cases() -> None:
     print(f"\n{PLANTS} plants that scatter as identified models do; least gain, most harm (wanted: <= 2 um, <= 1 um)")
     print(f"{'path':32}{'RMS um':>8}{'left':>7}{'gain >=':>9}{'wanted':>8}{'/mirror':>9}{'wanted':>8}", end="")
@@ -171,6 +190,9 @@ def main() -> None:
     print(f"an hour of path, two axes on one core: {factor:.0f} x real time (wanted: 20); ", end="")
     print(f"memory grows by {growth:.1f} MB; largest error {largest:.2f} um")
     print(f"a seam adds {max(0.0, seams()):.3f} um (wanted: < 0.05)")
+    for share in (0.0, 0.5, 0.9, -0.9):
+        print(f"at the start the regulators hold {share:.0%} of the dry friction:", end=" ")
+        print("{:.2f} um RMS is left, {:.1f} um at most".format(*held_at_start(share)))
     _print_cases()
     _print_lags()
 

@@ -33,8 +33,8 @@ def machine(tmp_path: Path) -> Path:
 
 
 @contextmanager
-def answering(machine: Path, answer: Mapping[str, Any]) -> Iterator[list[dict[str, Any]]]:
-    """Stand in for the daemon: take one request and give ``answer``."""
+def answering(machine: Path, answer: Mapping[str, Any], *told: Mapping[str, Any]) -> Iterator[list[dict[str, Any]]]:
+    """Stand in for the daemon: take one request, tell its progress and give ``answer``."""
     requests: list[dict[str, Any]] = []
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as server:
         server.bind(str(machine.parent / "fdhil-data" / "run" / "daemon.sock"))
@@ -44,6 +44,8 @@ def answering(machine: Path, answer: Mapping[str, Any]) -> Iterator[list[dict[st
             peer, _ = server.accept()
             with peer, peer.makefile("rb") as lines:
                 requests.append(json.loads(lines.readline()))
+                for progress in told:
+                    peer.sendall(json.dumps({"progress": progress}).encode() + b"\n")
                 peer.sendall(json.dumps(answer).encode() + b"\n")
 
         thread = threading.Thread(target=serve)
@@ -79,7 +81,8 @@ def test_arm_sends_the_token_and_says_what_is_promised(machine: Path, tmp_path: 
     assert (code, out) == (0, "armed p.ngc\n")
     token = (machine.parent / "fdhil-data" / "run" / "token").read_text()
     program = str((tmp_path / "p.ngc").resolve())
-    assert requests == [{"request": "arm", "program": program, "method": "mirror", "token": token}]
+    wanted = {"request": "arm", "program": program, "method": "mirror", "token": token, "progress": True}
+    assert requests == [wanted]
 
 
 def test_a_refusal_exits_1_with_class_cause_and_next_action(machine: Path, tmp_path: Path, capsys: Any) -> None:
@@ -91,6 +94,21 @@ def test_a_refusal_exits_1_with_class_cause_and_next_action(machine: Path, tmp_p
     with answering(machine, answer):
         code, out, _ = fdhil("disarm", machine, "--json", capsys=capsys)
     assert (code, json.loads(out)) == (1, answer)
+
+
+def test_arm_shows_how_far_the_check_of_a_long_program_is(machine: Path, capsys: Any) -> None:
+    told = {"program": "p.ngc", "checked_s": 83.0, "line": 40, "times_real_time": 31.6, "refused": 2}
+    refused = {"ok": False, "code": "A", "text": "one", "advice": "do", "refused": ["A: one", "B: two"]}
+    with answering(machine, refused, told | {"refused": 0}, told):
+        code, out, err = fdhil("arm", machine, "p.ngc", capsys=capsys)
+    assert (code, out) == (1, "")
+    assert "\rchecked 1:23 of the program, line 40, 32 x real time, 2 places refused" in err
+    assert err.splitlines()[-2:] == ["refused: A: one; do", "also: B: two"]
+    (machine.parent / "fdhil-data" / "run" / "daemon.sock").unlink()
+    with answering(machine, refused, told):
+        code, out, err = fdhil("arm", machine, "p.ngc", "--json", capsys=capsys)
+    assert (code, json.loads(out)) == (1, refused)
+    assert json.loads(err) == {"progress": told}
 
 
 @pytest.mark.parametrize("command", ["status", "disarm"])
