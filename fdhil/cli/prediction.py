@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -18,12 +20,30 @@ if TYPE_CHECKING:
     from fdhil.records import Correction, Float, Parameters, Prediction, Reason, Trajectory
 
 FILE = click.Path(path_type=Path)
-Command = TypeVar("Command", bound=Callable[..., Any])
 MANY_ZONES = 12
 
 
-def _shared(command: Command) -> Command:
-    """Add the argument and options that both commands have."""
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """The argument and options that both commands have."""
+
+    program: Path
+    config_path: Path
+    model_path: Path | None
+    from_history: bool
+    out: Path | None
+    report: Path | None
+    as_json: bool
+
+
+def _shared(wanted: Callable[..., int]) -> Callable[..., int]:
+    """Add the argument and options that both commands have; ``wanted`` gets them as one ``Asked``."""
+
+    @functools.wraps(wanted)
+    def command(**options: Any) -> int:
+        own = {name: value for name, value in options.items() if name not in Asked.__dataclass_fields__}
+        return wanted(Asked(**{name: options[name] for name in Asked.__dataclass_fields__}), **own)
+
     for option in reversed(
         (
             click.argument("program", type=FILE, metavar="PROGRAM|DEMAND.csv"),
@@ -37,7 +57,7 @@ def _shared(command: Command) -> Command:
             click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else."),
         )
     ):
-        command = option(command)
+        option(command)
     return command
 
 
@@ -52,18 +72,7 @@ def _shared(command: Command) -> Command:
 @click.option(
     "--since", type=int, metavar="REVISION", help="With --from-history: compare inertia and friction with REVISION."
 )
-def predict(
-    program: Path,
-    config_path: Path,
-    model_path: Path | None,
-    from_history: bool,
-    out: Path | None,
-    report: Path | None,
-    as_json: bool,
-    sensitivity: bool,
-    tolerance_um: float | None,
-    since: int | None,
-) -> int:
+def predict(asked: Asked, sensitivity: bool, tolerance_um: float | None, since: int | None) -> int:
     """Predict the path error that the drives will leave of a PROGRAM (NC program or demand CSV).
 
     The parameters are the configuration's nominal ones unless --model or --from-history says otherwise. Exit codes: 0
@@ -73,28 +82,28 @@ def predict(
     axis' inertia or friction is told with what it costs: since REVISION, or since before the last step. The prediction
     is kept in the store, and the next one of the same program tells what became of each zone, and by which parameter.
     """
-    if not from_history and (tolerance_um is not None or since is not None):
+    if not asked.from_history and (tolerance_um is not None or since is not None):
         raise click.UsageError("--tolerance-um and --since look at the history: give --from-history too")
-    reference, models, config = inputs(program, config_path, model_path, from_history)
+    reference, models, config = inputs(asked.program, asked.config_path, asked.model_path, asked.from_history)
     from fdhil import prediction
 
     predicted = prediction.predict(reference, models, config)
     columns = _prediction_columns(predicted)
-    document = {"schema": "fdhil-predict-1", "program": str(program), **_prediction_document(predicted)}
+    document = {"schema": "fdhil-predict-1", "program": str(asked.program), **_prediction_document(predicted)}
     told = None
     if sensitivity or tolerance_um is not None:
         told = prediction.sensitivity_um(predicted, models, config)
         for zone, per_axis in zip(document["zones"], told, strict=True):
             zone["um_per_percent"] = per_axis
     steps: Sequence[Step] = ()
-    if from_history:
-        std_um, steps = _with_history(document, program, predicted, models, config, since, told, tolerance_um)
+    if asked.from_history:
+        std_um, steps = _with_history(document, asked.program, predicted, models, config, since, told, tolerance_um)
         columns["contour_std_um"] = (std_um, 4)
-    if out is not None:
-        _write(out, columns)
-    if report is not None:
-        _report(report, program, config, predicted)
-    if as_json:
+    if asked.out is not None:
+        _write(asked.out, columns)
+    if asked.report is not None:
+        _report(asked.report, asked.program, config, predicted)
+    if asked.as_json:
         click.echo(json.dumps(document, allow_nan=False))
         return 0
     from fdhil.cli import forecast
@@ -145,31 +154,22 @@ def _with_history(
 @click.command()
 @_shared
 @click.option("--method", type=click.Choice(list(tables.CORRECTIONS)), help="Left out: the best there is.")
-def correct(
-    program: Path,
-    config_path: Path,
-    model_path: Path | None,
-    from_history: bool,
-    out: Path | None,
-    report: Path | None,
-    as_json: bool,
-    method: str | None,
-) -> int:
+def correct(asked: Asked, method: str | None) -> int:
     """Plan the offsets that correct the predicted path error of a PROGRAM (NC program or demand CSV).
 
     Nothing is sent. A correction that is not predicted to help is refused, with advice: its offsets are 0. Exit codes:
     0 planned, 1 refused, 2 wrong option, model or configuration, 3 a file cannot be read or written.
     """
-    reference, models, config = inputs(program, config_path, model_path, from_history)
+    reference, models, config = inputs(asked.program, asked.config_path, asked.model_path, asked.from_history)
     from fdhil import correction
 
     planned = correction.plan(reference, models, config, method)
-    if out is not None:
-        _write(out, _correction_columns(planned))
-    if report is not None:
-        _report(report, program, config, planned)
-    if as_json:
-        click.echo(json.dumps(_correction_document(str(program), planned), allow_nan=False))
+    if asked.out is not None:
+        _write(asked.out, _correction_columns(planned))
+    if asked.report is not None:
+        _report(asked.report, asked.program, config, planned)
+    if asked.as_json:
+        click.echo(json.dumps(_correction_document(str(asked.program), planned), allow_nan=False))
     else:
         _show_correction(planned)
     return 1 if planned.refused else 0
