@@ -6,11 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fdhil.identification.filtering import through
+from fdhil.identification.filtering import quick_size, through
+from fdhil.identification.normal import root_of, solve
 from fdhil.records import Float, VoltageSampling
 
 TESTED_LAGS = 25
 SUMMED_LAGS = 50  # rows over which innovations may hang together
+COLOUR_ROWS = 10  # rows before that foretell an innovation: a window of 0.1 s tells no more weights
 VARIANCE_PARTS = 10
 BEYOND_CHANCE = 5.0  # standard deviations: some seventy figures a window
 
@@ -88,28 +90,68 @@ def suspicious(innovations: Float) -> bool:
     return bool(max(np.abs(correlations).max() * np.sqrt(n), uneven) > BEYOND_CHANCE)
 
 
-def robust(information: Float, scores: Sequence[Float]) -> Float:
+def robust(information: Float, scores: Sequence[Float], rows: Sequence[tuple[Float, Float]]) -> Float:
     """Return the covariance (k, k) of a fit with ``information`` (k, k), whose windows have ``scores`` (n, k) by row.
 
-    The sandwich of Newey and West (1987): inverse information around the long-run covariance of the scores, with
-    Bartlett's weights, widened by what its own scatter costs (Kiefer and Vogelsang 2005, 95 %). No direction is told
-    better than by the information: a lucky sample is not precision.
+    ``rows`` holds, for each window whose voltage comes with its rows, the innovations' slopes (n, 2, k) and those
+    innovations (m, 2) that are sure. The inverse information stands around the variance of the scores, told in two
+    ways. By the scores themselves (Newey and West 1987, with what its own scatter costs after Kiefer and Vogelsang
+    2005): that holds for uneven variance, but of what hangs together over a good part of the window, the fit has taken
+    most away. By an autoregression of the innovations, which lets a colour tell its slow part too. The larger of both
+    counts in every direction, and none is told better than by the information: a lucky sample is not precision.
     """
-    scale = np.sqrt(np.diag(information))
-    powers, axes = np.linalg.eigh(information / np.outer(scale, scale))
-    kept = powers > powers[-1] * 1e-15
-    root = (axes[:, kept] / np.sqrt(powers[kept])) / scale[:, None]  # root root' is the inverse information
-    meat = np.zeros((root.shape[1], root.shape[1]))
-    for rows in scores:
-        own = rows @ root
-        meat += own.T @ own
-        for lag in range(1, min(SUMMED_LAGS, len(own) // 4) + 1):
-            shifted = own[lag:].T @ own[:-lag]
-            meat += (1.0 - lag / (SUMMED_LAGS + 1)) * (shifted + shifted.T)
-    share = SUMMED_LAGS / sum(len(rows) for rows in scores)
-    ratios, turned = np.linalg.eigh(meat * (1.0 + 2.9694 / 1.96 * min(share, 1.0)) ** 2)
-    sandwich: Float = root @ (turned * np.maximum(ratios, 1.0)) @ turned.T @ root.T
+    root = root_of(information)
+    power, foretold = np.zeros((2, root.shape[1], root.shape[1]))
+    for own in scores:
+        power += _summed(own @ root)
+    for slopes, innovations in rows:
+        foretold += _coloured(slopes @ root, _spectrum(innovations, quick_size(2 * len(slopes))))
+    share = SUMMED_LAGS / sum(len(own) for own in scores)
+    power *= (1.0 + 2.9694 / 1.96 * min(share, 1.0)) ** 2
+    sandwich: Float = root @ _larger(foretold, _larger(power, np.eye(len(power)))) @ root.T
     return sandwich
+
+
+def _summed(scores: Float) -> Float:
+    """Return the variance (k, k) of the sum of ``scores`` (n, k) that hang together, with Bartlett's weights."""
+    meat = scores.T @ scores
+    for lag in range(1, min(SUMMED_LAGS, len(scores) // 4) + 1):
+        shifted = scores[lag:].T @ scores[:-lag]
+        meat += (1.0 - lag / (SUMMED_LAGS + 1)) * (shifted + shifted.T)
+    return meat
+
+
+def _spectrum(innovations: Float, size: int) -> Float:
+    """Return the spectrum (size // 2 + 1, 2, 2) of innovations (n, 2) by an autoregression of ``COLOUR_ROWS`` rows."""
+    n = len(innovations)
+    before = np.hstack([innovations[COLOUR_ROWS - lag : n - lag] for lag in range(1, COLOUR_ROWS + 1)])
+    weights, _ = solve(before, innovations[COLOUR_ROWS:])
+    left = innovations[COLOUR_ROWS:] - before @ weights
+    news = left.T @ left / (n - 3 * COLOUR_ROWS)
+    filters = np.concatenate([np.eye(2)[None], -weights.reshape(COLOUR_ROWS, 2, 2).transpose(0, 2, 1)])
+    answer = np.linalg.inv(np.fft.rfft(filters, size, axis=0))
+    spectrum: Float = answer @ news @ answer.conj().transpose(0, 2, 1)
+    return spectrum
+
+
+def _coloured(slopes: Float, spectrum: Float) -> Float:
+    """Return the variance (k, k) of the sum of slopes (n, 2, k) times innovations of that ``spectrum``."""
+    size = 2 * (len(spectrum) - 1)
+    turned = np.fft.rfft(slopes, size, axis=0)
+    weights = np.full(len(spectrum), 2.0)
+    weights[[0, -1]] = 1.0
+    variance: Float = np.einsum("f,far,fas->rs", weights, turned.conj(), spectrum @ turned).real / size
+    return variance
+
+
+def _larger(one: Float, other: Float) -> Float:
+    """Return the variance that is, in every direction, the larger of ``one`` and ``other`` (positive), both (k, k)."""
+    lower = np.linalg.cholesky(other)
+    inverse = np.linalg.inv(lower)
+    ratios, axes = np.linalg.eigh(inverse @ one @ inverse.T)
+    turned = lower @ axes
+    larger: Float = (turned * np.maximum(ratios, 1.0)) @ turned.T
+    return larger
 
 
 def aliasing(sampling: VoltageSampling, dt_s: float) -> Float:

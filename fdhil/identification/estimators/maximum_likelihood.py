@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdhil.config import Identification
-from fdhil.identification.covariance import aliasing, robust, suspicious
+from fdhil.identification.covariance import TESTED_LAGS, aliasing, robust, suspicious
 from fdhil.identification.delay import coarse_delay
 from fdhil.identification.estimators import least_squares
 from fdhil.identification.estimators.least_squares import Signals
@@ -335,9 +335,16 @@ def robust_inverse(result: Fit, inverse: Float) -> Float:
     sampled = [e[2 * m.n :, None] for m, e in zip(motions, parts, strict=True)]
     if not any(suspicious(e) for e in (*rows, *sampled)):
         return inverse
-    products = np.split(result.jacobian * result.residuals[:, None], cuts)
-    delay = float(result.theta[6])
-    return robust(result.information, [in_order(m, delay, p) for m, p in zip(motions, products, strict=True)])
+    slopes = np.split(result.jacobian, cuts)
+    scores = [
+        in_order(m, float(result.theta[6]), j * e[:, None]) for m, j, e in zip(motions, slopes, parts, strict=True)
+    ]
+    plain = [
+        (j.reshape(m.n, 2, -1), e)
+        for m, j, e in zip(motions, slopes, rows, strict=True)
+        if m.slow is None and len(e) >= 4 * TESTED_LAGS
+    ]
+    return robust(result.information, scores, plain)
 
 
 def finish(result: Fit) -> Estimate:
