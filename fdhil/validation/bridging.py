@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -136,38 +137,67 @@ class Bridge:
         walks = [np.full(motion.n, motion.speed_walk**2), np.maximum(about, float(change.mean())), RISES**2 * about]
         return cls(fit, np.column_stack([motion.current, motion.speed, voltage]), variances, np.column_stack(walks))
 
-    def log_chance(
-        self, name: str, run: tuple[int, int], judged: tuple[int, int], level: float, deviation: float
-    ) -> float:
-        """Return log p that a living sensor ``name`` is as far from ``level`` in the half-open rows ``judged``.
+    def crossing(self, name: str, start: int, end: int) -> Crossing | None:
+        """Return rows ``start`` to ``end`` - 1 and those beside them, without what sensor ``name`` reads in them.
 
-        It is that of the sum of squares by which these readings, each with a ``deviation``, make the best course of
-        all sensors worse; its other readings of the ``run`` are left out. 0 where samples are lost beside the rows,
-        or nothing is read there.
+        None where samples are lost there, or nothing else is read.
         """
         motion, theta = self.fit.problem.motions[0], self.fit.theta
         rows = round(BESIDE_S / motion.dt_s)
-        part = slice(max(0, run[0] - rows), min(motion.n, run[1] + rows))
+        part = slice(max(0, start - rows), min(motion.n, end + rows))
         if (motion.mode[part] == BROKEN).any():
-            return 0.0
+            return None
         signal = SIGNALS.index(name)
         # a voltage that is late by part of a row, or an instant, is mixed from two
-        more = math.ceil(abs(theta[6]) / motion.dt_s) + 1 if name == "voltage" else 0
-        without = self.variances[part].copy()
-        without[max(0, run[0] - part.start - more) : run[1] - part.start + more, signal] = np.inf
-        within = without.copy()
-        first, end = judged[0] - part.start, judged[1] - part.start
-        inside = slice(first + more, max(first + more, end - more))
-        within[inside, signal] = deviation**2
-        if not np.isfinite(without.min(axis=0)).all():
-            return 0.0
+        mixed = math.ceil(abs(theta[6]) / motion.dt_s) + 1 if name == "voltage" else 0
+        variances = self.variances[part].copy()
+        variances[max(0, start - part.start - mixed) : end - part.start + mixed, signal] = np.inf
+        if not np.isfinite(variances.min(axis=0)).all():
+            return None
         mode = motion.mode[part].astype(np.float64)
-        read = self.readings[part].copy()
-        read[inside, signal] = level
-        told = (theta, motion.dt_s, mode, read)
-        forced, news = _squares(*told, within, self.walks[part], signal)
-        free, other_news = _squares(*told, without, self.walks[part], signal)
+        return Crossing(
+            theta, motion.dt_s, mode, self.readings[part], variances, self.walks[part], signal, part.start, mixed
+        )
+
+
+@dataclass(frozen=True)
+class Crossing:
+    """The rows about a run whose readings of one ``signal`` are left out; they begin at row ``begin`` of the window.
+
+    Readings within ``mixed`` rows of the run's ends are mixed from the run and what is beside it.
+    """
+
+    theta: Float
+    dt_s: float
+    mode: Float
+    readings: Float
+    variances: Float
+    walks: Float
+    signal: int
+    begin: int
+    mixed: int
+
+    @cached_property
+    def free(self) -> tuple[float, float]:
+        """Return the squares and the news of the best course that leaves the run out."""
+        return self._squares(self.readings, self.variances)
+
+    def log_chance(self, start: int, end: int, level: float, deviation: float) -> float:
+        """Return log p that a living sensor is as far from ``level`` in rows ``start`` to ``end`` - 1 of the window.
+
+        It is that of the sum of squares by which these readings, each with a ``deviation``, make the best course of
+        all sensors worse.
+        """
+        first, beyond = start - self.begin + self.mixed, end - self.begin - self.mixed
+        if beyond <= first:
+            return 0.0
+        readings, variances = self.readings.copy(), self.variances.copy()
+        readings[first:beyond, self.signal], variances[first:beyond, self.signal] = level, deviation**2
+        (forced, news), (free, other_news) = self._squares(readings, variances), self.free
         return _log_beyond(forced - free, max(news - other_news, 1.0))
+
+    def _squares(self, readings: Float, variances: Float) -> tuple[float, float]:
+        return _squares(self.theta, self.dt_s, self.mode, readings, variances, self.walks, self.signal)
 
 
 def _log_beyond(square: float, freedom: float) -> float:

@@ -9,9 +9,9 @@ is refused where one of these leaves a chance below ``CHANCE``, shared by all re
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property, partial
 
 import numpy as np
 
@@ -61,7 +61,7 @@ class Signal:
 
 def stuck_values(window: Window, fit: Fit | None) -> Iterator[Reason]:
     """Yield a reason for each sensor that surely stuck during the move; ``fit`` is the window's, where there is one."""
-    bridge = Bridge.over(fit) if fit is not None and _bears(fit) else None
+    bridge = cache(partial(Bridge.over, fit)) if fit is not None and _bears(fit) else None
     begin, end = moving_range(window)
     for name, unit, values in signals_of(window):
         same = np.concatenate([[False], np.diff(values[begin:end]) == 0.0, [False]])
@@ -92,7 +92,7 @@ def _bears(fit: Fit) -> bool:
     return motion.slow is None and finite and bool((theta[:4] > 0).all()) and abs(theta[6]) <= motion.dt_s
 
 
-def _is_stuck(signal: Signal, start: int, last: int, limit: float, bridge: Bridge | None) -> bool:
+def _is_stuck(signal: Signal, start: int, last: int, limit: float, bridge: Callable[[], Bridge] | None) -> bool:
     """Return whether rows ``start`` to ``last``, all alike, are less likely than ``limit`` by every explanation."""
     if (last - start) < max(2, round(SHORTEST_S / signal.dt_s)):
         return False
@@ -103,13 +103,14 @@ def _is_stuck(signal: Signal, start: int, last: int, limit: float, bridge: Bridg
         return False
     left, right = _steady_rows(signal, start, last)
     length = last - start + 1
-    steady = min(left, right) >= max(LEAST_ROWS, length // SIDE) and max(left, right) >= min(length, MOST_ROWS)
+    whole = min(length, MOST_ROWS)
+    steady = min(left, right) >= max(LEAST_ROWS, length // SIDE) and max(left, right) >= whole
     if steady and _departs_from_neighbours(signal, start, last, (left, right), limit):
         return True
-    if at_rail or (steady and bridge is None):
+    if at_rail or (steady and (bridge is None or min(left, right) >= whole)):
         return False
     if bridge is not None:
-        return _departs_from_others(signal, start, last, limit, bridge)
+        return _departs_from_others(signal, start, last, limit, bridge())
     part = signal.readings[signal.begin : signal.end]
     first, end = start - signal.begin, last - signal.begin
     return beyond_chance(part, first, end) or wakes_with_a_jump(part, first, end)
@@ -180,12 +181,14 @@ def _departs_from_others(signal: Signal, start: int, last: int, limit: float, br
 
     A sensor that sticks is furthest from the truth where it wakes.
     """
+    crossing = bridge.crossing(signal.name, start + 1, last + 1)
+    if crossing is None:
+        return False
     deviation = signal.step * math.sqrt(signal.noise**2 + 1.0 / 12.0)
     levels = [signal.step * (signal.readings[start] + share) for share in (0.0, -WITHIN_STEP, WITHIN_STEP)]
     part = (last - start) // PARTS
     limit -= math.log(3.0)
     for first, end in ((start + 1, last + 1), (last + 1 - part, last + 1), (start + 1, start + 1 + part)):
-        run = (start + 1, last + 1)
-        if all(bridge.log_chance(signal.name, run, (first, end), level, deviation) < limit for level in levels):
+        if all(crossing.log_chance(first, end, level, deviation) < limit for level in levels):
             return True
     return False
