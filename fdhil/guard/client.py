@@ -19,6 +19,7 @@ from fdhil.guard import table
 from fdhil.guard.control import SOCKET_NAME
 
 TABLE_NAME = "guard.table"
+ANSWER_S = 8.0  # the guard answers a request at a SYNC, or when it has missed it for up to 5 s
 
 
 class GuardLost(DeviceError):
@@ -33,7 +34,7 @@ class GuardClient:
     no answer comes. Safe to use from two threads: ``alive`` may be called while another waits for an answer.
     """
 
-    def __init__(self, run_directory: Path, timeout_s: float = 5.0) -> None:
+    def __init__(self, run_directory: Path, timeout_s: float = ANSWER_S) -> None:
         self._table = run_directory / TABLE_NAME
         self._timeout_s = timeout_s
         self._asking, self._sending = threading.Lock(), threading.Lock()

@@ -55,9 +55,7 @@ def test_an_identified_machine_follows_without_a_program(shop: Shop, case: str, 
         shop.play("shuttle.ngc", SHUTTLE)
         shop.status_when(lambda s: all(s["axes"][a]["accepted"] >= 4 for a in "XY"))
         before = largest_error_um(shop, "before")
-        code, out, err = fdhil("arm", shop.path, "--method", "flatness", "--json", capsys=capsys)
-        assert code == 0, (out, err)
-        assert json.loads(out)["state"] == "FEEDFORWARD"
+        switch_on(shop, capsys)
         shop.status_when(lambda s: s["state"] == "FEEDFORWARD")
         after = largest_error_um(shop, "after")
         assert before / after >= CASES[case][1], (before, after)
@@ -71,9 +69,19 @@ def test_an_identified_machine_follows_without_a_program(shop: Shop, case: str, 
         assert guard.stop() == 0
 
 
+def switch_on(shop: Shop, capsys: Capture) -> None:
+    """Arm; a host that is busy for seconds on end may leave the guard without SYNC, which it then says."""
+    for _ in range(3):
+        code, out, err = fdhil("arm", shop.path, "--method", "flatness", "--json", capsys=capsys)
+        if code == 0 or not any(late in out + err for late in ("GuardAbsent", "SyncLost", "NotSettled")):
+            break
+    assert code == 0, (out, err)
+    assert json.loads(out)["state"] == "FEEDFORWARD"
+
+
 def fades_out_on_an_emergency(shop: Shop, capsys: Capture) -> None:
     """A drive's emergency ends it by itself, with its class; nothing is armed again."""
-    assert fdhil("arm", shop.path, "--method", "flatness", capsys=capsys)[0] == 0
+    switch_on(shop, capsys)
     shop.status_when(lambda s: s["state"] == "FEEDFORWARD")
     shop.twin.command("fault", fault="frame", can_id=0x081, data="1043080000000000")
     told = shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)

@@ -10,10 +10,12 @@ from typing import Any
 import pytest
 
 from fdhil.guard import core
+from fdhil.guard.client import ANSWER_S
 from fdhil.guard.conditions import View, failing, not_ready
 from fdhil.guard.interlocks import CATALOGUE, FACTS, Alarm, Reaction
 from fdhil.guard.state import AxisInput, AxisState, BusView, Inputs, Mode
 from tests.guard.machine import DIGEST, FACTS_GIVEN, Bench, arm_request, axis_settings, bench
+from tests.guard.machine import settings as machine_settings
 
 Change = Callable[[AxisInput], AxisInput]
 # one change per interlock, that breaks it and no other
@@ -251,3 +253,8 @@ def test_feedback_that_is_three_old_is_a_gap_four_is_stale() -> None:
     bus = BusView(sync_regular=True, silent=False)
     assert {alarm.code for alarm in failing(bus, (changed({"feedback_age": 3.0}),))} == {"FeedbackGap"}
     assert {alarm.code for alarm in failing(bus, (changed({"feedback_age": 3.5}),))} == {"FeedbackGap", "StaleData"}
+
+
+def test_the_client_waits_longer_than_the_guard_for_a_sync() -> None:
+    """Else an arming without SYNC would look like a guard that is gone, and not be refused as SyncLost."""
+    assert machine_settings(clock="sync").silence_s + 1 < ANSWER_S

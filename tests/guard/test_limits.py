@@ -164,3 +164,12 @@ def test_travel_lies_between_nine_tenths_of_a_second_and_a_whole_one(moves: list
         travel = travel.add(move, 100)
         assert sum(map(abs, moves[max(0, k - 89) : k + 1])) <= travel.total
         assert travel.total <= sum(map(abs, moves[max(0, k - 99) : k + 1]))
+
+
+def test_standing_still_or_moving_inward_is_allowed_outside_the_limit() -> None:
+    """An adopted offset may lie beyond it: it must not grow, and may stand."""
+    assert violation(SMALL, SMALL.offset + 5, 0, SMALL.offset + 5) is None
+    assert violation(SMALL, SMALL.offset + 5, 0, SMALL.offset + 4) is None
+    assert violation(SMALL, -SMALL.offset - 5, 0, -SMALL.offset - 5) is None
+    assert violation(SMALL, SMALL.offset + 5, 0, SMALL.offset + 6) == "OffsetLimit"
+    assert violation(SMALL, -SMALL.offset - 5, 0, -SMALL.offset - 6) == "OffsetLimit"

@@ -140,3 +140,16 @@ def test_it_is_not_judged_without_a_speed() -> None:
     for position in (0, 10**6, -(10**6)):
         state = observe(state, Inputs(True, (seen(position, 0),), BusView()), made)
         assert state.axes[0].implausible == 0
+
+
+def test_one_wrong_read_back_is_forgiven_two_in_a_row_are_not() -> None:
+    """A good reading in between starts the count anew; a value of a cycle or two before is late, not wrong."""
+    state = initial(machine.settings("X"))
+    axis = state.axes[0]._replace(sent=(40, 30, 20, 10, 0, 0))
+    counts = []
+    for shown in (30, 7, 30, 7, 7, 20, 10, 0):
+        state = state._replace(axes=(axis._replace(echo_misses=state.axes[0].echo_misses),))
+        given = AxisInput(target=0, read_back=shown)
+        state = observe(state, Inputs(True, (given,), BusView()), machine.settings("X"))
+        counts.append(state.axes[0].echo_misses)
+    assert counts == [0, 1, 0, 1, 2, 0, 0, 1]
