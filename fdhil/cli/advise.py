@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
+import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -57,11 +60,14 @@ def advise(
 
     corrects = all(config.axis[axis].correction is not None for axis in reference.axes)
     sure, hopeful = _sources(program, reference, models, config, tolerance_um)
+    sure, hopeful = _telling(sure), hopeful and _telling(hopeful)
     judge = (lambda slower: _corrected(slower, models, config)) if corrects else None
     advice = advising.advise(sure, models, config, tolerance_um, judge)
     most: dict[float, Advice] | None = None
     if hopeful:
         most = {a.start_s: a for a in advising.advise(hopeful, models, config, tolerance_um, judge)}
+    if sys.stderr.isatty():
+        click.echo(err=True)
     if as_json:
         document = {"schema": "fdhil-advise-1", "program": str(program), "tolerance_um": tolerance_um}
         lines = [_entry(a, most) for a in advice]
@@ -85,6 +91,20 @@ def _sources(
     if program.suffix.lower() == ".csv":
         return demand_sources(reference, models, config, tolerance_um)
     return program_source(list(interpret(program, Budget.of(config.nc))), config), None
+
+
+def _telling(source: Source) -> Source:
+    """Return the source that shows on a terminal how often the path was run, and how long it is by now."""
+    if not sys.stderr.isatty():
+        return source
+    at, trials = source.at, itertools.count(1)
+
+    def told(shares: Mapping[int, float]) -> Trajectory:
+        reference = at(shares)
+        click.echo(f"\rtrial {next(trials)}, {reference.time_s[-1]:.0f} s of path ", err=True, nl=False)
+        return reference
+
+    return replace(source, at=told)
 
 
 def _corrected(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> Float:
