@@ -9,6 +9,7 @@ import math
 import shutil
 import time
 from collections.abc import Iterator
+from itertools import product
 
 import numpy as np
 
@@ -20,12 +21,12 @@ from fdhil.program.planner import stream
 from fdhil.records import Float
 from tests.bench import bench_config, bench_document
 from tests.program.linuxcnc_machine import demand
-from tests.program.test_linuxcnc_demand import ACCELERATION_MM_S2, EXACT_SHARE, PATHS, apart_mm, ours, program
+from tests.program.test_linuxcnc_demand import ACCELERATION_MM_S2, EXACT_SHARE, apart_mm, ours, program
 
 BENCH = "G21 G90 G17 {mode}\nF{feed:g}\nG1 Y55\nX100\nG3 X200 I50\nG1 X250\nY0\nM2\n"
+BESIDE = ("contour", "zigzag", "helix", "wave")
 MODES = ("G61", "G64 P0.05", "G64")
-PROFILES = ("fir", "trapezoidal", "jerk_limited")
-MOVES = 100_000
+PROFILES = {"fir": 100_000, "trapezoidal": 100_000, "jerk_limited": 100_000, "linuxcnc": 10_000}  # motions of each
 HAVE_LINUXCNC = shutil.which("linuxcnc") is not None
 
 
@@ -52,26 +53,27 @@ def chords(count: int) -> Iterator[Motion]:
 
 def speeds() -> None:
     """Motions and seconds of path per second."""
-    for profile in PROFILES:
+    for profile, moves in PROFILES.items():
         begun, rows = time.process_time(), 0
-        for block in stream(chords(MOVES), machine(profile), 1000):
+        for block in stream(chords(moves), machine(profile), 1000):
             rows += block.time_s.size
         took = time.process_time() - begun
-        print(f"{profile}: {MOVES / took:.0f} motions/s, {rows * 0.001 / took:.0f} x real time on one core")
+        print(f"{profile}: {moves / took:.0f} motions/s, {rows * 0.001 / took:.0f} x real time on one core")
 
 
 def beside_linuxcnc() -> None:
-    """Rows, and the largest distance at the same millisecond, of demands of the same program."""
-    print(
-        "path, mode, feed: rows of fdhil and of LinuxCNC, difference of time, largest distance at the same millisecond"
-    )
-    for path in PATHS:
-        for mode, feed in (("G61", 6000.0), ("G61", 20000.0), ("G64 P0.05", 3000.0), ("G64 P0.05", 10000.0)):
+    """Difference of time, and the largest distance at the same millisecond, of two profiles beside LinuxCNC."""
+    print("path, mode, feed: rows of LinuxCNC; difference of time, largest distance at the same millisecond")
+    for path in BESIDE:
+        for mode, feed in product(("G61", "G64 P0.05", "G64 P0.2 Q0.02"), (6000.0, 20000.0)):
             text = program(path, mode, feed)
-            a = ours(text, ACCELERATION_MM_S2 * (EXACT_SHARE if mode == "G61" else 1.0))
             b = demand(text, acceleration_mm_s2=ACCELERATION_MM_S2)
-            told = f"{len(a)} and {len(b)}, {100 * (len(a) / len(b) - 1):+.2f} %, {apart_mm(a, b):.3f} mm"
-            print(f"{path}, {mode}, {feed / 1000:g} m/min: {told}")
+            told = []
+            for profile in ("linuxcnc", "trapezoidal"):
+                share = EXACT_SHARE if mode == "G61" and profile == "trapezoidal" else 1.0
+                a = ours(text, ACCELERATION_MM_S2 * share, profile)
+                told.append(f"{profile} {100 * (len(a) / len(b) - 1):+.2f} %, {apart_mm(a, b):.3f} mm")
+            print(f"{path}, {mode}, {feed / 1000:g} m/min: {len(b)}; {'; '.join(told)}")
 
 
 def jerky() -> Iterator[tuple[str, Float]]:

@@ -1,12 +1,13 @@
-"""The trapezoidal profile against the demand that LinuxCNC's own planner orders, millisecond by millisecond.
+"""The profiles against the demand that LinuxCNC's own planner orders, millisecond by millisecond.
 
-LinuxCNC accelerates with 0.9 of the joints' acceleration where a motion ends exactly, with all of it where it blends by
-an arc, and with half of it where it blends by a parabola (measured on the package's version); that is why G64 is
-compared by path and time alone.
+The profile ``linuxcnc`` does as it does. The trapezoidal one keeps what the axes can: LinuxCNC accelerates with 0.9 of
+the joints' acceleration where a motion ends exactly, with all of it where it blends by an arc, and with half of it
+where it blends by a parabola (measured on the package's version); that is why G64 is compared by path and time alone.
 """
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import numpy as np
@@ -40,16 +41,16 @@ def program(path: str, mode: str, feed: float) -> str:
     return f"G21 G90 G17 {mode}\nF{feed:g}\n{PATHS[path]}M2\n"
 
 
-def machine(acceleration_mm_s2: float) -> configuration.MachineConfig:
+def machine(acceleration_mm_s2: float, profile: str = "trapezoidal") -> configuration.MachineConfig:
     document = bench_document("XYZ")
     for axis in document["axis"].values():
         axis["max_acceleration_mm_s2"] = acceleration_mm_s2
-    document["nc"] = {"profile": "trapezoidal", "rapid_stop": False, "end_rest_s": 0.0}
+    document["nc"] = {"profile": profile, "rapid_stop": False, "end_rest_s": 0.0}
     return configuration.parse(document)
 
 
-def ours(text: str, acceleration_mm_s2: float = ACCELERATION_MM_S2) -> Float:
-    reference = plan(interpret(text.splitlines()), machine(acceleration_mm_s2))
+def ours(text: str, acceleration_mm_s2: float = ACCELERATION_MM_S2, profile: str = "trapezoidal") -> Float:
+    reference = plan(interpret(text.splitlines()), machine(acceleration_mm_s2, profile))
     rows = np.column_stack(list(reference.position_mm.values()))
     moving = np.flatnonzero(np.abs(np.diff(rows, axis=0)).max(axis=1) > 1e-9)
     return np.asarray(rows[: moving[-1] + 2])
@@ -101,6 +102,49 @@ def test_g64_stays_within_p_and_takes_about_the_same_time(
     for rows in (a, b):
         assert np.max(tree.query(rows[:, :2])[0]) <= tolerance_mm + 0.003
     assert len(a) == pytest.approx(len(b), rel=share)
+
+
+def polygon(seed: int, count: int = 14) -> str:
+    """Lines of 2 to 40 mm in any direction of space."""
+    random = np.random.default_rng(seed)
+    ways = random.normal(size=(count, 3)) * [1.0, 1.0, 0.3]
+    places = np.cumsum(ways / np.linalg.norm(ways, axis=1)[:, None] * random.uniform(2.0, 40.0, (count, 1)), axis=0)
+    return "".join(f"G1 X{x:.3f} Y{y:.3f} Z{z:.3f}\n" for x, y, z in places)
+
+
+def wave(step_mm: float, height_mm: float, count: int = 150) -> str:
+    """A sine in chords."""
+    return "".join(
+        f"G1 X{step_mm * n:.4f} Y{height_mm * math.sin(0.1 * step_mm * n):.4f}\n" for n in range(1, count + 1)
+    )
+
+
+PATHS |= {
+    "polygon 1": polygon(101),
+    "polygon 2": polygon(203),
+    "wave": wave(0.3, 4.0),
+    "coarse wave": wave(1.5, 8.0, 60),
+    "pockets": "G1 X30\nY10\nG2 X40 Y20 I10\nG1 X60\nG3 X70 Y10 J-10\nG1 Y-20\nG0 X0 Y0\nG1 Z-5\n",
+    "ramp": "G1 X30\nG3 X30 Y0 Z-6 I-12 P2\nG1 X0 Y20\n",
+}
+
+
+@pytest.mark.parametrize(("mode", "feed"), [("G61", 2e4), ("G64 P0.05", 6e3), ("G64 P0.2 Q0.02", 2e4)])
+@pytest.mark.parametrize("path", PATHS)
+def test_the_profile_of_linuxcnc_orders_its_demand(path: str, mode: str, feed: float) -> None:
+    """Within 2 % of its time, and on its path: beside what one cycle of the other's lies apart."""
+    text = program(path, mode, feed)
+    a, b = ours(text, profile="linuxcnc"), theirs(text)
+    assert len(a) == pytest.approx(len(b), rel=0.02)
+    assert beside_mm(a, b) <= 0.02
+    assert beside_mm(b, a) <= 0.02
+
+
+def beside_mm(places: Float, path: Float) -> float:
+    """Largest distance of places from a path through points, which is refined to a hundredth of a cycle."""
+    share = np.linspace(0.0, 1.0, 100, endpoint=False)[:, None, None]
+    fine = (path[:-1] + share * (path[1:] - path[:-1])).reshape(-1, 3)
+    return float(np.max(cKDTree(np.concatenate([fine, path[-1:]])).query(places)[0]))
 
 
 def test_the_correction_stands_the_jerky_demand() -> None:

@@ -97,7 +97,7 @@ class Planner:
             here, before = queue[place], queue[place - 1]
             if before.ending != TANGENT:
                 return
-            reach = math.sqrt(here.end_speed**2 + 2.0 * here.along * here.shape.length)
+            reach = math.sqrt(here.end_speed**2 + 2.0 * here.along * here.sure)
             speed = min(reach, here.target, before.target, before.kink_speed)
             if speed == before.end_speed and place < number - _UNSETTLED:
                 return

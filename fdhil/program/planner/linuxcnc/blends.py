@@ -27,6 +27,7 @@ _TOLERANCE_SHARE = 0.25  # of a segment's length, where the program gives none
 _LENGTH_SHARE = 0.5  # of a segment's length that one blend may take
 _GAP_CYCLES = 4.0
 _LEAST_ANGLE_RAD = 1e-6
+_REVERSAL = -1.0 + 1e-9
 _LEAST_RADIUS_MM = 1e-6
 _ROUNDING_MM = 1e-9
 _TRIES = 12
@@ -72,6 +73,9 @@ def _forget_kink(before: Segment, after: Segment) -> None:
 def _passed(before: Segment, after: Segment, machine: Machine) -> bool:
     """Tell whether the kink may be passed at full speed; else what speed it allows is kept."""
     t1, t2 = before.shape.tangent(before.shape.length), after.shape.tangent(0.0)
+    if dot(t1, t2) < _REVERSAL:
+        before.ending = EXACT  # measured: a stop, and nothing is kept back for it
+        return False
     speed = min(before.free, after.free)
     step = speed / machine.dt_s + after.acceleration
     share = max(abs(b - a) * step / limit for a, b, limit in zip(t1, t2, machine.acceleration, strict=True))

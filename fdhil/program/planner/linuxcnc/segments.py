@@ -77,10 +77,14 @@ class Segment:
         return math.sqrt(left * left - turning * turning)
 
     @property
+    def sure(self) -> float:
+        """Length that it will have at least: half of it may still go to a blend."""
+        return self.shape.length if self.settled else self.shape.length / 2.0
+
+    @property
     def reachable(self) -> float:
-        """Speed that it reaches from rest to rest; half of a segment may still go to a blend."""
-        length = self.shape.length if self.settled else self.shape.length / 2.0
-        return min(self.target, math.sqrt(self.along * length))
+        """Speed that it reaches from rest to rest."""
+        return min(self.target, math.sqrt(self.along * self.sure))
 
     def settle(self, dt_s: float) -> None:
         """Take as long as three cycles at least, now that its length is final."""
