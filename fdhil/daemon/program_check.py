@@ -207,7 +207,9 @@ def keep(folder: Path, key: str, request: Callable[[BinaryIO], dict[str, Any]]) 
 
 
 def _end_with_the_daemon() -> None:
-    sys.stdin.buffer.read()  # the daemon's end of the pipe is closed when it is gone
+    # the daemon's end of the pipe is closed when it is gone; unbuffered: a lock that is held here would spoil the exit
+    while os.read(0, 1):
+        pass
     os._exit(1)
 
 

@@ -7,8 +7,11 @@ import hashlib
 import io
 import json
 import os
+import subprocess
+import sys
 from collections.abc import Mapping
 from pathlib import Path
+from subprocess import PIPE
 from typing import Any
 
 import numpy as np
@@ -160,6 +163,30 @@ async def test_a_broken_program_is_refused_with_its_line(config: MachineConfig, 
     assert isinstance(refused, tuple)
     assert refused[0].code == "ProgramError"
     assert "43" in refused[0].text
+
+
+def test_the_process_ends_with_its_answer_or_with_the_daemon(config: MachineConfig, tmp_path: Path) -> None:
+    request = {
+        "program": str(written(tmp_path, HEAD + "G1 X[1/0]\nM2\n")),
+        "config": config.model_dump(mode="json"),
+        "models": {axis: model.as_dict() for axis, model in nominal_models(config).items()},
+        "folder": str(tmp_path / FOLDER),
+        "key": "key",
+    }
+    command = [sys.executable, "-m", "fdhil.daemon.program_check"]
+    with subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=PIPE) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdin.write(json.dumps(request).encode() + b"\n")
+        process.stdin.flush()
+        assert json.loads(process.stdout.read())["error"]["code"] == "ProgramError"
+        assert process.wait() == 0
+        assert process.stderr.read() == b""
+    request["program"] = str(written(tmp_path, HEAD + SQUARE * 5000 + "M2\n"))
+    done = subprocess.run(command, input=json.dumps(request).encode() + b"\n", capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (1, b"")
+    assert b"header" not in done.stdout
 
 
 def made(folder: Path, key: str) -> Path:
