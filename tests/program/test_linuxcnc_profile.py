@@ -12,7 +12,6 @@ import pytest
 from scipy.spatial import cKDTree
 
 from fdhil import config as configuration
-from fdhil.errors import ProgramError
 from fdhil.program import Arc, Dwell, Feed, Motion, Rapid, interpret, plan
 from fdhil.program.motions import Corner
 from fdhil.program.planner import stream
@@ -20,6 +19,7 @@ from fdhil.program.planner.linuxcnc.joining import joined
 from fdhil.records import Float
 from tests.bench import bench_document
 from tests.program.test_look_ahead import dense_path, random_moves
+from tests.program.test_planner import check_blocks
 
 ACCELERATION_MM_S2 = 2000.0
 INTERPOLATED_ROWS = 2
@@ -138,13 +138,7 @@ def test_the_path_is_left_by_no_more_than_p_and_ends_where_it_is_told() -> None:
 
 
 def test_blocks_make_the_same_reference_whatever_their_length() -> None:
-    config = machine()
-    moves = [*random_moves(3, 90), Dwell(301, 0.1), Rapid(302, (0.0, 0.0, 0.0))]
-    whole = plan(moves, config)
-    blocks = list(stream(moves, config, 333))
-    for axis in whole.axes:
-        joined_rows = np.concatenate([block.position_mm[axis] for block in blocks])
-        np.testing.assert_array_equal(joined_rows, whole.position_mm[axis])
+    check_blocks([*random_moves(3, 90), Dwell(301, 0.1), Rapid(302, (0.0, 0.0, 0.0))], machine(), atol=0.0)
 
 
 def chords(count: int) -> Iterator[Motion]:
@@ -162,9 +156,3 @@ def test_a_long_program_is_planned_in_flat_memory() -> None:
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < 1.3 * peaks[0]
-
-
-def test_what_lasts_for_ever_or_moves_an_axis_that_is_not_there_is_refused() -> None:
-    for move in (Dwell(1, 1e300), Feed(1, (1.0, 0.0, 0.0), 0.0), Dwell(1, 20000.0)):
-        with pytest.raises(ProgramError):
-            plan([move], machine())

@@ -15,7 +15,6 @@ from scipy.spatial import cKDTree
 from fdhil import config as configuration
 from fdhil.correction import plan as correct
 from fdhil.correction import streaming
-from fdhil.errors import ProgramError
 from fdhil.prediction.models import nominal_models
 from fdhil.program import Arc, Dwell, Feed, Motion, Rapid, plan
 from fdhil.program.motions import BLEND, Corner
@@ -25,7 +24,7 @@ from fdhil.program.planner.pieces import LENGTH, piece, points
 from fdhil.records import Float, Trajectory
 from tests.bench import bench_config, bench_document
 from tests.paths import rms
-from tests.program.test_planner import MOVES
+from tests.program.test_planner import MOVES, check_blocks
 
 DT_S = 1e-3
 PROFILES = ("trapezoidal", "jerk_limited")
@@ -177,15 +176,8 @@ def test_rapid_and_feed_are_parted_by_a_stop_unless_the_configuration_blends_the
 def test_blocks_make_the_same_reference_whatever_their_length(profile: str) -> None:
     config = machine(profile)
     moves = [*random_moves(3, 700), Dwell(701, 0.25), *MOVES]
-    whole = plan(moves, config)
-    blocks = list(stream(moves, config, 333))
-    assert {block.time_s.size for block in blocks[:-1]} == {333}
-    for axis in whole.axes:
-        joined = np.concatenate([block.position_mm[axis] for block in blocks])
-        np.testing.assert_allclose(joined, whole.position_mm[axis], atol=1e-9)
-    np.testing.assert_array_equal(np.concatenate([block.line for block in blocks]), whole.line)
-    np.testing.assert_array_equal(np.concatenate([block.rapid for block in blocks]), whole.rapid)
-    check_limits(whole, config)
+    check_blocks(moves, config)
+    check_limits(plan(moves, config), config)
 
 
 def zigzag(count: int) -> Iterator[Motion]:
@@ -219,18 +211,6 @@ def test_short_blocks_reach_the_feed() -> None:
         check_limits(reference, config)
         if profile == "trapezoidal":
             assert reference.time_s[-1] == pytest.approx(2 * math.pi * radius / 150.0, rel=0.06)
-
-
-def test_what_lasts_for_ever_is_refused() -> None:
-    for moves in ([Dwell(1, 1e300)], [Feed(1, (1.0, 0.0, 0.0), 0.0)], [Feed(1, (1000.0, 0.0, 0.0), 1e-6)]):
-        with pytest.raises(ProgramError):
-            plan(moves, machine("trapezoidal"))
-    with pytest.raises(ProgramError, match="axis Z"):
-        plan([Rapid(7, (0.0, 0.0, 1.0))], machine("trapezoidal"))
-
-
-def test_no_motion_is_a_rest() -> None:
-    assert not plan([], machine("jerk_limited")).position_mm["X"].any()
 
 
 def test_the_smoothed_profile_is_what_it_was() -> None:

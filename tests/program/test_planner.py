@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -20,6 +21,15 @@ MOVES: list[Motion] = [
     Feed(4, (250.0, 55.0, 0.0), 10000.0),
     Rapid(5, (0.0, 0.0, 0.0)),
 ]
+
+
+PROFILES = ("fir", "trapezoidal", "jerk_limited", "linuxcnc")
+
+
+def profiled(profile: str) -> configuration.MachineConfig:
+    document = bench_document()
+    document["nc"] = {"profile": profile}
+    return configuration.parse(document)
 
 
 def test_a_feed_is_the_programmed_speed_through_two_moving_averages() -> None:
@@ -88,21 +98,27 @@ def test_a_dwell_holds_all_axes() -> None:
     assert reference.time_s[-1] == pytest.approx(0.1 + 0.088 + 0.5 + 0.088 + 0.1 + 0.088 + 0.5, abs=0.003)
 
 
-def test_blocks_of_a_stream_make_the_same_reference() -> None:
-    config = bench_config()
-    whole = plan(MOVES, config)
-    blocks = list(stream(MOVES, config, 333))
+def check_blocks(moves: Sequence[Motion], config: configuration.MachineConfig, atol: float = 1e-9) -> None:
+    """Planned at once and in blocks of 333 rows: the same."""
+    whole = plan(moves, config)
+    blocks = list(stream(moves, config, 333))
     assert {block.time_s.size for block in blocks[:-1]} == {333}
     for axis in whole.axes:
         joined = np.concatenate([block.position_mm[axis] for block in blocks])
-        np.testing.assert_allclose(joined, whole.position_mm[axis], atol=1e-9)
+        np.testing.assert_allclose(joined, whole.position_mm[axis], atol=atol)
     np.testing.assert_array_equal(np.concatenate([block.line for block in blocks]), whole.line)
     np.testing.assert_array_equal(np.concatenate([block.rapid for block in blocks]), whole.rapid)
 
 
-def test_an_axis_that_the_machine_lacks_is_refused() -> None:
+@pytest.mark.parametrize("profile", PROFILES)
+def test_blocks_of_a_stream_make_the_same_reference(profile: str) -> None:
+    check_blocks([*MOVES, Dwell(6, 0.25), *MOVES], profiled(profile))
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_an_axis_that_the_machine_lacks_is_refused(profile: str) -> None:
     with pytest.raises(ProgramError, match="axis Z") as caught:
-        plan([Rapid(7, (0.0, 0.0, 1.0))], bench_config())
+        plan([Rapid(7, (0.0, 0.0, 1.0))], profiled(profile))
     assert caught.value.line == 7
 
 
@@ -112,18 +128,18 @@ def test_axes_that_the_program_does_not_move_stay() -> None:
     assert not reference.position_mm["Z"].any()
 
 
-def test_no_motion_is_a_rest() -> None:
-    reference = plan([], bench_config())
-    assert not reference.position_mm["X"].any()
+@pytest.mark.parametrize("profile", PROFILES)
+def test_no_motion_is_a_rest(profile: str) -> None:
+    assert not plan([], profiled(profile)).position_mm["X"].any()
 
 
-def test_an_endless_duration_is_refused() -> None:
-    with pytest.raises(ProgramError):
-        plan([Dwell(1, 1e300)], bench_config())
-    with pytest.raises(ProgramError):
-        plan([Feed(1, (1.0, 0.0, 0.0), 0.0)], bench_config())
+@pytest.mark.parametrize("profile", PROFILES)
+def test_an_endless_duration_is_refused(profile: str) -> None:
+    for move in (Dwell(1, 1e300), Feed(1, (1.0, 0.0, 0.0), 0.0)):
+        with pytest.raises(ProgramError):
+            plan([move], profiled(profile))
     with pytest.raises(ProgramError, match="h; split"):
-        plan([Feed(1, (1000.0, 0.0, 0.0), 1e-6)], bench_config())
+        plan([Feed(1, (1000.0, 0.0, 0.0), 1e-6)], profiled(profile))
 
 
 def test_helices_and_spirals_end_where_they_are_told() -> None:

@@ -80,6 +80,8 @@ class Planner:
         self._at = motion.end
         if new is None:
             return
+        self._line = motion.line
+        self._check(0, new.shape.length / new.free / self._dt_s)
         if self._stop_always:
             new.ending = STOP
         if self._queue:
@@ -121,10 +123,10 @@ class Planner:
         for _ in range(rows):
             yield row
 
-    def _check(self, rows: int = 1) -> None:
+    def _check(self, rows: int = 1, ahead: float = 0.0) -> None:
         self._count += rows
-        if self._count > self._max_rows:
-            hours = self._count * self._dt_s / 3600
+        if self._count + ahead > self._max_rows:
+            hours = (self._count + ahead) * self._dt_s / 3600
             raise ProgramError(self._line, "", f"by here the program lasts {hours:.3g} h; split it")
 
 
