@@ -54,6 +54,7 @@ class Sim(Section):
         (), description="lockstep: RPDOs to wait for, such as X:2; left out: those heard in the cycle before"
     )
     modbus: bool = Field(True, description="serve a Modbus voltage sensor per axis")
+    modbus_cycles: int = Field(1, ge=1, le=100, description="SYNC cycles over which one of its samples is the mean")
     noise: Noise = Noise()
     thermal: Thermal = Thermal()
     axis: Mapping[AxisName, SimAxis] = Field(default_factory=dict)

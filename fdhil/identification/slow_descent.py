@@ -22,7 +22,7 @@ CONVERGED = 0.01  # of a standard deviation
 DIFFERENCE = 1e-5  # of a parameter's typical size
 DELAY_DIFFERENCE_S = 1e-6
 LEAST_SHARE = 1e-3
-ROUNDING = 1e-9
+GAIN = 1e-3  # of twice the log likelihood: a step that gains less moves nothing by more than some hundredths
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,10 +95,12 @@ def ascend(likelihood: Likelihood, theta: Float, free: Sequence[int], sizes: Flo
             trial[list(free)] += share * step
             possible = bool(np.isfinite(trial).all() and (trial[:4] > 0).all())
             there = likelihood.at(trial, float(trial[6])) if possible else here
-            if possible and there.cost <= here.cost + ROUNDING * abs(here.cost):
+            if possible and there.cost <= here.cost:
                 break
             share *= 0.5
         else:
             return theta, white, mean, True  # nothing more likely along the step: this is the top, to rounding
-        theta, here = trial, there
+        gained, theta, here = here.cost - there.cost, trial, there
+        if gained < GAIN:
+            return theta, here.whitened, mean, True
     return theta, here.whitened, mean, False

@@ -28,7 +28,7 @@ DIFFUSE = 1e6  # variance, in units of the measurement's, of a state about which
 STATES = 4
 NO_SAMPLE = -1
 
-CURRENT_LATE = 0.01  # of a row, one standard deviation: see course_effect()
+CURRENT_LATE_S, CURRENT_LATE = 1e-5, 0.01  # in s, and of a row: one standard deviation, see course_effect()
 CURRENT_ABOVE = 2.5e-4  # of the accelerating current, one standard deviation
 CORNER_ROWS = 5
 SMOOTH_ROWS = 15
@@ -267,10 +267,21 @@ def course_effect(motion: Motion, theta: Float, variances: Float) -> Float:
     """
     slope = np.gradient(moving_mean(motion.current, CORNER_ROWS))
     accelerating = theta[3] / theta[2] * np.gradient(moving_mean(motion.speed, SMOOTH_ROWS), motion.dt_s)
-    mean = replace(motion, current=motion.current + CURRENT_LATE * slope - CURRENT_ABOVE * accelerating)
+    late_rows = max(CURRENT_LATE, CURRENT_LATE_S / motion.dt_s)  # finer rows make no finer regulators
+    mean = replace(motion, current=motion.current + late_rows * slope - CURRENT_ABOVE * accelerating)
     delay = float(theta[6])
     changed: Float = innovations_of(mean, theta, variances, delay).whitened
     return changed - innovations_of(motion, theta, variances, delay).whitened
+
+
+def left_open_v(motion: Motion, theta: Float, variances: Float) -> float:
+    """Return the standard deviation (V) of what current and speed leave open of a voltage sample, in the median."""
+    made = innovations_of(motion, theta, variances, float(theta[6]))
+    known = made.values[2 * motion.n :] != 0.0
+    if not known.any():
+        return 0.0
+    beyond = made.variance[2 * motion.n :][known] - variances[0]
+    return float(np.sqrt(max(np.median(beyond), 0.0)))
 
 
 def in_order(motion: Motion, delay_s: float, columns: Float) -> Float:

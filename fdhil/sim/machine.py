@@ -58,10 +58,11 @@ class Machine:
         section = self.config.axis[axis]
         sim = self.config.sim
         sensor = VoltageSensor(
-            1 / self.period_s,
+            1 / (self.period_s * sim.modbus_cycles),
             section.regulators.voltage_limit_v,
             sim.noise.voltage_v,
             np.random.default_rng(sensor_seed),
+            sim.modbus_cycles,
         )
         sensor.celsius = sim.thermal.ambient_c
         return Unit(

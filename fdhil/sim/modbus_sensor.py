@@ -54,8 +54,12 @@ class SensorFaults:
 class VoltageSensor:
     """Registers and sample memory of one sensor; :meth:`feed` and the reading thread may run at the same time."""
 
-    def __init__(self, rate_hz: float, limit_v: float, noise_v: float, rng: np.random.Generator) -> None:
+    def __init__(
+        self, rate_hz: float, limit_v: float, noise_v: float, rng: np.random.Generator, cycles: int = 1
+    ) -> None:
+        """Make a sensor of which a sample is the mean over ``cycles`` means that it is fed."""
         self.faults = SensorFaults()
+        self._cycles, self._sum_v, self._summed = cycles, 0.0, 0
         self.celsius = 20.0
         self.rate_hz = rate_hz
         self.volts_per_count = max(0.01, round(1.05 * limit_v / 32767, 4))
@@ -70,7 +74,11 @@ class VoltageSensor:
         self._block = [0] * (REGISTERS - STATUS)
 
     def feed(self, mean_v: float) -> None:
-        """Take the mean terminal voltage of one period: one sample."""
+        """Take the mean terminal voltage of one cycle; the last of a sample's cycles makes the sample."""
+        self._sum_v, self._summed = self._sum_v + mean_v, self._summed + 1
+        if self._summed < self._cycles:
+            return
+        mean_v, self._sum_v, self._summed = self._sum_v / self._cycles, 0.0, 0
         if not self._noise:
             self._noise = (self._rng.standard_normal(_NOISE_BLOCK) * self._noise_v).tolist()
         value = mean_v + self._noise.pop()

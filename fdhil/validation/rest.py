@@ -29,7 +29,7 @@ LONGEST_BREAKAWAY_S = 0.060
 def rest_faults(window: Window, fit: Fit) -> Iterator[Reason]:
     """Yield what the rows at standstill contradict."""
     rows = np.flatnonzero(at_rest(window))
-    if rows.size < ROWS or window.voltage_v is None:
+    if rows.size < ROWS or (window.voltage_v is None and window.slow_voltage is None):
         return
     noise = noise_levels(window)
     speed = float(np.mean(window.speed_rad_s[rows]))

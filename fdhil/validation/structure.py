@@ -21,6 +21,7 @@ from fdhil.identification.filtering import moving_mean
 from fdhil.identification.innovations import innovations
 from fdhil.identification.motion import Motion
 from fdhil.identification.normal import inverse_of
+from fdhil.identification.slow_voltage import left_open_v
 from fdhil.records import Float, Reason, Window
 
 BEYOND_CHANCE = 5.5  # standard deviations: about 4e-8 a test, some hundred tests a window
@@ -180,10 +181,13 @@ def courses(fit: Fit) -> Float:
     shape = fit.problem.shape_effect(fit.theta)[:, None]
     motion, theta = fit.problem.motions[0], fit.theta
     doubt = aliasing(motion.voltage_sampling, motion.voltage_period_s)[0]
-    if motion.slow is not None or doubt == 0.0:
+    if doubt == 0.0:
         return shape
     rate = np.gradient(moving_mean(motion.speed, 2 * round(SLOPE_S / 2 / motion.dt_s) + 1), motion.dt_s)
     missed = doubt * theta[0] * theta[3] / theta[2] * rate
+    if motion.slow is not None:
+        moved = replace(motion, voltage_mean=motion.voltage_mean + motion.at_voltage(missed))
+        return np.column_stack([shape, innovations(moved, theta, fit.problem.filters[0], theta[6]) - fit.residuals])
     answer = sweeps.answers(
         motion, theta, fit.problem.filters[0], sweeps.VOLTAGE, missed[None], np.zeros((1, motion.n))
     )
@@ -349,6 +353,10 @@ def excess_noise(fit: Fit, window: Window) -> Iterator[Reason]:
         if name == "voltage":
             seen = float(np.hypot(seen, _aliased_v(fit, window)))
         seen = float(np.hypot(seen, shape * wanted))
+        if name == "voltage" and fit.problem.slow:  # what current and speed leave open of a sample hides its noise
+            motion, theta = fit.problem.motions[0], fit.theta
+            open_v = left_open_v(motion, theta, fitted.vector() ** 2)
+            wanted, seen = float(np.hypot(wanted, open_v)), float(np.hypot(seen, open_v))
         if wanted > NOISE_RATIO * seen:
             text = f"the model explains {name} to {wanted:.3g} {unit} only, while it scatters by {seen:.3g} {unit}"
             yield Reason("ValidationFailed", text, "the drive does what the model does not have: look at the residuals")

@@ -17,6 +17,7 @@ from fdhil.model.feed_drive import discretise, simulate_plant
 from fdhil.records import Estimate, Float, Parameters, Reason, Result, Verdict, Window, WindowOutcome
 from fdhil.validation.plausibility import implausibilities
 from fdhil.validation.rest import rest_faults
+from fdhil.validation.slow_readings import slow_voltage_faults
 from fdhil.validation.structure import excess_noise, findings, whiteness
 from fdhil.validation.stuck import stuck_values
 from fdhil.validation.timing import timing_faults
@@ -29,7 +30,7 @@ UNFIT = ("NotFinite",)
 
 def analyse(window: Window, settings: Identification) -> WindowOutcome:
     """Return what one window says of the drive, and whether it is believed; never raises, whatever the data."""
-    reasons = implausibilities(window)
+    reasons = [*implausibilities(window), *slow_voltage_faults(window)]
     if window.voltage_v is None and window.slow_voltage is None:
         return _without_voltage(window, settings, reasons)
     if window.n < 32 or any(r.code in UNFIT for r in reasons):

@@ -210,3 +210,13 @@ def test_noise_is_white_and_repeats_with_the_seed() -> None:
     assert first == read()
     assert np.std(first) == pytest.approx(0.5, rel=0.1)
     assert abs(np.corrcoef(first[1:], first[:-1])[0, 1]) < 0.1
+
+
+def test_a_slow_sensors_sample_is_the_mean_over_its_cycles() -> None:
+    slow = VoltageSensor(200.0, 300.0, 0.0, np.random.default_rng(1), 5)
+    for volts in (1.0, 2.0, 3.0, 4.0, 5.0, 9.0):
+        slow.feed(volts)
+    slow.latch()
+    registers = slow.registers()
+    assert registers[14] == 1
+    assert registers[16] * slow.volts_per_count == pytest.approx(3.0, abs=slow.volts_per_count)

@@ -1,0 +1,78 @@
+"""What a slow voltage sensor's own samples tell before any fit: that they stand still while the axis does not.
+
+A steady voltage that is read coarsely repeats itself, and that is no fault. So a run of equal samples is refused where
+the speed changes over it by more than such a reading hides, or where the sensor's noise would have changed it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from fdhil.identification.motion import resolution
+from fdhil.identification.windows import carried, smooth
+from fdhil.records import Float, Reason, Window
+
+LEAST_SAMPLES = 3
+MOVED_SAMPLES = 4  # equal while the speed changes: shorter runs may lie where current and speed balance
+CHANCE = 1e-5  # of a false alarm of one window
+SPEED_CHANGE = 0.05  # of the rapid speed
+READ_STEPS = 4.0  # by which a voltage changes before its equal readings are strange
+MOVING = 0.05  # of the rapid speed
+LEAST_NOISE = 0.2  # of a step: what hides in the resolution
+LEAST_NOISE_SAMPLES = 20
+
+
+def slow_voltage_faults(window: Window) -> Iterator[Reason]:
+    """Yield a reason where the samples of a slow voltage sensor repeat themselves, or lie at the sensor's limit."""
+    slow = window.slow_voltage
+    if slow is None or np.count_nonzero(np.isfinite(slow.voltage_v)) < LEAST_NOISE_SAMPLES:
+        return
+    volts, begins = slow.voltage_v, slow.begin_s + slow.period_s * np.arange(slow.voltage_v.size)
+    speed = np.interp(
+        begins + slow.period_s / 2, np.arange(window.n) * window.dt_s, smooth(window.speed_rad_s, window.dt_s)
+    )
+    rails = (float(np.nanmax(volts)), float(np.nanmin(volts)))
+    step = max(resolution(volts[np.isfinite(volts)]), 1e-12)
+    alike = _alike(volts, step)
+    for start, end in _runs(volts):
+        moving = np.abs(speed[start:end]) > MOVING * window.rapid_speed_rad_s
+        if not moving.all() or not _strange(window, volts, speed, (start, end), step, alike):
+            continue
+        at, lasts = window.start_s + begins[start], 1e3 * (end - start) * slow.period_s
+        if volts[start] in rails:
+            text = f"voltage stays at its extreme {volts[start]:.6g} V for {end - start} samples from {at:.3f} s"
+            yield Reason("Saturated", text, "use a larger measuring range")
+        else:
+            text = f"voltage repeats {volts[start]:.6g} V for {lasts:.0f} ms from {at:.3f} s while the axis moves"
+            yield Reason("StuckValue", text, "check the sensor or the object's mapping")
+        return
+
+
+def _runs(volts: Float) -> list[tuple[int, int]]:
+    """Return the half-open runs of equal samples, the longest first."""
+    same = np.concatenate([[False], np.diff(volts) == 0.0, [False]])
+    edges = np.flatnonzero(np.diff(same.astype(np.int8))).reshape(-1, 2)
+    runs = [(int(a), int(b) + 1) for a, b in edges if b + 1 - a >= LEAST_SAMPLES]
+    return sorted(runs, key=lambda run: run[0] - run[1])
+
+
+def _strange(window: Window, volts: Float, speed: Float, run: tuple[int, int], step: float, alike: float) -> bool:
+    start, end = run
+    peak = float(np.nanmax(np.abs(volts)))
+    hidden = max(SPEED_CHANGE, READ_STEPS * step / peak) * window.rapid_speed_rad_s
+    # its first and last sample may have been the last right one, and the first right one again
+    inner = speed[start + 1 : end - 1]
+    if end - start >= MOVED_SAMPLES and float(np.ptp(inner)) > hidden:
+        return True
+    return volts.size * alike ** (end - start - 1) < CHANCE
+
+
+def _alike(volts: Float, step: float) -> float:
+    """Return how likely a constant in the middle of a step is read there, by the noise of third differences."""
+    third = np.diff(carried(volts), 3)
+    scatter = float(1.4826 * np.median(np.abs(third))) / math.sqrt(20.0)
+    noise = math.sqrt(max(scatter**2 - step**2 / 12.0, (LEAST_NOISE * step) ** 2))
+    return math.erf(step / (math.sqrt(8.0) * noise))

@@ -1,0 +1,43 @@
+"""What a slow voltage sensor's own samples tell: stuck and clipped ones are named, steady coarse ones are not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from fdhil.records import Float, Window, frozen
+from fdhil.validation.slow_readings import slow_voltage_faults
+from studies.slow_sensor import slow_windows
+
+
+def _told(window: Window, volts: Float) -> list[str]:
+    assert window.slow_voltage is not None
+    changed = replace(window, slow_voltage=replace(window.slow_voltage, voltage_v=frozen(volts)))
+    return [reason.code for reason in slow_voltage_faults(changed)]
+
+
+def _volts(window: Window) -> Float:
+    assert window.slow_voltage is not None
+    return np.array(window.slow_voltage.voltage_v)
+
+
+def test_a_sample_that_repeats_on_a_ramp_or_where_noise_would_change_it_is_stuck() -> None:
+    window = slow_windows(0.005)[0]
+    for start in (25, 80):  # on the ramp, and at full speed
+        volts = _volts(window)
+        volts[start : start + 8] = volts[start]
+        assert _told(window, volts) == ["StuckValue"]
+
+
+def test_a_clipped_ramp_is_saturated() -> None:
+    window = slow_windows(0.005)[0]
+    volts = _volts(window)
+    assert _told(window, np.minimum(volts, 0.8 * volts.max())) == ["Saturated"]
+
+
+def test_good_samples_are_nothing_however_coarse() -> None:
+    for period in (0.002, 0.005, 0.010):
+        window = slow_windows(period)[0]
+        for step in (0.001, 0.3, 1.0):
+            assert _told(window, np.round(_volts(window) / step) * step) == []
