@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from fdhil.config import Identification
+from fdhil.daemon.documents import as_document
 from fdhil.errors import RecordingError
 from fdhil.store.windows import decode_window, encode_window
+from fdhil.validation import analyse
 from tests.identification.slow_sensor import slow_windows
 
 
@@ -28,3 +33,12 @@ def test_a_changed_grid_is_damage() -> None:
     assert content.count(b'"period_s": 0.005') == 1
     with pytest.raises(RecordingError, match="digest"):
         decode_window(content.replace(b'"period_s": 0.005', b'"period_s": 0.006'))
+
+
+def test_what_current_and_speed_alone_tell_has_its_units_in_the_document() -> None:
+    outcome = analyse(replace(slow_windows(0.005)[0], slow_voltage=None), Identification())
+    told = as_document(outcome)["parameters"]
+    assert told["Jt/K"]["value"] == pytest.approx(0.075 / 0.8, rel=0.01)
+    assert [told[name]["unit"] for name in ("Jt/K", "ft/K", "Cd/K")] == ["A.s2/rad", "A.s/rad", "A"]
+    assert told["L"]["value"] is None
+    assert "there is no voltage" in told["L"]["reason"]
