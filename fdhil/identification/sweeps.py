@@ -95,14 +95,10 @@ def _one_plain(
         f00, f01, f10, f11, b1, b2, t1, t2, r1, r2, v1 = free if unknown else moving
         q11, q12 = f00 * p11 + f01 * p12, f00 * p12 + f01 * p22
         q21, q22 = f10 * p11 + f11 * p12, f10 * p12 + f11 * p22
-        p11 = q11 * f00 + q12 * f01 + b1 * b1 * vu
-        p12 = q11 * f10 + q12 * f11 + b1 * b2 * vu
-        p22 = q21 * f10 + q22 * f11 + b2 * b2 * vu
-        if unknown:
-            # the walk of the speed over the interval reaches the current through the back-EMF
-            p11 += v1 * v1 * walk * walk
-            p12 += v1 * walk * walk
-            p22 += walk * walk
+        own = walk if unknown else 0.0  # of the speed over the interval; it reaches the current through the back-EMF
+        p11 = q11 * f00 + q12 * f01 + b1 * b1 * vu + v1 * v1 * own * own
+        p12 = q11 * f10 + q12 * f11 + b1 * b2 * vu + v1 * own * own
+        p22 = q21 * f10 + q22 * f11 + b2 * b2 * vu + own * own
         u, torque, r = mean_v[k], theta[5] * mode[k], rise_v[k] if rise_v.size else 0.0
         i, w = (
             f00 * i + f01 * w + (b1 * u + t1 * torque + r1 * r),
