@@ -104,7 +104,7 @@ def _is_stuck(signal: Signal, start: int, last: int, limit: float, bridge: Calla
     left, right = _steady_rows(signal, start, last)
     length = last - start + 1
     whole = min(length, MOST_ROWS)
-    steady = min(left, right) >= max(LEAST_ROWS, length // SIDE) and max(left, right) >= whole
+    steady = max(left, right) >= whole
     if steady and _departs_from_neighbours(signal, start, last, (left, right), limit):
         return True
     if at_rail or (steady and (bridge is None or min(left, right) >= whole)):
@@ -167,10 +167,11 @@ def _departs_from_neighbours(signal: Signal, start: int, last: int, steady: tupl
     if (length - 1) * math.log((equal + 1) / (beside.size - length + 2)) > limit / 2:
         return False
     noise = 1.25 * signal.noise
-    tried = [(min(steady[0], most), min(steady[1], most), degree) for most in (length, MOST_ROWS) for degree in (2, 3)]
+    sides = [(min(steady[0], most), min(steady[1], most)) for most in (length, MOST_ROWS)]
+    tried = [(*rows, degree) for rows in sides for degree in (2, 3) if min(rows) >= LEAST_ROWS]
     # where the signal was steady for less than the run's own length, it may have come to rest only as the run began
-    tried += [(0, steady[1], 1)] if steady[0] < min(length, MOST_ROWS) else []
-    tried += [(steady[0], 0, 1)] if steady[1] < min(length, MOST_ROWS) else []
+    tried += [(0, steady[1], degree) for degree in (1, 2) if steady[0] < min(length, MOST_ROWS)]
+    tried += [(steady[0], 0, degree) for degree in (1, 2) if steady[1] < min(length, MOST_ROWS)]
     return all(
         log_chance(readings, start, last, before, after, degree, noise) < limit for before, after, degree in tried
     )
