@@ -55,9 +55,7 @@ def test_an_identified_machine_follows_without_a_program(shop: Shop, case: str, 
         shop.play("shuttle.ngc", SHUTTLE)
         shop.status_when(lambda s: all(s["axes"][a]["accepted"] >= 4 for a in "XY"))
         before = largest_error_um(shop, "before")
-        switch_on(shop, capsys)
-        shop.status_when(lambda s: s["state"] == "FEEDFORWARD")
-        after = largest_error_um(shop, "after")
+        after = fed_forward(shop, capsys)
         assert before / after >= CASES[case][1], (before, after)
         assert fdhil("disarm", shop.path, capsys=capsys)[0] == 0
         told = shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
@@ -77,6 +75,20 @@ def switch_on(shop: Shop, capsys: Capture) -> None:
             break
     assert code == 0, (out, err)
     assert json.loads(out)["state"] == "FEEDFORWARD"
+
+
+def fed_forward(shop: Shop, capsys: Capture) -> float:
+    """The largest error with the feed-forward on; on a busy host the guard may end it in the move, and says why."""
+    for _ in range(4):
+        switch_on(shop, capsys)
+        shop.status_when(lambda s: s["state"] == "FEEDFORWARD")
+        error_um = largest_error_um(shop, "after")
+        told = shop.status_when(lambda s: s["guard"])
+        if told["state"] == "FEEDFORWARD":
+            return error_um
+        assert feed_of(told)["cause"]["code"] in {"MainLost", "LoopOverrun", "SyncLost", "StaleData"}, told["guard"]
+        shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
+    raise AssertionError("this host is too busy for a feed-forward")
 
 
 def fades_out_on_an_emergency(shop: Shop, capsys: Capture) -> None:
