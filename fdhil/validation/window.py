@@ -127,7 +127,7 @@ def _late(window: Window, fit: Fit) -> Reason | None:
         return None
     text = (
         f"voltage is {1e3 * abs(delay):.2f} ms {'late' if delay > 0 else 'early'} against current and speed, "
-        f"more than a sample of {1e3 * period:g} ms"
+        f"more than a sample of {1e3 * period:.3g} ms"
     )
     return Reason("SampleTiming", text, "take voltage, current and speed from one SYNC, or enter the sensor's delay")
 
