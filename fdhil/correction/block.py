@@ -22,6 +22,7 @@ from fdhil.records import Bool, Float, Parameters
 
 ITERATIONS = 8
 GOOD_ENOUGH_UM, PEAK_UM = 0.05, 0.15  # RMS and largest: below what the drive's increments (0.3 um) can tell
+PEAK_SHARE = 0.3
 LEAST_PROGRESS = 0.85  # what an iteration may leave of the best so far; two that leave more end it
 STILL_MM_S = 1e-3
 SHORTEST_REST_S = 0.03
@@ -114,6 +115,7 @@ def solve(loop: AxisLoop, reference_mm: Float, target_mm: Float, carry: Carry, e
     gain = 1.0
     needed_um = 0.0
     idle = 0
+    best_worth = np.inf
     for iteration in range(ITERATIONS + 1):
         offset, position, error = _run(loop, reference_mm, target_mm, guess, carry, still, lead=iteration > 0)
         unknown = 0 if ends else round(FORGET_S / loop.sync_period_s)  # what follows would change these rows
@@ -121,9 +123,12 @@ def solve(loop: AxisLoop, reference_mm: Float, target_mm: Float, carry: Carry, e
         left_um = 1e3 * (target_mm - position)[: max(1, n - unknown)]
         rms_um = float(np.sqrt(np.mean(left_um**2)))
         idle = 0 if best is None or rms_um < LEAST_PROGRESS * best.rms_um else idle + 1
-        if best is None or rms_um < best.rms_um:
+        peak_um = float(np.abs(left_um).max())
+        worth = rms_um + PEAK_SHARE * peak_um  # a slip of the table hardly shows in the RMS
+        if best is None or worth < best_worth:
+            best_worth = worth
             best = Solution(offset, position, guess, rms_um, needed_um)
-        if (rms_um < GOOD_ENOUGH_UM and np.abs(left_um).max() < PEAK_UM) or idle == 2:
+        if (rms_um < GOOD_ENOUGH_UM and peak_um < PEAK_UM) or idle == 2:
             break
         if rms_um > 2.0 * best.rms_um:  # a step too far: half of it, from where it was good
             gain *= 0.5
