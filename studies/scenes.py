@@ -5,12 +5,36 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import log_ndtr
 
 from fdhil.records import Recording, VoltageSampling, frozen
 from studies import drives
 from studies.drives import Array, Drive, Move, Rng, Signals, log_uniform
 
 SENSORS = ("voltage", "current", "speed")
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """What a sensor reads: true values (n,), its noise's standard deviation and its step, all in its unit."""
+
+    true: Array
+    noise: float
+    step: float
+
+    def read(self, rng: Rng) -> Array:
+        """Return its readings (n,)."""
+        noisy = self.true + self.noise * rng.standard_normal(self.true.size)
+        readings: Array = np.round(noisy / self.step) * self.step
+        return readings
+
+    def log_chance(self, reading: float, start: int, end: int) -> float:
+        """Return the logarithm of the probability that a working sensor gives ``reading`` in all these rows."""
+        low = (reading - self.step / 2 - self.true[start:end]) / self.noise
+        high = (reading + self.step / 2 - self.true[start:end]) / self.noise
+        low, high = np.where(low > 0, -high, low), np.where(low > 0, -low, high)  # the tail that keeps its digits
+        upper = log_ndtr(high)
+        return float(np.sum(upper + np.log1p(-np.exp(np.minimum(log_ndtr(low) - upper, -1e-12)))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +57,7 @@ class Rows:
 
     dt_s: float
     signals: dict[str, Array]
+    sensors: dict[str, Sensor]
     moving: tuple[int, int]
     cruise: tuple[int, int]
 
@@ -85,20 +110,20 @@ def demand_of(scene: Scene, *rates: Array) -> Array:
 def measured(rng: Rng, scene: Scene, signals: Signals) -> Rows:
     """Return what the sensors give of a run: noise, then resolution."""
     voltage = signals.voltage if scene.sampling == "interval_mean" else signals.voltage_instant
-    out = {}
+    sensors = {}
     sizes = (0.4, 0.4, 1.0)
     for name, true, size, step in zip(
         SENSORS, (voltage, signals.current, signals.speed), sizes, scene.steps, strict=True
     ):
         peak = float(np.abs(true).max())
-        noisy = true + scene.noise * size * peak * rng.standard_normal(true.size)
-        out[name] = np.round(noisy / (step * peak)) * step * peak
+        sensors[name] = Sensor(true, scene.noise * size * peak, step * peak)
+    out = {name: sensor.read(rng) for name, sensor in sensors.items()}
     out["position"] = np.round(signals.position / scene.position_step_m) * scene.position_step_m
     out["demand"] = np.round(signals.demand / 1e-6) * 1e-6
     speed = np.abs(signals.speed)
     moving = np.flatnonzero(speed > 0.05 * speed.max())
     top = np.flatnonzero(speed > 0.95 * np.median(speed[speed > 0.7 * speed.max()]))
-    return Rows(signals.dt_s, out, (int(moving[0]), int(moving[-1])), (int(top[0]), int(top[-1])))
+    return Rows(signals.dt_s, out, sensors, (int(moving[0]), int(moving[-1])), (int(top[0]), int(top[-1])))
 
 
 def recorded(scene: Scene, rows: Rows, *, says_rapid: bool = True) -> Recording:

@@ -10,6 +10,8 @@ from studies import drives
 from studies.drives import Rng, log_uniform
 from studies.scenes import SENSORS, Rows, Spoilt, demand_of, draw_scene, measured, recorded
 
+BY_CHANCE = float(np.log(1e-6))  # beside up to a thousand rows in which a run may begin
+
 SignalFault = Callable[[Rng, Rows], tuple[Rows, float]]
 
 
@@ -72,14 +74,18 @@ def offset_drift(rng: Rng, rows: Rows) -> tuple[Rows, float]:
 
 
 def stuck(rng: Rng, rows: Rows) -> tuple[Rows, float]:
-    """Seconds for which a sensor repeats one value that would have changed in the meantime."""
-    name, seconds = _sensor(rng), rng.uniform(0.02, 0.1)
-    values = rows.signals[name].copy()
-    length = round(seconds / rows.dt_s)
-    start = int(rng.uniform(rows.moving[0], rows.moving[1] - length))
-    # where all readings are alike anyway, the recording is a good one, to the last bit
-    while np.ptp(values[start : start + length]) == 0.0:
+    """Seconds for which a sensor repeats one value that a working one would have changed.
+
+    A working sensor repeats a value too, where the signal is steady and its steps are coarse: a recording in which it
+    would have done so by chance, with one of a million, holds no fault that anybody could see, and is drawn anew.
+    """
+    while True:
+        name, seconds = _sensor(rng), rng.uniform(0.02, 0.1)
+        values = rows.signals[name].copy()
+        length = round(seconds / rows.dt_s)
         start = int(rng.uniform(rows.moving[0], rows.moving[1] - length))
+        if rows.sensors[name].log_chance(values[start], start + 1, start + length) < BY_CHANCE:
+            break
     values[start : start + length] = values[start]
     return rows.with_signals(**{name: values}), seconds
 
