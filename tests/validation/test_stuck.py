@@ -10,12 +10,12 @@ import pytest
 
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
-from fdhil.records import Float, Window, frozen
+from fdhil.records import Window, frozen
 from fdhil.validation import analyse
 from fdhil.validation.readings import log_chance
 from fdhil.validation.stuck import noise_steps, stuck_values
 from studies import drives, signal_faults
-from studies.scenes import demand_of, measured, recorded
+from studies.scenes import Sensor, demand_of, measured, recorded
 from tests.identification.recorded import windows
 from tests.validation.test_episodes import SCENE
 
@@ -104,13 +104,18 @@ def test_a_coarse_sensor_that_sticks_while_it_should_move_is_told_by_the_others(
     assert "StuckValue" in _codes(_stuck(window, "current", begin - 25, 30))
 
 
-def test_the_fault_of_the_study_changes_the_recording() -> None:
+def test_the_fault_of_the_study_changes_what_a_working_sensor_had_read() -> None:
+    scene = replace(SCENE, noise=0.001, steps=(0.02, 0.02, 0.02))  # the plateau reads alike throughout
     for seed in range(12):
         rng = np.random.default_rng(seed)
-        rows = measured(rng, SCENE, drives.run(SCENE.drive, demand_of(SCENE), SCENE.dt_s))
-        coarse: dict[str, Float] = {
-            name: np.round(values / np.abs(values).max() / 0.02) for name, values in rows.signals.items()
-        }
-        before = rows.with_signals(**coarse)
+        before = measured(rng, scene, drives.run(scene.drive, demand_of(scene), scene.dt_s))
         after, _ = signal_faults.stuck(rng, before)
         assert any((after.signals[name] != before.signals[name]).any() for name in FIELDS)
+
+
+def test_how_likely_a_working_sensor_repeats_its_reading() -> None:
+    ramp = Sensor(np.array([0.0, 0.5, 1.0]), 0.5, 1.0)
+    # probabilities of the normal distribution within +-1, 0..2 and 1..3 standard deviations
+    by_hand = math.log(0.682689492 * 0.477249868 * 0.157305356)
+    assert ramp.log_chance(0.0, 0, 3) == pytest.approx(by_hand, rel=1e-6)
+    assert ramp.log_chance(40.0, 0, 3) < -3000.0
