@@ -151,6 +151,8 @@ def wakes_with_a_jump(part: Float, start: int, end: int) -> bool:
 
 def _clipped(window: Window) -> Iterator[Reason]:
     for name, unit, values in signals_of(window):
+        if not np.isfinite(values).any():
+            continue
         for rail, side in ((np.nanmax(values), "upper"), (np.nanmin(values), "lower")):
             at_rail = values == rail
             start, end = longest(at_rail)

@@ -47,8 +47,9 @@ def pool(
     fits = [o.verdict.fit_percent for o in accepted if o.verdict.fit_percent is not None]
     if len(accepted) == 1 and accepted[0].estimate is not None:
         return accepted[0].estimate, Verdict(True, accepted[0].verdict.fit_percent)
+    told = [(o.window, o.estimate) for o in accepted if o.estimate is not None]
     try:
-        estimate = None if refit else weighted([o.estimate for o in accepted if o.estimate is not None])
+        estimate = None if refit else weighted(told)
         if estimate is None:
             estimate = chosen(settings)[1]([o.window for o in accepted], settings)
     except (np.linalg.LinAlgError, FloatingPointError, ZeroDivisionError, OverflowError) as error:
@@ -56,38 +57,39 @@ def pool(
             False, None, (Reason("SolverFailed", f"the solver gave up ({error})", "look at the windows"),)
         )
     reasons = list({r.text: r for r in estimate.missing.values()}.values()) + unphysical(estimate)
-    reasons += _moved([(o.window, o.estimate) for o in accepted if o.estimate is not None])
+    reasons += _moved(told)
     return estimate, Verdict(not reasons, min(fits, default=None), tuple(reasons))
 
 
-def weighted(estimates: Sequence[Estimate]) -> Estimate | None:
-    """Return the estimates weighted by their information (inverse covariance); None when one of them lacks a value.
+def weighted(told: Sequence[tuple[Window, Estimate]]) -> Estimate | None:
+    """Return the estimates weighted by the inverse covariance of each window's own chance; None when one lacks a value.
 
-    What is systematic in all windows does not average away: it goes through the same weights.
+    What windows share (the systematic part, and what instants of the voltage miss) does not average away: it goes
+    through the same weights.
     """
-    first = np.abs(estimates[0].values)
-    scale = np.where(first > 0, first, 1.0)  # the parameters differ by orders of magnitude
+    first = told[0][1]
+    scale = np.where(first.values != 0.0, np.abs(first.values), 1.0)  # the parameters differ by orders of magnitude
     information = np.zeros((len(PARAMETERS), len(PARAMETERS)))
     pull = np.zeros(len(PARAMETERS))
-    shared = np.zeros((len(PARAMETERS), 1))
-    for estimate in estimates:
+    shared = np.zeros((len(PARAMETERS), 2 + len(PARAMETERS)))
+    for window, estimate in told:
         if not (np.isfinite(estimate.values).all() and np.isfinite(estimate.covariance).all()):
             return None
-        systematic = np.zeros_like(shared) if estimate.systematic is None else estimate.systematic
-        weight = np.linalg.inv((estimate.covariance - systematic @ systematic.T) / np.outer(scale, scale))
+        own, systematic, alias = _parts(window, estimate)
+        weight = np.linalg.inv(own / np.outer(scale, scale))
         information += weight
         pull += weight @ (estimate.values / scale)
-        shared = shared + weight @ (systematic / scale[:, None])
+        shared += weight @ (np.column_stack([systematic, np.diag(alias)]) / scale[:, None])
     covariance = np.linalg.inv(information)
-    systematic = (covariance @ shared) * scale[:, None]
+    doubts = (covariance @ shared) * scale[:, None]
     return replace(
-        estimates[0],
+        first,
         values=frozen(covariance @ pull * scale),
-        covariance=frozen(covariance * np.outer(scale, scale) + systematic @ systematic.T),
+        covariance=frozen(covariance * np.outer(scale, scale) + doubts @ doubts.T),
         residuals={},
         delay_s=None,
         delay_std_s=None,
-        systematic=frozen(systematic),
+        systematic=frozen(doubts[:, :2]),
     )
 
 

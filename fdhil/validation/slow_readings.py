@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from fdhil.identification.motion import resolution
-from fdhil.identification.windows import carried, smooth
+from fdhil.identification.windows import carried, noise_of, smooth
 from fdhil.records import Float, Reason, Window
 
 LEAST_SAMPLES = 3
@@ -28,7 +28,7 @@ LEAST_NOISE_SAMPLES = 20
 def slow_voltage_faults(window: Window) -> Iterator[Reason]:
     """Yield a reason where the samples of a slow voltage sensor repeat themselves, or lie at the sensor's limit."""
     slow = window.slow_voltage
-    if slow is None or np.count_nonzero(np.isfinite(slow.voltage_v)) < LEAST_NOISE_SAMPLES:
+    if slow is None or window.n == 0 or np.count_nonzero(np.isfinite(slow.voltage_v)) < LEAST_NOISE_SAMPLES:
         return
     volts, begins = slow.voltage_v, slow.begin_s + slow.period_s * np.arange(slow.voltage_v.size)
     speed = np.interp(
@@ -42,7 +42,7 @@ def slow_voltage_faults(window: Window) -> Iterator[Reason]:
         if not moving.all() or not _strange(window, volts, speed, (start, end), step, alike):
             continue
         at, lasts = window.start_s + begins[start], 1e3 * (end - start) * slow.period_s
-        if volts[start] in rails:
+        if volts[start] in rails and rails[0] > rails[1]:
             text = f"voltage stays at its extreme {volts[start]:.6g} V for {end - start} samples from {at:.3f} s"
             yield Reason("Saturated", text, "use a larger measuring range")
         else:
@@ -62,7 +62,8 @@ def _runs(volts: Float) -> list[tuple[int, int]]:
 def _strange(window: Window, volts: Float, speed: Float, run: tuple[int, int], step: float, alike: float) -> bool:
     start, end = run
     peak = float(np.nanmax(np.abs(volts)))
-    hidden = max(SPEED_CHANGE, READ_STEPS * step / peak) * window.rapid_speed_rad_s
+    read = READ_STEPS * step / peak if peak else 0.0  # a sensor that only ever read 0 tells no step
+    hidden = max(SPEED_CHANGE, read) * window.rapid_speed_rad_s
     # its first and last sample may have been the last right one, and the first right one again
     inner = speed[start + 1 : end - 1]
     if end - start >= MOVED_SAMPLES and float(np.ptp(inner)) > hidden:
@@ -72,7 +73,5 @@ def _strange(window: Window, volts: Float, speed: Float, run: tuple[int, int], s
 
 def _alike(volts: Float, step: float) -> float:
     """Return how likely a constant in the middle of a step is read there, by the noise of third differences."""
-    third = np.diff(carried(volts), 3)
-    scatter = float(1.4826 * np.median(np.abs(third))) / math.sqrt(20.0)
-    noise = math.sqrt(max(scatter**2 - step**2 / 12.0, (LEAST_NOISE * step) ** 2))
+    noise = math.sqrt(max(noise_of(carried(volts)) ** 2 - step**2 / 12.0, (LEAST_NOISE * step) ** 2))
     return math.erf(step / (math.sqrt(8.0) * noise))

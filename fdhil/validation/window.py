@@ -42,12 +42,12 @@ def analyse(window: Window, settings: Identification) -> WindowOutcome:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             estimate, fit = _estimate(window, settings)
             fit_percent = simulated_fit_percent(window, estimate)
-            doubts = _doubts(window, estimate, fit, fit_percent, settings)
+            doubts = [*stuck_values(window, fit), *_doubts(window, estimate, fit, fit_percent, settings)]
     except (np.linalg.LinAlgError, FloatingPointError, ZeroDivisionError, OverflowError) as error:
         reasons.append(Reason("SolverFailed", f"the solver gave up ({error})", "look at the window's signals"))
         missing = empty_estimate(chosen(settings)[0], Result.DIVERGED, reasons[-1])
         return WindowOutcome(window, missing, Verdict(False, None, (*reasons, *stuck_values(window, None))))
-    reasons += [*stuck_values(window, fit), *doubts]
+    reasons += doubts
     return WindowOutcome(window, estimate, Verdict(not reasons, fit_percent, tuple(reasons)))
 
 
@@ -101,6 +101,8 @@ def _doubts(
 
 def expected_fit_percent(window: Window, fit: Fit) -> float:
     """Return the fit that a right model has at least, from the noise of speed and of the voltage that drives it."""
+    if window.slow_voltage is not None:
+        return LEAST_FIT_PERCENT  # the voltage's course within its samples is not known
     noise = fit.problem.motions[0].noise
     own = fit.problem.noises[0].voltage_v
     p = Parameters(*fit.theta[:6])
@@ -109,8 +111,6 @@ def expected_fit_percent(window: Window, fit: Fit) -> float:
     # the steady state of P = phi P phi' + push push'
     spread = np.linalg.solve(np.eye(4) - np.kron(step.phi, step.phi), np.outer(push, push).ravel()).reshape(2, 2)
     variance = EXCESS * (noise.speed_rad_s**2 + spread[1, 1]) + (SHAPE_SHARE * window.rapid_speed_rad_s) ** 2
-    if window.slow_voltage is not None:
-        return LEAST_FIT_PERCENT  # the voltage's course within its samples is not known
     deviation = float(np.nanstd(window.speed_rad_s))
     return max(LEAST_FIT_PERCENT, 100.0 * (1.0 - float(np.sqrt(variance)) / max(deviation, 1e-300)))
 

@@ -174,7 +174,7 @@ def test_what_may_be_the_voltages_course_is_a_doubt_and_no_delay(share: float) -
     late = [_late(window, share) for window in windows(0.0002, moves=4)]
     one = maximum_likelihood.estimate(late[:1], SETTINGS)
     all_four = maximum_likelihood.estimate(late, SETTINGS)
-    averaged = weighted([maximum_likelihood.estimate([window], SETTINGS) for window in late])
+    averaged = weighted([(window, maximum_likelihood.estimate([window], SETTINGS)) for window in late])
     assert averaged is not None
     for estimate in (one, all_four, averaged):
         assert estimate.delay_s is None

@@ -88,3 +88,16 @@ def test_short_windows_are_answered() -> None:
         arrays = {name: frozen(np.array(getattr(window, name))[:rows]) for name in (*FIELDS, "demand_mm")}
         short = Window(**{f: getattr(window, f) for f in window.__slots__} | arrays)
         _told(analyse(short, Identification()))
+
+
+def test_a_window_that_is_lost_whole_is_answered() -> None:
+    window = windows(0.003)[0]
+    nothing = frozen(np.full(window.n, np.nan))
+    lost = Window(
+        **{f: getattr(window, f) for f in window.__slots__}
+        | dict.fromkeys((*FIELDS, "demand_mm"), nothing)
+        | {"gaps": ((0, window.n),)}
+    )
+    outcome = analyse(lost, Identification())
+    _told(outcome)
+    assert "StaleData" in [reason.code for reason in outcome.verdict.reasons]

@@ -33,6 +33,20 @@ def test_both_ways_of_pooling_agree_within_their_uncertainty(seed: int) -> None:
     assert np.sqrt(np.diag(weighted.covariance)) == pytest.approx(stds, rel=0.5)
 
 
+@pytest.mark.parametrize("refit", [True, False])
+def test_what_instants_miss_is_the_same_in_every_rapid_and_does_not_average_away(refit: bool) -> None:
+    scene = replace(SCENE, dt_s=2e-3, sampling="instant")
+    ways = [drives.rates(scene.move), -drives.rates(scene.move)] * 3
+    rows = measured(np.random.default_rng(8), scene, drives.run(scene.drive, demand_of(scene, *ways), scene.dt_s))
+    outcomes = [analyse(window, Identification()) for window in find_windows(recorded(scene, rows))]
+    assert sum(outcome.verdict.accepted for outcome in outcomes) >= 4
+    pooled, verdict = pool(outcomes, Identification(), refit=refit)
+    assert verdict.accepted, verdict.reasons
+    assert pooled is not None
+    for name, share in (("R", 0.05), ("L", 0.2), ("K", 0.003)):
+        assert pooled.std(name) >= 0.99 * share * pooled.value(name)
+
+
 @pytest.mark.parametrize(("name", "share"), [("R", 0.12), ("Jt", 0.04), ("K", 0.03)])
 @pytest.mark.parametrize("dt_s", [1e-3, 2e-3])
 def test_a_doubt_that_windows_share_hides_no_change_between_them(name: str, share: float, dt_s: float) -> None:

@@ -6,7 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdhil.records import Float, Window, frozen
+from fdhil.config import Identification
+from fdhil.records import Float, Stages, Window, frozen
+from fdhil.validation import analyse
 from fdhil.validation.slow_readings import slow_voltage_faults
 from studies.slow_sensor import slow_windows
 
@@ -41,3 +43,13 @@ def test_good_samples_are_nothing_however_coarse() -> None:
         window = slow_windows(period)[0]
         for step in (0.001, 0.3, 1.0):
             assert _told(window, np.round(_volts(window) / step) * step) == []
+
+
+def test_a_sensor_that_reads_nothing_but_zero_is_named_and_no_rows_are_answered() -> None:
+    window = slow_windows(0.005)[0]
+    begin, end = 80, 980  # the move alone: a run over standstill would be no finding
+    names = ("demand_mm", "position_mm", "speed_rad_s", "current_a")
+    for rows, codes in ((slice(begin, end), ["StuckValue"]), (slice(0), [])):
+        cut = replace(window, stages=Stages(None, None, None), **{n: getattr(window, n)[rows] for n in names})
+        assert _told(cut, np.zeros(int((end - begin) / 5) - 12)) == codes
+        assert not analyse(cut, Identification()).verdict.accepted
