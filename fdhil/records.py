@@ -250,10 +250,11 @@ class Reason:
 class Estimate:
     """An estimator's answer: ``values`` (k,) and ``covariance`` (k, k) of ``names``; NaN where the data cannot tell.
 
-    ``residuals`` maps "electrical" (V) and "mechanical" (A) to their residuals (m,). ``missing`` maps the names that
-    are NaN to the reason. ``delay_s`` is the voltage delay that the data show, None when not estimated, and
-    ``delay_std_s`` its standard deviation. ``systematic`` (k, q) is that part of the covariance, one standard deviation
-    a column, which is the same in every window of a drive, None when not told.
+    ``residuals`` maps "electrical" (V) and "mechanical" (A) to their residuals (m,), in standard deviations where the
+    method is maximum likelihood. ``missing`` maps the names that are NaN to the reason. ``delay_s`` is the voltage
+    delay that the data show, None when not estimated, and ``delay_std_s`` its standard deviation. ``systematic`` (k, q)
+    is that part of the covariance, one standard deviation a column, which is the same in every window of a drive, None
+    when not told.
     """
 
     method: str

@@ -12,7 +12,7 @@ from fdhil.identification.estimators import maximum_likelihood
 from fdhil.records import PARAMETERS, Float, Result, VoltageSampling, frozen
 from fdhil.validation import analyse
 from studies import bench
-from tests.identification.slow_sensor import slow_windows
+from studies.slow_sensor import slow_windows
 
 SETTINGS = Identification()
 TRUTH = np.array([bench.Plant().truth()[name] for name in PARAMETERS])
@@ -77,3 +77,7 @@ def test_windows_with_clocks_of_their_own_are_pooled() -> None:
     two = [slow_windows(delay_s=delay, noise=0.005, seed=seed)[0] for seed, delay in ((1, 0.001), (2, -0.001))]
     estimate = maximum_likelihood.estimate(two, SETTINGS)
     assert (_errors_percent(estimate.values)[:4] < (0.3, 1.2, 0.1, 0.2)).all()
+    # one residual of [5] for each voltage sample, one of [6] for each row, all of unit variance
+    assert estimate.residuals["electrical"].size == sum(w.slow_voltage.voltage_v.size for w in two if w.slow_voltage)
+    assert estimate.residuals["mechanical"].size == sum(w.n for w in two)
+    assert all(0.8 < np.std(e[e != 0.0]) < 1.2 for e in estimate.residuals.values())

@@ -12,7 +12,7 @@ from fdhil.daemon.documents import as_document
 from fdhil.errors import RecordingError
 from fdhil.store.windows import decode_window, encode_window
 from fdhil.validation import analyse
-from tests.identification.slow_sensor import slow_windows
+from studies.slow_sensor import slow_windows
 
 
 def test_the_sensors_own_grid_is_kept_bit_by_bit() -> None:

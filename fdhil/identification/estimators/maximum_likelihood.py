@@ -105,6 +105,18 @@ class Fit:
     converged: bool
     delay_doubt_s: float = 0.0
 
+    def by_window(self, values: Float) -> list[Float]:
+        """Return ``values`` (m, ...) of all innovations in parts, one for each window."""
+        return np.split(values, np.cumsum([2 * m.n + m.samples for m in self.problem.motions])[:-1])
+
+    def by_equation(self) -> dict[str, Float]:
+        """Return the innovations of [5], of the current or the samples of a slow voltage, and of [6], the speed's."""
+        pairs = list(zip(self.problem.motions, self.by_window(self.residuals), strict=True))
+        return {
+            "electrical": np.concatenate([e[2 * m.n :] if m.slow is not None else e[0::2] for m, e in pairs]),
+            "mechanical": np.concatenate([e[1 : 2 * m.n : 2] for m, e in pairs]),
+        }
+
 
 def pose(motions: Sequence[Motion], theta: Float, noises: Sequence[Noise]) -> Problem:
     """Return the problem with the filters made for ``theta``."""
@@ -328,14 +340,13 @@ def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
 def robust_inverse(result: Fit, inverse: Float) -> Float:
     """Return ``inverse`` (k, k), or the covariance that holds where innovations are coloured or of uneven variance."""
     motions = result.problem.motions
-    cuts = np.cumsum([2 * m.n + m.samples for m in motions])[:-1]
-    parts = np.split(result.residuals, cuts)
+    parts = result.by_window(result.residuals)
     known = [(m.mode != UNKNOWN) & m.observed for m in motions]
     rows = [e[: 2 * m.n].reshape(-1, 2)[where] for m, e, where in zip(motions, parts, known, strict=True)]
     sampled = [e[2 * m.n :, None] for m, e in zip(motions, parts, strict=True)]
     if not any(suspicious(e) for e in (*rows, *sampled)):
         return inverse
-    slopes = np.split(result.jacobian, cuts)
+    slopes = result.by_window(result.jacobian)
     scores = [
         in_order(m, float(result.theta[6]), j * e[:, None]) for m, j, e in zip(motions, slopes, parts, strict=True)
     ]
@@ -361,7 +372,7 @@ def finish(result: Fit) -> Estimate:
         names=PARAMETERS,
         values=result.theta[:k],
         covariance=inverse[:k, :k] + systematic[:k] @ systematic[:k].T + np.diag(np.square(alias * result.theta[:k])),
-        residuals={"electrical": result.residuals[0::2], "mechanical": result.residuals[1::2]},
+        residuals=result.by_equation(),
         result=Result.OK if result.converged else Result.DIVERGED,
         delay_s=float(result.theta[6]) if late else None,
         delay_std_s=float(np.sqrt(held[6, 6] + systematic[6] @ systematic[6])) if late else None,
