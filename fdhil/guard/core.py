@@ -138,7 +138,7 @@ def _adopt_refusals(state: State, request: Request, alarms: Alarms, settings: Se
     for setting, axis in zip(settings.axes, state.axes, strict=True):
         if setting.reads_back and axis.read_back is None:
             refused.append(Alarm("StaleData", setting.name, "its offset was not read yet"))
-    if state.mode not in (Mode.OFF, Mode.FROZEN):
+    if state.mode not in (Mode.OFF, Mode.FROZEN) or state.feed.mode is not FeedMode.OFF:
         refused.append(Alarm("NotOff", detail=state.mode.value))
     if request.token_valid is not True:
         refused.append(Alarm("AuthRequired"))

@@ -25,10 +25,9 @@ from fdhil.guard.path import Path
 from fdhil.guard.requests import parse_request
 from fdhil.guard.settings import Settings
 from fdhil.guard.shadow import Shadow
-from fdhil.guard.state import SENDING, Inputs, Mode, Output, Request, initial
+from fdhil.guard.state import Inputs, Mode, Output, Request, initial
 
 TABLE_NAME = "guard.table"
-MAIN_LOST_S = 0.5
 IDLE_S = 0.05
 ROWS_PER_TURN = 64
 ROWS_PER_IDLE_TURN = 1024
@@ -178,7 +177,7 @@ class Guard:
         """Run one step of the core and send what it says; answer and journal after that."""
         client, document, request = self._requests.popleft() if self._requests and not late else (None, {}, None)
         arming = request is not None and request.kind in ("arm", "feedforward")
-        alive, alarms = _alive(client if arming else self._owner, now_s), self._listener.alarms()
+        alive, alarms = self._alive(client if arming else self._owner, now_s), self._listener.alarms()
         told = (late, self._transmitted, alive, alarms, self._withdrawn, self._path, request)
         inputs = Inputs(seen.sync, seen.axes, seen.bus, *told)
         self.state, output = core.step(self.state, inputs, self.settings)
@@ -194,6 +193,10 @@ class Guard:
             self._tell(*output.transition)
         if output.feed_transition is not None:
             self._tell_feed(*output.feed_transition)
+
+    def _alive(self, owner: Client | None, now_s: float) -> bool:
+        """Whether the daemon that armed is connected and says so often enough."""
+        return owner is not None and not owner.gone and now_s - owner.heard_s <= self.settings.daemon_lost_s
 
     def _send(self, output: Output) -> bool:
         sent = True
@@ -307,7 +310,7 @@ class Guard:
     # --- the table ---
 
     def _begin_loading(self, client: Client, document: dict[str, Any]) -> None:
-        running = self.state.mode is not Mode.OFF
+        running = self.state.sending or self.state.mode is not Mode.OFF
         loaded = self._path
         found = table.read(FilePath(self.settings.run_directory) / TABLE_NAME, loaded.sequence if loaded else 0)
         try:
@@ -332,7 +335,7 @@ class Guard:
             return
         loading, client, document = self._loading
         try:
-            loading.check(ROWS_PER_TURN if self.state.mode in SENDING else ROWS_PER_IDLE_TURN)
+            loading.check(ROWS_PER_TURN if self.state.sending else ROWS_PER_IDLE_TURN)
         except table.TableRefused as refusal:
             self._loading = None
             self._refuse_table(client, document, refusal)
@@ -351,8 +354,3 @@ class Guard:
 
 def _told(alarm: Alarm) -> dict[str, str]:
     return {"code": alarm.code, "axis": alarm.axis, "text": alarm.cause, "advice": alarm.action}
-
-
-def _alive(owner: Client | None, now_s: float) -> bool:
-    """Whether the daemon that armed is connected and says so at least every half second."""
-    return owner is not None and not owner.gone and now_s - owner.heard_s <= MAIN_LOST_S

@@ -105,6 +105,11 @@ class Settings:
         return 5.0 if self.clock == "sync" else 4 * self.sync_period_s
 
     @property
+    def daemon_lost_s(self) -> float:
+        """How long the daemon may say nothing while it has something armed."""
+        return 5.0 if self.clock == "sync" else 0.5
+
+    @property
     def heartbeat_cycles(self) -> int:
         """Our heartbeat comes with every so many SYNC."""
         return max(1, round(self.heartbeat_s / self.sync_period_s))

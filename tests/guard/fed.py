@@ -1,0 +1,57 @@
+"""The machine of the feed-forward's tests: a law, its limits, and drives that take speed and torque offset."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from fdhil.guard.feedforward import SHIFT, Law, Limits
+from fdhil.guard.interlocks import FEEDFORWARD_FACTS
+from fdhil.guard.settings import Feedforward, Pdo, Settings
+from fdhil.guard.state import Request
+from tests.guard import machine
+from tests.guard.machine import Bench
+
+ONE = 1 << SHIFT
+LAW = Law(speed=(-200 * ONE,), torque=(2 * ONE, -ONE), pace=(-2 * ONE,), dry=30)
+LIMITS = Limits(speed=40_000, speed_rate=3_000, torque=900, torque_rate=120)
+FACTS = dict.fromkeys(FEEDFORWARD_FACTS, True)
+
+
+def fed_settings(shown: bool = False) -> Settings:
+    """The bench's settings with an RPDO for both offsets, ``shown`` with a TPDO for them as well."""
+    made = machine.settings()
+    layout = ((0x60B1, 0, 32, True), (0x60B2, 0, 16, True))
+    axes = [
+        replace(
+            axis,
+            feedforward=Feedforward(Pdo(0x400 + axis.node_id, layout), LIMITS),
+            tpdos=(*axis.tpdos, Pdo(0x1A0 + axis.node_id, layout)) if shown else axis.tpdos,
+        )
+        for axis in made.axes
+    ]
+    return replace(made, axes=tuple(axes))
+
+
+def fed_bench(shown: bool = False) -> Bench:
+    """The machine with a moving demand, the guard knowing of no program."""
+    bench = machine.bench()
+    for drive in bench.drives:
+        drive.shows_fed = shown
+    return Bench(fed_settings(shown), None, bench.demand, bench.drives)
+
+
+def request(**changes: Any) -> Request:
+    """A granted request, or one with something changed."""
+    return replace(Request("feedforward", True, "", FACTS, (LAW, LAW)), **changes)
+
+
+def switched_on(shown: bool = False) -> Bench:
+    """The feed-forward on, faded in, the path running."""
+    bench = fed_bench(shown)
+    bench.settle()
+    assert bench.sync(request()).refused == ()
+    bench.run(120)
+    bench.play()
+    bench.run(150)
+    return bench

@@ -1,0 +1,177 @@
+"""The feed-forward's law, its limits, its fades and its gaps, cycle by cycle, without a machine."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fdhil.guard.feedforward import (
+    HOLD_CYCLES,
+    ZEROS,
+    Feed,
+    FeedMode,
+    Law,
+    Limits,
+    armed,
+    end,
+    hear,
+    move,
+    react,
+    violates,
+)
+from fdhil.guard.interlocks import Alarm
+from fdhil.guard.requests import parse_law
+from tests.guard.fed import LAW, LIMITS, ONE
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(-(2**31), 2**31 - 1), st.booleans()), min_size=5, max_size=80), st.integers(1, 50)
+)
+def test_limits_hold_for_any_targets(heard: list[tuple[int, bool]], ending: int) -> None:
+    """Amplitude and rate of both offsets, whatever the targets jump to or lack; at the end they are zero."""
+    feed: Feed = armed((LAW,))
+    for k, (target, lost) in enumerate(heard):
+        if k == ending:
+            feed = end(feed, Alarm("Disarmed"))
+        before = feed.applied
+        feed = move(hear(feed, [None if lost else target]), [LIMITS], 20)
+        assert not violates(LIMITS, before[0], feed.applied[0])
+    feed = end(feed, Alarm("Disarmed"))
+    for _ in range(60):
+        feed = move(feed, [LIMITS], 20)
+    assert feed.applied == ((0, 0),)
+    assert feed.mode is FeedMode.OFF
+
+
+def test_at_rest_the_law_says_zero() -> None:
+    """Weights count from the newest target: rounding of the weights cannot leave an offset on an axis at rest."""
+    assert LAW.offsets([123_456] * 3) == (0, 0)
+    assert LAW.offsets([10, 0, -10]) == (2000, -20 + 20 + 30)
+
+
+GOOD = {"speed": [1], "torque": [1], "pace": [1], "dry": 1}
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"speed": []},
+        {"speed": [1.5]},
+        {"pace": [True]},
+        {"torque": [1] * 65},
+        {"dry": 1 << 60},
+        {"dry": None},
+        {"pace": 3},
+    ],
+)
+def test_only_a_whole_law_is_taken(change: dict[str, object]) -> None:
+    """Integers of a bounded size, a bounded number of them."""
+    assert parse_law(GOOD) == Law((1,), (1,), (1,), 1)
+    assert parse_law(GOOD | change) is None
+    assert parse_law([GOOD]) is None
+
+
+def fed(**changes: Any) -> Feed:
+    """A feed-forward of one axis that is on, with all targets it needs."""
+    return armed((LAW,))._replace(targets=((30, 20, 10),), **changes)
+
+
+def test_it_fades_in_cycle_by_cycle_and_out_the_same_way() -> None:
+    """Of 10 cycles each adds a tenth of what the law says, rounded down; ending takes it back."""
+    wide, feed = Limits(10**6, 10**6, 10**4, 10**4), fed()
+    assert LAW.offsets((30, 20, 10)) == (2000, 30)
+    seen = []
+    for _ in range(12):
+        feed = move(feed, [wide], 10)
+        seen.append(feed.applied[0])
+    assert seen == [(200 * k, 3 * k) for k in range(1, 11)] + [(2000, 30)] * 2
+    feed = end(feed, Alarm("Disarmed"))
+    seen = []
+    for _ in range(10):
+        feed = move(feed, [wide], 10)
+        seen.append(feed.applied[0])
+    assert seen == [(200 * k, 3 * k) for k in range(9, -1, -1)]
+    assert feed.zeros == 1
+    for _ in range(ZEROS - 1):
+        feed = move(feed, [wide], 10)
+        assert feed.mode is FeedMode.ENDING
+    assert move(feed, [wide], 10).mode is FeedMode.OFF
+
+
+def test_nothing_but_zeros_until_every_target_was_heard() -> None:
+    feed = armed((LAW,))
+    for heard in (5, 1005):
+        feed = move(hear(feed, [heard]), [LIMITS], 10)
+        assert (feed.applied, feed.share) == (((0, 0),), 0)
+    feed = move(hear(feed, [2005]), [LIMITS], 10)
+    assert feed.share == 1
+    assert any(feed.applied[0])
+
+
+@pytest.mark.parametrize(
+    ("after", "broken"),
+    [
+        ((40_000, 900), True),
+        ((3_000, 120), False),
+        ((3_001, 120), True),
+        ((3_000, 121), True),
+        ((-3_000, -120), False),
+        ((-3_001, 0), True),
+        ((0, -121), True),
+        ((0, 0), False),
+        ((0, 0.0), True),
+        ((True, 0), True),
+    ],
+)
+def test_the_check_of_a_frame_knows_the_limits_alone(after: Any, broken: bool) -> None:
+    assert violates(LIMITS, (0, 0), after) is broken
+
+
+def test_the_largest_values_are_the_last_that_pass() -> None:
+    for largest, torque in ((40_000, 900), (-40_000, -900)):
+        assert not violates(LIMITS, (largest, torque), (largest, torque))
+        step = 1 if largest > 0 else -1
+        assert violates(LIMITS, (largest, torque), (largest + step, torque))
+        assert violates(LIMITS, (largest, torque), (largest, torque + step))
+    assert not violates(LIMITS, (40_000, 900), (0, 0))  # zero may always be sent
+
+
+def test_a_gap_is_bridged_for_ten_cycles_in_a_row() -> None:
+    """The eleventh ends it; one good cycle in between starts the count anew."""
+    hold, feed = (Alarm("TargetLost"),), fed()
+    for k in range(HOLD_CYCLES):
+        feed = react(feed, hold)
+        assert (feed.mode, feed.held) == (FeedMode.ON, k + 1)
+    assert react(feed, hold).mode is FeedMode.ENDING
+    assert react(feed, ()).held == 0
+    assert react(react(feed, ()), hold).held == 1
+
+
+def test_the_worst_alarm_decides() -> None:
+    both = (Alarm("TargetLost"), Alarm("EchoMismatch"), Alarm("BusOff"))
+    assert react(fed(), both[:2]).cause == Alarm("EchoMismatch")
+    zeroing = react(fed(share=7, zeros=2), both)
+    assert (zeroing.mode, zeroing.cause, zeroing.share, zeroing.zeros) == (FeedMode.ZEROING, Alarm("BusOff"), 0, 0)
+    assert react(zeroing, (Alarm("SyncLost"),)).cause == Alarm("BusOff")
+    assert react(fed(), (Alarm("StaleOffset"),)).mode is FeedMode.ON  # what only forbids arming
+    assert react(Feed(), both).mode is FeedMode.OFF
+
+
+def test_a_lost_target_goes_on_as_the_two_before_it() -> None:
+    feed = armed((LAW,))
+    assert hear(feed, [None]).targets == ((),)
+    feed = hear(hear(feed, [100]), [None])
+    assert feed.targets == ((100,),)
+    feed = hear(hear(feed, [130]), [None])
+    assert feed.targets == ((160, 130, 100),)
+    assert hear(feed, [7]).targets == ((7, 160, 130),)
+
+
+@given(st.integers(-(2**40), 2**40))
+def test_dividing_by_the_scale_rounds_to_the_nearest(value: int) -> None:
+    law = Law(speed=(value,), torque=(0,), pace=(0,), dry=0)
+    assert abs(law.offsets((0, 1))[0] * ONE - value) <= ONE // 2
