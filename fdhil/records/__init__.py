@@ -1,0 +1,62 @@
+"""The immutable records that cross rooms. Arrays are read-only float64 unless said; the unit is in the name.
+
+Physics is SI (V, A, rad/s, N.m, kg.m2, s), path geometry is millimetres, path errors are micrometres where the
+name says ``_um``. Drive increments appear in :class:`CorrectionTable` alone.
+"""
+
+from __future__ import annotations
+
+from fdhil.records.paths import Correction, CorrectionTable, Prediction, Skill, Trajectory, Zone
+from fdhil.records.signals import (
+    AxisSamples,
+    MoveEvent,
+    MoveKind,
+    Recording,
+    SlowVoltage,
+    Stages,
+    Temperature,
+    TickTimes,
+    VoltageSamples,
+    VoltageSampling,
+    Window,
+)
+from fdhil.records.values import PARAMETERS, UNITS, Bool, Float, Int, Parameters, frozen, frozen_ints
+from fdhil.records.verdicts import Estimate, Notice, ParameterSet, Reason, Result, Verdict, WindowOutcome
+
+Outcome = WindowOutcome | ParameterSet | Skill | Notice
+
+__all__ = [
+    "PARAMETERS",
+    "UNITS",
+    "AxisSamples",
+    "Bool",
+    "Correction",
+    "CorrectionTable",
+    "Estimate",
+    "Float",
+    "Int",
+    "MoveEvent",
+    "MoveKind",
+    "Notice",
+    "Outcome",
+    "ParameterSet",
+    "Parameters",
+    "Prediction",
+    "Reason",
+    "Recording",
+    "Result",
+    "Skill",
+    "SlowVoltage",
+    "Stages",
+    "Temperature",
+    "TickTimes",
+    "Trajectory",
+    "Verdict",
+    "VoltageSamples",
+    "VoltageSampling",
+    "Window",
+    "WindowOutcome",
+    "Zone",
+    "frozen",
+    "frozen_ints",
+]

@@ -1,0 +1,99 @@
+"""What becomes of a path: reference, prediction and correction."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from fdhil.records.values import Bool, Float, Int
+from fdhil.records.verdicts import Reason
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """A reference on the SYNC grid: ``time_s`` (n,) and ``position_mm`` per axis (n,); ``rapid`` (n,) marks G0 rows.
+
+    ``line`` (n,) is the source line of the program that ordered the row, 0 where there is none.
+    """
+
+    dt_s: float
+    time_s: Float
+    position_mm: Mapping[str, Float]
+    rapid: Bool
+    line: Int
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """The axes in the order of the machine."""
+        return tuple(self.position_mm)
+
+
+@dataclass(frozen=True, slots=True)
+class Zone:
+    """A stretch of the path whose contour error stands out: where it is, how much, and why."""
+
+    start_s: float
+    end_s: float
+    where: str
+    max_um: float
+    cause: str
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """Predicted against reference: per axis arrays (n,), contour error (n,) in um, and zones.
+
+    ``current_a`` per axis (n,) is the model's at the SYNC instants; ``limited_s`` is the time each axis spent with a
+    limit acting.
+    """
+
+    reference: Trajectory
+    predicted_mm: Mapping[str, Float]
+    error_um: Mapping[str, Float]
+    contour_um: Float
+    current_a: Mapping[str, Float]
+    limited_s: Mapping[str, float]
+    zones: tuple[Zone, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Skill:
+    """Predicted against measured following error of one recorded move."""
+
+    axis: str
+    tick: int
+    rms_um: float
+    max_um: float
+    delay_ms: float
+    measured_rms_um: float
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """What a correction method plans for a reference: offsets per axis (n,), the path error without and with them.
+
+    ``offset_um`` is added to the reference; ``refused`` is empty when the gate lets the correction through, else the
+    offsets are all 0. ``warnings`` do not refuse. ``delay_s`` is the delay tau of r(t - tau) that was aimed at. Speed
+    and torque offsets (n,) per axis are empty unless the method is an on-line feed-forward.
+    """
+
+    method: str
+    before: Prediction
+    after: Prediction
+    offset_um: Mapping[str, Float]
+    refused: tuple[Reason, ...] = ()
+    warnings: tuple[Reason, ...] = ()
+    delay_s: float = 0.0
+    speed_offset_rad_s: Mapping[str, Float] = field(default_factory=dict)
+    torque_offset_nm: Mapping[str, Float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectionTable:
+    """What the guard loads: rows of demand and offset in drive increments, (n,) int64 per axis."""
+
+    axes: tuple[str, ...]
+    demand_increments: Mapping[str, Int]
+    offset_increments: Mapping[str, Int]
+    program_digest: str
+    digest: str

@@ -1,0 +1,115 @@
+"""What is told of a drive: estimates, and whether they are believed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Literal
+
+import numpy as np
+
+from fdhil.records.signals import Window
+from fdhil.records.values import PARAMETERS, Float, Parameters
+
+
+class Result(Enum):
+    """How an estimation ended."""
+
+    OK = "OK"
+    UNDER_EXCITED = "UNDER_EXCITED"
+    ILL_CONDITIONED = "ILL_CONDITIONED"
+    DIVERGED = "DIVERGED"
+    UNPHYSICAL = "UNPHYSICAL"
+    NOT_FINITE = "NOT_FINITE"
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """Why something was refused or is not known: the class name of FAULTS, the figure that caused it, what to do."""
+
+    code: str
+    text: str
+    advice: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.code}: {self.text}"
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """An estimator's answer: ``values`` (k,) and ``covariance`` (k, k) of ``names``; NaN where the data cannot tell.
+
+    ``residuals`` maps "electrical" (V) and "mechanical" (A) to their residuals (m,), in standard deviations where the
+    method is maximum likelihood. ``missing`` maps the names that are NaN to the reason. ``delay_s`` is the voltage
+    delay that the data show, None when not estimated, and ``delay_std_s`` its standard deviation. ``systematic`` (k, q)
+    is that part of the covariance, one standard deviation a column, which is the same in every window of a drive, None
+    when not told.
+    """
+
+    method: str
+    names: tuple[str, ...]
+    values: Float
+    covariance: Float
+    residuals: Mapping[str, Float]
+    result: Result
+    missing: Mapping[str, Reason] = field(default_factory=dict)
+    delay_s: float | None = None
+    delay_std_s: float | None = None
+    systematic: Float | None = None
+
+    def value(self, name: str) -> float:
+        """Return one parameter's value (NaN when the data cannot tell it)."""
+        return float(self.values[self.names.index(name)])
+
+    def std(self, name: str) -> float:
+        """Return one parameter's standard deviation."""
+        k = self.names.index(name)
+        return float(np.sqrt(self.covariance[k, k]))
+
+    def parameters(self) -> Parameters:
+        """Return the six parameters; NaN stays NaN."""
+        return Parameters(*(self.value(name) for name in PARAMETERS))
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The validation's answer for one window or pool."""
+
+    accepted: bool
+    fit_percent: float | None
+    reasons: tuple[Reason, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class WindowOutcome:
+    """One window that was analysed: what was estimated, and whether it is believed."""
+
+    window: Window
+    estimate: Estimate | None
+    verdict: Verdict
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterSet:
+    """A published revision of one axis' parameters: pooled from ``windows`` accepted windows."""
+
+    axis: str
+    revision: int
+    parameters: Parameters
+    covariance: Float
+    windows: int
+    tick: int
+    temperature_c: float | None
+    config_digest: str
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """Something an operator should know: a FAULTS class, its severity, cause, effect and next action."""
+
+    code: str
+    severity: Literal["info", "minor", "MAJOR"]
+    text: str
+    axis: str = ""
+    tick: int = 0
