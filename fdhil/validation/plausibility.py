@@ -15,6 +15,7 @@ from fdhil.validation.episode import interruptions
 
 CHANCE = 1e-4  # of a false alarm of one check on one good window
 TOLERATED_GAP = 3  # rows: a longer gap hides what the drive did
+STILL_MM = 0.004  # of the table at rest
 TOLERATED_LOSS = 0.02
 RAIL_SAMPLES = 3
 RESOLVED = 0.2  # of a step: noise below it hides in the resolution
@@ -90,11 +91,17 @@ def _stages(window: Window) -> Iterator[Reason]:
 
 def _gaps(window: Window) -> Iterator[Reason]:
     a, b = moving_range(window)
-    inside = [(max(g, a), min(h, b)) for g, h in window.gaps if g < b and h > a]
+    inside = [(g, h) for g, h in window.gaps if (g < b and h > a) or _travels(window, g, h)]
     rows = sum(h - g for g, h in inside)
     if rows and (max(h - g for g, h in inside) > TOLERATED_GAP or rows > TOLERATED_LOSS * (b - a)):
         text = f"{rows} of {b - a} samples of the move are lost, the first at {_time(window, inside[0][0]):.3f} s"
         yield Reason("StaleData", text, "find where frames are lost: bus load, receive buffer")
+
+
+def _travels(window: Window, begin: int, end: int) -> bool:
+    """Return whether the table moves while these rows are lost: the end of the move may lie within them."""
+    beside = window.position_mm[[max(0, begin - 1), min(end, window.n - 1)]]
+    return bool(abs(beside[1] - beside[0]) > STILL_MM)
 
 
 def beyond_chance(values: Float, start: int, end: int) -> bool:
@@ -223,9 +230,9 @@ def at_rest(window: Window) -> Bool:
     position = carried(window.position_mm)
     reach = max(1, round(0.010 / window.dt_s))
     ahead, behind = np.roll(position, -reach), np.roll(position, reach)
-    still = (np.abs(ahead - position) < 0.004) & (np.abs(behind - position) < 0.004)
-    still[:reach] &= np.abs(position[:reach] - position[0]) < 0.004
-    still[-reach:] &= np.abs(position[-reach:] - position[-1]) < 0.004
+    still = (np.abs(ahead - position) < STILL_MM) & (np.abs(behind - position) < STILL_MM)
+    still[:reach] &= np.abs(position[:reach] - position[0]) < STILL_MM
+    still[-reach:] &= np.abs(position[-reach:] - position[-1]) < STILL_MM
     slow = np.abs(smooth(window.speed_rad_s, window.dt_s)) < 0.02 * window.rapid_speed_rad_s
     return still & slow & np.isfinite(window.speed_rad_s)
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.motion import UNKNOWN, noise_levels
@@ -14,10 +15,13 @@ from fdhil.identification.windows import carried, smooth
 from fdhil.records import Reason, Window
 from fdhil.validation.plausibility import at_rest
 
+Rows = np.ndarray[tuple[int], np.dtype[np.intp]]
+
 ROWS = 12
 SURE = 5.5
 LEAST_SPEED = 0.004  # of the rapid speed
-LEAST_VOLTAGE = 0.01  # of the peak voltage
+LEAST_CURRENT = 0.01  # of the peak current
+SETTLING_S, RISING_S = 0.010, 0.020  # at the ends of standstill, in which the current follows from or for a move
 HOLDING_SHARE = 1.15  # a drive at rest may hold as much as dry friction drags, and no more
 LEAST_TORQUE = 0.01
 LEAST_BREAKAWAY = 0.02  # of the peak torque
@@ -37,8 +41,42 @@ def rest_faults(window: Window, fit: Fit) -> Iterator[Reason]:
     if abs(speed) > limit:
         text = f"speed reads {speed:+.3g} rad/s at standstill, limit {limit:.2g}"
         yield Reason("CalibrationSuspect", text, "set the zero of the speed sensor at standstill")
+    yield from _contradiction(window, fit, rows)
     yield from _holding(window, fit, rows)
     yield from breakaway(window, fit)
+
+
+def _contradiction(window: Window, fit: Fit, rows: Rows) -> Iterator[Reason]:
+    """At standstill u = R i + L di/dt: the zero of current or voltage is off where they contradict each other."""
+    if window.voltage_v is None:
+        return
+    noise, peak = noise_levels(window), float(np.nanmax(np.abs(window.current_a)))
+    resistance, inductance, torque_constant = fit.theta[:3]
+    settled, rising = round(SETTLING_S / window.dt_s), round(RISING_S / window.dt_s)
+    for part in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
+        still = part[settled:-rising]
+        if still.size < ROWS:
+            continue
+        current, quarter = window.current_a[still], still.size // 4
+        lasted_s = (still.size - quarter) * window.dt_s
+        rise = (current[-quarter:].mean() - current[:quarter].mean()) / lasted_s
+        excess = float(current.mean() - (window.voltage_v[still].mean() - inductance * rise) / resistance)
+        crept = float(np.ptp(window.position_mm[still[[0, -1]]])) / window.pitch_mm * 2 * np.pi
+        doubts = (
+            np.hypot(noise.current_a, noise.voltage_v / resistance) / np.sqrt(still.size),
+            inductance / resistance * noise.current_a * np.sqrt(2 / quarter) / lasted_s,
+            torque_constant / resistance * crept / (still.size * window.dt_s),
+        )
+        limit = max(SURE * float(np.linalg.norm(doubts)), LEAST_CURRENT * peak)
+        if abs(excess) > limit and abs(excess) > SURE * _resistance_share(fit) * abs(float(current.mean())):
+            text = f"at standstill the current reads {excess:+.3g} A more than voltage and resistance make"
+            yield Reason("CalibrationSuspect", text, "set the zeros of current and voltage sensor at standstill")
+            return
+
+
+def _resistance_share(fit: Fit) -> float:
+    """Return the standard deviation of the resistance as a share of it."""
+    return maximum_likelihood.finish(fit).std("R") / float(fit.theta[0])
 
 
 def breakaway(window: Window, fit: Fit) -> Iterator[Reason]:
@@ -90,7 +128,7 @@ def _rest_before(fit: Fit, begin: int, side: int) -> int | None:
     return row if quiet and unknown and row < begin - 1 else None
 
 
-def _holding(window: Window, fit: Fit, rows: np.ndarray[tuple[int], np.dtype[np.intp]]) -> Iterator[Reason]:
+def _holding(window: Window, fit: Fit, rows: Rows) -> Iterator[Reason]:
     """A shaft that sticks although K i exceeds Cd has friction that the model does not have."""
     current = smooth(carried(window.current_a), window.dt_s)[rows]
     torque = abs(fit.theta[2]) * float(np.median(np.abs(current)))

@@ -1,0 +1,73 @@
+"""What standstill tells of the sensors' zeros, and what is lost just as the move ends."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil.config import Identification
+from fdhil.identification.estimators import maximum_likelihood
+from fdhil.identification.windows import moving_range
+from fdhil.records import Float, Reason, Window, frozen
+from fdhil.validation import analyse
+from fdhil.validation.rest import rest_faults
+from tests.identification.recorded import windows
+
+SETTINGS = Identification()
+
+
+def _at_rest(window: Window) -> Sequence[Reason]:
+    fit = maximum_likelihood.fit_windows([window], SETTINGS)
+    assert fit is not None
+    return [reason for reason in rest_faults(window, fit) if "at standstill the current" in reason.text]
+
+
+@pytest.mark.parametrize("share", [-0.02, 0.02])
+def test_a_current_that_is_not_the_voltages_over_resistance_at_standstill_has_a_wrong_zero(share: float) -> None:
+    window = windows(0.003)[0]
+    off = share * float(np.abs(window.current_a).max())
+    (reason,) = _at_rest(replace(window, current_a=frozen(window.current_a + off)))
+    assert reason.code == "CalibrationSuspect"
+    told = re.search(r"reads (\S+) A", reason.text)
+    assert told is not None
+    assert float(told[1]) == pytest.approx(off, rel=0.1)
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.003, 0.005])
+def test_right_zeros_are_believed(noise: float) -> None:
+    assert [_at_rest(window) for window in windows(noise, moves=2)] == [[], []]
+
+
+@pytest.mark.parametrize("rows_before_its_end", [5, 20, 60])
+def test_samples_lost_while_the_table_still_moves_are_missed(rows_before_its_end: int) -> None:
+    window = windows(0.003)[0]
+    end = moving_range(window)[1] - rows_before_its_end
+    assert "StaleData" in {r.code for r in analyse(_lost(window, end, 30), SETTINGS).verdict.reasons}
+
+
+def test_samples_lost_at_standstill_are_not() -> None:
+    outcome = analyse(_lost(windows(0.003)[0], 10, 20), SETTINGS)
+    assert "StaleData" not in {r.code for r in outcome.verdict.reasons}
+
+
+def _lost(window: Window, begin: int, rows: int) -> Window:
+    end = min(begin + rows, window.n)
+    assert window.voltage_v is not None
+
+    def spoilt(values: Float) -> Float:
+        values = values.copy()
+        values[begin:end] = np.nan
+        return frozen(values)
+
+    return replace(
+        window,
+        gaps=((begin, end),),
+        voltage_v=spoilt(window.voltage_v),
+        current_a=spoilt(window.current_a),
+        speed_rad_s=spoilt(window.speed_rad_s),
+        position_mm=spoilt(window.position_mm),
+    )
