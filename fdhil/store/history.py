@@ -244,7 +244,9 @@ class History:
 
     def comparisons(self, program: str, limit: int) -> list[tuple[Stamp, Comparison]]:
         """Return what was predicted of a program (its digest), newest first."""
-        if _version(self._db) <= _STEPS.index(_COMPARISONS):
+        with _told(self._path):
+            version = _version(self._db)
+        if version <= _STEPS.index(_COMPARISONS):
             return []  # a reader does not bring an older store up
         query = "SELECT * FROM comparisons WHERE program = ? ORDER BY id DESC LIMIT ?"
         return [(_stamp(row), _comparison(row)) for row in self._select(query, (program, limit))]

@@ -174,6 +174,13 @@ def test_the_oldest_comparisons_go(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         assert [c.rms_um for _, c in history.comparisons("a" * 64, 9)] == [3.0, 2.0]
 
 
+def test_comparisons_of_a_database_that_refuses_are_told(tmp_path: Path) -> None:
+    history = History.open(tmp_path)
+    history.close()
+    with pytest.raises(StoreError):
+        history.comparisons("a" * 64, 2)
+
+
 @pytest.mark.parametrize(
     "content", [b"this is no database at all, not even nearly" * 100, b"SQLite format 3\0" + b"\xff" * 5000]
 )
