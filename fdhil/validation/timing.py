@@ -27,6 +27,7 @@ SURE = 4.5  # standard deviations: two tests a window
 SEARCH = 6  # fits: each takes away most of what is left
 REACH = 16.0  # samples: longer ones show in whole samples, see identification.delay
 FOUND = 0.1  # samples
+LATE = (1.5, 2.0, 2.5, 3.0)  # samples that a winding shorter than a sample is weighed against
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +55,31 @@ def timing_faults(window: Window, fit: Fit) -> Iterator[Reason]:
         samples = searched(fit, voltage.samples)
         if samples is not None and abs(samples) > LARGEST:
             yield _reason("voltage", "current and speed", samples, window.dt_s)
+            return
+    yield from _short_winding(fit)
+
+
+def _short_winding(fit: Fit) -> Iterator[Reason]:
+    """A late voltage makes the current follow early, which a winding without inductance would do too.
+
+    Where the time constant found is less than a sample, the window is refused unless it is surely likelier so than with
+    a longer winding and a late voltage.
+    """
+    motion, theta = fit.problem.motions[0], fit.theta
+    if theta[1] > theta[0] * motion.dt_s:
+        return
+    least = float(fit.residuals @ fit.residuals) * (1.0 + SURE**2 / fit.residuals.size)
+    for samples in LATE:
+        start = np.append(theta[:6], samples * motion.dt_s)
+        theta, residuals, _, _ = maximum_likelihood.descend(fit.problem, start, range(6))
+        if float(residuals @ residuals) < least:
+            short_ms, long_ms = (1e3 * t[1] / t[0] for t in (fit.theta, theta))
+            text = (
+                f"a winding of {short_ms:.2g} ms, less than a sample, is no likelier than one of {long_ms:.2g} ms "
+                f"and a voltage {1e3 * samples * motion.dt_s:.2g} ms late"
+            )
+            yield Reason("SampleTiming", text, "take voltage and current from one SYNC, or sample faster")
+            return
 
 
 def _reason(name: str, others: str, samples: float, dt_s: float) -> Reason:

@@ -72,3 +72,20 @@ def test_instants_share_the_noise_of_the_voltage_between_intervals(seed: int) ->
     assert seen > 0.3
     assert expected_correlation(fit)[0] == pytest.approx(seen, abs=0.15)
     assert analyse(window, SETTINGS).verdict.accepted
+
+
+def test_a_late_voltage_that_passes_for_a_short_winding_is_refused() -> None:
+    late = faults.KINDS["voltage late"].make(np.random.default_rng([31, 2, 357]))
+    (window,) = find_windows(late.recording)
+    (reason,) = analyse(window, SETTINGS).verdict.reasons
+    assert reason.code == "SampleTiming"
+    assert "a winding of 0.54 ms" in reason.text
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_winding_that_is_shorter_than_a_sample_is_believed_where_it_is_likelier(seed: int) -> None:
+    scene = replace(SCENE, drive=replace(SCENE.drive, L=SCENE.drive.R * 0.0007), dt_s=1e-3, noise=0.002)
+    rng = np.random.default_rng(seed)
+    rows = measured(rng, scene, drives.run(scene.drive, demand_of(scene), scene.dt_s))
+    verdict = analyse(find_windows(recorded(scene, rows))[0], SETTINGS).verdict
+    assert "SampleTiming" not in {reason.code for reason in verdict.reasons}
