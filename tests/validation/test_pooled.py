@@ -10,7 +10,7 @@ import pytest
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.validation import analyse, pool
-from studies import drives
+from studies import drives, faults
 from studies.scenes import demand_of, measured, recorded
 from tests.identification.recorded import windows
 from tests.validation.test_episodes import SCENE
@@ -73,3 +73,12 @@ def test_rapids_of_other_speed_and_acceleration_agree() -> None:
     assert len(outcomes) == 2
     _, verdict = pool(outcomes, Identification())
     assert verdict.accepted, verdict.reasons
+
+
+@pytest.mark.parametrize("seed", [17, 47, 1487])
+def test_a_gain_that_changes_between_rapids_is_told_where_no_parameter_alone_tells_it(seed: int) -> None:
+    changed = faults.KINDS["gain between rapids"].make(np.random.default_rng([31, 2, seed]))
+    outcomes = [analyse(window, Identification()) for window in find_windows(changed.recording)]
+    assert all(outcome.verdict.accepted for outcome in outcomes)
+    _, verdict = pool(outcomes, Identification())
+    assert [reason.code for reason in verdict.reasons] == ["CalibrationSuspect"]
