@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -18,37 +18,22 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-import numpy.typing as npt
 
 from fdhil.config import Identification
 from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.windows import find_windows
-from fdhil.records import PARAMETERS, Recording, SlowVoltage, VoltageSampling, Window, frozen
+from fdhil.records import PARAMETERS, SlowVoltage, VoltageSampling, Window, frozen
 from fdhil.store.recording_csv import parse_recording
 from fdhil.validation import analyse
-from studies import bench, drives, machine_faults, signal_faults
-from studies.drives import Array, Rng, log_uniform
-from studies.scenes import Rows, Scene, demand_of, draw_scene, measured, recorded
+from studies import bench
+from studies.drives import Array
+from studies.slow_recordings import GOOD, KINDS, PERIODS_S, recording_of, sampled
 
 SETTINGS = Identification()
 TRUTH = np.array([bench.Plant().truth()[name] for name in PARAMETERS])
-PERIODS_S = (0.010, 0.005, 0.002)
 NOISES = (0.001, 0.005)
 SAMPLINGS: tuple[VoltageSampling, ...] = ("interval_mean", "instant")
-GOOD = "good"
-Maker = Callable[[Rng], tuple[Recording, float]]
 Made = TypeVar("Made")
-
-
-def sampled(
-    fine: Array, step_s: float, begin_s: npt.NDArray[np.floating], period_s: float, sampling: VoltageSampling
-) -> Array:
-    """Return what a sensor tells of a voltage held over steps of ``step_s``, of samples that begin at ``begin_s``."""
-    if sampling == "instant":
-        return np.asarray(fine[np.clip((begin_s / step_s + 1e-6).astype(int), 0, fine.size - 1)])
-    swept = np.concatenate([[0.0], np.cumsum(fine)]) * step_s
-    grid = np.arange(swept.size) * step_s
-    return np.asarray((np.interp(begin_s + period_s, grid, swept) - np.interp(begin_s, grid, swept)) / period_s)
 
 
 @lru_cache(maxsize=4)
@@ -139,168 +124,11 @@ def _all(one: Callable[[int], Made], seeds: range, processes: int) -> Iterator[M
 
 
 @dataclass(frozen=True, slots=True)
-class Sensed:
-    """What a recording is made of: the rows, and a sensor's samples with the place it gives them and where they are."""
-
-    rows: Rows
-    voltage: Array
-    begin_s: float
-    period_s: float
-
-    def spoilt(self, voltage: Array) -> Sensed:
-        """Return it with other samples."""
-        return replace(self, voltage=voltage)
-
-    @property
-    def moving(self) -> tuple[int, int]:
-        """Half-open samples of the true move."""
-        a, b = (int(row * self.rows.dt_s / self.period_s) for row in self.rows.moving)
-        return a, min(b, self.voltage.size)
-
-
-def sense(rng: Rng, scene: Scene, load: Array | None = None, late: float | None = None) -> Sensed:
-    """Return a run of a scene by a sensor of 100 to 500 Hz; ``late`` in its samples, drawn when left out."""
-    demand = demand_of(scene)
-    rows = measured(rng, scene, drives.run(scene.drive, demand, scene.dt_s, load))
-    fine = drives.run(scene.drive, demand, drives.STEP_S, load).voltage
-    period = float(rng.choice(PERIODS_S))
-    delay = (rng.uniform(-0.5, 0.5) if late is None else late) * period
-    begin = rng.uniform(0.0, period)
-    count = int((rows.signals["speed"].size * rows.dt_s - begin) / period)
-    told = sampled(fine, drives.STEP_S, begin - delay + np.arange(count) * period, period, scene.sampling)
-    peak = float(np.abs(told).max())
-    told = told + scene.noise * 0.4 * peak * rng.standard_normal(count)
-    return Sensed(rows, np.round(told / (scene.steps[0] * peak)) * scene.steps[0] * peak, begin, period)
-
-
-def scene_of(rng: Rng) -> Scene:
-    """Draw a drive, a rapid and a recorder whose rows are closer than the sensor's samples."""
-    scene = draw_scene(rng)
-    return replace(scene, dt_s=min(scene.dt_s, 1e-3))
-
-
-def told(scene: Scene, sensed: Sensed) -> Recording:
-    """Return the recording."""
-    slow = SlowVoltage(sensed.begin_s, sensed.period_s, 2e-4, frozen(sensed.voltage))
-    return replace(recorded(scene, sensed.rows), slow_voltage=slow)
-
-
-def _of_voltage(spoil: Callable[[Rng, Sensed], tuple[Sensed, float]]) -> Maker:
-    def make(rng: Rng) -> tuple[Recording, float]:
-        scene = scene_of(rng)
-        spoilt, severity = spoil(rng, sense(rng, scene))
-        return told(scene, spoilt), severity
-
-    return make
-
-
-def _of_rows(fault: signal_faults.SignalFault) -> Maker:
-    """Spoil current or speed as the other studies do."""
-
-    def make(rng: Rng) -> tuple[Recording, float]:
-        scene = scene_of(rng)
-        sensed = sense(rng, scene)
-        while True:
-            rows, severity = fault(rng, sensed.rows)
-            if rows.signals["voltage"] is sensed.rows.signals["voltage"]:
-                return told(scene, replace(sensed, rows=rows)), severity
-
-    return make
-
-
-def _of_machine(change: Callable[[Rng, Scene], tuple[Scene, Array | None, float]]) -> Maker:
-    def make(rng: Rng) -> tuple[Recording, float]:
-        scene, load, severity = change(rng, scene_of(rng))
-        return told(scene, sense(rng, scene, load)), severity
-
-    return make
-
-
-def _voltage_gain_step(rng: Rng, sensed: Sensed) -> tuple[Sensed, float]:
-    amount, (begin, end) = log_uniform(rng, 0.03, 0.2), sensed.moving
-    values = sensed.voltage.copy()
-    values[int(begin + rng.uniform(0.2, 0.8) * (end - begin)) :] *= 1 + signal_faults.sign(rng) * amount
-    return sensed.spoilt(values), amount
-
-
-def _voltage_gain_drift(rng: Rng, sensed: Sensed) -> tuple[Sensed, float]:
-    amount, (begin, end) = log_uniform(rng, 0.04, 0.2), sensed.moving
-    course = np.clip((np.arange(sensed.voltage.size) - begin) / (end - begin), 0, 1)
-    return sensed.spoilt(sensed.voltage * (1 + signal_faults.sign(rng) * amount * course)), amount
-
-
-def _voltage_offset(rng: Rng, sensed: Sensed) -> tuple[Sensed, float]:
-    amount = log_uniform(rng, 0.015, 0.08)
-    peak = float(np.abs(sensed.voltage).max())
-    return sensed.spoilt(sensed.voltage + signal_faults.sign(rng) * amount * peak), amount
-
-
-def _voltage_stuck(rng: Rng, sensed: Sensed) -> tuple[Sensed, float]:
-    begin, end = sensed.moving
-    length = max(4, round(rng.uniform(0.04, 0.1) / sensed.period_s))
-    start = int(rng.uniform(begin, end - length))
-    values = sensed.voltage.copy()
-    values[start : start + length] = values[start]
-    return sensed.spoilt(values), length * sensed.period_s
-
-
-def _voltage_clipped(rng: Rng, sensed: Sensed) -> tuple[Sensed, float]:
-    cut = rng.uniform(0.1, 0.5)
-    rail = (1 - cut) * float(np.abs(sensed.voltage).max())
-    return sensed.spoilt(np.clip(sensed.voltage, -rail, rail)), cut
-
-
-def _voltage_turned(_rng: Rng, sensed: Sensed) -> tuple[Sensed, float]:
-    return sensed.spoilt(-sensed.voltage), 1.0
-
-
-def _voltage_late(rng: Rng) -> tuple[Recording, float]:
-    scene = scene_of(rng)
-    late = signal_faults.sign(rng) * rng.uniform(1.3, 4.0)
-    return told(scene, sense(rng, scene, late=late)), abs(late)
-
-
-def _fine(rng: Rng) -> tuple[Recording, float]:
-    scene = scene_of(rng)
-    return told(scene, sense(rng, scene)), 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """A kind of recording: how one is made, the codes that name its fault rightly, the severity's unit."""
-
-    make: Maker
-    named: frozenset[str]
-    unit: str
-
-
-def _kind(make: Maker, named: str, unit: str) -> Kind:
-    return Kind(make, frozenset(named.split()), unit)
-
-
-KINDS: Mapping[str, Kind] = {
-    "voltage gain steps": _kind(_of_voltage(_voltage_gain_step), "CalibrationSuspect", "of the gain"),
-    "voltage gain drifts": _kind(_of_voltage(_voltage_gain_drift), "CalibrationSuspect", "of the gain"),
-    "voltage offset": _kind(_of_voltage(_voltage_offset), "CalibrationSuspect", "of the peak"),
-    "voltage stuck": _kind(_of_voltage(_voltage_stuck), "StuckValue", "s"),
-    "voltage clipped": _kind(_of_voltage(_voltage_clipped), "Saturated", "of the peak"),
-    "voltage turned": _kind(_of_voltage(_voltage_turned), "Unphysical CalibrationSuspect", ""),
-    "voltage late": _kind(_voltage_late, "SampleTiming", "samples"),
-    "gain steps": _kind(_of_rows(signal_faults.gain_step), "CalibrationSuspect", "of the gain"),
-    "gain drifts": _kind(_of_rows(signal_faults.gain_drift), "CalibrationSuspect", "of the gain"),
-    "offset": _kind(_of_rows(signal_faults.offset), "CalibrationSuspect", "of the peak"),
-    "stuck": _kind(_of_rows(signal_faults.stuck), "StuckValue", "s"),
-    "current late": _kind(_of_rows(signal_faults.current_late), "SampleTiming", "rows"),
-    "cutting load": _kind(_of_machine(machine_faults.cutting_load), "LoadDetected", "of the peak torque"),
-    "stiff travel": _kind(_of_machine(machine_faults.stiff_travel), "LoadDetected", "of the peak torque"),
-    "collision": _kind(_of_machine(machine_faults.collision), "LoadDetected", "of the peak torque"),
-    "Stribeck friction": _kind(_of_machine(machine_faults.stribeck), "ValidationFailed", "of the peak torque"),
-}
-
-
-@dataclass(frozen=True, slots=True)
 class Judged:
-    """One recording: its seed, kind, severity, windows listed and refused, and the reasons."""
+    """One recording: its seed, kind, severity, windows listed and refused, and the reasons.
+
+    ``left_open`` names what each accepted window that does not tell all leaves null.
+    """
 
     seed: int
     kind: str
@@ -308,6 +136,7 @@ class Judged:
     windows: int
     refused: int
     texts: tuple[str, ...]
+    left_open: tuple[str, ...] = ()
 
     @property
     def codes(self) -> frozenset[str]:
@@ -318,11 +147,13 @@ class Judged:
 def judge(seed: int, study: int, kind: str | None = None) -> Judged:
     """Return what the validation says of one recording; a bad one's kind goes round with ``seed``."""
     name = kind or list(KINDS)[seed % len(KINDS)]
-    make = _fine if name == GOOD else KINDS[name].make
-    recording, severity = make(np.random.default_rng([study, 1 if name == GOOD else 2, seed]))
-    verdicts = [analyse(window, SETTINGS).verdict for window in find_windows(recording)]
+    recording, severity = recording_of(seed, study, name)
+    outcomes = [analyse(window, SETTINGS) for window in find_windows(recording)]
+    verdicts = [outcome.verdict for outcome in outcomes]
     texts = tuple(dict.fromkeys(str(reason) for verdict in verdicts for reason in verdict.reasons))
-    return Judged(seed, name, severity, len(verdicts), sum(not v.accepted for v in verdicts), texts)
+    accepted = [o.estimate for o in outcomes if o.verdict.accepted and o.estimate is not None]
+    left_open = tuple(" and ".join(estimate.missing) for estimate in accepted if estimate.missing)
+    return Judged(seed, name, severity, len(verdicts), sum(not v.accepted for v in verdicts), texts, left_open)
 
 
 @dataclass
@@ -355,9 +186,12 @@ def verdicts_page(good: range, bad: range, study: int, processes: int) -> str:
         if one.windows > one.refused:
             print("accepted", one.kind, one.seed, f"{one.severity:.3g}", flush=True)
     told_of_good = ", ".join(f"{count} {code}" for code, count in given.most_common()) or "none"
+    nulls = Counter(names for one in fine for names in one.left_open)
+    told_of_nulls = ", ".join(f"{count} without {names}" for names, count in nulls.most_common()) or "none"
     return "\n".join([
         f"Good: {windows} windows of {len(fine)} recordings, {refused} refused ({refused / max(1, windows):.2%}). "
         f"Reasons: {told_of_good}.",
+        f"{nulls.total()} are accepted with a null and its reason: {told_of_nulls}.",
         "",
         "| fault | recordings | smallest severity | accepted | named rightly | reasons given |",
         "|---|---|---|---|---|---|",
@@ -365,7 +199,7 @@ def verdicts_page(good: range, bad: range, study: int, processes: int) -> str:
     ])  # fmt: skip
 
 
-INTRODUCTION = """# A voltage sensor slower than the drive
+PAGE = """# A voltage sensor slower than the drive
 
 Written by `python -m studies.slow_sensor`. The sensor samples on a grid of its own, later or earlier than it says by up
 to 0.6 of its samples, which the fit finds as a seventh parameter.
@@ -373,28 +207,36 @@ to 0.6 of its samples, which the fit finds as a seventh parameter.
 ## How well the parameters are known
 
 One rapid of the bench, rows at 1 kHz.
+
+{intervals}
+
+## Good windows refused, bad windows accepted
+
+Random drives and rapids as in [the verdicts](verdicts.md), seeds of their own. R and L are told by the voltage's course
+alone: where so slow a sensor leaves them open, they are null with the reason, and the window is accepted all the same.
+
+{verdicts}
 """
 
 
 def main() -> None:
-    """Run the study and write its page."""
+    """Run the study and write its page; without ``--out`` a part is only printed."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--part", choices=("intervals", "verdicts"), help="print one table only, and write no page")
     parser.add_argument("--runs", type=int, default=100, help="rapids for each row of the first table")
-    parser.add_argument("--good", type=int, default=400)
-    parser.add_argument("--bad", type=int, default=480)
+    parser.add_argument("--good", type=int, default=400, help="good recordings of the second table")
+    parser.add_argument("--bad", type=int, default=480, help="bad recordings of the second table")
     parser.add_argument("--first", type=int, default=0, help="the first seed")
-    parser.add_argument("--study", type=int, default=1, help="seed of the drives of the second table")
+    parser.add_argument("--study", type=int, default=3, help="seed of the drives of the second table")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("docs/studies/slow_sensor.md"))
     options = parser.parse_args()
-    first, second = options.first, options.first
-    intervals = intervals_page(range(first, first + options.runs), options.processes)
-    verdicts = verdicts_page(
-        range(second, second + options.good), range(second, second + options.bad), options.study, options.processes
-    )
+    runs, good, bad = (range(options.first, options.first + n) for n in (options.runs, options.good, options.bad))
+    intervals = "" if options.part == "verdicts" else intervals_page(runs, options.processes)
+    verdicts = "" if options.part == "intervals" else verdicts_page(good, bad, options.study, options.processes)
     print(verdicts)
-    heading = "\n\n## Good windows refused, bad windows accepted\n\nRandom drives and rapids as in [the verdicts]"
-    options.out.write_text(f"{INTRODUCTION}\n{intervals}{heading}(verdicts.md).\n\n{verdicts}\n")
+    if options.part is None:
+        options.out.write_text(PAGE.format(intervals=intervals, verdicts=verdicts))
 
 
 if __name__ == "__main__":

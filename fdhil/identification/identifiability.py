@@ -12,6 +12,7 @@ from fdhil.records import PARAMETERS, Estimate, Reason, Result
 CONDITION_LIMIT = 1e6
 RELATIVE_STD_LIMIT: Mapping[str, float] = {"R": 0.10, "L": 0.25, "K": 0.05, "Jt": 0.10, "ft": 0.5, "Cd": 0.5}
 FRICTION_SHARE = 0.25
+TOLD_BY_VOLTAGE = frozenset({"R", "L"})
 PHYSICAL: Mapping[str, tuple[float, float]] = {
     "R": (1e-3, 1e3),
     "L": (1e-6, 10.0),
@@ -72,6 +73,17 @@ def _unknown(estimate: Estimate, top_rad_s: float) -> dict[str, Reason]:
             text = f"the standard deviation of {name} is {100 * share:.0f} % of its size, limit {100 * limit:.0f} %"
             missing[name] = Reason("LowExcitation", text, "record rapids at other speeds and in both directions")
     return missing
+
+
+def untold(estimate: Estimate, *, slow: bool) -> list[Reason]:
+    """Return the reasons for which an estimate with missing parameters is not believed, each once.
+
+    R and L are told by the voltage's course alone. A ``slow`` sensor may leave them open, however good the window is:
+    then they are null, each with its reason, and the rest is as good as any.
+    """
+    if slow and set(estimate.missing) <= TOLD_BY_VOLTAGE and estimate.result is Result.UNDER_EXCITED:
+        return []
+    return list({r.text: r for r in estimate.missing.values()}.values())
 
 
 def unphysical(estimate: Estimate) -> list[Reason]:

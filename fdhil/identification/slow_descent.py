@@ -17,7 +17,7 @@ from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import innovations_of
 from fdhil.records import Float
 
-STEPS = 20
+STEPS = 60
 CONVERGED = 0.01  # of a standard deviation
 DIFFERENCE = 1e-5  # of a parameter's typical size
 DELAY_DIFFERENCE_S = 1e-6
@@ -61,14 +61,20 @@ class Likelihood:
     def slopes(self, here: Point, theta: Float, free: Sequence[int], sizes: Float) -> tuple[Float, Float]:
         """Return minus the derivatives (m, k) of innovations by ``free``, in deviations, and of half the log variance.
 
-        The order of rows and samples is held: an innovation must stay the same row's.
+        The order of rows and samples is held: an innovation must stay the same row's. A sample that would so be taken
+        before its row has its time run backwards; where a variance does not bear that, the delay is varied to the
+        other side.
         """
         deviation, order = np.sqrt(here.variance), float(theta[6])
         of_mean, of_variance = np.empty((here.values.size, len(free))), np.empty((here.values.size, len(free)))
         for k, j in enumerate(free):
             moved = theta.copy()
             moved[j] += DELAY_DIFFERENCE_S if j == 6 else DIFFERENCE * sizes[j]
-            there, change = self.at(moved, order), moved[j] - theta[j]
+            there = self.at(moved, order)
+            if j == 6 and not (there.variance > 0.0).all():
+                moved[j] = theta[j] - DELAY_DIFFERENCE_S
+                there = self.at(moved, order)
+            change = moved[j] - theta[j]
             of_mean[:, k] = (here.values - there.values) / deviation / change
             of_variance[:, k] = (np.log(here.variance) - np.log(there.variance)) / 2 / change
         return of_mean, of_variance

@@ -32,7 +32,8 @@ def slow_start(windows: Sequence[Window], settings: Identification) -> tuple[Flo
     None when there are too few samples to start from.
     """
     shifts = [_coarse_shift(w, settings.lowpass_hz) for w in windows]
-    electrical = np.vstack([_samples(w, s, settings.lowpass_hz) for w, s in zip(windows, shifts, strict=True)])
+    pairs = zip(windows, shifts, strict=True)
+    electrical = np.vstack([sample_rows(w, s, settings.lowpass_hz)[0] for w, s in pairs])
     mechanical = np.vstack([mechanical_signals(w, settings) for w in windows])
     known = np.isfinite(electrical).all() and np.isfinite(mechanical).all()
     if not known or electrical.shape[0] < LEAST_SAMPLES or mechanical.shape[0] < LEAST_SAMPLES:
@@ -43,8 +44,8 @@ def slow_start(windows: Sequence[Window], settings: Identification) -> tuple[Flo
     return theta, shifts, [prepare(w) for w in windows]
 
 
-def _samples(window: Window, delay_s: float, lowpass_hz: float) -> Float:
-    """Return the rows (m, 4) of [u, Di, i, w] of the voltage samples that lie wholly inside."""
+def sample_rows(window: Window, delay_s: float, lowpass_hz: float) -> tuple[Float, Float]:
+    """Return the rows (m, 4) of [u, Di, i, w] of the voltage samples that lie wholly inside, and their begins (m,)."""
     slow = window.slow_voltage
     assert slow is not None
     dt, last = window.dt_s, (window.n - 1) * window.dt_s
@@ -55,12 +56,14 @@ def _samples(window: Window, delay_s: float, lowpass_hz: float) -> Float:
     current, speed = carried(window.current_a), carried(window.speed_rad_s)
     if window.voltage_sampling == "instant":
         slope = np.gradient(zero_phase(current, lowpass_hz, dt), dt)
-        return np.column_stack([voltage, *(np.interp(begin, time, s) for s in (slope, current, speed))])
+        rows: Float = np.column_stack([voltage, *(np.interp(begin, time, s) for s in (slope, current, speed))])
+        return rows, np.asarray(begin, np.float64)
     end = begin + slow.period_s
     rise = np.interp(end, time, current) - np.interp(begin, time, current)
     sums = [np.concatenate([[0.0], np.cumsum((s[1:] + s[:-1]) / 2)]) * dt for s in (current, speed)]
     swept = [np.interp(end, time, s) - np.interp(begin, time, s) for s in sums]
-    return np.column_stack([voltage, *(part / slow.period_s for part in (rise, *swept))])
+    rows = np.column_stack([voltage, *(part / slow.period_s for part in (rise, *swept))])
+    return rows, np.asarray(begin, np.float64)
 
 
 def _coarse_shift(window: Window, lowpass_hz: float) -> float:
@@ -72,7 +75,7 @@ def _coarse_shift(window: Window, lowpass_hz: float) -> float:
     shifts = np.arange(-np.ceil(reach / step), np.ceil(reach / step) + 1) * step
     costs = np.full(shifts.size, np.inf)
     for k, shift in enumerate(shifts):
-        rows = _samples(window, float(shift), lowpass_hz)
+        rows, _ = sample_rows(window, float(shift), lowpass_hz)
         if rows.shape[0] >= LEAST_SAMPLES and np.isfinite(rows).all():
             residual = rows[:, 0] - rows[:, 1:] @ solve(rows[:, 1:], rows[:, 0])[0]
             costs[k] = float(residual @ residual) / rows.shape[0]

@@ -213,7 +213,8 @@ class AxisPipeline:
         outcome = validation.analyse(window, self._settings)
         before = self._published
         outcomes: list[Outcome] = [outcome]
-        if outcome.verdict.accepted and outcome.estimate is not None:
+        # a correction needs all six: what a slow voltage leaves open keeps the older set in use
+        if outcome.verdict.accepted and outcome.estimate is not None and not outcome.estimate.missing:
             notices = self._track(outcome)
             outcomes += notices
             if not self._tracker.holding:

@@ -194,13 +194,13 @@ class Crossing:
         readings, variances = self.readings.copy(), self.variances.copy()
         readings[first:beyond, self.signal], variances[first:beyond, self.signal] = level, deviation**2
         (forced, news), (free, other_news) = self._squares(readings, variances), self.free
-        return _log_beyond(forced - free, max(news - other_news, 1.0))
+        return log_beyond(forced - free, max(news - other_news, 1.0))
 
     def _squares(self, readings: Float, variances: Float) -> tuple[float, float]:
         return _squares(self.theta, self.dt_s, self.mode, readings, variances, self.walks, self.signal)
 
 
-def _log_beyond(square: float, freedom: float) -> float:
+def log_beyond(square: float, freedom: float) -> float:
     """Return the logarithm of the chance of a chi-square beyond ``square`` (Wilson and Hilferty)."""
     spread = 2.0 / (9.0 * freedom)
     return log_below(-((max(square, 0.0) / freedom) ** (1 / 3) - (1.0 - spread)) / math.sqrt(spread))

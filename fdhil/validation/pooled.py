@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 
 from fdhil.config import Identification
 from fdhil.identification.covariance import aliasing
 from fdhil.identification.estimators import chosen
-from fdhil.identification.identifiability import unphysical
+from fdhil.identification.identifiability import unphysical, untold
 from fdhil.records import PARAMETERS, Estimate, Float, Reason, Verdict, Window, WindowOutcome, frozen
 
 BEYOND_CHANCE = 5.0
@@ -25,7 +24,6 @@ GAINS: Mapping[str, Float] = {  # powers of R, L, K, Jt, ft, Cd
     "current": np.array([-1.0, -1.0, 0.0, 1.0, 1.0, 1.0]),
     "speed": np.array([0.0, 0.0, -1.0, -2.0, -2.0, -1.0]),
 }
-LEAST_GAIN_CHANGE = 0.02
 LEAST_CHANGE: Mapping[str, float] = {"R": 0.02, "L": 0.03, "K": 0.01, "Jt": 0.02, "ft": 0.15, "Cd": 0.10}
 
 
@@ -58,7 +56,8 @@ def pool(
         return None, Verdict(
             False, None, (Reason("SolverFailed", f"the solver gave up ({error})", "look at the windows"),)
         )
-    reasons = list({r.text: r for r in estimate.missing.values()}.values()) + unphysical(estimate)
+    slow = any(o.window.slow_voltage is not None for o in accepted)
+    reasons = untold(estimate, slow=slow) + unphysical(estimate)
     reasons += _moved(told)
     return estimate, Verdict(not reasons, min(fits, default=None), tuple(reasons))
 
@@ -99,13 +98,15 @@ def _moved(told: Sequence[tuple[Window, Estimate]]) -> list[Reason]:
     """Return a reason for each parameter that differs between windows beyond chance and by enough to matter.
 
     One sensor's gain moves several parameters at once, each in its own proportion: where that explains all of it, the
-    sensor is the reason, even where no parameter alone moves enough to tell.
+    sensor is the reason.
     """
     reasons: list[Reason] = []
     worst = (0, 0)
     estimates = [estimate for _, estimate in told]
     for k, name in enumerate(PARAMETERS):
         values = np.array([e.value(name) for e in estimates])
+        if np.count_nonzero(np.isfinite(values)) < 2:
+            continue  # a slow voltage may leave R and L open
         low, high = int(np.nanargmin(values)), int(np.nanargmax(values))
         apart = float(values[high] - values[low])
         chance = BEYOND_CHANCE * float(np.sqrt(difference_covariance(told[low], told[high])[k, k]))
@@ -114,11 +115,8 @@ def _moved(told: Sequence[tuple[Window, Estimate]]) -> list[Reason]:
             code = "LoadChanged" if name == "Jt" else "ParameterJump"
             text = f"{name} moves from {values[low]:.4g} to {values[high]:.4g} between the windows"
             reasons.append(Reason(code, text, "identify the windows before and after the change apart"))
-    if len(reasons) == 1:
-        return reasons
-    suspected = [(told[worst[0]], told[worst[1]])] if reasons else list(pairwise(told))
-    sensors = [reason for pair in suspected if (reason := gain_change(*pair)) is not None]
-    return sensors[:1] or reasons
+    sensor = gain_change(told[worst[0]], told[worst[1]]) if len(reasons) > 1 else None
+    return [sensor] if sensor is not None else reasons
 
 
 def difference_covariance(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) -> Float:
@@ -150,7 +148,7 @@ def gain_change(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) ->
     With g the factor of a sensor's gain, [1] and [2] hold again for parameters times g to the powers of ``GAINS``.
     """
     before, after = one[1], other[1]
-    names = [name for name in PARAMETERS if min(before.value(name), after.value(name)) > 0]
+    names = [name for name in PARAMETERS if before.value(name) > 0 and after.value(name) > 0]
     if len(names) < len(PARAMETERS) - 1:  # friction may be nil
         return None
     rows = [PARAMETERS.index(name) for name in names]
@@ -164,11 +162,7 @@ def gain_change(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) ->
     sensor = min(left, key=lambda name: left[name])
     if left[sensor] > min(UNEXPLAINED, *(_unexplained(moved, weight, single)[1] for single in singles)):
         return None
-    amplitude = _unexplained(moved, weight, patterns[sensor])[0]
-    deviation = float(patterns[sensor] @ weight @ patterns[sensor]) ** -0.5
-    share = float(np.expm1(amplitude))
-    if abs(amplitude) < BEYOND_CHANCE * deviation or abs(share) < LEAST_GAIN_CHANGE:
-        return None
+    share = float(np.expm1(_unexplained(moved, weight, patterns[sensor])[0]))
     text = f"the gain of {sensor} changes by {share:+.2%} between the windows: that alone explains what moves"
     return Reason("CalibrationSuspect", text, f"check the {sensor} sensor and its wiring")
 

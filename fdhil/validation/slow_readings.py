@@ -36,10 +36,10 @@ def slow_voltage_faults(window: Window) -> Iterator[Reason]:
     )
     rails = (float(np.nanmax(volts)), float(np.nanmin(volts)))
     step = max(resolution(volts[np.isfinite(volts)]), 1e-12)
-    alike = _alike(volts, step)
-    for start, end in _runs(volts):
+    same = alike(volts, step)
+    for start, end in runs(volts):
         moving = np.abs(speed[start:end]) > MOVING * window.rapid_speed_rad_s
-        if not moving.all() or not _strange(window, volts, speed, (start, end), step, alike):
+        if not moving.all() or not _strange(window, volts, speed, (start, end), step, same):
             continue
         at, lasts = window.start_s + begins[start], 1e3 * (end - start) * slow.period_s
         if volts[start] in rails and rails[0] > rails[1]:
@@ -51,7 +51,7 @@ def slow_voltage_faults(window: Window) -> Iterator[Reason]:
         return
 
 
-def _runs(volts: Float) -> list[tuple[int, int]]:
+def runs(volts: Float) -> list[tuple[int, int]]:
     """Return the half-open runs of equal samples, the longest first."""
     same = np.concatenate([[False], np.diff(volts) == 0.0, [False]])
     edges = np.flatnonzero(np.diff(same.astype(np.int8))).reshape(-1, 2)
@@ -59,7 +59,7 @@ def _runs(volts: Float) -> list[tuple[int, int]]:
     return sorted(runs, key=lambda run: run[0] - run[1])
 
 
-def _strange(window: Window, volts: Float, speed: Float, run: tuple[int, int], step: float, alike: float) -> bool:
+def _strange(window: Window, volts: Float, speed: Float, run: tuple[int, int], step: float, same: float) -> bool:
     start, end = run
     peak = float(np.nanmax(np.abs(volts)))
     read = READ_STEPS * step / peak if peak else 0.0  # a sensor that only ever read 0 tells no step
@@ -68,10 +68,10 @@ def _strange(window: Window, volts: Float, speed: Float, run: tuple[int, int], s
     inner = speed[start + 1 : end - 1]
     if end - start >= MOVED_SAMPLES and float(np.ptp(inner)) > hidden:
         return True
-    return volts.size * alike ** (end - start - 1) < CHANCE
+    return volts.size * same ** (end - start - 1) < CHANCE
 
 
-def _alike(volts: Float, step: float) -> float:
+def alike(volts: Float, step: float) -> float:
     """Return how likely a constant in the middle of a step is read there, by the noise of third differences."""
     noise = math.sqrt(max(noise_of(carried(volts)) ** 2 - step**2 / 12.0, (LEAST_NOISE * step) ** 2))
     return math.erf(step / (math.sqrt(8.0) * noise))

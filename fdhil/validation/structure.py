@@ -21,7 +21,7 @@ from fdhil.identification.filtering import moving_mean
 from fdhil.identification.innovations import innovations
 from fdhil.identification.motion import Motion
 from fdhil.identification.normal import inverse_of
-from fdhil.identification.slow_voltage import left_open_v
+from fdhil.identification.slow_voltage import innovations_of, left_open_v
 from fdhil.records import Float, Reason, Window
 
 BEYOND_CHANCE = 5.5  # standard deviations: about 4e-8 a test, some hundred tests a window
@@ -102,11 +102,26 @@ class Bench:
 
     def gain_answers(self, name: str, courses: Float) -> Float:
         """Return minus the change (m, q) of innovations when the gain of ``name`` grows by ``courses`` (q, n)."""
-        motion = self.motion
+        motion = self.motion if self.motion.slow is None else self._foretold()
         if name != "voltage":
             return self._answers(_KINDS[name], getattr(motion, name) * courses, None)
         at_samples = np.array([motion.at_voltage(c) for c in courses])
         return self._answers(sweeps.VOLTAGE, motion.voltage_mean * at_samples, motion.voltage_rise * at_samples)
+
+    def _foretold(self) -> Motion:
+        """Return the motion with each reading as those before it foretell it: a gain acts on what is measured.
+
+        A reading holds its own innovation. Of a gain that the parameters imitate, that alone would be left.
+        """
+        motion, fit = self.motion, self.fit
+        made = innovations_of(motion, fit.theta, fit.problem.noises[0].vector() ** 2, float(fit.theta[6])).values
+        rows = made[: 2 * motion.n].reshape(-1, 2)
+        return replace(
+            motion,
+            current=motion.current - rows[:, 0],
+            speed=motion.speed - rows[:, 1],
+            voltage_mean=motion.voltage_mean - made[2 * motion.n :],
+        )
 
     def offset_answers(self, name: str, courses: Float) -> Float:
         """Return minus the change (m, q) of the innovations when ``courses`` (q, n) are added to signal ``name``."""

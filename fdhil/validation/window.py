@@ -10,13 +10,14 @@ from fdhil.config import Identification
 from fdhil.identification.delay import coarse_delay
 from fdhil.identification.estimators import chosen, least_squares, maximum_likelihood
 from fdhil.identification.estimators.maximum_likelihood import Fit
-from fdhil.identification.identifiability import empty_estimate, unphysical
+from fdhil.identification.identifiability import empty_estimate, unphysical, untold
 from fdhil.identification.ratios import estimate_ratios
 from fdhil.identification.windows import carried
 from fdhil.model.feed_drive import discretise, simulate_plant
 from fdhil.records import Estimate, Float, Parameters, Reason, Result, Verdict, Window, WindowOutcome
 from fdhil.validation.plausibility import implausibilities
 from fdhil.validation.rest import rest_faults
+from fdhil.validation.slow_fitted import slow_faults_beside
 from fdhil.validation.slow_readings import slow_voltage_faults
 from fdhil.validation.structure import excess_noise, findings, whiteness
 from fdhil.validation.stuck import stuck_values
@@ -41,8 +42,10 @@ def analyse(window: Window, settings: Identification) -> WindowOutcome:
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             estimate, fit = _estimate(window, settings)
-            fit_percent = simulated_fit_percent(window, estimate)
+            fit_percent = simulated_fit_percent(window, _complete(estimate, fit))
             doubts = [*stuck_values(window, fit), *_doubts(window, estimate, fit, fit_percent, settings)]
+            if fit is not None and not any(reason.code in ("StuckValue", "Saturated") for reason in reasons):
+                doubts += slow_faults_beside(window, fit, settings.lowpass_hz)
     except (np.linalg.LinAlgError, FloatingPointError, ZeroDivisionError, OverflowError) as error:
         reasons.append(Reason("SolverFailed", f"the solver gave up ({error})", "look at the window's signals"))
         missing = empty_estimate(chosen(settings)[0], Result.DIVERGED, reasons[-1])
@@ -71,11 +74,19 @@ def _estimate(window: Window, settings: Identification) -> tuple[Estimate, Fit |
     return estimator([window], settings), fit
 
 
+def _complete(estimate: Estimate, fit: Fit | None) -> Estimate:
+    """Return the estimate with the fit's own value where a slow voltage leaves R or L open: a simulation needs all."""
+    if fit is None or not estimate.missing or untold(estimate, slow=fit.problem.slow):
+        return estimate
+    return replace(estimate, values=np.where(np.isnan(estimate.values), fit.theta[:6], estimate.values))
+
+
 def _doubts(
     window: Window, estimate: Estimate, fit: Fit | None, fit_percent: float | None, settings: Identification
 ) -> list[Reason]:
-    reasons = list({r.text: r for r in estimate.missing.values()}.values())
-    if estimate.result is Result.DIVERGED:
+    reasons = untold(estimate, slow=window.slow_voltage is not None)
+    open_end = bool(estimate.missing) and not reasons and fit is not None and not fit.converged
+    if open_end or estimate.result is Result.DIVERGED:
         reasons.append(Reason("SolverFailed", "the fit does not converge", "look at the window's signals"))
     reasons += unphysical(estimate)
     if fit is None:

@@ -1,0 +1,80 @@
+"""Verdicts on windows with a slow voltage: what it cannot tell is null and no fault, what it contradicts is one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil.identification.identifiability import untold
+from fdhil.identification.windows import find_windows
+from fdhil.records import Reason, Result, WindowOutcome, frozen
+from fdhil.validation import analyse, pool
+from fdhil.validation.slow_readings import slow_voltage_faults
+from studies.slow_recordings import GOOD, recording_of
+from studies.slow_sensor import SETTINGS, slow_windows
+
+
+def _analysed(seed: int, kind: str) -> WindowOutcome:
+    (window,) = find_windows(recording_of(seed, 2, kind)[0])
+    return analyse(window, SETTINGS)
+
+
+@pytest.mark.parametrize(("seed", "names"), [(59, {"L"}), (75, {"R"}), (198, {"R", "L"})])
+def test_what_a_slow_voltage_cannot_tell_is_null_with_its_reason_and_the_window_is_accepted(
+    seed: int, names: set[str]
+) -> None:
+    outcome = _analysed(seed, GOOD)
+    assert outcome.verdict.accepted
+    assert outcome.verdict.fit_percent is not None
+    assert outcome.verdict.fit_percent > 80.0
+    assert outcome.estimate is not None
+    assert set(outcome.estimate.missing) == names
+    assert {reason.code for reason in outcome.estimate.missing.values()} == {"LowExcitation"}
+    assert all(np.isnan(outcome.estimate.value(name)) for name in names)
+    assert all(np.isfinite(outcome.estimate.value(name)) for name in ("K", "Jt", "ft", "Cd"))
+
+
+def test_a_pool_of_windows_that_leave_l_open_is_validated() -> None:
+    outcome = _analysed(59, GOOD)
+    for refit in (True, False):
+        estimate, verdict = pool([outcome, outcome, outcome], SETTINGS, refit=refit)
+        assert verdict.accepted, verdict.reasons
+        assert estimate is not None
+        assert estimate.value("K") == pytest.approx(0.3130582, rel=0.01)
+
+
+def test_nothing_but_r_and_l_may_stay_open_and_only_at_a_slow_sensor() -> None:
+    outcome = _analysed(59, GOOD)
+    assert outcome.estimate is not None
+    reason = Reason("LowExcitation", "no")
+    assert untold(outcome.estimate, slow=False) != []
+    assert untold(replace(outcome.estimate, missing={"L": reason, "Jt": reason}), slow=True) == [reason]
+    assert untold(replace(outcome.estimate, result=Result.NOT_FINITE), slow=True) != []
+
+
+@pytest.mark.parametrize("seed", [147, 403])
+def test_a_slow_sensor_that_stands_while_the_voltage_creeps_is_stuck(seed: int) -> None:
+    # at full speed, where the speed changes too little and a coarse reading hides the noise: the model tells
+    recording, _ = recording_of(seed, 2, "voltage stuck")
+    (window,) = find_windows(recording)
+    assert list(slow_voltage_faults(window)) == []
+    texts = [reason.text for reason in analyse(window, SETTINGS).verdict.reasons if reason.code == "StuckValue"]
+    assert len(texts) == 1
+    assert "voltage repeats" in texts[0]
+
+
+@pytest.mark.parametrize("step", [0.03, 0.3, 1.0])
+def test_a_slow_sensor_that_reads_a_steady_voltage_coarsely_is_not(step: float) -> None:
+    window = slow_windows(0.010)[0]
+    assert window.slow_voltage is not None
+    coarse = frozen(np.round(window.slow_voltage.voltage_v / step) * step)
+    read = replace(window, slow_voltage=replace(window.slow_voltage, voltage_v=coarse))
+    assert "StuckValue" not in [reason.code for reason in analyse(read, SETTINGS).verdict.reasons]
+
+
+def test_a_current_that_is_off_is_seen_where_the_axis_stands() -> None:
+    # 1.75 % of the peak: friction imitates it in [2], and R and K in [1] but at standstill
+    codes = [reason.code for reason in _analysed(297, "offset").verdict.reasons]
+    assert codes == ["CalibrationSuspect"]
