@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -24,6 +25,7 @@ GAINS: Mapping[str, Float] = {  # powers of R, L, K, Jt, ft, Cd
     "current": np.array([-1.0, -1.0, 0.0, 1.0, 1.0, 1.0]),
     "speed": np.array([0.0, 0.0, -1.0, -2.0, -2.0, -1.0]),
 }
+LEAST_GAIN_CHANGE = 0.02
 LEAST_CHANGE: Mapping[str, float] = {"R": 0.02, "L": 0.03, "K": 0.01, "Jt": 0.02, "ft": 0.15, "Cd": 0.10}
 
 
@@ -98,7 +100,7 @@ def _moved(told: Sequence[tuple[Window, Estimate]]) -> list[Reason]:
     """Return a reason for each parameter that differs between windows beyond chance and by enough to matter.
 
     One sensor's gain moves several parameters at once, each in its own proportion: where that explains all of it, the
-    sensor is the reason.
+    sensor is the reason, even where no parameter alone moves enough to tell.
     """
     reasons: list[Reason] = []
     worst = (0, 0)
@@ -115,8 +117,11 @@ def _moved(told: Sequence[tuple[Window, Estimate]]) -> list[Reason]:
             code = "LoadChanged" if name == "Jt" else "ParameterJump"
             text = f"{name} moves from {values[low]:.4g} to {values[high]:.4g} between the windows"
             reasons.append(Reason(code, text, "identify the windows before and after the change apart"))
-    sensor = gain_change(told[worst[0]], told[worst[1]]) if len(reasons) > 1 else None
-    return [sensor] if sensor is not None else reasons
+    if len(reasons) == 1:
+        return reasons
+    suspected = [(told[worst[0]], told[worst[1]])] if reasons else list(pairwise(told))
+    sensors = [reason for pair in suspected if (reason := gain_change(*pair)) is not None]
+    return sensors[:1] or reasons
 
 
 def difference_covariance(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) -> Float:
@@ -162,7 +167,11 @@ def gain_change(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) ->
     sensor = min(left, key=lambda name: left[name])
     if left[sensor] > min(UNEXPLAINED, *(_unexplained(moved, weight, single)[1] for single in singles)):
         return None
-    share = float(np.expm1(_unexplained(moved, weight, patterns[sensor])[0]))
+    amplitude = _unexplained(moved, weight, patterns[sensor])[0]
+    deviation = float(patterns[sensor] @ weight @ patterns[sensor]) ** -0.5
+    share = float(np.expm1(amplitude))
+    if abs(amplitude) < BEYOND_CHANCE * deviation or abs(share) < LEAST_GAIN_CHANGE:
+        return None
     text = f"the gain of {sensor} changes by {share:+.2%} between the windows: that alone explains what moves"
     return Reason("CalibrationSuspect", text, f"check the {sensor} sensor and its wiring")
 
