@@ -31,7 +31,7 @@ from fdhil.daemon.guard_link import REST, GuardLink
 from fdhil.daemon.keeping import Keeper, boot_id
 from fdhil.daemon.token import ensure_token
 from fdhil.errors import DeviceError, StoreError
-from fdhil.records import Notice, Outcome, ParameterSet, Skill, Temperature
+from fdhil.records import Notice, Outcome, ParameterSet, Reason, Skill, Temperature
 from fdhil.store.history import Revision
 
 STREAM_S = 0.05
@@ -59,6 +59,7 @@ class Armory:
         self._arming = asyncio.Lock()
         self._armed: tuple[Armament | StreamedArmament | Feeding, Mapping[str, Any]] | None = None
         self._check = Check(config)
+        self._given_up = False
         self.guard = GuardLink(run_directory)
 
     def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
@@ -124,6 +125,7 @@ class Armory:
         if self._arming.locked():
             return refusal("NotOff", "another program is being armed", "wait for its answer")
         async with self._arming:
+            self._given_up = False
             if feeding:
                 return await self._feed_forward(token)
             return await self._arm(Path(str(program)), method, token)
@@ -144,6 +146,8 @@ class Armory:
         self, ask: Callable[[Prepared, str], Answer], prepared: Prepared, summary: Answer, token: str
     ) -> Answer:
         """Ask the guard in a thread; what it grants is armed, what it refuses is answered with what was planned."""
+        if self._given_up:
+            return refusal("Abandoned", "the arming was abandoned while it was prepared", "arm again when it is wanted")
         prepared.facts["journal_writable"] = self._keeper.fault is None
         try:
             answer = await asyncio.to_thread(ask, prepared, token)
@@ -170,7 +174,13 @@ class Armory:
         return {"ok": True, "state": answer.get("state", "ARMED"), "text": text, **summary}
 
     async def _checked(self, long: Long) -> StreamedArmament | Refused:
-        """Have a long program checked as a whole; only then it is armed with its first rows."""
+        """Have a long program checked as a whole; only then it is armed with its first rows.
+
+        Not beside a correction: the check takes its processor, and its rows may take the place of those that run.
+        """
+        if self._armed is not None:
+            advice = "disarm it or wait for its end, then arm again"
+            return Refused((Reason("NotOff", "a correction is armed or runs", advice),))
         checked = await self._check.run(long.program, long.program_digest, long.models)
         if isinstance(checked, tuple):
             return Refused(checked)
@@ -181,13 +191,14 @@ class Armory:
         """How far the check of a long program is; None while none runs."""
         return self._check.progress
 
-    def abandon(self) -> None:
-        """End the check of a long program, if one runs: who asked for it is gone."""
-        self._check.abandon()
+    def abandon(self) -> bool:
+        """Arm nothing of what is being prepared; return whether the check of a long program was ended."""
+        self._given_up = True
+        return self._check.abandon()
 
     async def disarm(self) -> Answer:
-        """Have the guard ramp to zero; a program that is still being checked is not armed."""
-        abandoned = self._check.abandon()
+        """Have the guard ramp to zero; a program that is still being planned or checked is not armed."""
+        abandoned = self.abandon()
         try:
             answer = await asyncio.to_thread(self.guard.disarm)
         except DeviceError as error:
@@ -196,16 +207,23 @@ class Armory:
         return dict(answer) | ({"text": text} if answer["ok"] else {})
 
     async def attend(self, tell: Tell) -> None:
-        """Tell the guard that this loop turns and what is still vouched for, and the log what the guard does."""
+        """Tell the guard that this loop turns and what is still vouched for, and the log what the guard does.
+
+        The guard's answer is not waited for: while a program is handed over it takes its time.
+        """
+        looking: asyncio.Future[list[Notice]] | None = None
         turn = 0
         while True:
             self.guard.say_alive(self._facts())
-            if turn % round(REFRESH_S / ALIVE_S) == 0 and not self._arming.locked():
-                tell(await asyncio.to_thread(self.guard.refresh))
+            if looking is None and turn % round(REFRESH_S / ALIVE_S) == 0:
+                looking = asyncio.ensure_future(asyncio.to_thread(self.guard.refresh))
+            await asyncio.sleep(ALIVE_S)
+            turn += 1
+            if looking is not None and looking.done():
+                tell(looking.result())
+                looking = None
                 if self._armed and self.guard.state in REST:
                     self._armed = None
-            turn += 1
-            await asyncio.sleep(ALIVE_S)
 
     async def stream(self, tell: Tell) -> None:
         """Hand a long program's rows to the guard as it runs; where that ends early the guard ramps down."""
@@ -247,7 +265,7 @@ class Armory:
 
     async def stand_down(self) -> str:
         """Have a running correction ramped to zero and wait for it; return the state that was reached."""
-        self._check.abandon()
+        self.abandon()
         if self.guard.connected and self.guard.state not in REST:
             await self.disarm()
             for _ in range(round(STAND_DOWN_S / ALIVE_S)):

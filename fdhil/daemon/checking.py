@@ -38,11 +38,12 @@ class Check:
     ) -> Checked | tuple[Reason, ...]:
         """Return the checked program, or why it is refused; what was checked before is not checked again."""
         key = self._key(program_digest, models)
-        known = await asyncio.to_thread(Checked.find, self._folder, key)
+        known = await asyncio.to_thread(Checked.find, self._folder, key, program.parent)
         if known is not None:
             return known
         request = {
             "program": str(program),
+            "program_digest": program_digest,
             "config": self._config.model_dump(mode="json"),
             "models": {axis: model.as_dict() for axis, model in models.items()},
             "folder": str(self._folder),
@@ -55,7 +56,7 @@ class Check:
         finally:
             self.progress = None
         if "header" in answer and not answer["header"]["refused"]:
-            done = await asyncio.to_thread(Checked.find, self._folder, key)
+            done = await asyncio.to_thread(Checked.find, self._folder, key, program.parent)
             if done is not None:
                 return done
             answer = {"error": {"code": "StoreFault", "text": "the check's rows cannot be read back", "advice": ""}}
@@ -92,7 +93,8 @@ class Check:
                 process.stdin.write(json.dumps(request).encode() + b"\n")
                 await process.stdin.drain()
             async for line in process.stdout:
-                answer = json.loads(line)
+                with contextlib.suppress(ValueError):  # half a line is what an ended process leaves
+                    answer = json.loads(line)
                 if "progress" in answer:
                     self.progress = {"program": program, **answer["progress"]}
         finally:

@@ -39,7 +39,7 @@ def refusal(code: str, text: str, advice: str = "") -> Answer:
 class ControlServer:
     """Serves requests to ``handle``; each client has its own task, a slow or dead one delays nobody else."""
 
-    def __init__(self, handle: Handler, progress: Progress, abandon: Callable[[], None]) -> None:
+    def __init__(self, handle: Handler, progress: Progress, abandon: Callable[[], object]) -> None:
         """``progress`` tells how far what takes long is, ``abandon`` ends it."""
         self._handle, self._progress, self._abandon = handle, progress, abandon
         self._clients: set[asyncio.Task[None]] = set()

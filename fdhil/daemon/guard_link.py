@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from fdhil.daemon.arming import Armament, Feeding, StreamedArmament
 from fdhil.daemon.streamed import Piece
 from fdhil.errors import DeviceError
-from fdhil.guard.client import GuardClient, GuardLost
+from fdhil.guard.client import GuardClient
 from fdhil.records import Notice
 
 ABSENT: Mapping[str, Any] = {"state": "absent", "text": "no guard runs: nothing can be armed, nothing is sent"}
@@ -31,6 +32,7 @@ class GuardLink:
         self._lock = threading.Lock()
         self._client: GuardClient | None = None
         self._status: Mapping[str, Any] = ABSENT
+        self._untold: list[Notice] = []
 
     @property
     def connected(self) -> bool:
@@ -48,18 +50,32 @@ class GuardLink:
         return str(self._status["state"])
 
     def refresh(self) -> list[Notice]:
-        """Connect where needed and ask for the status (blocking); return what changed."""
+        """Connect where needed and ask for the status (blocking); return what changed since the last call."""
+        with contextlib.suppress(DeviceError), self._asked():
+            pass
+        with self._lock:
+            told, self._untold = self._untold, []
+        return told
+
+    @contextlib.contextmanager
+    def _asked(self) -> Iterator[GuardClient]:
+        """Give the connection, and look at the status afterwards; what changed is told by the next ``refresh``.
+
+        A guard that does not answer is let go: what it may have armed it ramps down, and so it ends as it is told.
+        """
         with self._lock:
             before = self._status
             try:
                 if self._client is None:
                     self._client = GuardClient(self._run_directory)
-                status: Mapping[str, Any] = self._client.status()
+                yield self._client
+                status = self._client.status()
             except DeviceError as error:
                 self._drop()
-                return self._gone(before, error)
+                self._untold += self._gone(before, error)
+                raise
+            self._untold += _changes(before, status)
             self._status = status
-        return _changes(before, status)
 
     def _drop(self) -> None:
         if self._client is not None:
@@ -84,16 +100,11 @@ class GuardLink:
 
     def arm(self, armament: Armament | StreamedArmament, token: str) -> Mapping[str, Any]:
         """Load the table and arm (blocking); return the guard's answer. DeviceError when there is no guard."""
-        with self._lock:
-            if self._client is None:
-                self._client = GuardClient(self._run_directory)
-            digest = armament.program_digest
-            answer = self._load(self._client, armament, armament.first())
-            if answer["ok"]:
-                client = self._client
-                answer = self._ask(client, lambda: client.arm(token, digest, armament.facts))
-            self._status = self._client.status()
-        return answer
+        with self._asked() as client:
+            answer = self._load(client, armament, armament.first())
+            if not answer["ok"]:
+                return answer
+            return self._ask(client, lambda: client.arm(token, armament.program_digest, armament.facts))
 
     @staticmethod
     def _load(client: GuardClient, armament: Armament | StreamedArmament, piece: Piece) -> Mapping[str, Any]:
@@ -101,22 +112,13 @@ class GuardLink:
 
     def extend(self, armament: StreamedArmament, piece: Piece) -> Mapping[str, Any]:
         """Hand on more rows of a running stream (blocking); DeviceError when there is no guard."""
-        with self._lock:
-            if self._client is None:
-                raise GuardLost("guard", "is gone; the stream has no one to go to")
-            answer = self._load(self._client, armament, piece)
-            self._status = self._client.status()
-        return answer
+        with self._asked() as client:
+            return self._load(client, armament, piece)
 
     def feed_forward(self, feeding: Feeding, token: str) -> Mapping[str, Any]:
         """Switch the on-line feed-forward on (blocking); return the guard's answer. DeviceError without a guard."""
-        with self._lock:
-            if self._client is None:
-                self._client = GuardClient(self._run_directory)
-            client = self._client
-            answer = self._ask(client, lambda: client.feed_forward(token, feeding.laws, feeding.facts))
-            self._status = self._client.status()
-        return answer
+        with self._asked() as client:
+            return self._ask(client, lambda: client.feed_forward(token, feeding.laws, feeding.facts))
 
     @staticmethod
     def _ask(client: GuardClient, arm: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
@@ -131,12 +133,8 @@ class GuardLink:
 
     def disarm(self) -> Mapping[str, Any]:
         """Ask for the ramp to zero (blocking); DeviceError when there is no guard."""
-        with self._lock:
-            if self._client is None:
-                self._client = GuardClient(self._run_directory)
-            answer = self._client.disarm()
-            self._status = self._client.status()
-        return answer
+        with self._asked() as client:
+            return client.disarm()
 
     def close(self) -> None:
         """End the connection; a correction that still runs is ramped down by the guard."""

@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -26,14 +26,15 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.correction import gate
 from fdhil.correction.streaming import StreamBlock, stream
-from fdhil.errors import FdhilError, StoreError
-from fdhil.program import Budget, interpret
+from fdhil.errors import FdhilError, ProgramError, StoreError
+from fdhil.program import Budget, program_digest
 from fdhil.program.demand_csv import read_demand_csv
+from fdhil.program.interpreter import Interpreter
 from fdhil.program.planner import stream as planned
 from fdhil.records import Float, Parameters, Reason, Trajectory
 from fdhil.store.atomic import store_error, sync_folder, write_file
 
-SCHEMA = "fdhil-check-1"
+SCHEMA = "fdhil-check-2"
 ROWS = ".rows"
 HEADER = ".json"
 KEPT = 4  # checked programs; an hour of two axes takes 58 MB
@@ -46,11 +47,34 @@ Tell = Callable[[Mapping[str, Any]], None]
 
 
 def reference_blocks(program: Path, config: MachineConfig) -> Iterator[Trajectory]:
-    """Yield what the NC will order, in blocks; ProgramError, RecordingError or ConfigError where it cannot be used."""
+    """Return what the NC will order, in blocks; ProgramError, RecordingError or ConfigError where it cannot be used."""
+    return _opened(program, config)[0]
+
+
+def _opened(program: Path, config: MachineConfig) -> tuple[Iterator[Trajectory], Callable[[], list[Path]]]:
+    """Return the blocks, and what tells which files were opened for them so far."""
     if program.suffix.lower() == ".csv":
-        yield read_demand_csv(program, config)
-        return
-    yield from planned(interpret(program, Budget.of(config.nc)), config, PIECE_ROWS)
+        return iter([read_demand_csv(program, config)]), lambda: [program]
+    interpreter = Interpreter(program, Budget.of(config.nc), block_delete=False)
+    return planned(interpreter.run(), config, PIECE_ROWS), lambda: interpreter.files
+
+
+class _Files:
+    """What the files of a program held when they were first used: its subroutines may lie beside it."""
+
+    def __init__(self, program: Path, digest: str) -> None:
+        self._digests = {program: digest}
+
+    def take(self, files: Sequence[Path]) -> None:
+        """Note the files that are new."""
+        self._digests |= {file: program_digest(file) for file in files if file not in self._digests}
+
+    def unchanged(self) -> dict[str, str]:
+        """Return the digest of each subroutine's file by its name; ProgramError when one, or the program, changed."""
+        for file, digest in self._digests.items():
+            if program_digest(file) != digest:
+                raise ProgramError(0, "", f"{file} was changed while it was checked; arm it again")
+        return {file.name: digest for file, digest in list(self._digests.items())[1:]}
 
 
 class _Path:
@@ -132,17 +156,20 @@ class _Findings:
 
 
 def check(
-    program: Path, models: Mapping[str, Parameters], config: MachineConfig, body: BinaryIO, tell: Tell
+    program: Path, sha256: str, models: Mapping[str, Parameters], config: MachineConfig, body: BinaryIO, tell: Tell
 ) -> dict[str, Any]:
     """Run the whole program through correction and gate; write its rows to ``body``, return the header.
 
-    A row is the demand of each axis, then the offset of each, int32 in the guard's increments. ``tell`` hears now and
-    then how far it is. ProgramError, RecordingError or ConfigError when the program cannot be used.
+    ``sha256`` is the program's digest, under which its rows will be known. A row is the demand of each axis, then the
+    offset of each, int32 in the guard's increments. ``tell`` hears now and then how far it is. ProgramError,
+    RecordingError or ConfigError when the program cannot be used.
     """
     dt_s, begun_s, told_s = config.machine.sync_period_s, time.monotonic(), -math.inf
-    path, findings, digest = _Path(reference_blocks(program, config)), _Findings(), hashlib.sha256()
+    source, opened = _opened(program, config)
+    path, findings, digest, files = _Path(source), _Findings(), hashlib.sha256(), _Files(program, sha256)
     for block in stream(path.pieces(), models, config, goes_on=True):
         demand = path.positions(block.first_row, block.first_row + block.before_um.size)
+        files.take(opened())
         findings.take(block)
         findings.refuse(block, path, dt_s)
         if len(findings.refused) >= MOST_REFUSED:
@@ -162,7 +189,8 @@ def check(
                     "refused": len(findings.refused),
                 }
             )
-    return {"schema": SCHEMA, "axes": list(config.axis), "sha256": digest.hexdigest()} | findings.header()
+    of = {"schema": SCHEMA, "axes": list(config.axis), "sha256": digest.hexdigest(), "files": files.unchanged()}
+    return of | findings.header()
 
 
 def encoded(demand_mm: Mapping[str, Float], offset_um: Mapping[str, Float], config: MachineConfig) -> bytes:
@@ -228,7 +256,14 @@ def main() -> None:
     models = {axis: Parameters(**values) for axis, values in request["models"].items()}
 
     def run(body: BinaryIO) -> dict[str, Any]:
-        return check(Path(request["program"]), models, config, body, lambda told: say({"progress": dict(told)}))
+        return check(
+            Path(request["program"]),
+            request["program_digest"],
+            models,
+            config,
+            body,
+            lambda told: say({"progress": dict(told)}),
+        )
 
     try:
         say({"header": keep(Path(request["folder"]), request["key"], run)})

@@ -19,7 +19,8 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.daemon.program_check import HEADER, ROWS, SCHEMA, reference_blocks
-from fdhil.errors import StoreError
+from fdhil.errors import ProgramError, StoreError
+from fdhil.program import program_digest
 
 RING_S = 10.0  # of rows that the guard is given ahead of where the machine is; it ramps down below 1 s
 FIRST_S = 10.0
@@ -45,17 +46,21 @@ class Checked:
     header: Mapping[str, Any]
 
     @staticmethod
-    def find(folder: Path, key: str) -> Checked | None:
-        """Return what was checked under ``key``; None when nothing was, or its rows are not those of the check."""
+    def find(folder: Path, key: str, beside: Path) -> Checked | None:
+        """Return what was checked under ``key``; None when nothing was, or its rows are not those of the check.
+
+        ``beside`` is the program's folder: the subroutines there must be those of the check.
+        """
         rows_file = folder / (key + ROWS)
         try:
             header = json.loads((folder / (key + HEADER)).read_bytes())
             with rows_file.open("rb") as body:
                 digest = hashlib.file_digest(body, "sha256").hexdigest()
+            whole = header["schema"] == SCHEMA and header["sha256"] == digest
+            whole = whole and all(program_digest(beside / name) == sha for name, sha in header["files"].items())
             os.utime(folder / (key + HEADER))  # what is used is not the oldest
-        except (OSError, ValueError):
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, ProgramError):
             return None
-        whole = isinstance(header, dict) and header.get("schema") == SCHEMA and header.get("sha256") == digest
         return Checked(rows_file, header) if whole and not header.get("refused") else None
 
     @property

@@ -92,6 +92,11 @@ class Flow:
         """Whether lines are read over."""
         return self._skip is not None
 
+    @property
+    def files(self) -> list[Path]:
+        """The files that were opened so far, the program first."""
+        return [source.folder / source.name for source in self._files if source.folder is not None]
+
     def close(self) -> None:
         """Close every source that is open."""
         for source in self._files:

@@ -74,6 +74,11 @@ class Interpreter:
         self._pending_tool = 0.0
         self._ended = False
 
+    @property
+    def files(self) -> list[Path]:
+        """The files that were opened so far, the program first."""
+        return self._flow.files
+
     def run(self) -> Iterator[Motion]:
         """Yield the motions until the program ends."""
         machine = self._machine

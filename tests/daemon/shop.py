@@ -16,6 +16,8 @@ from fdhil.cli.demo.processes import Process, Twin
 from fdhil.cli.main import cli, run_safely
 from fdhil.config import MachineConfig
 from fdhil.daemon.control import ask
+from fdhil.drivers import canopen_sdo
+from fdhil.drivers.commissioning import commission, save_record
 from fdhil.errors import ConnectError
 from tests.bench import axis_toml
 
@@ -48,6 +50,14 @@ class Shop:
         """The folder of sockets and token."""
         assert self.config.store.run_directory is not None
         return self.config.store.run_directory
+
+    def commission(self) -> None:
+        """Commission both axes; a twin on a busy host may take seconds for an answer."""
+        with pytest.MonkeyPatch.context() as patch:
+            for name in ("RESPONSE_TIMEOUT_S", "DEADLINE_S"):
+                patch.setattr(canopen_sdo, name, 20.0)
+            for axis in self.config.axis:
+                save_record(commission(self.config, axis), self.config.store.directory)
 
     def daemon(self) -> Process:
         """Start a daemon and wait until it listens."""

@@ -23,7 +23,7 @@ from fdhil.daemon.arming import Long, StreamedArmament, prepare, prepare_stream
 from fdhil.daemon.checking import FOLDER, Check
 from fdhil.daemon.program_check import KEPT, check, keep
 from fdhil.daemon.streamed import Checked, Stream
-from fdhil.errors import StoreError
+from fdhil.errors import ProgramError, StoreError
 from fdhil.prediction.models import nominal_models
 from fdhil.program import load_trajectory, program_digest
 from fdhil.records import Reason
@@ -52,7 +52,7 @@ def written(folder: Path, text: str) -> Path:
 def checked(program: Path, config: MachineConfig) -> tuple[dict[str, Any], bytes, list[Mapping[str, Any]]]:
     """Check a program in this process; return header, rows and what was told."""
     body, told = io.BytesIO(), list[Mapping[str, Any]]()
-    header = check(program, nominal_models(config), config, body, told.append)
+    header = check(program, program_digest(program), nominal_models(config), config, body, told.append)
     return header, body.getvalue(), told
 
 
@@ -165,9 +165,62 @@ async def test_a_broken_program_is_refused_with_its_line(config: MachineConfig, 
     assert "43" in refused[0].text
 
 
+CALLS = HEAD + "O<square> CALL\n" * 10 + "G4 P0.3\nM2\n"
+BESIDE = "O<square> SUB\n" + SQUARE + "O<square> ENDSUB\n"
+
+
+async def test_a_subroutine_beside_the_program_belongs_to_it(config: MachineConfig, tmp_path: Path) -> None:
+    """The program is the same, its subroutine is not: what was checked is not what would be cut."""
+    beside = tmp_path / "square.ngc"
+    beside.write_text(BESIDE)
+    program = written(tmp_path, CALLS)
+    digest, models = program_digest(program), nominal_models(config)
+    first = await Check(config).run(program, digest, models)
+    assert isinstance(first, Checked)
+    assert first.header["files"] == {"square.ngc": program_digest(beside)}
+    key = first.rows_file.stem
+    assert Checked.find(first.rows_file.parent, key, tmp_path) is not None
+    beside.write_text(BESIDE.replace("X40", "X41"))
+    assert Checked.find(first.rows_file.parent, key, tmp_path) is None
+    again = await Check(config).run(program, digest, models)
+    assert isinstance(again, Checked)
+    assert again.header["sha256"] != first.header["sha256"]
+    beside.unlink()
+    assert Checked.find(first.rows_file.parent, key, tmp_path) is None
+
+
+@pytest.mark.parametrize("which", ["program.ngc", "square.ngc"])
+def test_what_changes_while_it_is_checked_is_refused(which: str, config: MachineConfig, tmp_path: Path) -> None:
+    """Its rows would be known under the digest of what it was."""
+    (tmp_path / "square.ngc").write_text(BESIDE)
+    program = written(tmp_path, CALLS)
+
+    def change(_told: Mapping[str, Any]) -> None:
+        with (tmp_path / which).open("a") as file:
+            file.write("(another)\n")
+
+    with pytest.raises(ProgramError, match=f"{which} was changed while it was checked"):
+        check(program, program_digest(program), nominal_models(config), config, io.BytesIO(), change)
+
+
+async def test_a_process_that_dies_within_a_line_is_told(
+    config: MachineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = written(tmp_path, LONG)
+    dying = tmp_path / "python"
+    dying.write_text('#!/bin/sh\nread line\nprintf \'{"header": {"ref\'\nexit 9\n')
+    dying.chmod(0o700)
+    monkeypatch.setattr(sys, "executable", str(dying))
+    refused = await Check(config).run(program, program_digest(program), nominal_models(config))
+    assert isinstance(refused, tuple)
+    assert (refused[0].code, "exit code 9" in refused[0].text) == ("InternalError", True)
+
+
 def test_the_process_ends_with_its_answer_or_with_the_daemon(config: MachineConfig, tmp_path: Path) -> None:
+    program = written(tmp_path, HEAD + "G1 X[1/0]\nM2\n")
     request = {
-        "program": str(written(tmp_path, HEAD + "G1 X[1/0]\nM2\n")),
+        "program": str(program),
+        "program_digest": program_digest(program),
         "config": config.model_dump(mode="json"),
         "models": {axis: model.as_dict() for axis, model in nominal_models(config).items()},
         "folder": str(tmp_path / FOLDER),
@@ -197,7 +250,7 @@ def made(folder: Path, key: str) -> Path:
         body.write(content)
         digest = hashlib.sha256(content).hexdigest()
         whole = {"rms_um": 2.0, "max_um": 3.0}
-        return {"schema": "fdhil-check-1", "axes": ["X", "Y"], "rows": 8, "sha256": digest, "refused": [],
+        return {"schema": "fdhil-check-2", "files": {}, "axes": ["X", "Y"], "rows": 8, "sha256": digest, "refused": [],
                 "before": whole, "after": {"rms_um": 0.5, "max_um": 1.0}, "largest_um": 1.0}  # fmt: skip
 
     keep(folder, key, rows)
@@ -206,20 +259,20 @@ def made(folder: Path, key: str) -> Path:
 
 def test_what_was_checked_is_only_believed_whole(tmp_path: Path) -> None:
     file = made(tmp_path, "a")
-    found = Checked.find(tmp_path, "a")
+    found = Checked.find(tmp_path, "a", tmp_path)
     assert found is not None
     assert found.gain_um == 1.5
-    assert Checked.find(tmp_path, "b") is None
+    assert Checked.find(tmp_path, "b", tmp_path) is None
     stream = Stream(found, "digest", 0.001)
     content = bytearray(file.read_bytes())
     content[17] ^= 1
     file.write_bytes(content)
-    assert Checked.find(tmp_path, "a") is None
+    assert Checked.find(tmp_path, "a", tmp_path) is None
     file.write_bytes(content[:40])
     with pytest.raises(StoreError, match="ends too early"):
         stream.take()
     file.unlink()
-    assert Checked.find(tmp_path, "a") is None
+    assert Checked.find(tmp_path, "a", tmp_path) is None
     with pytest.raises(StoreError, match="cannot be read"):
         stream.take()
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from fdhil.cli.demo.processes import Process
-from fdhil.drivers.commissioning import commission, save_record
 from fdhil.errors import ConnectError
 from fdhil.prediction import contour_error_um
 from fdhil.store.history import History
@@ -28,8 +27,7 @@ pytestmark = pytest.mark.timeout(1500)  # four processes in lockstep: minutes on
 def shop(tmp_path: Path) -> Iterator[Shop]:
     """A twin whose tables are heavier than the data sheet says, commissioned."""
     with opened(tmp_path) as shop:
-        for axis in shop.config.axis:
-            save_record(commission(shop.config, axis), shop.config.store.directory)
+        shop.commission()
         yield shop
 
 
@@ -37,7 +35,7 @@ def test_from_the_bus_to_the_history_to_a_corrected_cut_and_back(shop: Shop, cap
     with shop.guard() as guard, shop.daemon() as daemon:
         _refuses_what_is_not_known(shop, capsys)
         shop.nc_on()
-        shop.play("shuttle.ngc", SHUTTLE)
+        shop.play("shuttle.ngc", SHUTTLE, timeout_s=PATIENCE_S)
         told = shop.status_when(lambda s: all(s["axes"][a]["accepted"] + s["axes"][a]["refused"] >= 4 for a in "XY"))
         _knows_the_drives(told)
         _refuses_a_second_daemon(shop)
