@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from fdhil.config import MachineConfig
 from fdhil.daemon.warm import nominal_rapid
+from fdhil.identification.windows import find_windows
 from fdhil.pipeline import AxisPipeline, Record
 from fdhil.pipeline.ring import Ring
 from fdhil.records import (
@@ -32,6 +33,7 @@ from fdhil.records import (
     frozen_ints,
 )
 from fdhil.store.windows import decode_window, encode_window
+from studies.slow_recordings import GOOD, recording_of
 from tests.daemon.machine import config_of, rapids
 from tests.store.made import bits, same
 
@@ -257,3 +259,12 @@ def test_memory_is_bounded(config: MachineConfig) -> None:
     assert len(ring._samples) <= 22
     assert len(ring._times) <= 22
     assert math.isnan(ring.cut(0, 10, separate_voltage=False).speed_rad_s[0])
+
+
+def test_a_window_that_leaves_l_open_is_accepted_and_publishes_nothing(tmp_path: Path) -> None:
+    (open_end,) = find_windows(recording_of(59, 2, GOOD)[0])  # instants of a sensor of 200 Hz
+    (outcome,) = AxisPipeline("X", config_of(tmp_path)).feed(open_end)
+    assert isinstance(outcome, WindowOutcome)
+    assert outcome.verdict.accepted
+    assert outcome.estimate is not None
+    assert set(outcome.estimate.missing) == {"L"}
