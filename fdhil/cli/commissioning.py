@@ -236,9 +236,11 @@ def _stopped_like_ctrl_c() -> Iterator[None]:
 
 def _commission_axis(machine: MachineConfig, axis: str, yes: bool, quiet: bool) -> dict[str, Any]:
     """Run all steps for one axis and save its record; DriveFault when it is refused."""
+    from fdhil.cli.guard import lock_bus
     from fdhil.drivers import commissioning
 
-    record = commissioning.commission(machine, axis, _guide(machine, axis, yes, quiet))
+    with lock_bus(machine.bus[machine.axis[axis].drive.bus]):  # the guard reads the record when it starts
+        record = commissioning.commission(machine, axis, _guide(machine, axis, yes, quiet))
     path = commissioning.save_record(record, machine.store.directory)
     if not quiet:
         click.echo(

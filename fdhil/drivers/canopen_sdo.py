@@ -52,6 +52,7 @@ class SdoLink:
         self._client = client(COB_SDO_REQUEST + node_id, self.response_id, dictionary())
         self._client.network = self
         self._client.RESPONSE_TIMEOUT = RESPONSE_TIMEOUT_S
+        self._late = False
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
         """What the library's client calls to send; remote frames are never sent."""
@@ -67,7 +68,6 @@ class SdoLink:
         try:
             return self._upload(index, sub, block)
         except DeviceTimeout:
-            self._be_quiet()
             first, second = self._upload(index, sub, block), self._upload(index, sub, block)
             if first != second:
                 raise ProtocolError(
@@ -91,7 +91,6 @@ class SdoLink:
         try:
             self._guarded(index, sub, lambda: self._client.download(index, sub, data))
         except DeviceTimeout:
-            self._be_quiet()
             if self._upload(index, sub, False) == data == self._upload(index, sub, False):
                 return
             self._guarded(index, sub, lambda: self._client.download(index, sub, data))
@@ -100,6 +99,7 @@ class SdoLink:
         """Wait until no late answer can come any more, and forget those that came."""
         time.sleep(QUIET_S)
         self._client.responses = queue.Queue()
+        self._late = False
 
     def _upload(self, index: int, sub: int, block: bool) -> bytes:
         data: bytes = self._guarded(index, sub, lambda: self._segments(index, sub, block))
@@ -131,7 +131,9 @@ class SdoLink:
         return ProtocolError(self.device, text)
 
     def _guarded(self, index: int, sub: int, call: Any) -> Any:
-        """Run a call of the library and translate its errors into one sentence each."""
+        """Run a call of the library and translate its errors into one sentence each; quiet first after a time-out."""
+        if self._late:
+            self._be_quiet()
         try:
             return call()
         except SdoAbortedError as abort:
@@ -140,6 +142,7 @@ class SdoLink:
             raise SdoAbort(self.device, text, abort.code) from None
         except SdoCommunicationError as error:
             if "No SDO response" in str(error) or "could not be retransmitted" in str(error):
+                self._late = True
                 raise DeviceTimeout(
                     self.device, f"{_name(index, sub)} was not answered; check the drive's supply and its node-ID"
                 ) from None

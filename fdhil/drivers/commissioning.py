@@ -259,7 +259,8 @@ def commission(
 ) -> CommissioningRecord:
     """Commission one axis and return the signed-off record (not saved yet); ``report`` gets each step's name.
 
-    Nothing is written or moved before ``report`` returns from ``enable``: what it raises there ends it with no trace.
+    Nothing moves before ``report`` returns from ``enable``, and nothing is written but the RPDO of the feed-forward,
+    which is given back: what ``report`` raises there ends it with no trace.
 
     DriveFault, ProtocolError, DeviceTimeout or ConnectError, one sentence each, after everything was rolled back.
     """

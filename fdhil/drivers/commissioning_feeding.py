@@ -43,12 +43,12 @@ def feedforward_open(master: Master) -> Iterator[dict[str, int]]:
         raise _refused(master, f"it refuses the RPDO of 60B1 and 60B2 ({abort})") from None
     try:
         yield {feedforward_object(spec.number): cob_id}
-    except DeviceError as error:
+    except BaseException as error:  # Ctrl-C, too: what is not signed off is not left exchanged
         try:
             master.sdo.write_int(parameter, 1, before, 4)
             _write_zeros(master, spec)
         except DeviceError as left:
-            cause = str(error).removeprefix(f"{master.device}: ")
+            cause = str(error).removeprefix(f"{master.device}: ") or "it was interrupted"
             text = f"{cause}; 60B1, 60B2 or their RPDO stay as they are ({left}); power the drive off and on again"
             raise ProtocolError(master.device, text) from error
         raise

@@ -17,7 +17,7 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.cli.guard import guard, heartbeat_timeout_s, limits_of, lock_bus, open_bus, settings_of
-from fdhil.cli.main import run_safely
+from fdhil.cli.main import cli, run_safely
 from fdhil.config import CanBus, CorrectionLimits
 from fdhil.drivers.commissioning_record import CommissioningRecord, save_record
 from fdhil.errors import ConnectError, DeviceError, ProtocolError
@@ -153,6 +153,17 @@ def test_one_guard_per_bus() -> None:
     with lock_bus(bus), pytest.raises(DeviceError, match="BusLocked"):
         lock_bus(bus)
     lock_bus(bus).close()
+
+
+def test_no_drive_is_commissioned_while_a_guard_owns_the_bus(
+    tmp_path: Path, peer: Peer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It has read the records when it started, and would not know the new one."""
+    config = write_config(tmp_path, peer.port)
+    monkeypatch.setattr(sys, "argv", ["fdhil", "commission", str(config), "--yes"])
+    with lock_bus(machine_config.load(config).bus["can0"]):
+        assert run_safely(cli) == 3
+    assert "BusLocked" in capsys.readouterr().err
 
 
 def test_it_becomes_the_guard_owns_its_bus_and_stops_cleanly(tmp_path: Path, peer: Peer) -> None:

@@ -150,3 +150,16 @@ def test_what_fails_later_makes_the_rpdo_invalid_again(peer: tuple[Spoilt, Machi
     while drive.rpdo() != NOT_VALID and time.monotonic() < deadline:
         time.sleep(0.01)
     assert drive.rpdo() == NOT_VALID
+
+
+def test_ctrl_c_makes_the_rpdo_invalid_again(peer: tuple[Spoilt, MachineConfig]) -> None:
+    drive, settings = peer
+
+    def interrupted(step: str) -> None:
+        if step == "sign test":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        commission(settings, "X", interrupted)
+    assert drive.rpdo() == NOT_VALID
+    assert drive.held() == (0, 0)
