@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fdhil.cli.options import Positive
 from fdhil.cli.prediction import FILE, inputs
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ BRACKETED = (
 @click.option("--from-history", is_flag=True, help="Use the newest validated parameters of the store.")
 @click.option(
     "--tolerance-um",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=Positive(),
     required=True,
     help="Largest contour error allowed.",
 )

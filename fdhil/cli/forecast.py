@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fdhil.errors import FdhilError
-
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -183,7 +181,7 @@ def steps(
 ) -> tuple[Step, ...]:
     """Return what the steps since revision ``since`` (left out: since before each axis' last step) cost.
 
-    FdhilError when no axis has that revision.
+    UsageError when no axis has that revision.
     """
     from fdhil.prediction import forecast
 
@@ -198,7 +196,9 @@ def steps(
         if place is not None:
             earlier[axis] = sets[place]
     if since is not None and not earlier:
-        raise FdhilError(f"there is no revision {since} among the last {RECENT}; fdhil history lists them")
+        raise click.UsageError(
+            f"--since: there is no revision {since} among the last {RECENT}; fdhil history lists them"
+        )
     return forecast.step_costs(predicted, models, earlier, now, config)
 
 

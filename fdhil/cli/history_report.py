@@ -18,7 +18,7 @@ def write_report(
     """Write the report of revisions and health (see ``fdhil history --json``). FdhilError without extra ``report``."""
     from fdhil.report import Page, write
 
-    axes = dict.fromkeys(row["axis"] for row in rows)
+    axes = sorted({row["axis"] for row in rows})
     sections = [_axis_section(axis, [row for row in rows if row["axis"] == axis], health.get(axis)) for axis in axes]
     headline = [(f"axis {axis}", f"{sum(row['axis'] == axis for row in rows)} revisions") for axis in axes]
     page = Page(f"{machine.machine.name}: identified drives", "parameters with 95 % intervals", headline, sections)
@@ -30,11 +30,11 @@ def _axis_section(axis: str, rows: Sequence[Mapping[str, Any]], told: Mapping[st
 
     names = list(rows[0]["parameters"])
     table = Table(
-        head=["revision", "time", "degC", "windows", *names],
+        head=["revision", "time (UTC)", "degC", "windows", *names],
         rows=[
             [
                 str(row["revision"]),
-                row["time"],
+                row["time"][:19].replace("T", " "),
                 "" if row["temperature_c"] is None else f"{row['temperature_c']:.2f}",
                 str(row["windows_used"]),
                 *(with_interval(row["parameters"][name]) for name in names),
@@ -45,7 +45,10 @@ def _axis_section(axis: str, rows: Sequence[Mapping[str, Any]], told: Mapping[st
     )
     tables = [table] if told is None else [table, *_health_tables(told)]
     return Section(
-        f"Axis {axis}", tables=tables, figures=[("Course of each parameter", _svg(rows, {axis: told} if told else {}))]
+        f"Axis {axis}",
+        tables=tables,
+        figures=[("Course of each parameter", _svg(rows, {axis: told} if told else {}))],
+        wide=True,
     )
 
 

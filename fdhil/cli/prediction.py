@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import tables
+from fdhil.cli.options import Positive
 
 if TYPE_CHECKING:
     from fdhil.cli.forecast import Past
@@ -66,7 +67,7 @@ def _shared(wanted: Callable[..., int]) -> Callable[..., int]:
 @click.option("--sensitivity", is_flag=True, help="Tell per zone by how many um 1 % of each parameter raises it.")
 @click.option(
     "--tolerance-um",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=Positive(),
     help="With --from-history: when each zone leaves this tolerance, if the parameters go on as they did.",
 )
 @click.option(
@@ -102,7 +103,7 @@ def predict(asked: Asked, sensitivity: bool, tolerance_um: float | None, since: 
     if asked.out is not None:
         _write(asked.out, columns)
     if asked.report is not None:
-        _report(asked.report, asked.program, config, predicted)
+        _report(asked.report, asked, config, predicted)
     if asked.as_json:
         click.echo(json.dumps(document, allow_nan=False))
         return 0
@@ -167,7 +168,7 @@ def correct(asked: Asked, method: str | None) -> int:
     if asked.out is not None:
         _write(asked.out, _correction_columns(planned))
     if asked.report is not None:
-        _report(asked.report, asked.program, config, planned)
+        _report(asked.report, asked, config, planned)
     if asked.as_json:
         click.echo(json.dumps(_correction_document(str(asked.program), planned), allow_nan=False))
     else:
@@ -175,7 +176,7 @@ def correct(asked: Asked, method: str | None) -> int:
     return 1 if planned.refused else 0
 
 
-def _report(path: Path, program: Path, config: MachineConfig, found: Prediction | Correction) -> None:
+def _report(path: Path, asked: Asked, config: MachineConfig, found: Prediction | Correction) -> None:
     """Write the page of a prediction or correction; FdhilError without the extra ``report``."""
     from fdhil.records import Prediction
     from fdhil.report import require, write
@@ -183,11 +184,16 @@ def _report(path: Path, program: Path, config: MachineConfig, found: Prediction 
     require()
     from fdhil.report.path import correction_page, prediction_page
 
-    machine = config.machine.name
+    name, machine = asked.program.name, config.machine.name
+    parameters = "the nominal parameters of the configuration"
+    if asked.from_history:
+        parameters = "the newest parameters of the history"
+    elif asked.model_path is not None:
+        parameters = f"the parameters of {asked.model_path.name}"
     if isinstance(found, Prediction):
-        write(prediction_page(program.name, machine, found), path)
+        write(prediction_page(name, machine, found, parameters), path)
     else:
-        write(correction_page(program.name, machine, found), path)
+        write(correction_page(name, machine, found, parameters), path)
 
 
 def inputs(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import config as machine_config
+from fdhil.cli.options import Positive
 
 if TYPE_CHECKING:
     from fdhil.drivers.demand_recorder import DemandRecorder, RecordedDemand
@@ -20,10 +21,10 @@ _SHOWN_GAPS = 5
 @click.command()
 @click.argument("config", type=_FILE)
 @click.option("--out", required=True, type=_FILE, help="The demand CSV to write.")
-@click.option("--seconds", type=click.FloatRange(0.0, min_open=True), help="Record no longer than this.")
+@click.option("--seconds", type=Positive(), help="Record no longer than this.")
 @click.option(
     "--rest",
-    type=click.FloatRange(0.0, min_open=True),
+    type=Positive(),
     default=2.0,
     show_default=True,
     help="Seconds of rest after a motion that end the recording; more than the program's longest dwell.",

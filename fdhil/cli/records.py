@@ -111,6 +111,10 @@ def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) ->
     """Show how the identified parameters of CONFIG's machine moved: revisions, slopes, changes, maintenance dates."""
     machine = machine_config.load(config)
     rows, told = _history(machine, axis)
+    if axis is not None and axis not in machine.axis and not rows:
+        raise click.BadParameter(
+            f"{axis} is no axis of {config}; it has {', '.join(machine.axis)}", param_hint="--axis"
+        )
     if plot is not None:
         from fdhil.cli.history_plot import write_plot
 

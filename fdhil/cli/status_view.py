@@ -85,7 +85,7 @@ def sparkline(values: Sequence[float]) -> str:
 def show_history(rows: Sequence[Mapping[str, Any]], console: Console | None = None, newest: int = 15) -> None:
     """Print the newest revisions of every axis, and each parameter's course over all of them."""
     out = console or open_console()
-    for axis in dict.fromkeys(row["axis"] for row in rows):
+    for axis in sorted({row["axis"] for row in rows}):
         of_axis = [row for row in rows if row["axis"] == axis]
         names = list(of_axis[0]["parameters"])
         first, last = (of_axis[k]["time"][:10] for k in (0, -1))

@@ -21,7 +21,9 @@ POWERS = (0.3, 3.0)  # of the share, that an error may go with
 AIM, FULL = 0.996, 0.99  # of the tolerance: what is aimed at, and what is near enough
 EDGE = 0.1  # of a bracket, in logarithms: a trial keeps away from its ends
 LOWEST = 1e-3  # share of the feed that is tried
-STILL = 0.9  # an error that keeps this much of itself while its feed falls to half does not come from the feed
+# an error that keeps STILL of itself while its feed falls to 1 / FAR does not come from the feed; over less it may
+# come from the NC's acceleration, which is the same until the feed is below what a ramp gains while the loops settle
+STILL, FAR = 0.9, 8.0
 SLACK, MOST_RISES = 0.97, 3  # of the tolerance: what leaves more room is tried at a higher feed, so many times
 MOST_TRIALS = 80
 LONGEST_S, LONGEST_SHARE = 600.0, 10.0  # a path that lasts longer than both, the latter times its own, is not slowed
@@ -145,7 +147,7 @@ class _Stretch:
         return float(np.clip(wanted, self.low * margin, self.high / margin))
 
     def _is_lost(self, share: float, error_um: float) -> bool:
-        faster = [e for s, e in self.tried if np.isfinite(e) and s >= 2.0 * share]
+        faster = [e for s, e in self.tried if np.isfinite(e) and s >= FAR * share]
         return self.lost or share <= LOWEST or bool(faster and error_um > STILL * faster[-1])
 
     def _power(self) -> float:

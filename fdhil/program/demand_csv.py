@@ -27,7 +27,8 @@ def read_demand_csv(path: Path, config: MachineConfig) -> Trajectory:
     missing = [f"{name}_mm" for name in config.axis if f"{name}_mm" not in columns and name in "XYZ"]
     if "time_s" not in columns or missing:
         absent = ", ".join((["time_s"] if "time_s" not in columns else []) + missing)
-        raise RecordingError(f"{path}: the column {absent} is missing; a demand begins with the line time_s,X_mm,Y_mm")
+        wanted = ",".join(["time_s", *(f"{name}_mm" for name in config.axis if name in "XYZ")])
+        raise RecordingError(f"{path}: there is no column {absent}; a demand begins with the line {wanted}")
     table = _numbers(path, len(columns))
     time_s = table[:, columns.index("time_s")]
     _check_times(path, time_s, config.machine.sync_period_s)

@@ -22,12 +22,13 @@ class Table:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A titled part of the page: text, tables, then figures as (caption, inline SVG)."""
+    """A titled part of the page: text, tables, then figures as (caption, inline SVG), one a row when ``wide``."""
 
     title: str
     text: str = ""
     tables: Sequence[Table] = ()
     figures: Sequence[tuple[str, str]] = ()
+    wide: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,4 +66,4 @@ def write(page: Page, path: Path) -> None:
         part.write_text(text, "utf-8")
         part.replace(path)
     except OSError as error:
-        raise FdhilError(f"the report {path} cannot be written: {error.strerror}; choose another --out") from None
+        raise FdhilError(f"the report {path} cannot be written: {error.strerror}; choose another path") from None

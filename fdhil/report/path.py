@@ -20,18 +20,18 @@ BEFORE_S, ASIDE_S = 0.05, 0.25  # what led to a zone is shown too, and no other 
 MOST_ROWS = 50
 
 
-def prediction_page(name: str, machine: str, predicted: Prediction) -> Page:
-    """Lay a prediction out: where the error is, its zones, its worst places."""
+def prediction_page(name: str, machine: str, predicted: Prediction, parameters: str = "") -> Page:
+    """Lay a prediction out: where the error is, its zones, its worst places. ``parameters`` says whose they are."""
     return Page(
         title=f"Path error of {name}",
-        subtitle=f"Predicted for {machine} from its identified drives, before the cut.",
+        subtitle=f"Predicted for {machine} before the cut{_with(parameters)}.",
         headline=[*_figures("predicted", predicted), ("duration", f"{_duration(predicted.reference):.2f} s")],
         sections=[_along([("predicted", predicted)]), _places([("predicted", predicted)]), _zones(predicted, None)],
     )
 
 
-def correction_page(name: str, machine: str, planned: Correction) -> Page:
-    """Lay a correction out, before and after; a refused one with its reasons."""
+def correction_page(name: str, machine: str, planned: Correction, parameters: str = "") -> Page:
+    """Lay a correction out, before and after; a refused one with its reasons. ``parameters`` says whose they are."""
     before, after = planned.before, planned.after
     if planned.refused:
         cases = [("uncorrected", before)]
@@ -43,7 +43,7 @@ def correction_page(name: str, machine: str, planned: Correction) -> Page:
         verdict = [*_figures("corrected", after), ("smaller by", f"{_rms(before) / max(_rms(after), 1e-12):.0f} x")]
     return Page(
         title=f"Correction of {name}",
-        subtitle=f"Planned for {machine} with the method {planned.method}; predicted, nothing was sent.",
+        subtitle=f"Planned for {machine} with the method {planned.method}{_with(parameters)}; nothing was sent.",
         headline=[*_figures("uncorrected", before), *verdict],
         sections=[
             *([Section("Why it was refused", told)] if told else []),
@@ -52,6 +52,10 @@ def correction_page(name: str, machine: str, planned: Correction) -> Page:
             _zones(before, None if planned.refused else after),
         ],
     )
+
+
+def _with(parameters: str) -> str:
+    return f", with {parameters}" if parameters else ""
 
 
 def _rms(predicted: Prediction) -> float:

@@ -28,7 +28,9 @@ def test_lists_the_lines_that_leave_the_tolerance(bench: Path, tolerance: float,
     assert ("line 3" in invoke(*arguments).stdout) == (lines > 0)
 
 
-def test_the_tolerance_must_be_positive(bench: Path) -> None:
-    """0 is no tolerance."""
-    result = invoke("advise", bench / "demand.csv", "--config", bench / "bench.toml", "--tolerance-um", 0)
+@pytest.mark.parametrize("tolerance", ["0", "-3", "nan", "inf", "wide"])
+def test_the_tolerance_must_be_a_positive_number(bench: Path, tolerance: str) -> None:
+    """Against nan every path would be within the tolerance."""
+    result = invoke("advise", bench / "demand.csv", "--config", bench / "bench.toml", "--tolerance-um", tolerance)
     assert result.exit_code == 2
+    assert "--tolerance-um" in result.stderr

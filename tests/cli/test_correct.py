@@ -90,6 +90,7 @@ def test_a_report_shows_before_and_after(bench: Path) -> None:
         arguments = [command, bench / "demand.csv", "--config", bench / "bench.toml", "--report", page]
         assert invoke(*arguments).exit_code == 0
         assert shown in page.read_text("utf-8")
+        assert "with the nominal parameters of the configuration" in page.read_text("utf-8")
     missing = bench / "demand.csv" / "page.html"
     refused = invoke("predict", bench / "demand.csv", "--config", bench / "bench.toml", "--report", missing)
     assert refused.exit_code == 3

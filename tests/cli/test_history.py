@@ -97,5 +97,13 @@ def test_the_plot_and_the_report_show_it(worn: Path, tmp_path: Path, capsys: Any
     assert (tmp_path / "plot.png").stat().st_size > 50_000
     assert fdhil("report", worn, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
     page = (tmp_path / "report.html").read_text()
+    assert 'class="figures wide"' in page
     for words in ("Slopes since the last change", "a changed load", "maintenance limit"):
         assert words in page
+
+
+def test_an_axis_that_there_is_not_is_refused(worn: Path, capsys: Any) -> None:
+    """It is a wrong option, not an empty history."""
+    code, _, told = fdhil("history", worn, "--axis", "Q", capsys=capsys)
+    assert code == 2
+    assert "Q is no axis" in told

@@ -123,7 +123,7 @@ def test_history_tells_what_a_fixture_costs(bench: Path) -> None:
     assert steps[0]["parameters"] == {"Jt": {"before": 0.075, "now": 0.085}}
     assert "has changed since revision 2 (Jt 0.075 -> 0.085): it costs" in invoke(*arguments).stdout
     assert json.loads(invoke(*arguments, "--since", 3, "--json").stdout)["steps"] == []
-    assert invoke(*arguments, "--since", 99).exit_code != 0
+    assert invoke(*arguments, "--since", 99).exit_code == 2
     assert invoke("predict", program, "--config", bench / "bench.toml", "--since", 1).exit_code == 2
 
 

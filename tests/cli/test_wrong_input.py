@@ -108,3 +108,8 @@ def test_a_program_with_an_unknown_word_is_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", ["status", "disarm"])
 def test_a_daemon_that_does_not_run_is_told(command: str, tmp_path: Path) -> None:
     told(fdhil(command, write_config(tmp_path)), 3, "is not running")
+
+
+def test_a_demo_without_a_place_for_its_files_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    told(fdhil("demo", "--out", tmp_path / "file" / "out"), 3, "cannot be made: Not a directory; choose another --out")

@@ -213,6 +213,14 @@ def test_what_is_not_known_is_not_slowed() -> None:
     assert found.held == {1, 2}
 
 
+def test_an_error_of_the_acceleration_falls_only_at_a_low_feed() -> None:
+    """It is the same down to a fifth of the feed, where ramps become too short for it, and then falls."""
+    source, judge = made(lambda shares: [50.0 * min(1.0, shares.get(1, 1.0) / 0.2), 40.0 * shares.get(2, 1.0)])
+    found = highest(source, {1: 50.0, 2: 40.0}, judge, 20.0)
+    assert found.held == {1, 2}
+    assert 0.95 * 0.08 < found.share[1] <= 0.08
+
+
 def test_an_error_that_does_not_come_from_the_feed_is_lost_soon() -> None:
     """No feed holds it; the other stretch is not held up."""
     trials: list[int] = []

@@ -57,6 +57,15 @@ def test_a_broken_demand_is_a_recording_error(lines: list[str], tmp_path: Path) 
         load_trajectory(tmp_path / "d.csv", bench_config())
 
 
+def test_a_missing_column_is_told_with_the_line_that_is_wanted(tmp_path: Path) -> None:
+    """With the axes of this machine."""
+    (tmp_path / "d.csv").write_text("time_s,X_mm\n" + "\n".join(row.rpartition(",")[0] for row in ROWS))
+    with pytest.raises(
+        RecordingError, match="no column Y_mm, Z_mm; a demand begins with the line time_s,X_mm,Y_mm,Z_mm"
+    ):
+        load_trajectory(tmp_path / "d.csv", bench_config("XYZ"))
+
+
 def test_another_step_than_the_sync_period_is_a_config_error(tmp_path: Path) -> None:
     (tmp_path / "d.csv").write_text("time_s,X_mm,Y_mm\n" + "".join(f"{k * 0.002:.3f},0,0\n" for k in range(9)))
     with pytest.raises(ConfigError, match="sync_period_s"):

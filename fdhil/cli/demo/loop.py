@@ -64,7 +64,10 @@ class Stage:
 
 def run_loop(out: Path, realtime: bool, say: Say) -> Loop:
     """Run the whole loop below ``out`` and return what was measured; FdhilError when a step fails."""
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FdhilError(f"the folder {out} cannot be made: {error.strerror}; choose another --out") from None
     with ExitStack() as stack:
         say("starting the simulated machine: two drives, two voltage sensors, an NC")
         stage = _start_twin(out, realtime, say, stack)
