@@ -60,19 +60,23 @@ def parse_recording(text: str, source: str = "recording") -> Recording:
         temperature_c=_optional(headers, "temperature_C", source),
         gaps=gaps,
         headers=headers,
-        slow_voltage=_slow_voltage(headers, float(table[0, 0]), source),
+        slow_voltage=_slow_voltage(headers, float(table[0, 0]), dt, source),
     )
 
 
-def _slow_voltage(headers: dict[str, str], start_s: float, source: str) -> SlowVoltage | None:
+def _slow_voltage(headers: dict[str, str], start_s: float, dt_s: float, source: str) -> SlowVoltage | None:
     """Return the samples of a voltage sensor that is slower than the rows, where the headers hold them.
 
     Sample j begins ``voltage_begin_s`` + j ``voltage_period_s`` on the time axis of the rows, whose first is at
-    ``start_s``; a lost one is ``nan`` among ``voltage_samples_V``.
+    ``start_s`` and which are ``dt_s`` apart; a lost one is ``nan`` among ``voltage_samples_V``.
     """
     if "voltage_samples_V" not in headers:
         return None
     period, begin = _positive(headers, "voltage_period_s", source), _optional(headers, "voltage_begin_s", source)
+    if period < dt_s / 2:  # the place of finer samples among the rows would be sought for hours
+        raise RecordingError(
+            f"{source} has voltage samples {period:g} s apart, closer than its rows: give voltage_period_s in seconds"
+        )
     try:
         told = np.array(headers["voltage_samples_V"].split(), dtype=np.float64)
     except ValueError:

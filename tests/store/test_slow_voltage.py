@@ -10,6 +10,8 @@ import pytest
 from fdhil.config import Identification
 from fdhil.daemon.documents import as_document
 from fdhil.errors import RecordingError
+from fdhil.store.export import csv_lines
+from fdhil.store.recording_csv import parse_recording
 from fdhil.store.windows import decode_window, encode_window
 from fdhil.validation import analyse
 from studies.slow_sensor import slow_windows
@@ -42,3 +44,10 @@ def test_what_current_and_speed_alone_tell_has_its_units_in_the_document() -> No
     assert [told[name]["unit"] for name in ("Jt/K", "ft/K", "Cd/K")] == ["A.s2/rad", "A.s/rad", "A"]
     assert told["L"]["value"] is None
     assert "there is no voltage" in told["L"]["reason"]
+
+
+@pytest.mark.parametrize("period", ["5e-6", "1e-320"])
+def test_samples_closer_than_the_rows_are_refused(period: str) -> None:
+    lines = [line for line in csv_lines(slow_windows(0.005)[0]) if not line.startswith("# voltage_period_s")]
+    with pytest.raises(RecordingError, match="closer than its rows"):
+        parse_recording("\n".join([f"# voltage_period_s: {period}", *lines]) + "\n")
