@@ -105,6 +105,10 @@ class Flow:
     def at_end(self) -> None:
         """Check that the program may end here; ProgramError when a label is sought or a call is under way."""
         if self._skip is not None:
+            if self._skip.keywords == (FANUC,):
+                raise ProgramError(
+                    self._skip.line, f"O{self._skip.label}", "is called and stands nowhere; add that block"
+                )
             wanted = " or ".join(self._skip.keywords)
             raise ProgramError(self._skip.line, f"O<{self._skip.label}>", f"the program ends before its {wanted}")
         if self.depth:

@@ -233,3 +233,9 @@ def test_lines_that_are_made_as_they_are_read_are_kept_in_four_megabytes_at_most
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 10_000_000
+
+
+def test_a_called_block_that_there_is_not_is_told_by_its_number() -> None:
+    """As it was written, and without the name that fdhil has for such a block."""
+    with pytest.raises(ProgramError, match="line 1, 'O99': is called and stands nowhere"):
+        run("M98 P99", "M2")
