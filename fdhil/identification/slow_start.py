@@ -23,6 +23,7 @@ SHIFTS_PER_SAMPLE = 4
 IMPROVEMENT = 1.5  # the residual's power must fall by this factor before a shift is believed
 LEAST_SAMPLES = 16
 BEYOND_NOISE = 3.0  # of the variance that noise gives: what five rows rarely exceed by chance
+TIME_CONSTANT_S, LEAST_TIME_CONSTANT_S = 3e-3, 1e-4  # of a winding: a usual one, and what none has
 FLOORS = 10.0 ** np.arange(-6.0, 1.01, 0.5)  # of the variance of the current's second difference that is noise
 
 
@@ -40,6 +41,10 @@ def slow_start(windows: Sequence[Window], settings: Identification) -> tuple[Flo
         return None
     inductance, resistance, constant = solve(electrical[:, 1:], electrical[:, 0])[0]
     second = solve(mechanical[:, 1:], mechanical[:, 0] * constant)[0]
+    if resistance > 0.0 and inductance < LEAST_TIME_CONSTANT_S * resistance:
+        # so coarse a delay is taken for L: the voltage R i + L di/dt is that of R i, earlier by L / R
+        shifts = [shift + TIME_CONSTANT_S - float(inductance / resistance) for shift in shifts]
+        inductance = TIME_CONSTANT_S * resistance
     theta = np.array([resistance, inductance, constant, *second, 0.0])
     return theta, shifts, [prepare(w) for w in windows]
 

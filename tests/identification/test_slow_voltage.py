@@ -9,9 +9,11 @@ import pytest
 
 from fdhil.config import Identification
 from fdhil.identification.estimators import maximum_likelihood
+from fdhil.identification.windows import find_windows
 from fdhil.records import PARAMETERS, Float, Result, VoltageSampling, frozen
 from fdhil.validation import analyse
 from studies import bench
+from studies.slow_recordings import GOOD, recording_of
 from studies.slow_sensor import slow_windows
 
 SETTINGS = Identification()
@@ -81,3 +83,14 @@ def test_windows_with_clocks_of_their_own_are_pooled() -> None:
     assert estimate.residuals["electrical"].size == sum(w.slow_voltage.voltage_v.size for w in two if w.slow_voltage)
     assert estimate.residuals["mechanical"].size == sum(w.n for w in two)
     assert all(0.8 < np.std(e[e != 0.0]) < 1.2 for e in estimate.residuals.values())
+
+
+@pytest.mark.parametrize("seed", [61, 274])
+def test_a_delay_that_least_squares_took_for_a_negative_l_is_found(seed: int) -> None:
+    # a sensor of 100 Hz, 4 ms early or late: the fit began at L = 0 and stayed there, 6 ms beside the delay
+    recording, _ = recording_of(seed, 3, GOOD)
+    estimate = maximum_likelihood.estimate(find_windows(recording), SETTINGS)
+    assert estimate.result is Result.OK
+    assert estimate.delay_s is not None
+    assert estimate.value("L") / estimate.value("R") == pytest.approx(3.5e-3, rel=0.1)
+    assert abs(estimate.delay_s) == pytest.approx(3.8e-3, rel=0.05)
