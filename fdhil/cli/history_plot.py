@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fdhil.errors import FdhilError
+from fdhil.records import UNITS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,21 +28,26 @@ def courses(rows: Sequence[Mapping[str, Any]], health: Mapping[str, Mapping[str,
         from matplotlib.figure import Figure
     except ImportError:
         raise FdhilError("a plot needs the extra 'report': pip install 'fdhil[report]'") from None
-    names = list(rows[0]["parameters"]) if rows else []
+    published = [row["parameters"] for row in rows] + [
+        w["parameters"] for told in health.values() for w in told["windows"]
+    ]
+    names = list(dict.fromkeys(name for parameters in published for name in parameters))
     warm = any(told["slopes"] for told in health.values())
     figure = Figure(figsize=(15, 9) if warm else (11, 6.5), layout="constrained")
-    panels = figure.subplots(3, 4) if warm else figure.subplots(2, 3)
+    columns = 4 if warm else 3
+    panels = figure.subplots(max(1, -(-len(names) * (2 if warm else 1) // columns)), columns, squeeze=False)
     for k, name in enumerate(names):
         over_time = panels.flat[2 * k if warm else k]
-        over_time.set_title(f"{name} [{rows[0]['parameters'][name]['unit']}]{_limits(name, health)}", fontsize=9)
-        axes = list(dict.fromkeys(row["axis"] for row in rows))
+        over_time.set_title(f"{name} [{UNITS[name]}]{_limits(name, health)}", fontsize=9)
+        axes = list(dict.fromkeys([*(row["axis"] for row in rows), *health]))
         for number, axis in enumerate(axes):
-            _draw_time(over_time, [row for row in rows if row["axis"] == axis], health.get(axis), name, f"C{number}")
+            own = [row for row in rows if row["axis"] == axis and name in row["parameters"]]
+            _draw_time(over_time, own, health.get(axis), name, f"C{number}")
             if warm and axis in health:
                 _draw_temperature(panels.flat[2 * k + 1], health[axis], name, f"C{number}")
         if warm:
             panels.flat[2 * k + 1].set_title(f"{name} over the slide-way's temperature, degC", fontsize=9)
-        if len(axes) > 1 or k == 0:
+        if (len(axes) > 1 or k == 0) and over_time.get_legend_handles_labels()[1]:
             over_time.legend(fontsize=7)
     for panel in panels.flat:
         panel.tick_params(labelsize=7)
@@ -67,8 +73,9 @@ def _draw_time(
 
     formatter: Any = dates.ConciseDateFormatter
     times = [datetime.fromisoformat(row["time"]) for row in rows]
-    label = f"{rows[0]['axis']} published"
-    panel.plot(times, [row["parameters"][name]["value"] for row in rows], color=colour, linewidth=1.5, label=label)
+    if rows:
+        label = f"{rows[0]['axis']} published"
+        panel.plot(times, [row["parameters"][name]["value"] for row in rows], color=colour, linewidth=1.5, label=label)
     panel.xaxis.set_major_formatter(formatter(panel.xaxis.get_major_locator()))
     if told is None:
         return
@@ -94,7 +101,8 @@ def _draw_temperature(panel: Any, told: Mapping[str, Any], name: str, colour: st
 
 
 def _known(windows: Sequence[Mapping[str, Any]], name: str) -> list[Mapping[str, Any]]:
-    return [w for w in windows if None not in (w["parameters"][name]["value"], w["parameters"][name]["std"])]
+    told = ((window, window["parameters"].get(name, {})) for window in windows)
+    return [window for window, its in told if None not in (its.get("value"), its.get("std"))]
 
 
 def _points(panel: Any, at: Sequence[Any], windows: Sequence[Mapping[str, Any]], name: str, colour: str) -> None:
@@ -112,7 +120,7 @@ def _fan(panel: Any, ends: Sequence[Any], away: Sequence[float], line: Mapping[s
 
 def write_plot(rows: Sequence[Mapping[str, Any]], health: Mapping[str, Mapping[str, Any]], path: Path) -> None:
     """Write the courses as a PNG. FdhilError when there is nothing to plot or the file cannot be written."""
-    if not rows:
+    if not rows and not health:
         raise FdhilError("there is nothing to plot: no parameters were published yet; let the daemon see some rapids")
     figure = courses(rows, health)
     try:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from fdhil.records import PARAMETERS, UNITS
+from fdhil.records import PARAMETERS, RATIOS, UNITS
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -33,32 +33,49 @@ CAUSES = {
 
 
 def health(history: History, machine: MachineConfig, axis: str | None = None) -> dict[str, dict[str, Any]]:
-    """Return by axis ``slopes``, ``trends``, ``limits``, ``changes`` and their ``windows``, as JSON has them."""
-    stored = [w for w in history.windows(axis, limit=NEWEST_WINDOWS) if w.accepted and w.parameters]
+    """Return by axis ``slopes``, ``trends``, ``limits``, ``changes`` and their ``windows``, as JSON has them.
+
+    An axis without voltage has no accepted windows; its ratios to K follow friction and load all the same.
+    """
+    stored = [w for w in history.windows(axis, limit=NEWEST_WINDOWS) if w.parameters]
     told = {}
     for name in dict.fromkeys(window.axis for window in stored):
+        own = [window for window in stored if window.axis == name]
+        accepted = [window for window in own if window.accepted]
+        if not accepted:
+            if ratios := [window for window in own if _tells_ratios(window)]:
+                told[name] = of_axis(ratios, {}, RATIOS)
+            continue
         first = history.first_revision(name)
         limits = {}
         if first is not None:
             shares = machine.maintenance.model_dump()
             limits = {symbol: (value, shares[symbol]) for symbol, value in first.set.parameters.as_dict().items()}
-        told[name] = of_axis([window for window in stored if window.axis == name], limits)
+        told[name] = of_axis(accepted, limits)
     return told
 
 
-def of_axis(windows: Sequence[StoredWindow], limits: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
+def _tells_ratios(window: StoredWindow) -> bool:
+    """Return whether nothing but its missing voltage speaks against a window."""
+    told = (window.parameters or {}).get(RATIOS[0], {}).get("value") is not None
+    return told and len(window.reasons) == 1
+
+
+def of_axis(
+    windows: Sequence[StoredWindow], limits: Mapping[str, tuple[float, float]], symbols: Sequence[str] = PARAMETERS
+) -> dict[str, Any]:
     """Return an axis' health; ``limits`` maps a symbol to its first published value and the change that it may have."""
     import numpy as np
 
     from fdhil.identification.trends import slope, steps
 
-    values, stds = (_columns(windows, key) for key in ("value", "std"))
+    values, stds = (_columns(windows, key, symbols) for key in ("value", "std"))
     time_s = np.array([window.stamp.wall_s for window in windows])
     celsius = np.array([np.nan if w.temperature_c is None else w.temperature_c for w in windows], dtype=np.float64)
     known = bool(np.isfinite(celsius).all())
-    found = steps(values, stds, celsius if known else None)
+    found = steps(values, stds, celsius if known else None, symbols)
     told: dict[str, Any] = {"slopes": {}, "trends": {}, "limits": {}, "changes": _changes(found, windows)}
-    for k, symbol in enumerate(PARAMETERS):
+    for k, symbol in enumerate(symbols):
         since = max((step.row for step in found if step.name == symbol), default=0)
         y, std, kelvin = values[since:, k], stds[since:, k], celsius[since:]
         span_s = float(np.ptp(time_s[since:]))
@@ -75,15 +92,15 @@ def of_axis(windows: Sequence[StoredWindow], limits: Mapping[str, tuple[float, f
             told["trends"][symbol] = {"per_day": line.value, "std": line.std, **_interval(line.interval())} | rest
             if symbol in limits:
                 told["limits"] |= _limit(symbol, line, limits[symbol], float(time_s[-1]))
-    return told | {"windows": _rows(windows, values, stds)}
+    return told | {"windows": _rows(windows, values, stds, symbols)}
 
 
-def _columns(windows: Sequence[StoredWindow], key: str) -> Float:
-    """Return (n, 6) of the windows' values or standard deviations, NaN where one was not told."""
+def _columns(windows: Sequence[StoredWindow], key: str, symbols: Sequence[str]) -> Float:
+    """Return (n, k) of the windows' values or standard deviations, NaN where one was not told."""
     import numpy as np
 
-    told = [[(window.parameters or {}).get(name, {}).get(key) for name in PARAMETERS] for window in windows]
-    return np.array(told, dtype=np.float64).reshape(-1, len(PARAMETERS))
+    told = [[(window.parameters or {}).get(name, {}).get(key) for name in symbols] for window in windows]
+    return np.array(told, dtype=np.float64).reshape(-1, len(symbols))
 
 
 def _interval(interval: tuple[float, float]) -> dict[str, float]:
@@ -131,14 +148,15 @@ def _changes(found: Sequence[Step], windows: Sequence[StoredWindow]) -> list[dic
             s.name: {"before": s.before, "after": s.before + s.size, "std": s.std, "unit": UNITS[s.name]}
             for s in together
         }
-        cause = CAUSES.get(frozenset(parameters), "a changed drive or sensor")
+        moved_by = frozenset(name.removesuffix("/K") for name in parameters)
+        cause = CAUSES.get(moved_by, "a changed drive or sensor")
         told.append(
             {"window": window.number, "time": _date(window.stamp.wall_s), "cause": cause, "parameters": parameters}
         )
     return told
 
 
-def _rows(windows: Sequence[StoredWindow], values: Float, stds: Float) -> list[dict[str, Any]]:
+def _rows(windows: Sequence[StoredWindow], values: Float, stds: Float, symbols: Sequence[str]) -> list[dict[str, Any]]:
     """Return the windows as the plot and JSON have them: number, time, temperature, value and standard deviation."""
     import numpy as np
 
@@ -151,7 +169,7 @@ def _rows(windows: Sequence[StoredWindow], values: Float, stds: Float) -> list[d
             "time": _date(window.stamp.wall_s),
             "temperature_c": window.temperature_c,
             "parameters": {
-                name: {"value": told(v), "std": told(s)} for name, v, s in zip(PARAMETERS, row, spread, strict=True)
+                name: {"value": told(v), "std": told(s)} for name, v, s in zip(symbols, row, spread, strict=True)
             },
         }
         for window, row, spread in zip(windows, values, stds, strict=True)
@@ -186,7 +204,7 @@ def slope_rows(told: Mapping[str, Any]) -> list[list[str]]:
 
     slopes, trends, limits = (told[key] for key in ("slopes", "trends", "limits"))
     rows = []
-    for name in PARAMETERS:
+    for name in (*PARAMETERS, *RATIOS):
         if name in slopes or name in trends:
             cells = [
                 with_interval({"value": line[key], **line}) if (line := lines.get(name)) else "-"

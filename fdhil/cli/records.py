@@ -123,13 +123,14 @@ def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) ->
         parts = {key: {name: of_axis[key] for name, of_axis in told.items()} for key in HEALTH}
         click.echo(json.dumps({"schema": "fdhil-history-1", "revisions": rows} | parts))
         return
-    if not rows:
+    if not rows and not told:
         click.echo("no parameters were published yet")
         return
     from fdhil.cli.history_trends import show_health
     from fdhil.cli.status_view import show_history
 
-    show_history(rows)
+    if rows:
+        show_history(rows)
     show_health(told)
 
 

@@ -14,10 +14,9 @@ from fdhil.identification.filtering import impulse_response
 from fdhil.identification.identifiability import empty_estimate
 from fdhil.identification.motion import noise_levels
 from fdhil.identification.normal import inverse_gram
-from fdhil.records import PARAMETERS, Estimate, Float, Reason, Result, Window
+from fdhil.records import PARAMETERS, RATIOS, Estimate, Float, Reason, Result, Window
 
 METHOD = "least_squares"
-RATIOS = ("Jt/K", "ft/K", "Cd/K")  # kg.m2.A/(N.m), A.s, A
 
 
 def estimate_ratios(windows: Sequence[Window], settings: Identification) -> Estimate:

@@ -6,7 +6,7 @@ Pure: rows in, figures out; nothing here reads a clock.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +23,8 @@ NEAR = 8  # rows on either side in which a step must be seen too
 BEYOND_CHANCE = 5.0
 COLLINEAR = 1e-4  # share of a covariate that the others must leave
 # a smaller step is not told: drift that is no straight line looks like one
-LEAST_STEP: Mapping[str, float] = {"R": 0.05, "L": 0.08, "K": 0.03, "Jt": 0.02, "ft": 0.15, "Cd": 0.10}
+LEAST_STEP: dict[str, float] = {"R": 0.05, "L": 0.08, "K": 0.03, "Jt": 0.02, "ft": 0.15, "Cd": 0.10}
+LEAST_STEP |= {f"{name}/K": LEAST_STEP[name] for name in ("Jt", "ft", "Cd")}  # as K hardly moves
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,13 +130,15 @@ def crossing(line: Slope, limit: float) -> Crossing | None:
     return Crossing(line.at + apart / line.value, line.at + (b - root) / a, line.at + (b + root) / a)
 
 
-def steps(values: Float, stds: Float, temperature: Float | None = None) -> list[Step]:
-    """Return the steps of all parameters (n, 6) with ``stds`` (n, 6), by row; rows are windows in their order.
+def steps(
+    values: Float, stds: Float, temperature: Float | None = None, names: Sequence[str] = PARAMETERS
+) -> list[Step]:
+    """Return the steps of the parameters ``names`` (n, k) with ``stds`` (n, k), by row; rows are windows in order.
 
     Steady drift, a slow curve and what follows ``temperature`` (n,) are no steps.
     """
-    found = [s for k, name in enumerate(PARAMETERS) for s in _steps_of(name, values[:, k], stds[:, k], temperature)]
-    return sorted(found, key=lambda step: (step.row, PARAMETERS.index(step.name)))
+    found = [s for k, name in enumerate(names) for s in _steps_of(name, values[:, k], stds[:, k], temperature)]
+    return sorted(found, key=lambda step: (step.row, names.index(step.name)))
 
 
 def _steps_of(name: str, values: Float, stds: Float, temperature: Float | None) -> list[Step]:

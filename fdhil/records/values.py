@@ -13,6 +13,7 @@ Int = npt.NDArray[np.int64]
 Bool = npt.NDArray[np.bool_]
 
 PARAMETERS = ("R", "L", "K", "Jt", "ft", "Cd")
+RATIOS = ("Jt/K", "ft/K", "Cd/K")  # what current and speed alone tell
 UNITS: Mapping[str, str] = {
     "R": "ohm",
     "L": "H",
@@ -20,7 +21,6 @@ UNITS: Mapping[str, str] = {
     "Jt": "kg.m2",
     "ft": "N.m.s",
     "Cd": "N.m",
-    # what current and speed alone tell
     "Jt/K": "A.s2/rad",
     "ft/K": "A.s/rad",
     "Cd/K": "A",
