@@ -1,0 +1,59 @@
+"""history of an axis without a voltage sensor: its ratios to K still tell wear and a changed load."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil.config import Identification
+from fdhil.records import frozen
+from fdhil.store.history import History, Stamp
+from fdhil.validation import analyse
+from tests.daemon.machine import config_of
+from tests.daemon.shop import BENCH, fdhil
+from tests.identification.recorded import windows
+
+START_S, DAYS, LOADED_ON_DAY = 1_800_000_000.0, 20, 12
+WEAR_PER_DAY = 0.01  # of Cd/K
+
+
+@pytest.fixture(scope="module")
+def deaf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A machine that measures no voltage, whose friction wears and whose table is loaded on day 12."""
+    tmp_path = tmp_path_factory.mktemp("deaf")
+    path = tmp_path / "machine.toml"
+    path.write_text(BENCH)
+    analysed = analyse(replace(windows(0.003)[0], axis="X", voltage_v=None), Identification())
+    assert analysed.estimate is not None
+    deviations = np.sqrt(np.diag(analysed.estimate.covariance))
+    rng = np.random.default_rng(4)
+    with History.open(config_of(tmp_path, ("X",)).store.directory) as history:
+        for day in range(DAYS):
+            values = analysed.estimate.values + deviations * rng.standard_normal(deviations.size)
+            values[6] *= 1.13 if day >= LOADED_ON_DAY else 1.0
+            values[8] *= 1.0 + WEAR_PER_DAY * day
+            estimate = replace(analysed.estimate, values=frozen(values))
+            history.add_window(replace(analysed, estimate=estimate), "", Stamp(START_S + 86_400.0 * day, "boot", day))
+    return path
+
+
+def test_ratios_tell_wear_and_a_changed_load(deaf: Path, capsys: Any) -> None:
+    document = json.loads(fdhil("history", deaf, "--json", capsys=capsys)[1])
+    wear = document["trends"]["X"]["Cd/K"]
+    assert wear["low"] > 0
+    (change,) = document["changes"]["X"]
+    assert change["cause"] == "a changed load"
+    assert list(change["parameters"]) == ["Jt/K"]
+
+
+def test_ratios_are_shown_where_nothing_else_is_published(deaf: Path, capsys: Any, tmp_path: Path) -> None:
+    plot = tmp_path / "ratios.png"
+    shown = fdhil("history", deaf, "--plot", plot, capsys=capsys)[1]
+    assert "Cd/K A" in shown
+    assert "a changed load" in shown
+    assert plot.stat().st_size > 10_000
