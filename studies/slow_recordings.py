@@ -132,13 +132,13 @@ def _voltage_offset(rng: Rng, sensed: Sensed) -> tuple[Sensed, float]:
 
 
 def _voltage_stuck(rng: Rng, sensed: Sensed) -> tuple[Sensed, float]:
-    """Seconds for which the sensor repeats what a working one would have changed, as ``signal_faults.stuck`` draws."""
+    """Seconds for which the sensor repeats one value while the voltage moves."""
     begin, end = sensed.moving
     while True:
         length = max(4, round(rng.uniform(0.04, 0.1) / sensed.period_s))
         start = int(rng.uniform(begin, end - length))
         values = sensed.voltage.copy()
-        if sensed.sensor.log_chance(values[start], start + 1, start + length) < signal_faults.BY_CHANCE:
+        if sensed.sensor.moves(start, start + length):
             break
     values[start : start + length] = values[start]
     return sensed.spoilt(values), length * sensed.period_s

@@ -19,6 +19,7 @@ from fdhil.guard.client import GuardClient
 from fdhil.guard.interlocks import FACTS
 from fdhil.prediction import contour_error_um
 from fdhil.prediction.models import nominal_models
+from fdhil.program import program_digest
 from fdhil.records import Float
 from tests.integration.conftest import PATIENCE_S, Bench
 from tests.integration.test_guard import DIGEST, client, sections
@@ -78,8 +79,9 @@ def test_a_program_longer_than_the_ring(bench: Bench, client: GuardClient, tmp_p
     bench.command('{"command": "nc", "on": true}')
     bench.event("nc")
     models = nominal_models(bench.config)
-    keep(tmp_path, "key", lambda body: check(demand, models, bench.config, body, lambda told: None))
-    checked = Checked.find(tmp_path, "key")
+    digest = program_digest(demand)
+    keep(tmp_path, "key", lambda body: check(demand, digest, models, bench.config, body, lambda told: None))
+    checked = Checked.find(tmp_path, "key", tmp_path)
     assert checked is not None
     stream = Stream(checked, DIGEST, 0.001)
     piece = stream.take(FIRST_S)

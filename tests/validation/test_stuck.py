@@ -113,9 +113,7 @@ def test_the_fault_of_the_study_changes_what_a_working_sensor_had_read() -> None
         assert any((after.signals[name] != before.signals[name]).any() for name in FIELDS)
 
 
-def test_how_likely_a_working_sensor_repeats_its_reading() -> None:
-    ramp = Sensor(np.array([0.0, 0.5, 1.0]), 0.5, 1.0)
-    # probabilities of the normal distribution within +-1, 0..2 and 1..3 standard deviations
-    by_hand = math.log(0.682689492 * 0.477249868 * 0.157305356)
-    assert ramp.log_chance(0.0, 0, 3) == pytest.approx(by_hand, rel=1e-6)
-    assert ramp.log_chance(40.0, 0, 3) < -3000.0
+def test_a_sensor_is_said_to_move_beyond_its_noise_and_step_only() -> None:
+    ramp = Sensor(np.linspace(0.0, 20.0, 21), 0.6, 0.8)
+    assert ramp.moves(0, 8)
+    assert not ramp.moves(0, 7)
