@@ -17,13 +17,15 @@ import numpy as np
 
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.motion import resolution
-from fdhil.identification.windows import moving_range
+from fdhil.identification.windows import longest, moving_range
 from fdhil.records import Float, Reason, Window
 from fdhil.validation.bridging import Bridge
-from fdhil.validation.plausibility import beyond_chance, signals_of, wakes_with_a_jump
+from fdhil.validation.plausibility import RAIL_SAMPLES, beyond_chance, signals_of, wakes_with_a_jump
 from fdhil.validation.readings import log_chance
 
 CHANCE = 2e-3  # of a false alarm of one signal in one good window, were its runs explained by what is drawn at random
+NOISES = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}
+LOG_CLIPPED = math.log(1e-6)  # a few rows at an extreme, which lies where the voltage's course is known least
 SHORTEST_S = 0.003
 TOLD_S = 0.010  # the shortest run that its neighbours or the other signals are asked about
 LONGEST_RUNS = 2  # of a signal that are judged: a sensor sticks longer than chance repeats
@@ -83,6 +85,30 @@ def stuck_values(window: Window, fit: Fit | None) -> Iterator[Reason]:
                 )
                 yield Reason("StuckValue", text, "check the sensor or the object's mapping")
                 break
+    if bridge is not None and fit is not None:
+        yield from _clipped_peaks(window, fit, bridge)
+
+
+def _clipped_peaks(window: Window, fit: Fit, bridge: Callable[[], Bridge]) -> Iterator[Reason]:
+    """Yield a reason for each sensor whose extreme was cut off for too few rows to show by themselves.
+
+    Model and the other sensors tell where it should have been.
+    """
+    for name, unit, values in signals_of(window):
+        noise = getattr(fit.problem.noises[0], NOISES[name])
+        for rail in (np.nanmax(values), np.nanmin(values)):
+            start, end = longest(values == rail)
+            if rail == 0.0 or not RAIL_SAMPLES <= end - start < TOLD_S / window.dt_s:
+                continue
+            if beyond_chance(values, start, end - 1):
+                continue  # this is told without a model
+            crossing = bridge().crossing(name, start, end)
+            if crossing is not None and crossing.log_chance(start, end, float(rail), float(noise)) < LOG_CLIPPED:
+                text = (
+                    f"{name} stays at its extreme {rail:.6g} {unit} for {end - start} samples from "
+                    f"{window.start_s + start * window.dt_s:.3f} s, where the other signals tell more"
+                )
+                yield Reason("Saturated", text, "use a larger measuring range")
 
 
 def _bears(fit: Fit) -> bool:

@@ -14,7 +14,7 @@ from fdhil.records import Window, frozen
 from fdhil.validation import analyse
 from fdhil.validation.readings import log_chance
 from fdhil.validation.stuck import noise_steps, stuck_values
-from studies import drives, signal_faults
+from studies import drives, faults, signal_faults
 from studies.scenes import Sensor, demand_of, measured, recorded
 from tests.identification.recorded import windows
 from tests.validation.test_episodes import SCENE
@@ -117,3 +117,16 @@ def test_a_sensor_is_said_to_move_beyond_its_noise_and_step_only() -> None:
     ramp = Sensor(np.linspace(0.0, 20.0, 21), 0.6, 0.8)
     assert ramp.moves(0, 8)
     assert not ramp.moves(0, 7)
+
+
+def test_a_peak_that_is_cut_off_for_three_rows_is_told_by_the_model() -> None:
+    clipped = faults.KINDS["sensor clipped"].make(np.random.default_rng([41, 2, 360]))
+    (window,) = find_windows(clipped.recording)
+    (reason,) = analyse(window, SETTINGS).verdict.reasons
+    assert reason.code == "Saturated"
+    assert "for 3 samples" in reason.text
+
+
+def test_a_peak_that_is_not_cut_off_is_believed() -> None:
+    for seed in range(4):
+        assert "Saturated" not in _codes(_coarse(seed, voltage=0.002))
