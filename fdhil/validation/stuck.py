@@ -25,7 +25,7 @@ from fdhil.validation.readings import log_chance
 
 CHANCE = 2e-3  # of a false alarm of one signal in one good window, were its runs explained by what is drawn at random
 NOISES = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}
-LOG_CLIPPED = math.log(1e-6)  # a few rows at an extreme, which lies where the voltage's course is known least
+LOG_CLIPPED = math.log(1e-6)  # at an extreme the voltage's course within a row is known least
 SHORTEST_S = 0.003
 TOLD_S = 0.010  # the shortest run that its neighbours or the other signals are asked about
 LONGEST_RUNS = 2  # of a signal that are judged: a sensor sticks longer than chance repeats
@@ -90,7 +90,7 @@ def stuck_values(window: Window, fit: Fit | None) -> Iterator[Reason]:
 
 
 def _clipped_peaks(window: Window, fit: Fit, bridge: Callable[[], Bridge]) -> Iterator[Reason]:
-    """Yield a reason for each sensor whose extreme was cut off for too few rows to show by themselves.
+    """Yield a reason for each sensor whose extreme was cut off where its rows do not show it by themselves.
 
     Model and the other sensors tell where it should have been.
     """
@@ -98,7 +98,7 @@ def _clipped_peaks(window: Window, fit: Fit, bridge: Callable[[], Bridge]) -> It
         noise = getattr(fit.problem.noises[0], NOISES[name])
         for rail in (np.nanmax(values), np.nanmin(values)):
             start, end = longest(values == rail)
-            if rail == 0.0 or not RAIL_SAMPLES <= end - start < TOLD_S / window.dt_s:
+            if rail == 0.0 or end - start < RAIL_SAMPLES:
                 continue
             if beyond_chance(values, start, end - 1):
                 continue  # this is told without a model
