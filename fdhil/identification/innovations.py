@@ -14,12 +14,9 @@ import numpy as np
 from numba import njit
 
 from fdhil.identification import slow_voltage
-from fdhil.identification.motion import BROKEN, UNKNOWN, Motion, Noise
+from fdhil.identification.motion import BROKEN, DIFFUSE, UNKNOWN, Motion, Noise
 from fdhil.model.feed_drive import transition
 from fdhil.records import Float, Parameters
-
-DIFFUSE = 1e6  # variance, in units of the measurement's, of a state about which nothing is known
-
 
 NOTHING: Float = np.zeros(0)
 

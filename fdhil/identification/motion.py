@@ -18,6 +18,7 @@ UNKNOWN = 0  # stuck, reversing or about to move: the friction torque is not kno
 # what the model can explain at best, as a share of a signal's peak: the voltage's course within a sample is not known
 SHAPE_SHARE = (3e-4, 1e-4, 1e-4)
 BROKEN = 9  # a sample is lost: nothing is known over this interval
+DIFFUSE = 1e6  # variance, in units of the measurement's, of a state about which nothing is known
 
 Modes = npt.NDArray[np.int8]
 

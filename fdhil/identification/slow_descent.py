@@ -14,7 +14,7 @@ import numpy as np
 
 from fdhil.identification.motion import Motion, Noise
 from fdhil.identification.normal import inverse_of
-from fdhil.identification.slow_voltage import innovations_of
+from fdhil.identification.slow_voltage import Innovations, innovations_of
 from fdhil.records import Float
 
 STEPS = 60
@@ -26,39 +26,19 @@ GAIN = 1e-3  # of twice the log likelihood: a step that gains less moves nothing
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
-    """The innovations (m,) of all windows for one set of parameters, and their variances (m,)."""
-
-    values: Float
-    variance: Float
-
-    @property
-    def whitened(self) -> Float:
-        """The innovations in standard deviations."""
-        white: Float = self.values / np.sqrt(self.variance)
-        return white
-
-    @property
-    def cost(self) -> float:
-        """Minus twice the logarithm of the likelihood, but for its constant; infinite where it is none."""
-        value = float(self.whitened @ self.whitened + np.log(self.variance).sum())
-        return value if np.isfinite(value) else np.inf
-
-
-@dataclass(frozen=True, slots=True)
 class Likelihood:
     """Windows with a slow voltage and their noise levels."""
 
     motions: tuple[Motion, ...]
     noises: tuple[Noise, ...]
 
-    def at(self, theta: Float, ordered_for_s: float) -> Point:
-        """Return the innovations for ``theta`` (7,), rows and samples in the order of a delay of ``ordered_for_s``."""
+    def at(self, theta: Float, ordered_for_s: float) -> Innovations:
+        """Return all innovations for ``theta`` (7,), rows and samples in the order of a delay of ``ordered_for_s``."""
         pairs = zip(self.motions, self.noises, strict=True)
         made = [innovations_of(m, theta, s.vector() ** 2, ordered_for_s) for m, s in pairs]
-        return Point(np.concatenate([one.values for one in made]), np.concatenate([one.variance for one in made]))
+        return Innovations(np.concatenate([one.values for one in made]), np.concatenate([one.variance for one in made]))
 
-    def slopes(self, here: Point, theta: Float, free: Sequence[int], sizes: Float) -> tuple[Float, Float]:
+    def slopes(self, here: Innovations, theta: Float, free: Sequence[int], sizes: Float) -> tuple[Float, Float]:
         """Return minus the derivatives (m, k) of innovations by ``free``, in deviations, and of half the log variance.
 
         The order of rows and samples is held: an innovation must stay the same row's. A sample that would so be taken

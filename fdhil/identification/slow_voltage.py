@@ -21,10 +21,9 @@ import numpy.typing as npt
 from numba import njit
 
 from fdhil.identification.filtering import moving_mean
-from fdhil.identification.motion import UNKNOWN, Motion
+from fdhil.identification.motion import DIFFUSE, UNKNOWN, Motion
 from fdhil.records import Float
 
-DIFFUSE = 1e6  # variance, in units of the measurement's, of a state about which nothing is known
 STATES = 4
 NO_SAMPLE = -1
 
@@ -69,6 +68,12 @@ class Innovations:
     def logdet(self) -> float:
         """Logarithm of the determinant of their covariance."""
         return float(np.log(self.variance).sum())
+
+    @property
+    def cost(self) -> float:
+        """Minus twice the logarithm of their likelihood, but for its constant; infinite where it is none."""
+        value = float(self.whitened @ self.whitened) + self.logdet
+        return value if np.isfinite(value) else np.inf
 
 
 def marks_of(motion: Motion, delay_s: float, ordered_for_s: float) -> Marks:

@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numba import njit
 
-from fdhil.identification.innovations import DIFFUSE, Gains
-from fdhil.identification.motion import BROKEN, UNKNOWN, Motion
+from fdhil.identification.innovations import Gains
+from fdhil.identification.motion import BROKEN, DIFFUSE, UNKNOWN, Motion
 from fdhil.identification.slow_voltage import innovations_of
 from fdhil.model.feed_drive import transition
 from fdhil.records import Float

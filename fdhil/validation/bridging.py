@@ -16,11 +16,10 @@ from numba import njit
 
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.filtering import moving_mean
-from fdhil.identification.motion import BROKEN, UNKNOWN
+from fdhil.identification.motion import BROKEN, DIFFUSE, UNKNOWN
 from fdhil.model.feed_drive import transition
 from fdhil.records import Float
 
-DIFFUSE = 1e6  # variance, in units of the measurement's, of a state about which nothing is known
 BESIDE_S = 0.040  # rows beside the doubted ones that are taken in: some time constants of a winding
 SMOOTHING_S = 0.004
 COURSE = 0.3  # of a voltage's change from row to row: what is not known of its course between them

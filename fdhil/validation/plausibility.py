@@ -12,6 +12,7 @@ from fdhil.identification.windows import carried, longest, moving_range, smooth
 from fdhil.records import Bool, Float, Reason, Window
 from fdhil.validation.backlash import backlash
 from fdhil.validation.episode import interruptions
+from fdhil.validation.readings import alike
 
 CHANCE = 1e-4  # of a false alarm of one check on one good window
 TOLERATED_GAP = 3  # rows: a longer gap hides what the drive did
@@ -132,7 +133,7 @@ def likely_reading(values: Float, step: float) -> float:
         return 0.0
     # what is read in steps has the steps' own scatter too
     variance = float(np.mean(third**2)) / 20.0 - step**2 / 12
-    return math.erf(step / math.sqrt(8 * max(variance, (RESOLVED * step) ** 2)))
+    return alike(math.sqrt(max(variance, (RESOLVED * step) ** 2)) / step)
 
 
 def all_within(length: int, others: Bool) -> float:

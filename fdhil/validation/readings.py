@@ -24,6 +24,11 @@ _ROOT_2, _ROOT_2PI = math.sqrt(2.0), math.sqrt(2.0 * math.pi)
 _FAR = -25.0  # standard deviations beyond which the normal integral is its asymptote
 
 
+def alike(noise: float) -> float:
+    """Return how likely a constant in the middle of a step is read there; its ``noise`` is in steps."""
+    return math.erf(1.0 / (math.sqrt(8.0) * noise))
+
+
 def _within_plain(low: float, high: float) -> tuple[float, float, float]:
     """Return log p of a standard normal number between ``low`` and ``high``, and the density over p at both."""
     # the mirror image keeps the difference of two tails exact

@@ -19,7 +19,7 @@ from fdhil.identification.slow_voltage import innovations_of
 from fdhil.records import Float, Reason, Window
 from fdhil.validation.bridging import log_beyond
 from fdhil.validation.plausibility import at_rest
-from fdhil.validation.slow_readings import CHANCE, LEAST_NOISE_SAMPLES, alike, runs
+from fdhil.validation.slow_readings import CHANCE, LEAST_NOISE_SAMPLES, likely_same, runs
 
 SURE = 5.5  # standard deviations
 LEAST_OFFSET = 0.01  # of the peak of voltage or current
@@ -50,7 +50,7 @@ def _stuck(window: Window, fit: Fit, volts: Float) -> Iterator[Reason]:
     errors, spread = made.values[2 * motion.n :], np.sqrt(made.variance[2 * motion.n :])
     step = resolution(volts[np.isfinite(volts)])
     beyond = np.maximum(np.abs(errors) - step / 2, 0.0) / spread  # what its step does not hide
-    same = math.log(max(alike(volts, max(step, 1e-12)), 1e-300))
+    same = math.log(max(likely_same(volts, max(step, 1e-12)), 1e-300))
     for start, end in runs(volts):
         squares = float(beyond[start + 1 : end] @ beyond[start + 1 : end])
         count = end - start - 1

@@ -14,6 +14,7 @@ import numpy as np
 from fdhil.identification.motion import resolution
 from fdhil.identification.windows import carried, noise_of, smooth
 from fdhil.records import Float, Reason, Window
+from fdhil.validation.readings import alike
 
 LEAST_SAMPLES = 3
 MOVED_SAMPLES = 4  # equal while the speed changes: shorter runs may lie where current and speed balance
@@ -36,7 +37,7 @@ def slow_voltage_faults(window: Window) -> Iterator[Reason]:
     )
     rails = (float(np.nanmax(volts)), float(np.nanmin(volts)))
     step = max(resolution(volts[np.isfinite(volts)]), 1e-12)
-    same = alike(volts, step)
+    same = likely_same(volts, step)
     for start, end in runs(volts):
         moving = np.abs(speed[start:end]) > MOVING * window.rapid_speed_rad_s
         if not moving.all() or not _strange(window, volts, speed, (start, end), step, same):
@@ -71,7 +72,7 @@ def _strange(window: Window, volts: Float, speed: Float, run: tuple[int, int], s
     return volts.size * same ** (end - start - 1) < CHANCE
 
 
-def alike(volts: Float, step: float) -> float:
+def likely_same(volts: Float, step: float) -> float:
     """Return how likely a constant in the middle of a step is read there, by the noise of third differences."""
     noise = math.sqrt(max(noise_of(carried(volts)) ** 2 - step**2 / 12.0, (LEAST_NOISE * step) ** 2))
-    return math.erf(step / (math.sqrt(8.0) * noise))
+    return alike(noise / step)

@@ -21,7 +21,7 @@ from fdhil.identification.windows import longest, moving_range
 from fdhil.records import Float, Reason, Window
 from fdhil.validation.bridging import Bridge
 from fdhil.validation.plausibility import RAIL_SAMPLES, beyond_chance, signals_of, wakes_with_a_jump
-from fdhil.validation.readings import log_chance
+from fdhil.validation.readings import alike, log_chance
 
 CHANCE = 2e-3  # of a false alarm of one signal in one good window, were its runs explained by what is drawn at random
 NOISES = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}
@@ -147,11 +147,11 @@ def _quieter_than_noise(signal: Signal, start: int, last: int, limit: float) -> 
     readings, rows = signal.readings, SIDE * (last - start + 1)
     if signal.noise < TOLD_NOISE:
         return False
-    if (last - start) * math.log(_alike(signal.noise)) > limit:
+    if (last - start) * math.log(alike(signal.noise)) > limit:
         return False
     sides = (readings[max(0, start - rows) : start], readings[last + 1 : last + 1 + rows])
     least = min([noise_steps(side) for side in sides if side.size >= LEAST_NOISE_ROWS], default=signal.noise)
-    return least >= TOLD_NOISE and (last - start) * math.log(_alike(least)) < limit
+    return least >= TOLD_NOISE and (last - start) * math.log(alike(least)) < limit
 
 
 def noise_steps(readings: Float) -> float:
@@ -165,11 +165,6 @@ def noise_steps(readings: Float) -> float:
         before, kept = power, square[square <= max(9.0 * power, 1.0)]
         power = float(kept.mean())
     return math.sqrt(max(power / 20.0 - 1.0 / 12.0, LEAST_NOISE**2))
-
-
-def _alike(noise: float) -> float:
-    """Return how likely a constant in the middle of a step is read there."""
-    return math.erf(1.0 / (math.sqrt(8.0) * noise))
 
 
 def _steady_rows(signal: Signal, start: int, last: int) -> tuple[int, int]:

@@ -14,7 +14,7 @@ import pytest
 
 from fdhil.cia402 import Object, State
 from fdhil.config import MachineConfig
-from fdhil.drivers import canopen_sdo, commissioning, commissioning_checks, commissioning_watchdog
+from fdhil.drivers import commissioning, commissioning_checks, commissioning_watchdog
 from fdhil.drivers.commissioning import (
     CommissioningRecord,
     check_axis,
@@ -34,15 +34,7 @@ from fdhil.errors import ConnectError, DeviceError, DriveFault, ProtocolError, S
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
 
-
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorter waits than on a real machine; the simulated drive settles sooner."""
-    monkeypatch.setattr(commissioning_checks, "LISTEN_S", 0.25)
-    monkeypatch.setattr(canopen_sdo, "QUIET_S", 0.1)
-    monkeypatch.setattr(canopen_sdo, "RESPONSE_TIMEOUT_S", 0.2)
-    monkeypatch.setattr(commissioning, "SETTLE_CYCLES", 120)
-    monkeypatch.setattr(commissioning, "AVERAGE_CYCLES", 60)
+pytestmark = pytest.mark.usefixtures("quick_commissioning")
 
 
 def config(**sections: Any) -> MachineConfig:

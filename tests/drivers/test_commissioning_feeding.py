@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from fdhil.config import MachineConfig
-from fdhil.drivers import canopen_sdo, commissioning, commissioning_checks
 from fdhil.drivers.commissioning import commission
 from fdhil.errors import DeviceError, DriveFault
 from tests.drivers.peer import DrivePeer
@@ -39,14 +38,7 @@ class Spoilt(DrivePeer):
         return self.drive.dictionary.number(0x60B1), self.drive.dictionary.number(0x60B2)
 
 
-@pytest.fixture(autouse=True)
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shorter waits than on a real machine."""
-    monkeypatch.setattr(commissioning_checks, "LISTEN_S", 0.25)
-    monkeypatch.setattr(canopen_sdo, "QUIET_S", 0.1)
-    monkeypatch.setattr(canopen_sdo, "RESPONSE_TIMEOUT_S", 0.2)
-    monkeypatch.setattr(commissioning, "SETTLE_CYCLES", 120)
-    monkeypatch.setattr(commissioning, "AVERAGE_CYCLES", 60)
+pytestmark = pytest.mark.usefixtures("quick_commissioning")
 
 
 @pytest.fixture

@@ -52,6 +52,14 @@ class Bench:
         return can.Bus(**place)
 
 
+def take_voltage_from_sensors(bench: Bench) -> Bench:
+    """Tell the drivers to take the voltage from the Modbus sensors."""
+    for axis, settings in bench.config.axis.items():
+        voltage = settings.voltage.model_copy(update={"source": "modbus"})
+        bench.config.axis[axis].__dict__["voltage"] = voltage
+    return bench
+
+
 def digested(pipeline: AxisPipeline, records: Sequence[Any]) -> list[Outcome]:
     """Feed a pipeline as the daemon does: what an operator should know is for the operator."""
     return [o for record in records if not isinstance(record, Notice) for o in pipeline.feed(record)]

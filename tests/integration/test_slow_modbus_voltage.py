@@ -12,7 +12,7 @@ import pytest
 
 from fdhil.pipeline import AxisPipeline
 from fdhil.records import Outcome, ParameterSet, WindowOutcome
-from tests.integration.conftest import Bench, digested
+from tests.integration.conftest import Bench, digested, take_voltage_from_sensors
 from tests.integration.test_loop import TRUE, recorded, shuttle
 
 pytestmark = pytest.mark.timeout(240)
@@ -33,10 +33,7 @@ def sections() -> dict[str, Any]:
 @pytest.fixture
 def bench(bench: Bench) -> Bench:
     """The drivers are told to take the voltage from the sensors."""
-    for axis, settings in bench.config.axis.items():
-        voltage = settings.voltage.model_copy(update={"source": "modbus"})
-        bench.config.axis[axis].__dict__["voltage"] = voltage
-    return bench
+    return take_voltage_from_sensors(bench)
 
 
 def outcomes_of(bench: Bench, folder: Path) -> dict[str, list[Outcome]]:
