@@ -43,7 +43,7 @@ def interruptions(window: Window) -> Iterator[Reason]:
     seen = np.clip(speed[a:b], 0.0, plateau)
     reason = (
         _left_behind(window, b)
-        or _moves_on(window, b, plateau)
+        or _moves_on(window, a, b, plateau)
         or _dip(window, seen, plateau, a)
         or _held(window, seen, plateau, a)
     )
@@ -88,12 +88,19 @@ def _dip(window: Window, seen: Float, plateau: float, begin: int) -> str | None:
 
 
 def _held(window: Window, seen: Float, plateau: float, begin: int) -> str | None:
-    rate = np.abs(np.gradient(seen))
-    between = (seen > BETWEEN[0] * plateau) & (seen < BETWEEN[1] * plateau)
-    start, end = longest(between & (rate < HELD_RATE * rate.max()))
+    reach = max(1, round(SMOOTHING_S / 2 / window.dt_s))  # the position's steps hide the rate from row to row
+    if seen.size <= 2 * reach:
+        return None
+    rate = np.abs(seen[2 * reach :] - seen[: -2 * reach])
+    middle = seen[reach:-reach]
+    between = (middle > BETWEEN[0] * plateau) & (middle < BETWEEN[1] * plateau)
+    start, end = (row + reach for row in longest(between & (rate < HELD_RATE * rate.max())))
     if (end - start) * window.dt_s < HELD_S:
         return None
     level = float(np.median(seen[start:end]))
+    demand = _course(window.demand_mm, window, RAMP_S)
+    if demand is not None and np.median(demand[begin + start : begin + end]) > BETWEEN[1] * plateau:
+        return None  # the drive creeps towards a speed that is demanded already
     return (
         f"the speed is held at {level:.4g} mm/s for {1e3 * (end - start) * window.dt_s:.0f} ms from "
         f"{_at(window, begin + start)} s, beside its plateau of {plateau:.4g} mm/s"
@@ -130,15 +137,17 @@ def _left_behind(window: Window, end: int) -> str | None:
     return f"the axis comes to rest {abs(least):.3g} mm from its demand"
 
 
-def _moves_on(window: Window, end: int, plateau: float) -> str | None:
-    """Tell whether the drive only swings through rest after a drop of the speed that its demand does not end."""
+def _moves_on(window: Window, begin: int, end: int, plateau: float) -> str | None:
+    """Tell whether the drive only swings through rest, before or after the move, while its demand goes on."""
     speed = _course(window.demand_mm, window, RAMP_S)
-    if speed is None or window.stages.brake is None:
+    if speed is None:
         return None
-    least = float(speed[max(0, end - max(1, round(RAMP_S / window.dt_s))) :].min())
-    if least <= MOVES_ON * plateau:
-        return None
-    return f"the demand moves on with {least:.4g} mm/s where the drive passes through rest"
+    reach = max(1, round(RAMP_S / window.dt_s))
+    stages = window.stages
+    for ended, part in ((stages.accelerate, speed[: begin + reach]), (stages.brake, speed[max(0, end - reach) :])):
+        if ended is not None and (least := float(part.min())) > MOVES_ON * plateau:
+            return f"the demand moves on with {least:.4g} mm/s where the drive passes through rest"
+    return None
 
 
 def _at(window: Window, row: int) -> str:

@@ -8,7 +8,6 @@ both beyond chance and large enough to matter refuses a window. Whiteness over l
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,19 +20,16 @@ from fdhil.identification.filtering import moving_mean
 from fdhil.identification.innovations import innovations
 from fdhil.identification.motion import Motion
 from fdhil.identification.normal import inverse_of
-from fdhil.identification.slow_voltage import innovations_of, left_open_v
-from fdhil.records import Float, Reason, Window
+from fdhil.identification.slow_voltage import innovations_of
+from fdhil.records import Float, Reason
 
-BEYOND_CHANCE = 5.5  # standard deviations: about 4e-8 a test, some hundred tests a window
+BEYOND_CHANCE = 5.0  # standard deviations: 6e-7 a test, some hundred tests a window
 EDGES = 20  # instants at which a load may begin or end, or a gain may step
 LEAST_TORQUE = 0.01  # of the peak torque
 LEAST_GAIN = 0.01  # what pooled windows may differ in K
 LEAST_OFFSET = 0.01  # of the signal's peak
 IMITATED = 1e-6  # share of a direction below which only rounding is left of it
 LAGS = 25
-WHITENESS_BEYOND_CHANCE = 5.0
-PRACTICAL_CORRELATION = 0.25  # smaller ones come from the voltage's course within a sample and do no harm
-NOISE_RATIO = 1.6
 SLOPE_S = 0.005  # over which the acceleration is taken
 _KINDS = {"current": sweeps.CURRENT, "speed": sweeps.SPEED}
 STRIBECK_SPEEDS = (0.01, 0.03, 0.06, 0.12)  # of the rapid speed
@@ -102,7 +98,7 @@ class Bench:
 
     def gain_answers(self, name: str, courses: Float) -> Float:
         """Return minus the change (m, q) of innovations when the gain of ``name`` grows by ``courses`` (q, n)."""
-        motion = self.motion if self.motion.slow is None else self._foretold()
+        motion = self._foretold()
         if name != "voltage":
             return self._answers(_KINDS[name], getattr(motion, name) * courses, None)
         at_samples = np.array([motion.at_voltage(c) for c in courses])
@@ -114,6 +110,12 @@ class Bench:
         A reading holds its own innovation. Of a gain that the parameters imitate, that alone would be left.
         """
         motion, fit = self.motion, self.fit
+        if motion.slow is None:
+            white, whiteners = fit.residuals.reshape(-1, 2), fit.problem.filters[0].whiteners
+            safe = np.where(motion.observed[:, None], whiteners, 1.0)
+            current = white[:, 0] / safe[:, 0]
+            speed = (white[:, 1] - safe[:, 1] * current) / safe[:, 2]
+            return replace(motion, current=motion.current - current, speed=motion.speed - speed)
         made = innovations_of(motion, fit.theta, fit.problem.noises[0].vector() ** 2, float(fit.theta[6])).values
         rows = made[: 2 * motion.n].reshape(-1, 2)
         return replace(
@@ -323,75 +325,3 @@ def _low_speed_friction(bench: Bench) -> Finding:
         statistic,
         amplitude,
     )
-
-
-def whiteness(fit: Fit) -> Iterator[Reason]:
-    """Yield a reason where an autocorrelation of the innovations is neither chance (over all lags) nor harmless."""
-    motion = fit.problem.motions[0]
-    rows = (np.abs(motion.mode) == 1) & motion.observed
-    e = fit.residuals[: 2 * motion.n].reshape(-1, 2)[rows]
-    if e.shape[0] < 4 * LAGS:
-        return
-    limit = max(WHITENESS_BEYOND_CHANCE / np.sqrt(e.shape[0]), PRACTICAL_CORRELATION)
-    for k, name in enumerate(("current", "speed")):
-        if name == "current" and motion.slow is not None:
-            continue  # a slow voltage does not foretell the current from row to row
-        power = float(e[:, k] @ e[:, k])
-        correlations = np.array([e[lag:, k] @ e[:-lag, k] for lag in range(1, LAGS + 1)]) / power
-        if name == "current":  # noise levels may be fitted so as to hide a part of what is expected
-            expected = expected_correlation(fit)
-            correlations = correlations - np.clip(correlations, np.minimum(expected, 0.0), np.maximum(expected, 0.0))
-        worst = int(np.argmax(np.abs(correlations)))
-        if abs(correlations[worst]) > limit:
-            text = (
-                f"the innovations of {name} correlate by {correlations[worst]:+.2f} over {worst + 1} samples, "
-                f"limit {limit:.2f}"
-            )
-            yield Reason("ValidationFailed", text, "the drive does what the model does not have: look at the residuals")
-
-
-def excess_noise(fit: Fit, window: Window) -> Iterator[Reason]:
-    """Yield a reason where the fit needs more noise than the signal's own scatter from row to row shows.
-
-    What the voltage's course within its samples may add, and the parameters do not imitate, is no reason.
-    """
-    fitted = fit.problem.noises[0]
-    course = fit.problem.shape_effect(fit.theta)
-    course = course - fit.jacobian @ (inverse_of(fit.information)[0] @ (fit.jacobian.T @ course))
-    missed = np.sqrt(np.mean(course[: 2 * fit.problem.motions[0].n].reshape(-1, 2) ** 2, axis=0))
-    for name, unit, wanted, values, shape in (
-        ("voltage", "V", fitted.voltage_v, window.voltage_v, 0.0),
-        ("current", "A", fitted.current_a, window.current_a, float(missed[0])),
-        ("speed", "rad/s", fitted.speed_rad_s, window.speed_rad_s, float(missed[1])),
-    ):
-        seen = max(_scatter(values), getattr(fit.problem.motions[0].noise, _FIELDS[name]))
-        if name == "voltage":
-            seen = float(np.hypot(seen, _aliased_v(fit, window)))
-        seen = float(np.hypot(seen, shape * wanted))
-        if name == "voltage" and fit.problem.slow:  # what current and speed leave open of a sample hides its noise
-            motion, theta = fit.problem.motions[0], fit.theta
-            open_v = left_open_v(motion, theta, fitted.vector() ** 2)
-            wanted, seen = float(np.hypot(wanted, open_v)), float(np.hypot(seen, open_v))
-        if wanted > NOISE_RATIO * seen:
-            text = f"the model explains {name} to {wanted:.3g} {unit} only, while it scatters by {seen:.3g} {unit}"
-            yield Reason("ValidationFailed", text, "the drive does what the model does not have: look at the residuals")
-
-
-def _aliased_v(fit: Fit, window: Window) -> float:
-    """Return the voltage that instants may miss of the course between them: the same doubt that R and L carry."""
-    motion = fit.problem.motions[0]
-    doubt = aliasing(window.voltage_sampling, motion.voltage_period_s) * np.abs(fit.theta[:6])
-    current = motion.current[np.isfinite(motion.current)]
-    rate = np.gradient(current, motion.dt_s)
-    missed = doubt[0] * np.sqrt(np.mean(current**2)), doubt[1] * np.sqrt(np.mean(rate**2))
-    return float(np.hypot(*missed))
-
-
-_FIELDS = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}
-
-
-def _scatter(values: Float | None) -> float:
-    """Return what a signal scatters from row to row: noise, resolution, and what it does within a few rows."""
-    third = np.diff(values, 3) if values is not None else np.zeros(0)
-    third = third[np.isfinite(third)]
-    return float(np.sqrt(np.mean(third * third) / 20.0)) if third.size else 0.0

@@ -19,9 +19,10 @@ from fdhil.validation.plausibility import implausibilities
 from fdhil.validation.rest import rest_faults
 from fdhil.validation.slow_fitted import slow_faults_beside
 from fdhil.validation.slow_readings import slow_voltage_faults
-from fdhil.validation.structure import excess_noise, findings, whiteness
+from fdhil.validation.structure import findings
 from fdhil.validation.stuck import stuck_values
 from fdhil.validation.timing import timing_faults
+from fdhil.validation.whiteness import excess_noise, whiteness
 
 LEAST_FIT_PERCENT = 80.0
 EXCESS = 1.5  # of the variance that noise explains

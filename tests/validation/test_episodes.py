@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from fdhil.config import Identification
 from fdhil.identification.windows import find_windows, moving_range
 from fdhil.records import WindowOutcome
 from fdhil.validation import analyse
+from fdhil.validation.episode import interruptions
 from studies import drives, faults
 from studies.drives import Array, Drive, Move
 from studies.scenes import Rows, Scene, demand_of, measured, recorded
@@ -89,6 +92,24 @@ def test_a_drive_that_swings_through_rest_while_its_demand_goes_on_has_not_arriv
     texts = [[str(r) for r in analyse(w, Identification()).verdict.reasons] for w in find_windows(held.recording)]
     assert [len(reasons) > 0 for reasons in texts] == [True, True]
     assert texts[0] == ["EpisodeAborted: the demand moves on with 42 mm/s where the drive passes through rest"]
+    assert texts[1][0].startswith("EpisodeAborted: the demand moves on with ")  # nor does the rest of it begin there
+
+
+def test_a_drive_that_creeps_towards_a_demanded_speed_is_not_held_there() -> None:
+    slow = replace(DRIVE, position_gain=23.0, feedforward=0.45)
+    scene = replace(SCENE, drive=slow, move=Move(0.12, 0.22, 7.4, 0.02, 1))
+    for drop, said in ((0.0, []), (0.2, ["EpisodeAborted"])):
+        rates = drives.rates(scene.move, lambda t, drop=drop: 1 - drop * np.clip((t - 0.25) / 0.01, 0, 1))
+        rows = measured(np.random.default_rng(7), scene, drives.run(slow, demand_of(scene, rates), scene.dt_s))
+        (window,) = find_windows(recorded(scene, rows))
+        assert [reason.code for reason in interruptions(window)] == said
+
+
+def test_a_slow_plateau_is_seen_through_a_coarse_scale() -> None:
+    fallen = faults.KINDS["override changed"].make(np.random.default_rng([61, 2, 2888]))  # rows of 0.25 ms, slow ramps
+    (window,) = find_windows(fallen.recording)
+    (reason,) = interruptions(window)
+    assert "held at 96." in reason.text
 
 
 def test_a_feed_hold_to_rest_leaves_two_whole_moves() -> None:
