@@ -12,14 +12,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from fdhil.records import Recording, SlowVoltage, VoltageSampling, frozen
-from studies import drives, machine_faults, signal_faults
-from studies.drives import Array, Rng, log_uniform
-from studies.scenes import Rows, Scene, Sensor, demand_of, draw_scene, measured, recorded
+from fdhil.records import SlowVoltage, VoltageSampling, frozen
+from studies import drives, faults, machine_faults, signal_faults
+from studies.drives import Array, Drive, Rng, Signals, log_uniform
+from studies.faults import Kind
+from studies.judging import GOOD
+from studies.scenes import Rows, Scene, Sensor, Spoilt, demand_of, draw_scene, measured, recorded
 
 PERIODS_S = (0.010, 0.005, 0.002)
-GOOD = "good"
-Maker = Callable[[Rng], tuple[Recording, float]]
+TO_AND_FRO = "to and fro"
+Maker = Callable[[Rng], Spoilt]
 
 
 def sampled(
@@ -54,19 +56,34 @@ class Sensed:
         return a, min(b, self.voltage.size)
 
 
-def sense(rng: Rng, scene: Scene, load: Array | None = None, late: float | None = None) -> Sensed:
-    """Return a run of a scene by a sensor of 100 to 500 Hz; ``late`` in its samples, drawn when left out."""
-    demand = demand_of(scene)
-    rows = measured(rng, scene, drives.run(scene.drive, demand, scene.dt_s, load))
-    fine = drives.run(scene.drive, demand, drives.STEP_S, load).voltage
+def sense(rng: Rng, scene: Scene, fine: Signals, late: float | None = None) -> Sensed:
+    """Return a run by a sensor of 100 to 500 Hz; ``late`` in its samples, drawn when left out.
+
+    ``fine`` is the run with rows every 31.25 us.
+    """
+    rows = measured(rng, scene, in_rows(fine, scene.dt_s))
     period = float(rng.choice(PERIODS_S))
     delay = (rng.uniform(-0.5, 0.5) if late is None else late) * period
     begin = rng.uniform(0.0, period)
     count = int((rows.signals["speed"].size * rows.dt_s - begin) / period)
-    told = sampled(fine, drives.STEP_S, begin - delay + np.arange(count) * period, period, scene.sampling)
+    told = sampled(fine.voltage, drives.STEP_S, begin - delay + np.arange(count) * period, period, scene.sampling)
     peak = float(np.abs(told).max())
     sensor = Sensor(told, scene.noise * 0.4 * peak, scene.steps[0] * peak)
     return Sensed(rows, sensor.read(rng), begin, period, sensor)
+
+
+def run(scene: Scene, load: Array | None = None) -> Signals:
+    """Return the run of a scene's rapid, rows every 31.25 us."""
+    return drives.run(scene.drive, demand_of(scene), drives.STEP_S, load)
+
+
+def in_rows(fine: Signals, dt_s: float) -> Signals:
+    """Return a run in rows ``dt_s`` apart."""
+    every = round(dt_s / fine.dt_s)
+    n = fine.voltage.size // every
+    first = {name: getattr(fine, name)[: n * every : every] for name in ("current", "speed", "position", "demand")}
+    means = fine.voltage[: n * every].reshape(n, every).mean(axis=1)
+    return Signals(dt_s, means, fine.voltage_instant[: n * every : every], **first)
 
 
 def scene_of(rng: Rng) -> Scene:
@@ -75,41 +92,95 @@ def scene_of(rng: Rng) -> Scene:
     return replace(scene, dt_s=min(scene.dt_s, 1e-3))
 
 
-def told(scene: Scene, sensed: Sensed) -> Recording:
-    """Return the recording."""
+def told(scene: Scene, sensed: Sensed, severity: float = 0.0, *, says_rapid: bool = True) -> Spoilt:
+    """Return the recording with the severity of its fault."""
     slow = SlowVoltage(sensed.begin_s, sensed.period_s, 2e-4, frozen(sensed.voltage))
-    return replace(recorded(scene, sensed.rows), slow_voltage=slow)
+    return Spoilt(replace(recorded(scene, sensed.rows, says_rapid=says_rapid), slow_voltage=slow), severity)
 
 
 def _of_voltage(spoil: Callable[[Rng, Sensed], tuple[Sensed, float]]) -> Maker:
-    def make(rng: Rng) -> tuple[Recording, float]:
+    def make(rng: Rng) -> Spoilt:
         scene = scene_of(rng)
-        spoilt, severity = spoil(rng, sense(rng, scene))
-        return told(scene, spoilt), severity
+        return told(scene, *spoil(rng, sense(rng, scene, run(scene))))
 
     return make
 
 
 def _of_rows(fault: signal_faults.SignalFault) -> Maker:
-    """Spoil current or speed as the other studies do."""
+    """Spoil the rows as the other study does; the slow sensor goes on by its own clock, whatever rows are lost."""
 
-    def make(rng: Rng) -> tuple[Recording, float]:
+    def make(rng: Rng) -> Spoilt:
         scene = scene_of(rng)
-        sensed = sense(rng, scene)
+        sensed = sense(rng, scene, run(scene))
+        whole = sensed.rows.signals
+        numbered = sensed.rows.with_signals(row=np.arange(whole["speed"].size, dtype=np.float64))
         while True:
-            rows, severity = fault(rng, sensed.rows)
-            if rows.signals["voltage"] is sensed.rows.signals["voltage"]:
-                return told(scene, replace(sensed, rows=rows)), severity
+            rows, severity = fault(rng, numbered)
+            now = rows.signals
+            kept = now["current"] is whole["current"] or now["speed"] is whole["speed"]
+            if now["voltage"] is whole["voltage"] or not kept:  # what the rows tell of the voltage is not recorded
+                break
+        begin = sensed.begin_s - float(now["row"][0]) * rows.dt_s
+        return told(scene, replace(sensed, rows=rows, begin_s=begin), severity)
 
     return make
 
 
 def _of_machine(change: Callable[[Rng, Scene], tuple[Scene, Array | None, float]]) -> Maker:
-    def make(rng: Rng) -> tuple[Recording, float]:
+    def make(rng: Rng) -> Spoilt:
         scene, load, severity = change(rng, scene_of(rng))
-        return told(scene, sense(rng, scene, load)), severity
+        return told(scene, sense(rng, scene, run(scene, load)), severity)
 
     return make
+
+
+def _of_demand(shape: Callable[[Rng, Scene], tuple[Array, float]]) -> Maker:
+    def make(rng: Rng) -> Spoilt:
+        scene = scene_of(rng)
+        rates, severity = shape(rng, scene)
+        demand = demand_of(scene, scene.move.direction * rates)
+        return told(scene, sense(rng, scene, drives.run(scene.drive, demand, drives.STEP_S)), severity)
+
+    return make
+
+
+def _left_behind(rng: Rng) -> Spoilt:
+    scene = scene_of(rng)
+    signals, share = machine_faults.stopped_short(rng, scene, drives.STEP_S)
+    return told(scene, sense(rng, scene, signals), share)
+
+
+def _moved(rng: Rng) -> Spoilt:
+    scene = scene_of(rng)
+    other, amount = machine_faults.changed(rng, scene.drive)
+    signals, _ = _there_and_back(scene, other)
+    return told(scene, sense(rng, scene, signals), amount)
+
+
+def _gain_between(rng: Rng) -> Spoilt:
+    """Share by which the gain of voltage or current differs between two rapids of one recording."""
+    scene, of_voltage = scene_of(rng), bool(rng.random() < 0.5)
+    factor = 1 + signal_faults.sign(rng) * (amount := log_uniform(rng, 0.04, 0.2))
+    signals, seam_s = _there_and_back(scene, scene.drive)
+    sensed = sense(rng, scene, signals)
+    if of_voltage:
+        later = sensed.begin_s + np.arange(sensed.voltage.size) * sensed.period_s > seam_s
+        return told(scene, sensed.spoilt(np.where(later, factor, 1.0) * sensed.voltage), amount)
+    current = sensed.rows.signals["current"]
+    later = np.arange(current.size) * scene.dt_s > seam_s
+    rows = sensed.rows.with_signals(current=np.where(later, factor, 1.0) * current)
+    return told(scene, replace(sensed, rows=rows), amount)
+
+
+def _there_and_back(scene: Scene, other: Drive) -> tuple[Signals, float]:
+    """Return the run of a rapid and, by the drive ``other``, of its way back, and when the second begins."""
+    back = replace(scene, drive=other, move=drives.turned(scene.move), lead_s=max(scene.lead_s, machine_faults.SEAM_S))
+    first, again = run(scene), run(back)
+    shift = first.position[-1] - again.position[0]
+    again = replace(again, position=again.position + shift, demand=again.demand + shift)
+    names = ("voltage", "voltage_instant", "current", "speed", "position", "demand")
+    joined = {name: np.concatenate([getattr(first, name), getattr(again, name)]) for name in names}
+    return Signals(drives.STEP_S, **joined), first.voltage.size * drives.STEP_S
 
 
 def _voltage_gain_step(rng: Rng, sensed: Sensed) -> tuple[Sensed, float]:
@@ -129,6 +200,21 @@ def _voltage_offset(rng: Rng, sensed: Sensed) -> tuple[Sensed, float]:
     amount = log_uniform(rng, 0.015, 0.08)
     peak = float(np.abs(sensed.voltage).max())
     return sensed.spoilt(sensed.voltage + signal_faults.sign(rng) * amount * peak), amount
+
+
+def _voltage_offset_drift(rng: Rng, sensed: Sensed) -> tuple[Sensed, float]:
+    amount = log_uniform(rng, 0.03, 0.10) * signal_faults.sign(rng)
+    course = np.linspace(0.0, amount * float(np.abs(sensed.voltage).max()), sensed.voltage.size)
+    return sensed.spoilt(sensed.voltage + course), abs(amount)
+
+
+def _voltage_lagging(rng: Rng, sensed: Sensed) -> tuple[Sensed, float]:
+    """Samples of the sensor's own low-pass time constant."""
+    samples = rng.uniform(2.5, 10)
+    values, pole = sensed.voltage.copy(), float(np.exp(-1 / samples))
+    for k in range(1, values.size):
+        values[k] = pole * values[k - 1] + (1 - pole) * values[k]
+    return sensed.spoilt(values), samples
 
 
 def _voltage_stuck(rng: Rng, sensed: Sensed) -> tuple[Sensed, float]:
@@ -154,51 +240,85 @@ def _voltage_turned(_rng: Rng, sensed: Sensed) -> tuple[Sensed, float]:
     return sensed.spoilt(-sensed.voltage), 1.0
 
 
-def _voltage_late(rng: Rng) -> tuple[Recording, float]:
+def _voltage_late(rng: Rng) -> Spoilt:
     scene = scene_of(rng)
     late = signal_faults.sign(rng) * rng.uniform(1.3, 4.0)
-    return told(scene, sense(rng, scene, late=late)), abs(late)
+    return told(scene, sense(rng, scene, run(scene), late=late), abs(late))
 
 
-def _fine(rng: Rng) -> tuple[Recording, float]:
+def _good(rng: Rng) -> Spoilt:
     scene = scene_of(rng)
-    return told(scene, sense(rng, scene)), 0.0
+    return told(scene, sense(rng, scene, run(scene)))
 
 
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """A kind of recording: how one is made, the codes that name its fault rightly, the severity's unit."""
-
-    make: Maker
-    named: frozenset[str]
-    unit: str
+def _to_and_fro(rng: Rng) -> Spoilt:
+    """Return two rapids of a recording without the rapid speed in its header."""
+    scene = scene_of(rng)
+    signals, _ = _there_and_back(scene, scene.drive)
+    return told(scene, sense(rng, scene, signals), says_rapid=False)
 
 
-def _kind(make: Maker, named: str, unit: str) -> Kind:
-    return Kind(make, frozenset(named.split()), unit)
+def _kind(make: Maker, named: str, unit: str, matrix: str) -> Kind:
+    return Kind(make, frozenset(named.split()), unit, matrix)
+
+
+def _as_rows(name: str, fault: signal_faults.SignalFault) -> Kind:
+    """Return a kind of the other study, of current or speed."""
+    return replace(faults.KINDS[name], make=_of_rows(fault))
+
+
+def _as_machine(name: str, change: Callable[[Rng, Scene], tuple[Scene, Array | None, float]]) -> Kind:
+    return replace(faults.KINDS[name], make=_of_machine(change))
+
+
+def _as_demand(name: str, shape: Callable[[Rng, Scene], tuple[Array, float]]) -> Kind:
+    return replace(faults.KINDS[name], make=_of_demand(shape))
 
 
 KINDS: Mapping[str, Kind] = {
-    "voltage gain steps": _kind(_of_voltage(_voltage_gain_step), "CalibrationSuspect", "of the gain"),
-    "voltage gain drifts": _kind(_of_voltage(_voltage_gain_drift), "CalibrationSuspect", "of the gain"),
-    "voltage offset": _kind(_of_voltage(_voltage_offset), "CalibrationSuspect", "of the peak"),
-    "voltage stuck": _kind(_of_voltage(_voltage_stuck), "StuckValue", "s"),
-    "voltage clipped": _kind(_of_voltage(_voltage_clipped), "Saturated", "of the peak"),
-    "voltage turned": _kind(_of_voltage(_voltage_turned), "Unphysical CalibrationSuspect", ""),
-    "voltage late": _kind(_voltage_late, "SampleTiming", "samples"),
-    "gain steps": _kind(_of_rows(signal_faults.gain_step), "CalibrationSuspect", "of the gain"),
-    "gain drifts": _kind(_of_rows(signal_faults.gain_drift), "CalibrationSuspect", "of the gain"),
-    "offset": _kind(_of_rows(signal_faults.offset), "CalibrationSuspect", "of the peak"),
-    "stuck": _kind(_of_rows(signal_faults.stuck), "StuckValue", "s"),
-    "current late": _kind(_of_rows(signal_faults.current_late), "SampleTiming", "rows"),
-    "cutting load": _kind(_of_machine(machine_faults.cutting_load), "LoadDetected", "of the peak torque"),
-    "stiff travel": _kind(_of_machine(machine_faults.stiff_travel), "LoadDetected", "of the peak torque"),
-    "collision": _kind(_of_machine(machine_faults.collision), "LoadDetected", "of the peak torque"),
-    "Stribeck friction": _kind(_of_machine(machine_faults.stribeck), "ValidationFailed", "of the peak torque"),
+    "voltage gain steps": _kind(_of_voltage(_voltage_gain_step), "CalibrationSuspect", "of the gain", "C8"),
+    "voltage gain drifts": _kind(_of_voltage(_voltage_gain_drift), "CalibrationSuspect", "of the gain", "C8"),
+    "voltage offset": _kind(_of_voltage(_voltage_offset), "CalibrationSuspect", "of the peak", "C8"),
+    "voltage offset drifts": _kind(_of_voltage(_voltage_offset_drift), "CalibrationSuspect", "of the peak", "C8"),
+    "voltage stuck": _kind(_of_voltage(_voltage_stuck), "StuckValue", "s", "B11"),
+    "voltage clipped": _kind(_of_voltage(_voltage_clipped), "Saturated", "of the peak", "C1"),
+    "voltage turned": _kind(_of_voltage(_voltage_turned), "Unphysical CalibrationSuspect", "", "D3"),
+    "voltage late": _kind(_voltage_late, "SampleTiming", "samples", "B12"),
+    "voltage lags": _kind(_of_voltage(_voltage_lagging), "SampleTiming ValidationFailed", "samples", "B12"),
+    "sensor clipped": _as_rows("sensor clipped", signal_faults.clipped),
+    "not finite": _as_rows("not finite", signal_faults.not_finite),
+    "late trigger": _as_rows("late trigger", signal_faults.late_trigger),
+    "ends early": _as_rows("ends early", signal_faults.ends_early),
+    "no plateau": _as_demand("no plateau", machine_faults.no_plateau),
+    "cutting load": _as_machine("cutting load", machine_faults.cutting_load),
+    "stiff travel": _as_machine("stiff travel", machine_faults.stiff_travel),
+    "collision": _as_machine("collision", machine_faults.collision),
+    "override changed": _as_demand("override changed", machine_faults.override_changed),
+    "feed hold": _as_demand("feed hold", machine_faults.hold_resumed),
+    "quick stop": _as_demand("quick stop", machine_faults.quick_stop),
+    "left behind": replace(faults.KINDS["left behind"], make=_left_behind),
+    "gain step": _as_rows("gain step", signal_faults.gain_step),
+    "gain drift": _as_rows("gain drift", signal_faults.gain_drift),
+    "offset": _as_rows("offset", signal_faults.offset),
+    "offset drift": _as_rows("offset drift", signal_faults.offset_drift),
+    "speed scale": _as_rows("speed scale", signal_faults.speed_scale),
+    "gain between rapids": replace(faults.KINDS["gain between rapids"], make=_gain_between),
+    "constant speed": _as_rows("constant speed", signal_faults.constant_speed),
+    "wrong sign": _as_rows("wrong sign", signal_faults.wrong_sign),
+    "swapped columns": _as_rows("swapped columns", signal_faults.swapped_columns),
+    "parameter moved": replace(faults.KINDS["parameter moved"], make=_moved),
+    "Stribeck friction": _as_machine("Stribeck friction", machine_faults.stribeck),
+    "backlash": _as_machine("backlash", machine_faults.backlash),
+    "frames lost": _as_rows("frames lost", signal_faults.frames_lost),
+    "counted gap": _as_rows("counted gap", signal_faults.counted_gap),
+    "stuck value": _as_rows("stuck value", signal_faults.stuck),
+    "current late": replace(_as_rows("current late", signal_faults.current_late), unit="rows"),
+    "lagging sensor": replace(_as_rows("lagging sensor", signal_faults.lagging_sensor), unit="rows"),
 }
+_GOOD: Mapping[str, Maker] = {GOOD: _good, TO_AND_FRO: _to_and_fro}
 
 
-def recording_of(seed: int, study: int, kind: str) -> tuple[Recording, float]:
-    """Return one recording of the study, and the severity of its fault."""
-    make = _fine if kind == GOOD else KINDS[kind].make
-    return make(np.random.default_rng([study, 1 if kind == GOOD else 2, seed]))
+def recording_of(seed: int, study: int, kind: str) -> Spoilt:
+    """Return one recording of the study with the severity of its fault."""
+    make = _GOOD[kind] if kind in _GOOD else KINDS[kind].make
+    return make(np.random.default_rng([study, 1 if kind in _GOOD else 2, seed]))

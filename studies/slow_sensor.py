@@ -9,13 +9,9 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections import Counter
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -24,16 +20,15 @@ from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.windows import find_windows
 from fdhil.records import PARAMETERS, SlowVoltage, VoltageSampling, Window, frozen
 from fdhil.store.recording_csv import parse_recording
-from fdhil.validation import analyse
 from studies import bench
 from studies.drives import Array
-from studies.slow_recordings import GOOD, KINDS, PERIODS_S, recording_of, sampled
+from studies.judging import GOOD, Judged, judge, survey, tables, tally
+from studies.slow_recordings import KINDS, PERIODS_S, TO_AND_FRO, recording_of, sampled
 
 SETTINGS = Identification()
 TRUTH = np.array([bench.Plant().truth()[name] for name in PARAMETERS])
 NOISES = (0.001, 0.005)
 SAMPLINGS: tuple[VoltageSampling, ...] = ("interval_mean", "instant")
-Made = TypeVar("Made")
 
 
 @lru_cache(maxsize=4)
@@ -103,7 +98,7 @@ def intervals_page(seeds: range, processes: int) -> str:
         for period in PERIODS_S:
             for noise in NOISES:
                 case = Case(sampling, period, noise)
-                made = list(_all(partial(one_fit, case), seeds, processes))
+                made = list(survey(seeds, partial(one_fit, case), processes))
                 errors, stds = np.array([m[0] for m in made]), np.array([m[1] for m in made])
                 share = np.nanmean(np.where(np.isfinite(errors), np.abs(errors) <= 1.96 * stds, np.nan), axis=0)
                 rms = np.sqrt(np.nanmean(errors**2, axis=0)) / np.append(TRUTH / 100, 1e-6)
@@ -115,88 +110,25 @@ def intervals_page(seeds: range, processes: int) -> str:
     return "\n".join(lines)
 
 
-def _all(one: Callable[[int], Made], seeds: range, processes: int) -> Iterator[Made]:
-    if processes < 2:
-        yield from map(one, seeds)
-        return
-    with ProcessPoolExecutor(processes) as executor:
-        yield from executor.map(one, seeds, chunksize=8)
+def good(seed: int, study: int) -> Judged:
+    """Judge one good recording: one rapid, or every other time two."""
+    return judge(GOOD, seed, recording_of(seed, study, TO_AND_FRO if seed % 2 else GOOD))
 
 
-@dataclass(frozen=True, slots=True)
-class Judged:
-    """One recording: its seed, kind, severity, windows listed and refused, and the reasons.
-
-    ``left_open`` names what each accepted window that does not tell all leaves null.
-    """
-
-    seed: int
-    kind: str
-    severity: float
-    windows: int
-    refused: int
-    texts: tuple[str, ...]
-    left_open: tuple[str, ...] = ()
-
-    @property
-    def codes(self) -> frozenset[str]:
-        """Classes of the reasons."""
-        return frozenset(text.split(":")[0] for text in self.texts)
+def bad(seed: int, study: int) -> Judged:
+    """Judge one recording with the kind of fault that ``seed`` chooses."""
+    name = list(KINDS)[seed % len(KINDS)]
+    return judge(name, seed, recording_of(seed, study, name))
 
 
-def judge(seed: int, study: int, kind: str | None = None) -> Judged:
-    """Return what the validation says of one recording; a bad one's kind goes round with ``seed``."""
-    name = kind or list(KINDS)[seed % len(KINDS)]
-    recording, severity = recording_of(seed, study, name)
-    outcomes = [analyse(window, SETTINGS) for window in find_windows(recording)]
-    verdicts = [outcome.verdict for outcome in outcomes]
-    texts = tuple(dict.fromkeys(str(reason) for verdict in verdicts for reason in verdict.reasons))
-    accepted = [o.estimate for o in outcomes if o.verdict.accepted and o.estimate is not None]
-    left_open = tuple(" and ".join(estimate.missing) for estimate in accepted if estimate.missing)
-    return Judged(seed, name, severity, len(verdicts), sum(not v.accepted for v in verdicts), texts, left_open)
-
-
-@dataclass
-class Tally:
-    """What became of the recordings of one kind."""
-
-    made: list[Judged] = field(default_factory=list)
-
-    def row(self, name: str) -> str:
-        """Return the row of the table."""
-        kind, codes = KINDS[name], Counter(code for one in self.made for code in one.codes)
-        accepted = sum(one.windows > one.refused for one in self.made)
-        right = sum(bool(kind.named & one.codes) for one in self.made) / len(self.made)
-        least = f"{min(one.severity for one in self.made):.3g} {kind.unit}" if kind.unit else ""
-        given = ", ".join(f"{count} {code}" for code, count in codes.most_common())
-        return f"| {name} | {len(self.made)} | {least} | {accepted} | {right:.0%} | {given} |"
-
-
-def verdicts_page(good: range, bad: range, study: int, processes: int) -> str:
-    """Return the table of verdicts."""
-    fine = list(_all(partial(judge, study=study, kind=GOOD), good, processes))
-    windows, refused = sum(one.windows for one in fine), sum(one.refused for one in fine)
-    given = Counter(code for one in fine for code in one.codes)
-    for one in fine:
-        if one.refused:
-            print("refused", one.seed, one.texts, flush=True)
-    kinds = {name: Tally() for name in KINDS}
-    for one in _all(partial(judge, study=study), bad, processes):
-        kinds[one.kind].made.append(one)
-        if one.windows > one.refused:
-            print("accepted", one.kind, one.seed, f"{one.severity:.3g}", flush=True)
-    told_of_good = ", ".join(f"{count} {code}" for code, count in given.most_common()) or "none"
-    nulls = Counter(names for one in fine for names in one.left_open)
-    told_of_nulls = ", ".join(f"{count} without {names}" for names, count in nulls.most_common()) or "none"
-    return "\n".join([
-        f"Good: {windows} windows of {len(fine)} recordings, {refused} refused ({refused / max(1, windows):.2%}). "
-        f"Reasons: {told_of_good}.",
-        f"{nulls.total()} are accepted with a null and its reason: {told_of_nulls}.",
-        "",
-        "| fault | recordings | smallest severity | accepted | named rightly | reasons given |",
-        "|---|---|---|---|---|---|",
-        *(tally.row(name) for name, tally in kinds.items() if tally.made),
-    ])  # fmt: skip
+def verdicts_page(seeds_of_good: range, seeds_of_bad: range, study: int, processes: int) -> str:
+    """Return the table of verdicts, and print the recordings that were judged wrongly."""
+    results = list(survey(seeds_of_good, partial(good, study=study), processes))
+    results += survey(seeds_of_bad, partial(bad, study=study), processes)
+    for one in results:
+        if one.refused if one.kind == GOOD else one.accepted:
+            print(f"judged wrongly: {one.kind}, seed {one.seed}, {one.severity:.3g}", *one.texts, flush=True)
+    return tables(tally(results, KINDS), KINDS).rstrip()
 
 
 PAGE = """# A voltage sensor slower than the drive

@@ -7,63 +7,13 @@ gets one fault of random severity. The table goes to ``docs/studies/verdicts.md`
 from __future__ import annotations
 
 import argparse
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from fdhil.config import Identification
-from fdhil.identification.windows import find_windows
-from fdhil.validation import analyse, pool
 from studies import faults
-
-GOOD = "good"
-
-
-@dataclass(frozen=True, slots=True)
-class Judged:
-    """One recording: its kind, the fault's severity, windows listed, whether its pool was accepted, all codes."""
-
-    seed: int
-    kind: str
-    severity: float
-    windows: int
-    refused: int
-    accepted: bool
-    codes: tuple[str, ...]
-    texts: tuple[str, ...]
-
-
-@dataclass
-class Tally:
-    """What became of the recordings of one kind."""
-
-    count: int = 0
-    accepted: int = 0
-    right: int = 0
-    windows: int = 0
-    refused: int = 0
-    severities: list[float] = field(default_factory=list)
-    codes: Counter[str] = field(default_factory=Counter)
-    wrong: list[int] = field(default_factory=list)
-
-
-def judge(kind: str, seed: int, spoilt: faults.Spoilt) -> Judged:
-    """Return what the validation says of one recording."""
-    settings = Identification()
-    outcomes = [analyse(window, settings) for window in find_windows(spoilt.recording)]
-    _, verdict = pool(outcomes, settings)
-    reasons = [reason for outcome in outcomes for reason in outcome.verdict.reasons] + list(verdict.reasons)
-    refused = sum(not outcome.verdict.accepted for outcome in outcomes)
-    # what differs between two rapids is seen where both are believed
-    alone = kind in faults.BETWEEN and refused > 0
-    codes = tuple(sorted({reason.code for reason in reasons}))
-    texts = tuple(dict.fromkeys(str(reason) for reason in reasons))
-    return Judged(seed, kind, spoilt.severity, len(outcomes), refused, verdict.accepted and not alone, codes, texts)
+from studies.judging import GOOD, Judged, judge, survey, tables, tally
 
 
 def good(seed: int, study: int = 1) -> Judged:
@@ -76,67 +26,6 @@ def bad(seed: int, study: int = 1) -> Judged:
     names = list(faults.KINDS)
     name = names[seed % len(names)]
     return judge(name, seed, faults.KINDS[name].make(np.random.default_rng([study, 2, seed])))
-
-
-def survey(seeds: Iterable[int], judge_one: Callable[[int], Judged], processes: int) -> Iterator[Judged]:
-    """Yield what became of each seed."""
-    if processes < 2:
-        yield from map(judge_one, seeds)
-        return
-    with ProcessPoolExecutor(processes) as executor:
-        yield from executor.map(judge_one, seeds, chunksize=16)
-
-
-def tally(judged: Iterable[Judged]) -> dict[str, Tally]:
-    """Count by kind."""
-    kinds: dict[str, Tally] = {GOOD: Tally()} | {name: Tally() for name in faults.KINDS}
-    for one in judged:
-        entry = kinds[one.kind]
-        entry.count += 1
-        entry.accepted += one.accepted
-        entry.windows += one.windows
-        entry.refused += one.refused
-        entry.severities.append(one.severity)
-        entry.codes.update(one.codes)
-        is_good = one.kind == GOOD
-        entry.right += not one.codes if is_good else bool(faults.KINDS[one.kind].named & set(one.codes))
-        if one.accepted != is_good:
-            entry.wrong.append(one.seed)
-    return kinds
-
-
-def page(kinds: dict[str, Tally], heading: str) -> str:
-    """Return the tables of one study."""
-    fine = kinds[GOOD]
-    lines = [
-        heading,
-        "",
-        f"Good: {fine.windows} windows of {fine.count} recordings, {fine.refused} windows refused "
-        f"({fine.refused / max(1, fine.windows):.2%}), {len(fine.wrong)} recordings without a validated pool. "
-        f"Reasons: {listed(fine.codes) or 'none'}.",
-        "",
-        "| fault | matrix | recordings | smallest severity | accepted | named rightly | reasons given |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for name, kind in faults.KINDS.items():
-        entry = kinds[name]
-        if entry.count:
-            least = f"{min(entry.severities):.3g} {kind.unit}" if kind.unit else ""
-            lines.append(
-                f"| {name} | {kind.matrix} | {entry.count} | {least} | {entry.accepted} "
-                f"| {entry.right / entry.count:.0%} | {listed(entry.codes)} |"
-            )
-    bad_ones = [kinds[name] for name in faults.KINDS]
-    lines.append(
-        f"| all | | {sum(e.count for e in bad_ones)} | | {sum(e.accepted for e in bad_ones)} "
-        f"| {sum(e.right for e in bad_ones) / max(1, sum(e.count for e in bad_ones)):.0%} | |"
-    )
-    return "\n".join(lines) + "\n"
-
-
-def listed(codes: Counter[str]) -> str:
-    """Return codes with their counts, the most frequent first."""
-    return ", ".join(f"{count} {code}" for code, count in codes.most_common())
 
 
 INTRODUCTION = """# Good windows refused, bad windows accepted
@@ -163,8 +52,8 @@ def main() -> None:
     for study in options.study:
         results = list(survey(range(options.good), partial(good, study=study), options.processes))
         results += survey(range(options.bad), partial(bad, study=study), options.processes)
-        kinds = tally(results)
-        parts.append(page(kinds, f"## Study {study}"))
+        kinds = tally(results, faults.KINDS)
+        parts.append(f"## Study {study}\n\n{tables(kinds, faults.KINDS)}")
         print(parts[-1])
         wrong = {name: entry.wrong for name, entry in kinds.items() if entry.wrong}
         print("judged wrongly, by seed:", wrong, flush=True)

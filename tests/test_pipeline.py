@@ -33,7 +33,8 @@ from fdhil.records import (
     frozen_ints,
 )
 from fdhil.store.windows import decode_window, encode_window
-from studies.slow_recordings import GOOD, recording_of
+from studies.judging import GOOD
+from studies.slow_recordings import recording_of
 from tests.daemon.machine import config_of, rapids
 from tests.store.made import bits, same
 
@@ -262,7 +263,7 @@ def test_memory_is_bounded(config: MachineConfig) -> None:
 
 
 def test_a_window_that_leaves_l_open_is_accepted_and_publishes_nothing(tmp_path: Path) -> None:
-    (open_end,) = find_windows(recording_of(59, 2, GOOD)[0])  # instants of a sensor of 200 Hz
+    (open_end,) = find_windows(recording_of(59, 2, GOOD).recording)  # instants of a sensor of 200 Hz
     (outcome,) = AxisPipeline("X", config_of(tmp_path)).feed(open_end)
     assert isinstance(outcome, WindowOutcome)
     assert outcome.verdict.accepted

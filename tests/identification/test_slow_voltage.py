@@ -13,7 +13,8 @@ from fdhil.identification.windows import find_windows
 from fdhil.records import PARAMETERS, Float, Result, VoltageSampling, frozen
 from fdhil.validation import analyse
 from studies import bench
-from studies.slow_recordings import GOOD, recording_of
+from studies.judging import GOOD
+from studies.slow_recordings import recording_of
 from studies.slow_sensor import slow_windows
 
 SETTINGS = Identification()
@@ -88,7 +89,7 @@ def test_windows_with_clocks_of_their_own_are_pooled() -> None:
 @pytest.mark.parametrize("seed", [61, 274])
 def test_a_delay_that_least_squares_took_for_a_negative_l_is_found(seed: int) -> None:
     # a sensor of 100 Hz, 4 ms early or late: the fit began at L = 0 and stayed there, 6 ms beside the delay
-    recording, _ = recording_of(seed, 3, GOOD)
+    recording = recording_of(seed, 3, GOOD).recording
     estimate = maximum_likelihood.estimate(find_windows(recording), SETTINGS)
     assert estimate.result is Result.OK
     assert estimate.delay_s is not None

@@ -7,13 +7,14 @@ import numpy as np
 from fdhil.identification.estimators.maximum_likelihood import fit_windows
 from fdhil.identification.windows import find_windows
 from fdhil.validation.structure import findings
-from studies.slow_recordings import GOOD, recording_of
-from studies.slow_sensor import SETTINGS, judge
+from studies.judging import GOOD, judge
+from studies.slow_recordings import recording_of
+from studies.slow_sensor import SETTINGS
 
 
 def test_of_a_gain_that_the_parameters_imitate_noise_is_no_witness() -> None:
     # a long cruise at little current: the gain's drift was "found" at 11 standard deviations in the noise it scales
-    recording, _ = recording_of(105, 2, GOOD)
+    recording = recording_of(105, 2, GOOD).recording
     fit = fit_windows(find_windows(recording), SETTINGS)
     assert fit is not None
     gains = [f for f in findings(fit) if "gain" in f.text]
@@ -23,7 +24,7 @@ def test_of_a_gain_that_the_parameters_imitate_noise_is_no_witness() -> None:
 
 def test_a_delay_that_puts_a_sample_just_behind_its_row_is_fitted() -> None:
     # instants at every second row, the delay's derivative taken across the row: a variance was negative
-    recording, _ = recording_of(191, 2, GOOD)
+    recording = recording_of(191, 2, GOOD).recording
     with np.errstate(all="raise", under="ignore"):
         fit = fit_windows(find_windows(recording), SETTINGS)
     assert fit is not None
@@ -31,5 +32,5 @@ def test_a_delay_that_puts_a_sample_just_behind_its_row_is_fitted() -> None:
 
 
 def test_gains_that_do_step_or_drift_are_still_named() -> None:
-    for seed, kind in ((0, "voltage gain steps"), (1, "voltage gain drifts"), (7, "gain steps"), (8, "gain drifts")):
-        assert "CalibrationSuspect" in judge(seed, 2, kind).codes, kind
+    for seed, kind in ((0, "voltage gain steps"), (1, "voltage gain drifts"), (7, "gain step"), (8, "gain drift")):
+        assert "CalibrationSuspect" in judge(kind, seed, recording_of(seed, 2, kind)).codes, kind

@@ -12,12 +12,13 @@ from fdhil.identification.windows import find_windows
 from fdhil.records import Reason, Result, WindowOutcome, frozen
 from fdhil.validation import analyse, pool
 from fdhil.validation.slow_readings import slow_voltage_faults
-from studies.slow_recordings import GOOD, recording_of
+from studies.judging import GOOD
+from studies.slow_recordings import recording_of
 from studies.slow_sensor import PAGE, SETTINGS, parts_of, slow_windows
 
 
 def _analysed(seed: int, kind: str) -> WindowOutcome:
-    (window,) = find_windows(recording_of(seed, 2, kind)[0])
+    (window,) = find_windows(recording_of(seed, 2, kind).recording)
     return analyse(window, SETTINGS)
 
 
@@ -57,7 +58,7 @@ def test_nothing_but_r_and_l_may_stay_open_and_only_at_a_slow_sensor() -> None:
 @pytest.mark.parametrize("seed", [147, 403])
 def test_a_slow_sensor_that_stands_while_the_voltage_creeps_is_stuck(seed: int) -> None:
     # at full speed, where the speed changes too little and a coarse reading hides the noise: the model tells
-    recording, _ = recording_of(seed, 2, "voltage stuck")
+    recording = recording_of(seed, 2, "voltage stuck").recording
     (window,) = find_windows(recording)
     assert list(slow_voltage_faults(window)) == []
     texts = [reason.text for reason in analyse(window, SETTINGS).verdict.reasons if reason.code == "StuckValue"]
