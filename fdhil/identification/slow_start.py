@@ -9,13 +9,14 @@ import numpy as np
 
 from fdhil.config import Identification
 from fdhil.identification.covariance import aliasing
-from fdhil.identification.estimators.least_squares import mechanical_signals
+from fdhil.identification.estimators.least_squares import NAME, mechanical_signals, too_short
 from fdhil.identification.filtering import moving_mean, zero_phase
+from fdhil.identification.identifiability import judge
 from fdhil.identification.motion import Motion, prepare
-from fdhil.identification.normal import solve
+from fdhil.identification.normal import inverse_gram, solve
 from fdhil.identification.slow_voltage import CORNER_ROWS, innovations_of
 from fdhil.identification.windows import carried
-from fdhil.records import Float, Window
+from fdhil.records import PARAMETERS, Estimate, Float, Result, Window
 
 SPAN_S = 0.025
 SPAN_SAMPLES = 3
@@ -33,12 +34,10 @@ def slow_start(windows: Sequence[Window], settings: Identification) -> tuple[Flo
     None when there are too few samples to start from.
     """
     shifts = [_coarse_shift(w, settings.lowpass_hz) for w in windows]
-    pairs = zip(windows, shifts, strict=True)
-    electrical = np.vstack([sample_rows(w, s, settings.lowpass_hz)[0] for w, s in pairs])
-    mechanical = np.vstack([mechanical_signals(w, settings) for w in windows])
-    known = np.isfinite(electrical).all() and np.isfinite(mechanical).all()
-    if not known or electrical.shape[0] < LEAST_SAMPLES or mechanical.shape[0] < LEAST_SAMPLES:
+    rows = _rows(windows, shifts, settings)
+    if rows is None:
         return None
+    electrical, mechanical = rows
     inductance, resistance, constant = solve(electrical[:, 1:], electrical[:, 0])[0]
     second = solve(mechanical[:, 1:], mechanical[:, 0] * constant)[0]
     if resistance > 0.0 and inductance < LEAST_TIME_CONSTANT_S * resistance:
@@ -47,6 +46,45 @@ def slow_start(windows: Sequence[Window], settings: Identification) -> tuple[Flo
         inductance = TIME_CONSTANT_S * resistance
     theta = np.array([resistance, inductance, constant, *second, 0.0])
     return theta, shifts, [prepare(w) for w in windows]
+
+
+def _rows(windows: Sequence[Window], shifts: Sequence[float], settings: Identification) -> tuple[Float, Float] | None:
+    """Return rows (m, 4) of [u, Di, i, w] and (n, 4) of [i, Dw, w, sign w]; None where there are too few."""
+    pairs = zip(windows, shifts, strict=True)
+    electrical = np.vstack([sample_rows(w, s, settings.lowpass_hz)[0] for w, s in pairs])
+    mechanical = np.vstack([mechanical_signals(w, settings) for w in windows])
+    known = np.isfinite(electrical).all() and np.isfinite(mechanical).all()
+    enough = min(electrical.shape[0], mechanical.shape[0]) >= LEAST_SAMPLES
+    return (electrical, mechanical) if known and enough else None
+
+
+def slow_least_squares(windows: Sequence[Window], settings: Identification) -> Estimate:
+    """Fit [5] to the sensor's samples and [6] to the rows: for windows from which no likely drive can be begun.
+
+    What it finds says what is wrong with them: a turned sign makes R, K or Jt negative.
+    """
+    slow = [w for w in windows if w.slow_voltage is not None]
+    rows = _rows(slow, [_coarse_shift(w, settings.lowpass_hz) for w in slow], settings)
+    if rows is None:
+        return too_short(NAME, 0)
+    electrical, mechanical = rows
+    first, condition = solve(electrical[:, 1:], electrical[:, 0])
+    torque = mechanical[:, 0] * first[2]
+    second, other = solve(mechanical[:, 1:], torque)
+    order = [1, 0, 2, 3, 4, 5]  # from L, R, K to R, L, K
+    left = electrical[:, 0] - electrical[:, 1:] @ first, torque - mechanical[:, 1:] @ second
+    covariance = np.zeros((6, 6))
+    for block, x, e in zip((slice(0, 3), slice(3, 6)), (electrical, mechanical), left, strict=True):
+        covariance[block, block] = inverse_gram(x[:, 1:])[0] * float(e @ e) / e.size
+    answer = Estimate(
+        method=NAME,
+        names=PARAMETERS,
+        values=np.concatenate([first, second])[order],
+        covariance=covariance[np.ix_(order, order)],
+        residuals={"electrical": left[0], "mechanical": left[1] / first[2] if first[2] else left[1]},
+        result=Result.OK,
+    )
+    return judge(answer, max(condition, other), float(np.abs(mechanical[:, 2]).max()))
 
 
 def sample_rows(window: Window, delay_s: float, lowpass_hz: float) -> tuple[Float, Float]:

@@ -85,3 +85,23 @@ def test_a_part_of_the_page_is_written_beside_the_other() -> None:
     page = PAGE.format(intervals="one\ntable", verdicts="the other\n\n| a |")
     assert parts_of(page) == ("one\ntable", "the other\n\n| a |")
     assert parts_of("something else") == ("", "")
+
+
+@pytest.mark.parametrize("kind", ["voltage turned", "wrong sign"])
+def test_a_turned_signal_is_told_by_what_no_drive_can_be(kind: str) -> None:
+    for seed in (0, 1):
+        outcome = _analysed(seed, kind)
+        codes = {reason.code for reason in outcome.verdict.reasons}
+        assert "Unphysical" in codes
+        assert "LowExcitation" not in codes
+        assert outcome.estimate is not None
+        values = outcome.estimate.parameters()
+        assert min(values.R, values.K) < 0.0
+
+
+def test_samples_that_hold_too_few_rows_of_a_move_are_no_drive_at_all() -> None:
+    (window,) = slow_windows(0.010)
+    assert window.slow_voltage is not None
+    none = frozen(np.full(window.slow_voltage.voltage_v.size, np.nan))
+    outcome = analyse(replace(window, slow_voltage=replace(window.slow_voltage, voltage_v=none)), SETTINGS)
+    assert "LowExcitation" in {reason.code for reason in outcome.verdict.reasons}

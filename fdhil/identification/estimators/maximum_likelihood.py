@@ -25,7 +25,7 @@ from fdhil.identification.motion import UNKNOWN, Motion, Noise, prepare
 from fdhil.identification.noise import fit_noise
 from fdhil.identification.normal import inverse_of, solve
 from fdhil.identification.slow_descent import Likelihood, ascend
-from fdhil.identification.slow_start import slow_start, with_course
+from fdhil.identification.slow_start import slow_least_squares, slow_start, with_course
 from fdhil.identification.slow_voltage import course_effect, in_order
 from fdhil.identification.sweeps import whiten
 from fdhil.records import PARAMETERS, Estimate, Float, Result, Window
@@ -332,6 +332,8 @@ def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
     Where least squares finds nothing that could be a drive, that answer is returned: it says what is wrong.
     """
     result = fit_windows(windows, settings)
+    if result is None and any(w.slow_voltage is not None for w in windows):
+        return slow_least_squares(windows, settings)
     if result is None:
         return least_squares.estimate(windows, settings)
     return finish(result)
