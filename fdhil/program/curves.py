@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 
 from fdhil.errors import ProgramError
 from fdhil.program.machine import Machine
 from fdhil.program.modal import NO_MOTION
-from fdhil.program.targets import axis_words, feed_mm_min, target
+from fdhil.program.targets import axis_words, spline_feed_mm_min, target
 from fdhil.program.words import Block
 
 CODES = (50, 51)
@@ -39,6 +38,7 @@ def spline(machine: Machine, block: Block, series: Spline) -> None:
         raise ProgramError(block.line, code, "moves X and Y alone; take the other axis words out")
     start, end = modal.position, target(modal, block)
     a, d = (start[0], start[1]), (end[0], end[1])
+    feed = spline_feed_mm_min(modal, block)
     heading = _vector(block, "ij", modal.scale)
     if modal.motion == 51:
         if heading is None:
@@ -56,16 +56,16 @@ def spline(machine: Machine, block: Block, series: Spline) -> None:
             heading = (-series.leaving[0], -series.leaving[1]) if series.leaving is not None else (0.0, 0.0)
         series.leaving = leaving
         points = (a, _plus(a, heading), _plus(d, leaving), d)
-    _order(machine, block, points, end)
+    _order(machine, block, points, end, feed)
 
 
-def _order(machine: Machine, block: Block, points: tuple[Vector, Vector, Vector, Vector], end: list[float]) -> None:
+def _order(
+    machine: Machine, block: Block, points: tuple[Vector, Vector, Vector, Vector], end: list[float], feed: float
+) -> None:
     """Order chords of a cubic Bezier curve; their number follows from its second derivative."""
     bends = [math.hypot(p[0] - 2 * q[0] + r[0], p[1] - 2 * q[1] + r[1]) for p, q, r in (points[:3], points[1:])]
     chords = min(_MAX_CHORDS, max(1, math.ceil(math.sqrt(6.0 * max(bends) / (8.0 * _CHORD_ERROR_MM)))))
     places = [_at(points, number / chords) for number in range(chords + 1)]
-    length = sum(math.dist(p, q) for p, q in pairwise(places))
-    feed = feed_mm_min(machine.modal, block, length)
     for x, y in places[1:-1]:
         machine.feed_at(block, [x, y, *end[2:]], feed)
     machine.feed_at(block, end, feed)

@@ -32,6 +32,15 @@ class Machine:
         """Order a rapid to a position in active co-ordinates."""
         self._straight(block, target, None)
 
+    def rapid_beside(self, block: Block, target: list[float]) -> None:
+        """Order a rapid without cutter compensation, which the next move enters again."""
+        compensation = self.compensation
+        if compensation is not None:
+            self._give(compensation.flush())
+            compensation.entered, self.compensation = False, None
+        self.rapid_to(block, target)
+        self.compensation = compensation
+
     def feed_to(self, block: Block, target: list[float]) -> None:
         """Order a straight feed to a position in active co-ordinates, at the feed in force."""
         self._straight(block, target, feed_mm_min(self.modal, block, straight_length(self.modal.position, target)))

@@ -12,14 +12,17 @@ from fdhil.program.words import Block
 
 def set_feed(modal: Modal, block: Block) -> None:
     if "feed mode" in block.g:
+        if block.g["feed mode"] != 930 or modal.feed_mode == 950:  # G93 keeps the feed, for splines
+            modal.feed_mm_min = 0.0
         modal.feed_mode = block.g["feed mode"]
-        modal.feed_mm_min = modal.feed_word = 0.0
+        modal.feed_word = 0.0
     if "f" in block.words:
         feed = block.words["f"]
         if feed < 0.0:
             raise block.fault("f", "is a negative feed rate")
         modal.feed_word = feed
-        modal.feed_mm_min = feed * modal.scale
+        if modal.feed_mode != 930:
+            modal.feed_mm_min = feed * modal.scale
 
 
 def set_spindle(modal: Modal, block: Block) -> None:

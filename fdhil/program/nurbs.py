@@ -9,12 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 from fdhil.errors import ProgramError
 from fdhil.program.machine import Machine
 from fdhil.program.modal import NO_MOTION
-from fdhil.program.targets import axis_words, feed_mm_min, target
+from fdhil.program.targets import axis_words, spline_feed_mm_min, target
 from fdhil.program.words import Block
 
 BEGIN, END = 52, 53
@@ -38,7 +37,7 @@ class Nurbs:
         if modal.plane != 0:
             raise ProgramError(block.line, "G5.2", "works in the XY plane; give G17 first")
         axes = axis_words(block)
-        feed_mm_min(modal, block, 0.0)
+        spline_feed_mm_min(modal, block)
         weight = words.get("p", None if self.points else 1.0)
         if weight is None or weight < 0.0:
             raise ProgramError(block.line, "G5.2", "wants the weight of each control point as P, not negative")
@@ -63,8 +62,7 @@ class Nurbs:
         if not any(weight for _, _, weight in points):
             raise ProgramError(block.line, "G5.3", "all weights are zero; give one P that is not")
         places = list(_chords(points, self.order))
-        length = sum(math.dist(a, b) for a, b in pairwise(places))
-        feed = feed_mm_min(machine.modal, block, length)
+        feed = spline_feed_mm_min(machine.modal, block)
         machine.modal.motion = NO_MOTION
         rest = machine.modal.position[2:]
         for x, y in places[1:]:

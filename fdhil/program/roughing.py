@@ -106,7 +106,7 @@ def start_of(machine: Machine, block: Block) -> complex:
             value = length_mm(modal, axis, words[letter])
             start[axis] = value if modal.absolute else start[axis] + value
             first[axis] = value  # the reference takes the words of the first rapid as absolute under G91 too
-    machine.rapid_to(block, first)
+    machine.rapid_beside(block, first)
     return complex(start[2], start[0]) / modal.scale
 
 
@@ -136,11 +136,11 @@ class Tool:
 
     def rapid(self, place: complex) -> None:
         """Go to a place at rapid speed."""
-        self.machine.rapid_to(self.block, self._whole(place))
+        self.machine.rapid_to(self.block, self.whole(place))
 
     def feed(self, place: complex) -> None:
         """Go straight to a place at the feed in force."""
-        self.machine.feed_to(self.block, self._whole(place))
+        self.machine.feed_to(self.block, self.whole(place))
 
     def follow(self, part: Part, end: complex) -> None:
         """Follow a line or an arc to ``end``."""
@@ -159,10 +159,11 @@ class Tool:
         turns = 1 if ccw else -1
         angle = sweep((begin.real, begin.imag), (finish.real, finish.imag), turns)
         feed = feed_mm_min(modal, block, abs(angle) * (abs(begin) + abs(finish)) / 2.0)
-        target = self._whole(end)
+        target = self.whole(end)
         self.machine.arc_to(block, target, (centre.real, centre.imag), turns, feed, angle)
 
-    def _whole(self, place: complex) -> list[float]:
+    def whole(self, place: complex) -> list[float]:
+        """Return a place in active co-ordinates of all axes."""
         there = self.contour.programmed(place) * self.machine.modal.scale
         whole = list(self.machine.modal.position)
         whole[2], whole[0] = there.real, there.imag
@@ -181,7 +182,7 @@ def _finish(tool: Tool, first: float, last: float, passes: float) -> None:
     for number in range(int(passes), 0, -1):
         path = contour.copy()
         path.widen((number - 1) * (first - last) / passes + last)
-        tool.rapid(path.parts[0].start)
+        tool.machine.rapid_beside(tool.block, tool.whole(path.parts[0].start))
         tool.rapid(path.parts[0].end)
         for part in path.parts[1:]:
             tool.follow(part, part.end)

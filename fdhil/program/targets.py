@@ -26,13 +26,26 @@ def feed_mm_min(modal: Modal, block: Block, length_mm: float) -> float:
     if modal.feed_mode == 930:
         if "f" not in block.words:
             raise ProgramError(block.line, "G93", "a feed move in inverse-time mode wants an F word of its own")
-        return max(_MIN_INVERSE_TIME_FEED * modal.scale, length_mm * block.words["f"])
+        modal.feed_mm_min = max(_MIN_INVERSE_TIME_FEED * modal.scale, length_mm * block.words["f"])
+        return modal.feed_mm_min
     if modal.feed_mm_min <= 0.0:
         raise ProgramError(block.line, f"G{modal.motion / 10:g}", "there is no feed rate; give F before a feed move")
     if modal.feed_mode == 950:
         if modal.spindle_rpm <= 0.0:
             raise ProgramError(block.line, "G95", "feed per revolution wants a spindle speed; give S")
         return modal.feed_mm_min * modal.spindle_rpm
+    return modal.feed_mm_min
+
+
+def spline_feed_mm_min(modal: Modal, block: Block) -> float:
+    """Return the feed of a spline, which LinuxCNC does not work by inverse time: under G93 that of the move before."""
+    if modal.feed_mode != 930:
+        return feed_mm_min(modal, block, 0.0)
+    code = f"G{modal.motion / 10:g}"
+    if "f" not in block.words and modal.motion in (50, 51):
+        raise ProgramError(block.line, code, "a feed move in inverse-time mode wants an F word of its own")
+    if modal.feed_mm_min <= 0.0:
+        raise ProgramError(block.line, code, "keeps the feed in force under G93, and there is none; give G94 and F")
     return modal.feed_mm_min
 
 

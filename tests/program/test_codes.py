@@ -117,6 +117,26 @@ def test_an_arc_of_a_turned_system_outside_its_xy_plane_becomes_chords() -> None
     assert places[:, 2].min() == pytest.approx(-5.0, abs=1e-2)  # clockwise as seen from +Y, where Z points right, X up
 
 
+def test_g70_enters_compensation_on_its_way_to_the_contour_in_every_pass() -> None:
+    places = ends(*STEP, "G42.1 D1", "G70 Q100 X10 Z2 P2", "G40")
+    first, second = places[2:6], places[6:10]
+    assert first[[0, 2, 3]].tolist() == [[10, 0, 2], [2.5, 0, -9.5], [10, 0, -9.5]]
+    assert (second == first).all()
+    assert len(places) == 10
+
+
+@pytest.mark.parametrize(("before", "feed"), [("F100 G1 X1", 100.0), ("G93 G1 X1 F50", 50.0)])
+def test_a_spline_under_g93_keeps_the_feed_before_it(before: str, feed: float) -> None:
+    motions = run(before, "G93 G5.1 X10 Y10 I5 J0 F2")
+    assert {m.feed for m in motions if isinstance(m, Feed)} == {feed}
+
+
+@pytest.mark.parametrize("before", ["G93", "F100 G1 X1|G94", "M3 S100 G95 F1 G1 X1"])
+def test_a_spline_under_g93_without_a_feed_before_it_is_refused(before: str) -> None:
+    with pytest.raises(ProgramError, match="there is none"):
+        run(*before.split("|"), "G93 G5.1 X10 Y10 I5 J0 F2")
+
+
 def test_homes_go_by_way_of_their_words() -> None:
     assert ends("G0 X1 Y2 Z3", "G28.1", "G0 X5", "G28 Z9", "G30").tolist() == [
         [1, 2, 3], [5, 2, 3], [5, 2, 9], [5, 2, 3], [5, 2, 3], [0, 0, 0]

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from fdhil.errors import ProgramError
-from fdhil.program import Arc, Dwell, interpret
+from fdhil.program import Arc, Dwell, Feed, interpret
 from fdhil.records import Float
-from tests.program.linuxcnc import cases
+from tests.program.linuxcnc import ask, cases, difference
 from tests.program.linuxcnc_machine import demand
 
 pytestmark = pytest.mark.debian
@@ -44,6 +45,27 @@ def test_the_machine_moves_as_fdhil_says(text: str, why: str) -> None:
     if "G38" not in text:  # fdhil does not list the probe's own move
         assert apart_mm(moved, corners) <= NEAR_MM
     assert moved[-1] == pytest.approx(corners[-1], abs=1e-3)
+
+
+@pytest.mark.parametrize(("text", "why"), [m for m in MARKED if "their feed" in m[1]])
+def test_the_machine_works_a_spline_at_the_feed_before_it(text: str, why: str) -> None:
+    text = text.replace("F100", "F1000")
+    said = {motion.feed for motion in interpret(text.splitlines()) if isinstance(motion, Feed)}
+    steps = np.linalg.norm(np.diff(demand("G61\n" + text), axis=0), axis=1) * 60_000.0
+    assert list(said) == pytest.approx([float(np.median(steps[len(steps) // 2 :]))], rel=0.01)
+
+
+@pytest.mark.parametrize(("text", "why"), [m for m in MARKED if m[1].startswith("written out")])
+def test_what_the_reference_spoils_is_what_it_does_with_the_same_moves_written_out(
+    text: str, why: str, tmp_path: Path
+) -> None:
+    """G70: each pass from X20 Z2 without compensation, which the move to the contour enters."""
+    head, contour, offset = "F100 G18", "G0 X2 Z0|G1 X4 Z-2|Z-10|X8", text.split("\n")[7]
+    start, passes = "G40 G0 X20 Z2", 1 + ("P2" in text)
+    assert [head, contour] == [text.split("\n")[0], "|".join(text.split("\n")[2:6])]
+    path = tmp_path / "program.ngc"
+    path.write_text("|".join([head, start, *([start, offset, contour] * passes), "G40|G0 X50|M2"]).replace("|", "\n"))
+    assert not difference(list(interpret(text.splitlines())), ask(path).motions)
 
 
 @pytest.mark.parametrize(("text", "why"), [m for m in MARKED if m[1].startswith("machine refuses")])
