@@ -176,7 +176,7 @@ def _filter_plain(
     theta: Float,
     dt: float,
     mode: Float,
-    observed: Float,
+    spread: Float,
     load: Float,
     current: Float,
     speed: Float,
@@ -193,7 +193,8 @@ def _filter_plain(
 ) -> tuple[Float, Float]:
     """Return the innovations (2 n + m,) and their variances.
 
-    ``noise`` (3,) = variances of voltage, current, speed; ``shape`` (m,) adds to the first.
+    ``noise`` (3,) = variances of voltage, current, speed; ``shape`` (m,) adds to the first, and ``spread`` (n, 2) are
+    the others of each row, infinite where nothing was read.
     """
     n = current.size
     values, variance = np.zeros(2 * n + voltage.size), np.ones(2 * n + voltage.size)
@@ -206,9 +207,10 @@ def _filter_plain(
     if instant:
         of_voltage[:] = theta[0], theta[2], theta[1], 0.0
     for k in range(n):
-        if observed[k]:
-            values[2 * k], variance[2 * k] = _take(x, p, of_current, current[k], noise[1])
-            values[2 * k + 1], variance[2 * k + 1] = _take(x, p, of_speed, speed[k], noise[2])
+        if spread[k, 0] < np.inf:
+            values[2 * k], variance[2 * k] = _take(x, p, of_current, current[k], spread[k, 0])
+        if spread[k, 1] < np.inf:
+            values[2 * k + 1], variance[2 * k + 1] = _take(x, p, of_speed, speed[k], spread[k, 1])
         known, now = mode[k] != UNKNOWN, k * dt
         push = -(theta[5] * mode[k] + (load[k] if load.size else 0.0)) / theta[3] if known else 0.0
         stray = 0.0 if known else speed_walk * speed_walk / dt
@@ -231,13 +233,24 @@ def _filter_plain(
 _filter: Callable[..., tuple[Float, Float]] = njit(cache=True, nogil=True, error_model="numpy")(_filter_plain)
 
 
+def spread_of(motion: Motion, variances: Float) -> Float:
+    """Return the variances (n, 2) of each row's current and speed, infinite where they are lost."""
+    return np.where(motion.observed[:, None], variances[1:], np.inf)
+
+
 def innovations_of(
-    motion: Motion, theta: Float, variances: Float, ordered_for_s: float, load_nm: Float | None = None
+    motion: Motion,
+    theta: Float,
+    variances: Float,
+    ordered_for_s: float,
+    load_nm: Float | None = None,
+    spread: Float | None = None,
 ) -> Innovations:
     """Return the innovations by the filter that is right for ``theta`` (7,) = [R, L, K, Jt, ft, Cd, delay].
 
     ``variances`` (3,) are those of voltage, current and speed; ``ordered_for_s`` as in :func:`marks_of`; ``load_nm``
-    (n,) is a torque against the positive direction over each row's interval.
+    (n,) is a torque against the positive direction over each row's interval; ``spread`` (n, 2) stands in the place of
+    what :func:`spread_of` gives.
     """
     assert motion.slow is not None
     marks = marks_of(motion, float(theta[6]), ordered_for_s)
@@ -245,7 +258,7 @@ def innovations_of(
         theta,
         motion.dt_s,
         motion.mode,
-        motion.observed,
+        spread_of(motion, variances) if spread is None else spread,
         np.zeros(0) if load_nm is None else load_nm,
         motion.current,
         motion.speed,

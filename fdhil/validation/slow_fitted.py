@@ -20,6 +20,7 @@ from fdhil.records import Float, Reason, Window
 from fdhil.validation.bridging import log_beyond
 from fdhil.validation.plausibility import at_rest
 from fdhil.validation.slow_readings import CHANCE, LEAST_NOISE_SAMPLES, likely_same, runs
+from fdhil.validation.slow_stuck import slow_stuck_values
 
 SURE = 5.5  # standard deviations
 LEAST_OFFSET = 0.01  # of the peak of voltage or current
@@ -34,6 +35,7 @@ def slow_faults_beside(window: Window, fit: Fit, lowpass_hz: float) -> Iterator[
     if not (np.isfinite(fit.theta).all() and (fit.theta[:4] > 0).all()):
         return
     yield from _stuck(window, fit, slow.voltage_v)
+    yield from slow_stuck_values(window, fit)
     yield from _off_at_rest(window, fit, lowpass_hz)
 
 

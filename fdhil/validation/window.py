@@ -19,6 +19,7 @@ from fdhil.validation.plausibility import implausibilities
 from fdhil.validation.rest import rest_faults
 from fdhil.validation.slow_fitted import slow_faults_beside
 from fdhil.validation.slow_readings import slow_voltage_faults
+from fdhil.validation.slow_timing import current_late
 from fdhil.validation.structure import findings
 from fdhil.validation.stuck import stuck_values
 from fdhil.validation.timing import timing_faults
@@ -98,7 +99,9 @@ def _doubts(
     if late is not None:  # what else is wrong moves the delay too: without it, it shows under its own name
         fit = maximum_likelihood.fit(fit.problem.motions, np.append(fit.theta[:6], 0.0), range(6))
     if np.isfinite(fit.residuals).all() and np.isfinite(fit.information).all():
-        found = [*_structure(fit, window), *rest_faults(window, fit)]
+        found = _structure(fit, window)
+        if not any(reason.code == "SampleTiming" for reason in found):  # a late current seems to move a shaft at rest
+            found += rest_faults(window, fit)
         reasons += found or ([late] if late is not None else list(timing_faults(window, fit)))
     elif late is not None:
         reasons.append(late)
@@ -146,7 +149,12 @@ def _late(window: Window, fit: Fit) -> Reason | None:
 
 def _structure(fit: Fit, window: Window) -> list[Reason]:
     """Return the named finding that explains most, else what has no name."""
-    found = [f for f in findings(fit) if f.matters]
+    tried = findings(fit)
+    if window.slow_voltage is not None:
+        late = list(current_late(window, fit, max((f.statistic**2 for f in tried), default=0.0)))
+        if late:
+            return late
+    found = [f for f in tried if f.matters]
     if found:
         return [found[0].reason()]
     return [*whiteness(fit), *excess_noise(fit, window)]
