@@ -66,14 +66,17 @@ def status(config: Path, as_json: bool) -> None:
 @CONFIG
 @click.argument("program", type=click.Path(path_type=Path), required=False)
 @click.option("--method", type=click.Choice(list(tables.CORRECTIONS)), help="Left out: the best there is.")
+@click.option("--whole", is_flag=True, help="Arm only when all of a long PROGRAM has passed, however long that takes.")
 @AS_JSON
-def arm(config: Path, program: Path | None, method: str | None, as_json: bool) -> None:
+def arm(config: Path, program: Path | None, method: str | None, whole: bool, as_json: bool) -> None:
     """Arm the correction of one PROGRAM (or demand CSV) on the machine of CONFIG.
 
     Without PROGRAM, --method flatness feeds speed and torque forward on line, whatever runs.
 
-    A program longer than 10 s is checked as a whole first; how far that is goes to stderr (with --json one JSON object
-    per line). Ctrl-C abandons it. What was checked is not checked again until program, parameters or config change.
+    A program longer than 10 s is armed when all of it, or its first minute, has passed the check, which then goes on
+    ahead of the motion: what it refuses later is told at least a minute ahead, and the correction ramped to zero before
+    that place. How far the check is goes to stderr (with --json one JSON object per line); Ctrl-C abandons it. What was
+    checked is not checked again until program, parameters or config change.
 
     Exit 1 with class, cause and next action when it is refused. Nothing is armed again by itself, ever.
     """
@@ -86,6 +89,7 @@ def arm(config: Path, program: Path | None, method: str | None, as_json: bool) -
         "request": "arm",
         "program": None if program is None else str(program.resolve()),
         "method": method,
+        "whole": whole,
         "token": read_token(run_directory(machine)),
     }
     shown = _Shown(as_json)

@@ -34,6 +34,8 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
     if guard.get("shadow_um"):
         would = ", ".join(f"{axis} {offset:+.1f} um" for axis, offset in guard["shadow_um"].items())
         out.print(escape(f"in shadow, not sent: {would}"))
+    for refused in ((status.get("armed") or {}).get("check") or {}).get("refused", []):
+        out.print(f"[red]the correction ends early: {escape(refused)}[/red]")
     if checking := status.get("checking"):
         out.print(escape(f"checking {checking['program']}: {checking['checked_s']:.0f} s, line {checking['line']}"))
     if status["store"]["fault"]:

@@ -5,6 +5,7 @@ Pure but for reading the program and the commissioning records; what says no is 
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ MODEL_AGE_S = 8 * 3600.0  # a shift: older parameters are of another state of th
 MODEL_KELVIN = 3.0
 SKILL_MOVES = 3  # FAULTS E19: the last three recorded moves ...
 SKILL_SHARE = 0.5  # ... must be predicted within half of the gain that is promised
+AHEAD_S = 60.0  # of a program that must have passed before it is armed ahead of its check
 UNGUARDED_UM = 20.0  # the largest offset that may stay in a drive whose watchdog on us is not proven
 
 
@@ -87,12 +89,16 @@ class Armament:
 
 @dataclass(frozen=True, slots=True)
 class StreamedArmament:
-    """A long program that passed the gate as a whole: its first rows, ready for the guard, and the others' stream."""
+    """A long program: its first rows, ready for the guard, and the stream of all that passed and will pass the gate.
+
+    ``begun_um`` is what the rows promised that were checked when it was armed.
+    """
 
     program: str
     stream: Stream
     begin: Piece
     facts: dict[str, bool]
+    begun_um: float
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -106,23 +112,25 @@ class StreamedArmament:
 
     @property
     def gain_um(self) -> float:
-        """What is promised."""
-        return self.stream.checked.gain_um
+        """What is promised: of the whole, once that is known."""
+        return self.stream.checked.gain_um if self.stream.checked.whole else self.begun_um
 
     def first(self) -> Piece:
         """Return the rows to arm with."""
         return self.begin
 
     def summary(self) -> dict[str, Any]:
-        """Return what the operator is told."""
+        """Return what the operator is told; errors and rows are those that were checked by now."""
+        checked = self.stream.checked
         return {
             "program": self.program,
             "program_digest": self.program_digest,
             "method": "inverse",
-            "rows": self.stream.rows,
+            "rows": checked.rows,
             "streamed": True,
-            "before": dict(self.stream.checked.header["before"]),
-            "after": dict(self.stream.checked.header["after"]),
+            "before": dict(checked.errors["before"]),
+            "after": dict(checked.errors["after"]),
+            "check": self.stream.status(),
             "warnings": [],
             "facts": dict(self.facts),
         }
@@ -130,7 +138,7 @@ class StreamedArmament:
 
 @dataclass(frozen=True, slots=True)
 class Long:
-    """A program longer than the guard's ring: it is to be checked as a whole, by itself, before it is armed."""
+    """A program longer than the guard's ring: it is to be checked in a process of its own, ahead of the motion."""
 
     program: Path
     program_digest: str
@@ -181,14 +189,27 @@ def prepare(
     return Armament(str(program), planned, table, facts)
 
 
+def may_begin(checked: Checked, config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> bool:
+    """Whether a program may be armed while its check goes on: far ahead, and nothing left to learn that forbids it.
+
+    What the rest could still change, the largest offset and the gain, must be good enough already as it is.
+    StoreError for a damaged commissioning record.
+    """
+    if checked.rows * config.machine.sync_period_s < AHEAD_S:
+        return False
+    axes = checked.axes
+    certain = standing_facts(axes, config, known, checked.gain_um) | _commissioned(axes, checked.largest_um, config)
+    return certain == standing_facts(axes, config, known, math.inf) | _commissioned(axes, 0.0, config)
+
+
 def prepare_stream(
     long: Long, checked: Checked, config: MachineConfig, known: Mapping[str, AxisKnowledge]
 ) -> StreamedArmament:
     """Make a checked program ready with the rows that it is armed with. StoreError when its rows cannot be read."""
-    stream = Stream(checked, long.program_digest, config.machine.sync_period_s)
-    facts = standing_facts(stream.axes, config, known, checked.gain_um)
-    facts |= _commissioned(stream.axes, float(checked.header["largest_um"]), config)
-    return StreamedArmament(str(long.program), stream, stream.take(FIRST_S), facts)
+    stream, gain_um = Stream(checked, long.program_digest, config.machine.sync_period_s), checked.gain_um
+    facts = standing_facts(stream.axes, config, known, gain_um)
+    facts |= _commissioned(stream.axes, checked.largest_um, config)
+    return StreamedArmament(str(long.program), stream, stream.take(FIRST_S), facts, gain_um)
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ from fdhil.daemon.arming import (
     Skills,
     StreamedArmament,
     feeding_facts,
+    may_begin,
     prepare,
     prepare_feeding,
     prepare_stream,
@@ -29,14 +30,17 @@ from fdhil.daemon.checking import Check
 from fdhil.daemon.control import Answer, refusal
 from fdhil.daemon.guard_link import REST, GuardLink
 from fdhil.daemon.keeping import Keeper, boot_id
+from fdhil.daemon.streamed import Checked
+from fdhil.daemon.supply import Supply
 from fdhil.daemon.token import ensure_token
-from fdhil.errors import DeviceError, StoreError
-from fdhil.records import Notice, Outcome, ParameterSet, Reason, Skill, Temperature
+from fdhil.errors import DeviceError
+from fdhil.records import Notice, Outcome, ParameterSet, Skill, Temperature
 from fdhil.store.history import Revision
 
 STREAM_S = 0.05
 ALIVE_S = 0.1  # the guard calls us lost after 0.5 s
 REFRESH_S = 0.5
+LANDING_S = 1.0  # what ended a moment ago is off within it: ramp, zeros and their read-back take 0.3 s at most
 STAND_DOWN_S = 3.0  # the longest ramp to zero takes 0.12 s
 NO_GUARD = "start fdhil-guard with this machine's config"
 
@@ -59,6 +63,7 @@ class Armory:
         self._arming = asyncio.Lock()
         self._armed: tuple[Armament | StreamedArmament | Feeding, Mapping[str, Any]] | None = None
         self._check = Check(config)
+        self._supply: Supply | None = None
         self._given_up = False
         self.guard = GuardLink(run_directory)
 
@@ -97,8 +102,11 @@ class Armory:
 
     @property
     def armed(self) -> Mapping[str, Any] | None:
-        """What was armed last and still is, None otherwise."""
-        return self._armed[1] if self._armed else None
+        """What was armed last and still is, None otherwise; of a long program also how far its check is."""
+        if self._armed is None:
+            return None
+        prepared, summary = self._armed
+        return {**summary, "check": prepared.stream.status()} if isinstance(prepared, StreamedArmament) else summary
 
     def _known(self) -> dict[str, AxisKnowledge]:
         now_s = time.monotonic()
@@ -126,9 +134,26 @@ class Armory:
             return refusal("NotOff", "another program is being armed", "wait for its answer")
         async with self._arming:
             self._given_up = False
+            if not await self._landed():
+                text = f"what was armed before is still on, in state {self.guard.state}"
+                return refusal("NotOff", text, "run fdhil disarm or wait until it has ended, then arm again")
             if feeding:
                 return await self._feed_forward(token)
-            return await self._arm(Path(str(program)), method, token)
+            return await self._arm(Path(str(program)), method, token, request.get("whole") is True)
+
+    async def _landed(self) -> bool:
+        """Wait a moment for the end of what ramps down; return whether the guard is at rest, or absent."""
+        deadline_s = time.monotonic() + LANDING_S
+        await asyncio.to_thread(self.guard.look)
+        while self.guard.state not in REST and time.monotonic() < deadline_s:
+            await asyncio.sleep(STREAM_S)
+            await asyncio.to_thread(self.guard.look)
+        if self.guard.state in REST:
+            self._release()
+        return self.guard.state in REST
+
+    def _release(self) -> None:
+        self._armed = self._supply = None
 
     async def _feed_forward(self, token: str) -> Answer:
         """Switch the on-line feed-forward on: it needs no program."""
@@ -156,11 +181,12 @@ class Armory:
         if not answer["ok"]:
             return dict(answer) | {"planned": summary}
         self._armed = (prepared, summary)
+        self._supply = Supply(prepared, self.guard) if isinstance(prepared, StreamedArmament) else None
         return dict(answer)
 
-    async def _arm(self, program: Path, method: str | None, token: str) -> Answer:
+    async def _arm(self, program: Path, method: str | None, token: str, whole: bool) -> Answer:
         found = await asyncio.to_thread(prepare, program, method, self._config, self._known())
-        prepared = await self._checked(found) if isinstance(found, Long) else found
+        prepared = await self._checked(found, whole) if isinstance(found, Long) else found
         if isinstance(prepared, Refused):
             return _refused(prepared)
         summary = prepared.summary()
@@ -169,19 +195,19 @@ class Armory:
             return answer
         text = (
             f"armed {program.name} by {summary['method']}: contour error {summary['before']['rms_um']:.1f} um RMS is"
-            f" predicted to become {summary['after']['rms_um']:.1f}; start the program"
+            f" predicted to become {summary['after']['rms_um']:.1f}"
         )
-        return {"ok": True, "state": answer.get("state", "ARMED"), "text": text, **summary}
+        if not summary.get("check", {"whole": True})["whole"]:
+            text += f" in its first {summary['check']['checked_s']:.0f} s; the check of the rest goes on ahead of it"
+        return {"ok": True, "state": answer.get("state", "ARMED"), "text": f"{text}; start the program", **summary}
 
-    async def _checked(self, long: Long) -> StreamedArmament | Refused:
-        """Have a long program checked as a whole; only then it is armed with its first rows.
+    async def _checked(self, long: Long, whole: bool) -> StreamedArmament | Refused:
+        """Have a long program checked as far as arming asks, or as a ``whole``; it is armed with its first rows."""
 
-        Not beside a correction: the check takes its processor, and its rows may take the place of those that run.
-        """
-        if self._armed is not None:
-            advice = "disarm it or wait for its end, then arm again"
-            return Refused((Reason("NotOff", "a correction is armed or runs", advice),))
-        checked = await self._check.run(long.program, long.program_digest, long.models)
+        def enough(checked: Checked) -> bool:
+            return not whole and may_begin(checked, self._config, self._known())
+
+        checked = await self._check.run(long.program, long.program_digest, long.models, enough)
         if isinstance(checked, tuple):
             return Refused(checked)
         return await asyncio.to_thread(prepare_stream, long, checked, self._config, self._known())
@@ -192,12 +218,13 @@ class Armory:
         return self._check.progress
 
     def abandon(self) -> bool:
-        """Arm nothing of what is being prepared; return whether the check of a long program was ended."""
+        """Arm nothing of what is being prepared; return whether its check was ended. That of what is armed goes on."""
         self._given_up = True
-        return self._check.abandon()
+        return self._supply is None and self._check.abandon()
 
     async def disarm(self) -> Answer:
         """Have the guard ramp to zero; a program that is still being planned or checked is not armed."""
+        self._supply = None  # no more rows, no more words about them
         abandoned = self.abandon()
         try:
             answer = await asyncio.to_thread(self.guard.disarm)
@@ -222,35 +249,16 @@ class Armory:
             if looking is not None and looking.done():
                 tell(looking.result())
                 looking = None
-                if self._armed and self.guard.state in REST:
-                    self._armed = None
+                if self.guard.state in REST:
+                    self._release()
 
     async def stream(self, tell: Tell) -> None:
-        """Hand a long program's rows to the guard as it runs; where that ends early the guard ramps down."""
-        ended: StreamedArmament | None = None
+        """Hand a long program's rows to the guard as they pass and as it runs, and tell what is refused of them."""
         while True:
             await asyncio.sleep(STREAM_S)
-            armed = self._armed[0] if self._armed else None
-            if isinstance(armed, StreamedArmament) and armed is not ended:
-                notices, goes_on = await asyncio.to_thread(self._extend, armed)
-                tell(notices)
-                ended = None if goes_on else armed
-
-    def _extend(self, armed: StreamedArmament) -> tuple[list[Notice], bool]:
-        """Hand on what the guard lacks; return what is to be told, and whether more rows come."""
-        notices = self.guard.refresh()
-        if self.guard.state in REST or not armed.stream.lacks(self.guard.status):
-            return notices, True
-        try:
-            answer = self.guard.extend(armed, armed.stream.take())
-        except StoreError as error:
-            return [*notices, Notice(error.code, "MAJOR", f"{error}; the correction ends before these rows")], False
-        except DeviceError as error:
-            return [*notices, Notice("GuardLost", "MAJOR", str(error))], False
-        if answer["ok"]:
-            return notices, True
-        text = f"{answer['text']}; the correction ends before these rows"
-        return [*notices, Notice("StreamRefused", "MAJOR", text)], False
+            if self._supply is not None:
+                tell(await asyncio.to_thread(self._supply.go_on))
+            await self._check.attend()
 
     def _facts(self) -> Mapping[str, bool] | None:
         """What is still vouched for while a correction runs; None while none does."""
@@ -265,6 +273,7 @@ class Armory:
 
     async def stand_down(self) -> str:
         """Have a running correction ramped to zero and wait for it; return the state that was reached."""
+        self._supply = None
         self.abandon()
         if self.guard.connected and self.guard.state not in REST:
             await self.disarm()
@@ -275,6 +284,7 @@ class Armory:
                 await asyncio.sleep(ALIVE_S)
                 await asyncio.to_thread(self.guard.refresh)
         state = self.guard.state
+        await self._check.close()
         await asyncio.to_thread(self.guard.close)
         return state
 

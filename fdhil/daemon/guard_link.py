@@ -49,10 +49,19 @@ class GuardLink:
         """The guard's state when it was asked last."""
         return str(self._status["state"])
 
-    def refresh(self) -> list[Notice]:
-        """Connect where needed and ask for the status (blocking); return what changed since the last call."""
+    @property
+    def row(self) -> int:
+        """The row of the path where the machine is, 0 before it has begun."""
+        return int(self._status.get("row") or 0)
+
+    def look(self) -> None:
+        """Connect where needed and ask for the status (blocking); what changed is told by the next ``refresh``."""
         with contextlib.suppress(DeviceError), self._asked():
             pass
+
+    def refresh(self) -> list[Notice]:
+        """Look at the status (blocking); return what changed since the last call."""
+        self.look()
         with self._lock:
             told, self._untold = self._untold, []
         return told

@@ -1,8 +1,9 @@
-"""A whole program through the planner, the correction and the gate, block by block, before anything is armed.
+"""A whole program through the planner, the correction and the gate, block by block, ahead of the motion.
 
 A process of its own (``python -m fdhil.daemon.program_check``, one JSON request on stdin): it may take minutes for an
-hour's program, at low priority, without holding up what the daemon listens to, and can be ended at any moment. What it
-leaves is a file of the rows as the guard will get them, and a header that vouches for it.
+hour's program, at low priority, without holding up what the daemon listens to, and can be ended at any moment. Each
+block that passed is on disk, as the guard will get it, before it is told with its digest; what remains in the end is
+the file of all rows, and a header that vouches for it.
 """
 
 from __future__ import annotations
@@ -21,8 +22,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numba
 import numpy as np
+import scipy
 
+import fdhil
 from fdhil.config import MachineConfig
 from fdhil.correction import gate
 from fdhil.correction.streaming import StreamBlock, stream
@@ -34,7 +38,7 @@ from fdhil.program.planner import stream as planned
 from fdhil.records import Float, Parameters, Reason, Trajectory
 from fdhil.store.atomic import store_error, sync_folder, write_file
 
-SCHEMA = "fdhil-check-2"
+SCHEMA = "fdhil-check-3"
 ROWS = ".rows"
 HEADER = ".json"
 KEPT = 4  # checked programs; an hour of two axes takes 58 MB
@@ -42,8 +46,26 @@ PIECE_ROWS = 2000
 MOST_REFUSED = 20  # places that are listed
 TELL_S = 0.5
 NICENESS = 10
+# what the rows depend on: their code and the libraries that compute them
+ROOMS = ("program", "correction", "prediction", "model", "records", "config", "tables.py", "cia402.py")
+OWN = "daemon/program_check.py"
+LIBRARIES = (np, scipy, numba)
 
 Tell = Callable[[Mapping[str, Any]], None]
+
+
+def code_digest() -> str:
+    """Return the digest of the code that makes the rows, as it is on disk now, and of its libraries' versions.
+
+    What another planner made under the same version is not reused.
+    """
+    home = Path(fdhil.__file__).parent
+    digest = hashlib.sha256(json.dumps([sys.version, *(library.__version__ for library in LIBRARIES)]).encode())
+    for room in (*ROOMS, OWN):
+        place = home / room
+        for file in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
+            digest.update(str(file.relative_to(home)).encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()
 
 
 def reference_blocks(program: Path, config: MachineConfig) -> Iterator[Trajectory]:
@@ -132,8 +154,9 @@ class _Findings:
         self.after_max = max(self.after_max, float(block.after_um.max()))
         self.largest_um = max(self.largest_um, *(float(np.abs(o).max()) for o in block.offset_um.values()))
 
-    def refuse(self, block: StreamBlock, path: _Path, dt_s: float) -> None:
-        """Add a block's refusals with their line and time; the same one in the same line is told once."""
+    def refuse(self, block: StreamBlock, path: _Path, dt_s: float) -> list[Reason]:
+        """Add a block's refusals with their line and time, return the new ones; the same in a line is told once."""
+        known = len(self.refused)
         for row, reason in sorted(zip(block.at, block.refused, strict=True), key=lambda told: told[0]):
             line = path.line(row)
             name = (reason.code, *reason.text.split()[:2], str(line or row))
@@ -141,18 +164,26 @@ class _Findings:
                 self.named.add(name)
                 place = f"line {line}, at {row * dt_s:.2f} s" if line else f"at {row * dt_s:.2f} s"
                 self.refused.append(Reason(reason.code, f"{place}: {reason.text}", reason.advice))
+        return self.refused[known:]
+
+    def errors(self) -> dict[str, dict[str, float]]:
+        """Return the contour error so far, without and with the correction."""
+        then, now = (math.sqrt(square / max(1, self.rows)) for square in (self.before_square, self.after_square))
+        return {
+            "before": {"rms_um": then, "max_um": self.before_max},
+            "after": {"rms_um": now, "max_um": self.after_max},
+        }
 
     def header(self) -> dict[str, Any]:
         """Return the figures of the whole; what it gains is asked last."""
-        then, now = (math.sqrt(square / max(1, self.rows)) for square in (self.before_square, self.after_square))
-        refused = self.refused or list(gate.gains(then, now))
-        return {
-            "rows": self.rows,
-            "before": {"rms_um": then, "max_um": self.before_max},
-            "after": {"rms_um": now, "max_um": self.after_max},
-            "largest_um": self.largest_um,
-            "refused": [{"code": r.code, "text": r.text, "advice": r.advice} for r in refused[:MOST_REFUSED]],
-        }
+        errors = self.errors()
+        refused = self.refused or list(gate.gains(errors["before"]["rms_um"], errors["after"]["rms_um"]))
+        told = [_told(reason) for reason in refused[:MOST_REFUSED]]
+        return {"rows": self.rows, **errors, "largest_um": self.largest_um, "refused": told}
+
+
+def _told(reason: Reason) -> dict[str, str]:
+    return {"code": reason.code, "text": reason.text, "advice": reason.advice}
 
 
 def check(
@@ -161,36 +192,50 @@ def check(
     """Run the whole program through correction and gate; write its rows to ``body``, return the header.
 
     ``sha256`` is the program's digest, under which its rows will be known. A row is the demand of each axis, then the
-    offset of each, int32 in the guard's increments. ``tell`` hears now and then how far it is. ProgramError,
-    RecordingError or ConfigError when the program cannot be used.
+    offset of each, int32 in the guard's increments. ``tell`` hears of each block that passed ({"block": ...}, once its
+    rows are written), of each place that is refused ({"refused": ...}), and now and then how far it is
+    ({"progress": ...}). ProgramError, RecordingError or ConfigError when the program cannot be used.
     """
-    dt_s, begun_s, told_s = config.machine.sync_period_s, time.monotonic(), -math.inf
     source, opened = _opened(program, config)
-    path, findings, digest, files = _Path(source), _Findings(), hashlib.sha256(), _Files(program, sha256)
+    path, findings, files = _Path(source), _Findings(), _Files(program, sha256)
+    code, blocks, pace = code_digest(), list[list[Any]](), _Pace(config.machine.sync_period_s)
     for block in stream(path.pieces(), models, config, goes_on=True):
         demand = path.positions(block.first_row, block.first_row + block.before_um.size)
         files.take(opened())
         findings.take(block)
-        findings.refuse(block, path, dt_s)
+        for reason in findings.refuse(block, path, config.machine.sync_period_s):
+            tell({"refused": _told(reason)})
         if len(findings.refused) >= MOST_REFUSED:
             break
         if not findings.refused:
             rows = encoded(demand, block.offset_um, config)
-            digest.update(rows)
             body.write(rows)
-        now_s = time.monotonic()
-        if now_s - told_s >= TELL_S:
-            told_s, checked_s = now_s, findings.rows * dt_s
-            tell(
-                {
-                    "checked_s": round(checked_s, 3),
-                    "line": path.line(findings.rows - 1),
-                    "times_real_time": round(checked_s / max(1e-3, now_s - begun_s), 1),
-                    "refused": len(findings.refused),
-                }
-            )
-    of = {"schema": SCHEMA, "axes": list(config.axis), "sha256": digest.hexdigest(), "files": files.unchanged()}
+            body.flush()
+            blocks.append([findings.rows, hashlib.sha256(rows).hexdigest()])
+            tell({"block": blocks[-1], "last": block.final, "errors": findings.errors()})
+        pace.tell(tell, findings, path)
+    of = {"schema": SCHEMA, "axes": list(config.axis), "code": code, "blocks": blocks, "files": files.unchanged()}
     return of | findings.header()
+
+
+class _Pace:
+    """How far the check is and how fast; told now and then."""
+
+    def __init__(self, dt_s: float) -> None:
+        self._dt_s, self._begun_s, self._told_s = dt_s, time.monotonic(), -math.inf
+
+    def tell(self, tell: Tell, findings: _Findings, path: _Path) -> None:
+        now_s = time.monotonic()
+        if now_s - self._told_s < TELL_S:
+            return
+        self._told_s, checked_s = now_s, findings.rows * self._dt_s
+        progress = {
+            "checked_s": round(checked_s, 3),
+            "line": path.line(findings.rows - 1),
+            "times_real_time": round(checked_s / max(1e-3, now_s - self._begun_s), 1),
+            "refused": len(findings.refused),
+        }
+        tell({"progress": progress})
 
 
 def encoded(demand_mm: Mapping[str, Float], offset_um: Mapping[str, Float], config: MachineConfig) -> bytes:
@@ -203,16 +248,22 @@ def encoded(demand_mm: Mapping[str, Float], offset_um: Mapping[str, Float], conf
     return np.column_stack(columns).astype("<i4").tobytes()
 
 
+def part_file(folder: Path, key: str) -> Path:
+    """Return where rows are while they are written."""
+    return folder / f".{key}.part"
+
+
 def keep(folder: Path, key: str, request: Callable[[BinaryIO], dict[str, Any]]) -> dict[str, Any]:
     """Have the rows written, then make them and their header durable under ``key``; the oldest programs go.
 
     StoreError when that fails. A refused program leaves nothing.
     """
-    part = folder / f".{key}.part"
+    part = part_file(folder, key)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for left in folder.glob(".*.part"):  # by a check that was ended
-            left.unlink()
+            if left != part:
+                left.unlink()
         with part.open("wb") as body:
             header = request(body)
             body.flush()
@@ -256,17 +307,11 @@ def main() -> None:
     models = {axis: Parameters(**values) for axis, values in request["models"].items()}
 
     def run(body: BinaryIO) -> dict[str, Any]:
-        return check(
-            Path(request["program"]),
-            request["program_digest"],
-            models,
-            config,
-            body,
-            lambda told: say({"progress": dict(told)}),
-        )
+        return check(Path(request["program"]), request["program_digest"], models, config, body, say)
 
     try:
-        say({"header": keep(Path(request["folder"]), request["key"], run)})
+        header = keep(Path(request["folder"]), request["key"], run)
+        say({"header": {name: value for name, value in header.items() if name != "blocks"}})  # they were told
     except StoreError as error:
         say({"error": {"code": error.code, "text": str(error), "advice": "free the disk, then arm again"}})
     except FdhilError as error:

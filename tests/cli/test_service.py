@@ -75,13 +75,22 @@ def test_status_as_a_table_and_as_json(machine: Path, tmp_path: Path, capsys: An
     assert json.loads(out)["axes"]["X"]["parameters"]["K"]["value"] == 0.8
 
 
+def test_status_names_what_the_check_of_an_armed_program_refused(machine: Path, tmp_path: Path, capsys: Any) -> None:
+    check = {"checked_s": 90.0, "whole": False, "refused": ["DemandTooHigh: line [7]: axis X", "HarmPredicted: line 9"]}
+    with answering(machine, {**status_of(tmp_path), "armed": {"program": "p.ngc", "check": check}}):
+        _, out, _ = fdhil("status", machine, capsys=capsys)
+    assert "the correction ends early: DemandTooHigh: line [7]: axis X" in out
+    assert "the correction ends early: HarmPredicted: line 9" in out
+
+
 def test_arm_sends_the_token_and_says_what_is_promised(machine: Path, tmp_path: Path, capsys: Any) -> None:
     with answering(machine, {"ok": True, "text": "armed p.ngc"}) as requests:
-        code, out, _ = fdhil("arm", machine, tmp_path / "p.ngc", "--method", "mirror", capsys=capsys)
+        arguments = ("arm", machine, tmp_path / "p.ngc", "--method", "mirror", "--whole")
+        code, out, _ = fdhil(*arguments, capsys=capsys)
     assert (code, out) == (0, "armed p.ngc\n")
     token = (machine.parent / "fdhil-data" / "run" / "token").read_text()
     program = str((tmp_path / "p.ngc").resolve())
-    wanted = {"request": "arm", "program": program, "method": "mirror", "token": token, "progress": True}
+    wanted = {"request": "arm", "program": program, "method": "mirror", "whole": True, "token": token, "progress": True}
     assert requests == [wanted]
 
 

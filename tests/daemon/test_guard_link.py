@@ -15,7 +15,6 @@ from typing import Any
 import pytest
 
 from fdhil.config import MachineConfig
-from fdhil.daemon.arming import Refused
 from fdhil.daemon.armory import ALIVE_S, Armory
 from fdhil.daemon.guard_link import TRIPPED, GuardLink
 from fdhil.daemon.keeping import Keeper
@@ -156,6 +155,7 @@ async def test_what_is_given_up_while_it_is_planned_is_not_armed(
         return SimpleNamespace(facts={}, summary=lambda: {"method": "inverse"})
 
     monkeypatch.setattr("fdhil.daemon.armory.prepare", slow)
+    guard.says = lambda _kind: {**FINE, "state": "OFF"}
     armory = Armory(config, Keeper(config), folder)
     armory.begin({}, [])
     request = {"request": "arm", "program": "a.ngc", "token": read_token(folder)}
@@ -171,12 +171,3 @@ async def test_what_is_given_up_while_it_is_planned_is_not_armed(
     assert set(guard.heard) <= {"disarm", "status"}
     assert armory.armed is None
     armory.guard.close()
-
-
-async def test_no_long_program_is_checked_beside_a_correction(config: MachineConfig, folder: Path) -> None:
-    """Its rows could take the place of those that are handed on."""
-    armory = Armory(config, Keeper(config), folder)
-    armory._armed = (Long(), {})  # type: ignore[assignment]
-    refused = await armory._checked(Long())  # type: ignore[arg-type]
-    assert isinstance(refused, Refused)
-    assert refused.reasons[0].code == "NotOff"

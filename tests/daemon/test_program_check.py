@@ -7,6 +7,7 @@ import hashlib
 import io
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -17,12 +18,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+import fdhil
 from fdhil import correction
 from fdhil.config import MachineConfig
 from fdhil.daemon.arming import Long, StreamedArmament, prepare, prepare_stream
 from fdhil.daemon.checking import FOLDER, Check
-from fdhil.daemon.program_check import KEPT, check, keep
-from fdhil.daemon.streamed import Checked, Stream
+from fdhil.daemon.program_check import KEPT, OWN, ROOMS, SCHEMA, check, code_digest, keep
+from fdhil.daemon.streamed import Checked, Piece, Stream
 from fdhil.errors import ProgramError, StoreError
 from fdhil.prediction.models import nominal_models
 from fdhil.program import load_trajectory, program_digest
@@ -49,9 +51,9 @@ def written(folder: Path, text: str) -> Path:
     return path
 
 
-def checked(program: Path, config: MachineConfig) -> tuple[dict[str, Any], bytes, list[Mapping[str, Any]]]:
+def checked(program: Path, config: MachineConfig) -> tuple[dict[str, Any], bytes, list[Any]]:
     """Check a program in this process; return header, rows and what was told."""
-    body, told = io.BytesIO(), list[Mapping[str, Any]]()
+    body, told = io.BytesIO(), list[Any]()
     header = check(program, program_digest(program), nominal_models(config), config, body, told.append)
     return header, body.getvalue(), told
 
@@ -68,7 +70,35 @@ def test_the_rows_are_those_of_the_whole_plan(config: MachineConfig, tmp_path: P
     assert header["rows"] == len(rows)
     assert header["before"]["rms_um"] == pytest.approx(np.sqrt(np.mean(planned.before.contour_um**2)))
     assert header["after"]["max_um"] == pytest.approx(planned.after.contour_um.max(), abs=1e-6)
-    assert told[0].keys() == {"checked_s", "line", "times_real_time", "refused"}
+    progress = next(one["progress"] for one in told if "progress" in one)
+    assert progress.keys() == {"checked_s", "line", "times_real_time", "refused"}
+    blocks = [one for one in told if "block" in one]
+    assert [one["block"] for one in blocks] == header["blocks"]
+    assert [one["last"] for one in blocks] == [False] * (len(blocks) - 1) + [True]
+    assert blocks[-1]["errors"] == {"before": header["before"], "after": header["after"]}
+    first = 0
+    for end, sha256 in header["blocks"]:
+        assert hashlib.sha256(rows[first:end].tobytes()).hexdigest() == sha256
+        first = end
+    assert first == header["rows"]
+
+
+def test_a_block_is_written_before_it_is_told(config: MachineConfig, tmp_path: Path) -> None:
+    """Who reads as far as was told finds the rows that were told."""
+    file, program, seen = tmp_path / "rows", written(tmp_path, LONG), 0
+
+    def look(told: Mapping[str, Any]) -> None:
+        nonlocal seen
+        if "block" in told:
+            end, sha256 = told["block"]
+            content = file.read_bytes()
+            assert len(content) == 16 * end
+            assert hashlib.sha256(content[16 * seen :]).hexdigest() == sha256
+            seen = end
+
+    with file.open("wb") as body:
+        check(program, program_digest(program), nominal_models(config), config, body, look)
+    assert seen > 15_000
 
 
 def hard_program() -> str:
@@ -82,7 +112,9 @@ def hard_program() -> str:
 
 def test_every_place_is_named_with_line_axis_figure_and_advice(config: MachineConfig, tmp_path: Path) -> None:
     sharp = config.model_copy(update={"nc": config.nc.model_copy(update={"smoothing_s": (0.02, 0.01)})})
-    header, _, _ = checked(written(tmp_path, hard_program()), sharp)
+    header, body, at_once = checked(written(tmp_path, hard_program()), sharp)
+    assert [one["refused"] for one in at_once if "refused" in one] == header["refused"]
+    assert len(body) == 16 * header["blocks"][-1][0] < 16 * header["rows"]  # no row from the first place on
     demand = [told for told in header["refused"] if told["code"] == "DemandTooHigh"]
     told = " | ".join(reason["text"] for reason in demand)
     for number in HARD_LINES:
@@ -110,15 +142,22 @@ def test_a_checked_program_is_armed_with_its_first_rows_and_goes_on(config: Mach
     assert armament.program_digest == program_digest(program)
     stream, pieces = armament.stream, [armament.first()]
     assert len(pieces[0].demand["X"]) == 10_000
+    assert first.whole
     assert stream.lacks({"rows": [0, 10_000], "row": 1})
     assert not stream.lacks({"rows": [0, 10_000], "row": 0})
-    while not stream.done:
+    while stream.ready:
         pieces.append(stream.take())
     assert [piece.final for piece in pieces] == [False] * (len(pieces) - 1) + [True]
-    assert [piece.first for piece in pieces[1:]] == list(range(10_000, stream.rows, 2000))
-    body = np.frombuffer(first.rows_file.read_bytes(), "<i4").reshape(-1, 4)
+    assert [piece.first for piece in pieces[1:]] == [block.end for block in first.blocks[4:-1]]
+    (file,) = (config.store.directory / FOLDER).glob("*.rows")
+    body = np.frombuffer(file.read_bytes(), "<i4").reshape(-1, 4)
     assert np.array_equal(np.concatenate([piece.offset["Y"] for piece in pieces]), body[:, 3])
     assert not stream.lacks({"rows": [0, 10_000], "row": 9_999})
+
+
+def whole(_checked: Checked) -> bool:
+    """Nothing but the whole is enough."""
+    return False
 
 
 async def _twice(config: MachineConfig, found: Long) -> list[Checked | tuple[Reason, ...]]:
@@ -132,9 +171,9 @@ async def _twice(config: MachineConfig, found: Long) -> list[Checked | tuple[Rea
             await asyncio.sleep(0.01)
 
     listening = asyncio.create_task(listen())
-    first = await check.run(found.program, found.program_digest, found.models)
+    first = await check.run(found.program, found.program_digest, found.models, whole)
     before = len(heard)
-    again = await check.run(found.program, found.program_digest, found.models)
+    again = await check.run(found.program, found.program_digest, found.models, whole)
     listening.cancel()
     assert heard[-1]["program"] == str(found.program)
     assert len(heard) == before
@@ -144,7 +183,7 @@ async def _twice(config: MachineConfig, found: Long) -> list[Checked | tuple[Rea
 async def test_an_abandoned_check_says_so_and_leaves_nothing(config: MachineConfig, tmp_path: Path) -> None:
     program = written(tmp_path, HEAD + SQUARE * 2000 + "M2\n")
     check = Check(config)
-    running = asyncio.create_task(check.run(program, program_digest(program), nominal_models(config)))
+    running = asyncio.create_task(check.run(program, program_digest(program), nominal_models(config), whole))
     async with asyncio.timeout(100):
         while not (check.progress or {}).get("checked_s"):  # noqa: ASYNC110 - what another process says has no event
             await asyncio.sleep(0.05)
@@ -159,7 +198,7 @@ async def test_an_abandoned_check_says_so_and_leaves_nothing(config: MachineConf
 
 async def test_a_broken_program_is_refused_with_its_line(config: MachineConfig, tmp_path: Path) -> None:
     program = written(tmp_path, HEAD + SQUARE * 10 + "G1 X[1/0]\nM2\n")
-    refused = await Check(config).run(program, program_digest(program), nominal_models(config))
+    refused = await Check(config).run(program, program_digest(program), nominal_models(config), whole)
     assert isinstance(refused, tuple)
     assert refused[0].code == "ProgramError"
     assert "43" in refused[0].text
@@ -175,18 +214,19 @@ async def test_a_subroutine_beside_the_program_belongs_to_it(config: MachineConf
     beside.write_text(BESIDE)
     program = written(tmp_path, CALLS)
     digest, models = program_digest(program), nominal_models(config)
-    first = await Check(config).run(program, digest, models)
+    first = await Check(config).run(program, digest, models, whole)
     assert isinstance(first, Checked)
+    assert first.header is not None
     assert first.header["files"] == {"square.ngc": program_digest(beside)}
-    key = first.rows_file.stem
-    assert Checked.find(first.rows_file.parent, key, tmp_path) is not None
+    (file,) = (config.store.directory / FOLDER).glob("*.rows")
+    assert Checked.find(file.parent, file.stem, tmp_path) is not None
     beside.write_text(BESIDE.replace("X40", "X41"))
-    assert Checked.find(first.rows_file.parent, key, tmp_path) is None
-    again = await Check(config).run(program, digest, models)
+    assert Checked.find(file.parent, file.stem, tmp_path) is None
+    again = await Check(config).run(program, digest, models, whole)
     assert isinstance(again, Checked)
-    assert again.header["sha256"] != first.header["sha256"]
+    assert again.blocks != first.blocks
     beside.unlink()
-    assert Checked.find(first.rows_file.parent, key, tmp_path) is None
+    assert Checked.find(file.parent, file.stem, tmp_path) is None
 
 
 @pytest.mark.parametrize("which", ["program.ngc", "square.ngc"])
@@ -211,7 +251,7 @@ async def test_a_process_that_dies_within_a_line_is_told(
     dying.write_text('#!/bin/sh\nread line\nprintf \'{"header": {"ref\'\nexit 9\n')
     dying.chmod(0o700)
     monkeypatch.setattr(sys, "executable", str(dying))
-    refused = await Check(config).run(program, program_digest(program), nominal_models(config))
+    refused = await Check(config).run(program, program_digest(program), nominal_models(config), whole)
     assert isinstance(refused, tuple)
     assert (refused[0].code, "exit code 9" in refused[0].text) == ("InternalError", True)
 
@@ -243,15 +283,16 @@ def test_the_process_ends_with_its_answer_or_with_the_daemon(config: MachineConf
 
 
 def made(folder: Path, key: str) -> Path:
-    """Keep eight rows under a key; return their file."""
+    """Keep eight rows in two blocks under a key; return their file."""
+    code = code_digest()
 
     def rows(body: Any) -> dict[str, Any]:
         content = np.arange(32, dtype="<i4").tobytes()
         body.write(content)
-        digest = hashlib.sha256(content).hexdigest()
-        whole = {"rms_um": 2.0, "max_um": 3.0}
-        return {"schema": "fdhil-check-2", "files": {}, "axes": ["X", "Y"], "rows": 8, "sha256": digest, "refused": [],
-                "before": whole, "after": {"rms_um": 0.5, "max_um": 1.0}, "largest_um": 1.0}  # fmt: skip
+        blocks = [[end, hashlib.sha256(content[16 * (end - 4) : 16 * end]).hexdigest()] for end in (4, 8)]
+        errors = {which: {"rms_um": rms, "max_um": 3.0} for which, rms in (("before", 2.0), ("after", 0.5))}
+        of = {"schema": SCHEMA, "code": code, "files": {}, "axes": ["X", "Y"], "rows": 8, "blocks": blocks}
+        return {**of, **errors, "refused": [], "largest_um": 1.0}
 
     keep(folder, key, rows)
     return folder / f"{key}.rows"
@@ -261,20 +302,59 @@ def test_what_was_checked_is_only_believed_whole(tmp_path: Path) -> None:
     file = made(tmp_path, "a")
     found = Checked.find(tmp_path, "a", tmp_path)
     assert found is not None
-    assert found.gain_um == 1.5
+    assert (found.whole, found.rows, found.gain_um) == (True, 8, 1.5)
     assert Checked.find(tmp_path, "b", tmp_path) is None
     stream = Stream(found, "digest", 0.001)
     content = bytearray(file.read_bytes())
-    content[17] ^= 1
+    content[70] ^= 1
     file.write_bytes(content)
     assert Checked.find(tmp_path, "a", tmp_path) is None
-    file.write_bytes(content[:40])
-    with pytest.raises(StoreError, match="ends too early"):
+    assert stream.take() == Piece(
+        0, {"X": [0, 4, 8, 12], "Y": [1, 5, 9, 13]}, {"X": [2, 6, 10, 14], "Y": [3, 7, 11, 15]}, False
+    )
+    with pytest.raises(StoreError, match="damaged"):
         stream.take()
+    file.write_bytes(content[:40])
+    with pytest.raises(StoreError, match="damaged"):
+        Stream(found, "digest", 0.001).take()
+    assert Checked.find(tmp_path, "a", tmp_path) is None
     file.unlink()
     assert Checked.find(tmp_path, "a", tmp_path) is None
-    with pytest.raises(StoreError, match="cannot be read"):
-        stream.take()
+
+
+def test_what_is_armed_outlives_its_file(tmp_path: Path) -> None:
+    """Another program may take its place in the store while it runs."""
+    file = made(tmp_path, "a")
+    found = Checked.find(tmp_path, "a", tmp_path)
+    assert found is not None
+    file.unlink()
+    assert Stream(found, "digest", 0.001).take(1.0).final
+
+
+def test_what_other_code_made_is_checked_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A changed planner under the same version makes other rows."""
+    made(tmp_path, "a")
+    home = tmp_path / "fdhil"
+    shutil.copytree(Path(fdhil.__file__).parent, home, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(fdhil, "__file__", str(home / "__init__.py"))
+    assert Checked.find(tmp_path, "a", tmp_path) is not None
+    (home / "guard" / "core.py").write_text("")  # makes no row
+    assert Checked.find(tmp_path, "a", tmp_path) is not None
+    with (home / "program" / "planner" / "smoothing.py").open("a") as file:
+        file.write("# otherwise\n")
+    assert Checked.find(tmp_path, "a", tmp_path) is None
+
+
+def test_the_digest_covers_all_code_that_the_check_runs() -> None:
+    """A room that the check begins to use must be in it; errors and the writing of files make no row."""
+    told = "import sys, fdhil.daemon.program_check\nprint(*(m for m in sys.modules if m.startswith('fdhil.')))"
+    done = subprocess.run([sys.executable, "-c", told], capture_output=True, check=True, text=True)
+    rooms = {name.removesuffix(".py").replace("/", ".") for name in (*ROOMS, OWN)}
+    others = {"daemon", "errors", "store", "store.atomic"}
+    modules = {name.removeprefix("fdhil.") for name in done.stdout.split()}
+    outside = {name for name in modules - others - rooms if name.split(".")[0] not in rooms}
+    assert outside == set()
+    assert len(modules) > 50
 
 
 def test_a_refused_program_is_not_kept_and_old_ones_go(tmp_path: Path) -> None:
