@@ -14,13 +14,14 @@ import numpy as np
 
 from fdhil.identification.motion import Motion, Noise
 from fdhil.identification.normal import inverse_of
-from fdhil.identification.slow_voltage import Innovations, innovations_of
+from fdhil.identification.slow_voltage import Innovations, innovations_of, room_s
 from fdhil.records import Float
 
 STEPS = 60
 CONVERGED = 0.01  # of a standard deviation
 DIFFERENCE = 1e-5  # of a parameter's typical size
 DELAY_DIFFERENCE_S = 1e-6
+LEAST_DIFFERENCE_S = 1e-8
 LEAST_SHARE = 1e-3
 GAIN = 1e-3  # of twice the log likelihood: a step that gains less moves nothing by more than some hundredths
 
@@ -41,23 +42,27 @@ class Likelihood:
     def slopes(self, here: Innovations, theta: Float, free: Sequence[int], sizes: Float) -> tuple[Float, Float]:
         """Return minus the derivatives (m, k) of innovations by ``free``, in deviations, and of half the log variance.
 
-        The order of rows and samples is held: an innovation must stay the same row's. A sample that would so be taken
-        before its row has its time run backwards; where a variance does not bear that, the delay is varied to the
-        other side.
+        The order of rows and samples is held: an innovation must stay the same row's. So the delay is varied to the
+        side on which the samples are further from a row that they would pass, and by no more than that.
         """
         deviation, order = np.sqrt(here.variance), float(theta[6])
         of_mean, of_variance = np.empty((here.values.size, len(free))), np.empty((here.values.size, len(free)))
         for k, j in enumerate(free):
             moved = theta.copy()
-            moved[j] += DELAY_DIFFERENCE_S if j == 6 else DIFFERENCE * sizes[j]
+            moved[j] += self._delay_step(order) if j == 6 else DIFFERENCE * sizes[j]
             there = self.at(moved, order)
-            if j == 6 and not (there.variance > 0.0).all():
-                moved[j] = theta[j] - DELAY_DIFFERENCE_S
-                there = self.at(moved, order)
             change = moved[j] - theta[j]
             of_mean[:, k] = (here.values - there.values) / deviation / change
             of_variance[:, k] = (np.log(here.variance) - np.log(there.variance)) / 2 / change
         return of_mean, of_variance
+
+    def _delay_step(self, delay_s: float) -> float:
+        """Return a small change of the delay by which no sample passes a row."""
+        rooms = [room_s(motion, delay_s) for motion in self.motions]
+        earlier, later = min(room[0] for room in rooms), min(room[1] for room in rooms)
+        # a longer delay puts a sample earlier
+        step = min(DELAY_DIFFERENCE_S, max(max(earlier, later) / 2, LEAST_DIFFERENCE_S))
+        return step if earlier >= later else -step
 
 
 def ascend(likelihood: Likelihood, theta: Float, free: Sequence[int], sizes: Float) -> tuple[Float, Float, Float, bool]:

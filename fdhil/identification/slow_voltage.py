@@ -99,6 +99,13 @@ def marks_of(motion: Motion, delay_s: float, ordered_for_s: float) -> Marks:
     return Marks(row.astype(np.int64), sample.astype(np.int64), np.asarray(grid[inside] - delay_s, np.float64))
 
 
+def room_s(motion: Motion, delay_s: float) -> tuple[float, float]:
+    """Return by how much all samples may be earlier, and later, before one of them passes a row."""
+    marks = marks_of(motion, delay_s, delay_s)
+    after = marks.time_s - marks.row * motion.dt_s
+    return float(after.min(initial=motion.dt_s)), float((motion.dt_s - after).min(initial=motion.dt_s))
+
+
 def _advance_plain(
     theta: Float, x: Float, p: Float, h: float, known: bool, push: float, walk: float, period: float
 ) -> None:

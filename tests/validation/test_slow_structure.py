@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.estimators.maximum_likelihood import fit_windows
 from fdhil.identification.windows import find_windows
 from fdhil.validation.structure import findings
 from studies.judging import GOOD, judge
-from studies.slow_recordings import recording_of
+from studies.slow_recordings import TO_AND_FRO, recording_of
 from studies.slow_sensor import SETTINGS
 
 
@@ -29,6 +30,16 @@ def test_a_delay_that_puts_a_sample_just_behind_its_row_is_fitted() -> None:
         fit = fit_windows(find_windows(recording), SETTINGS)
     assert fit is not None
     assert fit.converged
+
+
+def test_no_sample_near_a_row_passes_for_knowledge_of_the_delay() -> None:
+    # instants at every other row: one that a derivative put before its row "told" the delay to 0.2 us, the friction not
+    for window in find_windows(recording_of(121, 2002, TO_AND_FRO).recording):
+        fit = fit_windows([window], SETTINGS)
+        assert fit is not None
+        column = fit.jacobian[:, 6]
+        assert np.abs(column).max() ** 2 < 0.5 * (column @ column)
+        assert maximum_likelihood.finish(fit).missing == {}
 
 
 def test_gains_that_do_step_or_drift_are_still_named() -> None:
