@@ -8,6 +8,7 @@ leads the current to the middle of the dry friction's band, and which one, by as
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -26,6 +27,7 @@ STEADINESS = 3.0  # A per increment a cycle^2: how smooth the offset is to be, a
 AGAIN_S = 0.4
 UNEVEN = 20.0  # increments times cycles of rounding error after which the other neighbour is taken
 PASSES = 3
+LENGTHS_KEPT = 32  # of rests: an iteration meets most of them again
 KNOT_ROWS = 8
 EVERY = 3  # of the cycles says enough: the current cannot change faster than the spline
 RIDGE = 1e-6  # for splines that lie behind a short rest but for their tail
@@ -83,9 +85,10 @@ def _demand(response: Response) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class _Length:
-    """What depends on a rest's length alone: which of the splines count, and how stiff they are."""
+    """What depends on a rest's length alone: which of the splines count, how stiff they are, and both as one matrix."""
 
     effect: Float
+    even: Float
     spline: Float
     bend_first: Float
     bend_second: Float
@@ -111,7 +114,7 @@ class _Lead:
         self._bends = np.diff(np.pad(self._spline, ((2, 0), (0, 0))), 2, axis=0)
         self._smooth = (STEADINESS**2 / EVERY) * self._bends.T
         self._stiffness = self._smooth @ self._bends
-        self._long = self._of_length(answer_a.size)  # most rests end beyond the look
+        self._length = lru_cache(maxsize=LENGTHS_KEPT)(self._of_length)
 
     def _of_length(self, n: int) -> _Length:
         free = min(n - 2, self._free)
@@ -127,19 +130,22 @@ class _Lead:
         stiffness[np.diag_indices(columns)] += RIDGE
         first, second = self._smooth[:columns, 0], self._smooth[:columns, 1]
         effect = np.ascontiguousarray(self._effect[:seen:EVERY, :columns])
-        return _Length(effect, self._spline[:free, :columns], first, second if rows > 1 else 0 * second, stiffness)
+        even = effect.T @ effect + stiffness
+        return _Length(
+            effect, even, self._spline[:free, :columns], first, second if rows > 1 else 0 * second, stiffness
+        )
 
     def away(self, base_a: Float, before: Float) -> Float:
         """Return d (free,): least squares of the current base (n,) + effect and of d's bends.
 
         d ends in 0 with its slope, unless the rest ends first. ``before`` (2,) are its values in rows 0 and 1.
         """
-        length = self._long if base_a.size == len(self._effect) else self._of_length(base_a.size)
+        length = self._length(base_a.size)
         effect = length.effect
         base_a = base_a[: EVERY * len(effect) : EVERY]
         bent = length.bend_first * (before[0] - 2 * before[1]) + length.bend_second * before[1]
-        weighted, found = effect.T, np.zeros(len(bent))
-        for _ in range(PASSES):  # the largest currents weigh most: it is they that break the table loose
-            found = dposv(weighted @ effect + length.stiffness, -(weighted @ base_a) - bent)[1]
+        found = dposv(length.even, -(effect.T @ base_a) - bent)[1]
+        for _ in range(PASSES - 1):  # the largest currents weigh most: it is they that break the table loose
             weighted = effect.T * (1.0 + (base_a + effect @ found) ** 2)
+            found = dposv(weighted @ effect + length.stiffness, -(weighted @ base_a) - bent)[1]
         return np.asarray(length.spline @ found)
