@@ -87,3 +87,10 @@ def test_nothing_moves() -> None:
     assert find_windows(parse_recording(bench.as_csv(still))) == []
     silent = replace(parse_recording(bench.as_csv(still, 0.0)), rapid_speed_rad_s=None)
     assert find_windows(silent) == []
+
+
+def test_readings_that_are_no_numbers_do_not_disturb_the_search() -> None:
+    whole = recording(0.002)
+    speed = np.array(whole.speed_rad_s)
+    speed[[400, 401, 403, 404]] = np.inf  # whose differences are no numbers either
+    assert len(find_windows(replace(whole, speed_rad_s=speed))) == 1
