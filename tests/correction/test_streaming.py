@@ -118,7 +118,7 @@ def test_memory_is_flat() -> None:
     loop = np.concatenate([there, there[::-1]])
 
     def long() -> Iterator[Mapping[str, Float]]:
-        for _ in range(8):
+        for _ in range(12):
             yield from pieces(loop, 200)
 
     tracemalloc.start()
@@ -126,8 +126,10 @@ def test_memory_is_flat() -> None:
         held = [tracemalloc.get_traced_memory()[0] for _ in stream(long(), MODELS, CONFIG)]
     finally:
         tracemalloc.stop()
-    assert len(held) > 12
-    assert max(held[6:]) < 1.05 * max(held[:6])
+    assert len(held) > 20
+    # what a few lengths of rests need comes and goes (60 kB each); a path that is kept grows by 32 kB a block
+    assert max(held[6:]) < 1.10 * max(held[:6])
+    assert max(held[-6:]) < 1.05 * max(held[6:12])
 
 
 def test_no_path_gives_no_block() -> None:
