@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from fdhil.config import Identification
-from studies import comparison, drift, estimators
+from fdhil.records import frozen
+from fdhil.store.recording_csv import parse_recording
+from studies import bench, comparison, drift, estimators, faults, judging
 from studies.comparison_page import paragraph
+
+SHUTTLE = parse_recording(bench.as_csv(bench.run(bench.Plant(), bench.shuttle(moves=2)), 0.001, 1))
 
 
 def test_the_hausman_test_tells_a_bias_and_nothing_else() -> None:
@@ -46,3 +52,29 @@ def test_paragraphs_fit_the_page() -> None:
     lines = paragraph("a low-pass " * 60)
     assert max(map(len, lines)) <= 120
     assert lines[-1] == ""
+
+
+def test_what_is_accepted_or_named_wrongly_is_counted_for_good_and_bad_alike() -> None:
+    kinds = {"stuck": faults.Kind(lambda _: faults.Spoilt(SHUTTLE), frozenset({"StuckValue"}), "s", "B11")}
+    made = [
+        judging.Judged(1, judging.GOOD, 0.0, 2, 0, True, (), (), ("L",)),
+        judging.Judged(2, judging.GOOD, 0.0, 1, 1, False, ("LoadDetected",), ("LoadDetected: a torque",), ()),
+        judging.Judged(3, "stuck", 0.02, 1, 1, False, ("StuckValue",), ("StuckValue: 2 A",), ()),
+        judging.Judged(4, "stuck", 0.01, 1, 0, True, (), (), ()),
+    ]
+    counted = judging.tally(made, kinds)
+    assert counted[judging.GOOD].wrong == [2]
+    assert counted["stuck"].wrong == [4]
+    told = judging.tables(counted, kinds)
+    assert "Good: 3 windows of 2 recordings, 1 windows refused (33.33%), 1 recordings without" in told
+    assert "1 windows are accepted with a null and its reason: 1 without L." in told
+    assert "| stuck | B11 | 2 | 0.01 s | 1 | 50% | 1 StuckValue |" in told
+
+
+def test_a_good_recording_is_judged_good_and_a_turned_one_is_not() -> None:
+    assert judging.judge(judging.GOOD, 1, faults.Spoilt(SHUTTLE)).accepted
+    turned = replace(SHUTTLE, voltage_v=frozen(-SHUTTLE.voltage_v))
+    judged = judging.judge("wrong sign", 1, faults.Spoilt(turned, 1.0))
+    assert not judged.accepted
+    assert "Unphysical" in judged.codes
+    assert judged.refused == judged.windows == 2
