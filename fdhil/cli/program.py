@@ -18,7 +18,9 @@ _SPOOL_CHARACTERS = 8_000_000
 @click.option("--json", "as_document", is_flag=True, help="Print one JSON document instead of a table.")
 @click.option("--max-blocks", type=click.IntRange(min=1), default=10_000_000, show_default=True,
               help="Blocks that may be executed before the program is refused.")  # fmt: skip
-def interpret(program: Path, as_document: bool, max_blocks: int) -> None:
+@click.option("--max-repeated-blocks", "max_repeated", type=click.IntRange(min=1), default=500_000, show_default=True,
+              help="Of these, blocks that loops and calls may execute again.")  # fmt: skip
+def interpret(program: Path, as_document: bool, max_blocks: int, max_repeated: int) -> None:
     """List the motions that PROGRAM (ISO 6983, G-code) orders, in machine millimetres.
 
     Nothing is printed unless the whole program can be interpreted.
@@ -27,7 +29,7 @@ def interpret(program: Path, as_document: bool, max_blocks: int) -> None:
     from fdhil.program.interpreter import interpret as motions_of
     from fdhil.program.motions import as_json
 
-    motions = motions_of(program, Budget.of_blocks(max_blocks))
+    motions = motions_of(program, Budget(max_blocks, max_repeated))
     with tempfile.SpooledTemporaryFile(_SPOOL_CHARACTERS, mode="w+", encoding="utf-8") as spool:
         if as_document:
             spool.write('{"schema": "fdhil-interpret-1", "motions": [')

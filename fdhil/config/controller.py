@@ -28,6 +28,7 @@ class Nc(Section):
         0.5, le=10, description="rest after the last motion: the drives' settling belongs to the path's error"
     )
     max_blocks: int = Field(10_000_000, ge=1, description="blocks a program may execute before it is refused")
+    max_repeated_blocks: int = Field(500_000, ge=1, description="of these, blocks that loops and calls execute again")
     max_call_depth: int = Field(50, ge=1, le=200, description="nesting of calls before a program is refused")
 
 

@@ -11,8 +11,8 @@ from fdhil.config import Nc
 class Budget:
     """Limits of one interpretation; whatever exceeds them ends in a ProgramError that names line and word.
 
-    ``max_blocks`` lines read, those of a loop counted each time; ``max_jumps`` calls and turns of loops;
-    ``max_idle_blocks`` lines of a program with loops that order no motion;
+    ``max_blocks`` lines read, those of a loop counted each time; ``max_repeated_blocks`` lines that loops and calls
+    execute again, and what these order beyond a motion each;
     ``max_motions_per_block`` what one block may order; ``max_call_depth`` nested calls;
     ``max_nesting`` brackets within a value and loops or conditions within one another; ``max_line_chars`` characters
     of one line; ``max_coordinate_mm`` largest co-ordinate; ``max_kept_lines``, ``max_labels`` and ``max_parameters``
@@ -20,8 +20,7 @@ class Budget:
     """
 
     max_blocks: int = 10_000_000
-    max_jumps: int = 200_000
-    max_idle_blocks: int = 500_000
+    max_repeated_blocks: int = 500_000
     max_motions_per_block: int = 100_000
     max_call_depth: int = 50
     max_nesting: int = 50
@@ -34,14 +33,4 @@ class Budget:
     @classmethod
     def of(cls, nc: Nc) -> Budget:
         """Return the budget that a machine's configuration sets."""
-        return cls.of_blocks(nc.max_blocks, nc.max_call_depth)
-
-    @classmethod
-    def of_blocks(cls, max_blocks: int, max_call_depth: int = 50) -> Budget:
-        """Return a budget of ``max_blocks`` in the usual proportions."""
-        return cls(
-            max_blocks=max_blocks,
-            max_jumps=max(1000, max_blocks // 50),
-            max_idle_blocks=max(1000, max_blocks // 20),
-            max_call_depth=max_call_depth,
-        )
+        return cls(nc.max_blocks, nc.max_repeated_blocks, max_call_depth=nc.max_call_depth)

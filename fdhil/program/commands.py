@@ -15,14 +15,16 @@ FANUC = "fanuc"  # the keyword of a bare O-number
 class Command:
     """One O-word; what follows its keyword is read when it is executed first, since what is skipped may be anything."""
 
-    __slots__ = ("_label", "_reader", "_values", "_variables", "keyword")
+    __slots__ = ("_label", "_reader", "_shown", "_values", "_variables", "keyword")
 
     def __init__(self, text: str, variables: Variables, max_nesting: int) -> None:
         self._variables = variables
         self._reader = reader = Reader(text, variables, max_nesting)
         self._values: tuple[Value, ...] | None = None
         reader.take("o")
-        self._label: str | Value = reader.name() if text.startswith("<", reader.at) else reader.value()
+        label: str | Value = reader.name() if text.startswith("<", reader.at) else reader.value()
+        self._label = str(whole(variables, label, "O")) if isinstance(label, float) else label
+        self._shown = text[: reader.at]
         self.keyword = FANUC
         if reader.done():
             return
@@ -58,4 +60,4 @@ class Command:
 
     def fault(self, message: str) -> ProgramError:
         """Return an error that names this command."""
-        return self._reader.fault(message)
+        return self._reader.fault(message, f"{self._shown} {self.keyword}")

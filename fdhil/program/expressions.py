@@ -8,8 +8,10 @@ that a loop reads its lines once only. Operators bind in steps: ``**``; ``* / MO
 from __future__ import annotations
 
 import math
+import operator as operators
 import re
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Protocol
 
 from fdhil.errors import ProgramError
@@ -197,16 +199,18 @@ def _named(context: Context, name: str) -> Value:
 
 
 def _numbered(context: Context, index: Value) -> Value:
-    fixed = whole(context, index, "#") if not callable(index) else None
+    if not callable(index):
+        number = whole(context, index, "#")
+        _number(context, number)
+        return partial(context.number, number)
+    return lambda: _number(context, whole(context, index(), "#"))
 
-    def read() -> float:
-        number = fixed if fixed is not None else whole(context, now(index), "#")
-        try:
-            return context.number(number)
-        except KeyError:
-            raise _fault(context, f"#{number}", "is no parameter; they are numbered 1 to 5601") from None
 
-    return read
+def _number(context: Context, number: int) -> float:
+    try:
+        return context.number(number)
+    except KeyError:
+        raise _fault(context, f"#{number}", "is no parameter; they are numbered 1 to 5601") from None
 
 
 def _applied(context: Context, name: str, argument: Value) -> Value:
@@ -225,9 +229,11 @@ def _binary(context: Context, operator: str, left: Value, right: Value) -> Value
     function = _BINARY[operator]
 
     def combine() -> float:
-        a, b = now(left), now(right)
+        a = left() if callable(left) else left
+        b = right() if callable(right) else right
         try:
-            return _finite(context, function(a, b), operator)
+            value = function(a, b)
+            return value if value - value == 0.0 else _finite(context, value, operator)
         except ZeroDivisionError:
             raise _fault(context, operator, "divides by zero; guard it with IF") from None
         except (ValueError, OverflowError, TypeError):
@@ -261,11 +267,11 @@ _UNARY: Mapping[str, Callable[[float], float]] = {
 }
 _BINARY: Mapping[str, Callable[[float, float], float]] = {
     "**": math.pow,
-    "*": lambda a, b: a * b,
-    "/": lambda a, b: a / b,
+    "*": operators.mul,
+    "/": operators.truediv,
     "mod": _modulo,
-    "+": lambda a, b: a + b,
-    "-": lambda a, b: a - b,
+    "+": operators.add,
+    "-": operators.sub,
     "eq": lambda a, b: float(abs(a - b) < _EQUAL),
     "ne": lambda a, b: float(abs(a - b) >= _EQUAL),
     "gt": lambda a, b: float(a > b),

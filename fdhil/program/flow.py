@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
 
 from fdhil.errors import ProgramError
 from fdhil.program.budget import Budget
 from fdhil.program.commands import FANUC, Command
+from fdhil.program.frames import Frame, Label, Place, Skip
 from fdhil.program.parameters import LOCAL_NUMBERS, Variables
-from fdhil.program.source import Mark, Source
+from fdhil.program.source import Source
 from fdhil.program.words import Block, clean, without_number
 
 _MAYBE_O_WORD = re.compile(r"[\s/]*(?:n[\d.\s]*)?o", re.IGNORECASE)
@@ -24,60 +23,29 @@ _WITH_VALUES = ("call", "return", "endsub", "if", "elseif", "while", "repeat")
 _FILE_NAME = re.compile(r"[\w+-][\w .+-]*")
 
 
-class Place(NamedTuple):
-    """A mark in one source."""
-
-    source: Source
-    mark: Mark
-
-
-@dataclass(slots=True)
-class Label:
-    """What is known of a label in this call: what opened it where, and how far it is."""
-
-    kind: str
-    line: int
-    mark: Mark
-    done: bool = False
-    left: float = 0.0
-
-
-@dataclass(slots=True)
-class Frame:
-    """One call: where to go back to, and the labels of the subroutine."""
-
-    name: str
-    back: Place | None = None
-    fanuc: bool = False
-    again: int = 0
-    entry: Place | None = None
-    labels: dict[str, Label] = field(default_factory=dict)
-
-
-@dataclass(slots=True)
-class Skip:
-    """Reading over lines until ``label`` comes with one of ``keywords``; then that line is executed or not."""
-
-    label: str
-    keywords: tuple[str, ...]
-    line: int
-    execute: bool = False
-
-
 class Flow:
-    """Where execution goes; ``on_return`` is told when a call ends."""
+    """Where execution goes; ``on_return`` is told when a call ends, ``state`` copies what a loop may change."""
 
-    def __init__(self, source: Source, variables: Variables, budget: Budget, on_return: Callable[[int], None]) -> None:
+    def __init__(
+        self,
+        source: Source,
+        variables: Variables,
+        budget: Budget,
+        on_return: Callable[[int], None],
+        state: Callable[[], object],
+    ) -> None:
         self.source = source
         self._variables = variables
         self._budget = budget
         self._on_return = on_return
+        self._state = state
         self._frames = [Frame("")]
         self._subs: dict[str, tuple[Place, bool]] = {}
+        self._entered: set[str] = set()
         self._skip: Skip | None = None
-        self._jumps = 0
         self._entering = False
-        self._repeats = False
+        self.repeats = False  # lines may come again, so that it pays to keep them as they were read
+        self.repeating = False  # the lines at hand were executed before, in this loop or subroutine
         self._known: dict[str, Command] = {}
         self._folder = source.folder
         self._files: list[Source] = [source]
@@ -115,11 +83,6 @@ class Flow:
             name = self._frames[-1].name
             raise ProgramError(self.source.line, f"O<{name}>", "the file ends within the subroutine; add its endsub")
 
-    @property
-    def repeats(self) -> bool:
-        """Whether lines may come again, so that it pays to keep them as they were read."""
-        return self._repeats
-
     def skip_over(self, raw: str, line: int) -> None:
         """Look at a line that is read over: it may be the one that is sought."""
         if _MAYBE_O_WORD.match(raw) is None:
@@ -152,7 +115,7 @@ class Flow:
         self._do(command.label(), command, line)
 
     def _do(self, label: str, command: Command, line: int) -> None:
-        self._repeats = True
+        self.repeats = True
         match command.keyword:
             case "sub":
                 self._define(label, line)
@@ -171,13 +134,13 @@ class Flow:
             case "while":
                 self._while(label, command, line)
             case "endwhile":
-                self._jump(self._label(label, ("while",), command).mark, line)
+                self._turn(label, self._label(label, ("while",), command), command)
             case "do":
                 self._open(label, "do", line)
             case "repeat":
                 self._repeat(label, command, line)
             case "endrepeat":
-                self._next_repeat(label, command, line)
+                self._next_repeat(label, command)
             case "break" | "continue":
                 self._leave_loop(label, command, line)
             case _:
@@ -195,8 +158,9 @@ class Flow:
         if known is None and len(labels) >= self._budget.max_labels:
             raise ProgramError(line, f"O<{label}>", f"is one label more than the {self._budget.max_labels} allowed")
         mark = self.source.after() if kind in ("do", "repeat") else self.source.here()
-        opened = labels[label] = Label(kind, line, mark)
-        return opened
+        if known is None:
+            known = labels[label] = Label(kind, line, mark)
+        return known
 
     def _label(self, label: str, kinds: tuple[str, ...], command: Command) -> Label:
         known = self._frames[-1].labels.get(label)
@@ -204,14 +168,27 @@ class Flow:
             raise command.fault(f"has no {' or '.join(kinds)} of the same label before it")
         return known
 
-    def _jump(self, mark: Mark, line: int) -> None:
-        self._count_jump(line)
-        self.source.go(mark)
+    def _turn(self, label: str, state: Label, command: Command) -> None:
+        """Begin the next turn of a loop; ProgramError for one that is where it was before, so that it never ends."""
+        self._frames[-1].turning.add(label)
+        self.repeating = True
+        if state.turns.one_more(self._whole_state):
+            raise command.fault("ends a turn that changes nothing, so the loop never ends; let its condition change")
+        self.source.go(state.mark)
 
-    def _count_jump(self, line: int) -> None:
-        self._jumps += 1
-        if self._jumps > self._budget.max_jumps:
-            raise ProgramError(line, "O", f"more than {self._budget.max_jumps} jumps were made; is a loop endless?")
+    def _left(self, label: str) -> None:
+        """Note that a loop has ended."""
+        frame = self._frames[-1]
+        frame.turning.discard(label)
+        frame.labels[label].turns.end()
+        self.repeating = frame.repeated or bool(frame.turning)
+
+    def _whole_state(self) -> object:
+        labels = [
+            (frame.again, {name: (one.line, one.done, one.left) for name, one in frame.labels.items()})
+            for frame in self._frames
+        ]
+        return labels, self._state()
 
     def _if(self, label: str, command: Command, line: int) -> None:
         state = self._open(label, "if", line)
@@ -235,30 +212,37 @@ class Flow:
         known = self._frames[-1].labels.get(label)
         if known is not None and known.kind == "do":
             if command.condition() != 0.0:
-                self._jump(known.mark, line)
+                self._turn(label, known, command)
+            else:
+                self._left(label)
             return
         self._open(label, "while", line)
         if command.condition() == 0.0:
+            self._left(label)
             self._skip = Skip(label, ("endwhile",), line)
 
     def _repeat(self, label: str, command: Command, line: int) -> None:
         state = self._open(label, "repeat", line)
         state.left = float(round(command.condition()))
+        self._left(label)
         if state.left <= 0.0:
             self._skip = Skip(label, ("endrepeat",), line)
 
-    def _next_repeat(self, label: str, command: Command, line: int) -> None:
+    def _next_repeat(self, label: str, command: Command) -> None:
         state = self._label(label, ("repeat",), command)
         state.left -= 1.0
         if state.left > 0.0:
-            self._jump(state.mark, line)
+            self._turn(label, state, command)
+        else:
+            self._left(label)
 
     def _leave_loop(self, label: str, command: Command, line: int) -> None:
         state = self._label(label, ("while", "do"), command)
         if command.keyword == "break":
+            self._left(label)
             self._skip = Skip(label, ("endwhile",) if state.kind == "while" else ("while",), line)
         elif state.kind == "while":
-            self._jump(state.mark, line)
+            self._turn(label, state, command)
         else:
             self._skip = Skip(label, ("while",), line, execute=True)
 
@@ -280,12 +264,22 @@ class Flow:
         self._enter(Frame(name, Place(self.source, self.source.after())), line)
         self._variables.enter(arguments)
 
-    def call_fanuc(self, name: str, times: int, line: int) -> None:
-        """M98 P<name> L<times>."""
-        if times > 0:
-            frame = Frame(name, Place(self.source, self.source.after()), fanuc=True, again=times - 1)
-            self._enter(frame, line)
+    def call_or_end(self, block: Block, text: str) -> bool:
+        """M98 and M99: they begin their line (``text``), whose other words are not executed; False ends the program."""
+        code = block.m["call"]
+        if not text.startswith(f"m{code}") or (code == 99 and text != "m99"):
+            raise ProgramError(block.line, f"M{code}", "must begin its line; M99 stands alone, M98 with P and L")
+        if code == 99:
+            return self._end_fanuc()
+        name, times = block.words.get("p", -1.0), block.words.get("l", 1.0)
+        off = max(abs(name - round(name)), abs(times - round(times)))
+        if name < 0.0 or off > 1e-4 or not 0 <= times < 1e9:
+            raise ProgramError(block.line, "M98", "wants the subroutine's number as P and may have its repeats as L")
+        if round(times) > 0:
+            back = Place(self.source, self.source.after())
+            self._enter(Frame(str(round(name)), back, fanuc=True, again=round(times) - 1), block.line)
             self._variables.enter_names()
+        return True
 
     def call_contour(self, block: Block, name: str) -> None:
         """Enter the subroutine that describes a contour (G70 to G72.2); it must stand before the block."""
@@ -296,12 +290,14 @@ class Flow:
         self._variables.enter([])
 
     def _enter(self, frame: Frame, line: int) -> None:
-        self._count_jump(line)
         if self.depth >= self._budget.max_call_depth:
             raise ProgramError(line, f"O<{frame.name}>", f"calls nest deeper than {self._budget.max_call_depth} levels")
         known = self._subs.get(frame.name)
+        frame.repeated = self.repeating or frame.name in self._entered
+        self._entered.add(frame.name)
         self._frames.append(frame)
-        self._entering = self._repeats = True
+        self.repeating = frame.repeated
+        self._entering = self.repeats = True
         self._skip = Skip(frame.name, (FANUC,) if frame.fanuc else ("sub",), line)
         if known is not None:
             place, fanuc = known
@@ -339,7 +335,7 @@ class Flow:
         self._variables.set_returned(values[0] if values else None)
         self._go_back()
 
-    def end_fanuc(self) -> bool:
+    def _end_fanuc(self) -> bool:
         """M99: return True when it ends a subroutine, False in the main program."""
         if not self.depth:
             return False
@@ -350,7 +346,8 @@ class Flow:
             )
         if frame.again > 0 and frame.entry is not None:
             frame.again -= 1
-            self._jump(frame.entry.mark, self.source.line)
+            frame.repeated = self.repeating = True
+            self.source.go(frame.entry.mark)
             return True
         self._variables.leave_names()
         self._go_back()
@@ -358,6 +355,7 @@ class Flow:
 
     def _go_back(self) -> None:
         frame = self._frames.pop()
+        self.repeating = self._frames[-1].repeated or bool(self._frames[-1].turning)
         self._on_return(self.depth + 1)
         if frame.back is not None:
             self.source = frame.back.source

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator
+from copy import deepcopy
 from pathlib import Path
 
 from fdhil.errors import ProgramError
@@ -17,9 +18,10 @@ from fdhil.program import arcs, canned, curves, lathe, modes, nurbs, offsets, pr
 from fdhil.program.budget import Budget
 from fdhil.program.checks import CYCLES, check_machine_words, check_readers, one_reader_of_axes
 from fdhil.program.commands import Command
+from fdhil.program.expressions import now
 from fdhil.program.flow import Flow
 from fdhil.program.machine import Machine
-from fdhil.program.modal import INDEX, NO_MOTION, Modal
+from fdhil.program.modal import NO_MOTION, Modal
 from fdhil.program.motions import Feed, Motion, Rapid
 from fdhil.program.parameters import Variables
 from fdhil.program.source import Source
@@ -33,6 +35,8 @@ _SIMPLE = re.compile(
     re.IGNORECASE,
 )
 _STOPS = (2, 30)
+_MOTION_ALONE = frozenset({"motion"})
+_MACHINE_WORDS = frozenset("st$")
 
 
 def interpret(
@@ -62,12 +66,12 @@ class Interpreter:
         self._variables = Variables(budget.max_parameters, numbers_of(modal), names)
         self._variables.store(5220, 1.0)
         self._kept = KeptModes(modal, self._variables)
-        self._flow = Flow(first, self._variables, budget, self._kept.returned)
+        self._flow = Flow(first, self._variables, budget, self._kept.returned, self._state)
         self._series = canned.Series()
         self._spline = curves.Spline()
         self._nurbs = nurbs.Nurbs()
         self._known: dict[str, Command | Line] = {}
-        self._blocks = self._idle = 0
+        self._blocks = self._again = 0
         self._empty_so_far = True
         self._percent = False
         self._tool = False
@@ -89,15 +93,13 @@ class Interpreter:
                     self._check_end()
                     break
                 raw, line = found
-                motion = self._simple(raw, line)
+                motion = self._simple(raw, line) or self._line(raw, line)
                 if motion is not None:
-                    self._idle = 0
                     yield motion
-                    continue
-                self._line(raw, line)
-                if machine.out:
-                    self._idle = 0
+                elif machine.out:
                     ordered, machine.out = machine.out, []
+                    if self._flow.repeating:
+                        self._again += len(ordered) - 1
                     yield from ordered
             machine.end_compensation()
             yield from machine.out
@@ -108,7 +110,7 @@ class Interpreter:
         """Return the next line to execute and its number, None after the last one; what is skipped is counted too."""
         flow = self._flow
         while True:
-            raw = flow.source.next()
+            raw = flow.source.next(flow.repeating)
             if raw is None:
                 flow.at_end()
                 return None
@@ -122,13 +124,21 @@ class Interpreter:
     def _count(self, raw: str, line: int) -> None:
         self._blocks += 1
         if self._blocks > self._budget.max_blocks:
-            what = f"more than {self._budget.max_blocks} blocks were executed; is a loop endless?"
+            what = f"more than {self._budget.max_blocks} blocks were executed; raise max_blocks if they are meant"
             raise ProgramError(line, raw.strip()[:24], what)
-        if self._flow.repeats:
-            self._idle += 1
-            if self._idle > self._budget.max_idle_blocks:
-                what = f"{self._idle} blocks were executed without a motion; is a loop endless?"
+        if self._flow.repeating:
+            self._again += 1
+            if self._again > self._budget.max_repeated_blocks:
+                most = self._budget.max_repeated_blocks
+                what = (
+                    f"more than {most} blocks were executed again; is a loop endless? If not, raise max_repeated_blocks"
+                )
                 raise ProgramError(line, raw.strip()[:24], what)
+
+    def _state(self) -> object:
+        """Return a copy of all that the program has changed so far but its place."""
+        kept = (self._machine, self._series, self._spline, self._nurbs, self._pending_tool, self._tool)
+        return self._variables.state(), self._kept.state(), deepcopy(kept)
 
     def _simple(self, raw: str, line: int) -> Motion | None:
         """Execute a block of G0, G1, X, Y, Z, F alone; None leaves it to the long way."""
@@ -136,24 +146,37 @@ class Interpreter:
         if match is None:
             return None
         g, x, y, z, f = match.groups()
+        return self._straight(
+            line,
+            10 * int(g) if g else None,
+            float(x) if x else None,
+            float(y) if y else None,
+            float(z) if z else None,
+            float(f) if f else None,
+        )
+
+    def _straight(
+        self, line: int, code: int | None, x: float | None, y: float | None, z: float | None, f: float | None
+    ) -> Motion | None:
+        """Execute a block of G0 or G1 (times ten), X, Y, Z and F; None, and nothing done, leaves it to the long way."""
         modal = self._machine.modal
-        motion = modal.motion if g is None else 10 * int(g)
+        motion = modal.motion if code is None else code
         if motion not in (0, 10) or not modal.plain or self._nurbs.points or (x is None and y is None and z is None):
+            return None
+        feed = modal.feed_mm_min if f is None else f * modal.scale
+        if not 0.0 <= feed < math.inf or (motion == 10 and feed == 0.0):
             return None
         position = list(modal.position)
         for index, word in ((0, x), (1, y), (2, z)):
             if word is not None:
-                value = float(word) * modal.scale
+                value = word * modal.scale
                 position[index] = value if modal.absolute else position[index] + value
         end = modal.machine(position)
         limit = self._budget.max_coordinate_mm
         if not (abs(end[0]) <= limit and abs(end[1]) <= limit and abs(end[2]) <= limit):
             return None
         if f is not None:
-            modal.feed_word = float(f)
-            modal.feed_mm_min = modal.feed_word * modal.scale
-        if motion == 10 and not 0.0 < modal.feed_mm_min < math.inf:
-            return None
+            modal.feed_word, modal.feed_mm_min = f, feed
         self._empty_so_far = False
         modal.motion = motion
         modal.position = position
@@ -161,20 +184,32 @@ class Interpreter:
         self._series.began = None
         self._machine.just_left = False
         corner = modal.corner
-        return Rapid(line, end, corner) if motion == 0 else Feed(line, end, modal.feed_mm_min, corner)
+        return Rapid(line, end, corner) if motion == 0 else Feed(line, end, feed, corner)
 
-    def _line(self, raw: str, line: int) -> None:
-        block = self._fetch(raw, line)
-        if block is None:
-            return
-        if "call" in block.m:
-            self._call(block, without_number(clean(raw, line).lstrip("/")))
-            return
-        self._execute(block)
-        self._settle(block)
+    def _line(self, raw: str, line: int) -> Motion | None:
+        """Execute a line; return its motion when it took the short way, else what it orders goes to the machine."""
+        known = self._fetch(raw, line)
+        if known is None:
+            return None
+        if known.straight is not None:
+            x, y, z, f = (None if value is None else now(value) for value in known.straight)
+            motion = self._straight(line, known.code, x, y, z, f)
+            if motion is not None:
+                return motion
+        if known.words or known.fixed is not None:
+            block = known.block(self._variables)
+            if "call" in block.m:
+                check_readers(block, None)
+                self._ended = not self._flow.call_or_end(block, without_number(clean(raw, line).lstrip("/")))
+                return None
+            self._execute(block)
+            self._settle(block.settings, line)
+        else:
+            self._settle(known.values(self._variables), line)
+        return None
 
-    def _fetch(self, raw: str, line: int) -> Block | None:
-        """Return a line's block, None when it has none; an O-word is executed."""
+    def _fetch(self, raw: str, line: int) -> Line | None:
+        """Return a line as it was read, None when it has no words; an O-word is executed."""
         self._variables.line = line
         known = self._known.get(raw)
         if known is None:
@@ -188,11 +223,11 @@ class Interpreter:
         if isinstance(known, Command):
             self._flow.execute(known, line)
             return None
-        return known.block(self._variables)
+        return known
 
-    def _settle(self, block: Block) -> None:
-        for key, value in block.settings:
-            self._variables.set(key, value, block.line)
+    def _settle(self, settings: list[tuple[int | str, float]], line: int) -> None:
+        for key, value in settings:
+            self._variables.set(key, value, line)
 
     def _read(self, raw: str, line: int) -> Command | Line | None:
         if raw.strip() == "%":
@@ -231,8 +266,12 @@ class Interpreter:
             modes.check_compensated(modal, block)
             if "stop" in block.m or "tool" in block.m:
                 machine.settle()
-        one_reader_of_axes(block)
         check_readers(block, _motion_of(modal, block))
+        if not block.m and block.g.keys() <= _MOTION_ALONE and block.words.keys().isdisjoint(_MACHINE_WORDS):
+            modes.set_feed(modal, block)
+            self._motion(block, False)
+            return
+        one_reader_of_axes(block)
         check_machine_words(block)
         modes.set_feed(modal, block)
         modes.set_spindle(modal, block)
@@ -254,23 +293,6 @@ class Interpreter:
             self._tool = self._pending_tool != 0.0
         elif block.m.get("tool") == 61:
             self._tool = block.words.get("q", 0.0) != 0.0
-
-    def _call(self, block: Block, text: str) -> None:
-        """M98 and M99: they begin their line, and nothing else in it is executed."""
-        code = block.m["call"]
-        if not text.startswith(f"m{code}") or (code == 99 and text != "m99"):
-            raise ProgramError(block.line, f"M{code}", "must begin its line; M99 stands alone, M98 with P and L")
-        check_readers(block, None)
-        if code == 98:
-            name, times = block.words.get("p", -1.0), block.words.get("l", 1.0)
-            off = max(abs(name - round(name)), abs(times - round(times)))
-            if name < 0.0 or off > 1e-4 or not 0 <= times < 1e9:
-                raise ProgramError(
-                    block.line, "M98", "wants the subroutine's number as P and may have its repeats as L"
-                )
-            self._flow.call_fanuc(str(round(name)), round(times), block.line)
-        elif not self._flow.end_fanuc():
-            self._ended = True
 
     def _coordinates(self, block: Block) -> None:
         modal, g = self._machine.modal, block.g
@@ -299,7 +321,7 @@ class Interpreter:
 
     def _motion(self, block: Block, axes_used: bool) -> None:
         machine, modal = self._machine, self._machine.modal
-        axis = _axis_letter(block)
+        axis = targets.axis_letter(block)
         before = modal.motion
         if "motion" in block.g:
             modal.motion = block.g["motion"]
@@ -337,7 +359,7 @@ class Interpreter:
         elif code == nurbs.END:
             self._nurbs.order_motions(machine, block)
         elif code != NO_MOTION:
-            raise unknown(block, code)
+            raise ProgramError(block.line, f"G{code / 10:g}", "is a G code that fdhil does not know")
         elif axis is not None and not axes_used:
             raise block.fault(axis, "has no motion to go with; give G0, G1, G2 or G3")
 
@@ -354,22 +376,14 @@ class Interpreter:
             if found is None:
                 break
             raw, line = found
-            drawn = self._fetch(raw, line)
-            if drawn is not None:
+            known = self._fetch(raw, line)
+            if known is not None:
+                drawn = known.block(self._variables)
                 contour.add(drawn)
-                self._settle(drawn)
+                self._settle(drawn.settings, line)
         modal.position = here
         roughing.work(self._machine, block, contour, start)
         modal.motion = contour.motion
-
-
-def unknown(block: Block, code: int) -> ProgramError:
-    """Return the error for a G code (times ten) that fdhil does not know."""
-    return ProgramError(block.line, f"G{code / 10:g}", "is a G code that fdhil does not know; see the list of codes")
-
-
-def _axis_letter(block: Block) -> str | None:
-    return next((letter for letter in block.words if letter in INDEX or letter in "@^"), None)
 
 
 def _motion_of(modal: Modal, block: Block) -> int | None:
@@ -377,4 +391,4 @@ def _motion_of(modal: Modal, block: Block) -> int | None:
     if "motion" in block.g:
         return block.g["motion"]
     arc = modal.motion in arcs.CODES and any(letter in block.words for letter in "ijkr")
-    return modal.motion if arc or _axis_letter(block) is not None else None
+    return modal.motion if arc or targets.axis_letter(block) is not None else None

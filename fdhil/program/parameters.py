@@ -78,6 +78,10 @@ class Variables:
         """Set a numbered parameter on behalf of the machine (offsets, homes)."""
         self._numbers[index] = value
 
+    def state(self) -> object:
+        """Return a copy of what the call at hand and the whole program have set."""
+        return dict(self._numbers), dict(self._globals), dict(self._locals), self.returned
+
     def set_returned(self, value: float | None) -> None:
         """Keep what a subroutine returned, as #<_value> and #<_value_returned>."""
         self.returned = value

@@ -15,6 +15,7 @@ from fdhil.errors import ProgramError
 
 _SPOOL_BYTES = 4_000_000
 _READ_AHEAD_BYTES = 1 << 18
+_MAX_KEPT = 2000
 
 
 class Mark(NamedTuple):
@@ -30,13 +31,15 @@ class Source:
     ``line`` is the 1-based number of the line last read; ``folder`` is where its subroutines lie, None for an iterable.
     """
 
-    __slots__ = ("_begin", "_end", "_feed", "_file", "_max_chars", "_open", "folder", "line", "name")
+    __slots__ = ("_begin", "_end", "_feed", "_file", "_kept", "_max_chars", "_moved", "_open", "folder", "line", "name")
 
     def __init__(self, program: Path | Iterable[str], max_line_chars: int) -> None:
         self._max_chars = max_line_chars
         self._feed: Iterator[str] | None = None
         self._open = ExitStack()
         self._begin = self._end = 0
+        self._moved = False
+        self._kept: dict[int, tuple[str, int]] = {}
         self.line = 0
         self.name = ""
         self.folder: Path | None = None
@@ -65,29 +68,47 @@ class Source:
 
     def go(self, mark: Mark) -> None:
         """Return to a place."""
-        self._file.seek(mark.offset)
         self._begin = self._end = mark.offset
+        self._moved = True
         self.line = mark.lines
 
-    def next(self) -> str | None:
-        """Return the next line without its end, None after the last one."""
+    def next(self, again: bool = False) -> str | None:
+        """Return the next line without its end, None after the last one; lines that come ``again`` are kept."""
+        kept = self._kept.get(self._end) if again else None
+        if kept is not None:
+            self._moved = True
+            text, length = kept
+        else:
+            raw = self._read()
+            if not raw:
+                return None
+            text, length = raw.decode("latin-1").rstrip("\r\n"), len(raw)
+        if again and kept is None:
+            if len(self._kept) >= _MAX_KEPT:
+                self._kept.clear()
+            self._kept[self._end] = (text, length)
+        self._begin = self._end
+        self._end += length
+        self.line += 1
+        return text
+
+    def _read(self) -> bytes:
+        """Read the line at hand; ProgramError for one that is no text or too long."""
         try:
+            if self._moved:
+                self._file.seek(self._end)
+                self._moved = False
             raw = self._file.readline(self._max_chars + 2)
         except OSError as error:
             raise ProgramError(self.line + 1, "", f"cannot be read ({error.strerror}); check the disk") from None
         if not raw and self._feed is not None:
             raw = self._draw(self._feed)
-        if not raw:
-            return None
-        self._begin = self._end
-        self._end += len(raw)
-        self.line += 1
         if len(raw) > self._max_chars and len(raw.rstrip(b"\r\n")) > self._max_chars:
             word = raw[:12].decode("latin-1")
-            raise ProgramError(self.line, word, f"the line is longer than {self._max_chars} characters; split it")
+            raise ProgramError(self.line + 1, word, f"the line is longer than {self._max_chars} characters; split it")
         if b"\0" in raw:
-            raise ProgramError(self.line, "\\0", "holds a zero byte, so this is no text; give an NC program")
-        return raw.decode("latin-1").rstrip("\r\n")
+            raise ProgramError(self.line + 1, "\\0", "holds a zero byte, so this is no text; give an NC program")
+        return raw
 
     def _draw(self, feed: Iterator[str]) -> bytes:
         """Take one line from the iterable and keep it, so that a loop can come back to it."""

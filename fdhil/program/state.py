@@ -128,6 +128,10 @@ class KeptModes:
             self._restore(self._kept[level])
         return True
 
+    def state(self) -> object:
+        """Return a copy of what is kept."""
+        return dict(self._kept)
+
     def returned(self, level: int) -> None:
         """Tell that the call of this level has ended."""
         kept = self._kept.pop(level, None)

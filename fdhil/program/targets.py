@@ -58,6 +58,11 @@ def plane_axes(modal: Modal, block: Block) -> tuple[int, int, int]:
     return axes
 
 
+def axis_letter(block: Block) -> str | None:
+    """Return one letter of the block that says where it leads, None when there is none."""
+    return next((letter for letter in block.words if letter in INDEX or letter in "@^"), None)
+
+
 def axis_words(block: Block) -> dict[int, float]:
     """Return the block's axis words by the axis' index, in program units."""
     words = block.words

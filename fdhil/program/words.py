@@ -18,6 +18,7 @@ _WORD = re.compile(r"([a-z@^])([+-]?(?:\d++\.?\d*+|\.\d++))")
 _NUMBER = re.compile(r"n(\d++)(?:\.\d++)?+")
 _BLANKS = str.maketrans("", "", " \t\r\v\f")
 _COMMENT = "("
+_STRAIGHT = frozenset("xyzf")
 _LETTERS = frozenset("abcdefghijklmpqrstuvwxyz@^$")
 
 
@@ -121,11 +122,16 @@ def without_number(text: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A line that was read: ``fixed`` when it is always the same block, else its words and settings to evaluate."""
+    """A line that was read: ``fixed`` when it is always the same block, else its words and settings to evaluate.
+
+    ``straight`` are X, Y, Z and F of a line that has no other words but G0 or G1 (``code``, times ten).
+    """
 
     fixed: Block | None
     words: tuple[tuple[str, Value], ...] = ()
     settings: tuple[tuple[Value | str, Value], ...] = ()
+    code: int | None = None
+    straight: tuple[Value | None, ...] | None = None
 
     def block(self, context: Context) -> Block:
         """Return the block that the line is now, with the parameters as they are before its own settings."""
@@ -135,10 +141,14 @@ class Line:
         block = Block(line)
         for letter, value in self.words:
             _add(block, letter, now(value))
-        for key, value in self.settings:
-            index = key if isinstance(key, str) else whole(context, now(key), "#")
-            block.settings.append((index, now(value)))
+        block.settings = self.values(context)
         return _ended(block)
+
+    def values(self, context: Context) -> list[tuple[int | str, float]]:
+        """Return the parameters that the line sets and their values, with the parameters as they are before that."""
+        return [
+            (key if isinstance(key, str) else whole(context, now(key), "#"), now(value)) for key, value in self.settings
+        ]
 
 
 def _ended(block: Block) -> Block:
@@ -157,13 +167,35 @@ def read(text: str, context: Context, max_nesting: int) -> Line:
             if value - value != 0.0:
                 raise ProgramError(context.line, letter.upper() + digits[:12], "is too large a number")
             _add(block, letter, value)
-        return Line(_ended(block))
+        return _fixed(_ended(block))
     reader = Reader(text, context, max_nesting)
     words: list[tuple[str, Value]] = []
     settings: list[tuple[Value | str, Value]] = []
     while not reader.done():
         _next(reader, words, settings)
-    return Line(None, tuple(words), tuple(settings))
+    if settings:
+        return Line(None, tuple(words), tuple(settings))
+    return Line(None, tuple(words), (), *_straight(words))
+
+
+def _fixed(block: Block) -> Line:
+    code = block.g.get("motion")
+    straight = not block.m and len(block.g) == (code is not None) and code in (None, 0, 10)
+    if not straight or not block.words.keys() <= _STRAIGHT:
+        return Line(block)
+    return Line(block, code=code, straight=tuple(block.words.get(letter) for letter in "xyzf"))
+
+
+def _straight(words: list[tuple[str, Value]]) -> tuple[int | None, tuple[Value | None, ...] | None]:
+    """Return G0 or G1 and X, Y, Z, F when a line has these words alone."""
+    by_letter = dict(words)
+    code = by_letter.pop("g", None)
+    if len(by_letter) + (code is not None) != len(words) or not by_letter.keys() <= _STRAIGHT:
+        return None, None
+    if code is not None and code not in (0.0, 1.0):
+        return None, None
+    number = 10 * int(code) if isinstance(code, float) else None
+    return number, tuple(by_letter.get(letter) for letter in "xyzf")
 
 
 def _next(reader: Reader, words: list[tuple[str, Value]], settings: list[tuple[Value | str, Value]]) -> None:

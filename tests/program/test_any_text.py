@@ -11,7 +11,7 @@ from fdhil.errors import ProgramError
 from fdhil.program import Budget, Dwell, interpret
 from tests.program.generated import GROUPS, program
 
-BUDGET = Budget(max_blocks=300, max_jumps=50, max_call_depth=5, max_motions_per_block=200)
+BUDGET = Budget(max_blocks=300, max_repeated_blocks=100, max_call_depth=5, max_motions_per_block=200)
 NUMBERS = st.sampled_from(
     [
         "0",

@@ -204,14 +204,14 @@ def test_outputs_of_any_number_order_no_motion() -> None:
 
 
 @pytest.mark.parametrize(("text", "line", "word"), [
-    ("O1 while [1]\nO1 endwhile", 2, "O1 endwhile"), ("O1 do\n#1=1\nO1 while [1]", 2, "#1=1"),
+    ("O1 while [1]\nO1 endwhile", 2, "O1 ENDWHILE"), ("O1 do\n#1=[#1+1]\nO1 while [1]", 3, "O1 while [1]"),
     ("O1 sub\nO1 call\nO1 endsub\nO1 call", 2, "O<1>"), ("M98 P1\nM2\nO1\nM98 P1\nM99", 4, "O<1>"),
     ("F1\nG0 X99999999", 2, "X1e+08"), ("G0 X[" + "9" * 400 + "]", 1, "9" * 12), ("F1 G2 I5 P2000000", 1, "P2e+06"),
     ("G0 X" + "[" * 200 + "1" + "]" * 200, 1, "X" + "[" * 11),
 ])  # fmt: skip
 def test_budgets_of_the_configuration_name_line_and_word(text: str, line: int, word: str) -> None:
     document = bench_document()
-    document["nc"] = {"max_blocks": 3000, "max_call_depth": 7}
+    document["nc"] = {"max_blocks": 3000, "max_repeated_blocks": 1001, "max_call_depth": 7}
     budget = Budget.of(configuration.parse(document).nc)
     with pytest.raises(ProgramError) as caught:
         list(interpret(text.splitlines(), budget))

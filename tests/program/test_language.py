@@ -115,7 +115,7 @@ def test_probes_rotary_axes_and_block_delete() -> None:
     ],
 )  # fmt: skip
 def test_hostile_programs_end_in_an_error_with_its_line(text: str) -> None:
-    small = Budget(max_blocks=5000, max_jumps=500, max_idle_blocks=2000, max_motions_per_block=500)
+    small = Budget(max_blocks=5000, max_repeated_blocks=1000, max_motions_per_block=500)
     with pytest.raises(ProgramError) as caught:
         list(interpret(text.split("|"), small))
     assert caught.value.line >= 1
