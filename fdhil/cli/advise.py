@@ -159,6 +159,7 @@ def _held(name: str, held: Held | None, feed_mm_min: float) -> dict[str, float |
         f"{name}feed_share": None if held is None else held.share,
         f"{name or 'advised_'}feed_mm_min": _feed(held, feed_mm_min),
         f"{name}tried_feed_mm_min": None if held is None else held.tried * feed_mm_min,
+        f"{name}run_feed_mm_min": None if held is None else held.run * feed_mm_min,
         f"{name}left_um": None if held is None or not math.isfinite(held.left_um) else held.left_um,
     }
 
@@ -193,7 +194,8 @@ def _told(held: Held, most: Held | None, feed_mm_min: float) -> str:
     feed = _feed(held, feed_mm_min)
     if feed is None:
         left = f": {held.left_um:.1f} um are left there" if math.isfinite(held.left_um) else ""
-        return f"no feed down to {_rounded(held.tried * feed_mm_min)} mm/min holds it{left}"
+        with_it = f"; the others hold with it at {_rounded(held.run * feed_mm_min)}" if held.run > held.tried else ""
+        return f"no feed down to {_rounded(held.tried * feed_mm_min)} mm/min holds it{left}{with_it}"
     reach = _feed(most, feed_mm_min)
     more = f", perhaps {_rounded(reach)}" if reach and reach > 1.02 * feed else ""
     return f"at most {_rounded(feed)} mm/min{more}"

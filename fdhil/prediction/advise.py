@@ -10,7 +10,8 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.prediction import load
 from fdhil.prediction.feeds import Feeds, Judge, Source, highest, stretches, worst_rows
-from fdhil.prediction.predict import predict
+from fdhil.prediction.predict import contour_um, predict
+from fdhil.prediction.raising import raised_alone
 from fdhil.records import Float, Int, Parameters, Prediction, Zone
 
 ALONG_MM = 1e-9  # a row that moves less has no direction
@@ -20,12 +21,14 @@ ALONG_MM = 1e-9  # a row that moves less has no direction
 class Held:
     """The highest ``share`` of the feed that keeps a stretch within the tolerance; None where none that was tried does.
 
-    ``left_um`` is its largest error at ``share``, or at ``tried``, the lowest that was.
+    ``left_um`` is its largest error at ``tried``: at ``share``, or at the lowest that was tried. ``run`` is the share
+    at which it was run when the others were found to hold.
     """
 
     share: float | None
     tried: float
     left_um: float
+    run: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +72,8 @@ def advise(
     over = {k: error for k, (error, _) in worst.items() if error > tolerance_um}
     if not over:
         return ()
-    plain = highest(source, over, lambda r: predict(r, models, config).contour_um, tolerance_um)
-    better = highest(source, over, corrected, tolerance_um) if corrected is not None else None
+    plain = _feeds(source, over, lambda r: contour_um(r, models, config), tolerance_um)
+    better = _feeds(source, over, corrected, tolerance_um) if corrected is not None else None
     loads = {
         axis: load.required(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s)
         for axis in reference.axes
@@ -98,11 +101,17 @@ def advise(
     return tuple(found)
 
 
+def _feeds(source: Source, over: Mapping[int, float], judge: Judge, tolerance_um: float) -> Feeds:
+    return raised_alone(highest(source, over, judge, tolerance_um), source, judge, tolerance_um)
+
+
 def _held(feeds: Feeds, stretch: int) -> Held:
     if stretch not in feeds.share:
-        return Held(1.0, 1.0, 0.0)  # it needs no advice
-    share, left_um = feeds.share[stretch], feeds.left_um[stretch]
-    return Held(share if stretch in feeds.held else None, share, left_um)
+        return Held(1.0, 1.0, 0.0, 1.0)  # it needs no advice
+    run = feeds.share[stretch]
+    if stretch in feeds.held:
+        return Held(run, run, feeds.left_um[stretch], run)
+    return Held(None, *feeds.tried[stretch], run)
 
 
 def _zone(prediction: Prediction, row: int) -> Zone | None:

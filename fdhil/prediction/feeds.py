@@ -19,14 +19,16 @@ NARROW = 1.02  # two shares nearer than this are not parted further
 LEAST_FALL, MOST_FALL, RISE = 0.97, 0.25, 1.05  # of a share, from one trial to the next
 POWERS = (0.3, 3.0)  # of the share, that an error may go with
 AIM, FULL = 0.996, 0.99  # of the tolerance: what is aimed at, and what is near enough
+PATIENCE = 2  # so many rises in a row by the power law of the last trials
 EDGE = 0.1  # of a bracket, in logarithms: a trial keeps away from its ends
 LOWEST = 1e-3  # share of the feed that is tried
 # an error that keeps STILL of itself while its feed falls to 1 / FAR does not come from the feed; over less it may
 # come from the NC's acceleration, which is the same until the feed is below what a ramp gains while the loops settle
 STILL, FAR = 0.9, 8.0
-SLACK, MOST_RISES = 0.97, 3  # of the tolerance: what leaves more room is tried at a higher feed, so many times
+SLACK, MOST_RISES = 0.97, 2  # of the tolerance: what leaves more room is tried at a higher feed, so many times
 MOST_TRIALS = 80
-LONGEST_S, LONGEST_SHARE = 600.0, 10.0  # a path that lasts longer than both, the latter times its own, is not slowed
+WORTH, FEW = 1.02, 0.02  # a trial that lets so few stretches run faster by so much is not run
+LONGEST_S, LONGEST_SHARE = 120.0, 10.0  # a path that lasts longer than both, the latter times its own, is not slowed
 
 # contour error (n,) um of a reference; inf where the drives cannot do it, NaN where that leaves the error unknown
 Judge = Callable[[Trajectory], Float]
@@ -74,21 +76,31 @@ def worst_rows(stretch: Int, contour_um: Float, dt_s: float, after_s: float) -> 
     """Return for each stretch the largest error in it and ``after_s`` behind it, and its row; -1 where it is NaN."""
     judged = np.where(stretch != RAPID, np.nan_to_num(contour_um, nan=-1.0, posinf=np.inf), 0.0)
     size = round(after_s / dt_s) + 1
-    ahead = maximum_filter1d(judged, size, origin=-((size - 1) // 2), mode="constant") if size > 1 else judged
-    rows = np.flatnonzero(stretch >= 0)
-    order = rows[np.argsort(ahead[rows], kind="stable")]
-    # the last one of a stretch in the order of the errors is its largest
-    last = {int(stretch[row]): row for row in order.tolist()}
-    return {k: (float(ahead[row]), row + int(np.argmax(judged[row : row + size]))) for k, row in last.items()}
+    ahead = maximum_filter1d(judged, size, origin=-(size // 2), mode="constant") if size > 1 else judged
+    edges = np.flatnonzero(np.diff(stretch, prepend=REST - 1)).tolist()
+    found: dict[int, tuple[float, int]] = {}
+    for first, error in zip(edges, np.maximum.reduceat(ahead, edges).tolist(), strict=True):
+        k = int(stretch[first])
+        if k >= 0 and (k not in found or error > found[k][0]):
+            found[k] = (error, first)
+    worst = {}
+    for k, (error, first) in found.items():
+        row = first + int(np.argmax(ahead[first:] == error))
+        worst[k] = (error, row + int(np.argmax(judged[row : row + size])))
+    return worst
 
 
 @dataclass(frozen=True, slots=True)
 class Feeds:
-    """The share of the feed of each stretch, the largest error there, and which of them are held at it."""
+    """The share of the feed of each stretch as they were run together, its largest error, and which are held by it.
+
+    ``tried`` is of each the lowest share that was tried, with the largest error there.
+    """
 
     share: Mapping[int, float]
     left_um: Mapping[int, float]
     held: frozenset[int]
+    tried: Mapping[int, tuple[float, float]]
 
 
 def highest(source: Source, over: Mapping[int, float], judge: Judge, tolerance_um: float) -> Feeds:
@@ -108,17 +120,25 @@ def highest(source: Source, over: Mapping[int, float], judge: Judge, tolerance_u
 
 @dataclass(slots=True)
 class _Stretch:
-    """What is known of one stretch: ``low`` holds, ``high`` does not; it is ``lost`` when no share is worth a trial."""
+    """What is known of one stretch: ``low`` holds, ``high`` does not; it is ``lost`` when no share is worth a trial.
+
+    ``risen`` is how often in a row a higher share held.
+    """
 
     share: float = 1.0
     low: float | None = None
     high: float | None = None
     lost: bool = False
+    risen: int = 0
     tried: list[tuple[float, float]] = field(default_factory=list)
 
     def learn(self, share: float, error_um: float, holds: bool) -> None:
         """Take in a trial."""
         self.tried.append((share, error_um))
+        if not holds:
+            self.risen = 0
+        elif self.low is None or share > self.low:
+            self.risen += 1
         if holds:
             self.low, self.lost = share, False
             if self.high is not None and self.high <= share:  # a neighbour has changed since
@@ -133,7 +153,7 @@ class _Stretch:
         share, error = self.tried[-1]
         if self.low is None and self._is_lost(share, error):
             self.lost = True
-            return share
+            return self._no_better()
         if self.low is not None and (self.low >= 1.0 or (share == self.low and error > FULL * tolerance_um)):
             return self.low
         if self.low is not None and self.high is not None and self.high / self.low <= NARROW:
@@ -141,10 +161,17 @@ class _Stretch:
         wanted = share * (AIM * tolerance_um / error) ** (1.0 / self._power()) if 0.0 < error < np.inf else 0.0
         if self.low is None:
             return max(LOWEST, float(np.clip(wanted, MOST_FALL * share, LEAST_FALL * share)))
+        if self.risen > PATIENCE:  # its error hardly goes with its own share: halve the bracket
+            wanted = max(wanted, float(np.sqrt(self.low * (self.high or 1.0))))
         if self.high is None:
             return min(1.0, max(wanted, RISE * self.low))
         margin = (self.high / self.low) ** EDGE
         return float(np.clip(wanted, self.low * margin, self.high / margin))
+
+    def _no_better(self) -> float:
+        """Return the highest share that was tried and below which the error is hardly less."""
+        least = min(error for _, error in self.tried)
+        return max(share for share, error in self.tried if STILL * error <= least)
 
     def _is_lost(self, share: float, error_um: float) -> bool:
         faster = [e for s, e in self.tried if np.isfinite(e) and s >= FAR * share]
@@ -177,9 +204,12 @@ class _Search:
             for k, stretch in self._open.items():
                 if stretch.tried and stretch.tried[-1][0] == shares.get(k):
                     stretch.share = stretch.next_share(self._tolerance_um)
+            now = {k: s.share for k, s in self._open.items()}
             if not bad - {k for k, s in self._open.items() if s.lost}:
                 self._kept = {k: s.tried[-1] for k, s in self._open.items() if s.tried}
-            if shares == {k: s.share for k, s in self._open.items()}:
+                if sum(share > WORTH * shares.get(k, 1.0) for k, share in now.items()) <= FEW * len(now):
+                    return
+            if shares == now:
                 return
 
     def rises(self) -> bool:
@@ -198,7 +228,10 @@ class _Search:
         """Return the last shares that held together."""
         known = {k: self._kept.get(k, s.tried[-1] if s.tried else (s.share, np.inf)) for k, s in self._open.items()}
         held = frozenset(k for k, (_, error_um) in self._kept.items() if error_um <= self._tolerance_um)
-        return Feeds({k: share for k, (share, _) in known.items()}, {k: um for k, (_, um) in known.items()}, held)
+        tried = {k: min(s.tried, default=known[k]) for k, s in self._open.items()}
+        return Feeds(
+            {k: share for k, (share, _) in known.items()}, {k: um for k, (_, um) in known.items()}, held, tried
+        )
 
     def _run(self, shares: Mapping[int, float]) -> set[int]:
         """Run the path; return the stretches that leave the tolerance."""

@@ -26,6 +26,15 @@ def _segment_plain(path: Float, j: int, point: Float) -> float:
     return float(np.sqrt(square))
 
 
+def _row_plain(path: Float, j: int, point: Float) -> float:
+    """Return the distance from ``point`` (d,) to row j of ``path``."""
+    square = 0.0
+    for a in range(point.size):
+        square += (point[a] - path[j, a]) ** 2
+    return float(np.sqrt(square))
+
+
+_row: Callable[[Float, int, Float], float] = njit(cache=True, nogil=True)(_row_plain)
 _segment: Callable[[Float, int, Float], float] = njit(cache=True, nogil=True)(_segment_plain)
 
 
@@ -75,7 +84,8 @@ def _contour_plain(path: Float, actual: Float, half_window: int, first: int) -> 
     """Return (m,) the distance of each row of ``actual`` (m, d) to the polyline of ``path`` (n, d) within the window.
 
     Row k of ``actual`` belongs to row ``first`` + k. A stretch of the path is passed over only where its length proves
-    that no point of it can be nearer than the best one found, so the result is that of the full search.
+    that no point of it can be nearer than the best one found, so the result is that of the full search. The search
+    begins where the row before was nearest: on a slow path that is many rows from the row itself.
     """
     n, d = path.shape
     arc = np.zeros(n)
@@ -85,26 +95,38 @@ def _contour_plain(path: Float, actual: Float, half_window: int, first: int) -> 
             square += (path[k, a] - path[k - 1, a]) ** 2
         arc[k] = arc[k - 1] + np.sqrt(square)
     out = np.empty(len(actual))
+    nearest = first
     for row in range(len(actual)):
         k = first + row
         point = actual[row]
         low = max(0, k - half_window)
         high = min(n - 1, k + half_window)
-        here = 0.0
-        for a in range(d):
-            here += (point[a] - path[k, a]) ** 2
-        best = np.sqrt(here)
-        j = k
+        best = _row(path, k, point)
+        begin = max(low, min(nearest, high))
+        nearest = k
+        j = begin
         while j < high:
+            # no point of the path within so far of row j is nearer than the best one
+            room = _row(path, j, point) - best
+            if arc[j + 1] - arc[j] <= room:
+                j = _beyond(arc, arc[j] + room, j + 1, high) - 1
+                continue
             distance = _segment(path, j, point)
-            best = min(best, distance)
-            # on to the segment that holds the first point of the path that may be nearer
-            j = _beyond(arc, arc[j] + (distance - best), j + 1, high) - 1
-        j = k - 1
-        while j >= low:
+            if distance < best:
+                best = distance
+                nearest = j
+            j += 1
+        j = begin
+        while j > low:
+            room = _row(path, j, point) - best
+            if arc[j] - arc[j - 1] <= room:
+                j = _before(arc, arc[j] - room, low, j - 1) + 1
+                continue
+            j -= 1
             distance = _segment(path, j, point)
-            best = min(best, distance)
-            j = _before(arc, arc[j + 1] - (distance - best), low, j)
+            if distance < best:
+                best = distance
+                nearest = j
         out[row] = best
     return out
 

@@ -42,6 +42,19 @@ def predict(
     return assemble(reference, responses, zones_above_um)
 
 
+def contour_um(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> Float:
+    """Return the contour error (n,) um alone, as :func:`predict` has it: for those who run many paths."""
+    check_axes(reference, models, config)
+    responses = closed_loop.simulate_axes(models, config.axis, reference.dt_s, reference.position_mm)
+    return _contour(reference, responses)
+
+
+def _contour(reference: Trajectory, responses: Mapping[str, closed_loop.Response]) -> Float:
+    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    actual = np.column_stack([responses[axis].position_mm for axis in reference.axes])
+    return contour_error_um(path, actual, reference.dt_s)
+
+
 def predict_corrected(
     reference: Trajectory,
     models: Mapping[str, Parameters],
@@ -67,9 +80,7 @@ def assemble(
 ) -> Prediction:
     """Put the axes' responses together: errors per axis, contour error, zones."""
     axes = reference.axes
-    path = np.column_stack([reference.position_mm[axis] for axis in axes])
-    actual = np.column_stack([responses[axis].position_mm for axis in axes])
-    contour = frozen(contour_error_um(path, actual, reference.dt_s))
+    contour = frozen(_contour(reference, responses))
     limited = np.max([responses[axis].limited for axis in axes], axis=0)
     return Prediction(
         reference=reference,

@@ -13,7 +13,7 @@ from fdhil.config import MachineConfig
 from fdhil.correction import plan as plan_correction
 from fdhil.prediction import predict
 from fdhil.prediction.advise import Advice, Held, advise
-from fdhil.prediction.feeds import RAPID, REST, Source, at_shares, highest, program_source, stretches
+from fdhil.prediction.feeds import RAPID, REST, Source, at_shares, highest, program_source, stretches, worst_rows
 from fdhil.prediction.models import nominal_models
 from fdhil.program import Dwell, Feed, interpret
 from fdhil.program.budget import Budget
@@ -85,6 +85,26 @@ def test_the_advised_feeds_hold_and_more_does_not(seed: int) -> None:
     assert len(shares) == len(advice) > 0
     assert largest(source, shares, models, config) <= tolerance
     assert largest(source, {line: 1.05 * share for line, share in shares.items()}, models, config) > tolerance
+
+
+def test_no_line_alone_may_run_much_faster() -> None:
+    """Two lines share the error of the corner between them: each is as fast as the other lets it."""
+    lines = ["G21 G90 G64 F12000", "G1 X40", "Y12", "X70 Y45", "G3 X90 Y25 I20", "G1 X90 Y-20", "M2"]
+    source = program_source(list(interpret(lines, Budget.of(CONFIG.nc))), CONFIG)
+    shares = shares_of(advise(source, MODELS, CONFIG, 35.0), lambda a: a.plain)
+    assert largest(source, shares, MODELS, CONFIG) <= 35.0
+    slowed = [line for line, share in shares.items() if share < 0.95]
+    assert len(slowed) >= 4
+    for line in slowed:
+        assert largest(source, {**shares, line: 1.05 * shares[line]}, MODELS, CONFIG) > 35.0
+
+
+def test_worst_rows_of_stretches_that_come_again() -> None:
+    """Line 1 twice, line 2 between: each with the largest error in it and behind it, a rapid not judged."""
+    stretch = np.array([1, 1, 2, 2, 1, RAPID, 3, REST])
+    error = np.array([1.0, 2.0, 7.0, 1.0, 3.0, 99.0, 4.0, 5.0])
+    assert worst_rows(stretch, error, 0.001, 0.001) == {1: (7.0, 2), 2: (7.0, 2), 3: (5.0, 7)}
+    assert worst_rows(stretch, error, 0.001, 0.0) == {1: (3.0, 4), 2: (7.0, 2), 3: (4.0, 6)}
 
 
 def largest(
