@@ -29,7 +29,10 @@ class Supply:
         if self._guard.state in REST:
             return notices
         notices += self._found()
-        if self._broken or not stream.lacks(self._guard.status):
+        if self._broken:
+            return notices
+        if not stream.lacks(self._guard.status):
+            self._scarce = False
             return notices
         return notices + (self._extend() if stream.ready else self._missing())
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import os
 import re
 import signal
@@ -17,13 +18,15 @@ import numpy as np
 import pytest
 
 from fdhil.config import MachineConfig
-from fdhil.daemon.arming import AHEAD_S, may_begin
+from fdhil.daemon.arming import AHEAD_S, StreamedArmament, may_begin
 from fdhil.daemon.armory import Armory
+from fdhil.daemon.guard_link import GuardLink
 from fdhil.daemon.keeping import Keeper
 from fdhil.daemon.program_check import encoded
-from fdhil.daemon.streamed import Block, Checked
+from fdhil.daemon.streamed import Block, Checked, Piece, Stream
+from fdhil.daemon.supply import Supply
 from fdhil.daemon.token import read_token
-from fdhil.records import Notice, Skill
+from fdhil.records import Notice, Reason, Skill
 from fdhil.store.history import Revision, Stamp
 from tests.daemon.machine import config_of
 from tests.daemon.mill import RESERVE_ROWS, Mill
@@ -277,9 +280,77 @@ def checked_of(config: MachineConfig, folder: Path, seconds: float, after_um: fl
     rows = {axis: np.zeros(round(seconds / 0.001)) for axis in config.axis}
     (folder / "rows").write_bytes(encoded(rows, rows, config))
     checked = Checked(folder / "rows", tuple(config.axis))
-    before, after = ({"rms_um": rms, "max_um": 2 * rms} for rms in (30.0, after_um))
-    checked.take(Block(round(seconds / 0.001), "", False), {"before": before, "after": after})
+    pass_on(checked, round(seconds / 0.001), after_um)
     return checked
+
+
+def pass_on(checked: Checked, end: int, after_um: float = 1.0) -> None:
+    """Let the rows at rest up to ``end`` pass."""
+    digest = hashlib.sha256(bytes(16 * (end - checked.rows))).hexdigest()
+    before, after = ({"rms_um": rms, "max_um": 2 * rms} for rms in (30.0, after_um))
+    checked.take(Block(end, digest, False), {"before": before, "after": after})
+
+
+def supply_of(checked: Checked, mill: Mill, folder: Path) -> tuple[Supply, GuardLink]:
+    """What feeds the mill with these rows, of which it has none yet."""
+    link = GuardLink(folder)
+    link.look()
+    stream = Stream(checked, "digest", 0.001)
+    armed = StreamedArmament("long.ngc", stream, Piece(0, {}, {}, False), {}, 29.0)
+    return Supply(armed, link), link
+
+
+def test_what_is_refused_before_it_begins_is_disarmed(config: MachineConfig, mill: Mill, tmp_path: Path) -> None:
+    """Nothing has moved: it is as if it had been refused at once; further places are told as they are found."""
+    checked = checked_of(config, tmp_path / "c", 62.0)
+    assert config.store.run_directory is not None
+    supply, link = supply_of(checked, mill, config.store.run_directory)
+    mill.state = "ARMED"
+    assert {notice.code for notice in supply.go_on()} == {"GuardFound", "GuardState"}
+    checked.refused = (Reason("DemandTooHigh", "line 7, at 63.00 s: axis X has", "lower the feed"),)
+    (found,) = supply.go_on()
+    assert (found.code, found.severity, mill.state) == ("DemandTooHigh", "MAJOR", "OFF")
+    assert found.text == (
+        "line 7, at 63.00 s: axis X has; lower the feed; long.ngc was armed ahead of its check: it had not begun and is"
+        " disarmed"
+    )
+    link.close()
+
+
+def test_a_block_that_is_not_what_was_checked_is_not_sent(config: MachineConfig, mill: Mill, tmp_path: Path) -> None:
+    checked = checked_of(config, tmp_path / "c", 62.0)
+    with (tmp_path / "c" / "rows").open("r+b") as file:
+        file.write(b"\1")
+    assert config.store.run_directory is not None
+    supply, link = supply_of(checked, mill, config.store.run_directory)
+    mill.state, mill.rows = "ACTIVE", [(0, 0, 0, 0)] * 5_000
+    notices = [notice for _ in range(3) for notice in supply.go_on()]
+    assert [notice.code for notice in notices if notice.severity == "MAJOR"] == ["CorruptFile"]
+    assert "the correction ends before these rows" in notices[-1].text
+    assert len(mill.rows) == 5_000
+    link.close()
+
+
+def test_a_check_that_falls_behind_twice_is_told_twice(config: MachineConfig, mill: Mill, tmp_path: Path) -> None:
+    checked = checked_of(config, tmp_path / "c", 10.0)
+    with (tmp_path / "c" / "rows").open("ab") as file:
+        file.write(bytes(16 * 8_000))
+    assert config.store.run_directory is not None
+    supply, link = supply_of(checked, mill, config.store.run_directory)
+    mill.state = "ACTIVE"
+    told = []
+    for row, end in ((0, 10_000), (3_000, 10_000), (4_500, 10_000), (4_600, 10_000), (4_600, 14_000), (3_900, 14_000),
+                     (7_500, 14_000), (8_500, 14_000)):  # fmt: skip
+        if end > checked.rows:
+            pass_on(checked, end)
+        mill.row = row
+        if not mill.rows:
+            assert link.extend(supply._armed, supply._armed.stream.take())["ok"]
+        told.append([notice.code for notice in supply.go_on() if notice.severity == "MAJOR"])
+    behind = ["CheckBehind"]
+    assert told == [[], [], behind, [], [], [], [], behind]
+    assert len(mill.rows) == 14_000
+    link.close()
 
 
 @pytest.mark.parametrize(

@@ -42,6 +42,7 @@ def test_from_the_bus_to_the_history_to_a_corrected_cut_and_back(shop: Shop, cap
         _cuts_corrected(shop, capsys)
         _refuses_a_long_program_by_its_line(shop, capsys)
         _cuts_a_program_longer_than_the_ring(shop, capsys)
+        _disarms_what_is_refused_before_it_begins(shop, capsys)
         assert fdhil("arm", shop.path, shop.folder / "corner.ngc", capsys=capsys)[0] == 0
         assert daemon.stop() == 0  # disarms first
         assert guard.stop() == 0
@@ -129,6 +130,25 @@ def _refuses_a_long_program_by_its_line(shop: Shop, capsys: Capture) -> None:
     assert (code, out) == (1, "")
     assert re.search(r"DemandTooHigh: line 3[67], at \d+\.\d+ s: axis [XY] has", err), err
     assert "no offset can help; lower the feed" in err
+
+
+def _disarms_what_is_refused_before_it_begins(shop: Shop, capsys: Capture) -> None:
+    """Its first minute passes and is armed; the check, which goes on, meets a feed that no drive can hold."""
+    body = LONG.splitlines()[2:-2]
+    lines = [*LONG.splitlines()[:2], *body * 5, "G1 Y400 F60000", "G1 X-400", "G1 X0 Y0 F8000", *body, "M2"]
+    program = shop.folder / "later.ngc"
+    program.write_text("\n".join(lines) + "\n")
+    code, out, err = fdhil("arm", shop.path, program, "--json", capsys=capsys)
+    assert code == 0, (out, err)
+    assert json.loads(out)["check"]["whole"] is False
+    told = shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
+    refused = next(notice for notice in told["notices"] if notice["severity"] == "MAJOR")
+    assert refused["code"] == "DemandTooHigh"
+    line = re.match(r"line (\d+), at \d+\.\d+ s: axis [XY] has", refused["text"])
+    assert line, refused
+    assert 0 <= int(line[1]) - (3 + 5 * len(body)) <= 1  # its first or its second move
+    assert "it had not begun and is disarmed" in refused["text"]
+    shop.status_when(lambda s: s["checking"] is None)
 
 
 def _cut(shop: Shop, name: str, program: str = "corner.ngc", text: str = CORNER) -> float:
