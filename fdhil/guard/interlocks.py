@@ -98,11 +98,7 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     "Misaligned": (_H, "the targets differ from the table's path", "plan the correction for the program that runs"),
     "OverrideChanged": (_H, "the path is run at another rate than planned", "set the override of the plan"),
     "FeedHold": (_H, "the path stands still", "start the feed, or arm again"),
-    "TableStarved": (
-        _R,
-        "less than one second of the streamed table is left",
-        "see fdhil status for what ended its rows",
-    ),
+    "TableStarved": (_R, "less than one second of the streamed table is left", "see fdhil status for the cause"),
     "OffsetLimit": (_R, "an offset is beyond the limit, braking included", "plan the correction inside the limits"),
     "OffsetRate": (_R, "an offset changes too fast", "plan the correction inside the limits"),
     "OffsetEnergy": (_R, "the offsets travel more than allowed in one second", "plan a smoother correction"),
