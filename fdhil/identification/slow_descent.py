@@ -22,7 +22,7 @@ CONVERGED = 0.01  # of a standard deviation
 DIFFERENCE = 1e-5  # of a parameter's typical size
 DELAY_DIFFERENCE_S = 1e-6
 LEAST_DIFFERENCE_S = 1e-8
-LEAST_SHARE = 1e-3
+LEAST_SHARE, MOST_SHARE = 1e-3, 256.0
 GAIN = 1e-3  # of twice the log likelihood: a step that gains less moves nothing by more than some hundredths
 
 
@@ -68,7 +68,7 @@ class Likelihood:
 def ascend(likelihood: Likelihood, theta: Float, free: Sequence[int], sizes: Float) -> tuple[Float, Float, Float, bool]:
     """Step from ``theta`` (7,) until a step is nothing; return theta, innovations (m,), jacobian (m, k), and success.
 
-    ``sizes`` (7,) are the parameters' typical ones. A step that is not more likely is halved.
+    ``sizes`` (7,) are the parameters' typical ones.
     """
     here = likelihood.at(theta, float(theta[6]))
     for _ in range(STEPS):
@@ -80,18 +80,44 @@ def ascend(likelihood: Likelihood, theta: Float, free: Sequence[int], sizes: Flo
         step = inverse_of(information)[0] @ (mean.T @ white + variance.T @ (1.0 - white**2))
         if float(np.abs(step * np.sqrt(np.diag(information))).max()) < CONVERGED:
             return theta, white, mean, True
-        share = 1.0
-        while share > LEAST_SHARE:
-            trial = theta.copy()
-            trial[list(free)] += share * step
-            possible = bool(np.isfinite(trial).all() and (trial[:4] > 0).all())
-            there = likelihood.at(trial, float(trial[6])) if possible else here
-            if possible and there.cost <= here.cost:
-                break
-            share *= 0.5
-        else:
+        found = _along(likelihood, theta, here, free, step)
+        if found is None:
             return theta, white, mean, True  # nothing more likely along the step: this is the top, to rounding
-        gained, theta, here = here.cost - there.cost, trial, there
+        gained, (theta, here) = here.cost - found[1].cost, found
         if gained < GAIN:
             return theta, here.whitened, mean, True
     return theta, here.whitened, mean, False
+
+
+def _along(
+    likelihood: Likelihood, theta: Float, here: Innovations, free: Sequence[int], step: Float
+) -> tuple[Float, Innovations] | None:
+    """Return where along the ``step`` it is more likely, and the innovations there; None where it is nowhere.
+
+    A step that is not more likely is halved, and a whole one doubled as long as that is more likely: innovations that
+    hold much noise seem to tell the delay better than they do, and steps are too short then.
+    """
+
+    def tried(share: float) -> tuple[Float, Innovations] | None:
+        trial = theta.copy()
+        trial[list(free)] += share * step
+        if not (np.isfinite(trial).all() and (trial[:4] > 0).all()):
+            return None
+        there = likelihood.at(trial, float(trial[6]))
+        return (trial, there) if there.cost <= here.cost else None
+
+    share = 1.0
+    while share > LEAST_SHARE:
+        best = tried(share)
+        if best is not None:
+            break
+        share *= 0.5
+    else:
+        return None
+    while 1.0 <= share < MOST_SHARE:
+        share *= 2.0
+        further = tried(share)
+        if further is None or not further[1].cost < best[1].cost:
+            break
+        best = further
+    return best
