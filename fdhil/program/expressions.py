@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import operator as operators
 import re
+import unicodedata
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Protocol
@@ -57,7 +58,20 @@ class Reader:
 
     def fault(self, message: str, word: str | None = None) -> ProgramError:
         """Return the error for the word being read (from ``word_at`` on), or for another one."""
+        if word is None and not self.text[self.at : self.at + 1].isascii():
+            return self._stranger()
         return _fault(self._context, word or self.text[self.word_at : self.word_at + 12], message)
+
+    def _stranger(self) -> ProgramError:
+        """Return the error for a character that is none of the language, often pasted from a text processor."""
+        end = self.at + 1
+        while end < min(len(self.text), self.at + 4) and not self.text[end].isascii():
+            end += 1
+        ways = (as_written(self.text[self.at : stop]) for stop in range(end, self.at, -1))
+        character = next((way for way in ways if len(way) == 1), self.text[self.at])
+        name = f"U+{ord(character):04X}, {unicodedata.name(character, 'unnamed').lower()}"
+        word = self.text[self.word_at : self.at].upper() + character
+        return ProgramError(self._context.line, word, f"ends in a character that no NC knows ({name}); type it anew")
 
     def done(self) -> bool:
         """Tell whether the text is used up."""
@@ -167,7 +181,15 @@ def whole(context: Context, value: float, what: str) -> int:
 
 
 def _fault(context: Context, word: str, message: str) -> ProgramError:
-    return ProgramError(context.line, word.upper(), message)
+    return ProgramError(context.line, word.upper() if word.isascii() else as_written(word), message)
+
+
+def as_written(text: str) -> str:
+    """Return text whose characters stand for the bytes of a file: UTF-8 when it can be, else Latin-1."""
+    try:
+        return text.encode("latin-1").decode("utf-8")
+    except UnicodeDecodeError:
+        return text
 
 
 def _finite(context: Context, value: float, word: str) -> float:

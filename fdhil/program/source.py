@@ -5,6 +5,7 @@ Only what a loop or a call may come back to is kept: a place in the file. Memory
 
 from __future__ import annotations
 
+import codecs
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -16,6 +17,7 @@ from fdhil.errors import ProgramError
 _SPOOL_BYTES = 4_000_000
 _READ_AHEAD_BYTES = 1 << 18
 _MAX_KEPT = 2000
+_BYTE_ORDER_MARK = codecs.BOM_UTF8.decode("latin-1")  # editors on Windows begin a file in UTF-8 with it
 
 
 class Mark(NamedTuple):
@@ -83,6 +85,8 @@ class Source:
             if not raw:
                 return None
             text, length = raw.decode("latin-1").rstrip("\r\n"), len(raw)
+            if self._end == 0:
+                text = text.removeprefix(_BYTE_ORDER_MARK)
         if again and kept is None:
             if len(self._kept) >= _MAX_KEPT:
                 self._kept.clear()
@@ -106,6 +110,8 @@ class Source:
         if len(raw) > self._max_chars and len(raw.rstrip(b"\r\n")) > self._max_chars:
             word = raw[:12].decode("latin-1")
             raise ProgramError(self.line + 1, word, f"the line is longer than {self._max_chars} characters; split it")
+        if self._end == 0 and raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            raise ProgramError(1, "", "the file is text in UTF-16, which no NC reads; save it as ASCII or UTF-8")
         if b"\0" in raw:
             raise ProgramError(self.line + 1, "\\0", "holds a zero byte, so this is no text; give an NC program")
         return raw
@@ -115,7 +121,7 @@ class Source:
         line = next(feed, None)
         if line is None:
             return b""
-        raw = (line.rstrip("\r\n").replace("\n", " ") + "\n").encode("latin-1", "replace")
+        raw = (line.rstrip("\r\n").replace("\n", " ") + "\n").encode("utf-8", "replace")
         raw = raw[: self._max_chars + 2]
         self._file.write(raw)
         return raw

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from string import ascii_lowercase, ascii_uppercase
 
 from fdhil.errors import ProgramError
 from fdhil.program.expressions import Context, Reader, Value, now, whole
@@ -16,7 +17,7 @@ from fdhil.program.expressions import Context, Reader, Value, now, whole
 _PLAIN = re.compile(r"(?:[a-z@^][+-]?(?:\d++\.?\d*+|\.\d++))*+")
 _WORD = re.compile(r"([a-z@^])([+-]?(?:\d++\.?\d*+|\.\d++))")
 _NUMBER = re.compile(r"n(\d++)(?:\.\d++)?+")
-_BLANKS = str.maketrans("", "", " \t\r\v\f")
+_CLEANED = str.maketrans(ascii_uppercase, ascii_lowercase, " \t\r\v\f")
 _COMMENT = "("
 _STRAIGHT = frozenset("xyzf")
 _LETTERS = frozenset("abcdefghijklmpqrstuvwxyz@^$")
@@ -84,8 +85,8 @@ def clean(raw: str, line: int) -> str:
     A comment between two words is left as one mark, since it may not stand within a word.
     """
     if "(" in raw or ";" in raw:
-        return _without_comments(raw, line).lower().translate(_BLANKS).strip(_COMMENT)
-    return raw.lower().translate(_BLANKS)
+        return _without_comments(raw, line).translate(_CLEANED).strip(_COMMENT)
+    return raw.translate(_CLEANED)
 
 
 def _without_comments(raw: str, line: int) -> str:
