@@ -1,4 +1,4 @@
-"""A program longer than the guard's ring: checked as a whole, handed on and applied while the machine runs."""
+"""A program longer than the guard's ring: its checked rows are handed on and applied while the machine runs."""
 
 from __future__ import annotations
 
@@ -6,21 +6,25 @@ import contextlib
 import json
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from fdhil.config import MachineConfig
+from fdhil.correction import Limits
+from fdhil.correction import check as check_limits
 from fdhil.daemon.program_check import check, keep
-from fdhil.daemon.streamed import FIRST_S, Checked, Stream
+from fdhil.daemon.streamed import FIRST_S, Block, Checked, Stream
 from fdhil.daemon.token import read_token
 from fdhil.guard.client import GuardClient
 from fdhil.guard.interlocks import FACTS
 from fdhil.prediction import contour_error_um
 from fdhil.prediction.models import nominal_models
 from fdhil.program import program_digest
-from fdhil.records import Float
+from fdhil.records import Float, Reason
 from tests.integration.conftest import PATIENCE_S, Bench
 from tests.integration.test_guard import DIGEST, client, sections
 from tests.paths import bench_demand, rms
@@ -63,11 +67,9 @@ def kept_alive(client: GuardClient) -> Iterator[None]:
         thread.join()
 
 
-def test_a_program_longer_than_the_ring(bench: Bench, client: GuardClient, tmp_path: Path) -> None:
-    """Armed with its first 10 s, never interrupted, 20 times better on the whole."""
-    there = bench_demand(10)
-    path = np.concatenate([np.repeat(there[:1], 300, axis=0), *[there, there[::-1]] * (PASSES // 2)])
-    demand = tmp_path / "demand.csv"
+def written(folder: Path, path: Float) -> Path:
+    """A demand on disk."""
+    demand = folder / "demand.csv"
     np.savetxt(
         demand,
         np.column_stack([np.arange(len(path)) * 0.001, path]),
@@ -76,14 +78,36 @@ def test_a_program_longer_than_the_ring(bench: Bench, client: GuardClient, tmp_p
         header="time_s,X_mm,Y_mm",
         comments="",
     )
-    bench.command('{"command": "nc", "on": true}')
-    bench.event("nc")
+    return demand
+
+
+def test_a_program_longer_than_the_ring(bench: Bench, client: GuardClient, tmp_path: Path) -> None:
+    """Armed with its first 10 s, never interrupted, 20 times better on the whole."""
+    there = bench_demand(10)
+    path = np.concatenate([np.repeat(there[:1], 300, axis=0), *[there, there[::-1]] * (PASSES // 2)])
+    demand = written(tmp_path, path)
     models = nominal_models(bench.config)
     digest = program_digest(demand)
     keep(tmp_path, "key", lambda body: check(demand, digest, models, bench.config, body, lambda told: None))
     checked = Checked.find(tmp_path, "key", tmp_path)
     assert checked is not None
     stream = Stream(checked, DIGEST, 0.001)
+    states, held = played(bench, client, demand, stream)
+    # one process hands on here and runs the twin: it may sleep longer than the twin waits, a few cycles of 30,000
+    assert max(bench.event("finished")["late_rpdo"].values()) < 10
+    assert stream.done
+    assert states <= {"RAMPING", "ACTIVE"}
+    assert held < 15_000  # the ring, not the program
+    cause = client.status()["cause"]
+    assert cause["code"] == "Finished"
+    after = contour_um(demand.with_name("trace.csv"), len(path))[400:]
+    assert checked.errors["before"]["rms_um"] > 20 * rms(after)
+
+
+def played(bench: Bench, client: GuardClient, demand: Path, stream: Stream) -> tuple[set[str], int]:
+    """Arm a stream and let the NC play its demand, handing on what the guard lacks; return its states, most rows."""
+    bench.command('{"command": "nc", "on": true}')
+    bench.event("nc")
     piece = stream.take(FIRST_S)
     assert client.load("XY", piece.demand, piece.offset, DIGEST, piece.first, piece.final)["ok"]
     run = bench.config.store.run_directory
@@ -92,7 +116,7 @@ def test_a_program_longer_than_the_ring(bench: Bench, client: GuardClient, tmp_p
     while not client.arm(read_token(run), DIGEST, dict.fromkeys(FACTS, True))["ok"] and time.monotonic() < deadline:
         client.alive()
         time.sleep(0.1)
-    trace = tmp_path / "trace.csv"
+    trace = demand.with_name("trace.csv")
     bench.command(json.dumps({"command": "trace", "file": str(trace)}))
     bench.command(json.dumps({"command": "play", "file": str(demand)}))
     states, held = set(), 0
@@ -102,18 +126,52 @@ def test_a_program_longer_than_the_ring(bench: Bench, client: GuardClient, tmp_p
             if status["row"]:
                 states.add(status["state"])
                 held = max(held, status["rows"][1] - status["rows"][0])
-            if stream.lacks(status):
+            if stream.lacks(status) and stream.ready and status["state"] != "OFF":
                 piece = stream.take()
                 answer = client.load("XY", piece.demand, piece.offset, DIGEST, piece.first, piece.final)
                 assert answer["ok"], answer
             else:
                 time.sleep(0.01)
-    # one process hands on here and runs the twin: it may sleep longer than the twin waits, a few cycles of 30,000
-    assert max(bench.event("finished")["late_rpdo"].values()) < 10
-    assert stream.done
-    assert states <= {"RAMPING", "ACTIVE"}
-    assert held < 15_000  # the ring, not the program
-    cause = client.status()["cause"]
-    assert cause["code"] == "Finished"
-    after = contour_um(trace, len(path))[400:]
-    assert checked.header["before"]["rms_um"] > 20 * rms(after)
+    return states, held
+
+
+def test_rows_end_before_a_place_that_is_refused(bench: Bench, client: GuardClient, tmp_path: Path) -> None:
+    """Armed while the check goes on: corrected until a second before the block with the place, none beyond, no jump."""
+    there, hard = bench_demand(10), bench_demand(20, (0.030, 0.015))
+    path = np.concatenate([np.repeat(there[:1], 300, axis=0), *[there, there[::-1]] * 3, hard])
+    place = len(path) - len(hard)
+    demand = written(tmp_path, path)
+    (tmp_path / "rows").touch()
+    checked = Checked(tmp_path / "rows", "XY")
+    checking = threading.Thread(target=grow, args=(checked, demand, tmp_path / "rows", bench.config))
+    checking.start()
+    while checked.rows < 12_000:
+        time.sleep(0.01)
+    stream = Stream(checked, DIGEST, 0.001)
+    played(bench, client, demand, stream)
+    checking.join()
+    assert checked.refused[0].code == "DemandTooHigh"
+    assert place - 2_500 <= checked.rows <= place
+    assert stream.end == checked.rows
+    assert client.status()["cause"]["code"] == "TableStarved"
+    trace = np.genfromtxt(tmp_path / "trace.csv", delimiter=",", names=True)
+    limits = Limits.of(bench.config.axis["X"], 0.001)
+    for axis in "XY":
+        sent = np.rint(trace[f"{axis}_offset_um"] / limits.um_per_increment)
+        assert np.any(sent[: checked.rows - 1_000])
+        assert not np.any(sent[checked.rows - 500 :])
+        assert check_limits(sent.astype(np.int64), limits) == []
+
+
+def grow(checked: Checked, demand: Path, rows: Path, config: MachineConfig) -> None:
+    """Check a demand as the process does; what it tells is known at once."""
+
+    def hear(told: Mapping[str, Any]) -> None:
+        if "block" in told:
+            end, sha256 = told["block"]
+            checked.take(Block(end, sha256, told["last"]), told["errors"])
+        elif "refused" in told:
+            checked.refused += (Reason(**told["refused"]),)
+
+    with rows.open("r+b") as body:
+        check(demand, program_digest(demand), nominal_models(config), config, body, hear)
