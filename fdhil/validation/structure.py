@@ -18,7 +18,7 @@ from fdhil.identification.covariance import aliasing
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.innovations import innovations
-from fdhil.identification.motion import Motion
+from fdhil.identification.motion import UNKNOWN, Motion
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import innovations_of
 from fdhil.records import Float, Reason
@@ -99,10 +99,14 @@ class Bench:
     def gain_answers(self, name: str, courses: Float) -> Float:
         """Return minus the change (m, q) of innovations when the gain of ``name`` grows by ``courses`` (q, n)."""
         motion = self._foretold()
-        if name != "voltage":
-            return self._answers(_KINDS[name], getattr(motion, name) * courses, None)
-        at_samples = np.array([motion.at_voltage(c) for c in courses])
-        return self._answers(sweeps.VOLTAGE, motion.voltage_mean * at_samples, motion.voltage_rise * at_samples)
+        if name == "voltage":
+            at = np.array([motion.at_voltage(c) for c in courses])
+            answers = self._answers(sweeps.VOLTAGE, motion.voltage_mean * at, motion.voltage_rise * at)
+        else:
+            answers = self._answers(_KINDS[name], getattr(motion, name) * courses, None)
+        # a drive that creeps to rest is no random walk, for which its speed is taken there: its innovations lean
+        answers[: 2 * motion.n][np.repeat(motion.mode == UNKNOWN, 2)] = 0.0
+        return answers
 
     def _foretold(self) -> Motion:
         """Return the motion with each reading as those before it foretell it: a gain acts on what is measured.

@@ -24,6 +24,8 @@ SMOOTHING_S = 0.010  # of the jerk-limited course of a rapid nothing is lost ove
 LARGEST = 1.0  # samples: a recorder may assign a value to the SYNC before or after it
 DOUBTFUL = 0.5  # samples: a delay that may be larger is searched for
 SURE = 4.5  # standard deviations: two tests a window
+TOLD = 2.5  # standard deviations
+STRIDE = 1.0  # samples: with other parameters fitted to none, hardly anything may be left of a delay of several
 SEARCH = 6  # fits: each takes away most of what is left
 REACH = 16.0  # samples: longer ones show in whole samples, see identification.delay
 FOUND = 0.1  # samples
@@ -51,8 +53,8 @@ def timing_faults(window: Window, fit: Fit) -> Iterator[Reason]:
     if current.sure and abs(current.samples) * voltage.std > abs(voltage.samples) * current.std:
         yield _reason("current", "voltage and speed", current.samples, window.dt_s)
         return
-    if abs(voltage.samples) + voltage.std > DOUBTFUL:
-        samples = searched(fit, voltage.samples)
+    if abs(voltage.samples) + TOLD * voltage.std > DOUBTFUL:
+        samples = searched(fit, voltage)
         if samples is not None and abs(samples) > LARGEST:
             yield _reason("voltage", "current and speed", samples, window.dt_s)
             return
@@ -117,11 +119,12 @@ def _no_rise(kind: int, n: int) -> list[Float] | None:
     return [np.zeros(n)] if kind == sweeps.VOLTAGE else None
 
 
-def searched(fit: Fit, first: float) -> float | None:
+def searched(fit: Fit, first: Shift) -> float | None:
     """Return the samples of the voltage's delay beyond which, all else fitted to it, the innovations show no more.
 
-    ``first`` is what they show to begin with. The delay must make the window likelier by as much as a sure finding:
-    what regulators do within a sample shifts the innovations too, but that gets no likelier by it. None otherwise.
+    ``first`` is what they show to begin with; where that tells no direction, the voltage is taken to be late, as
+    sensors are. The delay must make the window likelier by as much as a sure finding: what regulators do within a
+    sample shifts the innovations too, but that gets no likelier by it. None otherwise.
     """
     motion = fit.problem.motions[0]
     begun, last = float(fit.theta[6]) / motion.dt_s, fit
@@ -133,7 +136,9 @@ def searched(fit: Fit, first: float) -> float | None:
             return float("nan")
         return shifts(last)[0].samples - delay
 
-    found = _root(left, begun, first - begun)
+    rest = first.samples - begun
+    stride = max(2.0 * abs(rest), STRIDE)  # what is left shows smaller than it is
+    found = _root(left, begun, rest, -stride if rest < -TOLD * first.std else stride)
     return found if found is not None and _deviance(fit) - _deviance(last) > SURE**2 else None
 
 
@@ -142,10 +147,13 @@ def _deviance(fit: Fit) -> float:
     return float(fit.residuals @ fit.residuals) + fit.problem.filters[0].logdet
 
 
-def _root(left: Callable[[float], float], begun: float, rest: float) -> float | None:
-    """Return where ``left`` vanishes, by secants that stay within the bracket once there is one; None when lost."""
+def _root(left: Callable[[float], float], begun: float, rest: float, stride: float) -> float | None:
+    """Return where ``left`` vanishes, by secants that stay within the bracket once there is one; None when lost.
+
+    ``rest`` is left at ``begun``; the first step is ``stride``.
+    """
     known = [(begun, rest)]
-    here = begun + 2.0 * rest  # what is left shows smaller than it is
+    here = begun + stride
     for _ in range(SEARCH):
         here = float(np.clip(here, -REACH, REACH))
         value = left(here)

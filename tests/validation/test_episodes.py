@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -95,11 +96,15 @@ def test_a_drive_that_swings_through_rest_while_its_demand_goes_on_has_not_arriv
     assert texts[1][0].startswith("EpisodeAborted: the demand moves on with ")  # nor does the rest of it begin there
 
 
+def _falls(drop: float, time_s: Array) -> Array:
+    return 1 - drop * np.clip((time_s - 0.25) / 0.01, 0, 1)
+
+
 def test_a_drive_that_creeps_towards_a_demanded_speed_is_not_held_there() -> None:
     slow = replace(DRIVE, position_gain=23.0, feedforward=0.45)
     scene = replace(SCENE, drive=slow, move=Move(0.12, 0.22, 7.4, 0.02, 1))
     for drop, said in ((0.0, []), (0.2, ["EpisodeAborted"])):
-        rates = drives.rates(scene.move, lambda t, drop=drop: 1 - drop * np.clip((t - 0.25) / 0.01, 0, 1))
+        rates = drives.rates(scene.move, partial(_falls, drop))
         rows = measured(np.random.default_rng(7), scene, drives.run(slow, demand_of(scene, rates), scene.dt_s))
         (window,) = find_windows(recorded(scene, rows))
         assert [reason.code for reason in interruptions(window)] == said

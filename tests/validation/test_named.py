@@ -15,7 +15,7 @@ from fdhil.records import Window, frozen
 from fdhil.validation import analyse, pool
 from fdhil.validation.backlash import backlash, dead_band, overrun
 from fdhil.validation.structure import findings
-from studies import drives
+from studies import drives, faults
 from studies.drives import Drive, Move
 from studies.scenes import Scene, demand_of, measured, recorded
 from tests.identification.recorded import windows
@@ -71,6 +71,11 @@ def test_the_noise_that_a_gain_scales_is_no_witness_for_it() -> None:
         (gain,) = (f for f in findings(fit) if "gain of current" in f.text)
         shares.append(gain.statistic)
     assert np.abs(shares).max() < 4.0
+
+
+def test_a_drive_that_creeps_to_rest_is_no_witness_for_a_gain() -> None:
+    good = faults.good(np.random.default_rng([81, 1, 870]))  # 7 deviations were seen after the move
+    assert [analyse(window, SETTINGS).verdict.reasons for window in find_windows(good.recording)] == [(), ()]
 
 
 @pytest.mark.parametrize(("field", "name"), [("voltage_v", "voltage"), ("current_a", "current")])

@@ -14,7 +14,7 @@ from fdhil.identification.windows import find_windows
 from fdhil.records import VoltageSampling, Window
 from fdhil.validation import analyse
 from fdhil.validation.structure import expected_correlation
-from fdhil.validation.timing import searched, shifts
+from fdhil.validation.timing import Shift, searched, shifts
 from studies import drives, faults
 from studies.scenes import demand_of, measured, recorded
 from tests.validation.test_episodes import SCENE
@@ -45,6 +45,17 @@ def test_a_late_signal_is_refused_with_its_delay(sampling: VoltageSampling, name
     assert ms == pytest.approx(1e3 * FINE_S * rows, abs=1e3 * FINE_S * (0.6 if sampling == "interval_mean" else 1.6))
 
 
+def test_a_delay_of_which_the_other_parameters_leave_nothing_at_first_is_searched_for() -> None:
+    late = faults.KINDS["voltage late"].make(np.random.default_rng([81, 2, 1557]))  # a shorter winding imitates it
+    (window,) = find_windows(late.recording)
+    fit = maximum_likelihood.fit_windows([window], SETTINGS)
+    assert fit is not None
+    assert abs(shifts(fit)[0].samples) < 0.5
+    (reason,) = analyse(window, SETTINGS).verdict.reasons
+    assert reason.code == "SampleTiming"
+    assert float(re.findall(r"is ([\d.]+) ms", reason.text)[0]) == pytest.approx(late.severity * 0.25, abs=0.2)
+
+
 @pytest.mark.parametrize("sampling", ["interval_mean", "instant"])
 def test_signals_of_one_instant_are_accepted(sampling: VoltageSampling) -> None:
     verdict = analyse(_window({}, sampling), SETTINGS).verdict
@@ -57,7 +68,7 @@ def test_a_shift_without_a_gain_in_likelihood_is_not_believed() -> None:
     voltage, current = shifts(fit)
     assert not voltage.sure
     assert not current.sure
-    found = searched(fit, 1.2)  # as if the innovations had shown it
+    found = searched(fit, Shift(1.2, 0.1))  # as if the innovations had shown it
     assert found is None or abs(found) < 1.0
 
 
