@@ -154,7 +154,7 @@ class _Going:
     async def _follow(self, request: Mapping[str, Any]) -> None:
         """Take what the process says until it ends."""
         try:
-            process = await asyncio.create_subprocess_exec(
+            self._process = process = await asyncio.create_subprocess_exec(
                 sys.executable,
                 "-m",
                 "fdhil.daemon.program_check",
@@ -163,25 +163,32 @@ class _Going:
                 limit=MAX_LINE,
                 env={**os.environ, **ONE_THREAD},
             )
-            self._process = process
             if self._abandoned:
                 self._kill()
-            assert process.stdin is not None
-            assert process.stdout is not None
             try:
-                with contextlib.suppress(ConnectionError):  # a process that ended already is told by its silence
-                    process.stdin.write(json.dumps(request).encode() + b"\n")
-                    await process.stdin.drain()
-                async for line in process.stdout:
-                    with contextlib.suppress(ValueError):  # half a line is what an ended process leaves
-                        self._hear(json.loads(line))
-                    self._news.set()
+                await self._converse(process, request)
             finally:
                 self._kill()
                 await process.wait()
             self._conclude(process.returncode)
+        except OSError as error:
+            text = f"the check cannot be started ({error.strerror or error})"
+            self.checked.refused += (Reason("InternalError", text, "free memory and processes, then arm again"),)
         finally:
             self.ended = True
+            self._news.set()
+
+    async def _converse(self, process: asyncio.subprocess.Process, request: Mapping[str, Any]) -> None:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        with contextlib.suppress(ConnectionError):  # a process that ended already is told by its silence
+            process.stdin.write(json.dumps(request).encode() + b"\n")
+            await process.stdin.drain()
+        async for line in process.stdout:
+            with contextlib.suppress(ValueError):  # half a line is what an ended process leaves
+                told = json.loads(line)
+                if isinstance(told, dict):
+                    self._hear(told)
             self._news.set()
 
     def _hear(self, told: Mapping[str, Any]) -> None:
@@ -195,10 +202,10 @@ class _Going:
             checked.refused += (_reason(told["refused"]),)
         elif "error" in told:
             checked.refused += (_reason(told["error"]),)
-        elif told["header"]["refused"]:
+        elif "header" in told:
             checked.refused = tuple(map(_reason, told["header"]["refused"]))
-        else:
-            checked.conclude(told["header"])
+            if not checked.refused:
+                checked.conclude(told["header"])
 
     def _conclude(self, code: int | None) -> None:
         """A check that ended without a word on the whole has died."""

@@ -256,6 +256,17 @@ async def test_a_process_that_dies_within_a_line_is_told(
     assert (refused[0].code, "exit code 9" in refused[0].text) == ("InternalError", True)
 
 
+async def test_a_process_that_cannot_be_started_is_told(
+    config: MachineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program, check = written(tmp_path, LONG), Check(config)
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "absent"))
+    refused = await check.run(program, program_digest(program), nominal_models(config), whole)
+    assert isinstance(refused, tuple)
+    assert refused[0].text == "the check cannot be started (No such file or directory)"
+    await check.attend()  # it is no fault of the daemon
+
+
 def test_the_process_ends_with_its_answer_or_with_the_daemon(config: MachineConfig, tmp_path: Path) -> None:
     program = written(tmp_path, HEAD + "G1 X[1/0]\nM2\n")
     request = {
