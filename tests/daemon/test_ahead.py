@@ -284,11 +284,11 @@ def checked_of(config: MachineConfig, folder: Path, seconds: float, after_um: fl
     return checked
 
 
-def pass_on(checked: Checked, end: int, after_um: float = 1.0) -> None:
+def pass_on(checked: Checked, end: int, after_um: float = 1.0, *, last: bool = False) -> None:
     """Let the rows at rest up to ``end`` pass."""
     digest = hashlib.sha256(bytes(16 * (end - checked.rows))).hexdigest()
     before, after = ({"rms_um": rms, "max_um": 2 * rms} for rms in (30.0, after_um))
-    checked.take(Block(end, digest, False), {"before": before, "after": after})
+    checked.take(Block(end, digest, last), {"before": before, "after": after})
 
 
 def supply_of(checked: Checked, mill: Mill, folder: Path) -> tuple[Supply, GuardLink]:
@@ -329,6 +329,28 @@ def test_a_block_that_is_not_what_was_checked_is_not_sent(config: MachineConfig,
     assert "the correction ends before these rows" in notices[-1].text
     assert len(mill.rows) == 5_000
     link.close()
+
+
+@pytest.mark.parametrize("refused", [True, False])
+def test_the_last_block_waits_for_what_is_found_of_the_whole(
+    refused: bool, config: MachineConfig, tmp_path: Path
+) -> None:
+    """A file that was changed, or a gain that there is not, is found at the end: nothing is final before that."""
+    checked = checked_of(config, tmp_path / "c", 4.0)
+    (tmp_path / "c" / "rows").write_bytes(bytes(16 * 5_000))
+    pass_on(checked, 5_000, last=True)
+    stream = Stream(checked, "digest", 0.001)
+    piece = stream.take(10.0)
+    assert (stream.end, piece.final, stream.ready, stream.done, stream.reach_s) == (4_000, False, False, False, 4.0)
+    if refused:
+        checked.refused = (Reason("NoGain", "the path error would be larger", "try another method"),)
+    else:
+        checked.conclude({**checked.errors, "largest_um": 5.0})
+    assert (stream.ready, checked.whole, stream.reach_s) == (not refused, not refused, 4.0 if refused else 5.0)
+    assert stream.lacks({"rows": [0, 4_000], "row": 0})
+    if not refused:
+        assert stream.take().final
+        assert stream.done
 
 
 def test_a_check_that_falls_behind_twice_is_told_twice(config: MachineConfig, mill: Mill, tmp_path: Path) -> None:
