@@ -10,7 +10,7 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.identification import trends
 from fdhil.identification.trends import LEAST_STEP, Slope, slope
-from fdhil.prediction.predict import predict
+from fdhil.prediction.predict import contour_um, predict
 from fdhil.records import PARAMETERS, Float, Parameters, ParameterSet, Prediction, Zone
 
 BEYOND_CHANCE = 3.0  # standard deviations
@@ -112,7 +112,7 @@ def step_costs(
         for what in moved(earlier[axis], now[axis]):
             names = GROUPS[what]
             old = {name: float(getattr(earlier[axis].parameters, name)) for name in names}
-            without = predict(reference, {**models, axis: replace(models[axis], **old)}, config).contour_um
+            without = contour_um(reference, {**models, axis: replace(models[axis], **old)}, config)
             change = prediction.contour_um - without
             row = int(np.argmax(np.abs(change)))
             if abs(change[row]) < COMMON_UM:
@@ -149,7 +149,7 @@ def zone_changes(
     reference = prediction.reference
     then = predict(reference, {**models, **earlier}, config)
     without = {
-        (axis, name): predict(reference, {**models, axis: replace(models[axis], **{name: old})}, config).contour_um
+        (axis, name): contour_um(reference, {**models, axis: replace(models[axis], **{name: old})}, config)
         for axis in earlier
         for name, old in earlier[axis].as_dict().items()
         if old != getattr(models[axis], name)

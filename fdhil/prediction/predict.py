@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -39,7 +40,8 @@ def predict(
     """
     check_axes(reference, models, config)
     responses = closed_loop.simulate_axes(models, config.axis, reference.dt_s, reference.position_mm)
-    return assemble(reference, responses, zones_above_um)
+    smooth = {axis: replace(model, Cd=0.0) for axis, model in models.items()}
+    return _assemble(reference, responses, config, zones_above_um, lambda: contour_um(reference, smooth, config))
 
 
 def contour_um(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> Float:
@@ -72,15 +74,20 @@ def predict_corrected(
     responses = closed_loop.simulate_axes(
         models, config.axis, reference.dt_s, reference.position_mm, offsets, speed_offset_rad_s, torque_offset_nm
     )
-    return assemble(reference, responses)
+    return _assemble(reference, responses, config)
 
 
-def assemble(
-    reference: Trajectory, responses: Mapping[str, closed_loop.Response], zones_above_um: float | None = None
+def _assemble(
+    reference: Trajectory,
+    responses: Mapping[str, closed_loop.Response],
+    config: MachineConfig,
+    zones_above_um: float | None = None,
+    without_friction: Callable[[], Float] | None = None,
 ) -> Prediction:
     """Put the axes' responses together: errors per axis, contour error, zones."""
     axes = reference.axes
     contour = frozen(_contour(reference, responses))
+    loop_s = max(1.0 / config.axis[axis].regulators.position_gain_per_s for axis in axes)
     limited = np.max([responses[axis].limited for axis in axes], axis=0)
     return Prediction(
         reference=reference,
@@ -89,5 +96,5 @@ def assemble(
         contour_um=contour,
         current_a={axis: frozen(responses[axis].current_a) for axis in axes},
         limited_s={axis: responses[axis].limited_s for axis in axes},
-        zones=find_zones(reference, contour, limited, zones_above_um),
+        zones=find_zones(reference, contour, limited, loop_s, zones_above_um, without_friction),
     )

@@ -2,42 +2,50 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 from fdhil.records import Bool, Float, Int, Trajectory, Zone
 
 # an error stands out above this share of the largest one, and never below a micrometre
 SHARE = 0.05
 FLOOR_UM = 1.0
-# an event explains the errors shortly before it (smoothing) and as long as the loops need to settle
-BEFORE_S, AFTER_S = 0.05, 0.20
-CORNER_S = 0.045  # a corner turns within twice this time; a turn that goes on is a circle
-ASIDE_S = 0.07  # what lies further away than this is not the corner's own turn
-SHARP = 0.6
-CORNER_RAD = np.deg2rad(20.0)
+# times in units of the slowest position loop's own, 1 / Kv: an event explains the errors shortly before it (the NC's
+# smoothing) and as long as the loops need to settle, most of it while it is RECENT; what is nearer than TOGETHER they
+# answer as one
+BEFORE, AFTER, RECENT, TOGETHER = 2.5, 10.0, 5.0, 2.0
+TURNING_RAD_S = 0.1  # less is straight: a radius of 2 m at 12 m/min
+CHANGED = 0.5  # of the acceleration across the path: such a change of it is a corner
 BACK_RAD = np.deg2rad(179.0)  # in one row: the path goes back along its own line, which is a reversal
+MOST_OF_IT = 0.5  # of an error that is still there without dry friction: then it is not friction's
 CHANGE = 1e-6  # of the largest speed, from one row to the next: less is none
 PAUSE_S = 0.01  # a rest that is shorter is no stop
 MERGE_S = 0.03
 SHORTEST_S = 0.003
+TO_REST = ("stop", "start")
 
 CAUSES = ("saturation", "corner", "start", "stop", "reversal", "circular lag", "straight")
 
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """What the reference does, (n,) each: path speed in mm/s, turn rate in rad/s, and the rows of its events."""
+    """What the reference does, (n,) each: path speed in mm/s, turn rate in rad/s, and the rows of its events.
+
+    ``arc``: it turns, and not in a corner.
+    """
 
     speed: Float
     turn_rate: Float
     events: dict[str, Bool]
+    arc: Bool
 
 
-def geometry(reference: Trajectory) -> Geometry:
-    """Find starts, stops, corners and reversals of a reference."""
+def geometry(reference: Trajectory, loop_s: float) -> Geometry:
+    """Find starts, stops, corners and reversals of a reference; ``loop_s`` is the time of the drives' loops."""
     dt = reference.dt_s
     path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
     velocity = np.zeros_like(path)
@@ -53,16 +61,12 @@ def geometry(reference: Trajectory) -> Geometry:
     start |= _leading_to(start[::-1], change[::-1] > CHANGE * speed.max())[::-1]
     stop |= _leading_to(stop, change < -CHANGE * speed.max())
     turn_rate = _turn_rate(velocity, speed, moving, dt)
-    return Geometry(
-        speed,
-        turn_rate,
-        {
-            "start": start,
-            "stop": stop,
-            "corner": _corners(turn_rate, dt),
-            "reversal": np.any([_reversals(velocity[:, a]) for a in range(path.shape[1])], axis=0),
-        },
-    )
+    turn_rate = np.where(turn_rate * dt > BACK_RAD, 0.0, turn_rate)
+    turning = _joined(turn_rate > TURNING_RAD_S, TOGETHER * loop_s, dt)
+    corner = _joined(_corners(velocity, turn_rate, speed, loop_s, dt) & ~start & ~stop, TOGETHER * loop_s, dt)
+    reversal = np.any([_reversals(velocity[:, a]) for a in range(path.shape[1])], axis=0)
+    events = {"start": start, "stop": stop, "corner": corner, "reversal": reversal}
+    return Geometry(speed, turn_rate, events, turning & ~corner)
 
 
 def _leading_to(events: Bool, changing: Bool) -> Bool:
@@ -85,23 +89,30 @@ def _turn_rate(velocity: Float, speed: Float, moving: Bool, dt: float) -> Float:
     return rate
 
 
-def _corners(turn_rate: Float, dt: float) -> Bool:
-    """Rows in the middle of a turn that is over within 2 ``CORNER_S``: more turns there than on both sides of it."""
-    half, gap = max(1, round(CORNER_S / dt)), max(1, round(ASIDE_S / dt))
-    turn_rate = np.where(turn_rate * dt > BACK_RAD, 0.0, turn_rate)
-    total = np.concatenate([[0.0], np.cumsum(turn_rate) * dt])
-    rows = np.arange(turn_rate.size)
+def _joined(rows: Bool, gap_s: float, dt: float) -> Bool:
+    """Rows with the gaps between them closed that are shorter than ``gap_s``."""
+    return rows | (_near(rows, gap_s, 0.0, dt) & _near(rows, 0.0, gap_s, dt))
 
-    def turned(low: int, high: int) -> Float:
-        first = np.clip(rows + low, 0, turn_rate.size)
-        last = np.clip(rows + high, 0, turn_rate.size)
-        return np.asarray(total[last] - total[first])
 
-    here = turned(-half, half)
-    aside = np.maximum(turned(-gap - 2 * half, -gap), turned(gap, gap + 2 * half))
-    # a circle turns as much in the outer half of that time as in the inner one
-    sharp = turned(-(half // 2), half // 2) > SHARP * here
-    return np.asarray(_near((here > CORNER_RAD) & (here > 1.5 * aside) & sharp, CORNER_S, CORNER_S, dt))
+def _corners(velocity: Float, turn_rate: Float, speed: Float, loop_s: float, dt: float) -> Bool:
+    """Rows at which the curvature changes by more than the loops can follow: a turn begins, ends, tightens, or changes
+    its side or plane.
+
+    What happens within the loops' time they answer as one, so that the chords of a circle are a circle; and a change
+    counts by the acceleration across the path that it makes there, against the largest one around.
+    """
+    half, around = max(1, round(TOGETHER * loop_s / dt)), round(AFTER * loop_s / dt)
+    pace = np.maximum(uniform_filter1d(speed, half), 1e-9)
+    rate = uniform_filter1d(turn_rate, half)
+    across = maximum_filter1d(np.where(rate > TURNING_RAD_S, rate * pace, 0.0), 2 * around + 1)
+    unit = velocity / np.maximum(speed, 1e-12)[:, None]
+    change = np.zeros(speed.size)
+    # the turn rate in each plane of two axes, with its sign
+    for a, b in combinations(range(velocity.shape[1]), 2):
+        plane = unit[:-1, a] * unit[1:, b] - unit[:-1, b] * unit[1:, a]
+        curvature = uniform_filter1d(np.append(np.where(turn_rate[:-1] > 0.0, plane, 0.0), 0.0) / dt, half) / pace
+        change += (maximum_filter1d(curvature, half) - minimum_filter1d(curvature, half)) ** 2
+    return np.asarray((np.sqrt(change) * pace**2 > CHANGED * across) & (across > 0.0))
 
 
 def _reversals(velocity: Float) -> Bool:
@@ -114,38 +125,125 @@ def _reversals(velocity: Float) -> Bool:
 
 
 def find_zones(
-    reference: Trajectory, contour_um: Float, limited: Float, above_um: float | None = None
+    reference: Trajectory,
+    contour_um: Float,
+    limited: Float,
+    loop_s: float,
+    above_um: float | None = None,
+    without_friction: Callable[[], Float] | None = None,
 ) -> tuple[Zone, ...]:
     """Return the zones in the order of time; ``limited`` (n,) is the share of each cycle with a limit acting.
 
-    ``above_um``: every error above it belongs to a zone; left out, what stands out against the largest.
+    ``loop_s`` is the slowest position loop's time, 1 / Kv. ``above_um``: every error above it belongs to a zone; left
+    out, what stands out against the largest. ``without_friction`` gives the contour error (n,) um that would be left
+    without dry friction; left out, every error beside a reversal is taken for friction's.
     """
     above = contour_um > (max(FLOOR_UM, SHARE * float(contour_um.max())) if above_um is None else above_um)
     if not above.any():
         return ()
-    shape = geometry(reference)
-    cause = _causes(shape, limited, reference.dt_s)
-    zones = [
-        _zone(reference, shape, contour_um, first, last, CAUSES[cause[first] % len(CAUSES)])
-        for first, last in _runs(above, cause, reference.dt_s)
+    dt = reference.dt_s
+    shape = geometry(reference, loop_s)
+    cause = _causes(shape, limited, loop_s, dt)
+    _name_again(cause, _runs(above, cause, dt), shape, reference, contour_um, loop_s, without_friction)
+    runs = [
+        _Run(first, last, CAUSES[cause[first] % len(CAUSES)], _peak(contour_um, first, last))
+        for first, last in _runs(above, cause, dt)
     ]
-    return tuple(zones)
+    joined = _corners_joined(runs, shape, contour_um, loop_s, dt)
+    return tuple(_zone(reference, shape, contour_um, run, loop_s) for run in joined)
 
 
-def _causes(shape: Geometry, limited: Float, dt: float) -> Int:
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """Rows of one cause, half open, and the row of their largest error."""
+
+    first: int
+    last: int
+    cause: str
+    peak: int
+
+
+def _peak(contour_um: Float, first: int, last: int) -> int:
+    return first + int(np.argmax(contour_um[first:last]))
+
+
+def _turn(shape: Geometry, peak: int, loop_s: float, dt: float) -> int:
+    """Return the row at which the path turns most just before an error."""
+    begin = max(0, peak - round(RECENT * loop_s / dt))
+    return begin + int(np.argmax(shape.turn_rate[begin : peak + round(BEFORE * loop_s / dt) + 1]))
+
+
+def _corners_joined(runs: Sequence[_Run], shape: Geometry, contour_um: Float, loop_s: float, dt: float) -> list[_Run]:
+    """Join what the beginning and the end of the same turn leave, one right behind the other."""
+    joined: list[_Run] = []
+    for run in runs:
+        before = joined[-1] if joined else None
+        if before is not None and before.cause == run.cause == "corner" and run.first - before.last <= MERGE_S / dt:
+            apart = abs(_turn(shape, run.peak, loop_s, dt) - _turn(shape, before.peak, loop_s, dt))
+            if apart <= RECENT * loop_s / dt:
+                joined[-1] = _Run(before.first, run.last, run.cause, _peak(contour_um, before.first, run.last))
+                continue
+        joined.append(run)
+    return joined
+
+
+def _causes(shape: Geometry, limited: Float, loop_s: float, dt: float) -> Int:
     """Return (n,) an index into ``CAUSES`` plus a multiple of their number that parts one corner from the next.
 
     Where several events are near, the more violent one explains the error.
     """
+    before_s, after_s = BEFORE * loop_s, AFTER * loop_s
     cause = np.full(shape.speed.size, CAUSES.index("straight"), dtype=np.int64)
-    rate = np.where(shape.turn_rate * dt > BACK_RAD, 0.0, shape.turn_rate)
-    turning = rate > 0.05 * max(float(rate.max()), 1e-9)
-    cause[_near(turning, 0.0, 0.1, dt)] = CAUSES.index("circular lag")
+    cause[_near(shape.arc, 0.0, RECENT * loop_s, dt)] = CAUSES.index("circular lag")
     for name in ("reversal", "stop", "start", "corner"):
-        near = _near(shape.events[name], BEFORE_S, AFTER_S, dt)
-        cause[near] = CAUSES.index(name) + len(CAUSES) * _ordinal(shape.events[name], BEFORE_S, dt)[near]
-    cause[_near(limited > 0.0, BEFORE_S, AFTER_S, dt)] = CAUSES.index("saturation")
+        ahead_s = 0.0 if name == "corner" else before_s  # its rows begin with the smoothing
+        near = _near(shape.events[name], ahead_s, after_s, dt)
+        cause[near] = CAUSES.index(name) + len(CAUSES) * _ordinal(shape.events[name], ahead_s, dt)[near]
+    cause[_near(limited > 0.0, before_s, after_s, dt)] = CAUSES.index("saturation")
     return cause
+
+
+def _name_again(
+    cause: Int,
+    runs: Sequence[tuple[int, int]],
+    shape: Geometry,
+    reference: Trajectory,
+    contour_um: Float,
+    loop_s: float,
+    without_friction: Callable[[], Float] | None,
+) -> None:
+    """Look at the largest error of each run: what is near in time may not be what makes it."""
+    names = [CAUSES[k % len(CAUSES)] for k in cause[[first for first, _ in runs]]]
+    free = contour_um
+    if without_friction is None:
+        free = np.zeros(contour_um.size)
+    elif {"reversal", "corner", "circular lag"} & set(names):
+        free = without_friction()
+    dt = reference.dt_s
+    turned = _near(shape.arc, 0.0, RECENT * loop_s, dt)
+    recent = _near(shape.events["corner"], BEFORE * loop_s, RECENT * loop_s, dt)
+    reversing = _near(shape.events["reversal"], BEFORE * loop_s, AFTER * loop_s, dt)
+    across, along = _accelerations(shape, dt)
+    for (first, last), name in zip(runs, names, strict=True):
+        peak = _peak(contour_um, first, last)
+        frictions = free[peak] < MOST_OF_IT * contour_um[peak]
+        led = slice(max(0, peak - round(BEFORE * loop_s / dt)), peak + 1)
+        new = name
+        if name in ("corner", "reversal", "circular lag") and frictions and reversing[peak]:
+            new = "reversal"
+        elif name == "reversal" and not frictions:
+            new = "circular lag" if turned[peak] else name
+        elif name == "corner":
+            new = "circular lag" if shape.arc[peak] and not recent[peak] else name
+        elif name in TO_REST and turned[peak] and across[led].max() > along[led].max():
+            new = "circular lag"
+        if new != name:
+            cause[first:last] = CAUSES.index(new) + (len(CAUSES) * first if new == "reversal" else 0)
+
+
+def _accelerations(shape: Geometry, dt: float) -> tuple[Float, Float]:
+    """Return (n,) how fast the velocity turns and how fast it grows or falls, mm/s2."""
+    return shape.speed * shape.turn_rate, np.abs(np.gradient(shape.speed, dt))
 
 
 def _ordinal(rows: Bool, before_s: float, dt: float) -> Int:
@@ -178,21 +276,20 @@ def _runs(above: Bool, cause: Int, dt: float) -> list[tuple[int, int]]:
     return runs
 
 
-def _zone(reference: Trajectory, shape: Geometry, contour_um: Float, first: int, last: int, cause: str) -> Zone:
-    peak = first + int(np.argmax(contour_um[first:last]))
-    place = peak
-    low = max(0, first - round(AFTER_S / reference.dt_s))
-    if cause == "corner":
-        place = low + int(np.argmax(shape.turn_rate[low:last]))
-    elif cause == "reversal":
-        events = low + np.flatnonzero(shape.events["reversal"][low : last + 1])
+def _zone(reference: Trajectory, shape: Geometry, contour_um: Float, run: _Run, loop_s: float) -> Zone:
+    place = run.peak
+    if run.cause == "corner":
+        place = _turn(shape, run.peak, loop_s, reference.dt_s)
+    elif run.cause == "reversal":
+        low = max(0, run.first - round(AFTER * loop_s / reference.dt_s))
+        events = low + np.flatnonzero(shape.events["reversal"][low : run.last + 1])
         if events.size:
-            place = int(events[np.argmin(np.abs(events - peak))])
+            place = int(events[np.argmin(np.abs(events - run.peak))])
     where = " ".join(f"{axis} {reference.position_mm[axis][place]:.1f}" for axis in reference.axes)
     return Zone(
-        start_s=round(float(reference.time_s[first]), 6),
-        end_s=round(float(reference.time_s[last - 1]) + reference.dt_s, 6),
+        start_s=round(float(reference.time_s[run.first]), 6),
+        end_s=round(float(reference.time_s[run.last - 1]) + reference.dt_s, 6),
         where=where,
-        max_um=float(contour_um[peak]),
-        cause=cause,
+        max_um=float(contour_um[run.peak]),
+        cause=run.cause,
     )

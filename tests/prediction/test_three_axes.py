@@ -52,7 +52,7 @@ def test_all_axes_move_and_count(reference: Trajectory, correction: Correction) 
     together = np.sqrt(sum(before.error_um[axis] ** 2 for axis in "XYZ"))
     assert (before.contour_um <= together + 1e-6).all()
     assert before.contour_um.max() > 1.05 * plane.max()
-    assert {zone.cause for zone in before.zones} >= {"corner", "reversal"}
+    assert {zone.cause for zone in before.zones} >= {"corner", "circular lag"}
     assert all("Z " in zone.where for zone in before.zones)
 
 

@@ -1,0 +1,159 @@
+"""The cause of the largest error at each place of many paths: any NC, feed, tolerance and radius."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil.config import MachineConfig
+from fdhil.prediction import predict
+from fdhil.prediction.models import nominal_models
+from fdhil.program import Budget, interpret
+from fdhil.program import plan as plan_program
+from fdhil.records import Trajectory, Zone
+from tests.bench import bench_config
+from tests.paths import bench_trajectory, rounded_demand, trajectory
+
+CONFIG = bench_config()
+LINUXCNC = CONFIG.model_copy(update={"nc": CONFIG.nc.model_copy(update={"profile": "linuxcnc"})})
+BENCH = "G21 G90 {mode}\nG1 X0 Y55 F{feed}\nG1 X100\nG3 X200 I50 J0\nG1 X250\nG1 Y0\nM2\n"
+CORNERS = ((0, 55), (100, 55), (200, 55), (250, 55))
+NC = {"fir": CONFIG, "linuxcnc": LINUXCNC}
+
+
+def planned(text: str, config: MachineConfig) -> Trajectory:
+    """The program as the NC orders it."""
+    return plan_program(list(interpret(text.splitlines(), Budget.of(config.nc))), config)
+
+
+def zones_of(reference: Trajectory, config: MachineConfig = CONFIG) -> tuple[Zone, ...]:
+    """Zones with nominal drives."""
+    return predict(reference, nominal_models(config), config).zones
+
+
+def nearest(zone: Zone, places: tuple[tuple[float, float], ...]) -> float:
+    """Distance in mm to the nearest of some places."""
+    at = np.array([float(word) for word in zone.where.split()[1::2]])[:2]
+    return min(float(np.linalg.norm(at - place)) for place in places)
+
+
+def seconds(zones: tuple[Zone, ...], cause: str) -> float:
+    """For how long a cause is told."""
+    return sum(zone.end_s - zone.start_s for zone in zones if zone.cause == cause)
+
+
+@pytest.mark.parametrize(
+    ("feed", "mode", "widest_mm"),
+    [
+        *((feed, mode, 6.0) for feed in (10, 20) for mode in ("fir", "G61", "G64 P0.01", "G64 P0.1", "G64 P1")),
+        (10, "G64", 12.0),
+        (10, "G64 P5", 12.0),
+        (20, "G64", 25.0),
+        (20, "G64 P5", 18.0),
+    ],
+)
+def test_the_bench_has_four_corners_however_wide_the_nc_blends_them(feed: int, mode: str, widest_mm: float) -> None:
+    """A blend of 2 to 200 ms: what is large is a corner, each near its place; the half circle is not."""
+    if mode == "fir":
+        zones = zones_of(bench_trajectory(feed))
+    else:
+        zones = zones_of(planned(BENCH.format(mode=mode, feed=1000 * feed), LINUXCNC), LINUXCNC)
+    large = [zone for zone in zones if zone.max_um > 46.0 and zone.cause != "stop"]
+    assert {zone.cause for zone in large} == {"corner"}
+    for zone in large:
+        assert nearest(zone, CORNERS) < widest_mm
+    for corner in CORNERS:
+        assert any(nearest(zone, (corner,)) < widest_mm for zone in large)
+    bottom = [zone for zone in zones if nearest(zone, ((150, 5),)) < 10.0]
+    assert {zone.cause for zone in bottom} <= {"reversal", "circular lag"}
+
+
+def test_the_stick_at_the_bottom_is_a_reversal_until_the_lag_is_more() -> None:
+    """At 10 m/min dry friction leaves 10 um there and the lag 5; at 20 the lag leaves 13."""
+    for feed, cause in ((10, "reversal"), (20, "circular lag")):
+        bottom = [zone for zone in zones_of(bench_trajectory(feed)) if nearest(zone, ((150, 5),)) < 2.0]
+        assert {zone.cause for zone in bottom} == {cause}
+
+
+@pytest.mark.parametrize("feed", [10, 20])
+def test_a_rounded_path_errs_where_its_arcs_begin_and_end(feed: int) -> None:
+    """The loops follow the arcs once they have settled: only what is left in the middle of one is circular lag."""
+    zones = zones_of(trajectory(rounded_demand(feed)))
+    assert {zone.cause for zone in sorted(zones, key=lambda z: -z.max_um)[:2]} == {"corner"}
+    lag = [zone for zone in zones if zone.cause == "circular lag"]
+    assert all(zone.max_um < 0.3 * max(z.max_um for z in zones) for zone in lag)
+
+
+@pytest.mark.parametrize("nc", NC)
+@pytest.mark.parametrize(
+    ("radius_mm", "feed_mm_min", "cause"),
+    [
+        (50, 3000, "reversal"),
+        (20, 3000, "reversal"),
+        (10, 3000, "reversal"),
+        (5, 3000, "reversal"),
+        (2, 3000, "circular lag"),
+        (1, 3000, "circular lag"),
+        (50, 10000, "reversal"),
+        (20, 10000, "circular lag"),
+    ],
+)
+def test_circles(nc: str, radius_mm: float, feed_mm_min: float, cause: str) -> None:
+    """A small or fast circle lags; on a slow one the axes stick where they turn around. It has no corner."""
+    config = NC[nc]
+    program = f"G21 G90 G64\nG3 X0 Y0 I{radius_mm} P4 F{feed_mm_min}\nM2\n"
+    reference = planned(program, config)
+    zones = zones_of(reference, config)
+    assert "corner" not in {zone.cause for zone in zones}
+    # once the loops have settled from the start, and before the stop
+    inside = [zone for zone in zones if zone.end_s > 0.35 and zone.start_s < reference.time_s[-1] - 1.0]
+    assert max(inside, key=lambda zone: zone.max_um if zone.cause not in ("start", "stop") else 0.0).cause == cause
+    quadrants = ((0, 0), (radius_mm, radius_mm), (2 * radius_mm, 0), (radius_mm, -radius_mm))
+    for zone in zones:
+        assert zone.cause != "reversal" or nearest(zone, quadrants) < 1.0
+
+
+def test_a_circle_beyond_the_drives_is_saturation() -> None:
+    """20 m/min on 10 mm."""
+    zones = zones_of(planned("G21 G90 G64\nG3 X0 Y0 I10 P3 F20000\nM2\n", CONFIG))
+    assert {zone.cause for zone in zones} == {"saturation"}
+
+
+@pytest.mark.parametrize("nc", NC)
+def test_chords_of_a_circle_are_a_circle(nc: str) -> None:
+    """Each chord turns by 5 degrees within 18 ms, less than the loops can tell apart."""
+    angle = np.linspace(0.0, 4 * np.pi, 145)[1:]
+    chords = [f"G1 X{20 - 20 * np.cos(a):.4f} Y{20 * np.sin(a):.4f} F6000" for a in angle]
+    zones = zones_of(planned("\n".join(["G21 G90 G64 P0.01", *chords, "M2"]), NC[nc]), NC[nc])
+    inside = [zone for zone in zones if zone.start_s > 0.25 and zone.cause != "stop"]
+    assert {zone.cause for zone in inside} == {"circular lag", "reversal"}
+
+
+@pytest.mark.parametrize("nc", NC)
+@pytest.mark.parametrize("radius_mm", [5, 20])
+def test_a_helix_is_a_circle(nc: str, radius_mm: float) -> None:
+    """Its plane of turning does not change."""
+    space = bench_config("XYZ")
+    config = space.model_copy(update={"nc": NC[nc].nc})
+    zones = zones_of(planned(f"G21 G90 G64\nG3 X0 Y0 I{radius_mm} Z20 P3 F8000\nM2\n", config), config)
+    assert {zone.cause for zone in zones} <= {"start", "circular lag", "reversal", "stop"}
+    assert seconds(zones, "circular lag") > 0.5
+
+
+@pytest.mark.parametrize(
+    ("gain", "cause", "never"), [(20.0, "corner", "circular lag"), (100.0, "circular lag", "corner")]
+)
+def test_what_is_a_corner_goes_with_the_time_of_the_loops(gain: float, cause: str, never: str) -> None:
+    """The same arc of 90 degrees: slow loops still answer its beginning when it ends, fast ones are settled always."""
+    axes = {
+        name: axis.model_copy(update={"regulators": axis.regulators.model_copy(update={"position_gain_per_s": gain})})
+        for name, axis in CONFIG.axis.items()
+    }
+    config = CONFIG.model_copy(update={"axis": axes})
+    models = {axis: replace(model, Cd=0.0) for axis, model in nominal_models(config).items()}
+    reference = planned("G21 G90 G64\nG1 X100 F6000\nG3 X120 Y20 J20\nG1 Y150\nM2\n", config)
+    zones = predict(reference, models, config, zones_above_um=0.5).zones
+    assert seconds(zones, cause) > 0.2
+    assert seconds(zones, never) == 0.0
