@@ -125,6 +125,8 @@ PATHS |= {
     "wave": wave(0.3, 4.0),
     "coarse wave": wave(1.5, 8.0, 60),
     "pockets": "G1 X30\nY10\nG2 X40 Y20 I10\nG1 X60\nG3 X70 Y10 J-10\nG1 Y-20\nG0 X0 Y0\nG1 Z-5\n",
+    "arcs": "G1 X10\nG3 X30 Y0 R12\nG2 X30 Y30 R20\nG1 X0\nG3 X0 Y10 R10.5\n",
+    "lenses": "G3 X20 Y0 R30\nG3 X0 Y0 R30\nG3 X20 Y0 R12\nG2 X40 Y0 R12\nG3 X60 Y5 R15\n",
     "ramp": "G1 X30\nG3 X30 Y0 Z-6 I-12 P2\nG1 X0 Y20\n",
 }
 

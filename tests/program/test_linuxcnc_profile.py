@@ -99,6 +99,21 @@ def test_beside_a_helix_a_parabola_overlaps_both_segments() -> None:
     assert np.abs(along[20:80]).max() == pytest.approx(1000.0, rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("path", "tolerance", "feed", "rows"),
+    [
+        ("G3 X20 Y0 R12|G2 X40 Y0 R12|G3 X60 Y5 R15", 0.05, 6000, 923),
+        ("G3 X20 Y0 R12|G2 X40 Y0 R12|G3 X60 Y5 R15", 0.5, 10000, 735),
+        ("G3 X20 Y0 R30|G3 X0 Y0 R30|G3 X20 Y0 R30", 0.2, 20000, 1133),  # so sharp that no arc is put between
+        ("G1 X10|G3 X30 Y0 R12|G2 X30 Y30 R20|G1 X0|G3 X0 Y10 R10.5", 0.2, 20000, 1330),
+    ],
+)
+def test_corners_of_arcs_take_the_time_that_was_measured(path: str, tolerance: float, feed: int, rows: int) -> None:
+    """Rows of LinuxCNC 2.9's own demand for these programs, give or take two cycles."""
+    text = f"G64 P{tolerance}|F{feed}|{path}"
+    assert len(rows_of(list(interpret(text.split("|"))))) == pytest.approx(rows + INTERPOLATED_ROWS, abs=3)
+
+
 def test_rapid_and_feed_are_parted_by_a_stop_and_dwells_rest() -> None:
     moves: list[Motion] = [Rapid(1, (50.0, 0.0, 0.0)), Feed(2, (50.0, 20.0, 0.0), 6000.0), Dwell(3, 0.25),
                            Feed(4, (60.0, 20.0, 0.0), 6000.0)]  # fmt: skip

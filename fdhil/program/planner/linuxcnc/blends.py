@@ -30,8 +30,8 @@ _LEAST_ANGLE_RAD = 1e-6
 _REVERSAL = -1.0 + 1e-9
 _LEAST_RADIUS_MM = 1e-6
 _ROUNDING_MM = 1e-9
-_TRIES = 12
-_SMALLER = 0.8
+_ARC_SHARE, _ARC_SHARE_AT_END = 1.0 / 3.0, 2.0 / 3.0  # of an arc's angle that one blend may take
+_LEAST_HALF_OF_ARCS_RAD = math.pi / 12.0  # sharper corners of two arcs get no arc
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,27 +146,53 @@ def _arc(before: Segment, after: Segment, machine: Machine) -> _Arc | None:
         return None
     limit = _within_plane(machine.acceleration, normal)
     tolerance = min(_tolerance(before), _tolerance(after))
-    lengths = min(one.length, before.nominal * _LENGTH_SHARE), two.length * _LENGTH_SHARE
-    reach = min(*lengths, math.cos(half) * tolerance / (1.0 - math.sin(half)))
+    room1, room2 = _room(before, t2, half, True), _room(after, t1, half, False)
+    half_taken = half - max(room1.steeper, room2.steeper)
+    if isinstance(one, Turn) and isinstance(two, Turn) and half_taken < _LEAST_HALF_OF_ARCS_RAD:
+        return None
+    reach = min(room1.reach, room2.reach, math.cos(half_taken) * tolerance / (1.0 - math.sin(half_taken)))
     goal = min(max(before.free, after.free), _fastest(before, after, half, machine, normal))
-    widest = math.tan(half) * reach
+    widest = math.tan(half_taken) * reach
     speed = min(math.sqrt(NORMAL_SHARE * limit * widest), goal)
     # measured: where there is room, the arc lasts as long as half of the acceleration needs for its speed
-    longest = speed * speed / (ALONG_SHARE * limit) / (math.pi - 2.0 * half)
+    longest = speed * speed / (ALONG_SHARE * limit) / (math.pi - 2.0 * half_taken)
     radius = min(widest, max(speed * speed / (NORMAL_SHARE * limit), longest))
-    for _ in range(_TRIES):  # beside arcs the widest may not fit
-        found = _touching(one, two, radius, normal, math.tan(half))
-        if found is not None and found[1] <= lengths[0] + _ROUNDING_MM and found[2] <= lengths[1] + _ROUNDING_MM:
-            break
-        radius *= _SMALLER
-    else:
+    found = _touching(one, two, radius, normal, math.tan(half))
+    if found is None or found[1] > room1.most + _ROUNDING_MM or found[2] > room2.most + _ROUNDING_MM:
+        return None
+    off = minus(found[0].centre, two.at(0.0))
+    if math.sqrt(dot(off, off)) - radius > tolerance + _ROUNDING_MM:
         return None
     speed = min(speed, math.sqrt(NORMAL_SHARE * limit * radius))
-    turn, taken = found[0], (min(found[1], one.length), found[2])
+    turn, taken = found[0], (min(found[1], one.length), min(found[2], two.length))
     wanted = max(before.wanted, after.wanted)
     segment = Segment(before.line, before.rapid, turn, wanted, speed, limit, turn.radius,
                       before.tolerance, TANGENT, turn.length, between=True)  # fmt: skip
     return _Arc(segment, taken)
+
+
+@dataclass(frozen=True, slots=True)
+class _Room:
+    """What a blend may take of a segment: ``reach`` mm as if it were straight, ``most`` mm along it, and by how much
+    (rad) half the corner's angle counts as steeper."""
+
+    reach: float
+    most: float
+    steeper: float = 0.0
+
+
+def _room(segment: Segment, other: Point, half: float, at_end: bool) -> _Room:
+    """Return what the corner with a segment of direction ``other`` may take: of an arc, less where it lies inside."""
+    shape = segment.shape
+    if not isinstance(shape, Turn):
+        reach = min(shape.length, segment.nominal * _LENGTH_SHARE) if at_end else shape.length * _LENGTH_SHARE
+        return _Room(reach, reach)
+    out = minus(shape.at(shape.length if at_end else 0.0), shape.centre)
+    inside = (dot(out, other) < 0.0) == at_end
+    angle = min(shape.angle * (_ARC_SHARE_AT_END if at_end else _ARC_SHARE), half if inside else math.pi / 2.0)
+    if inside:
+        return _Room(math.sin(angle / 4.0) * shape.radius, angle * shape.radius, angle / 4.0)
+    return _Room(angle * shape.radius, angle * shape.radius)
 
 
 def _tolerance(segment: Segment) -> float:
@@ -188,9 +214,11 @@ def _within_plane(limits: Point, normal: Point) -> float:
 def _fastest(before: Segment, after: Segment, half: float, machine: Machine, normal: Point) -> float:
     """Return the speed at which the axes' speeds are kept along the whole of an arc from one way to the other."""
     plane = _within_plane(machine.speed, normal)
+    if isinstance(before.shape, Turn) or isinstance(after.shape, Turn):
+        return plane
     turned = min(math.pi - 2.0 * half, 0.49 * math.pi)
     most = plane / math.cos(turned)
-    v1, v2 = (min(most, one.top if isinstance(one.shape, Line) else plane) for one in (before, after))
+    v1, v2 = min(most, before.top), min(most, after.top)
     base = math.sqrt(v1 * v1 + v2 * v2 - 2.0 * v1 * v2 * math.cos(turned))
     altitude = v1 * v2 * math.sin(turned) / base if base > 0.0 else v1
     return altitude if altitude > 0.0 else min(v1, v2)

@@ -55,7 +55,7 @@ class Segment:
     def target(self) -> float:
         """Speed that it may reach."""
         speed = self.free
-        if self.bent < math.inf:
+        if self.settled and self.bent < math.inf:
             speed = min(speed, math.sqrt(NORMAL_SHARE * self._left * self.bent))
         return speed
 
