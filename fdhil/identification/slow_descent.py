@@ -23,6 +23,7 @@ DIFFERENCE = 1e-5  # of a parameter's typical size
 DELAY_DIFFERENCE_S = 1e-6
 LEAST_DIFFERENCE_S = 1e-8
 LEAST_SHARE, MOST_SHARE = 1e-3, 256.0
+REACH, SPACING = 1.5, 0.125  # samples of the voltage
 GAIN = 1e-3  # of twice the log likelihood: a step that gains less moves nothing by more than some hundredths
 
 
@@ -121,3 +122,23 @@ def _along(
             break
         best = further
     return best
+
+
+def likelier_delay(likelihood: Likelihood, theta: Float, information: Float, period_s: float) -> Float | None:
+    """Return theta (7,) with the delay, up to ``REACH`` samples off, that is surely likelier; None where none is.
+
+    Whether a sample ends before or after a row makes the likelihood uneven: it has tops a part of a sample apart. The
+    other parameters follow the delay as the ``information`` (7, 7) says.
+    """
+    inverse = inverse_of(information)[0]
+    if not (np.isfinite(inverse).all() and inverse[6, 6] > 0.0):
+        return None
+    ridge = inverse[:, 6] / inverse[6, 6]
+    shifts = np.arange(-REACH, REACH + SPACING / 2, SPACING) * period_s
+    trials: list[Float] = [theta + shift * ridge for shift in shifts]
+    possible = [t for t in trials if np.isfinite(t).all() and (t[:4] > 0).all()]
+    costs = np.array([likelihood.at(t, float(t[6])).cost for t in possible])
+    here = likelihood.at(theta, float(theta[6])).cost
+    if costs.size == 0 or not costs.min() < here - GAIN:
+        return None
+    return possible[int(np.argmin(costs))]

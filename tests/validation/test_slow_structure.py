@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.estimators.maximum_likelihood import fit_windows
+from fdhil.identification.slow_descent import Likelihood, ascend, likelier_delay
 from fdhil.identification.windows import find_windows
 from fdhil.validation.structure import findings
 from studies.judging import GOOD, judge
@@ -53,3 +55,19 @@ def test_a_fit_whose_steps_are_too_short_gets_to_the_top() -> None:
     fit = fit_windows([window], SETTINGS)
     assert fit is not None
     assert fit.converged
+
+
+def test_of_a_delays_tops_the_likeliest_is_found() -> None:
+    # 1.72 samples early, and a fit that stopped at a lower top of the likelihood, 0.8 samples early
+    (window,) = find_windows(recording_of(1109, 7, "voltage late").recording)
+    fit = fit_windows([window], SETTINGS)
+    assert fit is not None
+    assert fit.theta[6] == pytest.approx(-1.7155e-3 * 2.0, abs=2e-4)
+    likelihood = Likelihood(fit.problem.motions, fit.problem.noises)
+    sizes = maximum_likelihood.typical(fit.theta, likelihood.motions)
+    for late_s in (-2.45e-3, -1.61e-3):
+        theta, *_ = ascend(likelihood, np.append(fit.theta[:6], late_s), range(6), sizes)
+        better = likelier_delay(likelihood, theta, fit.information, 2e-3)
+        assert better is not None
+        assert better[6] == pytest.approx(fit.theta[6], abs=3e-4)
+    assert likelier_delay(likelihood, fit.theta, fit.information, 2e-3) is None

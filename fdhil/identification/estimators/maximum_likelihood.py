@@ -24,7 +24,7 @@ from fdhil.identification.innovations import Gains, gains_of, innovations
 from fdhil.identification.motion import UNKNOWN, Motion, Noise, prepare
 from fdhil.identification.noise import fit_noise
 from fdhil.identification.normal import inverse_of, solve
-from fdhil.identification.slow_descent import Likelihood, ascend
+from fdhil.identification.slow_descent import Likelihood, ascend, likelier_delay
 from fdhil.identification.slow_start import slow_least_squares, slow_start, with_course
 from fdhil.identification.slow_voltage import course_effect, in_order
 from fdhil.identification.sweeps import whiten
@@ -266,12 +266,26 @@ def _fit_separate(motions: Sequence[Motion], start: Float, delays: Sequence[floa
     window from its coarse value on (the counters may be a whole sample off), taken out, and what remains is fitted once
     more with the parameters, whose intervals then contain it.
     """
-    alone = [fit([m], np.append(start[:6], delay), range(7)) for m, delay in zip(motions, delays, strict=True)]
+    alone = [_fit_alone(m, np.append(start[:6], delay)) for m, delay in zip(motions, delays, strict=True)]
     if len(motions) == 1:
         return replace(alone[0], delay_doubt_s=instant_doubt(motions[0]))
     aligned = [m.aligned(f.theta[6]) if f.converged else m for m, f in zip(motions, alone, strict=True)]
     together = fit(aligned, np.append(alone[0].theta[:6], 0.0), range(7))
     return replace(together, delay_doubt_s=instant_doubt(motions[0]))
+
+
+def _fit_alone(motion: Motion, start: Float) -> Fit:
+    """Fit one window with its delay; beside a slow voltage from the likeliest delay near the one found at first."""
+    found = fit([motion], start, range(7))
+    if motion.slow is None or not admissible(found.theta):
+        return found
+    here = Likelihood(found.problem.motions, found.problem.noises)
+    better = likelier_delay(here, found.theta, found.information, motion.slow.period_s)
+    if better is None:
+        return found
+    other = fit([motion], better, range(7))
+    there = Likelihood(other.problem.motions, other.problem.noises).at(other.theta, float(other.theta[6]))
+    return other if there.cost < here.at(found.theta, float(found.theta[6])).cost else found
 
 
 def instant_doubt(motion: Motion) -> float:
