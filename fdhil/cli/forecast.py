@@ -25,6 +25,7 @@ RECENT = 64  # revisions of an axis, or comparisons of a program, that are looke
 BEYOND_CHANCE = 2.0  # standard deviations
 TOLD_UM = 0.1  # a smaller change is listed by --json only
 MANY_CHANGES = 12
+MANY_CAUSES, WORTH_TELLING = 3, 0.3  # of a change, those that did so much of what the first did
 KEPT = ("start_s", "end_s", "where", "line", "max_um", "cause", "std_um")
 
 
@@ -165,11 +166,16 @@ def show_compared(found: Mapping[str, Any] | None) -> None:
 
 
 def _because(zone: Mapping[str, Any]) -> str:
-    by = zone["by"][0] if zone["by"] else None
-    settings_um = zone["settings_um"] or 0.0
-    if by is not None and abs(by["um"]) >= abs(settings_um):
-        return f": {by['um']:+.1f} by {by['parameter']} of axis {by['axis']}, {by['before']:.4g} -> {by['now']:.4g}"
-    return f": {settings_um:+.1f} by the configuration" if settings_um else ""
+    """Name what did it, the most first; what did little beside that is left to --json."""
+    causes = [
+        (by["um"], f"by {by['parameter']} of axis {by['axis']}, {by['before']:.4g} -> {by['now']:.4g}")
+        for by in zone["by"]
+    ]
+    if zone["settings_um"]:
+        causes.append((zone["settings_um"], "by the configuration"))
+    causes.sort(key=lambda cause: -abs(cause[0]))
+    told = [f"{um:+.1f} {text}" for um, text in causes[:MANY_CAUSES] if abs(um) >= WORTH_TELLING * abs(causes[0][0])]
+    return f": {'; '.join(told)}" if told else ""
 
 
 def steps(
@@ -291,6 +297,11 @@ def crossing_text(entry: Mapping[str, Any], tolerance_um: float) -> str:
     if entry["state"] == "not_foreseen":
         return f"is not foreseen to leave {tolerance_um:g} um"
     latest = entry["latest"] or "later"
+    if entry["date"] < datetime.datetime.now(datetime.UTC).date().isoformat():
+        return (
+            f"will have left {tolerance_um:g} um about {entry['date']} ({entry['earliest']} to {latest}), after the"
+            f" newest parameters, driven by {entry['parameter']} of axis {entry['axis']}: identify anew"
+        )
     return (
         f"leaves {tolerance_um:g} um about {entry['date']} ({entry['earliest']} to {latest}),"
         f" driven by {entry['parameter']} of axis {entry['axis']}"

@@ -162,14 +162,17 @@ def corner(
     place_mm: tuple[float, float],
     half_width_mm: float,
     names: tuple[str, str] = ("X", "Y"),
+    on_path: bool = True,
 ) -> str:
     """A place of the path enlarged (Figures 11-15, 17, 18, 20): reference grey, the others in colour.
 
     The NC rounds its corners by far more than the drives err, so the view is centred on the point of the reference (the
-    first curve) that is nearest to ``place_mm``.
+    first curve) that is nearest to ``place_mm``, unless ``on_path`` is false.
     """
     reference = curves[0].path_mm
-    centre = reference[np.argmin(np.hypot(*(reference - np.asarray(place_mm)).T))]
+    centre = np.asarray(place_mm)
+    if on_path:
+        centre = reference[np.argmin(np.hypot(*(reference - centre).T))]
     columns = len(curves) if len(curves) < 4 else 2
     above = 0.35 if len(curves) < 4 else 0.55
     with _drawing(WIDTH, (WIDTH - 1.0) * TALL + 0.55 + above, above) as (_, axes, svg):

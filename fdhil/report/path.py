@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fdhil.prediction.contour import WINDOW_S
 from fdhil.records import Correction, Float, Prediction, Trajectory, Zone
 from fdhil.report import figures
 from fdhil.report.figures import Curve
@@ -17,6 +18,7 @@ FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 SEEN = 0.25  # of the picture's half width that the largest error may take
 LEAST_HALF_MM, MOST_HALF_MM = 0.5, 20.0
 BEFORE_S, ASIDE_S = 0.05, 0.25  # what led to a zone is shown too, and no other pass over the same place
+BESIDE = 1.5  # of the largest error of a place: more is another place's
 MOST_ROWS = 50
 
 
@@ -164,19 +166,43 @@ def _place(cases: Sequence[tuple[str, Prediction]], zone: Zone, row: int) -> tup
         errors = {label: predicted.error_um[axis][rows] for label, predicted in cases}
         return caption, figures.axis_errors(reference.time_s[rows], errors, axis)
     plane = found[0]
+    columns = [reference.axes.index(axis) for axis in plane]
     path = _flat(reference, None, plane)
     seen = path[max(0, first - before) : last]
     wide, tall = np.ptp(seen, axis=0)
     half = float(np.clip(0.6 * max(wide, tall / figures.TALL), LEAST_HALF_MM, MOST_HALF_MM))
     factor = max(f for f in FACTORS if f == 1 or f * zone.max_um * 1e-3 <= SEEN * half)
     curves = [Curve("desired", path[rows])]
-    curves += [
-        Curve(label, figures.magnified(path, _flat(reference, predicted, plane), factor)[rows])
-        for label, predicted in cases
-    ]
-    across, along = (seen.min(axis=0) + seen.max(axis=0)) / 2
+    for label, predicted in cases:
+        at = nearest_mm(predicted, rows)[:, columns]
+        drawn = figures.magnified(at, _flat(reference, predicted, plane)[rows], factor)
+        # so many times as large, a worse place beside this one would cover it
+        drawn[predicted.contour_um[rows] > BESIDE * zone.max_um] = np.nan
+        curves.append(Curve(label, drawn))
+    # the errors of the zone are in the picture too
+    worst = curves[1].path_mm[first - rows.start : last - rows.start]
+    low, high = (np.vstack([seen, worst]).min(axis=0), np.vstack([seen, worst]).max(axis=0))
+    half = min(MOST_HALF_MM, max(half, 0.55 * float(max(high[0] - low[0], (high[1] - low[1]) / figures.TALL))))
+    across, along = (low + high) / 2
     larger = f", errors {factor} times as large" if factor > 1 else ""
-    return caption + larger, figures.corner(curves, (float(across), float(along)), half, plane)
+    return caption + larger, figures.corner(curves, (float(across), float(along)), half, plane, on_path=False)
+
+
+def nearest_mm(predicted: Prediction, rows: slice) -> Float:
+    """Return for each predicted point of ``rows`` the point (m, d) of the path from which its contour error counts."""
+    reference = predicted.reference
+    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    actual = np.column_stack([predicted.predicted_mm[axis] for axis in reference.axes])[rows]
+    window = round(WINDOW_S / reference.dt_s)
+    found = np.empty_like(actual)
+    for k, point in enumerate(actual):
+        begin = path[max(0, rows.start + k - window) : rows.start + k + window + 1]
+        edge = np.diff(begin, axis=0)
+        length = np.maximum(np.sum(edge**2, axis=1), 1e-30)
+        share = np.clip(np.sum(edge * (point - begin[:-1]), axis=1) / length, 0.0, 1.0)
+        on = begin[:-1] + share[:, None] * edge
+        found[k] = on[np.argmin(np.sum((on - point) ** 2, axis=1))]
+    return found
 
 
 def _zones(before: Prediction, after: Prediction | None) -> Section:

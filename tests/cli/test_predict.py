@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from fdhil.cli.forecast import crossing_text
 from fdhil.cli.main import cli, run_safely
 from fdhil.errors import StoreError
 from fdhil.program import write_demand_csv
@@ -207,7 +208,17 @@ def test_history_tells_when_a_zone_leaves_the_tolerance(bench: Path) -> None:
     assert all(zone["std_um"] >= 0 for zone in document["zones"])
     text = invoke(*arguments, "--tolerance-um", 98).stdout
     assert "is over 98 um" in text
-    assert "leaves 98 um about 1970-" in text
+    assert "will have left 98 um about 1970-" in text  # the newest parameters are of January 1970
+
+
+def test_a_date_that_has_passed_is_told_as_such() -> None:
+    """The newest parameters may be older than the day that they foresee."""
+    entry = {"state": "foreseen", "date": "2999-01-02", "earliest": "2999-01-01", "latest": None}
+    entry |= {"axis": "X", "parameter": "Jt"}
+    assert crossing_text(entry, 20.0).startswith("leaves 20 um about 2999-01-02 (2999-01-01 to later)")
+    past = crossing_text(entry | {"date": "2001-01-02"}, 20.0)
+    assert past.startswith("will have left 20 um about 2001-01-02")
+    assert past.endswith("identify anew")
 
 
 @pytest.mark.parametrize(

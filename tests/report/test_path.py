@@ -15,7 +15,7 @@ from fdhil.prediction import predict
 from fdhil.prediction.models import nominal_models
 from fdhil.records import Correction, frozen
 from fdhil.report import figures, write
-from fdhil.report.path import APART_MM, correction_page, planes, prediction_page, worst_places
+from fdhil.report.path import APART_MM, correction_page, nearest_mm, planes, prediction_page, worst_places
 from tests.bench import bench_config
 from tests.paths import bench_trajectory, smooth, trajectory
 
@@ -45,6 +45,15 @@ def test_before_and_after(correction: Correction, tmp_path: Path) -> None:
         assert float(row[-1]) < 0.05 * float(row[-2])
     write(page, tmp_path / "page.html")
     assert (tmp_path / "page.html").stat().st_size < 2_000_000
+
+
+def test_what_is_magnified_is_the_contour_error(correction: Correction) -> None:
+    """A lag along the path is none: the drawn point lies as far from the path as the figure says."""
+    before = correction.before
+    rows = slice(300, 600)
+    actual = np.column_stack([before.predicted_mm[axis] for axis in "XY"])[rows]
+    away_um = np.linalg.norm(actual - nearest_mm(before, rows), axis=1) * 1e3
+    assert np.allclose(away_um, before.contour_um[rows], atol=1e-6)
 
 
 def test_a_refused_correction_says_why() -> None:
