@@ -42,6 +42,7 @@ class Piece:
     angle: float = 0.0  # what an arc may turn at most before it is cut at its ends
     waiting: list[Waiting] = field(default_factory=list)
     given: bool = False  # its motion was ordered already
+    checked_along: Vector | None = None  # the way that it may not go against, where that is not ``leaving``
 
     @property
     def radius(self) -> float:
@@ -83,6 +84,8 @@ class Compensation:
         aside = self._aside(way)
         begin = _plus(start, aside) if self.entered else start
         piece = Piece(block, begin, _plus(corner, aside), corner, way, way, whole, feed)
+        if not self.entered:
+            piece.checked_along = aside  # as the reference does: it may enter backwards, to its side alone
         return self._next(piece)
 
     def arc(
@@ -169,7 +172,8 @@ class Compensation:
 def _checked(piece: Piece, block: Block) -> Piece:
     """Return a piece whose ends are final; ProgramError when cutting it has turned it round."""
     if piece.centre is None:
-        forward = sum((e - s) * w for s, e, w in zip(piece.start, piece.end, piece.leaving, strict=True))
+        along = piece.checked_along or piece.leaving
+        forward = sum((e - s) * w for s, e, w in zip(piece.start, piece.end, along, strict=True))
         gouges = forward < -_BACKWARDS_MM
     else:
         turned = _sweep(piece)

@@ -114,13 +114,18 @@ class _Canon:
 
 
 def ask(program: Path, limit_s: float = 20.0) -> Answer:
-    """Run the reference on a file, with tools that have no length and no stored parameters."""
+    """Run the reference on a file, with tools that have no length and no stored parameters.
+
+    SubprocessError when it does not end in time, or crashes.
+    """
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "tool.tbl").write_text("".join(f"T{n} P{n} Z0 D0\n" for n in range(1, 56)))
         (Path(folder) / "empty.var").touch()
         arguments = [str(RS274), "-t", f"{folder}/tool.tbl", "-v", f"{folder}/empty.var", "-g", "-n", "2"]
         arguments.append(str(program.resolve()))
         done = subprocess.run(arguments, cwd=program.parent, capture_output=True, timeout=limit_s, check=False)
+    if done.returncode < 0:
+        raise subprocess.SubprocessError(f"the reference was ended by signal {-done.returncode}")
     canon = _Canon()
     for line in done.stdout.decode("latin-1").splitlines():
         match = _CALL.match(line)
