@@ -87,6 +87,8 @@ class Part:
             way = self.start - self.end
             aside = 1j * distance * way
             length = abs(way)
+            if length == 0.0:
+                raise ContourError("a line of the contour has no length; its corners take all of it")
             step = complex(aside.real / length, aside.imag / length)
             self.start, self.end = self.start + step, self.end + step
             return

@@ -106,6 +106,13 @@ def test_what_makes_no_roughing_is_refused(line: str) -> None:
         run(*STEP, line)
 
 
+def test_a_contour_whose_corners_take_a_whole_line_is_refused() -> None:
+    """LinuxCNC's own interpreter never ends on it."""
+    lines = ("G0 X1 Z0", "G1 Z-2 A0.4", "G1 X2 Z-8 C0.5", "G1 X4 Z-11", "G1 X8 Z-17 C0.5", "O100 endsub", "G0 X11 Z2")
+    with pytest.raises(ProgramError, match="a line of the contour has no length"):
+        run("F100 G18", "O100 sub", *lines, "G71.2 Q100 X11 Z2 D0.2 I0.5 R0.5")
+
+
 def test_an_arc_of_a_turned_system_outside_its_xy_plane_becomes_chords() -> None:
     """A half circle in XZ, turned by 30 degrees about Z: all of it lies in the turned plane, 5 mm from its centre."""
     places = ends("G10 L2 P1 R30", "F100 G18", "G2 X10 Z0 I5")
