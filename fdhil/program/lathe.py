@@ -60,8 +60,8 @@ class Thread:
 
     def depths(self) -> Iterator[float]:
         """Yield the depth of each pass, the full one ``springs`` times more."""
-        number, depth = 1, self.first
-        while depth < self.depth and number < _MAX_PASSES:
+        number, depth, crest = 1, self.first, abs(self.offset)
+        while crest + depth < crest + self.depth and number < _MAX_PASSES:  # rounded from the drive line, as LinuxCNC
             yield depth
             number += 1
             depth = self.first * number ** (1.0 / self.degression)
