@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from fdhil.identification.motion import noise_levels, resolution
-from fdhil.identification.windows import carried, longest, moving_range, smooth
+from fdhil.identification.windows import carried, longest, moving_range, noise_of, smooth
 from fdhil.records import Bool, Float, Reason, Window
 from fdhil.validation.backlash import backlash
 from fdhil.validation.episode import interruptions
@@ -20,6 +20,7 @@ STILL_MM = 0.004  # of the table at rest
 TOLERATED_LOSS = 0.02
 RAIL_SAMPLES = 3
 RESOLVED = 0.2  # of a step: noise below it hides in the resolution
+TOLD_STEPS = 1.0  # of noise, beyond which two readings in three differ
 LEAST_NOISE_ROWS = 20
 SIDE = 3  # rows beside a run of equal readings that tell of it, in lengths of the run
 QUANTISATION = 1 / 50
@@ -109,7 +110,7 @@ def beyond_chance(values: Float, start: int, end: int) -> bool:
     """Return whether the readings of rows ``start`` to ``end``, all alike, are more than the rows about them explain.
 
     Either side may explain them: by how often it has that very reading (a constant read coarsely), or by how often it
-    repeats its reading (a signal that creeps through the steps).
+    repeats its reading (a signal that creeps through the steps). Noise of several steps leaves neither.
     """
     length = end - start + 1
     chance = 0.0
@@ -119,7 +120,8 @@ def beyond_chance(values: Float, start: int, end: int) -> bool:
         # the rows beside may lie at the edge of a step, and the run in its middle
         chance = max(chance, likely_reading(others, step) ** length)
     for side in sides:
-        if values[side].size >= length:
+        # where noise goes through several steps, no reading comes often: what has this one was cut off as well
+        if values[side].size >= length and noise_of(values[side]) < TOLD_STEPS * step:
             likely = all_within(length, values[side] == values[start]), all_within(length - 1, same[side])
             chance = max(chance, *likely)
     return values.size * chance < CHANCE

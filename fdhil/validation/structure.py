@@ -23,7 +23,9 @@ from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import innovations_of
 from fdhil.records import Float, Reason
 
-BEYOND_CHANCE = 5.0  # standard deviations: 6e-7 a test, some hundred tests a window
+BEYOND_CHANCE = (
+    4.5  # standard deviations: 7e-6 a test; some hundred tests a window, which must find enough to matter too
+)
 EDGES = 20  # instants at which a load may begin or end, or a gain may step
 LEAST_TORQUE = 0.01  # of the peak torque
 LEAST_GAIN = 0.01  # what pooled windows may differ in K

@@ -119,12 +119,14 @@ def test_a_sensor_is_said_to_move_beyond_its_noise_and_step_only() -> None:
     assert not ramp.moves(0, 7)
 
 
-@pytest.mark.parametrize(("study", "seed", "rows"), [(41, 360, 3), (81, 1680, 4)])  # the second: not its longest run
-def test_a_peak_that_is_cut_off_for_some_rows_is_told_by_the_model(study: int, seed: int, rows: int) -> None:
+@pytest.mark.parametrize(
+    ("study", "seed", "rows"),
+    [(41, 360, 3), (81, 1680, 8), (101, 3540, 10)],  # the others: cut off again beside that run, in noise of many steps
+)
+def test_a_peak_that_is_cut_off_for_some_rows_is_refused(study: int, seed: int, rows: int) -> None:
     clipped = faults.KINDS["sensor clipped"].make(np.random.default_rng([study, 2, seed]))
     (window,) = find_windows(clipped.recording)
-    (reason,) = analyse(window, SETTINGS).verdict.reasons
-    assert reason.code == "Saturated"
+    (reason,) = (r for r in analyse(window, SETTINGS).verdict.reasons if r.code == "Saturated")
     assert f"for {rows} samples" in reason.text
 
 
