@@ -16,7 +16,8 @@ MOST_PLACES, FEW_PLACES = 8, 4
 APART_MM = 3.0  # places nearer to each other are one picture
 FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
 SEEN = 0.25  # of the picture's half width that the largest error may take
-LEAST_HALF_MM, MOST_HALF_MM = 0.5, 20.0
+NEAR_MIDDLE = 0.4  # of half the picture: how far from its middle the largest error may lie
+LEAST_HALF_MM, MOST_HALF_MM = 0.5, 30.0
 BEFORE_S, ASIDE_S = 0.05, 0.25  # what led to a zone is shown too, and no other pass over the same place
 BESIDE = 1.5  # of the largest error of a place: more is another place's
 MOST_ROWS = 50
@@ -183,7 +184,10 @@ def _place(cases: Sequence[tuple[str, Prediction]], zone: Zone, row: int) -> tup
     worst = curves[1].path_mm[first - rows.start : last - rows.start]
     low, high = (np.vstack([seen, worst]).min(axis=0), np.vstack([seen, worst]).max(axis=0))
     half = min(MOST_HALF_MM, max(half, 0.55 * float(max(high[0] - low[0], (high[1] - low[1]) / figures.TALL))))
-    across, along = (low + high) / 2
+    # what is too large for the picture leaves it where the error is smaller
+    worst_mm = (path[row] + curves[1].path_mm[row - rows.start]) / 2
+    reach = NEAR_MIDDLE * half * np.array([1.0, figures.TALL])
+    across, along = np.clip((low + high) / 2, worst_mm - reach, worst_mm + reach)
     larger = f", errors {factor} times as large" if factor > 1 else ""
     return caption + larger, figures.corner(curves, (float(across), float(along)), half, plane, on_path=False)
 

@@ -24,7 +24,6 @@ SMOOTHING_S = 0.010  # of the jerk-limited course of a rapid nothing is lost ove
 LARGEST = 1.0  # samples: a recorder may assign a value to the SYNC before or after it
 DOUBTFUL = 0.5  # samples: a delay that may be larger is searched for
 SURE = 4.5  # standard deviations: two tests a window
-SURELY_LARGER = 1.5  # standard deviations
 TOLD = 2.5  # standard deviations
 STRIDE = 1.0  # samples: with other parameters fitted to none, hardly anything may be left of a delay of several
 SEARCH = 6  # fits: each takes away most of what is left
@@ -55,9 +54,9 @@ def timing_faults(window: Window, fit: Fit) -> Iterator[Reason]:
         yield _reason("current", "voltage and speed", current.samples, window.dt_s)
         return
     if abs(voltage.samples) + TOLD * voltage.std > DOUBTFUL:
-        found = searched(fit, voltage)
-        if found is not None and abs(found.samples) > LARGEST + SURELY_LARGER * found.std:
-            yield _reason("voltage", "current and speed", found.samples, window.dt_s)
+        samples = searched(fit, voltage)
+        if samples is not None and abs(samples) > LARGEST:
+            yield _reason("voltage", "current and speed", samples, window.dt_s)
             return
     yield from _short_winding(fit)
 
@@ -120,8 +119,8 @@ def _no_rise(kind: int, n: int) -> list[Float] | None:
     return [np.zeros(n)] if kind == sweeps.VOLTAGE else None
 
 
-def searched(fit: Fit, first: Shift) -> Shift | None:
-    """Return the voltage's delay beyond which, all else fitted to it, the innovations show no more.
+def searched(fit: Fit, first: Shift) -> float | None:
+    """Return the samples of the voltage's delay beyond which, all else fitted to it, the innovations show no more.
 
     ``first`` is what they show to begin with; where that tells no direction, the voltage is taken to be late, as
     sensors are. The delay must make the window likelier by as much as a sure finding: what regulators do within a
@@ -140,9 +139,7 @@ def searched(fit: Fit, first: Shift) -> Shift | None:
     rest = first.samples - begun
     stride = max(2.0 * abs(rest), STRIDE)  # what is left shows smaller than it is
     found = _root(left, begun, rest, -stride if rest < -TOLD * first.std else stride)
-    if found is None or _deviance(fit) - _deviance(last) <= SURE**2:
-        return None
-    return Shift(found, shifts(last)[0].std)
+    return found if found is not None and _deviance(fit) - _deviance(last) > SURE**2 else None
 
 
 def _deviance(fit: Fit) -> float:

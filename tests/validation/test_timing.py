@@ -69,7 +69,7 @@ def test_a_shift_without_a_gain_in_likelihood_is_not_believed() -> None:
     assert not voltage.sure
     assert not current.sure
     found = searched(fit, Shift(1.2, 0.1))  # as if the innovations had shown it
-    assert found is None or abs(found.samples) < 1.0
+    assert found is None or abs(found) < 1.0
 
 
 @pytest.mark.parametrize("seed", [7, 714])
