@@ -115,7 +115,7 @@ def _cuts_a_program_longer_than_the_ring(shop: Shop, capsys: Capture) -> None:
     corrected = _cut(shop, "long_corrected", "long.ngc", LONG)
     shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
     log = (shop.folder / "daemon.log").read_text()
-    assert log.count("Finished") == 2, log
+    assert log.count("-> OFF: Finished") == 2, log
     assert corrected < 0.1 * plain, (corrected, plain)
 
 
