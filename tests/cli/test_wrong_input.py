@@ -20,7 +20,7 @@ def fdhil(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=100)
 
 
-def told(done: subprocess.CompletedProcess[str], code: int, *words: str) -> None:
+def assert_told(done: subprocess.CompletedProcess[str], code: int, *words: str) -> None:
     """The exit code, the words, and no traceback."""
     said = done.stdout + done.stderr
     assert done.returncode == code, said
@@ -51,19 +51,19 @@ def port_in_use() -> Iterator[int]:
 def test_a_wrong_config_tells_where(command: str, old: str, new: str, words: tuple[str, ...], tmp_path: Path) -> None:
     path = write_config(tmp_path)
     path.write_text(path.read_text().replace(old, new, 1))
-    told(fdhil(command, path), 2, *words)
+    assert_told(fdhil(command, path), 2, *words)
 
 
 def test_a_port_in_use_is_told(port_in_use: int, tmp_path: Path) -> None:
     config = write_config(tmp_path, bus=f'interface = "socketcand"\nport = {port_in_use}')
-    told(fdhil("sim", config), 3, str(port_in_use))
+    assert_told(fdhil("sim", config), 3, str(port_in_use))
 
 
 def test_a_hub_that_is_not_there_is_told(tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    told(fdhil("run", write_config(tmp_path, bus=f'interface = "socketcand"\nport = {port}')), 3, str(port))
+    assert_told(fdhil("run", write_config(tmp_path, bus=f'interface = "socketcand"\nport = {port}')), 3, str(port))
 
 
 def test_a_bus_without_drives_is_told(tmp_path: Path) -> None:
@@ -72,7 +72,7 @@ def test_a_bus_without_drives_is_told(tmp_path: Path) -> None:
     try:
         port = hub.hub.settings["port"]
         config = write_config(tmp_path, bus=f'interface = "socketcand"\nport = {port}')
-        told(fdhil("run", config), 3, "there is no drive on the bus")
+        assert_told(fdhil("run", config), 3, "there is no drive on the bus")
     finally:
         hub.stop()
 
@@ -83,7 +83,7 @@ def test_a_sensor_that_is_not_there_is_told(tmp_path: Path) -> None:
     try:
         bus = f'interface = "socketcand"\nport = {hub.hub.settings["port"]}'
         sensor = 'source = "modbus"\nport = 1\ntimeout_s = 0.3'
-        told(
+        assert_told(
             fdhil("run", write_config(tmp_path, bus=bus, axes="X", voltage=sensor)), 3, "127.0.0.1:1 cannot be reached"
         )
     finally:
@@ -95,21 +95,23 @@ def test_a_recording_that_is_none_is_told(command: str, tmp_path: Path) -> None:
     path = tmp_path / ("window.parquet" if command != "identify" else "recording.csv")
     path.write_bytes(b"not a recording")
     options = ["--out", tmp_path / "out.csv"] if command == "export" else []
-    told(fdhil(command, path, *options), 3, str(path.name))
+    assert_told(fdhil(command, path, *options), 3, str(path.name))
     assert path.read_bytes() == b"not a recording"
 
 
 def test_a_program_with_an_unknown_word_is_told(tmp_path: Path) -> None:
     path = tmp_path / "part.ngc"
     path.write_text("G21 G90\nG1 X10 F1000\nG187 X3\nM2\n")
-    told(fdhil("interpret", path), 3, "line 3", "G187")
+    assert_told(fdhil("interpret", path), 3, "line 3", "G187")
 
 
 @pytest.mark.parametrize("command", ["status", "disarm"])
 def test_a_daemon_that_does_not_run_is_told(command: str, tmp_path: Path) -> None:
-    told(fdhil(command, write_config(tmp_path)), 3, "is not running")
+    assert_told(fdhil(command, write_config(tmp_path)), 3, "is not running")
 
 
 def test_a_demo_without_a_place_for_its_files_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    told(fdhil("demo", "--out", tmp_path / "file" / "out"), 3, "cannot be made: Not a directory; choose another --out")
+    assert_told(
+        fdhil("demo", "--out", tmp_path / "file" / "out"), 3, "cannot be made: Not a directory; choose another --out"
+    )

@@ -2,56 +2,28 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
-import socket
-import threading
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from fdhil.guard import table
 from fdhil.guard.client import TABLE_NAME
+from tests.daemon.guard_peer import Guard
 
 RESERVE_ROWS = 1000
 Answer = Mapping[str, Any]
 
 
 class Mill:
-    """What listens at ``guard.sock``: loads tables, arms, starves; ``begin`` and ``move`` are the machine's motion."""
+    """What listens at ``guard.sock``: loads tables, arms, starves; ``move`` is the machine's motion."""
 
     def __init__(self, folder: Path) -> None:
         self.state, self.row, self.cause = "OFF", 0, ""
         self.rows: list[tuple[int, ...]] = []
         self.final = False
         self._table, self._sequence = folder / TABLE_NAME, 0
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._listener.bind(str(folder / "guard.sock"))
-        self._listener.listen()
-        self._peers: list[socket.socket] = []
-        self._threads: list[threading.Thread] = []
-        self._begin(self._accept)
-
-    def _begin(self, what: Any, *values: Any) -> None:
-        self._threads.append(threading.Thread(target=what, args=values, daemon=True))
-        self._threads[-1].start()
-
-    def _accept(self) -> None:
-        while True:
-            try:
-                peer, _ = self._listener.accept()
-            except OSError:
-                return
-            self._peers.append(peer)
-            self._begin(self._serve, peer)
-
-    def _serve(self, peer: socket.socket) -> None:
-        with peer, peer.makefile("rb") as lines:
-            for line in lines:
-                request = json.loads(line)
-                if "id" in request:
-                    answer = {"ok": True, **self._answer(request["request"]), "id": request["id"]}
-                    peer.sendall(json.dumps(answer).encode() + b"\n")
+        self._peer = Guard(folder)
+        self._peer.says = self._answer
 
     def _answer(self, kind: str) -> Answer:
         if kind == "table":
@@ -62,7 +34,7 @@ class Mill:
             self.state, self.cause = "OFF", "Disarmed"
         cause = {"code": self.cause, "text": "", "axis": ""} if self.cause else None
         rows = [0, len(self.rows)] if self.rows else None
-        return {"state": self.state, "row": self.row or None, "rows": rows, "cause": cause}
+        return {"ok": True, "state": self.state, "row": self.row or None, "rows": rows, "cause": cause}
 
     def _load(self) -> Answer:
         found = table.read(self._table, self._sequence)
@@ -75,7 +47,7 @@ class Mill:
             return {"ok": False, "code": "ProgramMismatch", "text": "these rows do not continue the table"}
         self.rows += list(zip(*path.demand, *path.offset, strict=True))
         self.final = path.final
-        return {"rows": [0, len(self.rows)]}
+        return {"ok": True, "rows": [0, len(self.rows)]}
 
     def move(self, row: int) -> None:
         """Let the machine come to a row; where too few are left behind it, the correction is ramped down."""
@@ -85,9 +57,4 @@ class Mill:
 
     def close(self) -> None:
         """End all connections."""
-        for each in (self._listener, *self._peers):
-            with contextlib.suppress(OSError):
-                each.shutdown(socket.SHUT_RDWR)
-        self._listener.close()
-        for thread in self._threads:
-            thread.join(10.0)
+        self._peer.close()

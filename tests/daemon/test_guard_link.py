@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import json
-import socket
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,54 +18,10 @@ from fdhil.daemon.keeping import Keeper
 from fdhil.daemon.streamed import Piece
 from fdhil.daemon.token import read_token
 from fdhil.errors import DeviceError
+from tests.daemon.guard_peer import FINE, Guard
 from tests.daemon.machine import config_of
 
-FINE: Mapping[str, Any] = {"state": "ACTIVE", "cause": None, "ok": True}
 STARVED = {"state": "RAMP_DOWN", "cause": {"code": "TableStarved", "text": "no rows", "axis": ""}, "ok": True}
-
-
-class Guard:
-    """What listens at ``guard.sock`` instead of the guard: answers by ``says``, None: not at all."""
-
-    def __init__(self, folder: Path) -> None:
-        self.says: Callable[[str], Mapping[str, Any] | None] = lambda _kind: FINE
-        self.heard: list[str] = []
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._listener.bind(str(folder / "guard.sock"))
-        self._listener.listen()
-        self._threads: list[threading.Thread] = []
-        self._peers: list[socket.socket] = []
-        self._begin(self._accept)
-
-    def _begin(self, what: Callable[..., None], *values: Any) -> None:
-        self._threads.append(threading.Thread(target=what, args=values, daemon=True))
-        self._threads[-1].start()
-
-    def _accept(self) -> None:
-        while True:
-            try:
-                peer, _ = self._listener.accept()
-            except OSError:
-                return
-            self._peers.append(peer)
-            self._begin(self._serve, peer)
-
-    def _serve(self, peer: socket.socket) -> None:
-        with peer, peer.makefile("rb") as lines:
-            for line in lines:
-                request = json.loads(line)
-                self.heard.append(request["request"])
-                answer = self.says(request["request"]) if "id" in request else None
-                if answer is not None:
-                    peer.sendall(json.dumps({**answer, "id": request["id"]}).encode() + b"\n")
-
-    def close(self) -> None:
-        for each in (self._listener, *self._peers):
-            with contextlib.suppress(OSError):
-                each.shutdown(socket.SHUT_RDWR)
-        self._listener.close()
-        for thread in self._threads:
-            thread.join(10.0)
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ FIELDS = ("voltage_v", "current_a", "speed_rad_s", "position_mm")
 EXTREMES = [0.0, 1e-300, 1e-12, 1e6, 1e300, -1e300, np.nan, np.inf, -np.inf]
 
 
-def _told(outcome: WindowOutcome) -> None:
+def assert_answered(outcome: WindowOutcome) -> None:
     """Check that an outcome is an answer: values with intervals, or reasons."""
     assert outcome.verdict.accepted == (not outcome.verdict.reasons)
     assert outcome.estimate is not None
@@ -55,7 +55,7 @@ def test_spoilt_windows_are_answered(
     spoilt = _spoilt(windows(0.003)[0], name, start, length, value, scale)
     chosen = Identification(method=method)
     outcome = analyse(spoilt, chosen)
-    _told(outcome)
+    assert_answered(outcome)
     pool([outcome], chosen)
 
 
@@ -77,7 +77,7 @@ def test_noise_alone_is_answered(seed: int, rows: int, size: float) -> None:
     )
     outcomes = [analyse(window, Identification()) for window in find_windows(silent)]
     for outcome in outcomes:
-        _told(outcome)
+        assert_answered(outcome)
     _, verdict = pool(outcomes, Identification())
     assert verdict.accepted or verdict.reasons
 
@@ -87,7 +87,7 @@ def test_short_windows_are_answered() -> None:
     for rows in (0, 1, 3, 31, 40, 120):
         arrays = {name: frozen(np.array(getattr(window, name))[:rows]) for name in (*FIELDS, "demand_mm")}
         short = Window(**{f: getattr(window, f) for f in window.__slots__} | arrays)
-        _told(analyse(short, Identification()))
+        assert_answered(analyse(short, Identification()))
 
 
 def test_a_window_that_is_lost_whole_is_answered() -> None:
@@ -99,5 +99,5 @@ def test_a_window_that_is_lost_whole_is_answered() -> None:
         | {"gaps": ((0, window.n),)}
     )
     outcome = analyse(lost, Identification())
-    _told(outcome)
+    assert_answered(outcome)
     assert "StaleData" in [reason.code for reason in outcome.verdict.reasons]
