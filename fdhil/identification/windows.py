@@ -193,6 +193,13 @@ def longest(flags: Bool) -> tuple[int, int]:
     return int(starts[k]), int(ends[k])
 
 
+def runs_of(flags: Bool, least: int) -> list[tuple[int, int]]:
+    """Return the half-open rows of the runs of True that are ``least`` long or longer, the longest first."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))).reshape(-1, 2)
+    runs = [(int(start), int(end)) for start, end in edges if end - start >= least]
+    return sorted(runs, key=lambda run: run[0] - run[1])
+
+
 def moving_range(window: Window) -> tuple[int, int]:
     """Return the half-open rows of the move itself, without the margins of standstill."""
     stages = [s for s in (window.stages.accelerate, window.stages.cruise, window.stages.brake) if s is not None]

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from fdhil.identification.motion import resolution
-from fdhil.identification.windows import carried, noise_of, smooth
+from fdhil.identification.windows import carried, noise_of, runs_of, smooth
 from fdhil.records import Float, Reason, Window
 from fdhil.validation.readings import alike
 
@@ -54,10 +54,7 @@ def slow_voltage_faults(window: Window) -> Iterator[Reason]:
 
 def runs(volts: Float) -> list[tuple[int, int]]:
     """Return the half-open runs of equal samples, the longest first."""
-    same = np.concatenate([[False], np.diff(volts) == 0.0, [False]])
-    edges = np.flatnonzero(np.diff(same.astype(np.int8))).reshape(-1, 2)
-    runs = [(int(a), int(b) + 1) for a, b in edges if b + 1 - a >= LEAST_SAMPLES]
-    return sorted(runs, key=lambda run: run[0] - run[1])
+    return [(start, end + 1) for start, end in runs_of(np.diff(volts) == 0.0, LEAST_SAMPLES - 1)]
 
 
 def _strange(window: Window, volts: Float, speed: Float, run: tuple[int, int], step: float, same: float) -> bool:

@@ -17,8 +17,8 @@ import numpy as np
 
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.motion import resolution
-from fdhil.identification.windows import moving_range
-from fdhil.records import Bool, Float, Reason, Window
+from fdhil.identification.windows import moving_range, runs_of
+from fdhil.records import Float, Reason, Window
 from fdhil.validation.bridging import Bridge
 from fdhil.validation.plausibility import RAIL_SAMPLES, beyond_chance, signals_of, wakes_with_a_jump
 from fdhil.validation.readings import alike, log_chance
@@ -97,7 +97,7 @@ def _clipped_peaks(window: Window, fit: Fit, bridge: Callable[[], Bridge]) -> It
     for name, unit, values in signals_of(window):
         noise = getattr(fit.problem.noises[0], NOISES[name])
         for rail in (np.nanmax(values), np.nanmin(values)):
-            runs = _runs(values == rail, RAIL_SAMPLES) if rail != 0.0 else []
+            runs = runs_of(values == rail, RAIL_SAMPLES) if rail != 0.0 else []
             if runs and beyond_chance(values, runs[0][0], runs[0][1] - 1):
                 continue  # this is told without a model
             for start, end in runs:
@@ -110,13 +110,6 @@ def _clipped_peaks(window: Window, fit: Fit, bridge: Callable[[], Bridge]) -> It
                 )
                 yield Reason("Saturated", text, "use a larger measuring range")
                 break
-
-
-def _runs(flags: Bool, least: int) -> list[tuple[int, int]]:
-    """Return the half-open rows of the runs of True that are ``least`` long or longer, the longest first."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))).reshape(-1, 2)
-    runs = [(int(start), int(end)) for start, end in edges if end - start >= least]
-    return sorted(runs, key=lambda run: run[0] - run[1])
 
 
 def _bears(fit: Fit) -> bool:
