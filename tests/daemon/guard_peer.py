@@ -10,12 +10,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-FINE: Mapping[str, Any] = {"state": "ACTIVE", "cause": None, "ok": True}
+ZERO: Mapping[str, Any] = {"X": 0.0, "Y": 0.0}
+FINE: Mapping[str, Any] = {"state": "ACTIVE", "cause": None, "ok": True, "may_stand_um": ZERO}
 Says = Callable[[str], Mapping[str, Any] | None]
 
 
 class Guard:
-    """What listens at ``guard.sock`` instead of the guard: answers by ``says``, None: not at all."""
+    """What listens at ``guard.sock`` instead of the guard: answers by ``says`` (None: not at all)."""
 
     def __init__(self, folder: Path) -> None:
         self.says: Says = lambda _kind: FINE
@@ -41,7 +42,7 @@ class Guard:
             self._begin(self._serve, peer)
 
     def _serve(self, peer: socket.socket) -> None:
-        with peer, peer.makefile("rb") as lines:
+        with contextlib.suppress(ConnectionError), peer, peer.makefile("rb") as lines:
             for line in lines:
                 request = json.loads(line)
                 self.heard.append(request["request"])

@@ -8,7 +8,7 @@ from typing import Any
 
 from fdhil.guard import table
 from fdhil.guard.client import TABLE_NAME
-from tests.daemon.guard_peer import Guard
+from tests.daemon.guard_peer import ZERO, Guard
 
 RESERVE_ROWS = 1000
 Answer = Mapping[str, Any]
@@ -34,7 +34,8 @@ class Mill:
             self.state, self.cause = "OFF", "Disarmed"
         cause = {"code": self.cause, "text": "", "axis": ""} if self.cause else None
         rows = [0, len(self.rows)] if self.rows else None
-        return {"ok": True, "state": self.state, "row": self.row or None, "rows": rows, "cause": cause}
+        known = {"cause": cause, "may_stand_um": ZERO}
+        return {"ok": True, "state": self.state, "row": self.row or None, "rows": rows, **known}
 
     def _load(self) -> Answer:
         found = table.read(self._table, self._sequence)
