@@ -66,6 +66,7 @@ class Armory:
         self._check = Check(config)
         self._supply: Supply | None = None
         self._given_up = False
+        self._disarming: asyncio.Future[Answer] | None = None
         self.guard = GuardLink(run_directory)
 
     def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
@@ -235,14 +236,23 @@ class Armory:
         """Have the guard ramp to zero: ok only when it is reached. What is being planned or checked is not armed."""
         self._supply = None  # no more rows, no more words about them
         abandoned = self.abandon()
+        if self._disarming is None:  # who asks again meanwhile waits for the same ramp
+            self._disarming = asyncio.ensure_future(self._to_zero())
+            self._disarming.add_done_callback(self._disarmed)
+        answer = await asyncio.shield(self._disarming)
+        return {**answer, "text": f"{answer['text']}; the check was abandoned"} if abandoned else answer
+
+    def _disarmed(self, _: asyncio.Future[Answer]) -> None:
+        self._disarming = None
+
+    async def _to_zero(self) -> Answer:
         try:
             answer = await asyncio.to_thread(self.guard.disarm)
         except DeviceError as error:
             return self._without_guard(error)
         if not answer["ok"]:
             return answer
-        told = verdict(self.guard.status)
-        return told | {"text": told["text"] + ("; the check was abandoned" if abandoned else "")}
+        return verdict(self.guard.status)
 
     def _without_guard(self, error: DeviceError) -> Answer:
         """Return the refusal without a guard; what the last one may have left is told."""
