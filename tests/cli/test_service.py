@@ -67,7 +67,8 @@ def test_status_as_a_table_and_as_json(machine: Path, tmp_path: Path, capsys: An
     with answering(machine, status_of(tmp_path)) as requests:
         code, out, err = fdhil("status", machine, capsys=capsys)
     assert (code, err, requests) == (0, "", [{"request": "status"}])
-    for words in ("bench", "no SYNC yet", "frames 7", "1 accepted, 0 refused", "DiskFull", "[red]Jt rose[/red]", "OFF"):
+    heard = ("bench", "no SYNC yet", "frames received 7, lost 0")
+    for words in (*heard, "1 accepted, 0 refused", "DiskFull", "[red]Jt rose[/red]", "OFF"):
         assert words in out, (words, out)
     (machine.parent / "fdhil-data" / "run" / "daemon.sock").unlink()
     with answering(machine, status_of(tmp_path)):
