@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 BARS = "▁▂▃▄▅▆▇█"
+SHOWN_PASSES = 3
 LIVE_S = 1.0
 GUARD_LIVE_S = 2.0  # the daemon asks it twice a second
 IN_CHARGE = {"ARMED", "RAMPING", "ACTIVE", "HOLD", "FEEDFORWARD"}
@@ -52,6 +53,8 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
         out.print(escape(f"in shadow, not sent: {would}"))
     for refused in ((status.get("armed") or {}).get("check") or {}).get("refused", []):
         out.print(f"[red]the correction ends early: {escape(refused)}[/red]")
+    for told in status.get("passes", [])[-SHOWN_PASSES:]:
+        out.print(escape(told["text"]))
     if checking := status.get("checking"):
         out.print(escape(f"checking {checking['program']}: {checking['checked_s']:.0f} s, line {checking['line']}"))
     if status["store"]["fault"]:

@@ -28,7 +28,7 @@ from fdhil.daemon.status import Watch
 from fdhil.daemon.warm import warm
 from fdhil.errors import DeviceError, FdhilError
 from fdhil.pipeline import AxisPipeline, Record
-from fdhil.records import Notice, Outcome, Temperature, TickTimes
+from fdhil.records import AxisSamples, Notice, Outcome, Temperature, TickTimes
 
 QUEUE_RECORDS = 4000  # per axis: more than half a minute of blocks; beyond it the newest are dropped and counted
 NOTICE_QUEUE = 200
@@ -187,6 +187,8 @@ class Service:
             return
         if isinstance(record, Temperature):
             self._armory.note_temperature(record)
+        elif isinstance(record, AxisSamples):
+            self._armory.hear(record)
         for axis in self._config.axis if isinstance(record, TickTimes) else (record.axis,):
             if axis in self._queues:
                 if self._queues[axis].full():
@@ -307,6 +309,7 @@ class Service:
             "may_stand": {"nothing": guard.standing.nothing, "text": str(guard.standing)},
             "armed": self._armory.armed,
             "checking": self._armory.checking,
+            "passes": self._armory.passes,
             "store": store,
         }
 
