@@ -51,7 +51,10 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
     if guard.get("shadow_um"):
         would = ", ".join(f"{axis} {offset:+.1f} um" for axis, offset in guard["shadow_um"].items())
         out.print(escape(f"in shadow, not sent: {would}"))
-    for refused in ((status.get("armed") or {}).get("check") or {}).get("refused", []):
+    armed = status.get("armed") or {}
+    if armed.get("promise"):
+        out.print(escape(f"armed: {armed['program']}, {armed['promise']}"))
+    for refused in (armed.get("check") or {}).get("refused", []):
         out.print(f"[red]the correction ends early: {escape(refused)}[/red]")
     for told in status.get("passes", [])[-SHOWN_PASSES:]:
         out.print(escape(told["text"]))

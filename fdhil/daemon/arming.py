@@ -93,6 +93,7 @@ class Armament:
                 "max_um": float(after.contour_um.max()),
                 "uncertainty_um": predicted.half_um,
             },
+            "promise": _promise(predicted),
             "warnings": [str(reason) for reason in self.correction.warnings],
             "facts": dict(self.facts),
         }
@@ -148,6 +149,9 @@ class StreamedArmament:
             "streamed": True,
             "before": dict(checked.errors["before"]),
             "after": {**checked.errors["after"], "uncertainty_um": self.skill_um},
+            "promise": _promise(
+                Gain(checked.errors["before"]["rms_um"], checked.errors["after"]["rms_um"], self.skill_um)
+            ),
             "check": self.stream.status(),
             "warnings": [],
             "facts": dict(self.facts),
@@ -168,6 +172,10 @@ class Refused:
     """Why nothing is armed, the weightiest reason first."""
 
     reasons: tuple[Reason, ...]
+
+
+def _promise(predicted: Gain) -> str:
+    return f"contour error {predicted.before_um:.1f} um RMS is predicted to become {predicted}"
 
 
 def rms(values: Float) -> float:

@@ -37,7 +37,6 @@ from fdhil.daemon.streamed import Checked
 from fdhil.daemon.supply import Supply
 from fdhil.daemon.token import ensure_token
 from fdhil.errors import DeviceError
-from fdhil.prediction.gain import Gain
 from fdhil.records import AxisSamples, Notice, Outcome, ParameterSet, Skill, Temperature
 from fdhil.store.history import Revision
 
@@ -222,9 +221,7 @@ class Armory:
         answer = await self._hand_over(self.guard.arm, prepared, summary, token)
         if not answer["ok"]:
             return answer
-        predicted = Gain(summary["before"]["rms_um"], summary["after"]["rms_um"], summary["after"]["uncertainty_um"])
-        text = f"armed {program.name} by {summary['method']}: contour error {predicted.before_um:.1f} um RMS is"
-        text += f" predicted to become {predicted}"
+        text = f"armed {program.name} by {summary['method']}: {summary['promise']}"
         if not summary.get("check", {"whole": True})["whole"]:
             text += f" in its first {summary['check']['checked_s']:.0f} s; the check of the rest goes on ahead of it"
         text += "; start the program, its error is measured as it runs"

@@ -22,9 +22,12 @@ from fdhil.prediction.contour import WINDOW_S
 from fdhil.prediction.gain import plus_minus
 from fdhil.records import AxisSamples, Float, Int, Notice
 
+Rows = tuple[Int, Float, Float]
+"""Tick, demand and position (n,) of an axis."""
 KEPT = 20
 CHUNK_S = 2.0  # that is compared at once
 LATE_S = 0.5  # by which samples may come behind the guard's word
+MOST_BLOCKS = 1000
 MOST_LEAD_S = 10.0
 TOLERANCE_INCREMENTS = 2.5
 WORSE = 1.05  # times the error predicted without a correction
@@ -105,7 +108,7 @@ class Pass:
         self._start_mm: Float = path[0]
         leaves = np.flatnonzero(self._away(path))
         self._lead = min(int(leaves[0]) if leaves.size else 0, round(MOST_LEAD_S / self._dt_s))
-        self._waiting: dict[str, list[AxisSamples]] = {axis: [] for axis in self._axes}
+        self._waiting: dict[str, list[Rows]] = {axis: [] for axis in self._axes}
         self._demand: Float = np.empty((0, len(self._axes)))
         self._position: Float = np.empty((0, len(self._axes)))
         self._first = 0  # row of the buffer from which on nothing was compared yet
@@ -117,24 +120,23 @@ class Pass:
         return np.any(np.abs(rows_mm - self._start_mm) > self._tolerance_mm, axis=1)
 
     def take(self, samples: AxisSamples) -> None:
-        """Take a block of one axis; what all axes have by then is joined."""
-        if samples.axis not in self._waiting:
+        """Take a block of one axis; the rows that all axes have by then go on."""
+        if samples.axis not in self._waiting or samples.tick.size == 0:
             return
-        self._waiting[samples.axis].append(samples)
+        self._waiting[samples.axis].append((samples.tick, samples.demand_mm, samples.position_mm))
         if not all(self._waiting.values()):
+            if len(self._waiting[samples.axis]) > MOST_BLOCKS:  # another axis is not heard at all
+                self._waiting[samples.axis].clear()
             return
         blocks = {axis: _joined(waiting) for axis, waiting in self._waiting.items()}
         self._waiting = {axis: [] for axis in self._axes}
         if any(np.any(np.diff(tick) <= 0) for tick, _, _ in blocks.values()):  # the SYNC count began anew
             return
-        ticks = blocks[self._axes[0]][0]
-        for tick, _, _ in blocks.values():
-            ticks = np.intersect1d(ticks, tick, assume_unique=True)
-        rows = [np.searchsorted(tick, ticks) for tick, _, _ in blocks.values()]
-        demand = np.column_stack([d[k] for k, (_, d, _) in zip(rows, blocks.values(), strict=True)])
-        position = np.column_stack([p[k] for k, (_, _, p) in zip(rows, blocks.values(), strict=True)])
-        whole = np.isfinite(demand).all(axis=1) & np.isfinite(position).all(axis=1)
-        self._add(demand[whole], position[whole])
+        last = min(int(tick[-1]) for tick, _, _ in blocks.values())
+        for axis, (tick, demand, position) in blocks.items():
+            if (later := tick > last).any():
+                self._waiting[axis].append((tick[later], demand[later], position[later]))
+        self._add(*_common([(t[t <= last], d[t <= last], p[t <= last]) for t, d, p in blocks.values()]))
 
     def _add(self, demand: Float, position: Float) -> None:
         left = None if self._begun else self._departure(demand)
@@ -185,10 +187,21 @@ class Pass:
         }
 
 
-def _joined(blocks: Sequence[AxisSamples]) -> tuple[Int, Float, Float]:
-    columns = [[getattr(block, name) for block in blocks] for name in ("tick", "demand_mm", "position_mm")]
-    tick, demand, position = map(np.concatenate, columns)
+def _joined(blocks: Sequence[Rows]) -> Rows:
+    tick, demand, position = (np.concatenate([block[k] for block in blocks]) for k in range(3))
     return tick, demand, position
+
+
+def _common(axes: Sequence[Rows]) -> tuple[Float, Float]:
+    """Return demand and position (n, axes) of the ticks that all axes have, whole rows only."""
+    ticks = axes[0][0]
+    for tick, _, _ in axes[1:]:
+        ticks = np.intersect1d(ticks, tick, assume_unique=True)
+    rows = [np.searchsorted(tick, ticks) for tick, _, _ in axes]
+    demand = np.column_stack([axis[1][at] for axis, at in zip(axes, rows, strict=True)])
+    position = np.column_stack([axis[2][at] for axis, at in zip(axes, rows, strict=True)])
+    whole = np.isfinite(demand).all(axis=1) & np.isfinite(position).all(axis=1)
+    return demand[whole], position[whole]
 
 
 def _text(told: Mapping[str, Any]) -> str:

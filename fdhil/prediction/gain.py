@@ -77,7 +77,8 @@ def skill_of(skills: Mapping[str, Sequence[Skill]], axes: Sequence[str]) -> floa
     """Return how well the last moves were predicted, um RMS over the axes, by the worst of each; None without any."""
     if not axes or not all(skills.get(axis) for axis in axes):
         return None
-    return math.hypot(*(max(skill.rms_um for skill in skills[axis]) for axis in axes))
+    um = math.hypot(*(float(np.max([skill.rms_um for skill in skills[axis]])) for axis in axes))
+    return um if math.isfinite(um) else None
 
 
 def _rms(values: Float) -> float:
