@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from fdhil.daemon.arming import Armament, Feeding, StreamedArmament
 from fdhil.daemon.standing import ABSENT, AT_REST, START_AND_ADOPT, Standing, landed, lost, standing
@@ -172,12 +172,19 @@ def _gone(before: Mapping[str, Any], now: Mapping[str, Any], error: DeviceError)
     return [Notice("GuardLost", "MAJOR", f"{text}; {START_AND_ADOPT}")]
 
 
+def _severity(state: str, stands: Standing) -> Literal["info", "minor", "MAJOR"]:
+    """A guard that is off and has not read its drives yet is no alarm, what it knows or has left is one."""
+    if state not in AT_REST or stands.nothing:
+        return "info"
+    return "MAJOR" if state == "FROZEN" or stands.known else "minor"
+
+
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
     """Say when the guard came, or changed its state, and why; a correction that something ended is a trip."""
     cause = now.get("cause") or {}
     why = f": {cause.get('code', '')}: {cause['text']}" if cause.get("text") else ""
     stands = standing(now)
-    severity: Any = "info" if now["state"] not in AT_REST or stands.nothing else "MAJOR"
+    severity = _severity(now["state"], stands)
     left = f"; {stands}" if now["state"] in AT_REST else ""
     if before["state"] in GONE:
         return [Notice("GuardFound", severity, f"the guard runs, in state {now['state']}{why}{left}")]

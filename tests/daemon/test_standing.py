@@ -110,7 +110,7 @@ def test_a_guard_that_dies_in_the_cut_leaves_its_last_word_until_one_that_knows_
     (folder / "guard.sock").unlink()
     back = Guard(folder)
     back.says = lambda _kind: {**OFF, "may_stand_um": {"X": None, "Y": None}}
-    assert [(n.code, n.severity) for n in link.refresh()] == [("GuardFound", "MAJOR")]
+    assert [(n.code, n.severity) for n in link.refresh()] == [("GuardFound", "minor")]
     assert str(link.standing) == "an unknown offset on axis X, Y may still be applied"
     back.says = lambda _kind: OFF
     assert [(n.code, n.severity, n.text) for n in link.refresh()] == [("GuardState", "info", "OFF; offset 0")]
