@@ -13,7 +13,6 @@ BARS = "▁▂▃▄▅▆▇█"
 SHOWN_PASSES = 3
 LIVE_S = 1.0
 GUARD_LIVE_S = 2.0  # the daemon asks it twice a second
-IN_CHARGE = {"ARMED", "RAMPING", "ACTIVE", "HOLD", "FEEDFORWARD"}
 COUNTED = {
     "records_dropped": "records dropped",
     "ring_overflow": "not read in time",
@@ -46,7 +45,9 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
     loads = "".join(f", {bus} loaded {load:.0f} %" for bus, load in status["bus_load_percent"].items())
     out.print(escape(f"correction: {status['state']}, guard {_guard(guard)}{loads}"))
     stands = status.get("may_stand", {"nothing": True})
-    if not stands["nothing"] and str(guard.get("state")) not in IN_CHARGE:
+    if guard.get("state") == "lost":
+        out.print(f"[red]{escape(guard['text'])}[/red]")
+    elif not stands["nothing"] and guard.get("state") in ("OFF", "FROZEN"):
         out.print(f"[red]{escape(stands['text'])}[/red]; hold the feed, then run fdhil adopt")
     if guard.get("shadow_um"):
         would = ", ".join(f"{axis} {offset:+.1f} um" for axis, offset in guard["shadow_um"].items())
@@ -93,8 +94,8 @@ def _heard(status: Mapping[str, Any]) -> str:
 
 def _guard(guard: Mapping[str, Any]) -> str:
     """Say in which state the guard is; one that has not answered for a while may be in another by now."""
-    state, heard_s = str(guard.get("state", "absent")), guard.get("heard_s_ago", 0.0)
-    if state == "absent":
+    state, heard_s = str(guard.get("state", "absent")), guard.get("heard_s_ago")
+    if state == "absent" or heard_s is None:
         return state
     if state == "lost":
         return f"lost, heard {_ago(heard_s)} ago in state {guard.get('last_state')}"

@@ -36,7 +36,7 @@ class GuardLink:
         self._lock = threading.Lock()
         self._client: GuardClient | None = None
         self._status: Mapping[str, Any] = ABSENT
-        self._heard_s = time.monotonic()
+        self._heard_s: float | None = None
         self._untold: list[Notice] = []
 
     @property
@@ -46,8 +46,9 @@ class GuardLink:
 
     @property
     def status(self) -> Mapping[str, Any]:
-        """What the guard said last, and how long ago."""
-        return {**self._status, "heard_s_ago": round(time.monotonic() - self._heard_s, 3)}
+        """What the guard said last, and how long ago; None: it never did."""
+        age_s = None if self._heard_s is None else round(time.monotonic() - self._heard_s, 3)
+        return {**self._status, "heard_s_ago": age_s}
 
     @property
     def standing(self) -> Standing:

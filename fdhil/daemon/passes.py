@@ -12,7 +12,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,65 +33,77 @@ TOLERANCE_INCREMENTS = 2.5
 WORSE = 1.05  # times the error predicted without a correction
 
 
+class _Ended(NamedTuple):
+    """A pass that the guard has ended; its last samples may come until ``due_s``."""
+
+    running: Pass
+    due_s: float
+    cause: str
+    summary: Mapping[str, Any]
+
+
 class Passes:
     """The pass that runs, and what the last ones measured."""
 
     def __init__(self, config: MachineConfig) -> None:
         self._config = config
         self._count = Counter[str]()
-        self._pass: Pass | None = None
+        self._running: Pass | None = None
+        self._ended: deque[_Ended] = deque()
         self._taken: deque[AxisSamples] = deque()
-        self._over: tuple[float, str, Mapping[str, Any]] | None = None
         self.told: deque[Mapping[str, Any]] = deque(maxlen=KEPT)
 
     def begin(self, demand: Mapping[str, Sequence[int]], rows: int | None) -> None:
         """A program is about to be armed: the first rows of its table in increments, and how many there are."""
-        self._taken.clear()
-        self._over = None
-        self._pass = Pass(self._config, demand, rows)
+        self._running = Pass(self._config, demand, rows)
 
     def forget(self) -> None:
         """It was not armed."""
-        self._pass = None
+        self._running = None
 
     def take(self, samples: AxisSamples) -> None:
         """Take samples while a pass may run."""
-        if self._pass is not None:
+        if self._running is not None or self._ended:
             self._taken.append(samples)
 
     def end(self, cause: str, summary: Mapping[str, Any]) -> None:
-        """The guard has ended the correction; the last samples may still be on their way."""
-        if self._pass is not None and self._over is None:
-            self._over = (time.monotonic() + LATE_S, cause, summary)
+        """The guard has ended the correction."""
+        if self._running is not None:
+            self._ended.append(_Ended(self._running, time.monotonic() + LATE_S, cause, summary))
+            self._running = None
 
     def digest(self) -> list[Notice]:
-        """Go on with what was taken (in a thread); return what a pass that is over has shown."""
-        running, over = self._pass, self._over
-        if running is None:
-            return []
+        """Go on with what was taken (in a thread); return what the passes that are over have shown."""
+        hearing = [each.running for each in tuple(self._ended)]
+        if self._running is not None:
+            hearing.append(self._running)
         while self._taken:
-            running.take(self._taken.popleft())
-        if over is None or time.monotonic() < over[0]:
-            return []
-        self._pass = self._over = None
-        measured = running.measured()
-        if measured is None:
-            return []
-        _, cause, summary = over
+            samples = self._taken.popleft()
+            for each in hearing:
+                each.take(samples)
+        notices = []
+        while self._ended and time.monotonic() >= self._ended[0].due_s:
+            ended = self._ended.popleft()
+            measured = ended.running.measured()
+            notices += [] if measured is None else [self._tell(ended, measured)]
+        return notices
+
+    def _tell(self, ended: _Ended, measured: Mapping[str, Any]) -> Notice:
+        summary = ended.summary
         digest = str(summary["program_digest"])
         self._count[digest] += 1
         told = {
             "program": summary["program"],
             "program_digest": digest,
             "pass": self._count[digest],
-            "ended_by": cause,
+            "ended_by": ended.cause,
             **measured,
             "predicted": {key: summary["after"].get(key) for key in ("rms_um", "uncertainty_um")},
             "predicted_without": {"rms_um": summary["before"]["rms_um"]},
         }
         text = _text(told)
         self.told.append({**told, "text": text})
-        return [_notice(told, text)]
+        return _notice(told, text)
 
 
 class Pass:
