@@ -52,6 +52,8 @@ class AxisSettings:
     speed can change in one cycle; 0: not judged.
     ``travel`` are the drive's software limits (0x607D), None: it has none.
     ``heartbeat_timeout_s`` 0: the drive has no heartbeat, and its PDOs alone show that it is Operational.
+    ``record`` is the fingerprint of the drive as it was commissioned, empty: it was not; ``record_void`` says that
+    something against it was seen since.
     """
 
     name: str
@@ -69,11 +71,14 @@ class AxisSettings:
     speed_count: float = 0.0
     speed_step: float = 0.0
     travel: tuple[int, int] | None = None
+    record: str = ""
+    record_void: bool = False
 
     @property
-    def reads_back(self) -> bool:
-        """Whether a TPDO shows the offset in force."""
-        return any(entry[0] == 0x60B0 for pdo in self.tpdos for entry in pdo.layout)
+    def read_back_every(self) -> int:
+        """With every how many SYNC a TPDO shows the offset in force; 0: none does."""
+        shown = [pdo for pdo in self.tpdos if any(entry[:2] == (0x60B0, 0) for entry in pdo.layout)]
+        return max(1, shown[0].every_sync) if shown else 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,5 +213,7 @@ def _check_axis(axis: AxisSettings) -> None:
         )
     if not 0.0 <= axis.speed_step < 2**31 or not 0.0 <= axis.speed_count < 2**31:
         raise ValueError(f"axis {axis.name}: speed_count or speed_step is out of range")
+    if type(axis.record) is not str or type(axis.record_void) is not bool:
+        raise ValueError(f"axis {axis.name}: record or record_void is no text and no truth value")
     if type(axis.setpoint_delay_cycles) is not int or not 0 <= axis.setpoint_delay_cycles <= 16:
         raise ValueError(f"axis {axis.name}: setpoint_delay_cycles is out of range")
