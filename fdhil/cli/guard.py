@@ -126,6 +126,8 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
         offset=_pdo(offset, node_id),
         tpdos=tuple(_pdo(spec, node_id) for spec in profile.tpdos if spec.valid),
         increments_per_mm=axis.scaling.increments_per_mm,
+        max_speed_mm_s=axis.drive.speed_limit_mm_s or axis.rapid_speed_mm_s,
+        max_acceleration_mm_s2=axis.max_acceleration_mm_s2,
         sign=axis.drive.sign,
         limits=limits_of(axis, period_s),
         window=round(axis.drive.following_error_window_mm * axis.scaling.increments_per_mm),

@@ -136,6 +136,7 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     # the guard itself
     "NotOff": (_N, "a correction is already armed or ramping", "disarm it first"),
     "NotSettled": (_N, "the interlocks were not all good for 100 SYNC", "wait a moment and arm again"),
+    "GuardBusy": (_N, "a request of this connection still waits", "wait for its answer, then ask again"),
     "MainLost": (_R, "the daemon is gone or does not answer", "restart the daemon, then arm again"),
     "Disarmed": (_R, "disarmed", "arm when it is wanted again"),
     "Stopped": (_R, "the guard was told to stop", "start it again when it is wanted"),

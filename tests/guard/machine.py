@@ -37,6 +37,8 @@ def axis_settings(name: str, node_id: int, limits: Limits = LIMITS) -> AxisSetti
             Pdo(0x480 + node_id, ((0x60FD, 0, 32, False), (0x6061, 0, 8, True), (0x6077, 0, 16, True)), 10),
         ),
         increments_per_mm=3276.8,
+        max_speed_mm_s=500.0,
+        max_acceleration_mm_s2=4000.0,
         sign=1,
         limits=limits,
         window=32768,
