@@ -20,6 +20,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "status": ("fdhil.cli.service:status", "Ask the running daemon how it is."),
     "arm": ("fdhil.cli.service:arm", "Arm the correction of one program."),
     "disarm": ("fdhil.cli.service:disarm", "Ramp the correction to zero and disarm."),
+    "adopt": ("fdhil.cli.service:adopt", "Ramp to zero what an earlier correction may have left in the drives."),
     "sim": ("fdhil.cli.sim:sim", "Run the simulated machine: drives, sensors, NC."),
     "record": ("fdhil.cli.record:record", "Record the demand of an air cut from the bus, by listening."),
     "identify": ("fdhil.cli.identify:identify", "Identify a drive from recordings."),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hmac
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -30,6 +31,7 @@ from fdhil.daemon.checking import Check
 from fdhil.daemon.control import Answer, refusal
 from fdhil.daemon.guard_link import REST, GuardLink
 from fdhil.daemon.keeping import Keeper, boot_id
+from fdhil.daemon.standing import ADOPT, START_AND_ADOPT, Standing, verdict
 from fdhil.daemon.streamed import Checked
 from fdhil.daemon.supply import Supply
 from fdhil.daemon.token import ensure_token
@@ -41,7 +43,6 @@ STREAM_S = 0.05
 ALIVE_S = 0.1  # the guard calls us lost after 0.5 s
 REFRESH_S = 0.5
 LANDING_S = 1.0  # what ended a moment ago is off within it: ramp, zeros and their read-back take 0.3 s at most
-STAND_DOWN_S = 3.0  # the longest ramp to zero takes 0.12 s
 NO_GUARD = "start fdhil-guard with this machine's config"
 
 Tell = Callable[[Sequence[Notice]], None]
@@ -65,6 +66,7 @@ class Armory:
         self._check = Check(config)
         self._supply: Supply | None = None
         self._given_up = False
+        self._disarming: asyncio.Future[Answer] | None = None
         self.guard = GuardLink(run_directory)
 
     def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
@@ -137,6 +139,10 @@ class Armory:
             if not await self._landed():
                 text = f"what was armed before is still on, in state {self.guard.state}"
                 return refusal("NotOff", text, "run fdhil disarm or wait until it has ended, then arm again")
+            if self.guard.state in ("FROZEN", "lost"):
+                return refusal(
+                    "OffsetStands", f"the guard is {self.guard.state}: {self.guard.standing}", self._way_out()
+                )
             if feeding:
                 return await self._feed_forward(token)
             return await self._arm(Path(str(program)), method, token, request.get("whole") is True)
@@ -151,6 +157,10 @@ class Armory:
         if self.guard.state in REST:
             self._release()
         return self.guard.state in REST
+
+    def _way_out(self) -> str:
+        """Return what to do about what may still be applied before anything is armed."""
+        return f"{ADOPT if self.guard.connected else START_AND_ADOPT}, then arm again"
 
     def _release(self) -> None:
         self._armed = self._supply = None
@@ -177,7 +187,7 @@ class Armory:
         try:
             answer = await asyncio.to_thread(ask, prepared, token)
         except DeviceError as error:
-            return refusal("GuardAbsent", str(error), NO_GUARD)
+            return self._without_guard(error)
         if not answer["ok"]:
             return dict(answer) | {"planned": summary}
         self._armed = (prepared, summary)
@@ -223,15 +233,33 @@ class Armory:
         return self._supply is None and self._check.abandon()
 
     async def disarm(self) -> Answer:
-        """Have the guard ramp to zero; a program that is still being planned or checked is not armed."""
+        """Have the guard ramp to zero: ok only when it is reached. What is being planned or checked is not armed."""
         self._supply = None  # no more rows, no more words about them
         abandoned = self.abandon()
+        if self._disarming is None:  # who asks again meanwhile waits for the same ramp
+            self._disarming = asyncio.ensure_future(self._to_zero())
+            self._disarming.add_done_callback(self._disarmed)
+        answer = await asyncio.shield(self._disarming)
+        return {**answer, "text": f"{answer['text']}; the check was abandoned"} if abandoned else answer
+
+    def _disarmed(self, _: asyncio.Future[Answer]) -> None:
+        self._disarming = None
+
+    async def _to_zero(self) -> Answer:
         try:
             answer = await asyncio.to_thread(self.guard.disarm)
         except DeviceError as error:
+            return self._without_guard(error)
+        if not answer["ok"]:
+            return answer
+        return verdict(self.guard.status)
+
+    def _without_guard(self, error: DeviceError) -> Answer:
+        """Return the refusal without a guard; what the last one may have left is told."""
+        stands = self.guard.standing
+        if stands.nothing:
             return refusal("GuardAbsent", str(error), NO_GUARD)
-        text = f"guard: {self.guard.state}" + ("; the check was abandoned" if abandoned else "")
-        return dict(answer) | ({"text": text} if answer["ok"] else {})
+        return refusal("OffsetStands", f"{error}; {stands}", START_AND_ADOPT)
 
     async def attend(self, tell: Tell) -> None:
         """Tell the guard that this loop turns and what is still vouched for, and the log what the guard does.
@@ -271,22 +299,16 @@ class Armory:
             facts = standing_facts(armed.axes, self._config, self._known(), armed.gain_um)
         return facts | {"journal_writable": self._keeper.fault is None}
 
-    async def stand_down(self) -> str:
-        """Have a running correction ramped to zero and wait for it; return the state that was reached."""
+    async def stand_down(self) -> Standing:
+        """Have a running correction ramped to zero and wait for it; return what may still be applied."""
         self._supply = None
         self.abandon()
-        if self.guard.connected and self.guard.state not in REST:
-            await self.disarm()
-            for _ in range(round(STAND_DOWN_S / ALIVE_S)):
-                if self.guard.state in REST:
-                    break
-                self.guard.say_alive(None)
-                await asyncio.sleep(ALIVE_S)
-                await asyncio.to_thread(self.guard.refresh)
-        state = self.guard.state
+        if self.guard.connected:
+            with contextlib.suppress(DeviceError):
+                await asyncio.to_thread(self.guard.disarm if self.guard.state not in REST else self.guard.look)
         await self._check.close()
         await asyncio.to_thread(self.guard.close)
-        return state
+        return self.guard.standing
 
 
 def _refused(refused: Refused) -> Answer:

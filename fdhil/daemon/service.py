@@ -23,6 +23,7 @@ from fdhil.daemon.guard_link import TRIPPED
 from fdhil.daemon.keeping import Keeper
 from fdhil.daemon.lock import sole_owner
 from fdhil.daemon.notify import notify
+from fdhil.daemon.standing import ADOPT, START_AND_ADOPT, Standing
 from fdhil.daemon.status import Watch
 from fdhil.daemon.warm import warm
 from fdhil.errors import DeviceError, FdhilError
@@ -79,22 +80,34 @@ class Service:
         self._source: Source | None = None
         self._frames_seen = -1
 
-    async def run(self) -> None:
-        """Serve until SIGTERM or SIGINT. BusLocked when another daemon serves this config."""
+    async def run(self) -> Standing:
+        """Serve until SIGTERM or SIGINT; return what may still be applied. BusLocked when another daemon serves it."""
         loop = asyncio.get_running_loop()
         with sole_owner(self._run_directory):
             for number in (signal.SIGTERM, signal.SIGINT):
                 loop.add_signal_handler(number, self._stop.set)
-            state = "absent"
             try:
                 await self._serve()
             finally:
                 notify("STOPPING=1")
-                state = await self._armory.stand_down()
+                stands = await self._armory.stand_down()
                 await asyncio.to_thread(self._keeper.close)
                 for number in (signal.SIGTERM, signal.SIGINT):
                     loop.remove_signal_handler(number)
-        self._log("stopped, " + ("offset 0" if state in {"OFF", "absent"} else f"the guard is in state {state}"))
+                self._say_stopped(stands)
+        return stands
+
+    def _say_stopped(self, stands: Standing) -> None:
+        if stands.nothing:
+            self._log(f"stopped, {stands}")
+        else:
+            advice = START_AND_ADOPT if self._armory.guard.state == "lost" else ADOPT
+            self._log(f"stopped, {stands}; {advice}", "MAJOR")
+
+    @property
+    def standing(self) -> Standing:
+        """What may still be applied, as far as the daemon knows."""
+        return self._armory.guard.standing
 
     async def _serve(self) -> None:
         self._say(await asyncio.to_thread(self._keeper.open))
@@ -275,12 +288,13 @@ class Service:
             status["axes"][axis]["slideway_c"] = celsius
         return {
             "ok": True,
-            "state": guard.state if guard.connected else "OFF(SHADOW)",
+            "state": "OFF(SHADOW)" if guard.state == "absent" else guard.state,
             **status,
             "frames": {"received": counters.get("frames", 0), "lost": counters.get("lost", 0)},
             "counters": counters,
             "dropped": self._dropped,
             "guard": dict(guard.status),
+            "may_stand": {"nothing": guard.standing.nothing, "text": str(guard.standing)},
             "armed": self._armory.armed,
             "checking": self._armory.checking,
             "store": store,
@@ -294,17 +308,21 @@ def _told(answer: Answer) -> Notice:
     return Notice("ArmRefused", "minor", f"{answer['code']}: {answer['text']}")
 
 
-def run(config: MachineConfig, open_source: OpenSource, method: str | None = None) -> None:
-    """Run the daemon until it is told to stop. FdhilError when it cannot start or meets what it must not survive."""
+def run(config: MachineConfig, open_source: OpenSource, method: str | None = None) -> Standing:
+    """Run the daemon until it is told to stop; return what may still be applied.
+
+    FdhilError when it cannot start or meets what it must not survive.
+    """
+    service = Service(config, open_source, method)
     try:
-        asyncio.run(Service(config, open_source, method).run())
+        return asyncio.run(service.run())
     except ExceptionGroup as group:
         first = _first(group)
         if isinstance(first, FdhilError):
             raise first from None
         for line in "".join(traceback.format_exception(group)).splitlines():
             journal.write_line(line, "MAJOR")
-        text = f"InternalError: {first!r} ended the daemon and nothing is sent any more; report the lines above"
+        text = f"InternalError: {first!r} ended the daemon; {service.standing}; report the lines above"
         raise InternalError(text) from None
 
 

@@ -46,6 +46,8 @@ class Alarm:
     @property
     def action(self) -> str:
         """What the operator does next."""
+        if self.code == "NotOff" and self.detail == "FROZEN":
+            return "hold the feed, then run fdhil adopt"
         return CATALOGUE[self.code][2]
 
     def sentence(self, off: bool = False) -> str:
@@ -114,7 +116,7 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     "OffsetEnergy": (_R, "the offsets travel more than allowed in one second", "plan a smoother correction"),
     "SoftwareLimit": (_N, "the path is too near to a software limit", "lower max_offset_um, or move the work"),
     "CorruptFile": (_N, "the correction table cannot be read", "plan it again"),
-    "TableBusy": (_N, "a whole table cannot be changed while a correction runs", "disarm first"),
+    "TableBusy": (_N, "a whole table cannot be changed while a correction runs", "disarm, or adopt first"),
     "ProgramMismatch": (_N, "no table of this program is loaded", "plan and load the correction of this program"),
     # what the daemon vouches for
     "NotCommissioned": (_N, "there is no valid commissioning record", "run fdhil commission"),
@@ -134,7 +136,7 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     "LimitBeyondWindow": (_N, "the largest offset exceeds a quarter of the window", "lower max_offset_um"),
     "AuthRequired": (_N, "the operator's token is missing or wrong", "use the token of the run directory"),
     # the guard itself
-    "NotOff": (_N, "a correction is already armed or ramping", "disarm it first"),
+    "NotOff": (_N, "what was armed before has not ended", "disarm it first"),
     "NotSettled": (_N, "the interlocks were not all good for 100 SYNC", "wait a moment and arm again"),
     "GuardBusy": (_N, "a request of this connection still waits", "wait for its answer, then ask again"),
     "MainLost": (_R, "the daemon is gone or does not answer", "restart the daemon, then arm again"),

@@ -11,7 +11,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-FINE: Mapping[str, Any] = {"state": "ACTIVE", "cause": None, "ok": True}
+ZERO: Mapping[str, Any] = {"X": 0.0, "Y": 0.0}
+FINE: Mapping[str, Any] = {"state": "ACTIVE", "cause": None, "ok": True, "may_stand_um": ZERO}
 Says = Callable[[str], Mapping[str, Any] | None]
 
 
@@ -46,7 +47,7 @@ class Guard:
             self._begin(self._serve, peer)
 
     def _serve(self, peer: socket.socket) -> None:
-        with peer:
+        with contextlib.suppress(ConnectionError), peer:
             inbox = b""
             while chunk := self._receive(peer):
                 *lines, inbox = (inbox + chunk).split(b"\n")

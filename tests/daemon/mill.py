@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.guard import table
-from tests.daemon.guard_peer import Guard
+from tests.daemon.guard_peer import ZERO, Guard
 
 RESERVE_ROWS = 1000
 Answer = Mapping[str, Any]
@@ -32,7 +32,8 @@ class Mill:
             self.state, self.cause = "OFF", "Disarmed"
         cause = {"code": self.cause, "text": "", "axis": ""} if self.cause else None
         rows = [0, len(self.rows)] if self.rows else None
-        return {"ok": True, "state": self.state, "row": self.row or None, "rows": rows, "cause": cause}
+        known = {"cause": cause, "may_stand_um": ZERO}
+        return {"ok": True, "state": self.state, "row": self.row or None, "rows": rows, **known}
 
     def _load(self) -> Answer:
         _, path = table.decode(table.read_sealed(self._peer.descriptor))

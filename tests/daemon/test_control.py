@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import socket
 import threading
 from collections.abc import Iterator, Mapping
@@ -12,7 +13,7 @@ from typing import Any
 import pytest
 
 from fdhil.daemon import journal
-from fdhil.daemon.control import ControlServer, ask
+from fdhil.daemon.control import MAX_CLIENTS, ControlServer, ask
 from fdhil.daemon.journal import BURST, FloodGate, line_of, printable
 from fdhil.daemon.lock import BusLocked, sole_owner
 from fdhil.daemon.notify import notify
@@ -80,6 +81,46 @@ async def test_what_takes_its_time_tells_its_progress_and_ends_when_nobody_waits
         with pytest.raises(DeviceTimeout):
             await asyncio.to_thread(ask, tmp_path / "c", {"request": "wait", "progress": True}, 0.01)
         await asyncio.wait_for(abandoned.wait(), 30.0)
+
+
+async def test_idle_connections_make_room_and_those_that_wait_leave_some_for_disarm(tmp_path: Path) -> None:
+    """Three times as many connections as there are places, idle ones and such that wait for an answer."""
+    free, waiting = asyncio.Event(), asyncio.Semaphore(0)
+
+    async def handle(request: Mapping[str, Any]) -> Mapping[str, Any]:
+        if request["request"] == "arm":
+            waiting.release()
+            await free.wait()
+        return {"ok": True}
+
+    path = tmp_path / "c"
+    idle: list[socket.socket] = []
+    async with ControlServer(handle, lambda: None, free.set).serving(path):
+        for _ in range(3 * MAX_CLIENTS):
+            idle.append(socket.socket(socket.AF_UNIX))
+            idle[-1].connect(str(path))
+        assert await asyncio.to_thread(ask, path, {"request": "disarm"}) == {"ok": True}
+        assert await asyncio.to_thread(idle[0].recv, 1) == b""  # the longest idle made room
+        idle[-1].setblocking(False)
+        with pytest.raises(BlockingIOError):
+            idle[-1].recv(1)
+        arming = []
+        for _ in range(MAX_CLIENTS + 1):
+            reader, writer = await asyncio.open_unix_connection(str(path))
+            writer.write(b'{"request": "arm"}\n')
+            arming.append((reader, writer))
+        for _ in range(MAX_CLIENTS):
+            await asyncio.wait_for(waiting.acquire(), 60.0)
+        assert b"Busy" in await asyncio.wait_for(arming[-1][0].readline(), 60.0)
+        for request in ("disarm", "status", "disarm", "status", "disarm"):
+            assert await asyncio.to_thread(ask, path, {"request": request}) == {"ok": True}
+        free.set()
+        for reader, writer in arming[:-1]:
+            assert json.loads(await reader.readline()) == {"ok": True}
+            writer.close()
+        arming[-1][1].close()
+    for each in idle:
+        each.close()
 
 
 @pytest.mark.parametrize("abstract", [False, True])
