@@ -241,7 +241,7 @@ def _commission_axis(machine: MachineConfig, axis: str, yes: bool, quiet: bool) 
 
     with lock_bus(machine.bus[machine.axis[axis].drive.bus]):  # the guard reads the record when it starts
         record = commissioning.commission(machine, axis, _guide(machine, axis, yes, quiet))
-    path = commissioning.save_record(record, machine.store.directory)
+    path = commissioning.save_record(record, machine.store.directory, machine.store.commissioning_key)
     if not quiet:
         click.echo(
             f"axis {axis} is commissioned: moved {record.sign_test_um:+.1f} um, "

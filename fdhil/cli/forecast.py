@@ -7,6 +7,7 @@ from __future__ import annotations
 import datetime
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -41,7 +42,7 @@ class Past:
         """Read the machine's history; StoreError when there is none."""
         from fdhil.store.history import History
 
-        with History.read(config.store.directory) as history:
+        with History.read(config.store.directory, partial(click.echo, err=True)) as history:
             revisions = {axis: history.revisions(axis, RECENT) for axis in config.axis}
             return Past(revisions, history.comparisons(program_digest, RECENT))
 

@@ -187,7 +187,7 @@ def _record(machine: MachineConfig, axis: str) -> CommissioningRecord | None:
     from fdhil.drivers.commissioning_record import load_record  # late, as above
 
     try:
-        return load_record(machine.store.directory, axis)
+        return load_record(machine.store.directory, axis, machine.store.commissioning_key)
     except StoreError:
         return None
 

@@ -213,7 +213,8 @@ def inputs(
     elif from_history:
         from fdhil.store.history import latest_parameters
 
-        given, source = latest_parameters(config.store.directory), str(config.store.directory)
+        given = latest_parameters(config.store.directory, functools.partial(click.echo, err=True))
+        source = str(config.store.directory)
     reference = load_trajectory(program, config)
     return reference, model_files.models_for(reference, given, config, source), config
 

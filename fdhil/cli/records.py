@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -139,7 +140,7 @@ def _history(machine: machine_config.MachineConfig, axis: str | None) -> tuple[l
     from fdhil.cli.history_trends import health
     from fdhil.store.history import History
 
-    with History.read(machine.store.directory) as stored:
+    with History.read(machine.store.directory, partial(click.echo, err=True)) as stored:
         return [_row(revision) for revision in stored.revisions(axis)], health(stored, machine, axis)
 
 
