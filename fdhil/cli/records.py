@@ -11,6 +11,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil import tables
+from fdhil.cli.options import OutputFile
 from fdhil.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -105,7 +106,9 @@ def _config_of(window: Window) -> machine_config.MachineConfig:
 @click.command()
 @click.argument("config", type=FILE)
 @click.option("--axis", help="One axis only.")
-@click.option("--plot", type=FILE, help="Also write the parameters over time and temperature as a PNG.")
+@click.option(
+    "--plot", type=OutputFile(".png", ".svg", ".pdf"), help="Also draw the parameters over time and temperature."
+)
 @AS_JSON
 def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) -> None:
     """Show how the identified parameters of CONFIG's machine moved: revisions, slopes, changes, maintenance dates."""
@@ -162,7 +165,7 @@ def _row(revision: Revision) -> dict[str, Any]:
 
 @click.command()
 @click.argument("recording", type=FILE)
-@click.option("--out", required=True, type=FILE, help="The CSV file to write.")
+@click.option("--out", required=True, type=OutputFile(), help="The CSV file to write.")
 def export(recording: Path, out: Path) -> None:
     """Write a stored window (.parquet) as CSV of the recording format."""
     from fdhil.store.export import export_csv
@@ -176,7 +179,7 @@ def export(recording: Path, out: Path) -> None:
 
 @click.command()
 @click.argument("config", type=FILE)
-@click.option("--out", required=True, type=FILE, help="The HTML file to write.")
+@click.option("--out", required=True, type=OutputFile(), help="The HTML file to write.")
 def report(config: Path, out: Path) -> None:
     """Write an HTML report of the stored history of CONFIG's machine."""
     machine = machine_config.load(config)
