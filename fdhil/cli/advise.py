@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fdhil.cli.compiling import forewarn
 from fdhil.cli.options import OutputFile, Positive
 from fdhil.cli.prediction import FILE, inputs
 
@@ -61,6 +62,7 @@ def advise(
     from fdhil.prediction import advise as advising
 
     corrects = all(config.axis[axis].correction is not None for axis in reference.axes)
+    forewarn("predict", *(["correct"] if corrects else []))
     sure, hopeful = _sources(program, reference, models, config, tolerance_um)
     sure, hopeful = _telling(sure), hopeful and _telling(hopeful)
     judge = (lambda slower: _corrected(slower, models, config)) if corrects else None

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from fdhil.cli.compiling import forewarn
 from fdhil.cli.failing import error_document
 from fdhil.config import Identification
 from fdhil.errors import FdhilError
@@ -59,6 +60,7 @@ def analyse_files(
         for path in paths:
             yield analyse_file(path, settings, rapid_speeds_rad_s, progress)
         return
+    forewarn("identify")
     work = partial(analyse_file, settings=settings, rapid_speeds_rad_s=rapid_speeds_rad_s)
     with _processes() as executor:
         for result in executor.map(work, paths, chunksize=CHUNK):
@@ -76,6 +78,8 @@ def analyse_file(
         progress(1.0)
         reason = Reason(type(error).__name__, str(error))
         return FileResult(str(path), None, (), None, Verdict(False, None, (reason,)), error_document(error))
+    if multiprocessing.parent_process() is None:
+        forewarn("identify")
     outcomes = []
     windows = find_windows(recording, rapid_speeds_rad_s.get(recording.axis))
     for outcome in _outcomes(windows, settings):

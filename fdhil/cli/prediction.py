@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import tables
+from fdhil.cli.compiling import forewarn
 from fdhil.cli.options import OutputFile, Positive
 from fdhil.cli.parameter_view import INTERVAL_95, MEANING
 
@@ -91,6 +92,7 @@ def predict(asked: Asked, sensitivity: bool, tolerance_um: float | None, since: 
     reference, models, config = inputs(asked.program, asked.config_path, asked.model_path, asked.from_history)
     from fdhil import prediction
 
+    forewarn("predict")
     predicted = prediction.predict(reference, models, config)
     columns = _prediction_columns(predicted)
     document = {"schema": "fdhil-predict-1", "program": str(asked.program), **_prediction_document(predicted)}
@@ -167,6 +169,7 @@ def correct(asked: Asked, method: str | None) -> int:
     reference, models, config = inputs(asked.program, asked.config_path, asked.model_path, asked.from_history)
     from fdhil import correction
 
+    forewarn("predict", "correct")
     planned = correction.plan(reference, models, config, method)
     if asked.out is not None:
         _write(asked.out, _correction_columns(planned))

@@ -11,6 +11,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil import tables
+from fdhil.cli.compiling import forewarn
 from fdhil.cli.options import OutputFile
 from fdhil.errors import RecordingError
 
@@ -69,6 +70,7 @@ def _replayed(
                 settings = machine or _config_of(window)
                 if window.axis not in settings.axis:
                     raise RecordingError(f"{path} is of axis {window.axis}, which --config does not have; use its own")
+                forewarn("identify")
                 pipelines[window.axis] = AxisPipeline(window.axis, settings, method, with_skill=machine is not None)
             outcomes += pipelines[window.axis].feed(window)
         replayed.append((path, outcomes))

@@ -30,9 +30,11 @@ def run(config: Path, method: str | None) -> None:
     Writes one line per outcome to stderr. Stops on SIGTERM or Ctrl-C, with the correction ramped to zero first.
     """
     machine = machine_config.load(config)
+    from fdhil.cli.compiling import forewarn
     from fdhil.daemon import service  # late: --help imports nothing heavy
     from fdhil.drivers import open_machine
 
+    forewarn("identify", "predict", "correct")
     service.run(machine, open_machine, method)
 
 
