@@ -50,7 +50,7 @@ FEEDFORWARD: Mapping[bool | None, str] = {
 
 @click.command()
 @CONFIG
-@click.option("--eds", "places", multiple=True, type=click.Path(exists=True, path_type=Path),
+@click.option("--eds", "places", multiple=True, type=click.Path(path_type=Path),
               help="EDS or DCF file, or a folder of them; left out: the folder of CONFIG.")  # fmt: skip
 @AS_JSON
 def scan(config: Path, places: tuple[Path, ...], as_json: bool) -> None:

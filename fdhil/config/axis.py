@@ -67,6 +67,11 @@ class Drive(Section):
     following_error_window_mm: Positive = Field(10.0, description="0x6065: beyond it the drive faults")
     speed_limit_mm_s: Positive | None = Field(None, description="the axis maximum; left out: the rapid speed")
 
+    @field_validator("profile")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        return listed(name, tables.DRIVE_PROFILES)
+
 
 class Voltage(Section):
     """[axis.X.voltage]: where the motor's terminal voltage comes from."""
