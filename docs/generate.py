@@ -68,7 +68,7 @@ def template() -> str:
     """Return the commented machine configuration: required keys set, everything else commented out."""
     lines = [
         "# A machine for fdhil. The lines without a # in front are required: put your machine's values there.",
-        "# A line that begins with # and no space is a setting at its default, or an example where there is no default.",
+        "# A line that begins with # and no space is a setting at its default, or an example where it has none.",
         "# To change it, take the # away. The comment above each line says what it is.",
         "# A key that fdhil does not know is refused, with a suggestion.",
     ]

@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from collections.abc import Callable
+import tomllib
 from pathlib import Path
 
 import pytest
 
-from fdhil import config
+from fdhil import config, tables
 
 ROOT = Path(__file__).parents[1]
 TEMPLATE = ROOT / "configs" / "machine-template.toml"
@@ -96,3 +96,22 @@ def test_every_shipped_config_is_valid(path: Path) -> None:
 def test_every_link_between_documents_leads_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text("utf-8")):
         assert (page.parent / target).exists(), f"{page}: {target}"
+
+
+@pytest.mark.parametrize("table", [name for name in vars(tables) if name.isupper()])
+def test_being_listed_is_being_tested(table: str) -> None:
+    """Each table has a suite that runs over all its entries; a new entry is in it by being listed."""
+    runs_over_all = re.compile(rf"(parametrize\(.*|params=list\(|for name in )tables\.{table}\b")
+    assert any(runs_over_all.search(path.read_text("utf-8")) for path in (ROOT / "tests").glob("**/test_*.py"))
+
+
+def test_the_papers_that_a_stranger_looks_for_are_there() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+    shipped = project["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
+    assert [name for name in shipped if not (ROOT / name[1:]).exists()] == []
+    assert {"/LICENSE", "/SECURITY.md", "/CITATION.cff", "/tests", "/docs", "/systemd"} <= set(shipped)
+    assert project["project"]["license-files"] == ["LICENSE"]
+    assert "MIT License" in (ROOT / "LICENSE").read_text("utf-8")
+    citation = (ROOT / "CITATION.cff").read_text("utf-8")
+    assert f"\nversion: {project['project']['version']}\n" in citation
+    assert "\ncff-version: 1.2.0\n" in f"\n{citation}"

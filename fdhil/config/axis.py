@@ -92,7 +92,7 @@ class Thermometer(Section):
     host: str = Field("127.0.0.1", description="address of the thermometer")
     port: int = Field(502, ge=1, le=65535, description="TCP port")
     unit: int = Field(1, ge=0, le=247, description="unit identifier")
-    address: int = Field(8, ge=0, le=65534, description="the first of its two input registers: a float32, high word first")
+    address: int = Field(8, ge=0, le=65534, description="first of its two input registers (float32, high word first)")
     period_s: Positive = Field(1.0, le=3600, description="how often it is asked")
     timeout_s: Positive = Field(0.5, description="how long an answer may take")
 
