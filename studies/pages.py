@@ -42,19 +42,18 @@ def conduct(
         for key, value in vars(options).items()
         if key not in ("processes", "out") and value != parser.get_default(key)
     ]
-    run = provenance(f"python -m studies.{name}{''.join(changed)}", seeds(options))
+    run = provenance(f"python -m studies.{name}{''.join(changed)}") | {"seeds": seeds(options)}
     document = {"study": name, "run": run, "figures": plain(measure(options))}
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / f"{name}.json").write_text(json.dumps(document, separators=(",", ":")) + "\n", "utf-8")
     print(write_page(options.out / f"{name}.json"))
 
 
-def provenance(command: str, seeds: str) -> dict[str, str]:
-    """Return what a reader needs to measure the same again: command, seeds, commit, versions; and the day."""
+def provenance(command: str) -> dict[str, str]:
+    """Return what a reader needs to measure the same again: command, commit, versions; and the day."""
     told = {"Python": platform.python_version()} | {name: version(name) for name in ("numpy", "scipy", "numba")}
     return {
         "command": command,
-        "seeds": seeds,
         "commit": commit(),
         "date": f"{datetime.now(UTC):%Y-%m-%d}",
         "versions": ", ".join(f"{name} {number}" for name, number in told.items()),
