@@ -16,6 +16,7 @@ from fdhil.sim.modbus_sensor import SensorFaults
 from fdhil.sim.panel import Panel, PanelError
 from fdhil.sim.sensors import DriveFaults
 from fdhil.sim.service import Pace
+from tests.guard.machine import settings
 from tests.sim.bench_twin import PERIOD_S, TwinInHand, corner, trajectory, twin_config
 
 PER_MM = 65536 / 20
