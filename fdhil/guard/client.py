@@ -19,7 +19,7 @@ from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
 from fdhil.guard import table
 from fdhil.guard.control import SOCKET_NAME
 
-ANSWER_S = 8.0  # the guard answers a request at a SYNC, or when it has missed it for up to 5 s
+ANSWER_S = 13.0  # the guard answers a request at a SYNC, or when it has missed it for up to 10 s
 
 
 class GuardLost(DeviceError):

@@ -115,16 +115,16 @@ class Settings:
 
     @property
     def silence_s(self) -> float:
-        """How long the bus may be without SYNC: four periods; 5 s of wall clock where time is the SYNC count.
+        """How long the bus may be without SYNC: four periods; 10 s of wall clock where time is the SYNC count.
 
         A simulated machine stands still between two SYNCs, and its slowest listener may hold it up.
         """
-        return 5.0 if self.clock == "sync" else 4 * self.sync_period_s
+        return 10.0 if self.clock == "sync" else 4 * self.sync_period_s
 
     @property
     def daemon_lost_s(self) -> float:
         """How long the daemon may say nothing while it has something armed."""
-        return 5.0 if self.clock == "sync" else 0.5
+        return 10.0 if self.clock == "sync" else 0.5
 
     @property
     def heartbeat_cycles(self) -> int:

@@ -278,6 +278,29 @@ def test_many_missed_cycles_ramp_down(cutting: Bench) -> None:
     assert cutting.alarms[-1].code == "LoopOverrun"
 
 
+def test_a_simulated_machine_that_runs_ahead_of_a_guard_without_offsets_is_no_overrun() -> None:
+    """By the host's clock the guard may sleep: the machine waits for its frames as soon as it sends offsets."""
+    machine = bench()
+    machine.settle()
+    for _ in range(300):
+        machine.sync(late=True)
+    assert (machine.state.missed_run, machine.state.good_for > 300) == (0, True)
+    machine.arm()
+    for _ in range(300):
+        machine.sync(late=True)
+    machine.run(30)
+    machine.play()
+    machine.until(Mode.ACTIVE)
+
+
+def test_on_a_real_machine_a_late_loop_is_told_before_it_is_armed() -> None:
+    machine = bench(clock="monotonic")
+    machine.settle()
+    for _ in range(11):
+        machine.sync(late=True)
+    assert (machine.state.missed_run, machine.state.good_for) == (11, 0)
+
+
 @pytest.mark.parametrize(("failures", "mode"), [(1, Mode.ACTIVE), (3, Mode.OFF), (6, Mode.FROZEN)])
 def test_full_transmit_queue(cutting: Bench, failures: int, mode: Mode) -> None:
     for _ in range(failures):
