@@ -316,16 +316,3 @@ def _arrived(state: State, path: Path | None) -> State:
     if sent > ZEROS_UNCONFIRMED:
         return unread(state)._replace(mode=Mode.FROZEN, cause=Alarm("EchoMismatch", detail="no zero was read back"))
     return state._replace(zeros_sent=sent)
-
-
-def may_stand(state: State, settings: Settings) -> tuple[int | None, ...]:
-    """Return what may still be applied in the drives, in increments per axis; None: unknown."""
-    return tuple([_may_stand(state, s, axis) for s, axis in zip(settings.axes, state.axes, strict=True)])
-
-
-def _may_stand(state: State, setting: AxisSettings, axis: AxisState) -> int | None:
-    if state.mode is Mode.OFF:
-        return axis.read_back or 0
-    if state.mode is Mode.FROZEN:
-        return axis.read_back if setting.reads_back else axis.sent[0]
-    return axis.offset

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fdhil.guard.core import may_stand
+from fdhil.guard.adoption import may_stand
 from fdhil.guard.feedforward import FeedMode
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.path import Path
