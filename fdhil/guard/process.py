@@ -180,6 +180,7 @@ class Guard:
         alive, alarms = self._alive(client if arming else self._owner, now_s), self._listener.alarms()
         told = (late, self._transmitted, alive, alarms, self._withdrawn, self._path, request)
         inputs = Inputs(seen.sync, seen.axes, seen.bus, *told)
+        before = self.state.axes
         self.state, output = core.step(self.state, inputs, self.settings)
         self._transmitted = self._send(output)
         self._inputs, self._stepped_s = inputs, now_s
@@ -193,6 +194,9 @@ class Guard:
             self._tell(*output.transition)
         if output.feed_transition is not None:
             self._tell_feed(*output.feed_transition)
+        for own, was, axis in zip(self.settings.axes, before, self.state.axes, strict=True):
+            if axis.record_void and not was.record_void:
+                self._journal.write("record_void", axis=own.name, text=Alarm("RecordVoid", own.name).sentence())
 
     def _alive(self, owner: Client | None, now_s: float) -> bool:
         """Whether the daemon that armed is connected and says so often enough."""
@@ -255,10 +259,10 @@ class Guard:
                 self._withdraw(client, document)
             elif kind == "table":
                 self._begin_loading(client, document)
-            elif kind in ("arm", "feedforward", "disarm", "adopt"):
+            elif kind in ("arm", "feedforward", "disarm", "adopt", "compared"):
                 self._requests.append((client, document, parse_request(kind, document, self.settings)))
             else:
-                text, advice = f"{kind!r} is no request", "use status, alive, table, arm, disarm or adopt"
+                text, advice = f"{kind!r} is no request", "use status, alive, table, arm, disarm, adopt or compared"
                 client.reply(document, ok=False, code="BadRequest", text=text, advice=advice)
 
     def _withdraw(self, client: Client, document: dict[str, Any]) -> None:

@@ -21,9 +21,15 @@ def parse_request(kind: Any, document: Mapping[str, Any], settings: Settings) ->
     digest = hashlib.sha256(str(document.get("token", "")).encode()).hexdigest()
     valid = bool(settings.token_sha256) and hmac.compare_digest(digest, settings.token_sha256)
     program = str(document.get("program_digest", ""))
-    return Request(
-        kind, valid, program, facts if isinstance(facts, dict) else {}, _laws(document.get("laws"), settings)
-    )
+    facts = facts if isinstance(facts, dict) else {}
+    return Request(kind, valid, program, facts, _laws(document.get("laws"), settings), _compared(document, settings))
+
+
+def _compared(document: Mapping[str, Any], settings: Settings) -> dict[str, str]:
+    """The fingerprints of the drives that were compared; what is no text is no drive's."""
+    given = document.get("axes")
+    found = given if isinstance(given, dict) else {}
+    return {axis.name: str(found[axis.name]) for axis in settings.axes if axis.name in found}
 
 
 def _laws(given: object, settings: Settings) -> tuple[Law, ...]:

@@ -61,6 +61,11 @@ def settings(axes: Sequence[str] = ("X", "Y"), limits: Limits = LIMITS, **change
     return replace(made, **changes)  # type: ignore[arg-type] # any field of Settings
 
 
+def commissioned(made: Settings) -> Settings:
+    """The same settings, every drive signed off."""
+    return replace(made, axes=tuple(replace(axis, record=RECORD) for axis in made.axes))
+
+
 @dataclass
 class Drive:
     """What a drive holds and shows; ``answers`` False: it is silent; ``scale`` 0: it ignores its offset.
