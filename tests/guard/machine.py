@@ -109,7 +109,7 @@ class Drive:
             return []
         followed, before = sum(self.queue[0]), self.followed
         self.followed = followed
-        speed = 0 if before is None else (followed - before) * 1000
+        speed = 0 if before is None else max(-(2**31), min((followed - before) * 1000, 2**31 - 1))
         n = self.node_id
         frames = [
             (0x180 + n, struct.pack("<ii", followed - self.position_error, speed)),
