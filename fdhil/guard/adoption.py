@@ -127,24 +127,21 @@ def _from_measured(state: State) -> State:
     return state._replace(axes=tuple([at_rest(axis, known(axis) or 0) for axis in state.axes]), measuring=0)
 
 
-def compare_refusals(state: State, request: Request, settings: Settings) -> Alarms:
-    """A record holds again only where the drive was found to be the very one that it was signed off for."""
+def compared(state: State, request: Request, settings: Settings) -> tuple[State, Alarms]:
+    """A record holds again where the drive was found to be the one signed off; where it is another, it is void."""
     refused = [] if request.token_valid is True else [Alarm("AuthRequired")]
     if state.sending:
         refused.append(Alarm("NotOff", detail=state.mode.value))
-    for axis in settings.axes:
-        found = request.compared.get(axis.name)
-        if found is not None and (not axis.record or found != axis.record):
-            refused.append(Alarm("RecordVoid", axis.name, "what was compared is not this guard's record; restart it"))
-    return tuple(refused)
-
-
-def compared(state: State, request: Request, settings: Settings) -> State:
-    axes = [
-        axis._replace(record_void=axis.record_void and own.name not in request.compared)
-        for own, axis in zip(settings.axes, state.axes, strict=True)
-    ]
-    return state._replace(axes=tuple(axes))
+    if refused:
+        return state, tuple(refused)
+    axes = []
+    for own, axis in zip(settings.axes, state.axes, strict=True):
+        found = request.compared.get(own.name)
+        void = axis.record_void if found is None else not own.record or found != own.record
+        if found is not None and void:
+            refused.append(Alarm("RecordVoid", own.name, "it differs from the record that this guard knows"))
+        axes.append(axis._replace(record_void=void))
+    return state._replace(axes=tuple(axes)), tuple(refused)
 
 
 def at_rest(axis: AxisState, offset: int) -> AxisState:

@@ -14,7 +14,6 @@ from fdhil.guard.adoption import (
     adopting,
     at_rest,
     ceiling,
-    compare_refusals,
     compared,
     frozen,
     measure,
@@ -103,8 +102,7 @@ def _request(
         refused = adopt_refusals(state, request, alarms, views)
         return (state, refused) if refused else (adopting(state, settings), ())
     if request.kind == "compared":
-        refused = compare_refusals(state, request, settings)
-        return (state, refused) if refused else (compared(state, request, settings), ())
+        return compared(state, request, settings)
     cause = Alarm("Disarmed" if request.kind == "disarm" else "Stopped")
     if state.mode in IN_CHARGE:
         state = _ramp_down(state, cause)

@@ -63,6 +63,11 @@ def settings(axes: Sequence[str] = ("X", "Y"), limits: Limits = LIMITS, **change
     return replace(made, **changes)  # type: ignore[arg-type] # any field of Settings
 
 
+def commissioned(made: Settings) -> Settings:
+    """The same settings, every drive signed off."""
+    return replace(made, axes=tuple(replace(axis, record=RECORD) for axis in made.axes))
+
+
 @dataclass
 class Drive:
     """What a drive holds and shows; ``answers`` False: it is silent; ``scale`` 0: it ignores its offset.
@@ -106,7 +111,7 @@ class Drive:
             return []
         followed, before = sum(self.queue[0]), self.followed
         self.followed = followed
-        speed = 0 if before is None else (followed - before) * 1000
+        speed = 0 if before is None else max(-(2**31), min((followed - before) * 1000, 2**31 - 1))
         n = self.node_id
         frames = [
             (0x180 + n, struct.pack("<ii", followed - self.position_error, speed)),

@@ -154,7 +154,7 @@ def test_a_read_back_that_stops_ends_the_correction() -> None:
     assert [alarm.code for alarm in machine.alarms] == ["ReadBackStale"]
     for _ in range(150):
         machine.sync(drop=(0x381,))
-    assert machine.mode is Mode.FROZEN  # zeros were sent, and not read back
+    assert machine.state.mode is Mode.FROZEN  # zeros were sent, and not read back
     assert machine.frames[-1][1] == (0, 0)
     assert len(machine.frames) > frames + 50
     assert largest_step(machine, begin) <= machine.settings.axes[0].limits.hard_rate
@@ -287,7 +287,7 @@ def test_adopt_of_nothing_is_off_without_a_frame() -> None:
     machine.run(40)
     assert machine.sync(Request("adopt")).refused == (Alarm("AuthRequired"),)
     assert machine.sync(ADOPT).refused == ()
-    assert machine.mode is Mode.OFF
+    assert machine.state.mode is Mode.OFF
     assert machine.frames == []
     assert core.may_stand(machine.state, machine.settings) == (0, 0)
 

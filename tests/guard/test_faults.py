@@ -165,7 +165,7 @@ def test_fault_freezes_at_once_and_only_the_operator_leads_out(cutting: Bench, r
 
 
 def test_a_reboot_freezes_until_the_drive_was_compared_and_adopted(cutting: Bench) -> None:
-    """A23: what the drive holds and how it is set up is unknown; its new zero is a step that only its NC can prevent."""
+    """A23: what the drive holds and how it is set up is unknown; nothing is sent until both are known again."""
     count = len(cutting.frames)
     cutting.reboot(0)
     cutting.run(30)
