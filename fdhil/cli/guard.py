@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import os
 import socket
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -53,12 +54,25 @@ def guard(config: Path, check: bool) -> None:
     if check:
         click.echo(f"{file}: {len(settings.axes)} axes on {name}")
         return
-    with lock_bus(machine.bus[name]) as lock, open_bus(name, machine.bus[name]) as transmit:
+    with lock_bus(machine.bus[name]) as lock:
+        _compare_again(machine, name)
+        _write(file, to_json(settings_of(machine, name, run_directory, settings.token_sha256)))
+        transmit = open_bus(name, machine.bus[name])
         lock.set_inheritable(True)
         transmit.set_inheritable(True)
         arguments = ["-m", "fdhil.guard", "--settings", str(file), "--descriptor", str(transmit.fileno())]
         sys.stdout.flush()
         os.execv(sys.executable, [sys.executable, *arguments])
+
+
+def _compare_again(machine: MachineConfig, bus: str) -> None:
+    """Where no NC runs the bus, ask the commissioned drives whether they still are what was signed off."""
+    from fdhil.drivers.commissioning_compare import compare_again  # late, as below
+
+    def tell(text: str) -> None:
+        click.echo(json.dumps({"event": "record_void", "text": text}))
+
+    compare_again(machine, bus, tell)
 
 
 def corrected_bus(machine: MachineConfig, source: str) -> str:
@@ -126,6 +140,8 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
         offset=_pdo(offset, node_id),
         tpdos=tuple(_pdo(spec, node_id) for spec in profile.tpdos if spec.valid),
         increments_per_mm=axis.scaling.increments_per_mm,
+        max_speed_mm_s=axis.drive.speed_limit_mm_s or axis.rapid_speed_mm_s,
+        max_acceleration_mm_s2=axis.max_acceleration_mm_s2,
         sign=axis.drive.sign,
         limits=limits_of(axis, period_s),
         window=round(axis.drive.following_error_window_mm * axis.scaling.increments_per_mm),
@@ -135,7 +151,18 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
         speed_count=abs(profile.speed_rad_s_per_count(axis)) * per_rad * period_s,
         speed_step=SPEED_STEPS * _largest_acceleration_rad_s2(axis) * per_rad * period_s**2,
         travel=None if record is None else record.travel,
+        **_commissioned(machine, name, record),
     )
+
+
+def _commissioned(machine: MachineConfig, name: str, record: CommissioningRecord | None) -> dict[str, Any]:
+    """The fingerprint of the drive as it was signed off, and whether something against that was seen since."""
+    from fdhil.drivers.commissioning_record import holds  # late, as above
+    from fdhil.drivers.commissioning_void import is_void
+
+    if record is None or not holds(record, machine, name):
+        return {}
+    return {"record": record.fingerprint, "record_void": is_void(machine.store.directory, name)}
 
 
 def _largest_acceleration_rad_s2(axis: Axis) -> float:
@@ -185,7 +212,7 @@ def _record(machine: MachineConfig, axis: str) -> CommissioningRecord | None:
     from fdhil.drivers.commissioning_record import load_record  # late, as above
 
     try:
-        return load_record(machine.store.directory, axis)
+        return load_record(machine.store.directory, axis, machine.store.commissioning_key)
     except StoreError:
         return None
 

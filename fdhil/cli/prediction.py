@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import tables
-from fdhil.cli.options import Positive
+from fdhil.cli.compiling import forewarn
+from fdhil.cli.options import OutputFile, Positive
+from fdhil.cli.parameter_view import INTERVAL_95, MEANING
 
 if TYPE_CHECKING:
     from fdhil.cli.forecast import Past
@@ -55,8 +57,10 @@ def _shared(wanted: Callable[..., int]) -> Callable[..., int]:
             ),
             click.option("--model", "model_path", type=FILE, help="Parameters of each axis (JSON)."),
             click.option("--from-history", is_flag=True, help="Use the newest validated parameters of the store."),
-            click.option("--out", type=FILE, help="Write a CSV with a row per SYNC period."),
-            click.option("--report", type=FILE, help="Write an HTML page: a map of the error, its worst places."),
+            click.option("--out", type=OutputFile(), help="Write a CSV with a row per SYNC period."),
+            click.option(
+                "--report", type=OutputFile(), help="Write an HTML page: a map of the error, its worst places."
+            ),
             click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else."),
         )
     ):
@@ -90,6 +94,7 @@ def predict(asked: Asked, sensitivity: bool, tolerance_um: float | None, since: 
     reference, models, config = inputs(asked.program, asked.config_path, asked.model_path, asked.from_history)
     from fdhil import prediction
 
+    forewarn("predict")
     predicted = prediction.predict(reference, models, config)
     columns = _prediction_columns(predicted)
     document = {"schema": "fdhil-predict-1", "program": str(asked.program), **_prediction_document(predicted)}
@@ -166,6 +171,7 @@ def correct(asked: Asked, method: str | None) -> int:
     reference, models, config = inputs(asked.program, asked.config_path, asked.model_path, asked.from_history)
     from fdhil import correction
 
+    forewarn("predict", "correct")
     planned = correction.plan(reference, models, config, method)
     predicted = _gain(planned, models, config, asked.from_history)
     if asked.out is not None:
@@ -233,7 +239,8 @@ def inputs(
     elif from_history:
         from fdhil.store.history import latest_parameters
 
-        given, source = latest_parameters(config.store.directory), str(config.store.directory)
+        given = latest_parameters(config.store.directory, functools.partial(click.echo, err=True))
+        source = str(config.store.directory)
     reference = load_trajectory(program, config)
     return reference, model_files.models_for(reference, given, config, source), config
 
@@ -278,18 +285,16 @@ def _correction_columns(planned: Correction) -> dict[str, tuple[Float, int]]:
 
 
 def _write(path: Path, columns: Mapping[str, tuple[Float, int]]) -> None:
-    """Write columns as CSV whose first line is the header; RecordingError when the file cannot be written."""
+    """Write columns as CSV whose first line is the header; OutputError when the file cannot be written."""
     import numpy as np
 
-    from fdhil.errors import RecordingError
+    from fdhil.store.output import open_output
 
     # adding 0 after rounding turns -0.0000 into 0.0000
     values = np.column_stack([np.round(values, decimals) + 0.0 for values, decimals in columns.values()])
     formats = [f"%.{decimals}f" for _, decimals in columns.values()]
-    try:
-        np.savetxt(path, values, fmt=formats, delimiter=",", header=",".join(columns), comments="")
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be written ({error.strerror}); check the folder") from None
+    with open_output(path) as file:
+        np.savetxt(file, values, fmt=formats, delimiter=",", header=",".join(columns), comments="")
 
 
 def _contour(predicted: Prediction) -> dict[str, float]:
@@ -352,12 +357,12 @@ def _show_prediction(
     predicted: Prediction, told: Sequence[Mapping[str, Any]] | None = None, tolerance_um: float | None = None
 ) -> None:
     from fdhil.cli.forecast import crossing_text
-    from fdhil.prediction.gain import INTERVAL_95, plus_minus
+    from fdhil.prediction.gain import plus_minus
 
     contour = _contour(predicted)
     click.echo(
         f"{predicted.reference.time_s[-1]:.2f} s of path: contour error {contour['rms_um']:.1f} um RMS,"
-        f" {contour['max_um']:.1f} um at most"
+        f" {contour['max_um']:.1f} um at most" + (f"; {MEANING}" if told and "std_um" in told[0] else "")
     )
     entries = _zones(predicted) if told is None else told
     shown = sorted(sorted(entries, key=lambda zone: -zone["max_um"])[:MANY_ZONES], key=lambda zone: zone["start_s"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,8 @@ import click
 
 from fdhil import config as machine_config
 from fdhil import tables
+from fdhil.cli.compiling import forewarn
+from fdhil.cli.options import OutputFile
 from fdhil.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -68,6 +71,7 @@ def _replayed(
                 settings = machine or _config_of(window)
                 if window.axis not in settings.axis:
                     raise RecordingError(f"{path} is of axis {window.axis}, which --config does not have; use its own")
+                forewarn("identify")
                 pipelines[window.axis] = AxisPipeline(window.axis, settings, method, with_skill=machine is not None)
             outcomes += pipelines[window.axis].feed(window)
         replayed.append((path, outcomes))
@@ -105,7 +109,9 @@ def _config_of(window: Window) -> machine_config.MachineConfig:
 @click.command()
 @click.argument("config", type=FILE)
 @click.option("--axis", help="One axis only.")
-@click.option("--plot", type=FILE, help="Also write the parameters over time and temperature as a PNG.")
+@click.option(
+    "--plot", type=OutputFile(".png", ".svg", ".pdf"), help="Also draw the parameters over time and temperature."
+)
 @AS_JSON
 def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) -> None:
     """Show how the identified parameters of CONFIG's machine moved: revisions, slopes, changes, maintenance dates."""
@@ -139,7 +145,7 @@ def _history(machine: machine_config.MachineConfig, axis: str | None) -> tuple[l
     from fdhil.cli.history_trends import health
     from fdhil.store.history import History
 
-    with History.read(machine.store.directory) as stored:
+    with History.read(machine.store.directory, partial(click.echo, err=True)) as stored:
         return [_row(revision) for revision in stored.revisions(axis)], health(stored, machine, axis)
 
 
@@ -162,7 +168,7 @@ def _row(revision: Revision) -> dict[str, Any]:
 
 @click.command()
 @click.argument("recording", type=FILE)
-@click.option("--out", required=True, type=FILE, help="The CSV file to write.")
+@click.option("--out", required=True, type=OutputFile(), help="The CSV file to write.")
 def export(recording: Path, out: Path) -> None:
     """Write a stored window (.parquet) as CSV of the recording format."""
     from fdhil.store.export import export_csv
@@ -176,7 +182,7 @@ def export(recording: Path, out: Path) -> None:
 
 @click.command()
 @click.argument("config", type=FILE)
-@click.option("--out", required=True, type=FILE, help="The HTML file to write.")
+@click.option("--out", required=True, type=OutputFile(), help="The HTML file to write.")
 def report(config: Path, out: Path) -> None:
     """Write an HTML report of the stored history of CONFIG's machine."""
     machine = machine_config.load(config)

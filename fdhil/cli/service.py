@@ -36,9 +36,11 @@ def run(config: Path, method: str | None) -> int:
     when an offset may still be applied then: the last line says which, and what to do.
     """
     machine = machine_config.load(config)
+    from fdhil.cli.compiling import forewarn
     from fdhil.daemon import service  # late: --help imports nothing heavy
     from fdhil.drivers import open_machine
 
+    forewarn("identify", "predict", "correct")
     stands = service.run(machine, open_machine, method)
     return 0 if stands.nothing else 3
 

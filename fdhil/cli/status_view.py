@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+
+from fdhil.cli.parameter_view import MEANING, cell, half_of, head
+from fdhil.records import PARAMETERS
 
 BARS = "▁▂▃▄▅▆▇█"
 SHOWN_PASSES = 3
@@ -27,13 +32,12 @@ COUNTED = {
     "pdo_ambiguous": "PDO of uncertain SYNC",
     "failures": "polls failed",
 }
-COURSE = 14  # revisions in a row of bars: what fits the column of a value with its interval
+COURSE = 7  # revisions in a row of bars: what fits the column of a value
 
 
 def open_console() -> Console:
-    """Return a console for stdout: as wide as the terminal, or wide enough for the tables where there is none."""
-    console = Console()
-    return console if console.is_terminal else Console(width=150)
+    """Return a console for stdout: as wide as the terminal or as COLUMNS says, 80 columns where there is neither."""
+    return Console(width=shutil.get_terminal_size((80, 24)).columns)
 
 
 def show(status: Mapping[str, Any], console: Console | None = None) -> None:
@@ -139,25 +143,21 @@ def _unused(axis: Mapping[str, Any]) -> str:
 
 
 def _axes_table(axes: Mapping[str, Any]) -> Table:
-    table = Table(show_edge=False, pad_edge=False)
-    for head in ("axis", "windows", "revision", "R ohm", "L mH", "K N.m/A", "Jt kg.m2", "ft N.m.s", "Cd N.m"):
-        table.add_column(head)
+    table = narrow_table()
+    for text in ("axis", "windows\nok/not", "rev", *map(head, PARAMETERS)):
+        table.add_column(text, no_wrap=True)
     for name, axis in axes.items():
-        windows = f"{axis['accepted']} accepted, {axis['refused']} refused"
         told = axis["parameters"]
-        cells = [with_interval(told[p], 1e3 if p == "L" else 1) for p in told] if told else ["-"] * 6
-        table.add_row(name, windows, str(axis["revision"] or "-"), *cells)
+        cells = [cell(p, told[p]["value"], half_of(told[p])) for p in PARAMETERS] if told else ["-"] * len(PARAMETERS)
+        table.add_row(name, f"{axis['accepted']}/{axis['refused']}", str(axis["revision"] or "-"), *cells)
     return table
 
 
-def with_interval(parameter: Mapping[str, Any], factor: float = 1.0) -> str:
-    """Return ``value ±half`` of the 95 % interval, or why there is none."""
-    if parameter["value"] is None:
-        return "?"
-    if parameter.get("low") is None:
-        return f"{parameter['value'] * factor:.4g} (no interval)"
-    half = (parameter["high"] - parameter["low"]) / 2 * factor
-    return f"{parameter['value'] * factor:.4g} ±{half:.1g}"
+def narrow_table(title: str | None = None) -> Table:
+    """Return a table whose columns of parameters fit 80 columns, and which says what ± means in it."""
+    table = Table(title=title, title_justify="left", caption=MEANING, caption_justify="left", box=box.SIMPLE_HEAD)
+    table.show_edge, table.pad_edge, table.collapse_padding = False, False, True
+    return table
 
 
 def sparkline(values: Sequence[float]) -> str:
@@ -174,16 +174,15 @@ def show_history(rows: Sequence[Mapping[str, Any]], console: Console | None = No
         of_axis = [row for row in rows if row["axis"] == axis]
         names = list(of_axis[0]["parameters"])
         first, last = (of_axis[k]["time"][:10] for k in (0, -1))
-        title = f"axis {axis}: {len(of_axis)} revisions, {first} to {last}"
-        table = Table(title=title, show_edge=False, pad_edge=False)
-        for head in ("revision", "time", "degC", "windows", *names):
-            table.add_column(head)
+        table = narrow_table(f"axis {axis}: {len(of_axis)} revisions, {first} to {last}")
+        for text in ("rev", "time", "degC", "win", *map(head, names)):
+            table.add_column(text, no_wrap=True)
         for row in of_axis[-newest:]:
-            degrees = "-" if row["temperature_c"] is None else f"{row['temperature_c']:.2f}"
-            cells = [with_interval(row["parameters"][name]) for name in names]
-            time = row["time"][5:16].replace("T", " ")
+            degrees = "-" if row["temperature_c"] is None else f"{row['temperature_c']:.1f}"
+            cells = [cell(name, told["value"], half_of(told)) for name, told in row["parameters"].items()]
+            time = row["time"][5:16].replace("T", "\n")
             table.add_row(str(row["revision"]), time, degrees, str(row["windows_used"]), *cells)
         courses = [sparkline([row["parameters"][name]["value"] for row in of_axis[-COURSE:]]) for name in names]
         table.add_section()
-        table.add_row("course", "", "", "", *courses)
+        table.add_row("", "course", "", "", *courses)
         out.print(table)

@@ -40,9 +40,13 @@ def parse(document: Mapping[str, Any], source: str = "config", folder: Path = Pa
     except ValidationError as error:
         raise ConfigError(source, _faults(error)) from None
     directory = folder / config.store.directory
-    run = config.store.run_directory
+    run, key = config.store.run_directory, config.store.commissioning_key
     store = config.store.model_copy(
-        update={"directory": directory, "run_directory": folder / run if run else directory / "run"}
+        update={
+            "directory": directory,
+            "run_directory": folder / run if run else directory / "run",
+            "commissioning_key": folder / key if key else None,
+        }
     )
     return config.model_copy(update={"store": store})
 

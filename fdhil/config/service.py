@@ -25,6 +25,10 @@ class Store(Section):
 
     directory: Path = Field(Path("fdhil-data"), description="recordings and history; relative to the config's folder")
     run_directory: Path | None = Field(None, description="sockets and the guard's table; left out: <directory>/run")
+    commissioning_key: Path | None = Field(
+        None,
+        description="key that seals the commissioning records, mode 0600; left out: <directory>/commissioning.key",
+    )
     keep_windows: int = Field(10_000, ge=1, description="recorded windows kept; the oldest go first")
 
 

@@ -268,7 +268,7 @@ def prepare_feeding(config: MachineConfig, known: Mapping[str, AxisKnowledge]) -
             text = f"axis {name} has no validated parameters yet"
             return Refused((Reason("ModelNotValidated", text, "let the machine make a few rapids of this axis"),))
         laws[name] = online.law(published.parameters, config.axis[name], config.machine.sync_period_s)
-    records = {name: load_record(config.store.directory, name) for name in axes}
+    records = {name: _record(config, name) for name in axes}
     facts = feeding_facts(axes, config, known) | {
         "commissioned": all(_valid(record, config, name) for name, record in records.items()),
         "feedforward_commissioned": all(_feeds(record, config, name) for name, record in records.items()),
@@ -328,7 +328,7 @@ def _skilled(skills: Sequence[Skill], gain_um: float) -> bool:
 
 
 def _commissioned(axes: Sequence[str], largest_um: float, config: MachineConfig) -> dict[str, bool]:
-    records = {axis: load_record(config.store.directory, axis) for axis in axes}
+    records = {axis: _record(config, axis) for axis in axes}
     return {
         "commissioned": all(_valid(record, config, axis) for axis, record in records.items()),
         # the plans assume an offset that the feed-forward sees; another drive would be made worse
@@ -336,6 +336,11 @@ def _commissioned(axes: Sequence[str], largest_um: float, config: MachineConfig)
         "watchdog_proven": largest_um <= UNGUARDED_UM
         or all(r is not None and r.watchdog == "proven" for r in records.values()),
     }
+
+
+def _record(config: MachineConfig, axis: str) -> CommissioningRecord | None:
+    """Read an axis' record; a daemon that may not read the key leaves the seal to the guard."""
+    return load_record(config.store.directory, axis, config.store.commissioning_key, may_lack_key=True)
 
 
 def _valid(record: CommissioningRecord | None, config: MachineConfig, axis: str) -> bool:

@@ -84,6 +84,7 @@ class Keeper:
                 notices += self._put_aside(error)
             else:
                 notices += self._refused(error)
+        notices += self._damaged_rows()
         if self.strays:
             names = ", ".join(self.strays[:5])
             folder = self._directory / WINDOWS_FOLDER
@@ -97,6 +98,17 @@ class Keeper:
         folder = self._directory / WINDOWS_FOLDER
         self._windows = WindowStore(folder, self._config.store.keep_windows, self._config.digest)
         self.strays = self._windows.strays
+
+    def _damaged_rows(self) -> list[Notice]:
+        """Put damaged rows aside, so that they are told once."""
+        try:
+            places = self._history.put_damaged_aside() if self._history is not None else ""
+        except StoreError as error:
+            return self._refused(error)
+        if not places:
+            return []
+        text = f"Damaged rows of the history were put aside, older ones are used: {places}; check the disk."
+        return [Notice("CorruptFile", "MAJOR", text)]
 
     def _put_aside(self, error: StoreError) -> list[Notice]:
         path = self._directory / FILE_NAME

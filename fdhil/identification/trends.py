@@ -21,6 +21,10 @@ ENOUGH_FOR_DRIFT = 8  # rows from which on a steady drift is told apart from a s
 ENOUGH_FOR_CURVE = 16
 NEAR = 8  # rows on either side in which a step must be seen too
 BEYOND_CHANCE = 5.0
+# a date is told only of a slope that is so sure, seen over so long, and only so far ahead
+SURE_SLOPE = 3.0  # standard deviations
+LEAST_DAYS = 1.0
+FARTHEST_SPANS = 5.0
 COLLINEAR = 1e-4  # share of a covariate that the others must leave
 # a smaller step is not told: drift that is no straight line looks like one
 LEAST_STEP: dict[str, float] = {"R": 0.05, "L": 0.08, "K": 0.03, "Jt": 0.02, "ft": 0.15, "Cd": 0.10}
@@ -118,16 +122,23 @@ def _without(other: Float, column: Float) -> Float:
 
 
 def crossing(line: Slope, limit: float) -> Crossing | None:
-    """Return where the line reaches ``limit``, by Fieller's theorem; None when the slope may as well be nil."""
+    """Return where the line reaches ``limit``, by Fieller's theorem; None when the slope may as well be nil: it is less
+    than ``SURE_SLOPE`` standard deviations.
+    """
     sure = student_95(line.freedom) ** 2
+    if line.value**2 <= sure * (SURE_SLOPE / SURE_95 * line.std) ** 2:
+        return None
     apart = limit - line.level
     a = line.value**2 - sure * line.std**2
-    if not a > 0:
-        return None
     b = line.value * apart
     c = apart**2 - sure * line.level_std**2
     root = math.sqrt(max(b * b - a * c, 0.0))
     return Crossing(line.at + apart / line.value, line.at + (b - root) / a, line.at + (b + root) / a)
+
+
+def reach_days(span_days: float) -> float:
+    """Return how many days ahead a slope may be followed that was seen over ``span_days``; 0 when that is too short."""
+    return FARTHEST_SPANS * span_days if span_days >= LEAST_DAYS else 0.0
 
 
 def steps(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -91,13 +92,10 @@ def _check_times(path: Path, time_s: Float, sync_period_s: float) -> None:
         )
 
 
-def write_demand_csv(trajectory: Trajectory, path: Path) -> None:
-    """Write a reference as demand CSV: mm with 9 decimals. RecordingError when the file cannot be written."""
+def write_demand_csv(trajectory: Trajectory, file: Path | IO[bytes]) -> None:
+    """Write a reference as demand CSV: mm with 9 decimals."""
     decimals = max(6, min(12, 1 - math.floor(math.log10(trajectory.dt_s))))
     table = np.column_stack([trajectory.time_s, *trajectory.position_mm.values()])
     header = ",".join(["time_s", *(f"{axis}_mm" for axis in trajectory.axes)])
     formats = [f"%.{decimals}f", *("%.9f" for _ in trajectory.axes)]
-    try:
-        np.savetxt(path, table, fmt=formats, delimiter=",", header=header, comments="")
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be written ({error.strerror}); check the folder") from None
+    np.savetxt(file, table, fmt=formats, delimiter=",", header=header, comments="")

@@ -1,7 +1,8 @@
 """The history: revisions of the parameters, analysed windows, skills and notices, in SQLite.
 
 Rows are ordered by their running number, never by the wall clock; the time is kept beside it with the boot it belongs
-to. One writer (the daemon), any number of readers.
+to. One writer (the daemon), any number of readers. A row that is not what was written is left out and told of, never
+believed (:mod:`fdhil.store.schema`).
 """
 
 from __future__ import annotations
@@ -9,8 +10,9 @@ from __future__ import annotations
 import json
 import math
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -20,35 +22,12 @@ import numpy as np
 
 from fdhil.errors import StoreError
 from fdhil.records import PARAMETERS, Float, Notice, Parameters, ParameterSet, Skill, WindowOutcome, frozen
+from fdhil.store import schema
+from fdhil.store.schema import told
 
 FILE_NAME = "history.sqlite"
 KEEP_NOTICES = 100_000
 KEEP_COMPARISONS = 10_000
-_CODES = {"SQLITE_FULL": "DiskFull", "SQLITE_READONLY": "ReadOnlyStore", "SQLITE_CANTOPEN": "ReadOnlyStore"}
-_STAMP = "wall_s REAL NOT NULL, boot TEXT NOT NULL, monotonic_ns INTEGER NOT NULL"
-_FIRST = f"""
-CREATE TABLE windows (id INTEGER PRIMARY KEY AUTOINCREMENT, axis TEXT NOT NULL, file TEXT NOT NULL,
-  start_tick INTEGER NOT NULL, direction INTEGER NOT NULL, accepted INTEGER NOT NULL, fit_percent REAL,
-  reasons TEXT NOT NULL, method TEXT, result TEXT, parameters TEXT, temperature_c REAL, {_STAMP});
-CREATE TABLE revisions (id INTEGER PRIMARY KEY AUTOINCREMENT, axis TEXT NOT NULL, revision INTEGER NOT NULL,
-  R REAL NOT NULL, L REAL NOT NULL, K REAL NOT NULL, Jt REAL NOT NULL, ft REAL NOT NULL, Cd REAL NOT NULL,
-  covariance TEXT NOT NULL, windows INTEGER NOT NULL, window_ids TEXT NOT NULL, config_digest TEXT NOT NULL,
-  tick INTEGER NOT NULL, temperature_c REAL, {_STAMP}, UNIQUE (axis, revision));
-CREATE TABLE skills (id INTEGER PRIMARY KEY AUTOINCREMENT, axis TEXT NOT NULL, tick INTEGER NOT NULL,
-  rms_um REAL, max_um REAL, delay_ms REAL, measured_rms_um REAL, {_STAMP});
-CREATE TABLE notices (id INTEGER PRIMARY KEY AUTOINCREMENT, axis TEXT NOT NULL, code TEXT NOT NULL,
-  severity TEXT NOT NULL, text TEXT NOT NULL, tick INTEGER NOT NULL, {_STAMP});
-CREATE INDEX windows_axis ON windows (axis, id);
-CREATE INDEX revisions_axis ON revisions (axis, id);
-"""
-_COMPARISONS = f"""
-CREATE TABLE comparisons (id INTEGER PRIMARY KEY AUTOINCREMENT, program TEXT NOT NULL, name TEXT NOT NULL,
-  config_digest TEXT NOT NULL, parameters TEXT NOT NULL, rms_um REAL NOT NULL, zones TEXT NOT NULL, {_STAMP});
-CREATE INDEX comparisons_program ON comparisons (program, id);
-"""
-# what leads from each schema to the next, in order: a new one is added at the end, an old one never changes
-_STEPS = (_FIRST, _COMPARISONS)
-SCHEMA_VERSION = len(_STEPS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,15 +89,20 @@ class Comparison:
 class History:
     """The history of one store directory. Every method raises StoreError when the database refuses."""
 
-    def __init__(self, connection: sqlite3.Connection, path: Path) -> None:
+    def __init__(
+        self, connection: sqlite3.Connection, path: Path, version: int, tell: Callable[[str], object] | None = None
+    ) -> None:
         self._db = connection
         self._path = path
+        self._version = version
+        self._tell = tell
+        self._damaged: dict[tuple[str, int], dict[str, Any]] = {}
 
     @classmethod
     def open(cls, directory: Path) -> History:
         """Open for writing, and create where needed. StoreError with code SchemaVersion, CorruptFile, ReadOnlyStore."""
         path = directory / FILE_NAME
-        with _told(path):
+        with told(path):
             try:
                 directory.mkdir(parents=True, exist_ok=True)
             except OSError as error:
@@ -128,36 +112,43 @@ class History:
             try:
                 db.execute("PRAGMA journal_mode = WAL")
                 db.execute("PRAGMA synchronous = FULL")
-                _check_version(db, path)
-                _bring_up(db)
+                schema.check_file(db, path)
+                schema.bring_up(db, path)
             except (sqlite3.Error, StoreError):
                 db.close()
                 raise
-        return cls(db, path)
+        return cls(db, path, schema.SCHEMA_VERSION)
 
     @classmethod
-    def read(cls, directory: Path) -> History:
-        """Open for reading only, also from a read-only disk. StoreError when there is none or it is unusable."""
+    def read(cls, directory: Path, tell: Callable[[str], object] | None = None) -> History:
+        """Open for reading only, also from a read-only disk. StoreError when there is none or it is unusable.
+
+        ``tell`` hears, when it is closed, of the rows that were damaged and left out.
+        """
         path = directory / FILE_NAME
         if not path.is_file():
             raise StoreError(f"{path} does not exist: nothing was recorded yet; run the daemon first", "NoHistory")
-        with _told(path):
+        with told(path):
             for flags in ("mode=ro", "mode=ro&immutable=1"):  # without a shared-memory file only the latter opens
                 db = sqlite3.connect(f"{path.resolve().as_uri()}?{flags}", uri=True, timeout=5.0)
                 try:
-                    _check_version(db, path, least=1)
+                    version = schema.check_file(db, path, least=1)
                 except sqlite3.OperationalError:
                     db.close()
                     continue
                 except (sqlite3.Error, StoreError):
                     db.close()
                     raise
-                return cls(db, path)
+                return cls(db, path, version, tell)
         raise StoreError(f"{path} cannot be opened; check its rights", "StoreFault")
 
     def close(self) -> None:
-        """Close the database."""
+        """Close the database; tell what was left out."""
         self._db.close()
+        if self._damaged and self._tell is not None:
+            places = named(self._damaged)
+            self._tell(f"{self._path}: {places} damaged and left out; start the daemon, which puts them aside")
+            self._damaged.clear()
 
     def __enter__(self) -> History:
         return self
@@ -169,16 +160,42 @@ class History:
 
     def _insert(self, table: str, row: dict[str, Any], stamp: Stamp) -> int:
         row = row | {"wall_s": stamp.wall_s, "boot": stamp.boot, "monotonic_ns": stamp.monotonic_ns}
-        names = ", ".join(row)
-        marks = ", ".join(f":{name}" for name in row)
-        with _told(self._path):
-            cursor = self._db.execute(f"INSERT INTO {table} ({names}) VALUES ({marks})", row)
-        return int(cursor.lastrowid or 0)
+        with told(self._path):
+            return schema.insert(self._db, table, row)
 
-    def _select(self, query: str, arguments: Sequence[Any] = ()) -> list[sqlite3.Row]:
-        with _told(self._path), closing(self._db.cursor()) as cursor:
+    def _read(
+        self, table: str, only: Mapping[str, Any], limit: int | None = None, *, oldest: bool = False
+    ) -> list[Any]:
+        """Return what the newest rows (or the ``oldest``) hold, oldest first; damaged ones are noted and left out.
+
+        ``only`` is compared after a row was checked, so that damage of the very value compared is seen too.
+        """
+        found: list[Any] = []
+        with told(self._path), closing(self._db.cursor()) as cursor:
             cursor.row_factory = sqlite3.Row
-            return cursor.execute(query, arguments).fetchall()
+            for row in map(dict, cursor.execute(f"SELECT * FROM {table} ORDER BY id{'' if oldest else ' DESC'}")):
+                if len(found) == limit:
+                    break
+                if self._version >= schema.WITH_DIGESTS and row.get("digest") != schema.digest_of(table, row):
+                    self._damaged[table, row["id"]] = row
+                    continue
+                if all(row[name] == value for name, value in only.items()):
+                    try:
+                        found.append(_DECODED[table](row))
+                    except (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError):
+                        self._damaged[table, row["id"]] = row
+        return found if oldest else found[::-1]
+
+    def put_damaged_aside(self) -> str:
+        """Check every row, move the damaged ones to the table ``quarantine``, and name them; empty: all are sound."""
+        for table in schema.TABLES:
+            self._read(table, {})
+        places = named(self._damaged)
+        for (table, _), row in self._damaged.items():
+            with told(self._path):
+                schema.put_aside(self._db, table, row)
+        self._damaged.clear()
+        return places
 
     def add_window(self, outcome: WindowOutcome, file: str, stamp: Stamp) -> int:
         """Store an analysed window and return its number; ``file`` is its Parquet file's name, empty when not kept."""
@@ -222,7 +239,7 @@ class History:
         names = ("axis", "code", "severity", "text", "tick")
         number = self._insert("notices", {name: getattr(notice, name) for name in names}, stamp)
         if number % 1000 == 0:
-            with _told(self._path):
+            with told(self._path):
                 self._db.execute("DELETE FROM notices WHERE id <= ?", (number - KEEP_NOTICES,))
         return number
 
@@ -238,60 +255,63 @@ class History:
             "zones": json.dumps(list(found.zones)),
         }
         number = self._insert("comparisons", row, stamp)
-        with _told(self._path):
+        with told(self._path):
             self._db.execute("DELETE FROM comparisons WHERE id <= ?", (number - KEEP_COMPARISONS,))
         return number
 
     def comparisons(self, program: str, limit: int) -> list[tuple[Stamp, Comparison]]:
         """Return what was predicted of a program (its digest), newest first."""
-        with _told(self._path):
-            version = _version(self._db)
-        if version <= _STEPS.index(_COMPARISONS):
+        if self._version < schema.WITH_COMPARISONS:
             return []  # a reader does not bring an older store up
-        query = "SELECT * FROM comparisons WHERE program = ? ORDER BY id DESC LIMIT ?"
-        return [(_stamp(row), _comparison(row)) for row in self._select(query, (program, limit))]
+        return self._read("comparisons", {"program": program}, limit)[::-1]
 
     def revisions(self, axis: str | None = None, limit: int | None = None) -> list[Revision]:
         """Return the published parameter sets, oldest first; with ``limit`` the newest so many."""
-        return [_revision(row) for row in self._newest("revisions", axis, limit)]
+        return self._read("revisions", _of(axis), limit)
 
     def first_revision(self, axis: str) -> Revision | None:
         """Return the first parameter set that was ever published of an axis."""
-        rows = self._select("SELECT * FROM revisions WHERE axis = ? ORDER BY id LIMIT 1", (axis,))
-        return _revision(rows[0]) if rows else None
+        return next(iter(self._read("revisions", {"axis": axis}, 1, oldest=True)), None)
 
     def windows(self, axis: str | None = None, limit: int | None = None) -> list[StoredWindow]:
         """Return the analysed windows, oldest first; with ``limit`` the newest so many."""
-        return [_stored_window(row) for row in self._newest("windows", axis, limit)]
+        return self._read("windows", _of(axis), limit)
 
     def skills(self, axis: str | None = None, limit: int | None = None) -> list[Skill]:
         """Return the skills of recorded moves, oldest first."""
-        rows = self._newest("skills", axis, limit)
-        figures = ("rms_um", "max_um", "delay_ms", "measured_rms_um")
-        return [Skill(row["axis"], row["tick"], *(_number(row[name]) for name in figures)) for row in rows]
+        return self._read("skills", _of(axis), limit)
 
     def notices(self, axis: str | None = None, limit: int | None = None) -> list[tuple[Stamp, Notice]]:
         """Return the notices with their time, oldest first."""
-        rows = self._newest("notices", axis, limit)
-        names = ("code", "severity", "text", "axis", "tick")
-        return [(_stamp(row), Notice(*(row[name] for name in names))) for row in rows]
+        return self._read("notices", _of(axis), limit)
 
     def counts(self, axis: str) -> tuple[int, int]:
         """Return how many windows of an axis were accepted and refused."""
-        rows = self._select("SELECT accepted, COUNT(*) AS n FROM windows WHERE axis = ? GROUP BY accepted", (axis,))
-        found = {row["accepted"]: int(row["n"]) for row in rows}
-        return found.get(1, 0), found.get(0, 0)
+        found = Counter(window.accepted for window in self.windows(axis))
+        return found[True], found[False]
 
     def last_window_number(self) -> int:
         """Return the largest number a stored window file may have had, 0 when there was none."""
-        rows = self._select("SELECT file FROM windows WHERE file != '' ORDER BY id DESC LIMIT 1")
-        digits = "".join(c for c in rows[0]["file"].partition("-")[0] if c.isdigit()) if rows else ""
-        return int(digits or 0)
+        with told(self._path):
+            row = self._db.execute("SELECT file FROM windows WHERE file != '' ORDER BY id DESC LIMIT 1").fetchone()
+        digits = "".join(c for c in str(row[0]).partition("-")[0] if c in "0123456789") if row else ""
+        return int(digits[:12] or 0)
 
-    def _newest(self, table: str, axis: str | None, limit: int | None) -> list[sqlite3.Row]:
-        query = f"SELECT * FROM {table}" + (" WHERE axis = ?" if axis else "") + " ORDER BY id DESC LIMIT ?"
-        rows = self._select(query, ([axis] if axis else []) + [-1 if limit is None else limit])
-        return rows[::-1]
+
+def _of(axis: str | None) -> dict[str, str]:
+    return {"axis": axis} if axis else {}
+
+
+def named(rows: Mapping[tuple[str, int], Any]) -> str:
+    """Return which rows of which table these are, in one short phrase; empty for none."""
+    tables: dict[str, list[int]] = {}
+    for table, number in sorted(rows):
+        tables.setdefault(table, []).append(number)
+    parts = [
+        f"{len(numbers)} of {table} (row {', '.join(map(str, numbers[:5]))}{', ...' if len(numbers) > 5 else ''})"
+        for table, numbers in tables.items()
+    ]
+    return " and ".join(parts)
 
 
 def described(outcome: WindowOutcome) -> dict[str, dict[str, Any]]:
@@ -309,53 +329,18 @@ def described(outcome: WindowOutcome) -> dict[str, dict[str, Any]]:
     return told
 
 
-def latest_parameters(store_directory: Path) -> dict[str, Parameters]:
+def latest_parameters(store_directory: Path, tell: Callable[[str], object] | None = None) -> dict[str, Parameters]:
     """Return the newest published parameters of each axis; empty when nothing was recorded yet.
 
-    StoreError when a history exists but cannot be read.
+    ``tell`` hears of damaged rows. StoreError when a history exists but cannot be read.
     """
     if not (store_directory / FILE_NAME).is_file():
         return {}
-    with History.read(store_directory) as history:
+    with History.read(store_directory, tell) as history:
         return {revision.set.axis: revision.set.parameters for revision in history.revisions()}
 
 
-@contextmanager
-def _told(path: Path) -> Iterator[None]:
-    """Turn SQLite's errors into one sentence."""
-    try:
-        yield
-    except sqlite3.Error as error:
-        name = getattr(error, "sqlite_errorname", "") or ""
-        code = next((code for prefix, code in _CODES.items() if name.startswith(prefix)), "StoreFault")
-        if name in {"SQLITE_NOTADB", "SQLITE_CORRUPT"}:
-            code = "CorruptFile"
-        raise StoreError(f"{path} cannot be used ({error}); check the disk, or move the file away", code) from None
-
-
-def _version(db: sqlite3.Connection) -> int:
-    return int(db.execute("PRAGMA user_version").fetchone()[0])
-
-
-def _bring_up(db: sqlite3.Connection) -> None:
-    """Take an older schema, or an empty file, to the present one: every step is whole or not made at all."""
-    while (version := _version(db)) < SCHEMA_VERSION:
-        try:
-            db.executescript(f"BEGIN IMMEDIATE;{_STEPS[version]}PRAGMA user_version = {version + 1};COMMIT;")
-        except sqlite3.OperationalError:
-            db.rollback()
-            if _version(db) == version:  # else another process made the same step in between
-                raise
-
-
-def _check_version(db: sqlite3.Connection, path: Path, least: int = 0) -> None:
-    version = _version(db)
-    if not least <= version <= SCHEMA_VERSION:
-        text = f"{path} has schema {version}, this fdhil knows {SCHEMA_VERSION}; use the fdhil that wrote it"
-        raise StoreError(text, "SchemaVersion")
-
-
-def _stamp(row: sqlite3.Row) -> Stamp:
+def _stamp(row: Mapping[str, Any]) -> Stamp:
     return Stamp(row["wall_s"], row["boot"], row["monotonic_ns"])
 
 
@@ -363,7 +348,7 @@ def _number(value: float | None) -> float:
     return math.nan if value is None else float(value)
 
 
-def _revision(row: sqlite3.Row) -> Revision:
+def _revision(row: Mapping[str, Any]) -> Revision:
     parameters = Parameters(*(float(row[name]) for name in PARAMETERS))
     covariance: Float = frozen(np.array(json.loads(row["covariance"]), dtype=np.float64))
     published = ParameterSet(
@@ -373,19 +358,36 @@ def _revision(row: sqlite3.Row) -> Revision:
     return Revision(row["id"], published, tuple(json.loads(row["window_ids"])), _stamp(row))
 
 
-def _comparison(row: sqlite3.Row) -> Comparison:
+def _comparison(row: Mapping[str, Any]) -> tuple[Stamp, Comparison]:
     used = {
         axis: UsedParameters(int(u["revision"]), Parameters(*(float(u[name]) for name in PARAMETERS)))
         for axis, u in json.loads(row["parameters"]).items()
     }
-    return Comparison(
-        row["program"], row["name"], row["config_digest"], used, row["rms_um"], tuple(json.loads(row["zones"]))
-    )
+    zones = tuple(json.loads(row["zones"]))
+    return _stamp(row), Comparison(row["program"], row["name"], row["config_digest"], used, row["rms_um"], zones)
 
 
-def _stored_window(row: sqlite3.Row) -> StoredWindow:
+def _skill(row: Mapping[str, Any]) -> Skill:
+    figures = ("rms_um", "max_um", "delay_ms", "measured_rms_um")
+    return Skill(row["axis"], row["tick"], *(_number(row[name]) for name in figures))
+
+
+def _notice(row: Mapping[str, Any]) -> tuple[Stamp, Notice]:
+    return _stamp(row), Notice(*(row[name] for name in ("code", "severity", "text", "axis", "tick")))
+
+
+def _stored_window(row: Mapping[str, Any]) -> StoredWindow:
     parameters = None if row["parameters"] is None else json.loads(row["parameters"])
     return StoredWindow(
         row["id"], row["axis"], row["file"], row["start_tick"], row["direction"], bool(row["accepted"]),
         row["fit_percent"], tuple(json.loads(row["reasons"])), parameters, row["temperature_c"], _stamp(row),
     )  # fmt: skip
+
+
+_DECODED: Mapping[str, Callable[[Mapping[str, Any]], Any]] = {
+    "windows": _stored_window,
+    "revisions": _revision,
+    "skills": _skill,
+    "notices": _notice,
+    "comparisons": _comparison,
+}

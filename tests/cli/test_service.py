@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from fdhil.cli.status_view import sparkline, with_interval
+from fdhil.cli.parameter_view import cell, half_of
+from fdhil.cli.status_view import sparkline
 from fdhil.daemon.status import Watch
 from fdhil.daemon.token import ensure_token
 from fdhil.records import Notice
@@ -68,7 +69,7 @@ def test_status_as_a_table_and_as_json(machine: Path, tmp_path: Path, capsys: An
         code, out, err = fdhil("status", machine, capsys=capsys)
     assert (code, err, requests) == (0, "", [{"request": "status"}])
     heard = ("bench", "no SYNC yet", "frames received 7, lost 0")
-    for words in (*heard, "1 accepted, 0 refused", "DiskFull", "[red]Jt rose[/red]", "OFF"):
+    for words in (*heard, "1/0", "DiskFull", "[red]Jt rose[/red]", "OFF"):
         assert words in out, (words, out)
     (machine.parent / "fdhil-data" / "run" / "daemon.sock").unlink()
     with answering(machine, status_of(tmp_path)):
@@ -183,6 +184,6 @@ def test_run_on_a_bus_that_is_not_there_is_3_and_one_sentence(tmp_path: Path, ca
 def test_small_pictures() -> None:
     assert sparkline([1.0, 2.0, 3.0]) == "▁▅█"
     assert sparkline([1.0, 1.0]) == "▁▁"
-    assert with_interval({"value": 0.5, "low": 0.49, "high": 0.51}) == "0.5 ±0.01"
-    assert with_interval({"value": 0.5, "low": None, "high": None}) == "0.5 (no interval)"
-    assert with_interval({"value": None}) == "?"
+    assert cell("R", 0.5, half_of({"low": 0.488, "high": 0.512}), " ") == "500 ±12"
+    assert cell("K", 0.8, half_of({"low": None, "high": None}), " ") == "0.8 (no ±)"
+    assert cell("K", None, None) == "-"

@@ -231,7 +231,7 @@ async def test_the_daemon_tells_moves_it_cannot_use_instead_of_0_accepted_0_refu
         told = await status_when(path, lambda s: s["troubles"] and s["axes"]["X"]["moves"]["seen"] == 3)
         text = shown(told, capsys)
     assert [notice["code"] for notice in told["notices"]].count("MovesNotUsed") == 1
-    assert "0 accepted, 0 refused" in text
+    assert "X 0/0" in text
     assert "X: MovesNotUsed: 3 moves seen, none used" in text
     assert "X: 3 moves seen; not used: 3 too slow (the fastest at 5" in text
 

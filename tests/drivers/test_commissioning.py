@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import can
@@ -16,21 +14,17 @@ from fdhil.cia402 import Object, State
 from fdhil.config import MachineConfig
 from fdhil.drivers import commissioning, commissioning_checks, commissioning_watchdog
 from fdhil.drivers.commissioning import (
-    CommissioningRecord,
     check_axis,
     commission,
     enable,
     feedforward_test,
-    load_record,
     prepare,
-    record_path,
     rolled_back,
-    save_record,
     sign_test,
 )
 from fdhil.drivers.commissioning_master import Master
 from fdhil.drivers.commissioning_watchdog import watchdog_test
-from fdhil.errors import ConnectError, DeviceError, DriveFault, ProtocolError, StoreError
+from fdhil.errors import ConnectError, DeviceError, DriveFault, ProtocolError
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
 
@@ -326,31 +320,3 @@ def test_states_are_shown(peer: tuple[DrivePeer, MachineConfig]) -> None:
         assert master.state() is State.SWITCH_ON_DISABLED
         enable(master)
         assert master.state() is State.OPERATION_ENABLED
-
-
-RECORD = CommissioningRecord(
-    "X", 1, 2, 3, 4, "c0ffee", "f1f2", {"6007": 1}, 10_000.0, True, 9.8, True, "proven", "2026-01-01T00:00:00+00:00"
-)
-
-
-def test_a_record_comes_back_as_it_was(tmp_path: Path) -> None:
-    save_record(RECORD, tmp_path / "store")
-    assert load_record(tmp_path / "store", "X") == RECORD
-    assert load_record(tmp_path / "store", "Y") is None
-
-
-@pytest.mark.parametrize("key", ["offset_in_feedforward", "watchdog", "options", "serial", "digest", "schema", "axis"])
-def test_a_changed_record_is_refused(key: str, tmp_path: Path) -> None:
-    path = save_record(RECORD, tmp_path)
-    document = json.loads(path.read_text())
-    document[key] = {"6007": 0} if key == "options" else "other" if key != "serial" else 5
-    path.write_text(json.dumps(document))
-    with pytest.raises(StoreError, match="changed after it was signed off"):
-        load_record(tmp_path, "X")
-
-
-@pytest.mark.parametrize("text", ["", "{}", "[]", '{"schema": 1', "\x00", '{"options": 3}'])
-def test_what_is_no_record_is_refused(text: str, tmp_path: Path) -> None:
-    record_path(tmp_path, "X").write_text(text)
-    with pytest.raises(StoreError, match="commission the axis again"):
-        load_record(tmp_path, "X")

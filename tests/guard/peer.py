@@ -139,7 +139,7 @@ class Peer(threading.Thread):
         """(SYNC count, increments) of the offset frames to one node."""
         return [(k, int.from_bytes(d, "little", signed=True)) for k, i, d in list(self.sent) if i == 0x300 + node]
 
-    def wait(self, condition: Callable[[], bool], what: str, limit_s: float = 20.0) -> None:
+    def wait(self, condition: Callable[[], bool], what: str, limit_s: float = 100.0) -> None:
         """Wait until something has come about."""
         deadline_s = time.monotonic() + limit_s
         while not condition():

@@ -12,9 +12,9 @@ import pytest
 from fdhil.errors import StoreError
 from fdhil.records import Notice, Parameters, Skill
 from fdhil.store import history as history_module
+from fdhil.store import schema
 from fdhil.store.history import (
     FILE_NAME,
-    SCHEMA_VERSION,
     Comparison,
     History,
     Stamp,
@@ -111,8 +111,12 @@ def first_schema(folder: Path) -> None:
     """A store as the first release wrote it, with one revision."""
     with History.open(folder) as history:
         history.add_revision(published(), [4], STAMP)
+        (row,) = history._db.execute("SELECT * FROM revisions").fetchall()
+    (folder / FILE_NAME).unlink()
     db = sqlite3.connect(folder / FILE_NAME)
-    db.executescript("DROP TABLE comparisons; PRAGMA user_version = 1;")
+    db.executescript(schema._FIRST + "PRAGMA user_version = 1;")
+    db.execute(f"INSERT INTO revisions VALUES ({', '.join('?' * (len(row) - 1))})", row[:-1])
+    db.commit()
     db.close()
 
 
@@ -126,8 +130,13 @@ def test_an_older_schema_is_brought_up_by_the_writer_and_read_as_it_is(tmp_path:
         assert [r.window_ids for r in history.revisions()] == [(4,)]
         history.add_comparison(comparison(), STAMP)
     db = sqlite3.connect(tmp_path / FILE_NAME)
-    assert db.execute("PRAGMA user_version").fetchone() == (SCHEMA_VERSION,)
+    assert db.execute("PRAGMA user_version").fetchone() == (schema.SCHEMA_VERSION,)
     db.close()
+    for number in (1, 2):
+        copy = sqlite3.connect(tmp_path / f"{FILE_NAME}.schema-{number}")
+        assert copy.execute("PRAGMA user_version").fetchone() == (number,)
+        assert copy.execute("SELECT revision FROM revisions").fetchall() == [(1,)]
+        copy.close()
 
 
 def test_a_step_that_another_process_made_meanwhile_is_not_made_twice(
@@ -135,7 +144,7 @@ def test_a_step_that_another_process_made_meanwhile_is_not_made_twice(
 ) -> None:
     """Two writers see the old schema; the second one finds the step done."""
     first_schema(tmp_path)
-    seen = history_module._version
+    seen = schema.version_of
     late = iter([True])
 
     def slow(db: sqlite3.Connection) -> int:
@@ -144,8 +153,8 @@ def test_a_step_that_another_process_made_meanwhile_is_not_made_twice(
             History.open(tmp_path).close()
         return found
 
-    monkeypatch.setattr(history_module, "_check_version", lambda *_: None)
-    monkeypatch.setattr(history_module, "_version", slow)
+    monkeypatch.setattr(schema, "check_file", lambda *_: schema.SCHEMA_VERSION)
+    monkeypatch.setattr(schema, "version_of", slow)
     with History.open(tmp_path) as history:
         assert history.comparisons("a" * 64, 5) == []
 

@@ -123,7 +123,7 @@ def _commission(stage: Stage) -> None:
     for axis in stage.config.axis:
         stage.say(f"commissioning {axis}: identity, read-back, +10 um, feed-forward, watchdog")
         record = commission(stage.config, axis)
-        save_record(record, stage.config.store.directory)
+        save_record(record, stage.config.store.directory, stage.config.store.commissioning_key)
         where = "sees" if record.offset_in_feedforward else "does not see"
         stage.say(f"  the offset moved the axis {record.sign_test_um:+.1f} um; the feed-forward {where} it")
 

@@ -1,0 +1,191 @@
+"""The tables of the history, how an older file is brought up to them, and what tells a damaged file or row.
+
+Every row carries a digest over all its fields and its number. The file's own structure is checked when it is opened,
+and no index is kept: an index that is damaged would hide rows, a row that is damaged is seen by its digest.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import sqlite3
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from fdhil.errors import StoreError
+from fdhil.store.atomic import store_error
+
+_CODES = {"SQLITE_FULL": "DiskFull", "SQLITE_READONLY": "ReadOnlyStore", "SQLITE_CANTOPEN": "ReadOnlyStore"}
+# SQLITE_ERROR: our own statements are right, so the tables are not what their version says
+_DAMAGE = {"SQLITE_NOTADB", "SQLITE_CORRUPT", "SQLITE_ERROR"}
+_STAMP = "wall_s REAL NOT NULL, boot TEXT NOT NULL, monotonic_ns INTEGER NOT NULL"
+_REVISION = f"""(id INTEGER PRIMARY KEY AUTOINCREMENT, axis TEXT NOT NULL, revision INTEGER NOT NULL,
+  R REAL NOT NULL, L REAL NOT NULL, K REAL NOT NULL, Jt REAL NOT NULL, ft REAL NOT NULL, Cd REAL NOT NULL,
+  covariance TEXT NOT NULL, windows INTEGER NOT NULL, window_ids TEXT NOT NULL, config_digest TEXT NOT NULL,
+  tick INTEGER NOT NULL, temperature_c REAL, {_STAMP}"""
+_FIRST = f"""
+CREATE TABLE windows (id INTEGER PRIMARY KEY AUTOINCREMENT, axis TEXT NOT NULL, file TEXT NOT NULL,
+  start_tick INTEGER NOT NULL, direction INTEGER NOT NULL, accepted INTEGER NOT NULL, fit_percent REAL,
+  reasons TEXT NOT NULL, method TEXT, result TEXT, parameters TEXT, temperature_c REAL, {_STAMP});
+CREATE TABLE revisions {_REVISION}, UNIQUE (axis, revision));
+CREATE TABLE skills (id INTEGER PRIMARY KEY AUTOINCREMENT, axis TEXT NOT NULL, tick INTEGER NOT NULL,
+  rms_um REAL, max_um REAL, delay_ms REAL, measured_rms_um REAL, {_STAMP});
+CREATE TABLE notices (id INTEGER PRIMARY KEY AUTOINCREMENT, axis TEXT NOT NULL, code TEXT NOT NULL,
+  severity TEXT NOT NULL, text TEXT NOT NULL, tick INTEGER NOT NULL, {_STAMP});
+CREATE INDEX windows_axis ON windows (axis, id);
+CREATE INDEX revisions_axis ON revisions (axis, id);
+"""
+_COMPARISONS = f"""
+CREATE TABLE comparisons (id INTEGER PRIMARY KEY AUTOINCREMENT, program TEXT NOT NULL, name TEXT NOT NULL,
+  config_digest TEXT NOT NULL, parameters TEXT NOT NULL, rms_um REAL NOT NULL, zones TEXT NOT NULL, {_STAMP});
+CREATE INDEX comparisons_program ON comparisons (program, id);
+"""
+TABLES = ("windows", "revisions", "skills", "notices", "comparisons")
+# a revision whose row was damaged is numbered again, so no two axis and revision need differ
+_DIGESTS = (
+    "DROP INDEX windows_axis; DROP INDEX revisions_axis; DROP INDEX comparisons_program;"
+    f"CREATE TABLE renewed {_REVISION}); INSERT INTO renewed SELECT * FROM revisions;"
+    "DROP TABLE revisions; ALTER TABLE renewed RENAME TO revisions;"
+    + "".join(f"ALTER TABLE {table} ADD COLUMN digest TEXT NOT NULL DEFAULT '';" for table in TABLES)
+    + "CREATE TABLE quarantine (id INTEGER PRIMARY KEY, of TEXT NOT NULL, row INTEGER NOT NULL, content TEXT NOT NULL);"
+)
+# what leads from each schema to the next, in order: a new one is added at the end, an old one never changes
+_STEPS = (_FIRST, _COMPARISONS, _DIGESTS)
+SCHEMA_VERSION = len(_STEPS)
+WITH_COMPARISONS, WITH_DIGESTS = 2, 3
+# what the check of the structure says of single values; their row's digest tells the same and no more than the row
+_OF_ONE_ROW = (" value in ", "CHECK constraint failed")
+
+
+@contextmanager
+def told(path: Path) -> Iterator[None]:
+    """Turn SQLite's errors into one sentence."""
+    try:
+        yield
+    except UnicodeError:
+        raise _damaged(path, "a name in it is no text") from None
+    except sqlite3.Error as error:
+        name = getattr(error, "sqlite_errorname", "") or ""
+        code = next((code for prefix, code in _CODES.items() if name.startswith(prefix)), "StoreFault")
+        raise (
+            _damaged(path, str(error))
+            if _DAMAGE & {name, name[:14]}
+            else StoreError(f"{path} cannot be used ({error}); check the disk, or move the file away", code)
+        ) from None
+
+
+def _damaged(path: Path, what: str) -> StoreError:
+    text = f"{path} is damaged ({what}), nothing of it is believed; start the daemon, which keeps it and begins anew"
+    return StoreError(text, "CorruptFile")
+
+
+def version_of(db: sqlite3.Connection) -> int:
+    """Return the schema of the file."""
+    return int(db.execute("PRAGMA user_version").fetchone()[0])
+
+
+def check_file(db: sqlite3.Connection, path: Path, least: int = 0) -> int:
+    """Return the file's schema; StoreError when it is another program's, not what it says, or damaged in structure."""
+    db.text_factory = lambda raw: raw.decode("utf-8", "replace")  # a damaged text is seen by its digest
+    version = version_of(db)
+    if not least <= version <= SCHEMA_VERSION:
+        text = f"{path} has schema {version}, this fdhil knows {SCHEMA_VERSION}; use the fdhil that wrote it"
+        raise StoreError(text, "SchemaVersion")
+    if _columns(db) != _columns_of(version):
+        raise _damaged(path, f"its tables are not those of schema {version}")
+    for (found,) in db.execute("PRAGMA quick_check(20)"):
+        if found != "ok" and not any(part in found for part in _OF_ONE_ROW):
+            raise _damaged(path, " ".join(found.split())[:120])
+    return version
+
+
+def _columns(db: sqlite3.Connection) -> list[list[tuple[Any, ...]]]:
+    return [db.execute(f"PRAGMA table_info({table})").fetchall() for table in (*TABLES, "quarantine")]
+
+
+@cache
+def _columns_of(version: int) -> list[list[tuple[Any, ...]]]:
+    with closing(sqlite3.connect(":memory:")) as db:
+        for step in _STEPS[:version]:
+            db.executescript(step)
+        return _columns(db)
+
+
+def bring_up(db: sqlite3.Connection, path: Path) -> None:
+    """Take an older schema, or an empty file, to the present one: every step is whole or not made at all.
+
+    An older file is kept beside it as it was, under its name and the schema it had.
+    """
+    while (version := version_of(db)) < SCHEMA_VERSION:
+        if version:
+            _keep_copy(db, path.with_name(f"{path.name}.schema-{version}"))
+        db.execute("BEGIN IMMEDIATE")
+        try:
+            if version_of(db) == version:  # else another process made the same step in between
+                for statement in _STEPS[version].split(";"):
+                    db.execute(statement)
+                if version + 1 == WITH_DIGESTS:
+                    _sign_all(db)
+                db.execute(f"PRAGMA user_version = {version + 1}")
+            db.execute("COMMIT")
+        except sqlite3.Error:
+            db.rollback()
+            raise
+
+
+def _keep_copy(db: sqlite3.Connection, path: Path) -> None:
+    part = path.with_name(path.name + ".part")
+    try:
+        part.unlink(missing_ok=True)
+        with closing(sqlite3.connect(part)) as copy:
+            db.backup(copy)
+        part.replace(path)
+    except OSError as error:
+        raise store_error(path, error) from None
+
+
+def _sign_all(db: sqlite3.Connection) -> None:
+    """Give the rows of an older schema their digest, from what can be read of them now."""
+    for table in TABLES:
+        cursor = db.execute(f"SELECT * FROM {table}")
+        names = [column[0] for column in cursor.description]
+        signed = [(digest_of(table, dict(zip(names, row, strict=True))), row[0]) for row in cursor]
+        db.executemany(f"UPDATE {table} SET digest = ? WHERE id = ?", signed)
+
+
+def digest_of(table: str, row: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a row, over its table, its number and all its fields."""
+    values = [(name, value) for name, value in row.items() if name != "digest"]
+    return hashlib.sha256(ascii((table, values)).encode()).hexdigest()
+
+
+def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> int:
+    """Add a row with the digest of what the file then holds of it; return its number."""
+    names = ", ".join(row)
+    marks = ", ".join(f":{name}" for name in row)
+    db.execute("BEGIN IMMEDIATE")
+    try:
+        number = int(db.execute(f"INSERT INTO {table} ({names}, digest) VALUES ({marks}, '')", row).lastrowid or 0)
+        cursor = db.execute(f"SELECT * FROM {table} WHERE id = ?", (number,))
+        stored = dict(zip([column[0] for column in cursor.description], cursor.fetchone(), strict=True))
+        db.execute(f"UPDATE {table} SET digest = ? WHERE id = ?", (digest_of(table, stored), number))
+        db.execute("COMMIT")
+    except sqlite3.Error:
+        db.rollback()
+        raise
+    return number
+
+
+def put_aside(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
+    """Move a damaged row, as it is read now, to the table where nothing is believed."""
+    db.execute("BEGIN IMMEDIATE")
+    try:
+        content = (table, row["id"], ascii(dict(row)))
+        db.execute("INSERT INTO quarantine (of, row, content) VALUES (?, ?, ?)", content)
+        db.execute(f"DELETE FROM {table} WHERE id = ?", (row["id"],))
+        db.execute("COMMIT")
+    except sqlite3.Error:
+        db.rollback()
+        raise

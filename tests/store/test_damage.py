@@ -1,0 +1,172 @@
+"""A bit that flips in what is kept: the same values, or it is told; never other values, never an undeclared error."""
+
+from __future__ import annotations
+
+import random
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil.daemon.keeping import Keeper
+from fdhil.errors import RecordingError, StoreError
+from fdhil.records import Notice, Parameters, Skill
+from fdhil.store import schema
+from fdhil.store.history import FILE_NAME, Comparison, History, UsedParameters, latest_parameters
+from fdhil.store.windows import decode_window, encode_window
+from tests.daemon.machine import config_of
+from tests.store.made import BENCH, STAMP, outcome, published, same, window
+
+TABLES = ("windows", "revisions", "skills", "notices", "comparisons")
+FLIPS_PER_PAGE = 16
+
+
+def filled(folder: Path) -> bytes:
+    """A history of two axes, as its file's bytes after the daemon has ended."""
+    with History.open(folder) as history:
+        for k in range(8):
+            for axis in "XY":
+                history.add_window(
+                    outcome(accepted=k % 3 > 0, of=window(axis=axis)), f"w{k + 1:08d}-{axis}.parquet", STAMP
+                )
+                history.add_revision(
+                    published(k + 1, axis, Parameters(0.5 + k, 0.005, 0.8, 0.075, 0.05, 5.0)), [k], STAMP
+                )
+                history.add_skill(Skill(axis, k, 0.25, 1.5, 0.5, 24.0 + k), STAMP)
+                history.add_notice(Notice("LoadChanged", "MAJOR", f"Jt rose by {k} %", axis, k), STAMP)
+        zone = {"start_s": 0.1, "end_s": 0.3, "where": "X 1.0", "max_um": 98.5, "cause": "corner", "std_um": 0.5}
+        used = {"X": UsedParameters(7, BENCH)}
+        for k in range(8):
+            history.add_comparison(Comparison("a" * 64, "p.ngc", "0123", used, 1.0 + k, (zone,) * 4), STAMP)
+    return (folder / FILE_NAME).read_bytes()
+
+
+def contents(history: History) -> dict[str, list[Any]]:
+    """All that can be read of a history."""
+    return {
+        "windows": history.windows(),
+        "revisions": [(r.number, r.window_ids, r.stamp, r.set.axis, r.set.revision, r.set.parameters, r.set.windows,
+                       r.set.tick, r.set.temperature_c, r.set.config_digest, r.set.covariance.tobytes())
+                      for r in history.revisions()],
+        "skills": history.skills(),
+        "notices": history.notices(),
+        "comparisons": history.comparisons("a" * 64, 99),
+    }  # fmt: skip
+
+
+def places(size: int, page: int, seed: int) -> list[tuple[int, int]]:
+    """Byte and bit: the file's header, then places all over every page, its head more densely than its payload."""
+    rng = random.Random(seed)
+    found = [(byte, rng.randrange(8)) for byte in range(100)]
+    for start in range(0, size, page):
+        heads = [rng.randrange(80) for _ in range(FLIPS_PER_PAGE // 4)]
+        found += [(start + at, rng.randrange(8)) for at in heads + rng.sample(range(page), FLIPS_PER_PAGE)]
+    return found
+
+
+def test_no_flipped_bit_of_a_history_changes_what_is_read(tmp_path: Path) -> None:
+    whole = filled(tmp_path)
+    with History.read(tmp_path) as history:
+        true = contents(history)
+    refused, left_out = list[StoreError](), 0
+    damaged = tmp_path / "damaged"
+    damaged.mkdir()
+    for byte, bit in places(len(whole), 4096, 1):
+        flipped = bytearray(whole)
+        flipped[byte] ^= 1 << bit
+        (damaged / FILE_NAME).write_bytes(flipped)
+        told: list[str] = []
+        try:
+            with History.read(damaged, told.append) as history:
+                found = contents(history)
+                missing = {key for key in history._damaged if key[0] in TABLES}
+        except StoreError as error:
+            refused.append(error)
+            continue
+        for table in TABLES:
+            rest = [row for row in true[table] if row in found[table]]
+            assert found[table] == rest, (byte, bit, table)
+            assert len(true[table]) - len(rest) == sum(name == table for name, _ in missing), (byte, bit, table)
+        left_out += len(told)
+        assert len(told) == (len(missing) > 0)
+    assert len(refused) > 50
+    assert all("start the daemon" in str(e) or e.code in ("SchemaVersion", "StoreFault") for e in refused)
+    assert left_out > 100
+
+
+def test_the_daemon_begins_anew_or_goes_on_whatever_bit_is_flipped(tmp_path: Path) -> None:
+    """A damaged row is put aside and told once, a damaged file kept under another name; what is added then is read."""
+    whole = filled(tmp_path / "made")
+    for byte, bit in places(len(whole), 4096, 2)[::37]:
+        folder = tmp_path / f"{byte}-{bit}"
+        directory = config_of(folder).store.directory
+        directory.mkdir(parents=True)
+        flipped = bytearray(whole)
+        flipped[byte] ^= 1 << bit
+        (directory / FILE_NAME).write_bytes(flipped)
+        keeper = Keeper(config_of(folder))
+        first = [notice.code for notice in keeper.open()]
+        keeper.close()
+        if "SchemaVersion" in first:
+            assert (directory / FILE_NAME).read_bytes() == flipped
+            continue
+        assert first in ([], ["CorruptFile"])
+        again = Keeper(config_of(folder))
+        assert again.open() == []
+        assert again.keep([published(9), outcome()]) == []
+        again.close()
+        assert latest_parameters(directory)["X"] == BENCH
+
+
+def test_a_damaged_revision_is_told_and_the_one_before_it_is_used(tmp_path: Path) -> None:
+    filled(tmp_path)
+    db = sqlite3.connect(tmp_path / FILE_NAME)
+    db.execute("UPDATE revisions SET K = 0.9 WHERE axis = 'X' AND revision = 8")
+    db.commit()
+    db.close()
+    told: list[str] = []
+    assert latest_parameters(tmp_path, told.append)["X"].R == 0.5 + 6
+    (sentence,) = told
+    assert "1 of revisions (row 15) damaged and left out" in sentence
+    with History.open(tmp_path) as history:
+        assert history.put_damaged_aside() == "1 of revisions (row 15)"
+        assert history.put_damaged_aside() == ""
+        assert history.revisions("X", 1)[0].set.revision == 7
+    db = sqlite3.connect(tmp_path / FILE_NAME)
+    ((of, row, content),) = db.execute("SELECT of, row, content FROM quarantine").fetchall()
+    db.close()
+    assert (of, row) == ("revisions", 15)
+    assert "0.9" in content
+
+
+def test_a_row_of_an_older_schema_that_cannot_be_read_is_left_out(tmp_path: Path) -> None:
+    """It carries no digest yet; what is no JSON at all is seen all the same."""
+    db = sqlite3.connect(tmp_path / FILE_NAME)
+    db.executescript(schema._FIRST + "PRAGMA user_version = 1;")
+    row = (1, "X", 1, 0.5, 0.005, 0.8, 0.075, 0.05, 5.0, "[[1.0", 3, "[]", "0123", 5, None, 1.0, "boot", 1)
+    db.execute(f"INSERT INTO revisions VALUES ({', '.join('?' * len(row))})", row)
+    db.commit()
+    db.close()
+    told: list[str] = []
+    assert latest_parameters(tmp_path, told.append) == {}
+    assert len(told) == 1
+    with History.open(tmp_path) as history:
+        assert history.put_damaged_aside() == "1 of revisions (row 1)"
+
+
+@pytest.mark.parametrize("raw", [True, False])
+def test_no_flipped_bit_of_a_window_changes_what_is_read(raw: bool) -> None:
+    made = window(raw=raw)
+    whole = encode_window(made, "0123456789abcdef")
+    rng = random.Random(3)
+    refused = list[str]()
+    for byte in [*range(64), *rng.sample(range(len(whole)), 250), *range(len(whole) - 200, len(whole))]:
+        flipped = bytearray(whole)
+        flipped[byte] ^= 1 << rng.randrange(8)
+        try:
+            assert same(decode_window(bytes(flipped), "w.parquet"), made)
+        except RecordingError as error:
+            refused.append(str(error))
+    assert len(refused) > 300
+    assert all("w.parquet" in sentence for sentence in refused)
