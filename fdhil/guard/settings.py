@@ -167,7 +167,7 @@ def load(path: Path) -> Settings:
     """Read the settings file; ConfigError when it cannot be read or used. What is no plain file is not waited for."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
-        with open(descriptor, "rb") as file:
+        with os.fdopen(descriptor, "rb") as file:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
                 raise OSError("it is no plain file")
             text = file.read(MAX_BYTES).decode("utf-8")
