@@ -16,7 +16,7 @@ import click
 from fdhil import config as machine_config
 from fdhil.cia402 import PdoEntry
 from fdhil.cli.main import run_safely
-from fdhil.config import Axis, CanBus, MachineConfig
+from fdhil.config import Axis, CanBus, MachineConfig, OffsetLimits
 from fdhil.errors import ConfigError, ConfigFault, ConnectError, DeviceError, ProtocolError, StoreError
 from fdhil.guard.feedforward import Limits as FeedforwardLimits
 from fdhil.guard.limits import Limits
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from fdhil.drivers.profile import DriveProfile, PdoSpec
 
 SETTINGS_NAME = "guard.json"
-VARIATION_MM = 3.0
 CONNECT_S = 5.0
 SPEED_STEPS = 2.0  # times the motor's power: room for the load's own inertia and for the sensor's noise
 HEARTBEATS_AWAITED = 2.0  # periods of the drive's heartbeat until it counts as lost
@@ -92,18 +91,8 @@ def settings_of(machine: MachineConfig, bus: str, run_directory: Path, token_sha
 
 
 def limits_of(axis: Axis, sync_period_s: float) -> Limits:
-    """Return the config's limits in whole increments per SYNC cycle, rounded down, rate and acceleration at least 1."""
-    assert axis.correction is not None
-    per_mm = axis.scaling.increments_per_mm
-    rate = axis.correction.max_speed_mm_s * per_mm * sync_period_s
-    acceleration = axis.correction.max_acceleration_mm_s2 * per_mm * sync_period_s**2
-    return Limits(
-        offset=max(1, math.floor(axis.correction.max_offset_um * 1e-3 * per_mm + 1e-9)),
-        rate=max(1, math.floor(rate + 1e-9)),
-        acceleration=max(1, math.floor(acceleration + 1e-9)),
-        variation=max(1, math.floor(VARIATION_MM * per_mm)),
-        window=max(10, round(1.0 / sync_period_s)),
-    )
+    """Return the config's limits in whole increments per SYNC cycle, as the planner has them, rounded down."""
+    return Limits(*OffsetLimits.of(axis, sync_period_s).whole)
 
 
 def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
@@ -126,7 +115,7 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
         offset=_pdo(offset, node_id),
         tpdos=tuple(_pdo(spec, node_id) for spec in profile.tpdos if spec.valid),
         increments_per_mm=axis.scaling.increments_per_mm,
-        max_speed_mm_s=axis.drive.speed_limit_mm_s or axis.rapid_speed_mm_s,
+        max_speed_mm_s=axis.top_speed_mm_s,
         max_acceleration_mm_s2=axis.max_acceleration_mm_s2,
         sign=axis.drive.sign,
         limits=limits_of(axis, period_s),

@@ -66,11 +66,12 @@ def test_check_writes_the_settings_and_a_token(
     assert settings.axes[0].window == 32768
 
 
-def test_default_limits_are_whole_increments(tmp_path: Path) -> None:
+def test_limits_are_whole_increments_rounded_down(tmp_path: Path) -> None:
     config = machine_config.load(write_config(tmp_path, 1))
     axis = config.axis["X"].model_copy(update={"correction": CorrectionLimits()})
-    assert limits_of(axis, 0.001) == Limits(163, 6, 1, 9830, 1000)
     assert limits_of(axis, 0.002) == Limits(163, 13, 3, 9830, 500)
+    slow = config.axis["X"].model_copy(update={"rapid_speed_mm_s": 100.0, "max_acceleration_mm_s2": 1000.0})
+    assert limits_of(slow, 0.001) == Limits(819, 32, 1, 9830, 1000)  # 10 mm/s and 500 mm/s2: the axis' shares
 
 
 RECORD = CommissioningRecord(
