@@ -15,12 +15,13 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cia402 import PdoEntry
+from fdhil.cli.bus_lock import lock_bus
 from fdhil.cli.main import run_safely
 from fdhil.config import Axis, CanBus, MachineConfig, OffsetLimits
 from fdhil.errors import ConfigError, ConfigFault, ConnectError, DeviceError, ProtocolError, StoreError
 from fdhil.guard.feedforward import Limits as FeedforwardLimits
 from fdhil.guard.limits import Limits
-from fdhil.guard.settings import AxisSettings, Feedforward, Layout, Pdo, Settings, to_json
+from fdhil.guard.settings import AxisSettings, Feedforward, Layout, Pdo, Settings, from_json, to_json
 
 if TYPE_CHECKING:
     from fdhil.drivers.commissioning_record import CommissioningRecord
@@ -46,14 +47,17 @@ def guard(config: Path, check: bool) -> None:
     name = corrected_bus(machine, str(config))
     run_directory = machine.store.run_directory or machine.store.directory / "run"
     token = operator_token(run_directory)
-    settings = settings_of(machine, name, run_directory, hashlib.sha256(token.encode()).hexdigest())
-    file = run_directory / SETTINGS_NAME
-    _write(file, to_json(settings))
+    text = to_json(settings_of(machine, name, run_directory, hashlib.sha256(token.encode()).hexdigest()))
+    from_json(text, str(config))  # what the guard would refuse is refused before it is started
+    file, bus = run_directory / SETTINGS_NAME, machine.bus[name]
     if check:
-        click.echo(f"{file}: {len(settings.axes)} axes on {name}")
+        _write(file, text)
+        click.echo(f"{file}: what the guard would be told of {name}")
         return
-    with lock_bus(machine.bus[name]) as lock, open_bus(name, machine.bus[name]) as transmit:
-        lock.set_inheritable(True)
+    with connect_bus(name, bus) as transmit, lock_bus(bus, transmit, run_directory) as lock:
+        greet(name, bus, transmit)
+        _write(file, text)
+        os.set_inheritable(lock.fileno(), True)
         transmit.set_inheritable(True)
         arguments = ["-m", "fdhil.guard", "--settings", str(file), "--descriptor", str(transmit.fileno())]
         sys.stdout.flush()
@@ -212,32 +216,32 @@ def operator_token(run_directory: Path) -> str:
 def _write(file: Path, text: str) -> None:
     temporary = file.with_suffix(".new")
     try:
-        temporary.write_text(text, "utf-8")
+        temporary.unlink(missing_ok=True)
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        with os.fdopen(descriptor, "w", encoding="utf-8") as written:
+            written.write(text)
         temporary.replace(file)
     except OSError as error:
         raise DeviceError(str(file), f"cannot be written ({error.strerror}); check the run directory") from None
 
 
-def lock_bus(bus: CanBus) -> socket.socket:
-    """Hold the name of this bus for as long as the process lives; DeviceError (``BusLocked``) when another has it."""
-    place = f"{bus.interface}:{bus.host}:{bus.port}:{bus.channel}" if bus.interface != "socketcan" else bus.channel
-    lock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    try:
-        lock.bind(f"\0fdhil-guard:{place}")
-    except OSError:
-        lock.close()
-        raise DeviceError(
-            place, "BusLocked: another guard already owns this bus, and nothing was sent; stop that one first"
-        ) from None
-    return lock
-
-
 def open_bus(name: str, bus: CanBus) -> socket.socket:
-    """Open the transmit descriptor; ConnectError when the bus cannot be had."""
+    """Return a descriptor on which frames can be sent; ConnectError when the bus cannot be had."""
+    transmit = connect_bus(name, bus)
+    greet(name, bus, transmit)
+    return transmit
+
+
+def connect_bus(name: str, bus: CanBus) -> socket.socket:
+    """Open the transmit descriptor; a hub still has to be greeted. ConnectError when the bus cannot be had."""
     if bus.interface == "socketcan":
         return _open_raw(name, bus.channel)
     if bus.interface == "socketcand":
-        return _open_socketcand(name, bus)
+        try:
+            return socket.create_connection((bus.host, bus.port), timeout=CONNECT_S)
+        except OSError as error:
+            text = f"no hub answers at {bus.host} port {bus.port} ({error.strerror or error}); start the hub first"
+            raise ConnectError(f"bus {name}", text) from None
     text = f"the interface {bus.interface!r} lives inside one process; set socketcan or socketcand"
     raise ConnectError(f"bus {name}", text)
 
@@ -255,14 +259,11 @@ def _open_raw(name: str, channel: str) -> socket.socket:
     return raw
 
 
-def _open_socketcand(name: str, bus: CanBus) -> socket.socket:
-    """Connect to the hub and go through its greeting, byte by byte, so that no frame is swallowed."""
+def greet(name: str, bus: CanBus, hub: socket.socket) -> None:
+    """Go through the greeting of a hub, byte by byte, so that no frame is swallowed."""
+    if bus.interface != "socketcand":
+        return
     deadline_s = time.monotonic() + CONNECT_S
-    try:
-        hub = socket.create_connection((bus.host, bus.port), timeout=CONNECT_S)
-    except OSError as error:
-        text = f"no hub answers at {bus.host} port {bus.port} ({error.strerror or error}); start the hub first"
-        raise ConnectError(f"bus {name}", text) from None
     hub.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     try:
         _expect(hub, "hi", deadline_s)
@@ -273,7 +274,6 @@ def _open_socketcand(name: str, bus: CanBus) -> socket.socket:
         hub.close()
         text = f"the hub at {bus.host} port {bus.port} broke off its greeting ({error}); check that it is a socketcand"
         raise ConnectError(f"bus {name}", text) from None
-    return hub
 
 
 def _expect(hub: socket.socket, word: str, deadline_s: float) -> None:

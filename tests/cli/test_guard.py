@@ -16,11 +16,12 @@ from pathlib import Path
 import pytest
 
 from fdhil import config as machine_config
-from fdhil.cli.guard import guard, heartbeat_timeout_s, limits_of, lock_bus, open_bus, settings_of
+from fdhil.cli.bus_lock import lock_bus
+from fdhil.cli.guard import guard, heartbeat_timeout_s, limits_of, open_bus, settings_of
 from fdhil.cli.main import cli, run_safely
 from fdhil.config import CanBus, CorrectionLimits
 from fdhil.drivers.commissioning_record import CommissioningRecord, save_record
-from fdhil.errors import ConnectError, DeviceError, ProtocolError
+from fdhil.errors import ConnectError, ProtocolError
 from fdhil.guard.limits import Limits
 from fdhil.guard.settings import from_json, load, to_json
 from tests.guard.machine import DEMAND_AT_REST
@@ -52,7 +53,7 @@ def test_check_writes_the_settings_and_a_token(
 ) -> None:
     config = write_config(tmp_path, 1)
     assert run(monkeypatch, str(config), "--check") == 0
-    assert "2 axes on can0" in capsys.readouterr().out
+    assert "guard.json" in capsys.readouterr().out
     directory = tmp_path / "fdhil-data" / "run"
     settings = load(directory / "guard.json")
     token = (directory / "token").read_text()
@@ -149,13 +150,6 @@ def test_a_peer_that_is_no_hub(greeting: bytes, error: type[Exception]) -> None:
         thread.join()
 
 
-def test_one_guard_per_bus() -> None:
-    bus = CanBus(port=47)
-    with lock_bus(bus), pytest.raises(DeviceError, match="BusLocked"):
-        lock_bus(bus)
-    lock_bus(bus).close()
-
-
 def test_no_drive_is_commissioned_while_a_guard_owns_the_bus(
     tmp_path: Path, peer: Peer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -168,20 +162,26 @@ def test_no_drive_is_commissioned_while_a_guard_owns_the_bus(
 
 
 def test_it_becomes_the_guard_owns_its_bus_and_stops_cleanly(tmp_path: Path, peer: Peer) -> None:
+    """A second one, by another name of the same hub and from another directory, exits with 3 and sends nothing."""
     config = write_config(tmp_path, peer.port)
+    (tmp_path / "other").mkdir()
+    other = write_config(tmp_path / "other", peer.port)
+    other.write_text(other.read_text().replace("127.0.0.1", "localhost"))
     command = [sys.executable, "-m", "fdhil.cli.guard", str(config)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         ready = json.loads(process.stdout.readline())
-        assert (ready["event"], ready["axes"]) == ("ready", ["X", "Y"])
-        second = subprocess.run(command, capture_output=True, text=True, timeout=60)
-        assert second.returncode == 3
-        assert "BusLocked" in second.stderr
-        assert len(second.stderr.splitlines()) == 1
+        seconds = [
+            subprocess.run([*command[:-1], str(again)], capture_output=True, text=True, timeout=60)
+            for again in (config, other)
+        ]
         process.send_signal(signal.SIGTERM)
         told = [json.loads(line) for line in process.stdout]
         assert process.wait(20) == 0
         assert told[-1]["event"] == "stopped"
+    assert (ready["event"], ready["axes"]) == ("ready", ["X", "Y"])
+    assert [second.returncode for second in seconds] == [3, 3]
+    assert all("BusLocked" in second.stderr and len(second.stderr.splitlines()) == 1 for second in seconds)
     assert peer.sent == []
 
 
