@@ -49,7 +49,7 @@ def lock_bus(bus: CanBus, transmit: socket.socket | None = None, run_directory: 
 
 
 def endpoint(bus: CanBus, transmit: socket.socket | None = None) -> str:
-    """Return where a bus leads to: an interface of this network namespace, or a channel behind a hub's address and port.
+    """Return where a bus leads to: an interface of this network namespace, or a channel behind a hub's port.
 
     All addresses of this computer are one.
     """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+import pwd
 import socket
 import sys
 import time
@@ -45,8 +46,9 @@ def guard(config: Path, check: bool) -> None:
     """
     machine = machine_config.load(config)
     name = corrected_bus(machine, str(config))
-    run_directory = machine.store.run_directory or machine.store.directory / "run"
-    token = operator_token(run_directory)
+    daemons = machine.store.run_directory or machine.store.directory / "run"
+    token, run_directory = operator_token(daemons), machine.guard.run_directory or daemons
+    _make(run_directory)
     text = to_json(settings_of(machine, name, run_directory, hashlib.sha256(token.encode()).hexdigest()))
     from_json(text, str(config))  # what the guard would refuse is refused before it is started
     file, bus = run_directory / SETTINGS_NAME, machine.bus[name]
@@ -91,7 +93,18 @@ def settings_of(machine: MachineConfig, bus: str, run_directory: Path, token_sha
         token_sha256=token_sha256,
         run_directory=str(run_directory),
         axes=tuple(axes),
+        daemon_uid=_user_id(machine.guard.daemon_user),
     )
+
+
+def _user_id(name: str | None) -> int | None:
+    if name is None:
+        return None
+    try:
+        return pwd.getpwnam(name).pw_uid
+    except KeyError:
+        fault = ConfigFault("guard.daemon_user", f"there is no user {name!r}", "the user of fdhil.service")
+        raise ConfigError("config", [fault]) from None
 
 
 def limits_of(axis: Axis, sync_period_s: float) -> Limits:
@@ -202,15 +215,25 @@ def _layout(entries: tuple[PdoEntry, ...]) -> Layout:
 
 
 def operator_token(run_directory: Path) -> str:
-    """Return the token that arming needs, made at the first start of guard or daemon. DeviceError."""
-    from fdhil.daemon.token import ensure_token  # late, as above
+    """Return the token that arming needs, made at the first start of guard or daemon. DeviceError.
 
-    try:
-        run_directory.mkdir(parents=True, exist_ok=True, mode=0o700)
-    except OSError as error:
-        text = f"cannot be made ({error.strerror}); check [store] run_directory and its rights"
-        raise DeviceError(str(run_directory), text) from None
+    Under a user of its own the guard is given it by systemd (LoadCredential=token:...).
+    """
+    from fdhil.daemon.token import TOKEN_NAME, ensure_token, read_token  # late, as above
+
+    given = os.environ.get("CREDENTIALS_DIRECTORY")
+    if given and (Path(given) / TOKEN_NAME).exists():
+        return read_token(Path(given))
+    _make(run_directory)
     return ensure_token(run_directory)
+
+
+def _make(directory: Path) -> None:
+    try:
+        directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+    except OSError as error:
+        text = f"cannot be made ({error.strerror}), and nothing is sent; check run_directory and its rights"
+        raise DeviceError(str(directory), text) from None
 
 
 def _write(file: Path, text: str) -> None:

@@ -44,7 +44,9 @@ def parse(document: Mapping[str, Any], source: str = "config", folder: Path = Pa
     store = config.store.model_copy(
         update={"directory": directory, "run_directory": folder / run if run else directory / "run"}
     )
-    return config.model_copy(update={"store": store})
+    guard_run = config.guard.run_directory
+    guard = config.guard.model_copy(update={"run_directory": folder / guard_run if guard_run else None})
+    return config.model_copy(update={"store": store, "guard": guard})
 
 
 def _faults(error: ValidationError) -> list[ConfigFault]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import pwd
 import signal
 import socket
 import stat
@@ -191,3 +192,26 @@ def test_the_process_alone_refuses_what_it_cannot_use(tmp_path: Path) -> None:
     assert refused.returncode == 2
     assert "run fdhil-guard" in refused.stderr
     assert len(refused.stderr.splitlines()) == 1
+
+
+def test_a_guard_under_a_user_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its files are in a directory of its own, the token is given to it by systemd, and it knows the daemon's user."""
+    config = write_config(tmp_path, 1)
+    config.write_text(config.read_text() + 'run_directory = "own"\ndaemon_user = "daemon"\n')
+    given = tmp_path / "credentials"
+    given.mkdir()
+    (given / "token").write_text("the operator's")
+    (given / "token").chmod(0o400)
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(given))
+    assert run(monkeypatch, str(config), "--check") == 0
+    settings = load(tmp_path / "own" / "guard.json")
+    assert settings.token_sha256 == hashlib.sha256(b"the operator's").hexdigest()
+    assert settings.daemon_uid == pwd.getpwnam("daemon").pw_uid
+    assert settings.run_directory == str(tmp_path / "own")
+    assert stat.S_IMODE((tmp_path / "own" / "guard.json").stat().st_mode) == 0o600
+    assert not (tmp_path / "fdhil-data").exists()
+    config.write_text(config.read_text().replace('"daemon"', '"nobody of that name"'))
+    assert run(monkeypatch, str(config), "--check") == 2
+    assert "there is no user 'nobody of that name'" in capsys.readouterr().err
