@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import os
 import pwd
@@ -10,7 +11,7 @@ import socket
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -57,13 +58,25 @@ def guard(config: Path, check: bool) -> None:
         click.echo(f"{file}: what the guard would be told of {name}")
         return
     with connect_bus(name, bus) as transmit, lock_bus(bus, transmit, run_directory) as lock:
-        greet(name, bus, transmit)
+        _compare_again(machine, name)
+        text = to_json(settings_of(machine, name, run_directory, hashlib.sha256(token.encode()).hexdigest()))
         _write(file, text)
+        greet(name, bus, transmit)
         os.set_inheritable(lock.fileno(), True)
         transmit.set_inheritable(True)
         arguments = ["-m", "fdhil.guard", "--settings", str(file), "--descriptor", str(transmit.fileno())]
         sys.stdout.flush()
         os.execv(sys.executable, [sys.executable, *arguments])
+
+
+def _compare_again(machine: MachineConfig, bus: str) -> None:
+    """Where no NC runs the bus, ask the commissioned drives whether they still are what was signed off."""
+    from fdhil.drivers.commissioning_compare import compare_again  # late, as below
+
+    def tell(text: str) -> None:
+        click.echo(json.dumps({"event": "record_void", "text": text}))
+
+    compare_again(machine, bus, tell)
 
 
 def corrected_bus(machine: MachineConfig, source: str) -> str:
@@ -143,7 +156,18 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
         speed_count=abs(profile.speed_rad_s_per_count(axis)) * per_rad * period_s,
         speed_step=SPEED_STEPS * _largest_acceleration_rad_s2(axis) * per_rad * period_s**2,
         travel=None if record is None else record.travel,
+        **_commissioned(machine, name, record),
     )
+
+
+def _commissioned(machine: MachineConfig, name: str, record: CommissioningRecord | None) -> dict[str, Any]:
+    """The fingerprint of the drive as it was signed off, and whether something against that was seen since."""
+    from fdhil.drivers.commissioning_record import holds  # late, as above
+    from fdhil.drivers.commissioning_void import is_void
+
+    if record is None or not holds(record, machine, name):
+        return {}
+    return {"record": record.fingerprint, "record_void": is_void(machine.store.directory, name)}
 
 
 def _largest_acceleration_rad_s2(axis: Axis) -> float:
@@ -273,6 +297,7 @@ def _open_raw(name: str, channel: str) -> socket.socket:
     raw = None
     try:
         raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        raw.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")  # what comes before the guard listens is old
         raw.bind((channel,))
     except OSError as error:
         if raw is not None:

@@ -21,6 +21,8 @@ SETTLING_S = 0.2
 CHARGED = {"ARMED", "RAMPING", "ACTIVE", "HOLD", "FEEDFORWARD"}
 ORDERED = {"Disarmed", "Finished", "Stopped"}
 TRIPPED = "GuardTripped"
+RECORD_VOID = "RecordVoid"
+VOIDING = {RECORD_VOID, "NodeRebooted"}
 REST = {"OFF", "FROZEN", "absent"}
 
 
@@ -152,7 +154,18 @@ class GuardLink:
 
 
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
-    """Say when the guard came, or changed its state, and why; a correction that something ended is a trip."""
+    """Say when the guard came, changed its state, or saw a record void; what something ended is a trip."""
+    return [*_voided(before, now), *_moved(before, now)]
+
+
+def _voided(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
+    """Say which records hold no longer."""
+    known = {told["axis"] for told in before.get("not_good", []) if told["code"] == RECORD_VOID}
+    void = [told for told in now.get("not_good", []) if told["code"] == RECORD_VOID and told["axis"] not in known]
+    return [Notice(RECORD_VOID, "MAJOR", f"{told['text']}; {told['advice']}", told["axis"]) for told in void]
+
+
+def _moved(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
     if before["state"] == now["state"]:
         return []
     cause = now.get("cause") or {}

@@ -19,13 +19,14 @@ from fdhil.config import MachineConfig
 from fdhil.daemon import blackbox, journal
 from fdhil.daemon.armory import Armory
 from fdhil.daemon.control import SOCKET_NAME, Answer, ControlServer, refusal
-from fdhil.daemon.guard_link import TRIPPED
+from fdhil.daemon.guard_link import TRIPPED, VOIDING
 from fdhil.daemon.keeping import Keeper
 from fdhil.daemon.lock import sole_owner
 from fdhil.daemon.notify import notify
 from fdhil.daemon.status import Watch
 from fdhil.daemon.warm import warm
-from fdhil.errors import DeviceError, FdhilError
+from fdhil.drivers.commissioning_void import void_record
+from fdhil.errors import DeviceError, FdhilError, StoreError
 from fdhil.pipeline import AxisPipeline, Record
 from fdhil.records import Notice, Outcome, Temperature, TickTimes
 
@@ -211,10 +212,19 @@ class Service:
         while True:
             notice = await self._notices.get()
             self._say(await asyncio.to_thread(self._keeper.keep, [notice]))
+            if notice.code in VOIDING:
+                await asyncio.to_thread(self._void, notice)
             if notice.code == TRIPPED and self._source is not None:
                 code, store = notice.text.partition(":")[0], self._config.store.directory
                 self._say([await asyncio.to_thread(blackbox.dump, store, code, self._source.black_box)])
             self._notices.task_done()
+
+    def _void(self, notice: Notice) -> None:
+        """Mark the axis' commissioning record: the guard that is started next must know of it."""
+        try:
+            void_record(self._config.store.directory, notice.axis, notice.text)
+        except StoreError as error:
+            self._log(str(error), "MAJOR")
 
     def _say(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
         """Show outcomes: one log line each (a flood becomes a count), the newest in the status. Return those shown."""

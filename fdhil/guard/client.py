@@ -94,6 +94,10 @@ class GuardClient:
         """Take over what the drives hold and ramp it to zero (after FROZEN, or a stale offset)."""
         return self.ask({"request": "adopt", "token": token})
 
+    def compared(self, token: str, axes: Mapping[str, str]) -> dict[str, Any]:
+        """Tell which drives were compared with their records; a fingerprint that is not the record's voids it."""
+        return self.ask({"request": "compared", "token": token, "axes": dict(axes)})
+
     def alive(self, facts: Mapping[str, bool] | None = None) -> None:
         """Say that the daemon is well, and what it still vouches for; GuardLost when the guard is gone."""
         message: dict[str, Any] = {"request": "alive"}

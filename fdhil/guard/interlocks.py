@@ -74,12 +74,17 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     "TargetLost": (_H, "no new target (0x607A) came with this SYNC", "check that the NC streams its targets"),
     "HeartbeatLost": (_R, "the drive's heartbeat is missing", "check the drive, or its 0x1017"),
     "NmtStateWrong": (_F, "the drive is not Operational", "hold the feed, find the NMT master, then adopt"),
-    "NodeRebooted": (_F, "the drive has rebooted", "hold the feed, check the commissioning record, then adopt"),
+    "NodeRebooted": (_F, "the drive has rebooted", "hold the feed, run fdhil check with the NC off, then fdhil adopt"),
     "DriveNotEnabled": (_R, "the drive is not in Operation enabled", "clear its fault and enable it"),
     "NotFollowing": (_R, "the drive does not follow its demand (statusword bit 12)", "check the drive's limits"),
     "LimitActive": (_R, "an internal limit is active (statusword bit 11)", "leave the limit"),
     "FollowingError": (_R, "the following error exceeds half its window", "check load, gains and 0x6065"),
     "NotCsp": (_R, "the drive does not show cyclic synchronous position mode", "set 0x6060 to 8"),
+    "ReadBackStale": (
+        _R,
+        "the drive's offset (0x60B0) is not shown, so that it is unknown",
+        "check the drive and that one of its TPDOs maps 0x60B0",
+    ),
     "EchoMismatch": (_R, "the drive's offset is not the one that was sent", "check the PDO mapping and the scaling"),
     "Implausible": (
         _R,
@@ -90,6 +95,11 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     "PdoLength": (_R, "a PDO is shorter than its mapping", "compare the drive's mapping with the profile"),
     "PdoMapping": (_N, "a PDO is longer than its mapping", "compare the drive's mapping with the profile"),
     "StaleOffset": (_N, "the drive already holds an offset", "adopt it, so that it is ramped to zero"),
+    "OffsetDoubtful": (
+        _F,
+        "what the drive holds as offset may not be believed",
+        "hold the feed, switch the drive off and on, run fdhil check with the NC off, then fdhil adopt",
+    ),
     # other nodes
     "ForeignProducer": (_R, "two nodes send as this drive or NC", "find and remove the second node"),
     "OffsetHijack": (_R, "another node sends our offset COB-ID", "hold the feed, find and remove that node"),
@@ -108,6 +118,11 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     "ProgramMismatch": (_N, "no table of this program is loaded", "plan and load the correction of this program"),
     # what the daemon vouches for
     "NotCommissioned": (_N, "there is no valid commissioning record", "run fdhil commission"),
+    "RecordVoid": (
+        _N,
+        "the drive has rebooted or was set up anew since it was commissioned",
+        "switch the NC off and run fdhil check, which compares it again",
+    ),
     "FeedforwardUnknown": (_N, "it is unknown whether the offset enters the feed-forward", "run fdhil commission"),
     "FeedforwardOff": (_N, "this drive is not set up for speed and torque offsets", "run fdhil commission"),
     "ModelNotValidated": (_N, "the model was not validated", "record a rapid move of each axis"),

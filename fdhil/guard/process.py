@@ -31,7 +31,7 @@ from fdhil.guard.state import Inputs, Mode, Output, Request, initial
 
 IDLE_S = 0.05
 REST_S = 0.001
-DECIDED = ("arm", "feedforward", "disarm", "adopt")
+DECIDED = ("arm", "feedforward", "disarm", "adopt", "compared")
 
 
 class Guard:
@@ -196,6 +196,7 @@ class Guard:
         alive, alarms = self._alive(client if arming else self._owner, now_s), self._listener.alarms()
         heard = (late, self._transmitted, alive, alarms, self._withdrawn, self.intake.path, request)
         inputs = Inputs(seen.sync, seen.axes, seen.bus, *heard)
+        before = self.state.axes
         self.state, output = core.step(self.state, inputs, self.settings)
         self._transmitted = self._send(output)
         self._inputs, self._stepped_s = inputs, now_s
@@ -209,6 +210,9 @@ class Guard:
             self._tell(*output.transition)
         if output.feed_transition is not None:
             self._tell_feed(*output.feed_transition)
+        for own, was, axis in zip(self.settings.axes, before, self.state.axes, strict=True):
+            if axis.record_void and not was.record_void:
+                self._journal.write("record_void", axis=own.name, text=Alarm("RecordVoid", own.name).sentence())
 
     def _alive(self, owner: Client | None, now_s: float) -> bool:
         """Whether the daemon that armed is connected and says so often enough."""

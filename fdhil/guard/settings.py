@@ -60,6 +60,8 @@ class AxisSettings:
     speed can change in one cycle; 0: not judged.
     ``travel`` are the drive's software limits (0x607D), None: it has none.
     ``heartbeat_timeout_s`` 0: the drive has no heartbeat, and its PDOs alone show that it is Operational.
+    ``record`` is the fingerprint of the drive as it was commissioned, empty: it was not; ``record_void`` says that
+    something against it was seen since.
     """
 
     name: str
@@ -79,11 +81,14 @@ class AxisSettings:
     speed_count: float = 0.0
     speed_step: float = 0.0
     travel: tuple[int, int] | None = None
+    record: str = ""
+    record_void: bool = False
 
     @property
-    def reads_back(self) -> bool:
-        """Whether a TPDO shows the offset in force."""
-        return any(entry[0] == 0x60B0 for pdo in self.tpdos for entry in pdo.layout)
+    def read_back_every(self) -> int:
+        """With every how many SYNC a TPDO shows the offset in force; 0: none does."""
+        shown = [pdo for pdo in self.tpdos if any(entry[:2] == (0x60B0, 0) for entry in pdo.layout)]
+        return max(1, shown[0].every_sync) if shown else 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,6 +259,9 @@ def _check_axis(axis: AxisSettings) -> None:
     _number(axis.heartbeat_timeout_s, 0.0, 3600.0, where + "heartbeat_timeout_s")
     _number(axis.speed_step, 0.0, 2.0**31, where + "speed_step")
     _number(axis.speed_count, 0.0, 2.0**31, where + "speed_count")
+    _word(axis.record, ".{0,200}", where + "record")
+    if type(axis.record_void) is not bool:
+        raise ValueError(f"{where}record_void is neither true nor false")
     _check_sent(axis.offset, OFFSET_LAYOUT, f"{where}the offset RPDO must map 0x60B0:00 and nothing else")
     if axis.feedforward is not None:
         text = f"{where}the feed-forward's RPDO must map 0x60B1:00 and 0x60B2:00 and nothing else"

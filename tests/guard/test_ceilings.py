@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -111,7 +112,8 @@ def altered(**changes: object) -> str:
 def test_a_settings_file_can_raise_no_limit_above_its_ceiling(name: str) -> None:
     value = getattr(LIMITS, name)
     assert from_json(altered(**{name: value})).axes[0].limits == LIMITS
-    for wrong in (value + 1, 10 * value, 2**62, 0, -1, value + 0.5, True, None, "1", [], float("inf")):
+    wrongs: tuple[object, ...] = (value + 1, 10 * value, 2**62, 0, -1, value + 0.5, True, None, "1", [], math.inf)
+    for wrong in wrongs:
         with pytest.raises(ConfigError, match="let fdhil-guard write it"):
             from_json(altered(**{name: wrong}))
 
@@ -135,7 +137,8 @@ def test_no_value_of_any_kind_in_any_field_is_anything_but_a_refusal() -> None:
     clean = json.loads(to_json(made_settings()))
     paths = list(_paths(clean))
     assert len(paths) > 100
-    for path, wrong in itertools.product(paths, ("\ud800", -1, 1e300, [], {}, [[[]]], None, True, 10**400)):
+    wrongs: tuple[object, ...] = ("\ud800", -1, 1e300, [], {}, [[[]]], None, True, 10**400)
+    for path, wrong in itertools.product(paths, wrongs):
         document = json.loads(to_json(made_settings()))
         inner = document
         for key in path[:-1]:

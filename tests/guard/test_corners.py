@@ -51,7 +51,7 @@ def test_adopting_is_for_off_and_frozen_alone() -> None:
     machine = active()
     refused = machine.sync(Request("adopt", token_valid=True)).refused
     assert refused is not None
-    assert [alarm.code for alarm in refused] == ["NotOff"]
+    assert "NotOff" in {alarm.code for alarm in refused}
     assert machine.state.mode is Mode.ACTIVE
 
 

@@ -20,7 +20,7 @@ from fdhil import config as machine_config
 from fdhil.cli.guard import open_bus, settings_of
 from fdhil.guard.client import GuardClient, GuardLost
 from fdhil.guard.settings import to_json
-from tests.guard.machine import DIGEST, FACTS_GIVEN, LIMITS, smooth_path
+from tests.guard.machine import DIGEST, FACTS_GIVEN, LIMITS, commissioned, smooth_path
 from tests.guard.peer import Peer, write_config
 
 DEMAND, OFFSET = smooth_path(rows=800)
@@ -38,7 +38,7 @@ class Rig:
         self.program = program
         self.settings = folder / "guard.json"
         token = hashlib.sha256(TOKEN.encode()).hexdigest()
-        self.settings.write_text(to_json(settings_of(self.config, "can0", folder, token)))
+        self.settings.write_text(to_json(commissioned(settings_of(self.config, "can0", folder, token))))
         self.journal = (folder / "journal").open("a")
         self.process = self.start()
         self.client: GuardClient | None = None

@@ -14,7 +14,7 @@ import pytest
 from fdhil.cli.demo.processes import Process
 from fdhil.correction.online import law
 from fdhil.daemon.token import read_token
-from fdhil.drivers.commissioning import commission
+from fdhil.drivers.commissioning import commission, save_record
 from fdhil.guard.client import GuardClient
 from fdhil.guard.interlocks import FEEDFORWARD_FACTS
 from fdhil.prediction.models import nominal_models
@@ -55,6 +55,7 @@ def client(bench: Bench, tmp_path: Path) -> Iterator[GuardClient]:
     """A guard on the bench's bus, the drives commissioned before."""
     for axis in "XY":
         record = commission(bench.config, axis)
+        save_record(record, bench.config.store.directory)
         assert record.options["1402"] == 0x400 + bench.config.node_id(axis)
     path = tmp_path / "machine.toml"
     path.write_text(toml(json.loads(bench.config.model_dump_json(exclude_none=True))), "utf-8")
