@@ -275,7 +275,7 @@ def _stopped_like_ctrl_c() -> Iterator[None]:
 
 def _commission_axis(machine: MachineConfig, axis: str, yes: bool, quiet: bool) -> dict[str, Any]:
     """Run all steps for one axis and save its record; DriveFault when it is refused."""
-    from fdhil.cli.guard import lock_bus
+    from fdhil.cli.bus_lock import lock_bus
     from fdhil.drivers import commissioning
 
     with lock_bus(machine.bus[machine.axis[axis].drive.bus]):  # the guard reads the record when it starts

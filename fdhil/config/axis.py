@@ -130,6 +130,11 @@ class Axis(Section):
         return Scaling(self.drive.increments_per_rev, self.screw_pitch_mm, self.drive.sign)
 
     @property
+    def top_speed_mm_s(self) -> float:
+        """The axis maximum."""
+        return self.drive.speed_limit_mm_s or self.rapid_speed_mm_s
+
+    @property
     def rapid_speed_rad_s(self) -> float:
         """Shaft speed of G0."""
         return self.rapid_speed_mm_s / self.screw_pitch_mm * 2 * math.pi

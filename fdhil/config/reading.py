@@ -48,7 +48,9 @@ def parse(document: Mapping[str, Any], source: str = "config", folder: Path = Pa
             "commissioning_key": folder / key if key else None,
         }
     )
-    return config.model_copy(update={"store": store})
+    guard_run = config.guard.run_directory
+    guard = config.guard.model_copy(update={"run_directory": folder / guard_run if guard_run else None})
+    return config.model_copy(update={"store": store, "guard": guard})
 
 
 def _faults(error: ValidationError) -> list[ConfigFault]:

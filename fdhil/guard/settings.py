@@ -172,7 +172,7 @@ def load(path: Path) -> Settings:
     """Read the settings file; ConfigError when it cannot be read or used. What is no plain file is not waited for."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
-        with open(descriptor, "rb") as file:
+        with os.fdopen(descriptor, "rb") as file:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
                 raise OSError("it is no plain file")
             text = file.read(MAX_BYTES).decode("utf-8")
@@ -259,8 +259,9 @@ def _check_axis(axis: AxisSettings) -> None:
     _number(axis.heartbeat_timeout_s, 0.0, 3600.0, where + "heartbeat_timeout_s")
     _number(axis.speed_step, 0.0, 2.0**31, where + "speed_step")
     _number(axis.speed_count, 0.0, 2.0**31, where + "speed_count")
-    if type(axis.record) is not str or type(axis.record_void) is not bool:
-        raise ValueError(f"{where}record or record_void is no text and no truth value")
+    _word(axis.record, ".{0,200}", where + "record")
+    if type(axis.record_void) is not bool:
+        raise ValueError(f"{where}record_void is neither true nor false")
     _check_sent(axis.offset, OFFSET_LAYOUT, f"{where}the offset RPDO must map 0x60B0:00 and nothing else")
     if axis.feedforward is not None:
         text = f"{where}the feed-forward's RPDO must map 0x60B1:00 and 0x60B2:00 and nothing else"
