@@ -29,14 +29,15 @@ from fdhil.daemon.arming import (
 )
 from fdhil.daemon.checking import Check
 from fdhil.daemon.control import Answer, refusal
-from fdhil.daemon.guard_link import REST, GuardLink
+from fdhil.daemon.guard_link import GONE, REST, GuardLink
 from fdhil.daemon.keeping import Keeper, boot_id
+from fdhil.daemon.passes import Passes
 from fdhil.daemon.standing import ADOPT, START_AND_ADOPT, Standing, verdict
 from fdhil.daemon.streamed import Checked
 from fdhil.daemon.supply import Supply
 from fdhil.daemon.token import ensure_token
 from fdhil.errors import DeviceError
-from fdhil.records import Notice, Outcome, ParameterSet, Skill, Temperature
+from fdhil.records import AxisSamples, Notice, Outcome, ParameterSet, Skill, Temperature
 from fdhil.store.history import Revision
 
 STREAM_S = 0.05
@@ -64,6 +65,7 @@ class Armory:
         self._arming = asyncio.Lock()
         self._armed: tuple[Armament | StreamedArmament | Feeding, Mapping[str, Any]] | None = None
         self._check = Check(config)
+        self._passes = Passes(config)
         self._supply: Supply | None = None
         self._given_up = False
         self._disarming: asyncio.Future[Answer] | None = None
@@ -96,6 +98,15 @@ class Armory:
     def note_temperature(self, reading: Temperature) -> None:
         """Take a temperature."""
         self._temperature[reading.axis] = reading.celsius
+
+    def hear(self, samples: AxisSamples) -> None:
+        """Take samples: those of a pass of the armed program are compared with what was predicted."""
+        self._passes.take(samples)
+
+    @property
+    def passes(self) -> list[Mapping[str, Any]]:
+        """What the last passes under a correction measured, oldest first."""
+        return list(self._passes.told)
 
     @property
     def temperatures(self) -> Mapping[str, float]:
@@ -163,6 +174,9 @@ class Armory:
         return f"{ADOPT if self.guard.connected else START_AND_ADOPT}, then arm again"
 
     def _release(self) -> None:
+        if self._armed is not None and not isinstance(self._armed[0], Feeding):
+            cause = "GuardLost" if self.guard.state in GONE else (self.guard.status.get("cause") or {}).get("code", "")
+            self._passes.end(cause, self._armed[0].summary())
         self._armed = self._supply = None
 
     async def _feed_forward(self, token: str) -> Answer:
@@ -184,11 +198,15 @@ class Armory:
         if self._given_up:
             return refusal("Abandoned", "the arming was abandoned while it was prepared", "arm again when it is wanted")
         prepared.facts["journal_writable"] = self._keeper.fault is None
+        if not isinstance(prepared, Feeding):
+            self._passes.begin(prepared.first().demand, prepared.rows)
         try:
             answer = await asyncio.to_thread(ask, prepared, token)
         except DeviceError as error:
+            self._passes.forget()
             return self._without_guard(error)
         if not answer["ok"]:
+            self._passes.forget()
             return dict(answer) | {"planned": summary}
         self._armed = (prepared, summary)
         self._supply = Supply(prepared, self.guard) if isinstance(prepared, StreamedArmament) else None
@@ -203,13 +221,11 @@ class Armory:
         answer = await self._hand_over(self.guard.arm, prepared, summary, token)
         if not answer["ok"]:
             return answer
-        text = (
-            f"armed {program.name} by {summary['method']}: contour error {summary['before']['rms_um']:.1f} um RMS is"
-            f" predicted to become {summary['after']['rms_um']:.1f}"
-        )
+        text = f"armed {program.name} by {summary['method']}: {summary['promise']}"
         if not summary.get("check", {"whole": True})["whole"]:
             text += f" in its first {summary['check']['checked_s']:.0f} s; the check of the rest goes on ahead of it"
-        return {"ok": True, "state": answer.get("state", "ARMED"), "text": f"{text}; start the program", **summary}
+        text += "; start the program, its error is measured as it runs"
+        return {"ok": True, "state": answer.get("state", "ARMED"), "text": text, **summary}
 
     async def _checked(self, long: Long, whole: bool) -> StreamedArmament | Refused:
         """Have a long program checked as far as arming asks, or as a ``whole``; it is armed with its first rows."""
@@ -286,6 +302,7 @@ class Armory:
             await asyncio.sleep(STREAM_S)
             if self._supply is not None:
                 tell(await asyncio.to_thread(self._supply.go_on))
+            tell(await asyncio.to_thread(self._passes.digest))
             await self._check.attend()
 
     def _facts(self) -> Mapping[str, bool] | None:

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from fdhil.daemon.arming import Armament, Feeding, StreamedArmament
 from fdhil.daemon.standing import ABSENT, AT_REST, START_AND_ADOPT, Standing, landed, lost, standing
@@ -38,7 +38,7 @@ class GuardLink:
         self._lock = threading.Lock()
         self._client: GuardClient | None = None
         self._status: Mapping[str, Any] = ABSENT
-        self._heard_s = time.monotonic()
+        self._heard_s: float | None = None
         self._untold: list[Notice] = []
 
     @property
@@ -48,8 +48,9 @@ class GuardLink:
 
     @property
     def status(self) -> Mapping[str, Any]:
-        """What the guard said last, and how long ago."""
-        return {**self._status, "heard_s_ago": round(time.monotonic() - self._heard_s, 3)}
+        """What the guard said last, and how long ago; None: it never did."""
+        age_s = None if self._heard_s is None else round(time.monotonic() - self._heard_s, 3)
+        return {**self._status, "heard_s_ago": age_s}
 
     @property
     def standing(self) -> Standing:
@@ -174,6 +175,13 @@ def _gone(before: Mapping[str, Any], now: Mapping[str, Any], error: DeviceError)
     return [Notice("GuardLost", "MAJOR", f"{text}; {START_AND_ADOPT}")]
 
 
+def _severity(state: str, stands: Standing) -> Literal["info", "minor", "MAJOR"]:
+    """A guard that is off and has not read its drives yet is no alarm, what it knows or has left is one."""
+    if state not in AT_REST or stands.nothing:
+        return "info"
+    return "MAJOR" if state == "FROZEN" or stands.known else "minor"
+
+
 def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
     """Say when the guard came, changed its state, or saw a record void; what something ended is a trip."""
     return [*_voided(before, now), *_moved(before, now)]
@@ -190,7 +198,7 @@ def _moved(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
     cause = now.get("cause") or {}
     why = f": {cause.get('code', '')}: {cause['text']}" if cause.get("text") else ""
     stands = standing(now)
-    severity: Any = "info" if now["state"] not in AT_REST or stands.nothing else "MAJOR"
+    severity = _severity(now["state"], stands)
     left = f"; {stands}" if now["state"] in AT_REST else ""
     if before["state"] in GONE:
         return [Notice("GuardFound", severity, f"the guard runs, in state {now['state']}{why}{left}")]

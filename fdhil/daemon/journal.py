@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable
+from datetime import datetime
 from typing import Literal
 
 from fdhil.records import PARAMETERS, UNITS, Notice, Outcome, ParameterSet, Skill, WindowOutcome
@@ -24,8 +25,10 @@ def printable(text: str) -> str:
 
 
 def write_line(text: str, severity: Severity = "info") -> None:
-    """Write one line to stderr, with a journal prefix when stderr is the journal."""
-    prefix = f"<{_PRIORITY[severity]}>" if os.environ.get("JOURNAL_STREAM") else ""
+    """Write one line to stderr with the local time; to the journal, which has the time, with its priority."""
+    now = datetime.now().astimezone()
+    stamp = f"{now:%Y-%m-%d %H:%M:%S}.{now.microsecond // 1000:03d} "
+    prefix = f"<{_PRIORITY[severity]}>" if os.environ.get("JOURNAL_STREAM") else stamp
     sys.stderr.write(f"{prefix}{printable(text)}\n")
     sys.stderr.flush()
 

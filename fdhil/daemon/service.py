@@ -29,13 +29,14 @@ from fdhil.daemon.warm import warm
 from fdhil.drivers.commissioning_void import void_record
 from fdhil.errors import DeviceError, FdhilError, StoreError
 from fdhil.pipeline import AxisPipeline, Record
-from fdhil.records import Notice, Outcome, Temperature, TickTimes
+from fdhil.records import AxisSamples, Notice, Outcome, Temperature, TickTimes
 
 QUEUE_RECORDS = 4000  # per axis: more than half a minute of blocks; beyond it the newest are dropped and counted
 NOTICE_QUEUE = 200
 FIRST_RETRY_S = 0.1
 LAST_RETRY_S = 5.0
 WATCHDOG_S = 2.0
+LISTEN_S = 0.25
 STUCK_S = 60.0  # a batch that is digested for so long hangs
 
 
@@ -121,6 +122,7 @@ class Service:
             others.append(tasks.create_task(self._armory.attend(self._tell), name="guard"))
             others.append(tasks.create_task(self._armory.stream(self._tell), name="stream"))
             others.append(tasks.create_task(self._feed_watchdog(), name="watchdog"))
+            others.append(tasks.create_task(self._listen(), name="listen"))
             others.append(tasks.create_task(self._say_ready(), name="ready"))
             await self._stop.wait()
             notify("STOPPING=1")
@@ -162,7 +164,7 @@ class Service:
             try:
                 async with self._open_source(self._config) as source:
                     self._source = source
-                    self._watch.source_opened(time.monotonic())
+                    self._watch.hearing.source_opened(time.monotonic())
                     self._opened.set()
                     async for record in source.records():
                         delay_s = FIRST_RETRY_S
@@ -173,19 +175,21 @@ class Service:
                     raise
                 cause = str(error)
             self._source = None
-            self._watch.source_lost(time.monotonic())
+            self._watch.hearing.source_lost(time.monotonic())
             text = f"{cause}; it is opened again in {delay_s:.1f} s, what was learnt is kept."
             self._tell([Notice("SourceLost", "MAJOR", text)])
             await asyncio.sleep(delay_s)
             delay_s = min(LAST_RETRY_S, 2 * delay_s)
 
     def _take(self, record: Record | Notice) -> None:
-        self._watch.record_came(record, time.monotonic())
+        self._watch.hearing.record_came(record, time.monotonic())
         if isinstance(record, Notice):
             self._tell([record])
             return
         if isinstance(record, Temperature):
             self._armory.note_temperature(record)
+        elif isinstance(record, AxisSamples):
+            self._armory.hear(record)
         for axis in self._config.axis if isinstance(record, TickTimes) else (record.axis,):
             if axis in self._queues:
                 if self._queues[axis].full():
@@ -264,10 +268,18 @@ class Service:
         if any(now_s - since_s > STUCK_S for since_s in self._busy_since_s.values()):
             return False
         counters = self._source.counters() if self._source is not None else {}
-        self._watch.counted(counters, now_s)
         frames = int(counters.get("frames", 0))
         moved, self._frames_seen = frames != self._frames_seen, frames
-        return moved or self._watch.source_alive(now_s, period_s)
+        return moved or self._watch.hearing.alive(now_s, period_s)
+
+    async def _listen(self) -> None:
+        """Look a few times a second whether the machine is heard, and tell what is not as the config says."""
+        while True:
+            await asyncio.sleep(LISTEN_S)
+            now_s = time.monotonic()
+            if self._source is not None:
+                self._watch.hearing.counted(self._source.counters(), now_s)
+            self._tell(self._watch.troubles(now_s))
 
     # control ---------------------------------------------------------------------------------------------------
 
@@ -307,6 +319,7 @@ class Service:
             "may_stand": {"nothing": guard.standing.nothing, "text": str(guard.standing)},
             "armed": self._armory.armed,
             "checking": self._armory.checking,
+            "passes": self._armory.passes,
             "store": store,
         }
 

@@ -35,6 +35,11 @@ class Standing:
         """Whether it is known that no offset is applied; what is unknown is not nothing."""
         return not self.heard or (bool(self.offset_um) and not self.fed and not any(map(_stands, self._values())))
 
+    @property
+    def known(self) -> bool:
+        """Whether it is known that something is applied."""
+        return bool(self.fed) or any(self._values())
+
     def _values(self) -> list[float | None]:
         return list(self.offset_um.values())
 

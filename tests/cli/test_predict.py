@@ -96,17 +96,22 @@ def test_history_gives_parameters_and_their_uncertainty(bench: Path) -> None:
         assert max(float(row["contour_std_um"]) for row in csv.DictReader(file)) > 0.1
 
 
-def remember(folder: Path, revisions: list[dict[str, float]]) -> None:
+def remember(folder: Path, revisions: list[dict[str, float]], known_to: float = 0.003) -> None:
     """Store equal revisions of X and Y, one a day, with some values other than nominal."""
     for number, changed in enumerate(revisions, 1):
         for axis in "XY":
-            publish(folder, axis, number, **changed)
+            publish(folder, axis, number, known_to, **changed)
 
 
-def publish(folder: Path, axis: str, number: int, *, days: float | None = None, **changed: float) -> None:
-    """Store one more revision of an axis, known to 0.3 %; one a day, or ``days`` after the epoch."""
+def publish(
+    folder: Path, axis: str, number: int, known_to: float = 0.003, *, days: float | None = None, **changed: float
+) -> None:
+    """Store one more revision of an axis, whose values are known to a share of themselves.
+
+    One a day, or ``days`` after the epoch.
+    """
     nominal = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
-    covariance = np.diag([(0.003 * value) ** 2 for value in nominal.values()])
+    covariance = np.diag([(known_to * value) ** 2 for value in nominal.values()])
     with History.open(folder / "fdhil-data") as history:
         known = ParameterSet(axis, number, Parameters(**nominal | changed), frozen(covariance), 3, 0, None, "digest")
         history.add_revision(known, [], Stamp(86400.0 * (number if days is None else days), "boot", 0))

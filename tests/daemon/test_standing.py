@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -110,7 +111,7 @@ def test_a_guard_that_dies_in_the_cut_leaves_its_last_word_until_one_that_knows_
     (folder / "guard.sock").unlink()
     back = Guard(folder)
     back.says = lambda _kind: {**OFF, "may_stand_um": {"X": None, "Y": None}}
-    assert [(n.code, n.severity) for n in link.refresh()] == [("GuardFound", "MAJOR")]
+    assert [(n.code, n.severity) for n in link.refresh()] == [("GuardFound", "minor")]
     assert str(link.standing) == "an unknown offset on axis X, Y may still be applied"
     back.says = lambda _kind: OFF
     assert [(n.code, n.severity, n.text) for n in link.refresh()] == [("GuardState", "info", "OFF; offset 0")]
@@ -295,6 +296,17 @@ def test_adopt_that_does_not_end_at_zero_is_1_with_the_cause(machine: Path, guar
 def test_adopt_without_a_guard_is_3(machine: Path, capsys: Any) -> None:
     code, _, err = fdhil("adopt", machine, "--yes", capsys=capsys)
     assert (code, "start fdhil-guard" in err) == (3, True)
+
+
+def test_disarm_beside_a_daemon_that_hangs_asks_the_guard(
+    machine: Path, folder: Path, guard: Guard, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.setattr("fdhil.cli.service.DISARM_S", 0.05)
+    with socket.socket(socket.AF_UNIX) as hung:
+        hung.bind(str(folder / "daemon.sock"))
+        hung.listen()
+        code, out, _ = fdhil("disarm", machine, "--json", capsys=capsys)
+    assert (code, json.loads(out)["asked"], guard.heard) == (0, "guard", ["disarm", "status"])
 
 
 def test_disarm_without_a_daemon_asks_the_guard(machine: Path, guard: Guard, capsys: Any) -> None:

@@ -51,7 +51,8 @@ def test_from_the_bus_to_the_history_to_a_corrected_cut_and_back(shop: Shop, cap
     assert log.count("Armed: armed corner.ngc") == 2, log
     assert "ArmRefused: ModelNotValidated" in log
     assert "GuardState: ARMED -> " in log
-    assert log.splitlines()[-1] == "stopped, offset 0", log
+    assert "PassMeasured: pass 1 of corner.ngc: contour error measured" in log
+    assert log.splitlines()[-1].endswith(" stopped, offset 0"), log
     token = (shop.run_directory / "token").read_text()
     for file in (*shop.folder.glob("*.log"), *shop.config.store.directory.rglob("*.sqlite*")):
         assert token.encode() not in file.read_bytes(), file
