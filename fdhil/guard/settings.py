@@ -5,6 +5,7 @@ The file is written by ``fdhil-guard`` from the machine's config and profile; th
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -17,6 +18,7 @@ from fdhil.guard import feedforward
 from fdhil.guard.limits import Limits
 
 SCHEMA = "fdhil-guard-settings-1"
+MAX_CHARS = 1024 * 1024
 Layout = tuple[tuple[int, int, int, bool], ...]
 """Entries (index, sub-index, bits, signed) of a PDO, one behind the other."""
 
@@ -132,8 +134,10 @@ class Settings:
 
 
 def to_json(settings: Settings) -> str:
-    """Return the settings as the text of their file."""
-    return json.dumps({"schema": SCHEMA, **asdict(settings)}, indent=1)
+    """Return the settings as the text of their file, which ends with a digest over them."""
+    document = {"schema": SCHEMA, **asdict(settings)}
+    digest = hashlib.sha256(json.dumps(document).encode()).hexdigest()
+    return json.dumps({**document, "digest": digest}, indent=1)
 
 
 def from_json(text: str, source: str = "settings") -> Settings:
@@ -142,22 +146,28 @@ def from_json(text: str, source: str = "settings") -> Settings:
         document = json.loads(text)
         if document.pop("schema") != SCHEMA:
             raise ValueError(f"schema is not {SCHEMA}")
+        document.pop("digest", None)
         axes = tuple(_axis(axis) for axis in document.pop("axes"))
         settings = Settings(axes=axes, **document)
         _check(settings)
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        fault = ConfigFault("file", f"cannot be used: {error}", "let fdhil-guard write it")
+    except (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError) as error:
+        fault = ConfigFault("file", f"cannot be used: {str(error)[:200]}", "let fdhil-guard write it")
         raise ConfigError(source, [fault]) from None
     return settings
 
 
 def load(path: Path) -> Settings:
-    """Read the settings file; ConfigError when it cannot be read or used."""
+    """Read the settings file; ConfigError when it cannot be read or used, or is not as it was written."""
     try:
-        text = path.read_text("utf-8")
+        with path.open(encoding="utf-8") as file:
+            text = file.read(MAX_CHARS + 1)
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(str(path), [ConfigFault("file", f"cannot be read: {error}", "run fdhil-guard")]) from None
-    return from_json(text, str(path))
+    settings = from_json(text, str(path))
+    if to_json(settings) != text:  # a bit of a limit may have flipped
+        fault = ConfigFault("file", "is damaged or was changed by hand", "let fdhil-guard write it")
+        raise ConfigError(str(path), [fault])
+    return settings
 
 
 def _pdo(document: Mapping[str, Any]) -> Pdo:
