@@ -14,7 +14,8 @@ import click
 from fdhil import tables
 from fdhil.cli.compiling import forewarn
 from fdhil.cli.options import OutputFile, Positive
-from fdhil.cli.parameter_view import INTERVAL_95, MEANING
+from fdhil.cli.parameter_view import MEANING
+from fdhil.records import INTERVAL_95
 
 if TYPE_CHECKING:
     from fdhil.cli.forecast import Past
@@ -357,7 +358,7 @@ def _show_prediction(
     predicted: Prediction, told: Sequence[Mapping[str, Any]] | None = None, tolerance_um: float | None = None
 ) -> None:
     from fdhil.cli.forecast import crossing_text
-    from fdhil.prediction.gain import INTERVAL_95, plus_minus
+    from fdhil.prediction.gain import plus_minus
 
     contour = _contour(predicted)
     click.echo(

@@ -103,7 +103,7 @@ def _config_of(window: Window) -> machine_config.MachineConfig:
         "regulators": regulators,
     }
     machine = {"name": "replay", "sync_period_s": min(window.dt_s, 0.02)}
-    return machine_config.parse({"machine": machine, "axis": {window.axis: axis}}, "recording")
+    return machine_config.parse({"machine": machine, "axis": {window.axis: axis}}, "recording", made_up=True)
 
 
 @click.command()

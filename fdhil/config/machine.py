@@ -20,7 +20,7 @@ class Machine(Section):
     """[machine]"""
 
     name: str = Field(min_length=1, max_length=64, description="what the reports call this machine")
-    sync_period_s: Positive = Field(0.001, le=0.02, description="period of the SYNC message on the CAN bus")
+    sync_period_s: Positive = Field(0.001, ge=1e-4, le=0.02, description="period of the SYNC message on the CAN bus")
 
 
 class MachineConfig(Section):

@@ -14,6 +14,8 @@ Bool = npt.NDArray[np.bool_]
 
 PARAMETERS = ("R", "L", "K", "Jt", "ft", "Cd")
 RATIOS = ("Jt/K", "ft/K", "Cd/K")  # what current and speed alone tell
+INTERVAL_95 = 1.959963984540054
+"""Half the width of a 95 % interval, in standard deviations of a normal distribution."""
 UNITS: Mapping[str, str] = {
     "R": "ohm",
     "L": "H",
