@@ -24,18 +24,21 @@ def run_directory(config: machine_config.MachineConfig) -> Path:
 @click.command()
 @CONFIG
 @click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Left out: the config's, else the best.")
-def run(config: Path, method: str | None) -> None:
+@click.option("--json", "as_json", is_flag=True, help="Write each line as a JSON object to stdout.")
+def run(config: Path, method: str | None, as_json: bool) -> None:
     """Run the daemon of the machine in CONFIG: listen, identify, predict; correct only when armed.
 
-    Writes one line per outcome to stderr. Stops on SIGTERM or Ctrl-C, with the correction ramped to zero first.
+    Writes one line per outcome to stderr, with --json to stdout. Stops on SIGTERM or Ctrl-C, with the correction ramped
+    to zero first.
     """
     machine = machine_config.load(config)
     from fdhil.cli.compiling import forewarn
-    from fdhil.daemon import service  # late: --help imports nothing heavy
+    from fdhil.daemon import journal, service  # late: --help imports nothing heavy
     from fdhil.drivers import open_machine
 
     forewarn("identify", "predict", "correct")
-    service.run(machine, open_machine, method)
+    with journal.lines_as_json(as_json):
+        service.run(machine, open_machine, method)
 
 
 def _ask(
