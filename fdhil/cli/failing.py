@@ -35,7 +35,7 @@ def run_safely(command: click.Command) -> int:
         return _tell_config(error)
     except FdhilError as error:
         return tell(type(error).__name__, str(error), error.exit_code, _details(error))
-    except BrokenPipeError:  # whoever read the answer has seen enough of it
+    except (SystemExit, BrokenPipeError):  # whoever read the answer has seen enough of it; click raises the former
         _drop_stdout()
         return 0
     except OSError as error:
