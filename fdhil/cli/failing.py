@@ -35,7 +35,7 @@ def run_safely(command: click.Command) -> int:
         return _tell_config(error)
     except FdhilError as error:
         return tell(type(error).__name__, str(error), error.exit_code, _details(error))
-    except BrokenPipeError:  # whoever read the answer has seen enough of it
+    except (SystemExit, BrokenPipeError):  # whoever read the answer has seen enough of it; click raises the former
         _drop_stdout()
         return 0
     except OSError as error:
@@ -73,7 +73,7 @@ def error_document(error: FdhilError) -> dict[str, Any]:
 def _details(error: FdhilError) -> dict[str, Any]:
     """Return what an error knows beside its sentence: the device, the line and word, the faults of a config."""
     known = vars(error)
-    told = {name: value for name, value in known.items() if isinstance(value, str | int)}
+    told: dict[str, Any] = {name: value for name, value in known.items() if isinstance(value, str | int)}
     if faults := known.get("faults"):
         told["faults"] = [asdict(fault) for fault in faults if isinstance(fault, ConfigFault)]
     return told

@@ -29,19 +29,21 @@ def run_directory(config: machine_config.MachineConfig) -> Path:
 @click.command()
 @CONFIG
 @click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Left out: the config's, else the best.")
-def run(config: Path, method: str | None) -> int:
+@click.option("--json", "as_json", is_flag=True, help="Write each line as a JSON object to stdout.")
+def run(config: Path, method: str | None, as_json: bool) -> int:
     """Run the daemon of the machine in CONFIG: listen, identify, predict; correct only when armed.
 
-    Writes one line per outcome to stderr. Stops on SIGTERM or Ctrl-C, with the correction ramped to zero first. Exit 3
-    when an offset may still be applied then: the last line says which, and what to do.
+    Writes one line per outcome to stderr, with --json to stdout. Stops on SIGTERM or Ctrl-C, with the correction ramped
+    to zero first. Exit 3 when an offset may still be applied then: the last line says which, and what to do.
     """
     machine = machine_config.load(config)
     from fdhil.cli.compiling import forewarn
-    from fdhil.daemon import service  # late: --help imports nothing heavy
+    from fdhil.daemon import journal, service  # late: --help imports nothing heavy
     from fdhil.drivers import open_machine
 
     forewarn("identify", "predict", "correct")
-    stands = service.run(machine, open_machine, method)
+    with journal.lines_as_json(as_json):
+        stands = service.run(machine, open_machine, method)
     return 0 if stands.nothing else 3
 
 
