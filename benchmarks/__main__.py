@@ -49,8 +49,8 @@ def page(figures: Mapping[str, Any]) -> str:
     """Return the page of the benchmarks' figures."""
     lines = ["# Benchmarks", ""]
     lines += paragraph(
-        """Written by `make bench` from [benchmarks.json](benchmarks.json). A host that is shared with other work measures
-        less than it can: read the ratios, and compare within one run."""
+        """Written by `make bench` from [benchmarks.json](benchmarks.json). A host that is shared with other work
+        measures less than it can: read the ratios, and compare within one run."""
     )
     for name, title in BENCHMARKS.items():
         if name in figures:
