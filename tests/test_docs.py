@@ -115,3 +115,12 @@ def test_the_papers_that_a_stranger_looks_for_are_there() -> None:
     citation = (ROOT / "CITATION.cff").read_text("utf-8")
     assert f"\nversion: {project['project']['version']}\n" in citation
     assert "\ncff-version: 1.2.0\n" in f"\n{citation}"
+
+
+def test_the_index_of_decisions_lists_every_page_once_in_order() -> None:
+    folder = ROOT / "docs" / "decisions"
+    listed = re.findall(r"^(\d+)\. \[(.*)\]\((.*)\)$", (folder / "README.md").read_text("utf-8"), re.MULTILINE)
+    assert [target for _, _, target in listed] == sorted(path.name for path in folder.glob("0*.md"))
+    for number, title, target in listed:
+        assert target.startswith(f"{int(number):04}-")
+        assert (folder / target).read_text("utf-8").startswith(f"# {number}. {title}")
