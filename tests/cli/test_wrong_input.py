@@ -1,26 +1,47 @@
-"""Wrong input to the commands as processes: one sentence, the right exit code, never a traceback."""
+"""Wrong input to the commands as their entry point runs them: one sentence, the right exit code, never a traceback.
+
+A start of Python costs a second, so most run in this process; that a process does the same is shown once per command
+that serves.
+"""
 
 from __future__ import annotations
 
+import io
 import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import pytest
 
+from fdhil.cli.main import cli, run_safely
 from fdhil.sim.hub import Hub
 from tests.sim.hub_thread import HubThread
 from tests.sim.twin_process import write_config
 
 
-def fdhil(*arguments: object) -> subprocess.CompletedProcess[str]:
+Done = subprocess.CompletedProcess[str]
+
+
+def fdhil(*arguments: object) -> Done:
+    """Run a command line in this process as ``main`` does."""
+    command = ["fdhil", *map(str, arguments)]
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
+        patch.setattr("sys.argv", command)
+        code = run_safely(cli)
+    return subprocess.CompletedProcess(command, code, out.getvalue(), err.getvalue())
+
+
+def process(*arguments: object) -> Done:
+    """Run it as a process."""
     command = [sys.executable, "-m", "fdhil", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=100)
+    return subprocess.run(command, capture_output=True, text=True)
 
 
-def assert_told(done: subprocess.CompletedProcess[str], code: int, *words: str) -> None:
+def assert_told(done: Done, code: int, *words: str) -> None:
     """The exit code, the words, and no traceback."""
     said = done.stdout + done.stderr
     assert done.returncode == code, said
@@ -56,14 +77,14 @@ def test_a_wrong_config_tells_where(command: str, old: str, new: str, words: tup
 
 def test_a_port_in_use_is_told(port_in_use: int, tmp_path: Path) -> None:
     config = write_config(tmp_path, bus=f'interface = "socketcand"\nport = {port_in_use}')
-    assert_told(fdhil("sim", config), 3, str(port_in_use))
+    assert_told(process("sim", config), 3, str(port_in_use))
 
 
 def test_a_hub_that_is_not_there_is_told(tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    assert_told(fdhil("run", write_config(tmp_path, bus=f'interface = "socketcand"\nport = {port}')), 3, str(port))
+    assert_told(process("run", write_config(tmp_path, bus=f'interface = "socketcand"\nport = {port}')), 3, str(port))
 
 
 def test_a_bus_without_drives_is_told(tmp_path: Path) -> None:
