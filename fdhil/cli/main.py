@@ -34,6 +34,12 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
 }
 
 
+NO_CACHE = (
+    "fdhil: compiled code can be kept neither beside fdhil nor in the home of this user; nothing was started; "
+    "set NUMBA_CACHE_DIR to a folder that this user may write"
+)
+
+
 class LazyGroup(click.Group):
     """A group that imports a command's module when that command is called."""
 
@@ -93,6 +99,11 @@ def run_safely(command: click.Command) -> int:
         return error.exit_code
     except BrokenPipeError:
         return 0
+    except RuntimeError as error:
+        if "no locator available" not in str(error):  # numba's words
+            raise
+        click.echo(NO_CACHE, err=True)
+        return 3
     return int(result or 0)
 
 

@@ -20,7 +20,7 @@ from fdhil.records.signals import (
     VoltageSampling,
     Window,
 )
-from fdhil.records.values import PARAMETERS, RATIOS, UNITS, Bool, Float, Int, Parameters, frozen, frozen_ints
+from fdhil.records.values import PARAMETERS, RATIOS, UNITS, Bool, Float, Int, Parameters, frozen, frozen_ints, read_only
 from fdhil.records.verdicts import Estimate, Notice, ParameterSet, Reason, Result, Verdict, WindowOutcome
 
 Outcome = WindowOutcome | ParameterSet | Skill | Notice
@@ -60,4 +60,5 @@ __all__ = [
     "Zone",
     "frozen",
     "frozen_ints",
+    "read_only",
 ]

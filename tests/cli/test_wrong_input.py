@@ -21,7 +21,6 @@ from fdhil.sim.hub import Hub
 from tests.sim.hub_thread import HubThread
 from tests.sim.twin_process import write_config
 
-
 Done = subprocess.CompletedProcess[str]
 
 
