@@ -17,6 +17,10 @@ from fdhil.errors import ConfigError, ConfigFault, FdhilError
 SCHEMA = "fdhil-error-1"
 STOPPED = 130
 TROUBLE = 3
+NO_CACHE = (
+    "compiled code can be kept neither beside fdhil nor in the home of this user; nothing was started; "
+    "set NUMBA_CACHE_DIR to a folder that this user may write"
+)
 
 
 def run_safely(command: click.Command) -> int:
@@ -45,6 +49,10 @@ def run_safely(command: click.Command) -> int:
         return tell(type(error).__name__, text, TROUBLE)
     except MemoryError:
         return tell("MemoryError", "the memory is used up; give a smaller file, or free memory", TROUBLE)
+    except RuntimeError as error:
+        if "no locator available" not in str(error):  # numba's words
+            raise
+        return tell("NoCache", NO_CACHE, TROUBLE)
     return int(result or 0)
 
 

@@ -31,6 +31,7 @@ from fdhil.records.values import (
     Parameters,
     frozen,
     frozen_ints,
+    read_only,
 )
 from fdhil.records.verdicts import Estimate, Notice, ParameterSet, Reason, Result, Verdict, WindowOutcome
 
@@ -72,4 +73,5 @@ __all__ = [
     "Zone",
     "frozen",
     "frozen_ints",
+    "read_only",
 ]

@@ -36,6 +36,13 @@ def frozen(values: npt.ArrayLike) -> Float:
     return array
 
 
+def read_only(values: Float) -> Float:
+    """Return a read-only view, not a copy: a kernel that only reads is compiled for this one kind of array."""
+    view = values.view()
+    view.setflags(write=False)
+    return view
+
+
 def frozen_ints(values: npt.ArrayLike) -> Int:
     """Return ``values`` as a read-only int64 array."""
     array = np.array(values, dtype=np.int64)

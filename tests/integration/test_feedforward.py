@@ -35,7 +35,7 @@ def transport() -> str:
 
 
 CASES = {"X": (1.0, 3.0), "Y": (0.5, 50.0)}
-"""An axis of the bench and one that lags: the drive's own speed feed-forward, and by how much the error has to shrink."""
+"""An axis of the bench and one that lags: its own speed feed-forward, and by how much the error has to shrink."""
 
 
 @pytest.fixture
@@ -82,9 +82,7 @@ def switch_on(client: GuardClient, bench: Bench) -> None:
     raise AssertionError(answer)
 
 
-def largest_errors_um(
-    bench: Bench, client: GuardClient, demand: Path, trace: Path, rows: int
-) -> dict[str, float]:
+def largest_errors_um(bench: Bench, client: GuardClient, demand: Path, trace: Path, rows: int) -> dict[str, float]:
     """Play the demand and return the largest tracking error of each axis."""
     bench.command(json.dumps({"command": "trace", "file": str(trace)}))
     bench.command(json.dumps({"command": "play", "file": str(demand)}))
