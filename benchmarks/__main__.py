@@ -49,8 +49,8 @@ def page(figures: Mapping[str, Any]) -> str:
     """Return the page of the benchmarks' figures."""
     lines = ["# Benchmarks", ""]
     lines += paragraph(
-        """Written by `make bench` from [benchmarks.json](benchmarks.json). A host that is shared with other work measures
-        less than it can: read the ratios, and compare within one run."""
+        """Written by `make bench` from [benchmarks.json](benchmarks.json). A host that is shared with other work
+        measures less than it can: read the ratios, and compare within one run."""
     )
     for name, title in BENCHMARKS.items():
         if name in figures:
@@ -70,7 +70,8 @@ def main() -> None:
     figures = json.loads(FIGURES.read_text("utf-8")) if FIGURES.exists() else {}
     for name in names:
         figures[name] = run(name)
-        FIGURES.write_text(json.dumps(figures, indent=1) + "\n", "utf-8")
+        in_order = {key: figures[key] for key in BENCHMARKS if key in figures}
+        FIGURES.write_text(json.dumps(in_order, indent=1) + "\n", "utf-8")
     FIGURES.with_suffix(".md").write_text(page(figures), "utf-8")
 
 

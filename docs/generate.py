@@ -1,4 +1,4 @@
-"""Generate what can be generated: configs/machine-template.toml and docs/reference/ (config, commands, errors).
+"""Generate what can be generated: configs/machine-template.toml and docs/reference/ (config, commands, errors, faults).
 
 ``python docs/generate.py`` writes them; a test fails when they are not what the code says.
 """
@@ -22,6 +22,7 @@ from pydantic_core import PydanticUndefined
 
 from fdhil import config, errors
 from fdhil.cli.main import cli
+from fdhil.sim.fault_kinds import FAULTS
 
 ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES: Mapping[str, Any] = {  # of keys without a default: the bench machine
@@ -128,11 +129,28 @@ def error_reference() -> str:
     return "\n".join(lines) + "\n"
 
 
+def fault_reference() -> str:
+    """Return the faults of the simulated machine as Markdown."""
+    lines = [
+        "# Faults of the simulated machine",
+        "",
+        "Generated from `fdhil/sim/fault_kinds.py`. How to use them is in [the how-to](../how-to/simulate.md).",
+        "",
+        "| fault | value | axis |",
+        "|---|---|---|",
+    ]
+    for name, kind in FAULTS.items():
+        value = kind.value.meaning if kind.value else "none"
+        lines.append(f"| `{name}` | {value} | {'needed' if kind.needs_axis else 'not needed'} |")
+    return "\n".join(lines) + "\n"
+
+
 GENERATED = {
     ROOT / "configs" / "machine-template.toml": template,
     ROOT / "docs" / "reference" / "config.md": config_reference,
     ROOT / "docs" / "reference" / "commands.md": command_reference,
     ROOT / "docs" / "reference" / "errors.md": error_reference,
+    ROOT / "docs" / "reference" / "faults.md": fault_reference,
 }
 
 

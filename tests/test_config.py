@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 
 from fdhil import config
+from fdhil.config import reading
+from fdhil.config.section import _of_a_machine
 from fdhil.errors import ConfigError
 from tests.bench import bench_config, bench_document
 
@@ -67,9 +69,35 @@ def test_limits_that_cannot_be_ramped_down_in_time_are_refused() -> None:
     document["axis"]["X"]["correction"] = {
         "max_offset_um": 250.0,
         "max_speed_mm_s": 2.0,
-        "max_acceleration_mm_s2": 250.0,
+        "max_acceleration_mm_s2": 400.0,
     }
     assert "from the largest offset to zero these limits need" in faults(document)
+
+
+@pytest.mark.parametrize(
+    ("per_turn", "limits", "told"),
+    [
+        (2000, (50.0, 2.0, 2000.0), "2,000 increments per turn are too coarse: max_acceleration_mm_s2 is 0.2"),
+        (2000, (50.0, 2.0, 2000.0), "set the drive to 10,000 or more per turn, or raise max_acceleration_mm_s2"),
+        (15_000, (50.0, 1.0, 2000.0), "max_speed_mm_s is 0.75 of an increment per SYNC cycle (set the drive to 20,000"),
+        (10_000, (50.0, 2.0, 2000.0), ""),
+        (65_536, (50.0, 2.0, 250.0), "set the drive to 80,000 or more per turn"),
+        (100, (50.0, 20.0, 2000.0), "set the drive to 10,000 or more per turn"),
+        (65_536, (50.0, 1e-300, 2000.0), "no resolution would do"),
+    ],
+)
+def test_increments_too_coarse_for_the_limits_are_refused(
+    per_turn: int, limits: tuple[float, float, float], told: str
+) -> None:
+    """With the resolution that would do: rounded up to one increment per SYNC they would be other limits."""
+    document = bench_document("X")
+    names = ("max_offset_um", "max_speed_mm_s", "max_acceleration_mm_s2")
+    document["axis"]["X"]["correction"] = dict(zip(names, limits, strict=True))
+    document["axis"]["X"]["drive"] = {"increments_per_rev": per_turn}
+    if told:
+        assert told in faults(document)
+    else:
+        assert config.OffsetLimits.of(config.parse(document).axis["X"], 0.001).whole[1:3] == (1, 1)
 
 
 def test_two_drives_with_one_node_id_are_refused() -> None:
@@ -103,3 +131,80 @@ def test_the_store_lies_beside_the_config(tmp_path: Path) -> None:
     machine = bench_config(folder=tmp_path)
     assert machine.store.directory == tmp_path / "fdhil-data"
     assert machine.store.run_directory == tmp_path / "fdhil-data" / "run"
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value", "range_"),
+    [
+        ("machine", "sync_period_s", 1e-301, "from 0.0001 to 0.02"),
+        ("machine", "sync_period_s", math.inf, "from 0.0001 to 0.02"),
+        ("axis.X", "screw_pitch_mm", 1e-301, "from 0.001 to 10000"),
+        ("axis.X", "max_jerk_mm_s3", 1e300, "to 1e+09"),
+        ("axis.X.correction", "max_speed_mm_s", 1e-301, "from 1e-12 to 1e+09"),
+        ("axis.X.correction", "max_speed_mm_s", 1e301, "above 0 and at most 20"),
+        ("axis.X.regulators", "speed_kp", 1e-301, "from 1e-12 to 1e+09"),
+        ("axis.X.regulators", "current_period_s", 1e-301, "from 1e-06 to 0.02"),
+        ("axis.X.nominal", "Jt", math.nan, "from 1e-09 to 1e+06"),
+        ("axis.X.drive", "rated_current_a", 0.0, "from 0.001 to 100000"),
+        ("nc", "smoothing_s", [1e9], "from 0 to 10"),
+    ],
+)
+def test_a_number_out_of_its_range_is_told_with_the_range(section: str, key: str, value: float, range_: str) -> None:
+    document = bench_document("X")
+    table = document
+    for part in section.split("."):
+        table = table.setdefault(part, {})
+    table[key] = value
+    told = faults(document)
+    assert f"{section}.{key}" in told
+    assert range_ in told
+
+
+def test_every_number_of_every_section_has_a_range() -> None:
+    """Whatever the file says, the number that is used is finite and of a size that a machine may have."""
+    open_ended = []
+
+    def walk(section: type[config.Section], place: str) -> None:
+        for key, field in section.model_fields.items():
+            inner = [a for a in reading._arguments(field.annotation) if isinstance(a, type)]
+            for kind in inner:
+                if issubclass(kind, config.Section):
+                    walk(kind, f"{place}{key}.")
+                elif kind in (int, float):
+                    told = list(reading._constraints(field)) + list(reading._constraints(field.annotation))
+                    bounded = any(hasattr(c, "le") for c in told) and any(
+                        hasattr(c, "ge") or hasattr(c, "gt") for c in told
+                    )
+                    bounded |= any(getattr(c, "func", None) is _of_a_machine for c in told)
+                    if not bounded and key != "sign":
+                        open_ended.append(f"{place}{key}")
+
+    walk(config.MachineConfig, "")
+    assert open_ended == []
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("a = " + "[" * 100_000, "nested deeper"),
+        ("a = " + "{b=" * 60_000, "nested deeper"),
+        ("a = " + "9" * 5000, "is no TOML"),
+        ("[machine]\nsync_period_s = 0x" + "f" * 5000, "machine.sync_period_s: "),
+        ('[machine]\nname = "' + "x" * 200_000 + '"', "machine.name: "),
+        ('[machine]\nsync_period_s = "' + "9" * 5000 + '"', "machine.sync_period_s: "),
+        ("[store]\nkeep_windows = 0x" + "f" * 5000, "store.keep_windows: "),
+        ("[machine]\n" + "".join(f"k{n} = 1\n" for n in range(20_000)), "more faults (mend these first)"),
+        (("x" * 100_000) + " = 1", "is no key of this section"),
+        ("a" + ".a" * 100_000 + " = 1", "nested deeper"),
+        (("a" + ".a" * 90 + " = 1\n") + ("[b" + ".b" * 90 + "]\n") * 1000, "is no TOML"),
+    ],
+    ids=lambda text: text[:24],
+)
+def test_a_hostile_file_is_a_config_error_of_few_words(text: str, expected: str, tmp_path: Path) -> None:
+    path = tmp_path / "machine.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        config.load(path)
+    told = str(caught.value)
+    assert expected in told
+    assert len(told) < 12_000

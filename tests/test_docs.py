@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import tarfile
 import tomllib
 from pathlib import Path
 
 import pytest
+from hatchling.builders.sdist import SdistBuilder
 
 from fdhil import config, tables
 
@@ -109,9 +111,32 @@ def test_the_papers_that_a_stranger_looks_for_are_there() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
     shipped = project["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
     assert [name for name in shipped if not (ROOT / name[1:]).exists()] == []
-    assert {"/LICENSE", "/SECURITY.md", "/CITATION.cff", "/tests", "/docs", "/systemd"} <= set(shipped)
     assert project["project"]["license-files"] == ["LICENSE"]
     assert "MIT License" in (ROOT / "LICENSE").read_text("utf-8")
     citation = (ROOT / "CITATION.cff").read_text("utf-8")
     assert f"\nversion: {project['project']['version']}\n" in citation
     assert "\ncff-version: 1.2.0\n" in f"\n{citation}"
+
+
+def test_the_index_of_decisions_lists_every_page_once_in_order() -> None:
+    folder = ROOT / "docs" / "decisions"
+    listed = re.findall(r"^(\d+)\. \[(.*)\]\((.*)\)$", (folder / "README.md").read_text("utf-8"), re.MULTILINE)
+    assert [target for _, _, target in listed] == sorted(path.name for path in folder.glob("0*.md"))
+    for number, title, target in listed:
+        assert target.startswith(f"{int(number):04}-")
+        assert (folder / target).read_text("utf-8").startswith(f"# {number}. {title}")
+
+
+def test_the_source_archive_holds_what_is_needed_and_nothing_else(tmp_path: Path) -> None:
+    archive = next(iter(SdistBuilder(str(ROOT)).build(directory=str(tmp_path))))
+    with tarfile.open(archive) as opened:
+        names = {name.partition("/")[2] for name in opened.getnames()}
+    needed = {"LICENSE", "CITATION.cff", "SECURITY.md", "README.md", "CHANGELOG.md", "Makefile", "requirements.lock"}
+    needed |= {
+        "systemd/fdhil-guard.service",
+        "configs/machine-template.toml",
+        "docs/studies/drift.json",
+        "tests/bench.py",
+    }
+    assert needed <= names
+    assert [name for name in names if re.search(r"__pycache__|\.venv|fdhil-data|\.parquet$|^out/|^\.git/", name)] == []

@@ -169,14 +169,15 @@ def _tell_compared(machine: MachineConfig, found: Sequence[Place]) -> None:
 def _guard_told(machine: MachineConfig, seen: Mapping[str, str]) -> set[str]:
     """Tell the guard, where one runs, which drives were compared; return the axes whose records stay void there."""
     from fdhil.cli.guard import operator_token
+    from fdhil.cli.service import guard_directory, run_directory
     from fdhil.guard.client import GuardClient
 
-    run_directory = machine.store.run_directory or machine.store.directory / "run"
-    if not seen or not (run_directory / SOCKET_NAME).exists():
+    directory = guard_directory(machine)
+    if not seen or not (directory / SOCKET_NAME).exists():
         return set()
     try:
-        with GuardClient(run_directory) as guard:
-            answer = guard.compared(operator_token(run_directory), seen)
+        with GuardClient(directory) as guard:
+            answer = guard.compared(operator_token(run_directory(machine)), seen)
     except DeviceError as error:
         click.echo(f"the guard was not told: {error}", err=True)
         return set()
@@ -275,7 +276,7 @@ def _stopped_like_ctrl_c() -> Iterator[None]:
 
 def _commission_axis(machine: MachineConfig, axis: str, yes: bool, quiet: bool) -> dict[str, Any]:
     """Run all steps for one axis and save its record; DriveFault when it is refused."""
-    from fdhil.cli.guard import lock_bus
+    from fdhil.cli.bus_lock import lock_bus
     from fdhil.drivers import commissioning
 
     with lock_bus(machine.bus[machine.axis[axis].drive.bus]):  # the guard reads the record when it starts

@@ -17,6 +17,10 @@ from fdhil.errors import ConfigError, ConfigFault, FdhilError
 SCHEMA = "fdhil-error-1"
 STOPPED = 130
 TROUBLE = 3
+NO_CACHE = (
+    "compiled code can be kept neither beside fdhil nor in the home of this user; nothing was started; "
+    "set NUMBA_CACHE_DIR to a folder that this user may write"
+)
 
 
 def run_safely(command: click.Command) -> int:
@@ -35,7 +39,7 @@ def run_safely(command: click.Command) -> int:
         return _tell_config(error)
     except FdhilError as error:
         return tell(type(error).__name__, str(error), error.exit_code, _details(error))
-    except BrokenPipeError:  # whoever read the answer has seen enough of it
+    except (SystemExit, BrokenPipeError):  # whoever read the answer has seen enough of it; click raises the former
         _drop_stdout()
         return 0
     except OSError as error:
@@ -45,6 +49,10 @@ def run_safely(command: click.Command) -> int:
         return tell(type(error).__name__, text, TROUBLE)
     except MemoryError:
         return tell("MemoryError", "the memory is used up; give a smaller file, or free memory", TROUBLE)
+    except RuntimeError as error:
+        if "no locator available" not in str(error):  # numba's words
+            raise
+        return tell("NoCache", NO_CACHE, TROUBLE)
     return int(result or 0)
 
 
@@ -73,7 +81,7 @@ def error_document(error: FdhilError) -> dict[str, Any]:
 def _details(error: FdhilError) -> dict[str, Any]:
     """Return what an error knows beside its sentence: the device, the line and word, the faults of a config."""
     known = vars(error)
-    told = {name: value for name, value in known.items() if isinstance(value, str | int)}
+    told: dict[str, Any] = {name: value for name, value in known.items() if isinstance(value, str | int)}
     if faults := known.get("faults"):
         told["faults"] = [asdict(fault) for fault in faults if isinstance(fault, ConfigFault)]
     return told

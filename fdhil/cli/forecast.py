@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fdhil.cli.parameter_view import INTERVAL_95
+from fdhil.records import INTERVAL_95
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -7,9 +7,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fdhil.cli.parameter_view import INTERVAL_95
 from fdhil.errors import FdhilError
-from fdhil.records import UNITS
+from fdhil.records import INTERVAL_95, UNITS
 from fdhil.store.output import open_output
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import tables
-from fdhil.cli.parameter_view import INTERVAL_95, MEANING, cell, head
+from fdhil.cli.parameter_view import MEANING, cell, head
+from fdhil.records import INTERVAL_95
 
 if TYPE_CHECKING:
     from fdhil.cli.batch import FileResult
     from fdhil.config import Identification
-    from fdhil.records import Estimate, Verdict, WindowOutcome
+    from fdhil.records import Estimate, Parameters, Verdict, WindowOutcome
 
 SCHEMA = "fdhil-identify-1"
 UNREADABLE = 3
@@ -33,11 +34,13 @@ def identify(recordings: tuple[Path, ...], config_path: Path | None, method: str
     """Identify a drive from the rapid moves in each RECORDING (CSV).
 
     Each rapid is a window: it is checked, the six parameters are estimated from it, and the model is validated. The
-    accepted windows of a file together give its pooled parameters. Exit codes: 0 every file's pool is validated, 1 some
-    pool is not, 2 wrong option or configuration, 3 a recording cannot be read (the others are identified all the same).
+    accepted windows of a file together give its pooled parameters. With --config they are also compared with the axis'
+    nominal values: a sensor whose gain is wrong all along shows in no other way. Exit codes: 0 every file's pool is
+    validated, 1 some pool is not, 2 wrong option or configuration, 3 a recording cannot be read (the others are
+    identified all the same).
     """
-    settings, rapid_speeds = _settings(config_path, method)
-    results = _analyse(recordings, settings, rapid_speeds)
+    settings, rapid_speeds, nominal = _settings(config_path, method)
+    results = [_against_data_sheet(r, nominal) for r in _analyse(recordings, settings, rapid_speeds)]
     if as_json:
         document = {"schema": SCHEMA, "files": [_file_document(r) for r in results]}
         click.echo(json.dumps(document, allow_nan=False))
@@ -48,13 +51,33 @@ def identify(recordings: tuple[Path, ...], config_path: Path | None, method: str
     return 0 if all(r.verdict.accepted for r in results) else 1
 
 
-def _settings(path: Path | None, method: str | None) -> tuple[Identification, dict[str, float]]:
+def _settings(
+    path: Path | None, method: str | None
+) -> tuple[Identification, dict[str, float], Mapping[str, Parameters]]:
     from fdhil import config
+    from fdhil.records import Parameters
 
     machine = config.load(path) if path is not None else None
     settings = machine.identification if machine is not None else config.Identification()
     speeds = {name: axis.rapid_speed_rad_s for name, axis in machine.axis.items()} if machine is not None else {}
-    return (settings.model_copy(update={"method": method}) if method else settings), speeds
+    nominal = {n: Parameters(**a.nominal.model_dump()) for n, a in machine.axis.items()} if machine is not None else {}
+    return (settings.model_copy(update={"method": method}) if method else settings), speeds, nominal
+
+
+def _against_data_sheet(result: FileResult, nominal: Mapping[str, Parameters]) -> FileResult:
+    """Refuse a pool that only a sensor's gain takes to the axis' nominal values."""
+    from dataclasses import replace
+
+    from fdhil.validation.data_sheet import gain_error
+
+    if result.pooled is None or not result.verdict.accepted or result.axis not in nominal:
+        return result
+    reason = gain_error(result.pooled, nominal[result.axis])
+    return (
+        result
+        if reason is None
+        else replace(result, verdict=replace(result.verdict, accepted=False, reasons=(reason,)))
+    )
 
 
 def _analyse(paths: Sequence[Path], settings: Identification, speeds: dict[str, float]) -> list[FileResult]:

@@ -8,7 +8,6 @@ from typing import Any
 
 from fdhil.records import UNITS
 
-INTERVAL_95 = 1.959963984540054
 MEANING = "± is half the width of the 95 % interval"
 # what people read: unit and factor; the ratios to K and all of JSON stay in SI units
 DISPLAY: Mapping[str, tuple[str, float]] = {name: (unit, 1.0) for name, unit in UNITS.items()} | {

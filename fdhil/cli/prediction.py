@@ -14,7 +14,8 @@ import click
 from fdhil import tables
 from fdhil.cli.compiling import forewarn
 from fdhil.cli.options import OutputFile, Positive
-from fdhil.cli.parameter_view import INTERVAL_95, MEANING
+from fdhil.cli.parameter_view import MEANING
+from fdhil.records import INTERVAL_95
 
 if TYPE_CHECKING:
     from fdhil.cli.forecast import Past

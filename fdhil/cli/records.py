@@ -103,7 +103,7 @@ def _config_of(window: Window) -> machine_config.MachineConfig:
         "regulators": regulators,
     }
     machine = {"name": "replay", "sync_period_s": min(window.dt_s, 0.02)}
-    return machine_config.parse({"machine": machine, "axis": {window.axis: axis}}, "recording")
+    return machine_config.parse({"machine": machine, "axis": {window.axis: axis}}, "recording", made_up=True)
 
 
 @click.command()
@@ -169,7 +169,8 @@ def _row(revision: Revision) -> dict[str, Any]:
 @click.command()
 @click.argument("recording", type=FILE)
 @click.option("--out", required=True, type=OutputFile(), help="The CSV file to write.")
-def export(recording: Path, out: Path) -> None:
+@AS_JSON
+def export(recording: Path, out: Path, as_json: bool) -> None:
     """Write a stored window (.parquet) as CSV of the recording format."""
     from fdhil.store.export import export_csv
     from fdhil.store.windows import read_window
@@ -178,14 +179,21 @@ def export(recording: Path, out: Path) -> None:
     if out.exists() and out.samefile(recording):
         raise click.UsageError("--out is the recording itself; choose another name")
     export_csv(window, out)
+    if as_json:
+        told = {"recording": str(recording), "file": str(out), "axis": window.axis, "rows": window.n}
+        click.echo(json.dumps({"schema": "fdhil-export-1"} | told))
 
 
 @click.command()
 @click.argument("config", type=FILE)
 @click.option("--out", required=True, type=OutputFile(), help="The HTML file to write.")
-def report(config: Path, out: Path) -> None:
+@AS_JSON
+def report(config: Path, out: Path, as_json: bool) -> None:
     """Write an HTML report of the stored history of CONFIG's machine."""
     machine = machine_config.load(config)
     from fdhil.cli.history_report import write_report
 
-    write_report(machine, *_history(machine, None), out)
+    rows, told = _history(machine, None)
+    write_report(machine, rows, told, out)
+    if as_json:
+        click.echo(json.dumps({"schema": "fdhil-report-1", "file": str(out), "revisions": len(rows)}))

@@ -26,22 +26,29 @@ def run_directory(config: machine_config.MachineConfig) -> Path:
     return config.store.run_directory or config.store.directory / "run"
 
 
+def guard_directory(config: machine_config.MachineConfig) -> Path:
+    """Return the folder of the guard's socket: its own, or the daemon's."""
+    return config.guard.run_directory or run_directory(config)
+
+
 @click.command()
 @CONFIG
 @click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Left out: the config's, else the best.")
-def run(config: Path, method: str | None) -> int:
+@click.option("--json", "as_json", is_flag=True, help="Write each line as a JSON object to stdout.")
+def run(config: Path, method: str | None, as_json: bool) -> int:
     """Run the daemon of the machine in CONFIG: listen, identify, predict; correct only when armed.
 
-    Writes one line per outcome to stderr. Stops on SIGTERM or Ctrl-C, with the correction ramped to zero first. Exit 3
-    when an offset may still be applied then: the last line says which, and what to do.
+    Writes one line per outcome to stderr, with --json to stdout. Stops on SIGTERM or Ctrl-C, with the correction ramped
+    to zero first. Exit 3 when an offset may still be applied then: the last line says which, and what to do.
     """
     machine = machine_config.load(config)
     from fdhil.cli.compiling import forewarn
-    from fdhil.daemon import service  # late: --help imports nothing heavy
+    from fdhil.daemon import journal, service  # late: --help imports nothing heavy
     from fdhil.drivers import open_machine
 
     forewarn("identify", "predict", "correct")
-    stands = service.run(machine, open_machine, method)
+    with journal.lines_as_json(as_json):
+        stands = service.run(machine, open_machine, method)
     return 0 if stands.nothing else 3
 
 
@@ -154,7 +161,7 @@ def _disarm_at_the_guard(config: Path, silent: DeviceError) -> Mapping[str, Any]
     from fdhil.guard.client import GuardClient
 
     try:
-        with GuardClient(run_directory(machine)) as guard:
+        with GuardClient(guard_directory(machine)) as guard:
             answer = guard.disarm()
             return {**verdict(landed(guard)), "asked": "guard"} if answer["ok"] else answer
     except DeviceError as error:
@@ -179,9 +186,8 @@ def adopt(config: Path, yes: bool, as_json: bool) -> None:
     from fdhil.daemon.token import read_token
     from fdhil.guard.client import GuardClient
 
-    directory = run_directory(machine)
-    with GuardClient(directory) as guard:
-        answer = _adopted(guard, lambda: read_token(directory), yes, quiet=as_json)
+    with GuardClient(guard_directory(machine)) as guard:
+        answer = _adopted(guard, lambda: read_token(run_directory(machine)), yes, quiet=as_json)
     _tell(answer, as_json)
 
 

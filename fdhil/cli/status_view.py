@@ -15,6 +15,7 @@ from fdhil.cli.parameter_view import MEANING, cell, half_of, head
 from fdhil.records import PARAMETERS
 
 BARS = "▁▂▃▄▅▆▇█"
+COURSE = 7  # revisions in a row of bars: what fits the column of a value
 SHOWN_PASSES = 3
 LIVE_S = 1.0
 GUARD_LIVE_S = 2.0  # the daemon asks it twice a second
@@ -32,7 +33,6 @@ COUNTED = {
     "pdo_ambiguous": "PDO of uncertain SYNC",
     "failures": "polls failed",
 }
-COURSE = 7  # revisions in a row of bars: what fits the column of a value
 
 
 def open_console() -> Console:

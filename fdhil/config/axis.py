@@ -21,12 +21,12 @@ CEILING_ACCELERATION_MM_S2 = 2000.0
 class Nominal(Section):
     """[axis.X.nominal]: the data sheet's values, used until validated ones exist."""
 
-    R: Positive = Field(description="resistance, ohm")
-    L: Positive = Field(description="inductance, H")
-    K: Positive = Field(description="torque constant = back-EMF constant, N.m/A")
-    Jt: Positive = Field(description="total inertia on the motor shaft, kg.m2")
-    ft: NotNegative = Field(description="viscous friction, N.m.s")
-    Cd: NotNegative = Field(description="dry friction torque, N.m")
+    R: Positive = Field(ge=1e-4, le=1e6, description="resistance, ohm")
+    L: Positive = Field(ge=1e-7, le=1e6, description="inductance, H")
+    K: Positive = Field(ge=1e-5, le=1e6, description="torque constant = back-EMF constant, N.m/A")
+    Jt: Positive = Field(ge=1e-9, le=1e6, description="total inertia on the motor shaft, kg.m2")
+    ft: NotNegative = Field(le=1e6, description="viscous friction, N.m.s")
+    Cd: NotNegative = Field(le=1e6, description="dry friction torque, N.m")
 
 
 class CorrectionLimits(Section):
@@ -60,12 +60,14 @@ class Drive(Section):
         65536, ge=4, le=2**31 - 1, description="encoder and set-point increments per revolution"
     )
     sign: Literal[1, -1] = Field(1, description="-1 where the drive counts against the axis")
-    rated_current_a: Positive = Field(50.0, description="0x6075; 0x6078 counts in 0.1 % of it")
+    rated_current_a: Positive = Field(50.0, ge=1e-3, le=1e5, description="0x6075; 0x6078 counts in 0.1 % of it")
     setpoint_delay_cycles: int = Field(
         2, ge=0, le=16, description="SYNC cycles by which the drive runs its set-point late"
     )
-    following_error_window_mm: Positive = Field(10.0, description="0x6065: beyond it the drive faults")
-    speed_limit_mm_s: Positive | None = Field(None, description="the axis maximum; left out: the rapid speed")
+    following_error_window_mm: Positive = Field(10.0, ge=1e-3, le=1e4, description="0x6065: beyond it the drive faults")
+    speed_limit_mm_s: Positive | None = Field(
+        None, ge=1e-3, le=1e5, description="the axis maximum; left out: the rapid speed"
+    )
 
     @field_validator("profile")
     @classmethod
@@ -83,7 +85,7 @@ class Voltage(Section):
     host: str = Field("127.0.0.1", description="modbus: address of the sensor")
     port: int = Field(0, ge=0, le=65535, description="modbus: TCP port; 0 lets the simulator choose one")
     unit: int = Field(1, ge=0, le=247, description="modbus: unit identifier")
-    timeout_s: Positive = Field(0.5, description="modbus: how long an answer may take")
+    timeout_s: Positive = Field(0.5, ge=1e-3, le=60, description="modbus: how long an answer may take")
 
     @field_validator("source")
     @classmethod
@@ -98,18 +100,21 @@ class Thermometer(Section):
     port: int = Field(502, ge=1, le=65535, description="TCP port")
     unit: int = Field(1, ge=0, le=247, description="unit identifier")
     address: int = Field(8, ge=0, le=65534, description="first of its two input registers (float32, high word first)")
-    period_s: Positive = Field(1.0, le=3600, description="how often it is asked")
-    timeout_s: Positive = Field(0.5, description="how long an answer may take")
+    period_s: Positive = Field(1.0, ge=1e-2, le=3600, description="how often it is asked")
+    timeout_s: Positive = Field(0.5, ge=1e-3, le=60, description="how long an answer may take")
 
 
 class Axis(Section):
     """[axis.X]"""
 
-    screw_pitch_mm: Positive = Field(description="table travel per motor revolution")
-    rapid_speed_mm_s: Positive = Field(description="speed of G0")
-    max_acceleration_mm_s2: Positive = Field(description="acceleration of G0")
+    screw_pitch_mm: Positive = Field(ge=1e-3, le=1e4, description="table travel per motor revolution")
+    rapid_speed_mm_s: Positive = Field(ge=1e-3, le=1e5, description="speed of G0")
+    max_acceleration_mm_s2: Positive = Field(ge=1e-2, le=1e6, description="acceleration of G0")
     max_jerk_mm_s3: Positive | None = Field(
-        None, description="largest jerk of profile jerk_limited; left out: the acceleration is reached in 25 ms"
+        None,
+        ge=1.0,
+        le=1e9,
+        description="largest jerk of profile jerk_limited; left out: the acceleration is reached in 25 ms",
     )
     nominal: Nominal
     regulators: Regulators
@@ -128,6 +133,11 @@ class Axis(Section):
     def scaling(self) -> Scaling:
         """Between millimetres and the drive's increments."""
         return Scaling(self.drive.increments_per_rev, self.screw_pitch_mm, self.drive.sign)
+
+    @property
+    def top_speed_mm_s(self) -> float:
+        """The axis maximum."""
+        return self.drive.speed_limit_mm_s or self.rapid_speed_mm_s
 
     @property
     def rapid_speed_rad_s(self) -> float:

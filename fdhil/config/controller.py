@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
@@ -16,7 +16,7 @@ class Nc(Section):
     profile: Literal["fir", "trapezoidal", "jerk_limited", "linuxcnc"] = Field(
         "fir", description="fir: smoothed feed; trapezoidal, jerk_limited: look-ahead; linuxcnc: as its own planner"
     )
-    smoothing_s: tuple[NotNegative, ...] = Field(
+    smoothing_s: tuple[Annotated[NotNegative, Field(le=10)], ...] = Field(
         (0.060, 0.030), max_length=4, description="fir: moving averages over each axis' demand"
     )
     corner: Literal["continuous", "exact_stop"] = Field(
@@ -27,8 +27,12 @@ class Nc(Section):
     end_rest_s: NotNegative = Field(
         0.5, le=10, description="rest after the last motion: the drives' settling belongs to the path's error"
     )
-    max_blocks: int = Field(10_000_000, ge=1, description="blocks a program may execute before it is refused")
-    max_repeated_blocks: int = Field(500_000, ge=1, description="of these, blocks that loops and calls execute again")
+    max_blocks: int = Field(
+        10_000_000, ge=1, le=10**12, description="blocks a program may execute before it is refused"
+    )
+    max_repeated_blocks: int = Field(
+        500_000, ge=1, le=10**12, description="of these, blocks that loops and calls execute again"
+    )
     max_call_depth: int = Field(50, ge=1, le=200, description="nesting of calls before a program is refused")
 
 
@@ -48,7 +52,9 @@ class Identification(Section):
     """[identification]"""
 
     method: str | None = Field(None, description=f"{', '.join(tables.ESTIMATORS)}; left out: the best there is")
-    lowpass_hz: Positive = Field(40.0, description="least_squares: corner of the zero-phase low-pass on every signal")
+    lowpass_hz: Positive = Field(
+        40.0, ge=0.01, le=1e5, description="least_squares: corner of the zero-phase low-pass on every signal"
+    )
 
     @field_validator("method")
     @classmethod

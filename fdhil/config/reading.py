@@ -3,42 +3,73 @@
 from __future__ import annotations
 
 import difflib
+import logging
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
 
 from fdhil.config.machine import MachineConfig
-from fdhil.config.section import Section
+from fdhil.config.plausible import doubts
+from fdhil.config.section import LARGEST, Section
 from fdhil.errors import ConfigError, ConfigFault
 
 MAX_CONFIG_BYTES = 256 * 1024
+MOST_FAULTS = 50
+MOST_DOTS = 100  # in a line
+SHOWN_CHARS = 60
+OUT_OF_RANGE = {"greater_than", "greater_than_equal", "less_than", "less_than_equal", "finite_number"}
 
 
 def load(path: Path) -> MachineConfig:
-    """Read a machine configuration; ConfigError with every fault, its path and a suggestion."""
+    """Read a machine configuration; ConfigError with every fault, its path and a suggestion.
+
+    What is possible but unlikely is told on stderr.
+    """
     try:
-        raw = path.read_bytes()
+        with path.open("rb") as file:
+            raw = file.read(MAX_CONFIG_BYTES + 1)
     except OSError as error:
         fault = ConfigFault("file", f"cannot be read: {error.strerror}", "check the path")
         raise ConfigError(str(path), [fault]) from None
     if len(raw) > MAX_CONFIG_BYTES:
         raise ConfigError(str(path), [ConfigFault("file", "is larger than 256 KiB", "a machine config is a few kB")])
+    config = parse(toml_document(raw, str(path)), str(path), path.parent)
+    for sentence in unlikely(config):
+        logging.getLogger("fdhil").warning("%s: %s", path, sentence)  # nobody else may be there to tell: on stderr
+    return config
+
+
+def toml_document(raw: bytes, source: str) -> dict[str, Any]:
+    """Return the tables of a TOML file; ConfigError when it is none, also for one that is nested without end."""
     try:
-        document = tomllib.loads(raw.decode("utf-8"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ConfigError(str(path), [ConfigFault("file", f"is no TOML: {error}", "check the line it names")]) from None
-    return parse(document, str(path), path.parent)
+        if any(line.count(b".") > MOST_DOTS for line in raw.splitlines()):  # a key of n parts takes n^2 to read
+            raise RecursionError
+        return tomllib.loads(raw.decode("utf-8"))
+    except RecursionError:
+        what = "is nested deeper than any config"
+    except ValueError as error:  # no UTF-8, no TOML, or a number of thousands of digits
+        what = f"is no TOML: {_short(str(error))}"
+    raise ConfigError(source, [ConfigFault("file", what, "check the line it names")])
 
 
-def parse(document: Mapping[str, Any], source: str = "config", folder: Path = Path()) -> MachineConfig:
-    """Check a parsed TOML document; relative directories of [store] are taken from ``folder``."""
+def parse(
+    document: Mapping[str, Any], source: str = "config", folder: Path = Path(), *, made_up: bool = False
+) -> MachineConfig:
+    """Check a parsed TOML document; relative directories of [store] are taken from ``folder``.
+
+    ``made_up``: its axes need not be those of a machine that can be.
+    """
     try:
         config = MachineConfig.model_validate(document)
     except ValidationError as error:
         raise ConfigError(source, _faults(error)) from None
+    found = [] if made_up else [(name, doubt) for name, axis in config.axis.items() for doubt in doubts(axis)]
+    impossible = [ConfigFault(f"axis.{name}.{doubt.key}", doubt.text) for name, doubt in found if not doubt.possible]
+    if impossible:
+        raise ConfigError(source, impossible)
     directory = folder / config.store.directory
     run, key = config.store.run_directory, config.store.commissioning_key
     store = config.store.model_copy(
@@ -48,13 +79,22 @@ def parse(document: Mapping[str, Any], source: str = "config", folder: Path = Pa
             "commissioning_key": folder / key if key else None,
         }
     )
-    return config.model_copy(update={"store": store})
+    guard_run = config.guard.run_directory
+    guard = config.guard.model_copy(update={"run_directory": folder / guard_run if guard_run else None})
+    return config.model_copy(update={"store": store, "guard": guard})
+
+
+def unlikely(config: MachineConfig) -> list[str]:
+    """Return a sentence for everything about the axes that can be, but hardly is."""
+    found = [(name, doubt) for name, axis in config.axis.items() for doubt in doubts(axis)]
+    return [f"axis.{name}.{doubt.key} is unlikely: {doubt.text}" for name, doubt in found]
 
 
 def _faults(error: ValidationError) -> list[ConfigFault]:
     faults = []
-    for item in error.errors():
-        path = ".".join(str(part) for part in item["loc"]) or "config"
+    items = error.errors(include_url=False)
+    for item in items[:MOST_FAULTS]:
+        path = ".".join(_short(str(part)) for part in item["loc"]) or "config"
         if item["type"] == "extra_forbidden":
             faults.append(ConfigFault(path, "is no key of this section", _near_key(item["loc"])))
         elif item["type"] == "missing":
@@ -63,10 +103,47 @@ def _faults(error: ValidationError) -> list[ConfigFault]:
             for line in str(item["ctx"]["error"]).splitlines():
                 where, _, what = line.partition(": ")
                 faults.append(ConfigFault(where, what))
+        elif item["type"] in OUT_OF_RANGE and (bounds := _bounds(item["loc"])):
+            faults.append(ConfigFault(path, f"must be {bounds}, not {_shown(item['input'])}", _describe(item["loc"])))
         else:
-            shown = f", not {item['input']!r}" if isinstance(item["input"], str | int | float | bool) else ""
+            shown = f", not {_shown(item['input'])}" if isinstance(item["input"], str | int | float | bool) else ""
             faults.append(ConfigFault(path, item["msg"].removeprefix("Value error, ") + shown, _describe(item["loc"])))
+    if len(items) > MOST_FAULTS:
+        faults.append(ConfigFault("file", f"has {len(items) - MOST_FAULTS} more faults", "mend these first"))
     return faults
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= SHOWN_CHARS else f"{text[:SHOWN_CHARS]}..."
+
+
+def _shown(value: Any) -> str:
+    """Return a value as it is shown in a fault; no file can make it long."""
+    try:
+        return _short(repr(value))
+    except ValueError:
+        return "a number of thousands of digits"
+
+
+def _bounds(loc: tuple[int | str, ...]) -> str:
+    """Return the range that a key's number must have, as the models state it; empty when they state none."""
+    section = _section(loc[:-1])
+    names = [str(key) for key in loc if section and str(key) in section.model_fields]
+    if section is None or not names:
+        return ""
+    field = section.model_fields[names[-1]]
+    told = list(_constraints(field)) + list(_constraints(field.annotation))
+    low = max((bound for item in told if (bound := getattr(item, "ge", None)) is not None), default=None)
+    high = min((bound for item in told if (bound := getattr(item, "le", None)) is not None), default=LARGEST)
+    return f"above 0 and at most {high:g}" if low is None else f"from {low:g} to {high:g}"
+
+
+def _constraints(of: Any) -> Iterator[Any]:
+    for item in (*getattr(of, "metadata", ()), *getattr(of, "__metadata__", ())):
+        yield item
+        yield from _constraints(item)
+    for inner in getattr(of, "__args__", ()):
+        yield from _constraints(inner)
 
 
 def _section(loc: tuple[int | str, ...]) -> type[Section] | None:

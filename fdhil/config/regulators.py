@@ -14,7 +14,7 @@ class Regulators(Section):
     """[axis.X.regulators]: the drive's nested loops."""
 
     structure: str = Field("p_pi_pi", description=f"the regulators' structure: {', '.join(tables.REGULATORS)}")
-    position_gain_per_s: Positive = Field(description="Kv of the position loop, 1/s")
+    position_gain_per_s: Positive = Field(ge=1e-2, le=1e5, description="Kv of the position loop, 1/s")
     speed_feedforward: Annotated[float, Field(ge=0, le=1.5)] = Field(
         1.0, description="share of the demand's speed fed forward"
     )
@@ -22,17 +22,19 @@ class Regulators(Section):
         description="proportional gain of the speed loop, A.s/rad; pid: derivative gain, and factor of the other two"
     )
     speed_ki: NotNegative = Field(description="integral gain of the speed loop, A/rad")
-    speed_period_s: Positive = Field(0.00025, description="cycle of the speed loop")
-    current_limit_a: Positive = Field(description="limit of the speed loop's output")
+    speed_period_s: Positive = Field(0.00025, ge=1e-6, le=0.02, description="cycle of the speed loop")
+    current_limit_a: Positive = Field(ge=1e-2, le=1e5, description="limit of the speed loop's output")
     current_kp: Positive = Field(description="proportional gain of the current loop, V/A")
     current_ki: NotNegative = Field(description="integral gain of the current loop, V/(A.s)")
-    current_period_s: Positive = Field(3.125e-5, description="cycle of the current loop")
-    voltage_limit_v: Positive = Field(description="limit of the current loop's output")
+    current_period_s: Positive = Field(3.125e-5, ge=1e-6, le=0.02, description="cycle of the current loop")
+    voltage_limit_v: Positive = Field(ge=0.1, le=1e5, description="limit of the current loop's output")
     position_ki_per_s2: NotNegative = Field(0.0, description="double_pi, pid: integral gain of the position loop")
     torque_feedforward: Annotated[float, Field(ge=0, le=1.5)] = Field(
         0.0, description="share of the nominal inertia's current fed forward"
     )
-    setpoint_filter_s: NotNegative = Field(0.0, description="time constant of a filter on the set-point; 0: none")
+    setpoint_filter_s: NotNegative = Field(
+        0.0, le=1.0, description="time constant of a filter on the set-point; 0: none"
+    )
     setpoint_filter_order: Literal[1, 2] = Field(1, description="first-order, or two equal ones behind each other")
     current_delay_cycles: int = Field(0, ge=0, le=4, description="current cycles until a computed voltage acts")
 

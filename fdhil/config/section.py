@@ -6,12 +6,23 @@ import difflib
 from collections.abc import Mapping
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+# no quantity of a machine lies beyond, in the units used here; a key states its own range where that is narrower
+SMALLEST, LARGEST = 1e-12, 1e9
+
+
+def _of_a_machine(value: float) -> float:
+    # no ge and le: those of a key would not narrow these but take their place, or lose theirs
+    if value != 0 and not SMALLEST <= abs(value) <= LARGEST:
+        raise ValueError(f"must be from {SMALLEST:g} to {LARGEST:g}")
+    return value
+
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False), AfterValidator(_of_a_machine)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False), AfterValidator(_of_a_machine)]
 Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_of_a_machine)]
 AxisName = Annotated[str, Field(pattern="^[A-Z]$")]
 
 

@@ -21,10 +21,10 @@ class Noise(Section):
 class SimAxis(Section):
     """[sim.axis.X]: what the simulated drive really is; what is left out is the nominal value."""
 
-    R: Positive | None = Field(None, description="ohm")
-    L: Positive | None = Field(None, description="H")
-    K: Positive | None = Field(None, description="N.m/A")
-    Jt: Positive | None = Field(None, description="kg.m2")
+    R: Positive | None = Field(None, ge=1e-9, le=1e6, description="ohm")
+    L: Positive | None = Field(None, ge=1e-9, le=1e6, description="H")
+    K: Positive | None = Field(None, ge=1e-9, le=1e6, description="N.m/A")
+    Jt: Positive | None = Field(None, ge=1e-9, le=1e6, description="kg.m2")
     ft: NotNegative | None = Field(None, description="N.m.s, at the reference temperature")
     Cd: NotNegative | None = Field(None, description="N.m, at the reference temperature")
     ft_per_kelvin: Finite = Field(0.0, description="relative change of ft per kelvin of slide-way temperature")
@@ -37,8 +37,10 @@ class SimAxis(Section):
 class Thermal(Section):
     """[sim.thermal]: the slide-ways warm with the work of friction and cool toward the ambient."""
 
-    ambient_c: Finite = Field(20.0, description="ambient and start temperature, the reference of ft and Cd")
-    rise_c: NotNegative = Field(2.0, description="rise in steady shuttling at rapid speed")
+    ambient_c: Finite = Field(
+        20.0, ge=-50, le=200, description="ambient and start temperature, the reference of ft and Cd"
+    )
+    rise_c: NotNegative = Field(2.0, le=200, description="rise in steady shuttling at rapid speed")
     time_constant_s: Positive = Field(600.0, description="time constant of that rise")
 
 
@@ -48,7 +50,7 @@ class Sim(Section):
     pace: Literal["realtime", "lockstep"] = Field(
         "realtime", description="lockstep: as fast as the bus answers, repeatable"
     )
-    seed: int = Field(1, ge=0, description="seed of the sensor noise")
+    seed: int = Field(1, ge=0, le=2**63 - 1, description="seed of the sensor noise")
     nc: bool = Field(False, description="whether the simulated NC is switched on at start")
     lockstep_rpdo: tuple[str, ...] = Field(
         (), description="lockstep: RPDOs to wait for, such as X:2; left out: those heard in the cycle before"

@@ -69,7 +69,7 @@ class Armory:
         self._supply: Supply | None = None
         self._given_up = False
         self._disarming: asyncio.Future[Answer] | None = None
-        self.guard = GuardLink(run_directory)
+        self.guard = GuardLink(config.guard.run_directory or run_directory)
 
     def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
         """Start from what the history knows; the token is made where there is none. DeviceError when it cannot be."""

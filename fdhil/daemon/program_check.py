@@ -38,7 +38,7 @@ from fdhil.program.planner import stream as planned
 from fdhil.records import Float, Parameters, Reason, Trajectory
 from fdhil.store.atomic import store_error, sync_folder, write_file
 
-SCHEMA = "fdhil-check-3"
+SCHEMA = "fdhil-check-4"
 ROWS = ".rows"
 HEADER = ".json"
 KEPT = 4  # checked programs; an hour of two axes takes 58 MB
@@ -248,6 +248,11 @@ def encoded(demand_mm: Mapping[str, Float], offset_um: Mapping[str, Float], conf
     return np.column_stack(columns).astype("<i4").tobytes()
 
 
+def header_digest(header: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a header's meaning."""
+    return hashlib.sha256(json.dumps(header, sort_keys=True).encode()).hexdigest()
+
+
 def part_file(folder: Path, key: str) -> Path:
     """Return where rows are while they are written."""
     return folder / f".{key}.part"
@@ -271,7 +276,7 @@ def keep(folder: Path, key: str, request: Callable[[BinaryIO], dict[str, Any]]) 
         if header["refused"]:
             return header
         part.rename(folder / (key + ROWS))
-        write_file(folder / (key + HEADER), json.dumps(header).encode())
+        write_file(folder / (key + HEADER), json.dumps(header | {"digest": header_digest(header)}).encode())
         newest = sorted(folder.glob("*" + HEADER), key=lambda file: file.stat().st_mtime, reverse=True)
         for file in newest[KEPT:]:
             file.unlink()

@@ -15,7 +15,7 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
-from fdhil.config import MachineConfig
+from fdhil.config import MachineConfig, unlikely
 from fdhil.daemon import blackbox, journal
 from fdhil.daemon.armory import Armory
 from fdhil.daemon.control import SOCKET_NAME, Answer, ControlServer, refusal
@@ -113,6 +113,7 @@ class Service:
 
     async def _serve(self) -> None:
         self._say(await asyncio.to_thread(self._keeper.open))
+        self._say([Notice("ConfigUnlikely", "minor", text) for text in unlikely(self._config)])
         await asyncio.to_thread(self._prepare)
         control = ControlServer(self._handle, lambda: self._armory.checking, self._armory.abandon)
         async with control.serving(self._run_directory / SOCKET_NAME), asyncio.TaskGroup() as tasks:

@@ -20,7 +20,7 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.correction import gate
-from fdhil.daemon.program_check import HEADER, ROWS, SCHEMA, code_digest, reference_blocks
+from fdhil.daemon.program_check import HEADER, ROWS, SCHEMA, code_digest, header_digest, reference_blocks
 from fdhil.errors import ProgramError, StoreError
 from fdhil.program import program_digest
 from fdhil.records import Reason
@@ -75,6 +75,8 @@ class Checked:
         """
         try:
             header = json.loads((folder / (key + HEADER)).read_bytes())
+            if header.pop("digest") != header_digest(header):
+                return None
             found = Checked(folder / (key + ROWS), header["axes"])
             good = header["schema"] == SCHEMA and header["code"] == code_digest() and not header["refused"]
             good = good and all(program_digest(beside / name) == sha for name, sha in header["files"].items())
@@ -83,9 +85,9 @@ class Checked:
                 found.blocks.append(block)
                 found.content(k)
             os.utime(folder / (key + HEADER))  # what is used is not the oldest
-        except (OSError, StoreError, ValueError, KeyError, TypeError, AttributeError, ProgramError):
+            found.conclude(header)
+        except (OSError, StoreError, ValueError, LookupError, TypeError, AttributeError, RecursionError, ProgramError):
             return None
-        found.conclude(header)
         return found if good and blocks and blocks[-1].last else None
 
     def take(self, block: Block, errors: Mapping[str, Mapping[str, float]]) -> None:

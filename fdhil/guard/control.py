@@ -141,7 +141,7 @@ class Client:
 class Control:
     """The listening socket ``guard.sock`` and its clients; DeviceError when it cannot be made.
 
-    The file is the guard's alone (0600), or its group's too (0660) where the daemon runs under another user, ``peer_uid``.
+    The file is the guard's alone (0600), or its group's too (0660) where the daemon runs as another user, ``peer_uid``.
     """
 
     def __init__(self, run_directory: Path, peer_uid: int | None = None) -> None:

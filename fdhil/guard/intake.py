@@ -1,4 +1,4 @@
-"""The table on its way in: taken from its descriptor, then checked a few rows at a turn, so that no SYNC waits for it."""
+"""The table on its way in: taken from its descriptor, then checked a few rows a turn, so that no SYNC waits for it."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ class Intake:
         self._journal = journal
         self._loading: tuple[table.Loading, Client, Document] | None = None
         self._taken = 0
+        self._refused = ""
 
     @property
     def busy(self) -> bool:
@@ -73,6 +74,8 @@ class Intake:
             client.reply(document, ok=True, sequence=loading.joined.sequence, rows=rows)
 
     def _refuse(self, client: Client, document: dict[str, Any], refusal: table.TableRefused) -> None:
-        self._journal.write("table_refused", code=refusal.code, text=str(refusal))
+        if str(refusal) != self._refused:  # the same again and again is told once
+            self._journal.write("table_refused", code=refusal.code, text=str(refusal))
+        self._refused = str(refusal)
         advice = Alarm(refusal.code).action
         client.reply(document, ok=False, code=refusal.code, text=str(refusal), advice=advice)

@@ -75,7 +75,7 @@ class Guard:
         try:
             while not (self._stopping and not self.state.sending and not self._requests):
                 self._turn()
-        except Exception as error:  # the guard's supervisor: whatever has failed, the offset is taken away
+        except Exception as error:  # noqa: BLE001 - the guard's supervisor: whatever has failed, the offset is taken away
             self._failed(error)
             return 3
         standing_um = status.may_stand_um(self.state, self.settings)
@@ -293,7 +293,7 @@ class Guard:
             client.reply(document, ok=False, code="BadRequest", text=told, advice=f"use one of {', '.join(DECIDED)}")
 
     def _queue(self, client: Client, document: Document, request: Request) -> None:
-        """Have the next step decide; one request of a client waits at a time, but a disarm takes the place of another."""
+        """Have a step decide; one request of a client waits at a time, but a disarm takes the place of another."""
         waiting = next((waits for waits in self._requests if waits[0] is client), None)
         if waiting is not None and (request.kind != "disarm" or waiting[2].kind == "disarm"):
             self._answer(client, document, (Alarm("GuardBusy"),))

@@ -44,15 +44,9 @@ def parse_request(kind: Any, document: Mapping[str, Any], settings: Settings) ->
     facts = document.get("facts")
     digest = hashlib.sha256(_text(document, "token").encode("utf-8", "surrogatepass")).hexdigest()
     valid = bool(settings.token_sha256) and hmac.compare_digest(digest, settings.token_sha256)
-    laws = _laws(document.get("laws"), settings)
-    return Request(
-        kind,
-        valid,
-        _text(document, "program_digest"),
-        facts if isinstance(facts, dict) else {},
-        laws,
-        _compared(document, settings),
-    )
+    facts = facts if isinstance(facts, dict) else {}
+    laws, program = _laws(document.get("laws"), settings), _text(document, "program_digest")
+    return Request(kind, valid, program, facts, laws, _compared(document.get("axes"), settings))
 
 
 def _text(document: Mapping[str, Any], key: str) -> str:
@@ -61,9 +55,8 @@ def _text(document: Mapping[str, Any], key: str) -> str:
     return value if isinstance(value, str) and len(value) <= MOST_CHARACTERS else ""
 
 
-def _compared(document: Mapping[str, Any], settings: Settings) -> dict[str, str]:
+def _compared(given: object, settings: Settings) -> dict[str, str]:
     """The fingerprints of the drives that were compared; what is no text is no drive's."""
-    given = document.get("axes")
     found = given if isinstance(given, dict) else {}
     return {axis.name: _text(found, axis.name) for axis in settings.axes if axis.name in found}
 

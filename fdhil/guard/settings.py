@@ -5,6 +5,7 @@ The file is written by ``fdhil-guard`` from the machine's config and profile; th
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -149,8 +150,10 @@ class Settings:
 
 
 def to_json(settings: Settings) -> str:
-    """Return the settings as the text of their file."""
-    return json.dumps({"schema": SCHEMA, **asdict(settings)}, indent=1)
+    """Return the settings as the text of their file, which ends with a digest over them."""
+    document = {"schema": SCHEMA, **asdict(settings)}
+    digest = hashlib.sha256(json.dumps(document).encode()).hexdigest()
+    return json.dumps({**document, "digest": digest}, indent=1)
 
 
 def from_json(text: str, source: str = "settings") -> Settings:
@@ -159,26 +162,34 @@ def from_json(text: str, source: str = "settings") -> Settings:
         document = json.loads(text, parse_constant=_refuse)
         if document.pop("schema") != SCHEMA:
             raise ValueError(f"schema is not {SCHEMA}")
+        document.pop("digest", None)
         axes = tuple(_axis(axis) for axis in document.pop("axes"))
         settings = Settings(axes=axes, **document)
         _check(settings)
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+    except (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError) as error:
         fault = ConfigFault("file", f"cannot be used: {str(error)[:200]}", "let fdhil-guard write it")
         raise ConfigError(source, [fault]) from None
     return settings
 
 
 def load(path: Path) -> Settings:
-    """Read the settings file; ConfigError when it cannot be read or used. What is no plain file is not waited for."""
+    """Read the settings file; ConfigError when it cannot be read or used, or is not as it was written.
+
+    What is no plain file is not waited for.
+    """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
-        with open(descriptor, "rb") as file:
+        with os.fdopen(descriptor, "rb") as file:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
                 raise OSError("it is no plain file")
             text = file.read(MAX_BYTES).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(str(path), [ConfigFault("file", f"cannot be read: {error}", "run fdhil-guard")]) from None
-    return from_json(text, str(path))
+    settings = from_json(text, str(path))
+    if to_json(settings) != text:  # a bit of a limit may have flipped
+        fault = ConfigFault("file", "is damaged or was changed by hand", "let fdhil-guard write it")
+        raise ConfigError(str(path), [fault])
+    return settings
 
 
 def _refuse(constant: str) -> None:
@@ -259,8 +270,9 @@ def _check_axis(axis: AxisSettings) -> None:
     _number(axis.heartbeat_timeout_s, 0.0, 3600.0, where + "heartbeat_timeout_s")
     _number(axis.speed_step, 0.0, 2.0**31, where + "speed_step")
     _number(axis.speed_count, 0.0, 2.0**31, where + "speed_count")
-    if type(axis.record) is not str or type(axis.record_void) is not bool:
-        raise ValueError(f"{where}record or record_void is no text and no truth value")
+    _word(axis.record, ".{0,200}", where + "record")
+    if type(axis.record_void) is not bool:
+        raise ValueError(f"{where}record_void is neither true nor false")
     _check_sent(axis.offset, OFFSET_LAYOUT, f"{where}the offset RPDO must map 0x60B0:00 and nothing else")
     if axis.feedforward is not None:
         text = f"{where}the feed-forward's RPDO must map 0x60B1:00 and 0x60B2:00 and nothing else"

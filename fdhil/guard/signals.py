@@ -1,4 +1,4 @@
-"""No signal that can be caught ends the guard: those that ask it to stop have it ramp to zero, the others do nothing."""
+"""No signal that can be caught ends the guard: those that ask it to stop have it ramp to zero, others do nothing."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import socket
 STOP = frozenset({signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT, signal.SIGXCPU})
 KEPT = frozenset({signal.SIGKILL, signal.SIGSTOP, signal.SIGCONT, signal.SIGCHLD})
 RESERVED = 32, 33  # of the C library, which lets nobody handle them; sent from outside they would end the process
-SIGPROCMASK = {"x86_64": 14, "aarch64": 135, "riscv64": 135}
-SIG_BLOCK, MASK_BYTES = 0, 8
+SIGACTION = {"x86_64": 13, "aarch64": 134, "riscv64": 134}
+MASK_BYTES = 8
 
 
 def catch() -> socket.socket:
@@ -23,7 +23,7 @@ def catch() -> socket.socket:
     signal.set_wakeup_fd(signalled.detach(), warn_on_full_buffer=False)
     for number in signal.valid_signals() - KEPT:
         signal.signal(number, _note if number in STOP else signal.SIG_IGN)
-    _block_reserved()
+    _ignore_reserved()
     return wake
 
 
@@ -31,8 +31,8 @@ def _note(*_: object) -> None:
     """The signal's number is on the wake socket already."""
 
 
-def _block_reserved() -> None:
-    number = SIGPROCMASK.get(os.uname().machine)
-    if number is not None:
-        mask = ctypes.c_uint64(sum(1 << (reserved - 1) for reserved in RESERVED))
-        ctypes.CDLL(None).syscall(number, SIG_BLOCK, ctypes.byref(mask), None, MASK_BYTES)
+def _ignore_reserved() -> None:
+    number = SIGACTION.get(os.uname().machine)
+    ignore = (ctypes.c_uint64 * 4)(signal.SIG_IGN)  # the kernel's record: handler first, no flags, no mask
+    for reserved in RESERVED if number is not None else ():
+        ctypes.CDLL(None).syscall(number, reserved, ignore, None, MASK_BYTES)

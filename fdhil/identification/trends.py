@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdhil.records import PARAMETERS, Float
+from fdhil.records import INTERVAL_95, PARAMETERS, Float
 
-SURE_95 = 1.959963984540054
 LEAST_ROWS = 3
 LEAST_STRETCH = 3  # rows on either side of a step: fewer may be one bad estimate
 NEWEST = 2  # rows after the newest step: two that agree are believed, as they are when they are taken in
@@ -75,8 +74,8 @@ class Step:
 def student_95(freedom: float) -> float:
     """Return the quantile of Student's t that leaves 2.5 % on either side (Cornish-Fisher; within 1 % from 3 on)."""
     if math.isinf(freedom):
-        return SURE_95
-    z, v = SURE_95, max(freedom, 1.0)
+        return INTERVAL_95
+    z, v = INTERVAL_95, max(freedom, 1.0)
     terms = (z, (z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96, (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384)
     return sum(term / v**k for k, term in enumerate(terms))
 
@@ -126,7 +125,7 @@ def crossing(line: Slope, limit: float) -> Crossing | None:
     than ``SURE_SLOPE`` standard deviations.
     """
     sure = student_95(line.freedom) ** 2
-    if line.value**2 <= sure * (SURE_SLOPE / SURE_95 * line.std) ** 2:
+    if line.value**2 <= sure * (SURE_SLOPE / INTERVAL_95 * line.std) ** 2:
         return None
     apart = limit - line.level
     a = line.value**2 - sure * line.std**2

@@ -14,9 +14,7 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.prediction.uncertainty import contour_std_um
-from fdhil.records import Correction, Float, Parameters, Skill
-
-INTERVAL_95 = 1.959963984540054
+from fdhil.records import INTERVAL_95, Correction, Float, Parameters, Skill
 
 
 class Gain(NamedTuple):

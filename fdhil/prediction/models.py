@@ -15,7 +15,10 @@ from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault
 from fdhil.records import PARAMETERS, UNITS, Parameters, Trajectory
 
-MAX_BYTES = 1024 * 1024
+MAX_BYTES = 64 * 1024
+SHOWN_CHARS = 40
+MOST_FAULTS = 50
+LARGEST, SMALLEST = 1e12, 1e-12
 _MAY_BE_ZERO = ("ft", "Cd")
 
 
@@ -32,17 +35,17 @@ def load_models(path: Path) -> dict[str, Parameters]:
     except OSError as error:
         raise _cannot(path, f"cannot be read: {error.strerror}", "check the path") from None
     if len(raw) > MAX_BYTES:
-        raise _cannot(path, "is larger than 1 MiB", "a model file has six numbers per axis")
+        raise _cannot(path, "is larger than 64 KiB", "a model file has six numbers per axis")
     try:
         document = json.loads(raw.decode("utf-8"))
     except (UnicodeDecodeError, ValueError, RecursionError) as error:
-        raise _cannot(path, f"is no JSON: {error}", "fdhil identify --json gives the values") from None
+        raise _cannot(path, f"is no JSON: {str(error)[:120]}", "fdhil identify --json gives the values") from None
     if not isinstance(document, dict) or not document:
         raise _cannot(path, "holds no axis", 'write {"X": {"R": .., "L": .., "K": .., "Jt": .., "ft": .., "Cd": ..}}')
     faults: list[ConfigFault] = []
-    models = {axis: _parameters(axis, values, faults) for axis, values in document.items()}
+    models = {axis: _parameters(axis[:SHOWN_CHARS], values, faults) for axis, values in document.items()}
     if faults:
-        raise ConfigError(str(path), faults)
+        raise ConfigError(str(path), faults[:MOST_FAULTS])
     return {axis: model for axis, model in models.items() if model is not None}
 
 
@@ -63,7 +66,7 @@ def _parameters(axis: str, values: Any, faults: list[ConfigFault]) -> Parameters
     for name in set(values) - set(PARAMETERS):
         near = difflib.get_close_matches(name, PARAMETERS, n=1, cutoff=0.4)
         hint = f"did you mean {near[0]!r}?" if near else f"the parameters are {', '.join(PARAMETERS)}"
-        faults.append(ConfigFault(f"{axis}.{name}", "is no parameter", hint))
+        faults.append(ConfigFault(f"{axis}.{name[:SHOWN_CHARS]}", "is no parameter", hint))
     if len(faults) > before:
         return None
     return Parameters(**{name: float(values[name]) for name in PARAMETERS})
@@ -72,12 +75,17 @@ def _parameters(axis: str, values: Any, faults: list[ConfigFault]) -> Parameters
 def _fault(name: str, value: Any) -> str | None:
     """Say what is wrong with a value, None when nothing is."""
     if isinstance(value, bool) or not isinstance(value, int | float):
-        return f"must be a number, not {value!r}"
-    if abs(value) > 1e12 or not math.isfinite(value):
-        return f"must be a finite number of this physical quantity, not {value!r}"
+        return f"must be a number, not {_shown(value)}"
+    if abs(value) > LARGEST or not math.isfinite(value) or 0 < abs(value) < SMALLEST:
+        return f"must be a finite number of this physical quantity, not {_shown(value)}"
     if value < 0 or (value == 0 and name not in _MAY_BE_ZERO):
-        return f"must be {'at least 0' if name in _MAY_BE_ZERO else 'above 0'}, not {value!r}"
+        return f"must be {'at least 0' if name in _MAY_BE_ZERO else 'above 0'}, not {_shown(value)}"
     return None
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= SHOWN_CHARS else f"{text[:SHOWN_CHARS]}..."
 
 
 def models_for(

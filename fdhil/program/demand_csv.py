@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import logging
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import IO
 
 import numpy as np
 
 from fdhil.config import MachineConfig
+from fdhil.csv_text import read_csv_text
 from fdhil.errors import ConfigError, ConfigFault, RecordingError
 from fdhil.records import Float, Trajectory, frozen, frozen_ints
 
@@ -16,6 +19,8 @@ _STEP_TOLERANCE = 1e-3  # of the SYNC period, for the period itself
 _JITTER_TOLERANCE = 0.01  # of the SYNC period, for one row
 _ROUNDING_S = 1.1e-6  # times may be written with 6 decimals
 _MOVED_MM = 1e-9
+_TOO_FAST = 20.0  # times the rapid speed, over most of the rows that move
+_TOO_SLOW, _SMALL_MM = 2e-3, 2.0  # of the rapid speed, and of travel: both is no job, but may be a test
 
 
 def read_demand_csv(path: Path, config: MachineConfig) -> Trajectory:
@@ -24,19 +29,21 @@ def read_demand_csv(path: Path, config: MachineConfig) -> Trajectory:
     RecordingError when it cannot be read: a column is missing, text or nothing stands where a number belongs, times are
     not uniform, or an axis moves that the machine lacks. ConfigError when its step is not the SYNC period.
     """
-    columns = _columns(path)
+    text = read_csv_text(path)
+    columns = [name.strip() for name in text.partition("\n")[0][:4096].split(",")]
     missing = [f"{name}_mm" for name in config.axis if f"{name}_mm" not in columns and name in "XYZ"]
     if "time_s" not in columns or missing:
         absent = ", ".join((["time_s"] if "time_s" not in columns else []) + missing)
         wanted = ",".join(["time_s", *(f"{name}_mm" for name in config.axis if name in "XYZ")])
         raise RecordingError(f"{path}: there is no column {absent}; a demand begins with the line {wanted}")
-    table = _numbers(path, len(columns))
+    table = _numbers(path, text, len(columns))
     time_s = table[:, columns.index("time_s")]
     _check_times(path, time_s, config.machine.sync_period_s)
     for place, name in enumerate(columns):
         axis = name.removesuffix("_mm")
         if name.endswith("_mm") and axis not in config.axis and np.ptp(table[:, place]) > _MOVED_MM:
             raise RecordingError(f"{path}: axis {axis} moves, which the configuration lacks; add [axis.{axis}] to it")
+    _check_speeds(path, {n: table[:, columns.index(f"{n}_mm")] for n in config.axis if f"{n}_mm" in columns}, config)
     n = time_s.size
     position = {
         axis: frozen(table[:, columns.index(f"{axis}_mm")]) if f"{axis}_mm" in columns else frozen(np.zeros(n))
@@ -47,26 +54,14 @@ def read_demand_csv(path: Path, config: MachineConfig) -> Trajectory:
     return Trajectory(config.machine.sync_period_s, frozen(time_s), position, rapid, frozen_ints(np.zeros(n)))
 
 
-def _columns(path: Path) -> list[str]:
+def _numbers(path: Path, text: str, width: int) -> Float:
+    rows = text.splitlines()[1:]
+    if not any(row.strip() for row in rows):
+        raise RecordingError(f"{path}: there is no row of data; record or export it again")
     try:
-        with path.open(encoding="utf-8-sig") as file:
-            header = file.readline(4096)
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be read ({error.strerror}); check the path") from None
-    except UnicodeDecodeError:
-        raise RecordingError(f"{path} is no text; give a demand as CSV or an NC program") from None
-    return [name.strip() for name in header.split(",")]
-
-
-def _numbers(path: Path, width: int) -> Float:
-    try:
-        with path.open(encoding="utf-8-sig") as file:
-            next(file)
-            if not any(line.strip() for line in file):
-                raise RecordingError(f"{path}: there is no row of data; record or export it again")
-        table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2, comments=None, encoding="utf-8-sig")
-    except (ValueError, StopIteration) as error:
-        raise RecordingError(f"{path} cannot be read ({error}); each row wants {width} numbers") from None
+        table = np.loadtxt(rows, delimiter=",", ndmin=2, comments=None)
+    except ValueError as error:
+        raise RecordingError(f"{path} cannot be read ({str(error)[:120]}); each row wants {width} numbers") from None
     if table.shape[1] != width:
         raise RecordingError(f"{path}: {table.shape[1]} numbers a row under {width} columns; export it again")
     wrong = np.flatnonzero(~np.isfinite(table).all(axis=1))
@@ -92,10 +87,35 @@ def _check_times(path: Path, time_s: Float, sync_period_s: float) -> None:
         )
 
 
+def _check_speeds(path: Path, columns: Mapping[str, Float], config: MachineConfig) -> None:
+    """Refuse speeds that no unit but a mistaken one explains; tell of a demand that hardly moves."""
+    ratios, speeds = {}, {}
+    for name, values in columns.items():
+        steps = np.abs(np.diff(values))
+        moving = steps[steps > _MOVED_MM]
+        if moving.size:  # a step or two may be a jump, which is another matter
+            speeds[name] = float(np.median(moving)) / config.machine.sync_period_s
+            ratios[name] = speeds[name] / config.axis[name].rapid_speed_mm_s
+    if not ratios:
+        return
+    name = max(ratios, key=lambda axis: ratios[axis])
+    if ratios[name] > _TOO_FAST:
+        raise RecordingError(
+            f"{path}: axis {name} moves at {speeds[name]:.3g} mm/s, {ratios[name]:.0f} times its rapid speed; "
+            f"is {name}_mm in um or in increments? give it in mm, or correct rapid_speed_mm_s"
+        )
+    if ratios[name] < _TOO_SLOW and max(float(np.ptp(values)) for values in columns.values()) < _SMALL_MM:
+        text = "%s: no axis moves by more than %g mm or faster than %.2g of its rapid speed; is it in m? give mm"
+        logging.getLogger("fdhil").warning(text, path, _SMALL_MM, _TOO_SLOW)
+
+
 def write_demand_csv(trajectory: Trajectory, file: Path | IO[bytes]) -> None:
-    """Write a reference as demand CSV: mm with 9 decimals."""
+    """Write a reference as demand CSV: mm with 9 decimals. RecordingError when the file cannot be written."""
     decimals = max(6, min(12, 1 - math.floor(math.log10(trajectory.dt_s))))
     table = np.column_stack([trajectory.time_s, *trajectory.position_mm.values()])
     header = ",".join(["time_s", *(f"{axis}_mm" for axis in trajectory.axes)])
     formats = [f"%.{decimals}f", *("%.9f" for _ in trajectory.axes)]
-    np.savetxt(file, table, fmt=formats, delimiter=",", header=header, comments="")
+    try:
+        np.savetxt(file, table, fmt=formats, delimiter=",", header=header, comments="")
+    except OSError as error:
+        raise RecordingError(f"{file} cannot be written ({error.strerror}); check the folder") from None

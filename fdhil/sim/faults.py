@@ -13,13 +13,13 @@ A wrong entry is a ConfigError that names every fault of the script at once.
 from __future__ import annotations
 
 import difflib
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from fdhil.config import toml_document
 from fdhil.errors import ConfigError, ConfigFault
 from fdhil.sim.fault_kinds import FAULTS, Target
 
@@ -87,16 +87,15 @@ class FaultEntry(BaseModel):
 def load(path: Path, axes: tuple[str, ...]) -> list[FaultEntry]:
     """Read a fault script for a machine with these axes; ConfigError with everything that is wrong with it."""
     try:
-        raw = path.read_bytes()
+        with path.open("rb") as file:
+            raw = file.read(MAX_SCRIPT_BYTES + 1)
         if len(raw) > MAX_SCRIPT_BYTES:
             raise ConfigError(str(path), [ConfigFault("file", "is larger than 256 KiB", "a fault script is a few kB")])
-        document = tomllib.loads(raw.decode("utf-8"))
     except OSError as error:
         raise ConfigError(
             str(path), [ConfigFault("file", f"cannot be read: {error.strerror}", "check the path")]
         ) from None
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ConfigError(str(path), [ConfigFault("file", f"is no TOML: {error}", "check the line it names")]) from None
+    document = toml_document(raw, str(path))
     faults = [ConfigFault(key, "is no key of a fault script", "[[fault]] is") for key in document if key != "fault"]
     entries: list[FaultEntry] = []
     listed = document.get("fault", [])

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fdhil.csv_text import MAX_ROWS, read_csv_text, shown
 from fdhil.errors import RecordingError
 from fdhil.records import Float, Recording, SlowVoltage, VoltageSampling, frozen
 
@@ -15,18 +16,14 @@ COLUMNS = ("time_s", "voltage_V", "current_A", "speed_rad_per_s", "position_m", 
 REQUIRED = ("format", "sample_rate_hz", "voltage_sampling", "axis", "pitch_m_per_rev")
 STEP_TOLERANCE = 0.01
 MIN_ROWS = 16
-MAX_ROWS = 20_000_000
+PITCH_M = (1e-5, 0.8)
+RATE_HZ = (1.0, 1e6)
+RAPID_M_S = (1e-4, 20.0)
 
 
 def read_recording(path: Path) -> Recording:
     """Read one CSV recording; RecordingError names what is wrong with the file and what to do about it."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be read ({error.strerror}): check the path") from None
-    except UnicodeDecodeError:
-        raise RecordingError(f"{path} is no text file: export the recording as CSV in UTF-8") from None
-    return parse_recording(text, str(path))
+    return parse_recording(read_csv_text(path), str(path))
 
 
 def parse_recording(text: str, source: str = "recording") -> Recording:
@@ -34,7 +31,7 @@ def parse_recording(text: str, source: str = "recording") -> Recording:
     if not text.strip():
         raise RecordingError(f"{source} is empty: record it again")
     headers, first_row, lines = _split(text, source)
-    dt = 1.0 / _positive(headers, "sample_rate_hz", source)
+    dt = 1.0 / _within(headers, "sample_rate_hz", RATE_HZ, source)
     if not text.endswith("\n"):
         raise RecordingError(
             f"{source} is truncated: line {len(lines)} has no end of line, so its last number may be cut; copy it again"
@@ -43,8 +40,8 @@ def parse_recording(text: str, source: str = "recording") -> Recording:
     rows, gaps = _place(table[:, 0], dt, source)
     columns = _spread(table, rows)
     sampling = _sampling(headers, source)
-    pitch_m = _positive(headers, "pitch_m_per_rev", source)
-    rapid_m_s = _positive(headers, "rapid_speed_m_per_s", source) if "rapid_speed_m_per_s" in headers else None
+    pitch_m = _within(headers, "pitch_m_per_rev", PITCH_M, source)
+    rapid_m_s = _within(headers, "rapid_speed_m_per_s", RAPID_M_S, source) if "rapid_speed_m_per_s" in headers else None
     return Recording(
         axis=headers["axis"],
         dt_s=dt,
@@ -105,7 +102,9 @@ def _split(text: str, source: str) -> tuple[dict[str, str], int, list[str]]:
     if missing:
         raise RecordingError(f"{source} has no header {', '.join(missing)}: add a line such as '# {missing[0]}: ...'")
     if headers["format"] != FORMAT:
-        raise RecordingError(f"{source} has format {headers['format']!r}, which is not {FORMAT!r}: convert it first")
+        raise RecordingError(
+            f"{source} has format {shown(headers['format'])}, which is not {FORMAT!r}: convert it first"
+        )
     names = tuple(name.strip() for name in lines[k].split(","))
     absent = [name for name in COLUMNS if name not in names]
     if absent:
@@ -119,8 +118,6 @@ def _numbers(lines: list[str], first_row: int, source: str) -> Float:
     rows = [line for line in lines[first_row:] if line.strip()]
     if len(rows) < MIN_ROWS:
         raise RecordingError(f"{source} is truncated: {len(rows)} rows are no recording; record it again")
-    if len(rows) > MAX_ROWS:
-        raise RecordingError(f"{source} has {len(rows)} rows, more than {MAX_ROWS}: cut it into parts")
     try:
         table = np.loadtxt(rows, delimiter=",", comments=None, ndmin=2)
     except ValueError:
@@ -144,11 +141,12 @@ def _bad_row(lines: list[str], first_row: int, width: int, source: str) -> Recor
             try:
                 value = float(cell)
             except ValueError:
-                return RecordingError(f"{source} line {k + 1} has {cell.strip()!r} where a number belongs: correct it")
-            if not math.isfinite(value):
                 return RecordingError(
-                    f"{source} line {k + 1} has the non-finite value {cell.strip()!r}: leave a lost sample's row out"
+                    f"{source} line {k + 1} has {shown(cell.strip())} where a number belongs: correct it"
                 )
+            if not math.isfinite(value):
+                what = f"{source} line {k + 1} has the non-finite value {shown(cell.strip())}"
+                return RecordingError(f"{what}: leave a lost sample's row out")
     return RecordingError(f"{source} cannot be read as numbers: export it again")
 
 
@@ -162,6 +160,8 @@ def _place(
         raise RecordingError(
             f"{source}: time stands still or runs back at {time_s[k + 1]:g} s: sort or record it again"
         )
+    if time_s[-1] - time_s[0] > MAX_ROWS * dt:
+        raise RecordingError(f"{source}: a gap of {steps.max():g} s is no recording of one run: cut the file there")
     off = np.abs(steps - dt) > STEP_TOLERANCE * dt
     if off.mean() > 0.5:
         raise RecordingError(
@@ -170,8 +170,6 @@ def _place(
     # a step that is off is a gap even where it rounds to one sample: at least one row is then missing or misplaced
     counts = np.where(off, np.maximum(np.rint(steps / dt), 2), 1).astype(np.int64)
     rows = np.concatenate([[0], np.cumsum(counts)])
-    if rows[-1] > MAX_ROWS:
-        raise RecordingError(f"{source}: a gap of {steps.max():g} s is no recording of one run: cut the file there")
     gaps = tuple((int(rows[k]) + 1, int(rows[k + 1])) for k in np.flatnonzero(off))
     return rows, gaps
 
@@ -188,14 +186,24 @@ def _sampling(headers: dict[str, str], source: str) -> VoltageSampling:
         return "interval_mean"
     if value == "instant":
         return "instant"
-    raise RecordingError(f"{source} has voltage_sampling {value!r}: it must be interval_mean or instant")
+    raise RecordingError(f"{source} has voltage_sampling {shown(value)}: it must be interval_mean or instant")
 
 
 def _positive(headers: dict[str, str], key: str, source: str) -> float:
     value = _optional(headers, key, source)
     if value is None or not value > 0:
-        raise RecordingError(f"{source} has header {key} = {headers.get(key)!r}: it must be a number above 0")
+        raise RecordingError(f"{source} has header {key} = {shown(str(headers.get(key)))}: it must be a number above 0")
     return value
+
+
+def _within(headers: dict[str, str], key: str, bounds: tuple[float, float], source: str) -> float:
+    """Return a header's number; RecordingError beyond what machines have, with the unit that was likely meant."""
+    value, (low, high) = _positive(headers, key, source), bounds
+    if low <= value <= high:
+        return value
+    guess = f" (is {value:g} in mm? then write {value / 1e3:g})" if key != "sample_rate_hz" and value > high else ""
+    text = f"{source} has header {key} = {value:g}, machines have {low:g} to {high:g}: correct it{guess}"
+    raise RecordingError(text)
 
 
 def _optional(headers: dict[str, str], key: str, source: str) -> float | None:
@@ -205,8 +213,8 @@ def _optional(headers: dict[str, str], key: str, source: str) -> float | None:
         value = float(headers[key])
     except ValueError:
         raise RecordingError(
-            f"{source} has header {key} = {headers[key]!r} where a number belongs: correct it"
+            f"{source} has header {key} = {shown(headers[key])} where a number belongs: correct it"
         ) from None
     if not math.isfinite(value):
-        raise RecordingError(f"{source} has the non-finite header {key} = {headers[key]!r}: correct it")
+        raise RecordingError(f"{source} has the non-finite header {key} = {shown(headers[key])}: correct it")
     return value

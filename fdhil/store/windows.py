@@ -24,10 +24,13 @@ import pyarrow.parquet as pq
 from fdhil.errors import RecordingError, StoreError
 from fdhil.records import Float, SlowVoltage, Stages, Window, frozen
 from fdhil.store.atomic import store_error, sync_folder, write_file
+from fdhil.store.parquet_pages import uncompressed_bytes
 
 FORMAT = "fdhil-window-1"
 MAX_FILE_BYTES = 64 * 1024 * 1024
-MAX_ROWS = 4_000_000
+MAX_ROWS = 500_000  # half a minute at 60 us
+MAX_HEAD_BYTES = 1024 * 1024
+ROW_BYTES, SPARE_BYTES = 16, 64 * 1024  # of a column, whatever its encoding
 COLUMNS: Mapping[str, str] = {
     "demand_mm": "mm",
     "position_mm": "mm",
@@ -39,6 +42,10 @@ COLUMNS: Mapping[str, str] = {
 OPTIONAL = {"voltage_v", "offset_mm"}
 _NAME = re.compile(r"w(\d{8,12})-([A-Z])\.parquet")
 _META = b"fdhil"
+REFUSED = (
+    pa.ArrowException, OSError, ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError,
+    MemoryError,
+)  # fmt: skip
 _NEXT = "make a new recording or use an older one"
 
 Bits = npt.NDArray[np.int64]
@@ -160,8 +167,8 @@ def decode_window(content: bytes, source: str = "recording") -> Window:
     """Return the window of a Parquet file's bytes; RecordingError when it is foreign, truncated or damaged."""
     try:
         window, digest = _decode(content)
-    except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-        first = (str(error).splitlines() or [type(error).__name__])[0]
+    except REFUSED as error:
+        first = (str(error).splitlines() or [type(error).__name__])[0][:200]
         raise RecordingError(f"{source} is no window recording of fdhil: {first}; {_NEXT}") from None
     if digest != _digest(window):
         raise RecordingError(f"{source} is damaged: its digest does not match its content; {_NEXT}")
@@ -170,11 +177,10 @@ def decode_window(content: bytes, source: str = "recording") -> Window:
 
 def _decode(content: bytes) -> tuple[Window, str]:
     file = pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=True)
-    if file.metadata.num_rows > MAX_ROWS:
-        raise ValueError(f"it declares {file.metadata.num_rows} rows, {MAX_ROWS} are allowed")
-    head = json.loads((file.metadata.metadata or {}).get(_META, b"{}"))
+    head = json.loads((file.metadata.metadata or {}).get(_META, b"{}")[:MAX_HEAD_BYTES])
     if head.get("format") != FORMAT:
         raise ValueError(f"its format is {head.get('format')!r}, not {FORMAT}")
+    _check_declared(file, content)
     table = file.read()
     arrays: dict[str, Any] = {}
     for name in COLUMNS:
@@ -185,6 +191,26 @@ def _decode(content: bytes) -> tuple[Window, str]:
     grid = head.pop("slow_voltage", None)
     slow = None if grid is None else _slow(grid, table.column("slow_voltage_v"))
     return _window(head, arrays | {"slow_voltage": slow}), str(head["digest"])
+
+
+def _check_declared(file: pq.ParquetFile, content: bytes) -> None:
+    """Refuse, before any of it is read, what would take more than a window does; ValueError says what."""
+    told = file.metadata
+    if told.num_rows > MAX_ROWS:
+        raise ValueError(f"it declares {told.num_rows} rows, {MAX_ROWS} are allowed")
+    names = [file.schema.column(k).path for k in range(told.num_columns)]
+    if len(set(names)) != len(names) or not {"tick", *COLUMNS, "slow_voltage_v"}.issuperset(names):
+        raise ValueError("it has columns that no window has")
+    for group in map(told.row_group, range(told.num_row_groups)):
+        for k, name in enumerate(names):
+            column, shape = group.column(k), file.schema.column(k)
+            if column.physical_type not in ("INT64", "DOUBLE") or shape.max_repetition_level:
+                raise ValueError(f"its column {name} holds no plain numbers")
+            if column.has_dictionary_page:
+                raise ValueError(f"its column {name} has a dictionary, which no window has")
+            size = uncompressed_bytes(content, column.data_page_offset, column.total_compressed_size)
+            if size > ROW_BYTES * group.num_rows + SPARE_BYTES:
+                raise ValueError(f"its column {name} declares {size} bytes for {group.num_rows} rows")
 
 
 def _slow(grid: Mapping[str, Any], column: Any) -> SlowVoltage:
@@ -211,12 +237,12 @@ def _window(head: Mapping[str, Any], arrays: Mapping[str, Any]) -> Window:
 def read_window(path: Path) -> Window:
     """Read one window file. RecordingError when it cannot be read, is too large, foreign, truncated or damaged."""
     try:
-        size = path.stat().st_size
-        if size > MAX_FILE_BYTES:
-            raise RecordingError(f"{path} is larger than 64 MiB, which no window is; {_NEXT}")
-        content = path.read_bytes()
+        with path.open("rb") as file:
+            content = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
         raise RecordingError(f"{path} cannot be read: {error.strerror}; check the path and the rights") from None
+    if len(content) > MAX_FILE_BYTES:
+        raise RecordingError(f"{path} is larger than 64 MiB, which no window is; {_NEXT}")
     return decode_window(content, str(path))
 
 

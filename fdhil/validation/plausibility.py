@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -29,6 +29,20 @@ SCALE_TOLERANCE = 0.005  # of the travel: pitch and speed scale are known to tha
 ELASTIC_UM = 60.0  # a screw's wind-up, and backlash too small to be told
 
 
+# travel of the position per travel of the integral of speed, and the unit that makes it so
+UNITS_MISTAKEN: Mapping[float, str] = {
+    1e3: "as a position in mm where m belong",
+    1e6: "as a position in um where m belong",
+    1e3 / 25.4: "as a position in inches where m belong",
+    1e-3: "as a screw pitch in mm where m belong",
+    math.pi / 30: "as a speed in 1/min where rad/s belong",
+    math.pi / 180: "as a speed in degrees per second where rad/s belong",
+    -1.0: "as a position that counts against the speed",
+}
+UNIT_TOLERANCE = 0.02
+HOTTEST_C = 120.0  # no slide-way, screw or winding in service
+
+
 def implausibilities(window: Window) -> list[Reason]:
     """Return every reason why this window must not be identified from, before any fit; empty when it is plausible."""
     reasons = list(_not_finite(window)) + list(_stages(window))
@@ -43,7 +57,7 @@ def implausibilities(window: Window) -> list[Reason]:
 
 
 def warnings_of(window: Window) -> list[Reason]:
-    """Return what does not refuse the window but widens its intervals: coarse quantisation."""
+    """Return what is worth telling but does not refuse the window: coarse quantisation, an odd temperature."""
     found = []
     for name, unit, values in signals_of(window):
         finite = values[np.isfinite(values)]
@@ -52,7 +66,15 @@ def warnings_of(window: Window) -> list[Reason]:
         if span > 0 and step > QUANTISATION * span:
             text = f"{name} comes in steps of {step:.3g} {unit}, {100 * step / span:.1f} % of the range used"
             found.append(Reason("Quantised", text, "use a finer scale in the drive's mapping"))
+    if window.temperature_c is not None and not -HOTTEST_C < window.temperature_c < HOTTEST_C:
+        text = f"{window.temperature_c:g} degC is no temperature of a machine{_kelvin(window.temperature_c)}"
+        found.append(Reason("Implausible", text, "give temperature_C in degrees Celsius, drift is told against it"))
     return found
+
+
+def _kelvin(celsius: float) -> str:
+    guess = celsius - 273.15
+    return f"; {guess:.0f} degC in kelvin?" if -50.0 < guess < HOTTEST_C else ""
 
 
 def signals_of(window: Window) -> Iterator[tuple[str, str, Float]]:
@@ -189,6 +211,10 @@ def _position(window: Window, play_um: float) -> Iterator[Reason]:
     noise = noise_levels(window).speed_rad_s * window.dt_s * to_mm
     quantum = max(resolution(position), 1e-6)
     error = position - position[0] - travel
+    unit = _unit(travel, error)
+    if unit is not None:
+        yield unit
+        return
     elastic = 1e-3 * (ELASTIC_UM + 1.5 * play_um)
     yield from _jump(window, error, noise, quantum, elastic)
     yield from _scale(travel, error, noise, quantum, elastic)
@@ -217,6 +243,17 @@ def _jump(window: Window, error: Float, noise: float, quantum: float, elastic: f
     if worst > 1.0:
         text = f"position and the integral of speed part by {1e3 * amount:.0f} um at {_time(window, where):.3f} s"
         yield Reason("Implausible", text, "samples are lost or repeated there: check counters and time stamps")
+
+
+def _unit(travel: Float, error: Float) -> Reason | None:
+    """Return the unit that explains how position and integral of speed differ, where one does."""
+    whole = float(travel[-1])
+    times = 1.0 + float(error[-1]) / whole if whole else 1.0
+    for factor, meaning in UNITS_MISTAKEN.items():
+        if abs(times / factor - 1.0) < UNIT_TOLERANCE:
+            text = f"the position travels {times:.4g} times the integral of speed, {meaning}"
+            return Reason("CalibrationSuspect", text, "correct the unit where the recording is made")
+    return None
 
 
 def _scale(travel: Float, error: Float, noise: float, quantum: float, elastic: float) -> Iterator[Reason]:

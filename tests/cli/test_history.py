@@ -95,6 +95,7 @@ def test_the_date_of_a_limit_comes_with_its_interval(worn: Path, capsys: Any) ->
 
 def test_the_plot_and_the_report_show_it(worn: Path, tmp_path: Path, capsys: Any) -> None:
     assert fdhil("history", worn, "--plot", tmp_path / "plot.png", capsys=capsys)[::2] == (0, "")
+    assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "plot.png").stat().st_size > 50_000
     assert fdhil("report", worn, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
     page = (tmp_path / "report.html").read_text()

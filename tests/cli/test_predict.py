@@ -106,8 +106,10 @@ def remember(folder: Path, revisions: list[dict[str, float]], known_to: float = 
 def publish(
     folder: Path, axis: str, number: int, known_to: float = 0.003, *, days: float | None = None, **changed: float
 ) -> None:
-    """Store one more revision of an axis, whose values are known to a share of themselves; one a day, or ``days``
-    after the epoch."""
+    """Store one more revision of an axis, whose values are known to a share of themselves.
+
+    One a day, or ``days`` after the epoch.
+    """
     nominal = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
     covariance = np.diag([(known_to * value) ** 2 for value in nominal.values()])
     with History.open(folder / "fdhil-data") as history:

@@ -298,6 +298,16 @@ def test_adopt_without_a_guard_is_3(machine: Path, capsys: Any) -> None:
     assert (code, "start fdhil-guard" in err) == (3, True)
 
 
+def test_a_guard_with_a_folder_of_its_own_is_found_there(machine: Path, capsys: Any) -> None:
+    machine.write_text(machine.read_text().replace("[guard]", '[guard]\nrun_directory = "guards"'))
+    (machine.parent / "guards").mkdir()
+    guard = Guard(machine.parent / "guards")
+    guard.says = lambda _kind: OFF
+    assert fdhil("disarm", machine, capsys=capsys)[0] == 0
+    assert fdhil("adopt", machine, "--yes", capsys=capsys)[0] == 0
+    guard.close()
+
+
 def test_disarm_beside_a_daemon_that_hangs_asks_the_guard(
     machine: Path, folder: Path, guard: Guard, monkeypatch: pytest.MonkeyPatch, capsys: Any
 ) -> None:

@@ -64,15 +64,26 @@ class Peer(threading.Thread):
             client, _ = self._server.accept()
         except TimeoutError:
             return
+        try:
+            self._greet(client)
+        except OSError:  # it has gone again
+            client.close()
+        else:
+            self._client = client
+
+    @staticmethod
+    def _greet(client: socket.socket) -> None:
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client.sendall(b"< hi >")
         for command in (b"< open can0 >", b"< rawmode >"):
             got = b""
             while not got.endswith(b">"):
-                got += client.recv(1)
+                byte = client.recv(1)
+                if not byte:
+                    raise ConnectionError
+                got += byte
             assert got == command
             client.sendall(b"< ok >")
-        self._client = client
 
     def inject(self, *frames: Frame) -> None:
         """Put frames of another node on the bus."""

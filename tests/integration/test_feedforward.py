@@ -35,7 +35,7 @@ def transport() -> str:
 
 
 CASES = {"X": (1.0, 3.0), "Y": (0.5, 50.0)}
-"""An axis of the bench and one that lags: the drive's own speed feed-forward, and by how much the error has to shrink."""
+"""An axis of the bench and one that lags: its own speed feed-forward, and by how much the error has to shrink."""
 
 
 @pytest.fixture

@@ -78,3 +78,26 @@ def test_a_digest_tells_programs_apart(tmp_path: Path) -> None:
         program_digest(tmp_path / "none.ngc")
     with pytest.raises(ProgramError):
         load_trajectory(tmp_path / "none.ngc", bench_config())
+
+
+def straight(factor: float) -> str:
+    """A move of 100 mm at 10 m/min as a demand, in millimetres times ``factor``."""
+    rows = "".join(f"{k * 1e-3:.6f},{min(k, 600) / 6 * factor:.9f},{0.0:.1f}\n" for k in range(700))
+    return "time_s,X_mm,Y_mm\n" + rows
+
+
+def test_a_demand_in_micrometres_is_refused_and_one_in_metres_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "demand.csv"
+    path.write_text(straight(1.0))
+    assert load_trajectory(path, bench_config()).time_s.size == 700
+    assert caplog.records == []
+    path.write_text(straight(1e3))
+    with pytest.raises(
+        RecordingError, match=r"axis X moves at 1.67e\+05 mm/s, 333 times its rapid speed; is X_mm in um"
+    ):
+        load_trajectory(path, bench_config())
+    path.write_text(straight(1e-3))
+    load_trajectory(path, bench_config())
+    assert "is it in m? give mm" in caplog.records[0].getMessage()

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import io
 import random
 import sqlite3
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from fdhil.daemon.keeping import Keeper
 from fdhil.errors import RecordingError, StoreError
 from fdhil.records import Notice, Parameters, Skill
-from fdhil.store import schema
+from fdhil.store import schema, windows
 from fdhil.store.history import FILE_NAME, Comparison, History, UsedParameters, latest_parameters
 from fdhil.store.windows import decode_window, encode_window
 from tests.daemon.machine import config_of
@@ -170,3 +174,50 @@ def test_no_flipped_bit_of_a_window_changes_what_is_read(raw: bool) -> None:
             refused.append(str(error))
     assert len(refused) > 300
     assert all("w.parquet" in sentence for sentence in refused)
+
+
+def parquet(columns: dict[str, Any], **options: Any) -> bytes:
+    """A file of these columns under the head of a window."""
+    head = pq.ParquetFile(pa.BufferReader(encode_window(window(), "x"))).schema_arrow.metadata
+    sink = io.BytesIO()
+    pq.write_table(pa.table(columns).replace_schema_metadata(head), sink, **({"compression": "zstd"} | options))
+    return sink.getvalue()
+
+
+def large_page(rows: int) -> bytes:
+    """A file whose footer declares few bytes, while a page's own header declares more than it was."""
+    content = parquet({"tick": pa.array(np.arange(rows))}, use_dictionary=False)
+    column = pq.ParquetFile(pa.BufferReader(content)).metadata.row_group(0).column(0)
+    at = column.data_page_offset + 3  # after the page's type, field 1, and the head of field 2
+    length = next(k for k in range(1, 6) if content[at + k - 1] < 0x80)
+    largest = b"\xfe" + b"\xff" * (length - 2) + b"\x7f"  # as many bytes as there were
+    return content[:at] + largest + content[at + length :]
+
+
+ZEROS = np.zeros(400_000)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (parquet({name: np.zeros(600_000) for name in ("tick", "demand_mm")}), "declares 600000 rows"),
+        (parquet(dict.fromkeys(("tick", "demand_mm", "x1"), ZEROS)), "columns that no window has"),
+        (parquet({"tick": ZEROS}, use_dictionary=True), "has a dictionary"),
+        (parquet({"tick": pa.array(["a" * 1000] * 600)}, use_dictionary=False), "holds no plain numbers"),
+        (parquet({"tick": pa.array([[0.0] * 1000] * 600)}, use_dictionary=False), "columns that no window has"),
+        (large_page(40_000), "declares"),
+    ],
+    ids=["rows", "columns", "dictionary", "texts", "lists", "page"],
+)
+def test_a_file_that_would_take_more_than_a_window_is_refused_before_it_is_read(
+    content: bytes, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unread(*_: Any, **__: Any) -> None:
+        raise AssertionError("the columns were read")
+
+    class Watched(pq.ParquetFile):
+        read = unread
+
+    monkeypatch.setattr(windows.pq, "ParquetFile", Watched)
+    with pytest.raises(RecordingError, match=words):
+        decode_window(content)

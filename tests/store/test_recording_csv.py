@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fdhil import csv_text
 from fdhil.errors import RecordingError
 from fdhil.store.recording_csv import parse_recording, read_recording
 from studies import bench
@@ -80,6 +81,13 @@ def test_a_step_off_by_two_percent_is_a_gap() -> None:
         (_text(sample_rate_hz="fast"), "sample_rate_hz"),
         (_text(pitch_m_per_rev="-1"), "pitch_m_per_rev"),
         (_text(rapid_speed_m_per_s="nan"), "rapid_speed_m_per_s"),
+        (_text(pitch_m_per_rev="20"), "machines have 1e-05 to 0.8: correct it .is 20 in mm. then write 0.02"),
+        (_text(rapid_speed_m_per_s="500"), "is 500 in mm. then write 0.5"),
+        (_text(sample_rate_hz="1e-301"), "machines have 1 to 1e.06"),
+        (_text(sample_rate_hz="9" * 5000), "sample_rate_hz = '9999"),
+        (_text().replace(",2.50000,", "," + "9" * 5000 + ","), "non-finite value '9999"),
+        (_text().replace(",2.50000,", "," + "x" * 5000 + ","), "'xxxxx"),
+        (_text() + "1e300,1,1,1,1,1\n", "a gap of 1e.300 s is no recording of one run"),
         (_text().replace(",2.50000,", ",2.5x,"), "2.5x"),
         (_text().replace(",2.50000,", ",nan,"), "non-finite"),
         (_text().replace(",2.50000,", ",inf,"), "non-finite"),
@@ -94,6 +102,7 @@ def test_each_fault_is_one_sentence(text: str, words: str) -> None:
     message = str(caught.value)
     assert message.startswith("r.csv")
     assert "\n" not in message
+    assert len(message) < 200
 
 
 def test_a_file_that_is_no_text_or_not_there(tmp_path: Path) -> None:
@@ -134,3 +143,18 @@ def test_samples_of_a_slow_sensor_stand_in_headers_on_the_rows_time_axis() -> No
 def test_damaged_samples_of_a_slow_sensor_are_refused(key: str, value: str) -> None:
     with pytest.raises(RecordingError):
         parse_recording(_text(40, **(SLOW | {key: value})))
+
+
+def test_a_file_larger_than_any_recording_is_refused_before_it_is_taken_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of an endless file no more than the limit is read; rows of nothing are counted before they are split."""
+    monkeypatch.setattr(csv_text, "MAX_BYTES", 1 << 20)
+    monkeypatch.setattr(csv_text, "MAX_ROWS", 1000)
+    with pytest.raises(RecordingError, match="larger than 1 MiB or 1000 rows: cut it into parts"):
+        read_recording(Path("/dev/zero"))
+    many = tmp_path / "many.csv"
+    for end in ("\n", "\v", "\u2028"):
+        many.write_text(end * 1001)
+        with pytest.raises(RecordingError, match="larger than"):
+            read_recording(many)

@@ -1,0 +1,155 @@
+"""Whether the numbers of an axis can be those of one machine, and which unit was likely mistaken where they cannot.
+
+Each relation between keys has a range in which ordinary feed drives lie, with room to spare, and one beyond which no
+drive lies. Outside the second the configuration is refused; between both it is used and the doubt is told.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from fdhil.config.axis import Axis
+
+Numbers = Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Relation:
+    """A figure that follows from some ``keys``: what it ``is``, its ordinary range, and the range of the possible."""
+
+    keys: tuple[str, ...]
+    text: str
+    unit: str
+    figure: Callable[[Numbers], float]
+    ordinary: tuple[float, float]
+    possible: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Slip:
+    """A unit in which a key is often typed by mistake: ``factor`` takes the number to the key's own unit."""
+
+    key: str
+    factor: float
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """What cannot be, or is unlikely, about an axis; ``key`` is the one to look at first."""
+
+    key: str
+    text: str
+    possible: bool
+
+
+RELATIONS = (
+    Relation(("nominal.L", "nominal.R"), "the windings' time constant L/R", "s",
+             lambda n: n["nominal.L"] / n["nominal.R"], (1e-4, 0.1), (1e-5, 1.0)),
+    Relation(("rapid_speed_mm_s", "screw_pitch_mm"), "the motor's speed in a rapid", "1/min",
+             lambda n: 60.0 * n["rapid_speed_mm_s"] / n["screw_pitch_mm"], (10.0, 15e3), (0.5, 1e5)),
+    Relation(("rapid_speed_mm_s", "max_acceleration_mm_s2"), "the time to reach the rapid speed", "s",
+             lambda n: n["rapid_speed_mm_s"] / n["max_acceleration_mm_s2"], (2e-3, 10.0), (1e-4, 60.0)),
+    Relation(("nominal.K", "rapid_speed_mm_s", "screw_pitch_mm", "regulators.voltage_limit_v"),
+             "the back-EMF in a rapid, as a share of voltage_limit_v,", "",
+             lambda n: n["nominal.K"] * _speed_rad_s(n) / n["regulators.voltage_limit_v"], (1e-3, 1.5), (1e-5, 5.0)),
+    Relation(("nominal.Jt", "max_acceleration_mm_s2", "nominal.K", "screw_pitch_mm", "regulators.current_limit_a"),
+             "the current for max_acceleration_mm_s2, as a share of current_limit_a,", "",
+             lambda n: n["nominal.Jt"] * _acceleration_rad_s2(n) / _torque_nm(n), (2e-3, 2.0), (1e-6, 20.0)),
+    Relation(("nominal.Cd", "nominal.K", "regulators.current_limit_a"),
+             "the current against dry friction, as a share of current_limit_a,", "",
+             lambda n: n["nominal.Cd"] / _torque_nm(n), (0.0, 0.8), (0.0, 1.0)),
+    Relation(("nominal.ft", "nominal.K", "rapid_speed_mm_s", "screw_pitch_mm", "regulators.current_limit_a"),
+             "the current against viscous friction in a rapid, as a share of current_limit_a,", "",
+             lambda n: n["nominal.ft"] * _speed_rad_s(n) / _torque_nm(n), (0.0, 0.8), (0.0, 1.0)),
+    Relation(("nominal.R", "regulators.current_limit_a", "regulators.voltage_limit_v"),
+             "the voltage that drives current_limit_a through R, as a share of voltage_limit_v,", "",
+             lambda n: n["nominal.R"] * n["regulators.current_limit_a"] / n["regulators.voltage_limit_v"],
+             (1e-4, 5.0), (1e-6, 50.0)),
+)  # fmt: skip
+SLIPS = (  # the more frequent first
+    Slip("nominal.L", 1e-3, "mH"),
+    Slip("nominal.L", 1e-6, "uH"),
+    Slip("nominal.R", 1e-3, "mohm"),
+    Slip("nominal.K", 60e-3 / (2 * math.pi), "V/krpm"),
+    Slip("nominal.K", 1e-3, "mN.m/A"),
+    Slip("screw_pitch_mm", 1e3, "m"),
+    Slip("max_acceleration_mm_s2", 1e3, "m/s2"),
+    Slip("rapid_speed_mm_s", 1e3, "m/s"),
+    Slip("rapid_speed_mm_s", 1 / 60, "mm/min"),
+    Slip("nominal.Jt", 1e-3, "g.m2"),
+    Slip("nominal.Jt", 1e-4, "kg.cm2"),
+    Slip("nominal.Jt", 1e-6, "kg.mm2"),
+    Slip("nominal.Cd", 1e-2, "N.cm"),
+    Slip("nominal.Cd", 1e-3, "mN.m"),
+    Slip("nominal.ft", 1e-3, "mN.m.s"),
+)
+MOST_NAMED = 2
+
+
+def doubts(axis: Axis) -> list[Doubt]:
+    """Return what is wrong with an axis' numbers together, the impossible first; empty for an ordinary machine."""
+    numbers = _numbers(axis)
+    broken = [relation for relation in RELATIONS if not _within(relation.figure(numbers), relation.ordinary)]
+    if not broken:
+        return []
+    mended = [slip for slip in SLIPS if _mends(slip, numbers, broken)]
+    found = [_doubt(relation, numbers, mended) for relation in broken]
+    found.sort(key=lambda doubt: doubt.possible)
+    return found[:1] if mended else found  # one wrong unit has many consequences
+
+
+def _doubt(relation: Relation, numbers: Numbers, mended: list[Slip]) -> Doubt:
+    figure = relation.figure(numbers)
+    possible = _within(figure, relation.possible)
+    low, high = relation.ordinary
+    bounds = f"{low:g} to {high:g}" if low > 0 else f"at most {high:g}"
+    text = f"{_listed(relation, numbers)}: {relation.text} is {figure:.3g}{_spaced(relation.unit)}, "
+    text += f"feed drives have {bounds}{_spaced(relation.unit)}"
+    guesses = [f"{slip.key} = {numbers[slip.key] * slip.factor:.4g} ({numbers[slip.key]:g} {slip.unit})"
+               for slip in mended[:MOST_NAMED]]  # fmt: skip
+    text += f"; did you mean {' or '.join(guesses)}?" if guesses else "; check the units of these keys"
+    return Doubt(mended[0].key if mended else relation.keys[0], text, possible)
+
+
+def _listed(relation: Relation, numbers: Numbers) -> str:
+    return ", ".join(f"{key.rpartition('.')[2]} = {numbers[key]:g}" for key in relation.keys)
+
+
+def _spaced(unit: str) -> str:
+    return f" {unit}" if unit else ""
+
+
+def _mends(slip: Slip, numbers: Numbers, broken: list[Relation]) -> bool:
+    """Return whether the number in that unit makes the whole axis ordinary, and is of what is broken."""
+    if not all(slip.key in relation.keys for relation in broken):
+        return False
+    tried = {**numbers, slip.key: numbers[slip.key] * slip.factor}
+    return all(_within(relation.figure(tried), relation.ordinary) for relation in RELATIONS)
+
+
+def _within(figure: float, bounds: tuple[float, float]) -> bool:
+    return bounds[0] <= figure <= bounds[1]
+
+
+def _numbers(axis: Axis) -> dict[str, float]:
+    """Return the numbers of an axis by their key within it."""
+    own = ("screw_pitch_mm", "rapid_speed_mm_s", "max_acceleration_mm_s2")
+    numbers: dict[str, float] = {name: getattr(axis, name) for name in own}
+    numbers |= {f"nominal.{name}": value for name, value in axis.nominal.model_dump().items()}
+    limits = ("current_limit_a", "voltage_limit_v")
+    return numbers | {f"regulators.{name}": getattr(axis.regulators, name) for name in limits}
+
+
+def _speed_rad_s(numbers: Numbers) -> float:
+    return numbers["rapid_speed_mm_s"] / numbers["screw_pitch_mm"] * 2 * math.pi
+
+
+def _acceleration_rad_s2(numbers: Numbers) -> float:
+    return numbers["max_acceleration_mm_s2"] / numbers["screw_pitch_mm"] * 2 * math.pi
+
+
+def _torque_nm(numbers: Numbers) -> float:
+    return numbers["nominal.K"] * numbers["regulators.current_limit_a"]

@@ -1,0 +1,33 @@
+"""The text of a CSV file, read whole within a limit: what a file declares or repeats can never take more memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fdhil.errors import RecordingError
+
+MAX_BYTES = 256 * 1024 * 1024  # an hour of six columns at 1 kHz
+MAX_ROWS = 8_000_000  # more than two hours at 1 kHz
+SHOWN_CHARS = 40
+LINE_ENDS = "\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029"  # of str.splitlines
+
+
+def read_csv_text(path: Path) -> str:
+    """Return a file's text; RecordingError when it cannot be read, is no text, or is larger than a recording may be."""
+    try:
+        with path.open("rb") as file:
+            raw = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be read ({error.strerror}): check the path") from None
+    if len(raw) > MAX_BYTES or any(raw.count(end.encode()) > MAX_ROWS for end in LINE_ENDS):
+        text = f"{path} is larger than {MAX_BYTES >> 20} MiB or {MAX_ROWS} rows: cut it into parts"
+        raise RecordingError(text)
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise RecordingError(f"{path} is no text file: export it as CSV in UTF-8") from None
+
+
+def shown(text: str) -> str:
+    """Return a cell or header as an error shows it; no file can make it long."""
+    return repr(text if len(text) <= SHOWN_CHARS else f"{text[:SHOWN_CHARS]}...")

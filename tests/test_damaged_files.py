@@ -1,0 +1,149 @@
+"""Files that are read but not kept by the store: damaged or hostile, each is a declared error, never other values."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import random
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import pytest
+
+from fdhil.config import Nc
+from fdhil.daemon.program_check import HEADER, SCHEMA, code_digest, keep
+from fdhil.daemon.streamed import Checked
+from fdhil.daemon.token import TOKEN_NAME, ensure_token, read_token
+from fdhil.errors import ConfigError, FdhilError, ProgramError
+from fdhil.guard.settings import load, to_json
+from fdhil.prediction.models import load_models
+from fdhil.program import Budget, interpret
+from fdhil.sim import faults
+from tests.guard.machine import settings
+
+HOSTILE = {
+    "deep": "[" * 200_000,
+    "deep objects": '{"a":' * 100_000,
+    "digits": '{"X": {"R": ' + "9" * 5000 + "}}",
+    "large": '{"X": {"R": 1e999}}',
+    "endless text": '{"' + "x" * 3_000_000 + '": 1}',
+    "surrogate": '{"\\ud800": "\\udfff"}',
+    "nothing": "",
+    "no object": "3",
+}
+
+
+def flips(whole: bytes, most: int, seed: int) -> Iterator[bytes]:
+    """The content with one bit flipped, at places all over it."""
+    rng = random.Random(seed)
+    for byte in range(0, len(whole), max(1, len(whole) // most)):
+        flipped = bytearray(whole)
+        flipped[byte] ^= 1 << rng.randrange(8)
+        yield bytes(flipped)
+
+
+def test_no_flipped_bit_of_the_guards_settings_is_believed(tmp_path: Path) -> None:
+    path, true = tmp_path / "guard.json", settings()
+    path.write_text(to_json(true))
+    assert load(path) == true
+    for flipped in flips(path.read_bytes(), 300, 1):
+        path.write_bytes(flipped)
+        with pytest.raises(ConfigError, match=r"run fdhil-guard|let fdhil-guard write it"):
+            load(path)
+
+
+@pytest.mark.parametrize("text", HOSTILE.values(), ids=HOSTILE)
+def test_hostile_settings_of_the_guard_are_a_config_error(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "guard.json"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        load(path)
+    assert len(str(caught.value)) < 600
+
+
+@pytest.mark.parametrize("text", HOSTILE.values(), ids=HOSTILE)
+def test_a_hostile_model_file_is_a_config_error(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        load_models(path)
+    assert len(str(caught.value)) < 2000
+
+
+def test_a_model_file_with_a_flipped_bit_is_numbers_or_a_config_error(tmp_path: Path) -> None:
+    """It is written by hand and carries no digest; what it says is checked all the same."""
+    path = tmp_path / "model.json"
+    values = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
+    refused = 0
+    for flipped in flips(json.dumps({"X": values, "Y": values}).encode(), 1000, 2):
+        path.write_bytes(flipped)
+        try:
+            models = load_models(path)
+        except ConfigError:
+            refused += 1
+            continue
+        assert all(1e-12 <= value <= 1e12 for model in models.values() for value in model.as_dict().values())
+    assert refused > 50
+
+
+def test_a_token_with_a_flipped_bit_arms_nothing_and_is_no_traceback(tmp_path: Path) -> None:
+    true = ensure_token(tmp_path)
+    path = tmp_path / TOKEN_NAME
+    for flipped in flips(path.read_bytes(), 64, 3):
+        path.write_bytes(flipped)
+        assert read_token(tmp_path) != true
+    path.write_bytes(b"\xff" * 100_000)
+    assert len(read_token(tmp_path)) <= 256
+
+
+def test_a_checked_program_with_a_flipped_bit_is_checked_again(tmp_path: Path) -> None:
+    """The rows that the guard will get, and what vouches for them."""
+    rows = bytes(range(256)) * 16
+    errors = {"before": {"rms_um": 1.0, "max_um": 2.0}, "after": {"rms_um": 0.1, "max_um": 0.2}}
+    blocks = [[512, hashlib.sha256(rows).hexdigest()]]
+    header = {"schema": SCHEMA, "axes": ["X"], "code": code_digest(), "blocks": blocks, "files": {}, "rows": 512,
+              "largest_um": 3.0, "refused": [], **errors}  # fmt: skip
+
+    def write(body: BinaryIO) -> dict[str, object]:
+        body.write(rows)
+        return header
+
+    keep(tmp_path, "key", write)
+    found = Checked.find(tmp_path, "key", tmp_path)
+    assert found is not None
+    assert (found.rows, found.errors) == (512, errors)
+    for file, most in ((f"key{HEADER}", 400), ("key.rows", 40)):
+        path = tmp_path / file
+        whole = path.read_bytes()
+        for flipped in flips(whole, most, 4):
+            path.write_bytes(flipped)
+            assert Checked.find(tmp_path, "key", tmp_path) is None
+        path.write_bytes(whole)
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["G1 X" + "9" * 5000, "G" + "9" * 5000, "#" + "9" * 5000 + "=1", "G1 X[" + "9" * 5000 + "]",
+     "N" + "9" * 5000 + " G0",
+     "M98 P" + "9" * 5000, "O" + "9" * 5000 + " sub", "G10 L2 P" + "9" * 200, "G4 P1e308", "#1=" + "[" * 5000,
+     "G1 X#" + "#" * 3000 + "1"],
+    ids=lambda line: line[:10],
+)  # fmt: skip
+def test_a_number_of_thousands_of_digits_in_a_program_is_a_program_error(line: str) -> None:
+    try:
+        list(interpret([line, "M2"], Budget.of(Nc())))
+    except ProgramError as error:
+        told = str(error)
+    else:
+        told = ""  # a line number of any length means nothing
+        assert line[0] == "N"
+    assert len(told) < 300
+
+
+@pytest.mark.parametrize("text", ["a = " + "[" * 100_000, "a = " + "9" * 5000, "a = 0x" + "f" * 5000])
+def test_a_hostile_fault_script_is_a_config_error(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "faults.toml"
+    path.write_text(text)
+    with pytest.raises(FdhilError):
+        faults.load(path, ("X",))

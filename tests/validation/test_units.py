@@ -1,0 +1,69 @@
+"""A column in another unit than its name says is told with that unit; a recording in its own units never is."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from fdhil.config import Identification
+from fdhil.identification.windows import find_windows
+from fdhil.records import Recording, Window, frozen
+from fdhil.store.recording_csv import parse_recording
+from fdhil.validation import analyse
+from fdhil.validation.plausibility import warnings_of
+from studies import bench
+from tests.identification.recorded import signals
+
+
+@pytest.fixture(scope="module")
+def recording() -> Recording:
+    return parse_recording(bench.as_csv(signals(), 0.003))
+
+
+def window_of(recording: Recording) -> Window:
+    return find_windows(recording)[0]
+
+
+def positions(recording: Recording, factor: float) -> Recording:
+    return replace(
+        recording,
+        position_mm=frozen(recording.position_mm * factor),
+        demand_mm=frozen(recording.demand_mm * factor),
+    )
+
+
+def speeds(recording: Recording, factor: float) -> Recording:
+    return replace(recording, speed_rad_s=frozen(recording.speed_rad_s * factor))
+
+
+@pytest.mark.parametrize(
+    ("signal", "factor", "words"),
+    [
+        ("position", 1e3, "travels 1000 times the integral of speed, as a position in mm where m belong"),
+        ("position", 1e3 / 25.4, "inches"),
+        ("speed", 30 / math.pi, "as a speed in 1/min"),
+        ("speed", 180 / math.pi, "degrees per second"),
+        ("position", -1.0, "counts against the speed"),
+        ("pitch", 1e3, "as a screw pitch in mm where m belong"),
+    ],
+)
+def test_a_unit_is_named(signal: str, factor: float, words: str, recording: Recording) -> None:
+    if signal == "pitch":  # with a rapid speed in the header the reader refuses it before
+        made = replace(recording, pitch_mm=recording.pitch_mm * factor, rapid_speed_rad_s=None)
+    else:
+        made = (positions if signal == "position" else speeds)(recording, factor)
+    verdict = analyse(window_of(made), Identification()).verdict
+    assert not verdict.accepted
+    (told,) = [reason for reason in verdict.reasons if reason.code in ("CalibrationSuspect", "Implausible")]
+    assert words in told.text
+
+
+def test_a_temperature_in_kelvin_is_told_and_refuses_nothing(recording: Recording) -> None:
+    warm = window_of(replace(recording, temperature_c=294.65))
+    assert analyse(warm, Identification()).verdict.accepted
+    assert [str(reason) for reason in warnings_of(warm)] == [
+        "Implausible: 294.65 degC is no temperature of a machine; 22 degC in kelvin?"
+    ]
+    assert warnings_of(window_of(replace(recording, temperature_c=60.0))) == []
