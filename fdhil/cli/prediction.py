@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 FILE = click.Path(path_type=Path)
 MANY_ZONES = 12
-RECENT_MOVES = 3  # whose skill bounds what can be reached
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,10 +170,11 @@ def correct(asked: Asked, method: str | None) -> int:
     """
     reference, models, config = inputs(asked.program, asked.config_path, asked.model_path, asked.from_history)
     from fdhil import correction
+    from fdhil.cli import forecast
 
     forewarn("predict", "correct")
     planned = correction.plan(reference, models, config, method)
-    predicted = _gain(planned, models, config, asked.from_history)
+    predicted = forecast.predicted_gain(planned, models, config, asked.from_history)
     if asked.out is not None:
         _write(asked.out, _correction_columns(planned))
     if asked.report is not None:
@@ -184,21 +184,6 @@ def correct(asked: Asked, method: str | None) -> int:
     else:
         _show_correction(planned, predicted)
     return 1 if planned.refused else 0
-
-
-def _gain(planned: Correction, models: Mapping[str, Parameters], config: MachineConfig, from_history: bool) -> Gain:
-    """Return what is predicted to be gained, with the uncertainty that the history knows."""
-    from fdhil.prediction.gain import gain
-
-    if not from_history:
-        return gain(planned, models, config, {}, {})
-    from fdhil.store.history import History
-
-    with History.read(config.store.directory) as history:
-        newest = {axis: history.revisions(axis, limit=1) for axis in config.axis}
-        skills = {axis: history.skills(axis, limit=RECENT_MOVES) for axis in config.axis}
-    covariances = {axis: found[0].set.covariance for axis, found in newest.items() if found}
-    return gain(planned, models, config, covariances, skills)
 
 
 def _report(
