@@ -155,8 +155,11 @@ GENERATED = {
 
 
 def _example(path: str, key: str, field: FieldInfo) -> Any:
+    """Return what the template shows; KeyError where a key has neither a default nor an example."""
     default = _default(field)
-    return EXAMPLES.get(f"{path}.{key}", EXAMPLES.get(key)) if default is None else default
+    if default is not None:
+        return default
+    return EXAMPLES[f"{path}.{key}" if f"{path}.{key}" in EXAMPLES else key]
 
 
 def _default(field: FieldInfo) -> Any:

@@ -17,8 +17,8 @@ STUDIES = ("estimators", "comparison", "drift", "verdicts", "slow_sensor")
 def main() -> None:
     """Run the named studies, or all of them, each with its own defaults."""
     if sys.argv[1:] == ["--pages"]:
-        for path in sorted(FOLDER.glob("*.json")):
-            write_page(path)
+        for name in STUDIES:
+            write_page(FOLDER / f"{name}.json")
         return
     names = sys.argv[1:] or list(STUDIES)
     unknown = [name for name in names if name not in STUDIES]

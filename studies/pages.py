@@ -32,8 +32,11 @@ def conduct(
     parser: argparse.ArgumentParser,
     seeds: Callable[[argparse.Namespace], str],
     measure: Callable[[argparse.Namespace], Any],
-) -> None:
-    """Read the options, measure, and write figures, page and plot; ``seeds`` tells which ones the options mean."""
+) -> Any:
+    """Read the options, measure, and write figures, page and plot; ``seeds`` tells which ones the options mean.
+
+    Returns the figures as the file has them.
+    """
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--out", type=Path, default=FOLDER)
     options = parser.parse_args()
@@ -47,6 +50,7 @@ def conduct(
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / f"{name}.json").write_text(json.dumps(document, separators=(",", ":")) + "\n", "utf-8")
     print(write_page(options.out / f"{name}.json"))
+    return document["figures"]
 
 
 def provenance(command: str) -> dict[str, str]:

@@ -140,3 +140,12 @@ def test_the_source_archive_holds_what_is_needed_and_nothing_else(tmp_path: Path
     }
     assert needed <= names
     assert [name for name in names if re.search(r"__pycache__|\.venv|fdhil-data|\.parquet$|^out/|^\.git/", name)] == []
+
+
+def test_every_reason_to_refuse_a_window_is_explained() -> None:
+    sources = "".join(path.read_text("utf-8") for path in ROOT.glob("fdhil/validation/*.py"))
+    codes = set(re.findall(r'"([A-Z][a-z]+[A-Z][A-Za-z]+)"', sources))
+    codes |= set(re.findall(r'Reason\(\s*"([A-Z][A-Za-z]+)"', sources))
+    assert {"NotFinite", "StaleData", "LoadDetected", "NoWindow", "Quantised"} <= codes
+    page = (ROOT / "docs" / "explanation" / "verdicts.md").read_text("utf-8")
+    assert [code for code in sorted(codes) if f"`{code}" not in page] == []
