@@ -102,6 +102,7 @@ class Guard:
         self._journal.write("stopped", state=state, offset_um=sent_um, may_stand_um=standing_um, **told)
         self.control.close()
         self._notifier.close()
+        self._can.close()
 
     def _turn(self) -> None:
         now_s = time.monotonic()
