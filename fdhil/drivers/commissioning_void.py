@@ -32,13 +32,12 @@ def is_void(directory: Path, axis: str) -> bool:
 def void_record(directory: Path, axis: str, why: str) -> None:
     """Mark the axis' record as void, with the first reason; StoreError when the mark cannot be written."""
     path = void_path(directory, axis)
+    if path.exists():
+        return
     text = json.dumps({"why": why, "seen_utc": datetime.now(UTC).isoformat(timespec="seconds")})
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text + "\n")
-    except FileExistsError:
-        return
+        path.write_text(text + "\n", "utf-8")
     except OSError as error:
         raise StoreError(
             f"{path} cannot be written ({error.strerror}); until then arm nothing after a restart of the guard"

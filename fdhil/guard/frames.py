@@ -7,7 +7,7 @@ latches is the last one that came before it.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median
 
@@ -52,6 +52,7 @@ class _PdoState:
     length: int
     every_sync: int
     where: dict[int, int]
+    needed: bool = False
     data: bytes = b""
     age: int = NEVER
     sure_age: int = NEVER
@@ -75,8 +76,9 @@ class _PdoState:
         if 2 * self.age <= self.every_sync:
             self.early = True
             self.twice = self.twice or data != self.data
-        self.data, self.fresh, self.age = data, True, 0
-        self.values = unpack(self.entries, data)  # now, and not at the SYNC, when there is no time
+        self.fresh, self.age = True, 0
+        if data != self.data:
+            self.data, self.values = data, unpack(self.entries, data)  # now: at the SYNC there is no time
 
     def at_sync(self) -> None:
         """Age by one cycle."""
@@ -94,7 +96,7 @@ class _PdoState:
 def _pdo_state(axis: int, pdo: Pdo) -> _PdoState:
     entries = pdo.entries
     where = {entry.index: k for k, entry in enumerate(entries) if entry.sub == 0}
-    return _PdoState(axis, entries, pdo_length(entries), max(1, pdo.every_sync), where)
+    return _PdoState(axis, entries, pdo_length(entries), max(1, pdo.every_sync), where, bool(_NEEDED & where.keys()))
 
 
 @dataclass(slots=True)
@@ -119,6 +121,7 @@ class Listener:
     emergencies: int = 0
     _pdos: dict[int, _PdoState] = field(default_factory=dict)
     _tpdos: list[list[_PdoState]] = field(default_factory=list)
+    _carriers: list[Mapping[int, _PdoState]] = field(default_factory=list)
     _targets: list[_PdoState] = field(default_factory=list)
     _nodes: list[_Node] = field(default_factory=list)
     _node_of: dict[int, int] = field(default_factory=dict)
@@ -132,6 +135,7 @@ class Listener:
             target = _pdo_state(k, axis.target)
             self._targets.append(target)
             self._tpdos.append([_pdo_state(k, pdo) for pdo in axis.tpdos])
+            self._carriers.append(_carriers(self._tpdos[k]))
             self._pdos[axis.target.cob_id] = target
             self._pdos.update(zip([pdo.cob_id for pdo in axis.tpdos], self._tpdos[k], strict=True))
             self._nodes.append(_Node())
@@ -269,55 +273,47 @@ class Listener:
         return seen
 
     def _axis_input(self, k: int, axis: AxisSettings, now_s: float, target: int | None) -> AxisInput:
-        tpdos, node = self._tpdos[k], self._nodes[k]
+        tpdos, of, node = self._tpdos[k], self._carriers[k], self._nodes[k]
+        shown = of.get(READ_BACK)
         return AxisInput(
             target,
-            _fresh(tpdos, POSITION),
-            _alone(tpdos, READ_BACK),
-            _fresh(tpdos, FOLLOWING),
-            _last(tpdos, STATUSWORD),
-            _last(tpdos, MODE),
+            _fresh(of, POSITION),
+            _fresh(of, READ_BACK) if shown is not None and not shown.early else None,
+            _fresh(of, FOLLOWING),
+            _last(of, STATUSWORD),
+            _last(of, MODE),
             node.nmt,
             _age(tpdos),
             now_s - node.heartbeat_at_s,
             max([pdo.short for pdo in tpdos], default=0),
             max([pdo.long for pdo in tpdos], default=0),
-            (_fresh(tpdos, SPEED_OFFSET), _fresh(tpdos, TORQUE_OFFSET)),
-            _fresh(tpdos, SPEED),
-            _sure_age(tpdos, READ_BACK),
-            _fresh(tpdos, DEMAND),
+            (_fresh(of, SPEED_OFFSET), _fresh(of, TORQUE_OFFSET)),
+            _fresh(of, SPEED),
+            NEVER if shown is None else -(-shown.sure_age // shown.every_sync),
+            _fresh(of, DEMAND),
             node.touched,
         )
 
 
-def _fresh(pdos: Sequence[_PdoState], index: int) -> int | None:
-    for pdo in pdos:
-        if pdo.fresh and index in pdo.where:
-            return pdo.get(index)
-    return None
+def _carriers(pdos: Sequence[_PdoState]) -> dict[int, _PdoState]:
+    """Return of each object the TPDO that carries it, the most frequent one."""
+    rarest_first = sorted(pdos, key=lambda pdo: -pdo.every_sync)
+    return {index: pdo for pdo in rarest_first for index in pdo.where}
 
 
-def _alone(pdos: Sequence[_PdoState], index: int) -> int | None:
-    """The same; None as well where a frame came that was not due: one of two may be another node's."""
-    return _fresh([pdo for pdo in pdos if not pdo.early], index)
+def _fresh(of: Mapping[int, _PdoState], index: int) -> int | None:
+    pdo = of.get(index)
+    return pdo.get(index) if pdo is not None and pdo.fresh else None
 
 
-def _sure_age(pdos: Sequence[_PdoState], index: int) -> float:
-    """Age of what ``_alone`` gave last, in units of its own rate, rounded up."""
-    return next((-(-pdo.sure_age // pdo.every_sync) for pdo in pdos if index in pdo.where), NEVER)
-
-
-def _last(pdos: Sequence[_PdoState], index: int) -> int | None:
-    for pdo in pdos:
-        if index in pdo.where:
-            return pdo.get(index)
-    return None
+def _last(of: Mapping[int, _PdoState], index: int) -> int | None:
+    pdo = of.get(index)
+    return None if pdo is None else pdo.get(index)
 
 
 def _age(pdos: Sequence[_PdoState]) -> float:
     """Age of the oldest TPDO that carries a signal of the guard, in units of its own rate, rounded up."""
-    ages = [-(-pdo.age // pdo.every_sync) for pdo in pdos if _NEEDED & pdo.where.keys()]
-    return max(ages, default=NEVER)
+    return max([-(-pdo.age // pdo.every_sync) for pdo in pdos if pdo.needed], default=NEVER)
 
 
 _NEEDED = frozenset({STATUSWORD, POSITION, MODE})

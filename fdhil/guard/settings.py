@@ -87,8 +87,8 @@ class AxisSettings:
     @property
     def read_back_every(self) -> int:
         """With every how many SYNC a TPDO shows the offset in force; 0: none does."""
-        shown = [pdo for pdo in self.tpdos if any(entry[:2] == (0x60B0, 0) for entry in pdo.layout)]
-        return max(1, shown[0].every_sync) if shown else 0
+        shown = [pdo.every_sync for pdo in self.tpdos if any(entry[:2] == (0x60B0, 0) for entry in pdo.layout)]
+        return max(1, min(shown)) if shown else 0
 
 
 @dataclass(frozen=True, slots=True)

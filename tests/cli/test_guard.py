@@ -21,7 +21,8 @@ from fdhil.cli.bus_lock import lock_bus
 from fdhil.cli.guard import guard, heartbeat_timeout_s, limits_of, open_bus, settings_of
 from fdhil.cli.main import cli, run_safely
 from fdhil.config import CanBus, CorrectionLimits
-from fdhil.drivers.commissioning_record import CommissioningRecord, save_record
+from fdhil.drivers.commissioning_record import CommissioningRecord, axis_digest, save_record
+from fdhil.drivers.commissioning_void import void_record
 from fdhil.errors import ConnectError, ProtocolError
 from fdhil.guard.limits import Limits
 from fdhil.guard.settings import from_json, load, to_json
@@ -102,6 +103,25 @@ def test_the_software_limits_are_those_of_the_commissioning(tmp_path: Path) -> N
     save_record(replace(RECORD, options={"607D01": -1000, "607D02": 820_000}), config.store.directory)
     made = settings_of(config, "can0", tmp_path, "")
     assert [axis.travel for axis in made.axes] == [(-1000, 820_000), None]
+    assert from_json(to_json(made)) == made
+
+
+def test_the_guard_knows_the_record_and_whether_it_holds(tmp_path: Path) -> None:
+    config = machine_config.load(write_config(tmp_path, 1))
+    store, signed = config.store.directory, replace(RECORD, config_digest=axis_digest(config, "X"))
+
+    def known() -> list[tuple[str, bool]]:
+        return [(axis.record, axis.record_void) for axis in settings_of(config, "can0", tmp_path, "").axes]
+
+    save_record(RECORD, store)
+    assert known() == [("", False), ("", False)]  # it was made with another configuration
+    save_record(replace(signed, readback_ok=False), store)
+    assert known() == [("", False), ("", False)]
+    save_record(signed, store)
+    assert known() == [(signed.fingerprint, False), ("", False)]
+    void_record(store, "X", "booted")
+    assert known() == [(signed.fingerprint, True), ("", False)]
+    made = settings_of(config, "can0", tmp_path, "")
     assert from_json(to_json(made)) == made
 
 

@@ -42,6 +42,16 @@ def test_what_was_ordered_or_goes_on_is_none(before: dict[str, Any], after: dict
     assert [notice.code for notice in _changes(before, after) if notice.code == TRIPPED] == []
 
 
+def test_a_record_that_the_guard_saw_void_is_told_once() -> None:
+    void = {"code": "RecordVoid", "axis": "X", "text": "the drive has rebooted", "advice": "compare it"}
+    now = {"state": "OFF", "not_good": [void]}
+    assert [(n.code, n.axis, n.text) for n in _changes({"state": "OFF", "not_good": []}, now)] == [
+        ("RecordVoid", "X", "the drive has rebooted; compare it")
+    ]
+    assert _changes(now, now) == []
+    assert [notice.code for notice in _changes({"state": "absent"}, now)] == ["RecordVoid", "GuardFound"]
+
+
 def test_a_history_keeps_ten_seconds_and_no_more() -> None:
     history = FrameHistory(kept_s=10.0)
     history.add(frames_of([]))

@@ -20,6 +20,7 @@ from fdhil.daemon.control import ask
 from fdhil.daemon.lock import BusLocked
 from fdhil.daemon.service import InternalError, Service, run
 from fdhil.daemon.status import Watch
+from fdhil.drivers.commissioning_void import void_path
 from fdhil.errors import ConnectError, DeviceError
 from fdhil.records import Notice
 from fdhil.store.history import History
@@ -187,6 +188,18 @@ async def test_systemd_hears_ready_the_watchdog_and_the_end(tmp_path: Path, monk
     assert any(message.startswith(b"READY=1") for message in heard)
     assert b"WATCHDOG=1" in heard
     assert b"STOPPING=1" in heard
+
+
+async def test_a_drive_that_boots_voids_its_record(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config, booted = config_of(tmp_path), Notice("NodeRebooted", "MAJOR", "Drive X booted.", "X")
+    async with serving(config, Machine([Notice("SyncLost", "MAJOR", "SYNC stopped"), booted])):
+        await _exists(void_path(config.store.directory, "X"))
+    assert "booted" in void_path(config.store.directory, "X").read_text()
+    void_path(config.store.directory, "X").unlink()
+    (tmp_path / "file").write_text("")
+    blocked = config.model_copy(update={"store": config.store.model_copy(update={"directory": tmp_path / "file"})})
+    Service(blocked, Machine().open)._void(booted)
+    assert "cannot be written" in capsys.readouterr().err
 
 
 def test_the_watchdog_starves_when_the_source_hangs_but_not_when_the_bus_is_silent(tmp_path: Path) -> None:

@@ -72,7 +72,7 @@ def commissioned(made: Settings) -> Settings:
 class Drive:
     """What a drive holds and shows; ``answers`` False: it is silent; ``scale`` 0: it ignores its offset.
 
-    ``remapped``: TPDO 380 carries its two objects the other way round.
+    ``remapped``: TPDO 380 carries its two objects the other way round; ``shows_offset`` False: it does not come.
     ``fed`` are speed and torque offset in force, in TPDO 1A0 when ``shows_fed``; ``takes_fed``: what it makes of them.
     """
 
@@ -90,6 +90,7 @@ class Drive:
     received_fed: Pair | None = None
     shows_fed: bool = False
     remapped: bool = False
+    shows_offset: bool = True
     takes_fed: Callable[[Pair], Pair] = lambda pair: pair
     followed: int | None = None
     queue: list[tuple[int, int]] = field(default_factory=list)
@@ -111,7 +112,7 @@ class Drive:
             return []
         followed, before = sum(self.queue[0]), self.followed
         self.followed = followed
-        speed = 0 if before is None else (followed - before) * 1000
+        speed = 0 if before is None else max(-(2**31), min((followed - before) * 1000, 2**31 - 1))
         n = self.node_id
         frames = [
             (0x180 + n, struct.pack("<ii", followed - self.position_error, speed)),
@@ -121,7 +122,8 @@ class Drive:
             frames.append((0x1A0 + n, struct.pack("<ih", *self.fed)))
         if tick % 10 == 0:
             shown = (self.offset, followed) if self.remapped else (followed, self.offset)
-            frames.append((0x380 + n, struct.pack("<ii", *shown)))
+            if self.shows_offset:
+                frames.append((0x380 + n, struct.pack("<ii", *shown)))
             frames.append((0x480 + n, struct.pack("<Ibh", 0, self.mode, 0)))
         return frames
 

@@ -6,21 +6,33 @@ import struct
 
 import hypothesis.strategies as st
 from hypothesis import settings as hypothesis_settings
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
-from fdhil.guard.limits import violation
-from fdhil.guard.state import IN_CHARGE, LANDING, ON_PATH, SENDING, Mode, Request
-from tests.guard.machine import ENABLED, Bench, arm_request, bench
+from fdhil.guard.state import IN_CHARGE, ON_PATH, SENDING, Mode, Request
+from studies.guard_invariants import episode
+from tests.guard.machine import ENABLED, RECORD, Bench, arm_request, bench
+from tests.guard.wire import CEILING, Wire
 
 NODES = st.sampled_from((0, 1))
+VALUES = st.one_of(st.integers(-CEILING, CEILING), st.integers(-(2**24), 2**24))
 AUTOMATIC = {
     **{mode: {Mode.RAMP_DOWN, Mode.OFF, Mode.FROZEN} for mode in SENDING},
-    Mode.OFF: {Mode.ADOPT},
+    Mode.OFF: {Mode.ADOPT, Mode.FROZEN},
     Mode.FROZEN: set(),
 }
 AUTOMATIC[Mode.ARMED] |= ON_PATH
 for _mode in ON_PATH:
     AUTOMATIC[_mode] |= ON_PATH
+
+
+def test_random_walks_break_no_limit() -> None:
+    """Some of the study's; ``python -m studies.guard_invariants`` goes on for as long as wanted."""
+    frames = 0
+    for seed in range(4):
+        seen, wrong = episode(f"suite:{seed}")
+        assert wrong == []
+        frames += seen["frames"]
+    assert frames > 3000
 
 
 class Faults(RuleBasedStateMachine):
@@ -29,45 +41,34 @@ class Faults(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.machine: Bench = bench()
-        self.trace: list[tuple[int, ...]] = [(0, 0), (0, 0)]
-        self.gaps: list[bool] = [True, True]
-        self.fault_at: int | None = None
+        self.wires = [Wire(axis.limits, 0) for axis in self.machine.settings.axes]
+
+    @initialize(held=st.tuples(VALUES, VALUES))
+    def starts_beside_what_the_drives_hold(self, held: tuple[int, int]) -> None:
+        self.wires = [Wire(axis.limits, value) for axis, value in zip(self.machine.settings.axes, held, strict=True)]
+        for drive, value in zip(self.machine.drives, held, strict=True):
+            drive.hold(value)
 
     def cycle(self, request: Request | None = None, **how: object) -> None:
-        """One SYNC, its frame into the trace of what is in force."""
+        """One SYNC, its frames judged by the wire."""
         machine, before = self.machine, self.machine.mode
-        was_charged = any(offset for offset in self.trace[-1])
         if how.get("transmitted") is False and machine.outputs and machine.outputs[-1].offsets is not None:
-            self.trace[-1] = self.trace[-2]
-            self.gaps[-1] = True
+            for wire in self.wires:
+                wire.lost()
         output = machine.sync(request, **how)  # type: ignore[arg-type] # keywords of sync
-        self.follow(before, output.offsets, request, was_charged)
-        assert not (how.get("late") and output.offsets is not None)
-        assert not (output.heartbeat and output.offsets is None)
-
-    def follow(self, before: Mode, offsets: tuple[int, ...] | None, request: Request | None, was_charged: bool) -> None:
-        after = self.machine.mode
+        after = machine.mode
         if after is not before:
-            granted = {Mode.ARMED, Mode.ADOPT} if request is not None else set()
+            granted = {Mode.ARMED, Mode.ADOPT, Mode.OFF} if request is not None else set()
             assert after in AUTOMATIC[before] | granted, (before, after)
-        if offsets is None:
-            if after is Mode.ADOPT and before is not Mode.ADOPT:
-                self.trace.append(tuple(axis.offset for axis in self.machine.state.axes))
-            self.trace.append(self.trace[-1])
-            self.gaps.append(True)
+        assert not (output.heartbeat and output.offsets is None)
+        if output.offsets is None:
+            for wire in self.wires:
+                wire.nothing()
             return
+        assert not how.get("late")
         assert before in SENDING or after in SENDING
-        assert all(type(offset) is int for offset in offsets)
-        if after is Mode.ADOPT and before is not Mode.ADOPT:  # what the drive holds is where it starts
-            held = tuple(drive.offset for drive in self.machine.drives)
-            self.trace += [held, held]
-            self.gaps += [True, True]
-        for k, axis in enumerate(self.machine.settings.axes):
-            last, value = self.trace[-1][k], offsets[k]
-            rate = 0 if self.gaps[-1] else last - self.trace[-2][k]
-            assert violation(axis.limits, last, rate, value) is None, (before, after, last, rate, value)
-        self.trace.append(offsets)
-        self.gaps.append(False)
+        for wire, drive, offset in zip(self.wires, machine.drives, output.offsets, strict=True):
+            assert wire.ours(offset, drive.offset) is None, (before, after)
 
     @rule(cycles=st.integers(1, 60))
     def steady(self, cycles: int) -> None:
@@ -79,8 +80,15 @@ class Faults(RuleBasedStateMachine):
         """Everything good again, then armed and into the path where that is allowed."""
         for drive in self.machine.drives:
             drive.statusword, drive.mode, drive.answers, drive.scale, drive.position_error = ENABLED, 8, True, 1.0, 0
+            drive.remapped = False
         self.machine.main_alive = True
         self.machine.rest, self.machine.playing, self.machine.row = None, False, 0
+        self.cycle(Request("compared", True, compared={"X": RECORD, "Y": RECORD}))
+        self.machine.hear(0x701, b"\x05")
+        self.machine.hear(0x702, b"\x05")
+        for _ in range(40):
+            self.cycle()
+        self.cycle(Request("adopt", token_valid=True))
         for _ in range(140):
             self.cycle()
         self.cycle(arm_request())
@@ -157,7 +165,7 @@ class Faults(RuleBasedStateMachine):
     def emergency(self, node: int, code: int, size: int) -> None:
         self.machine.hear(0x081 + node, struct.pack("<H6x", code)[:size])
 
-    @rule(node=NODES, state=st.sampled_from((0x00, 0x04, 0x05, 0x7F)))
+    @rule(node=NODES, state=st.sampled_from((0x04, 0x05, 0x7F)))
     def heartbeat(self, node: int, state: int) -> None:
         self.machine.hear(0x701 + node, bytes([state]))
 
@@ -165,9 +173,46 @@ class Faults(RuleBasedStateMachine):
     def nmt(self, command: int, node: int) -> None:
         self.machine.hear(0x000, bytes([command, node]))
 
-    @rule(cob_id=st.sampled_from((0x301, 0x302, 0x764)), data=st.binary(max_size=8))
-    def foreign_frame(self, cob_id: int, data: bytes) -> None:
-        self.machine.hear(cob_id, data)
+    @rule(node=NODES, value=VALUES, by_sdo=st.booleans())
+    def foreign_offset(self, node: int, value: int, by_sdo: bool) -> None:
+        sdo = struct.pack("<BHBi", 0x23, 0x60B0, 0, value)
+        self.machine.inject(0x601 + node if by_sdo else 0x301 + node, sdo if by_sdo else struct.pack("<i", value))
+        self.wires[node].foreign(value)
+
+    @rule(data=st.binary(max_size=8))
+    def foreign_heartbeat(self, data: bytes) -> None:
+        self.machine.hear(0x764, data)
+
+    @rule(node=NODES, shown=VALUES, demand=VALUES, apart=st.lists(st.sampled_from((0, 1, 9, 10)), max_size=4))
+    def forged_read_back(self, node: int, shown: int, demand: int, apart: list[int]) -> None:
+        for cycles in (0, *apart):
+            for _ in range(cycles):
+                self.cycle()
+            self.machine.hear(0x381 + node, struct.pack("<ii", demand, shown))
+
+    @rule(node=NODES, remapped=st.booleans())
+    def remapped_read_back(self, node: int, remapped: bool) -> None:
+        self.machine.drives[node].remapped = remapped
+
+    @rule(node=NODES, cycles=st.sampled_from((5, 25, 80)))
+    def lost_read_back(self, node: int, cycles: int) -> None:
+        for _ in range(cycles):
+            self.cycle(drop=(0x381 + node,))
+
+    @rule()
+    def guard_restarts(self) -> None:
+        old = self.machine
+        self.machine = Bench(old.settings, old.path, old.demand, old.drives)
+        self.machine.tick, self.machine.counter, self.machine.row = old.tick, old.counter, old.row
+
+    @rule(node=NODES)
+    def reboot(self, node: int) -> None:
+        self.machine.reboot(node)
+        self.wires[node].foreign(0)
+
+    @rule(digest=st.sampled_from((RECORD, "")), valid=st.booleans())
+    def compared(self, digest: str, valid: bool) -> None:
+        self.cycle(Request("compared", valid, compared={"X": digest, "Y": RECORD}))
 
     @rule(cob_id=st.sampled_from((0x181, 0x281, 0x381, 0x481, 0x201)), data=st.binary(max_size=8))
     def garbage(self, cob_id: int, data: bytes) -> None:
@@ -196,12 +241,6 @@ class Faults(RuleBasedStateMachine):
         assert self.machine.mode in AUTOMATIC[before] | {before}
         assert self.machine.mode not in SENDING
 
-    @invariant()
-    def applied_is_what_was_sent(self) -> None:
-        """While it sends, the guard's idea of the offset is the last frame of the trace."""
-        if self.machine.mode in SENDING - LANDING:
-            assert tuple(axis.offset for axis in self.machine.state.axes) == self.trace[-1]
 
-
-Faults.TestCase.settings = hypothesis_settings(max_examples=25, stateful_step_count=20, deadline=None)
+Faults.TestCase.settings = hypothesis_settings(max_examples=25, stateful_step_count=20, deadline=None, derandomize=True)
 TestFaults = Faults.TestCase

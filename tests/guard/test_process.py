@@ -249,3 +249,45 @@ def test_killed_guard_leaves_a_value_that_the_next_one_adopts(rig: Rig) -> None:
         again.terminate()
         assert again.wait(20) == 0
         again.communicate()
+
+
+def test_what_is_forged_foreign_or_silent_makes_no_step(rig: Rig) -> None:
+    """Over the hub, as another node would do it: forged and missing read-backs, a foreign offset, a blind restart."""
+    client, peer, drive = rig.connect(), rig.peer, rig.peer.drives[0]
+    for value in (300, 300, 983_040, -983_040):
+        peer.inject((0x381, value.to_bytes(4, "little", signed=True) * 2))
+        tick = peer.tick
+        peer.wait(lambda tick=tick: peer.tick > tick + 40, "SYNC")  # type: ignore[misc]
+    assert peer.sent == []
+    rig.into_the_cut()
+    peer.inject((0x301, (-819).to_bytes(4, "little", signed=True)))
+    drive.received_offset = -819
+    peer.wait(lambda: rig.state() == "OFF", "off")
+    assert client.status()["cause"]["code"] == "OffsetHijack"
+    held = [offsets[0] for _, _, offsets in peer.latched]
+    steps = [abs(b - a) for a, b in itertools.pairwise(held)]
+    # the foreign one, and one back where a frame of ours was on its way already
+    assert sum(step > LIMITS.hard_rate for step in steps) <= 2 + client.status()["missed_cycles"]
+    peer.playing, peer.row = False, 0
+    rig.into_the_cut()
+    drive.shows_offset = False
+    peer.wait(lambda: rig.state() == "FROZEN", "frozen: no zero is read back")
+    assert "ReadBackStale" in {event.get("code") for event in rig.events()}
+    assert peer.offsets_sent()[-1][1] == 0
+    rig.process.kill()
+    rig.process.wait()
+    client.close()
+    count = len(peer.sent)
+    again = rig.start()
+    try:
+        peer.wait(lambda: [event["event"] for event in rig.events()].count("ready") == 2, "the next guard")
+        tick = peer.tick
+        peer.wait(lambda: peer.tick > tick + 300, "SYNC")
+        with GuardClient(rig.run_directory, timeout_s=20.0) as other:
+            refused = other.arm(TOKEN, DIGEST, FACTS_GIVEN)["refused"]
+            assert "ReadBackStale" in {told["code"] for told in refused}
+            assert not other.adopt(TOKEN)["ok"]
+        assert len(peer.sent) == count
+    finally:
+        again.kill()
+        again.communicate()

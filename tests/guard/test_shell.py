@@ -57,6 +57,8 @@ def test_told_to_stop_it_ramps_reads_zero_back_and_ends_with_0(make: Make) -> No
     shop = make()
     shop.into_the_cut()
     shop.stop.send(b"\x0f\x01")
+    shop.cycle()
+    shop.stop.send(b"\x01")  # once more changes nothing
     while shop.guard.state.sending or shop.guard._requests:
         shop.cycle()
     assert shop.guard.run() == 0
@@ -335,6 +337,21 @@ def test_rows_that_break_a_limit_are_refused_with_its_class(make: Make) -> None:
     assert shop.ask(client, {"request": "table"}, sealed)["code"] == "OffsetRate"
     os.close(sealed)
     assert shop.ask(client, {"request": "status"})["rows"] is None
+
+
+def test_a_boot_up_is_told_and_the_comparison_that_follows_is_asked_for(make: Make) -> None:
+    shop = make()
+    client = shop.connect()
+    shop.run(60)
+    shop.wire.feed([(0x701, b"\x00", 0.0)])
+    shop.run(5)
+    assert [event["axis"] for event in shop.events() if event["event"] == "record_void"] == ["X"]
+    asked = {"request": "compared", "axes": {"X": ["no text"], "Z": "none of these"}}
+    assert "AuthRequired" in str(shop.ask(client, asked))
+    law = {**LAW._asdict(), "dry": 1.5}
+    for wrong in ({"X": LAW._asdict()}, {"X": law, "Y": law}, {"X": 1, "Y": [law]}, {"X": {"speed": []}, "Y": {}}):
+        answer = shop.ask(client, {"request": "feedforward", "token": TOKEN, "laws": wrong, "facts": FACTS})
+        assert "FeedforwardOff" in str(answer["refused"])
 
 
 # --- connections ---
