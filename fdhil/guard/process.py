@@ -198,7 +198,8 @@ class Guard:
         """Run one step of the core and send what it says; answer and journal after that."""
         client, document, request = self._requests.popleft() if self._requests and not late else (None, {}, None)
         arming = request is not None and request.kind in ("arm", "feedforward")
-        alive, alarms = self._alive(client if arming else self._owner, now_s), self._listener.alarms()
+        in_charge = client if arming and not self.state.sending else self._owner
+        alive, alarms = self._alive(in_charge, now_s), self._listener.alarms()
         heard = (late, self._transmitted, alive, alarms, self._withdrawn, self.intake.path, request)
         inputs = Inputs(seen.sync, seen.axes, seen.bus, *heard)
         before = self.state.axes

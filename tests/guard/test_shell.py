@@ -279,6 +279,20 @@ def test_what_the_daemon_no_longer_vouches_for_ends_it(make: Make) -> None:
     assert shop.guard.state.cause.code == "ModelStale"
 
 
+def test_who_asks_to_arm_and_goes_ends_nobody_elses_correction(make: Make) -> None:
+    shop = make()
+    shop.into_the_cut()
+    other = shop.connect()
+    other.send(b'{"request": "arm"}\n')
+    while not shop.guard._requests:
+        shop.turn()
+    other.close()
+    while len(shop.guard.control.clients) > 1:
+        shop.turn()
+    shop.run(5)
+    assert shop.state == "ACTIVE"
+
+
 def test_refusals_are_answered_with_all_their_reasons(make: Make) -> None:
     shop = make()
     client = shop.connect()
