@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import gc
 import os
+import socket
 import sys
 from pathlib import Path
 
@@ -26,23 +27,26 @@ def main() -> int:
     parser.add_argument("--settings", type=Path, required=True, help="the settings file that fdhil-guard wrote")
     parser.add_argument("--descriptor", type=int, required=True, help="the open CAN_RAW or socketcand descriptor")
     options = parser.parse_args()
-    wake = signals.catch()
-    try:
-        settings = load(options.settings)
-        wanted = Listener(settings).wanted_ids()
-        can = adopt_descriptor(settings.transport, options.descriptor, settings.sent_ids, wanted)
-        guard = Guard(settings, can, Journal(), Notifier(os.environ.get("NOTIFY_SOCKET")), wake)
-    except FdhilError as error:
-        sys.stderr.write(f"fdhil-guard: {error}\n")
-        return error.exit_code
-    except OSError as error:
-        text = f"descriptor {options.descriptor} cannot be used ({error.strerror}); start the guard with fdhil-guard"
-        sys.stderr.write(f"fdhil-guard: {text}\n")
-        return 3
-    gc.collect()
-    gc.freeze()
-    gc.disable()  # nothing here makes cycles, and a collection would be a late frame
-    return guard.run()
+    with signals.catch() as wake:
+        try:
+            guard = _made(options.settings, options.descriptor, wake)
+        except FdhilError as error:
+            sys.stderr.write(f"fdhil-guard: {error}\n")
+            return error.exit_code
+        except OSError as error:
+            why = f"descriptor {options.descriptor} cannot be used ({error.strerror}), and nothing was sent"
+            sys.stderr.write(f"fdhil-guard: {why}; start the guard with fdhil-guard\n")
+            return 3
+        gc.collect()
+        gc.freeze()
+        gc.disable()  # nothing here makes cycles, and a collection would be a late frame
+        return guard.run()
+
+
+def _made(file: Path, descriptor: int, wake: socket.socket) -> Guard:
+    settings = load(file)
+    can = adopt_descriptor(settings.transport, descriptor, settings.sent_ids, Listener(settings).wanted_ids())
+    return Guard(settings, can, Journal(), Notifier(os.environ.get("NOTIFY_SOCKET")), wake)
 
 
 if __name__ == "__main__":

@@ -199,4 +199,9 @@ def adopt_descriptor(
 ) -> CanSocket:
     """Take over an open descriptor; OSError when it is none of that kind."""
     kind = RawCan if transport == "can_raw" else SocketcandText
-    return kind(socket.socket(fileno=descriptor), allowed, wanted)
+    taken = socket.socket(fileno=descriptor)
+    try:
+        return kind(taken, allowed, wanted)
+    except OSError:
+        taken.close()
+        raise

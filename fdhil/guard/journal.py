@@ -63,6 +63,11 @@ class Notifier:
             self._untold = deque([text for text in self._untold if text != WATCHDOG], maxlen=4)
             self.tell(WATCHDOG)
 
+    def close(self) -> None:
+        """Nothing more is told."""
+        self._address = None
+        self._socket.close()
+
     def _send(self) -> None:
         try:
             while self._untold:

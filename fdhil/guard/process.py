@@ -101,27 +101,32 @@ class Guard:
         state = self.state.mode.value
         self._journal.write("stopped", state=state, offset_um=sent_um, may_stand_um=standing_um, **told)
         self.control.close()
+        self._notifier.close()
+        self._can.close()
 
     def _turn(self) -> None:
         now_s = time.monotonic()
         self._notifier.alive(now_s)
-        ready = self._wait(now_s)
+        rest_s = self._rested_s - now_s
+        ready = self._wait(rest_s)
         if self._can.fileno() in ready:
             self._bus()
         self._local_timer()
         if self._wake.fileno() in ready:
             self._stop()
-        self._serve(ready)
+        if rest_s <= 0:
+            self._serve(ready - {self._can.fileno(), self._wake.fileno()})
 
-    def _wait(self, now_s: float) -> set[int]:
+    def _wait(self, rest_s: float) -> set[int]:
+        """Wait for the bus and for signals; for the clients too, unless they rest."""
         poll = select.poll()
         poll.register(self._wake, select.POLLIN)
         if self._listener.bus_state != "down":
             poll.register(self._can, select.POLLIN)
         busy = self.state.sending or self._requests
         wait_s = min(IDLE_S, self.settings.sync_period_s) if busy else IDLE_S
-        if now_s < self._rested_s:
-            wait_s = min(wait_s, self._rested_s - now_s)
+        if rest_s > 0:
+            wait_s = min(wait_s, rest_s)
         else:
             self.control.register(poll)
             wait_s = 0.0 if self.intake.busy or self.control.pending else wait_s
@@ -193,7 +198,8 @@ class Guard:
         """Run one step of the core and send what it says; answer and journal after that."""
         client, document, request = self._requests.popleft() if self._requests and not late else (None, {}, None)
         arming = request is not None and request.kind in ("arm", "feedforward")
-        alive, alarms = self._alive(client if arming else self._owner, now_s), self._listener.alarms()
+        in_charge = client if arming and not self.state.sending else self._owner
+        alive, alarms = self._alive(in_charge, now_s), self._listener.alarms()
         heard = (late, self._transmitted, alive, alarms, self._withdrawn, self.intake.path, request)
         inputs = Inputs(seen.sync, seen.axes, seen.bus, *heard)
         before = self.state.axes
@@ -264,13 +270,11 @@ class Guard:
 
     # --- the clients ---
 
-    def _serve(self, ready: set[int]) -> None:
+    def _serve(self, asked: set[int]) -> None:
         """Serve one client and check some rows of a table; then both rest, and the loop waits for the bus alone."""
-        asked = ready - {self._can.fileno(), self._wake.fileno()}
-        now_s = time.monotonic()
-        if now_s < self._rested_s or not (asked or self.control.pending or self.intake.busy):
+        if not (asked or self.control.pending or self.intake.busy):
             return
-        served = self.control.serve(asked, now_s)
+        served = self.control.serve(asked, time.monotonic())
         if served is not None:
             self._request(*served)
             served[0].settle()

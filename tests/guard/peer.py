@@ -13,6 +13,8 @@ from tests.bench import bench_toml
 from tests.guard.machine import Drive, Frame
 
 ANSWER_S = 0.3
+NEVER = 1 << 30
+SLOW_S = 0.02
 
 
 def encode(frames: list[Frame]) -> bytes:
@@ -24,7 +26,8 @@ class Peer(threading.Thread):
     """One client is the guard; ``sent`` lists (SYNC count, COB-ID, data) of everything it put on the bus.
 
     Each cycle: SYNC, the drives' TPDOs, then the NC's targets; while ``lockstep`` the next SYNC waits for the offset
-    frames of a guard that sent some in the cycle before. ``row`` runs over ``demand`` while ``playing``.
+    frames of a guard that sent some in the cycle before. ``row`` runs over ``demand`` while ``playing``,
+    slowly from ``slow_from``, so that a test on a busy host still meets the path where it wants to.
     """
 
     def __init__(self, demand: list[list[int]], period_s: float = 0.001) -> None:
@@ -36,6 +39,7 @@ class Peer(threading.Thread):
         self.tick = self.row = 0
         self.playing = False
         self.pause_s = 0.0
+        self.slow_from = NEVER
         self.lockstep = self.syncing = True
         self.ended = threading.Event()
         self._inbox = b""
@@ -92,7 +96,7 @@ class Peer(threading.Thread):
             self._client.sendall(encode(list(frames)))
 
     def _cycle(self) -> None:
-        time.sleep(self.pause_s)
+        time.sleep(max(self.pause_s, SLOW_S if self.row >= self.slow_from else 0.0))
         self.tick += 1
         sampled = [frame for drive in self.drives for frame in drive.at_sync(self.tick)]
         self.latched.append((self.tick, tuple(d.target for d in self.drives), tuple(d.offset for d in self.drives)))

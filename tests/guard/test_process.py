@@ -21,7 +21,7 @@ from fdhil.cli.guard import open_bus, settings_of
 from fdhil.guard.client import GuardClient, GuardLost
 from fdhil.guard.settings import to_json
 from tests.guard.machine import DIGEST, FACTS_GIVEN, LIMITS, commissioned, smooth_path
-from tests.guard.peer import Peer, write_config
+from tests.guard.peer import NEVER, Peer, write_config
 
 DEMAND, OFFSET = smooth_path(rows=800)
 TOKEN = "the operator's"
@@ -91,8 +91,7 @@ class Rig:
     def into_the_cut(self) -> None:
         """Armed, playing in lockstep, well into the bump of the offset."""
         self.arm()
-        self.peer.playing = True
-        self.peer.wait(lambda: self.peer.row > 330, "the path")
+        self.play_into_the_cut()
 
     def into_the_cut_blindly(self) -> None:
         """The same of a guard that cannot be asked for its status."""
@@ -101,6 +100,10 @@ class Rig:
         assert client.load("XY", columns[0], columns[1], DIGEST)["ok"]
         self.peer.wait(lambda: client.arm(TOKEN, DIGEST, FACTS_GIVEN)["ok"], "arming")
         self.peer.wait(lambda: len(self.peer.offsets_sent()) > 30, "zeros")
+        self.play_into_the_cut()
+
+    def play_into_the_cut(self) -> None:
+        self.peer.slow_from = 320
         self.peer.playing = True
         self.peer.wait(lambda: self.peer.row > 330, "the path")
 
@@ -217,7 +220,7 @@ def test_lost_sync_freezes_and_adopting_brings_it_to_zero(rig: Rig) -> None:
 
 def test_stopped_process_sends_nothing(rig: Rig) -> None:
     rig.into_the_cut()
-    rig.peer.lockstep = False
+    rig.peer.lockstep, rig.peer.slow_from = False, NEVER
     rig.process.send_signal(signal.SIGSTOP)
     os.waitid(os.P_PID, rig.process.pid, os.WSTOPPED | os.WNOWAIT)
     time.sleep(0.02)

@@ -239,3 +239,21 @@ def test_a_path_that_comes_nearer_is_no_table(demand: list[int]) -> None:
     with pytest.raises(TableRefused, match="software limit") as caught:
         loaded_within((-100, 100), demand)
     assert caught.value.code == "SoftwareLimit"
+
+
+def test_rows_are_little_endian_wherever_they_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    small = body()
+    monkeypatch.setattr(table.sys, "byteorder", "big")
+    swapped = body()
+    assert swapped != small
+    assert list(table.decode(swapped)[1].demand[0]) == ROWS["X"]
+
+
+def test_a_streamed_table_does_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Piece after piece, while nothing runs that would let the first ones go."""
+    monkeypatch.setattr(table, "MAX_TABLE_BYTES", 8 * 2 * 10)
+    loaded = table.begin(body("p", 0, False), 1, "XY", (TINY, TINY), None, 0).joined
+    loaded = table.begin(body("p", 4, False), 2, "XY", (TINY, TINY), loaded, 0).joined
+    with pytest.raises(TableRefused) as refusal:
+        table.begin(body("p", 8, False), 3, "XY", (TINY, TINY), loaded, 0)
+    assert refusal.value.code == "TableBusy"

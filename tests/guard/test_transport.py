@@ -4,17 +4,28 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import socket
 import struct
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from fdhil.errors import ConfigError
-from fdhil.guard.can_socket import ERROR, BusDown, ForbiddenFrame, RawCan, SocketcandText, controller_states
-from fdhil.guard.settings import Settings, from_json, to_json
+from fdhil.guard.can_socket import (
+    ERROR,
+    MOST_FRAMES,
+    BusDown,
+    ForbiddenFrame,
+    RawCan,
+    SocketcandText,
+    adopt_descriptor,
+    controller_states,
+)
+from fdhil.guard.settings import Settings, from_json, load, to_json
 from tests.guard.machine import settings
 
 
@@ -148,7 +159,7 @@ def test_raw_frames_stamps_drops_and_controller_states() -> None:
     drops = [(socket.SOL_SOCKET, 40, struct.pack("<I", 7))]
     raw.waiting = [
         (struct.pack("=IB3x8s", 0x080, 1, b"\x05"), stamp),
-        (struct.pack("=IB3x8s", 0x80000080, 1, b"\x05"), stamp),
+        (struct.pack("=IB3x8s", 0x80000080, 1, b"\x05"), [*stamp, (socket.SOL_SOCKET, 99, b"")]),
         (struct.pack("=IB3x8s", 0x20000004, 8, b"\0\x20"), drops),
         (struct.pack("=IB3x8s", 0x20000140, 8, b""), drops),
     ]
@@ -159,6 +170,8 @@ def test_raw_frames_stamps_drops_and_controller_states() -> None:
         (ERROR, b"restarted", 0.0),
     ]
     assert can.lost_frames == 7
+    raw.waiting = [(struct.pack("=IB3x8s", 0x080, 1, b"\x05"), stamp)] * (MOST_FRAMES + 3)
+    assert [len(can.receive()) for _ in range(3)] == [MOST_FRAMES, 3, 0]  # a flood must not keep the loop
     assert can.send(0x301, b"\x01\0\0\0")
     assert raw.sent == [struct.pack("=IB3x8s", 0x301, 4, b"\x01")]
     with pytest.raises(ForbiddenFrame):
@@ -241,3 +254,37 @@ def test_what_may_be_sent_and_how_long_silence_is() -> None:
     assert made.silence_s == 10.0
     assert settings(clock="monotonic").silence_s == pytest.approx(0.004)
     assert made.heartbeat_cycles == 20
+
+
+def test_nothing_waits_on_a_quiet_hub_and_a_broken_line_is_told(wire: tuple[SocketcandText, socket.socket]) -> None:
+    can, far = wire
+    assert can.receive() == []
+    far.sendall(b"< frame 181 1.0 " + b"00" * 30_000 + b" >")  # longer than any frame, and taken in pieces
+    got: list[tuple[int, bytes, float]] = []
+    while not got:
+        got = can.receive()
+    assert len(got[0][1]) == 30_000
+    far.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    far.close()  # resets the connection
+    with pytest.raises(BusDown, match="reset"):
+        can.receive()
+
+
+def test_descriptors_are_taken_over_by_their_kind() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()) as near:
+        can = adopt_descriptor("socketcand", os.dup(near.fileno()), {0x301}, {0x080})
+        assert isinstance(can, SocketcandText)
+        can.close()
+        with pytest.raises(OSError, match=r"Errno"):
+            adopt_descriptor("can_raw", near.detach(), {0x301}, {0x080})
+
+
+def test_what_is_no_plain_file_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "link").symlink_to(tmp_path / "fifo")
+    (tmp_path / "bytes").write_bytes(b"\xff\xfe")
+    for name in ("fifo", "link", "bytes", "missing", "."):
+        with pytest.raises(ConfigError, match="run fdhil-guard"):
+            load(tmp_path / name)
+    (tmp_path / "good").write_text(to_json(settings()))
+    assert load(tmp_path / "good") == settings()

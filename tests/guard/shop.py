@@ -1,0 +1,174 @@
+"""The guard's shell in this process, one turn at a time: a bus of lists, drives, and clients over its real socket."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import socket
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from fdhil.guard import table
+from fdhil.guard.can_socket import BusDown, CanSocket, Frame
+from fdhil.guard.journal import Journal, Notifier
+from fdhil.guard.process import Guard
+from fdhil.guard.settings import Settings
+from tests.guard.machine import DIGEST, FACTS_GIVEN, Drive, commissioned, settings, smooth_path
+
+TOKEN = "the operator's"
+DEMAND, OFFSET = smooth_path()
+
+
+class Wire(CanSocket):
+    """``sent`` are (COB-ID, data); ``down``: the bus is gone, ``full``: nothing leaves the queue."""
+
+    def __init__(self, allowed: frozenset[int]) -> None:
+        near, self._far = socket.socketpair()
+        super().__init__(near, allowed)
+        self._waiting: list[Frame] = []
+        self.sent: list[tuple[int, bytes]] = []
+        self.down = self.full = False
+
+    def feed(self, frames: Sequence[Frame]) -> None:
+        self._waiting += frames
+        self._far.send(b"x")
+
+    def receive(self) -> list[Frame]:
+        self._socket.recv(4096)
+        if self.down:
+            raise BusDown("the cable is cut")
+        waiting, self._waiting = self._waiting, []
+        return waiting
+
+    def _send(self, cob_id: int, data: bytes) -> bool:
+        if self.down:
+            raise OSError(100, "Network is down")
+        if not self.full:
+            self.sent.append((cob_id, data))
+        return not self.full
+
+    def close(self) -> None:
+        super().close()
+        self._far.close()
+
+
+class Shop:
+    """A guard, its drives at the begin of the path, and an NC that plays it while ``playing``."""
+
+    def __init__(self, folder: Path, made: Settings | None = None, notify: str | None = None, **changes: Any) -> None:
+        made = made or commissioned(settings(**changes))
+        digest = hashlib.sha256(TOKEN.encode()).hexdigest()
+        self.settings = replace(made, run_directory=str(folder), token_sha256=digest)
+        self.wire = Wire(self.settings.sent_ids)
+        self.wake, self.stop = socket.socketpair()
+        self.wake.setblocking(False)
+        self.lines = folder / "journal"
+        self._journal = self.lines.open("wb")
+        journal, self.notifier = Journal(self._journal.fileno()), Notifier(notify)
+        self.guard = Guard(self.settings, self.wire, journal, self.notifier, self.wake)
+        self.drives = [Drive(axis.node_id) for axis in self.settings.axes]
+        for drive, column in zip(self.drives, DEMAND, strict=False):
+            drive.queue = [(column[0], 0)] * 2
+        self.tick = self.row = self.taken = 0
+        self.playing = False
+        self._clients: list[socket.socket] = []
+
+    def cycle(self) -> None:
+        """One SYNC with all frames of its cycle; the guard takes a turn."""
+        self.tick += 1
+        sampled = [frame for drive in self.drives for frame in drive.at_sync(self.tick)]
+        targets = [column[min(self.row, len(column) - 1)] for column in DEMAND]
+        self.row += self.playing
+        frames = [(0x080, bytes([(self.tick - 1) % 240 + 1])), *sampled]
+        for drive, target in zip(self.drives, targets, strict=True):
+            drive.received_target = target
+            frames.append((0x200 + drive.node_id, struct.pack("<Hi", 0x0F, target)))
+        self.wire.feed([(cob_id, data, self.tick * 1e-3) for cob_id, data in frames])
+        self.turn()
+
+    def turn(self) -> None:
+        self.guard._turn()
+        for cob_id, data in self.wire.sent[self.taken :]:
+            for drive in self.drives:
+                if cob_id == 0x300 + drive.node_id:
+                    drive.received_offset = struct.unpack("<i", data)[0]
+        self.taken = len(self.wire.sent)
+
+    def run(self, cycles: int) -> None:
+        for _ in range(cycles):
+            self.cycle()
+
+    def connect(self) -> socket.socket:
+        client = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        client.connect(str(self.guard.control.path))
+        client.setblocking(False)
+        self._clients.append(client)
+        return client
+
+    def ask(self, client: socket.socket, request: Mapping[str, Any] | bytes, *descriptors: int) -> dict[str, Any]:
+        """Send a request and let SYNC go on until it is answered."""
+        line = request if isinstance(request, bytes) else json.dumps(request).encode()
+        socket.send_fds(client, [line + b"\n"], descriptors)
+        return self.answer(client)
+
+    def answer(self, client: socket.socket, syncing: bool = True) -> dict[str, Any]:
+        text = b""
+        while not text.endswith(b"\n"):
+            if syncing:
+                self.cycle()
+            else:
+                self.turn()
+            try:
+                text += client.recv(1 << 16)
+            except BlockingIOError:
+                continue
+        return dict(json.loads(text))
+
+    def load(self, client: socket.socket, amplitude: int = 1) -> None:
+        names = [axis.name for axis in self.settings.axes]
+        offsets = [[amplitude * value for value in column] for column in OFFSET]
+        body = table.encode(
+            names, dict(zip(names, DEMAND, strict=True)), dict(zip(names, offsets, strict=True)), DIGEST
+        )
+        sealed = table.seal(body)
+        answer = self.ask(client, {"request": "table"}, sealed)
+        os.close(sealed)
+        assert answer["ok"], answer
+
+    def arm(self) -> socket.socket:
+        """Table loaded, interlocks settled, armed; the client must go on being heard."""
+        client = self.connect()
+        self.load(client)
+        self.run(150)
+        armed = {"request": "arm", "token": TOKEN, "program_digest": DIGEST, "facts": dict(FACTS_GIVEN)}
+        answer = self.ask(client, armed)
+        assert answer["ok"], answer
+        return client
+
+    def into_the_cut(self) -> socket.socket:
+        client = self.arm()
+        self.playing = True
+        self.run(250)
+        assert self.state == "ACTIVE"
+        assert abs(self.offsets()[-1]) > 50
+        return client
+
+    @property
+    def state(self) -> str:
+        return self.guard.state.mode.value
+
+    def offsets(self, node: int = 1) -> list[int]:
+        return [struct.unpack("<i", data)[0] for cob_id, data in self.wire.sent if cob_id == 0x300 + node]
+
+    def events(self) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in self.lines.read_text().splitlines()]
+
+    def close(self) -> None:
+        self.guard.control.close()
+        self.notifier.close()
+        for each in (self.wire, self.wake, self.stop, self._journal, *self._clients):
+            each.close()

@@ -1,0 +1,572 @@
+"""The guard's shell, turn by turn: what it does with bus, clients, signals and systemd; no clock decides anything."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import socket
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil.errors import DeviceError
+from fdhil.guard import control, process, table
+from fdhil.guard.control import MAX_CLIENTS, MAX_LINE_BYTES, Client, Closer, Control
+from fdhil.guard.journal import Journal, Notifier
+from fdhil.guard.landing import land
+from tests.guard.fed import FACTS, LAW, fed_settings
+from tests.guard.machine import DIGEST, LIMITS
+from tests.guard.shop import TOKEN, Shop
+
+Make = Callable[..., Shop]
+
+
+@pytest.fixture
+def make(tmp_path: Path) -> Iterator[Make]:
+    made: list[Shop] = []
+
+    def build(*arguments: Any, **changes: Any) -> Shop:
+        folder = tmp_path / str(len(made))
+        folder.mkdir()
+        made.append(Shop(folder, *arguments, **changes))
+        return made[-1]
+
+    yield build
+    for shop in made:
+        shop.close()
+
+
+def inside(offsets: list[int]) -> None:
+    """No frame breaks a limit against those before it."""
+    values = [0, 0, *offsets]
+    rates = [b - a for a, b in itertools.pairwise(values)]
+    assert max(map(abs, values)) <= LIMITS.offset
+    assert max(map(abs, rates)) <= LIMITS.hard_rate
+    assert max(abs(b - a) for a, b in itertools.pairwise(rates)) <= LIMITS.hard_acceleration
+
+
+# --- signals and the end ---
+
+
+def test_told_to_stop_it_ramps_reads_zero_back_and_ends_with_0(make: Make) -> None:
+    shop = make()
+    shop.into_the_cut()
+    shop.stop.send(b"\x0f\x01")
+    shop.cycle()
+    shop.stop.send(b"\x01")  # once more changes nothing
+    while shop.guard.state.sending or shop.guard._requests:
+        shop.cycle()
+    assert shop.guard.run() == 0
+    inside(shop.offsets())
+    told = shop.events()[-1]
+    assert (told["event"], told["may_stand_um"]) == ("stopped", {"X": 0.0, "Y": 0.0})
+    assert "text" not in told
+
+
+def test_frozen_it_ends_with_3_and_says_what_stands(make: Make) -> None:
+    shop = make()
+    shop.into_the_cut()
+    shop.wire.down = True
+    shop.wire.feed([])
+    shop.turn()
+    assert shop.state == "FROZEN"
+    shop.stop.send(b"\x0f")
+    shop.guard._last_sync_s -= 10.0
+    assert shop.guard.run() == 3
+    told = shop.events()[-1]
+    assert told["may_stand_um"]["X"] != 0.0
+    assert "um on X" in told["text"]
+    assert "may still be applied" in told["text"]
+    assert "Network" not in told["text"]
+    assert [event["text"] for event in shop.events() if event["event"] == "bus_down"] == ["the cable is cut"]
+
+
+@pytest.mark.parametrize("where", ["client", "core", "listener"])
+def test_a_fault_of_the_program_ramps_to_zero_and_ends_with_3(
+    make: Make, where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shop = make()
+    client = shop.into_the_cut()
+    before = len(shop.offsets())
+
+    def fail(*_: object, **__: object) -> Any:
+        raise RecursionError("too deep")
+
+    if where == "client":
+        monkeypatch.setattr(process, "parse_request", fail)
+        client.send(b'{"request": "adopt"}\n')
+    else:
+        monkeypatch.setattr(*((process.core, "step") if where == "core" else (process.Listener, "at_sync")), fail)
+
+    def next_sync(*_: object) -> list[tuple[int, bytes, float]]:
+        return [(0x080, b"", 0.0)] if len(shop.offsets()) % 3 else [(0x080, b"", 0.0), (0x181, b"", 0.0)]
+
+    shop.wire.feed([(0x080, b"\x01", 0.0)])
+    monkeypatch.setattr(shop.wire, "receive", next_sync)
+    assert shop.guard.run() == 3
+    assert shop.offsets()[-5:] == [0] * 5
+    assert len(shop.offsets()) > before
+    inside(shop.offsets())
+    failed, stopped = shop.events()[-2:]
+    assert (failed["code"], stopped["may_stand_um"]) == ("InternalError", {"X": None, "Y": None})
+    assert "RecursionError: too deep" in failed["text"]
+    assert "an unknown offset on X and an unknown offset on Y may still be applied" in stopped["text"]
+
+
+def test_a_fault_while_nothing_is_sent_sends_nothing(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    shop = make()
+    shop.run(60)
+    monkeypatch.setattr(shop.guard, "_turn", lambda: [][0])
+    assert shop.guard.run() == 3
+    assert shop.wire.sent == []
+    assert shop.events()[-1]["may_stand_um"] == {"X": 0.0, "Y": 0.0}
+
+
+def test_landing_stops_where_bus_or_sync_stop_and_waits_where_the_queue_is_full(make: Make) -> None:
+    shop = make()
+    shop.into_the_cut()
+    offset = shop.offsets()[-1]
+    state, quick = shop.guard.state, replace(shop.settings, clock="monotonic", sync_period_s=1e-5)
+    assert land(state, quick, shop.wire)[0] == offset  # no SYNC comes
+    shop.wire.feed([(0x181, b"", 0.0)])
+    assert land(state, quick, shop.wire)[0] == offset  # nor any that counts
+    shop.wire.feed([(0x080, b"", 0.0)])
+    shop.wire.full = True
+    assert land(state, quick, shop.wire)[0] == offset
+    shop.wire.down = True
+    shop.wire.feed([])
+    assert land(state, shop.settings, shop.wire)[0] == offset
+
+
+def test_the_feed_forward_is_told_sent_and_set_to_zero_by_a_fault(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    shop = make(fed_settings())
+    client = shop.connect()
+    law = LAW._asdict()
+    shop.run(150)
+    laws = {"X": law, "Y": law}
+    answer = shop.ask(client, {"request": "feedforward", "token": TOKEN, "laws": laws, "facts": FACTS})
+    assert answer["ok"], answer
+    shop.playing = True
+    shop.run(150)
+    assert any(data != bytes(6) for cob_id, data in shop.wire.sent if cob_id == 0x401)
+    status = shop.ask(client, {"request": "status"})
+    assert (status["state"], status["feedforward"]["state"]) == ("FEEDFORWARD", "ON")
+    shop.wire.feed([(0x080, b"", 0.0)])
+    monkeypatch.setattr(shop.wire, "receive", lambda: [(0x080, b"", 0.0)])
+    monkeypatch.setattr(process.core, "step", lambda *_: [][0])
+    sent = len(shop.wire.sent)
+    assert shop.guard.run() == 3
+    assert {(cob_id, data) for cob_id, data in shop.wire.sent[sent:]} == {(0x401, bytes(6)), (0x402, bytes(6))}
+
+
+def test_the_feed_forward_ends_on_a_disarm(make: Make) -> None:
+    shop = make(fed_settings())
+    client = shop.connect()
+    shop.run(150)
+    asked = {"request": "feedforward", "token": TOKEN, "laws": dict.fromkeys("XY", LAW._asdict()), "facts": FACTS}
+    assert shop.ask(client, asked)["ok"]
+    assert shop.ask(client, {"request": "disarm"})["ok"]
+    shop.run(300)
+    ended = [event for event in shop.events() if event["event"] == "feedforward"][-1]
+    assert (ended["state"], ended["code"]) == ("OFF", "Disarmed")
+
+
+# --- the bus ---
+
+
+def test_a_bus_that_breaks_while_it_sends_is_down(make: Make) -> None:
+    shop = make()
+    shop.into_the_cut()
+    shop.wire.down = True
+    monkey = shop.wire.receive
+    shop.wire.down = False
+    frames = [(0x080, bytes([shop.tick % 240 + 1]), (shop.tick + 1) * 1e-3)]
+
+    def then_down() -> Any:
+        taken = monkey()
+        shop.wire.down = True
+        return taken
+
+    shop.wire.receive = then_down  # type: ignore[method-assign] # it breaks after this SYNC
+    shop.wire.feed(frames)
+    shop.turn()
+    assert [event["text"] for event in shop.events() if event["event"] == "bus_down"] == ["Network is down"]
+    shop.guard._last_sync_s -= 10.0  # and is not looked at any more
+    shop.turn()
+    assert shop.state == "FROZEN"
+
+
+def test_frames_that_do_not_leave_are_no_frames(make: Make) -> None:
+    shop = make()
+    shop.into_the_cut()
+    shop.wire.full = True
+    shop.run(20)
+    assert shop.guard.state.cause is not None
+    assert shop.guard.state.cause.code in ("TxQueueFull", "EchoMismatch")
+
+
+def test_controller_states_and_lost_frames_are_heard(make: Make) -> None:
+    shop = make()
+    shop.into_the_cut()
+    shop.wire.lost_frames = 3
+    shop.cycle()
+    assert shop.guard.state.cause is not None
+    assert shop.guard.state.cause.code == "RxOverflow"
+    shop.wire.feed([(-1, b"off", 0.0)])
+    shop.turn()
+    shop.cycle()
+    assert shop.state == "FROZEN"
+
+
+def test_without_sync_it_steps_by_the_local_timer_and_hears_frames_first(make: Make) -> None:
+    shop = make()
+    client = shop.into_the_cut()
+    shop.guard._last_sync_s -= 10.0
+    shop.wire.feed([])
+    shop.guard._local_timer()  # frames wait: it was this process that slept
+    assert shop.state == "ACTIVE"
+    shop.turn()
+    shop.turn()
+    assert shop.state == "FROZEN"
+    client.send(b'{"request": "status"}\n')
+    status = shop.answer(client, syncing=False)
+    assert (status["sync_heard"], status["not_good"][0]["code"]) == (False, "SyncLost")
+
+
+def test_of_two_sync_at_once_the_first_is_late(make: Make) -> None:
+    shop = make()
+    shop.into_the_cut()
+    sent = len(shop.offsets())
+    shop.wire.feed([(0x080, bytes([(shop.tick + k) % 240 + 1]), (shop.tick + k + 1) * 1e-3) for k in (0, 1)])
+    shop.turn()
+    assert len(shop.offsets()) == sent + 1
+    assert shop.guard.state.missed == 1
+
+
+# --- the clients ---
+
+
+def test_a_status_shows_what_would_be_sent(make: Make) -> None:
+    shop = make()
+    client = shop.connect()
+    shop.load(client)
+    shop.run(60)
+    shop.playing = True
+    shop.run(250)
+    status = shop.ask(client, {"request": "status", "id": "mine"})
+    assert status["id"] == "mine"
+    assert status["shadow_um"]["X"] != 0.0
+    assert status["may_stand_um"] == {"X": 0.0, "Y": 0.0}
+    assert shop.wire.sent == []
+
+
+def test_what_the_daemon_no_longer_vouches_for_ends_it(make: Make) -> None:
+    shop = make()
+    client = shop.into_the_cut()
+    other = shop.connect()
+    for sender, facts in ((other, {"model_fresh": False}), (client, "none"), (client, {"model_fresh": True})):
+        sender.send(json.dumps({"request": "alive", "facts": facts}).encode() + b"\n")
+        assert shop.ask(sender, {"request": "status"})["state"] == "ACTIVE"
+    client.send(b'{"request": "alive", "facts": {"model_fresh": null}}\n')
+    assert shop.ask(client, {"request": "status"})["ok"]
+    shop.cycle()
+    assert shop.guard.state.cause is not None
+    assert shop.guard.state.cause.code == "ModelStale"
+
+
+def test_who_asks_to_arm_and_goes_ends_nobody_elses_correction(make: Make) -> None:
+    shop = make()
+    shop.into_the_cut()
+    other = shop.connect()
+    other.send(b'{"request": "arm"}\n')
+    while not shop.guard._requests:
+        shop.turn()
+    other.close()
+    while len(shop.guard.control.clients) > 1:
+        shop.turn()
+    shop.run(5)
+    assert shop.state == "ACTIVE"
+
+
+def test_refusals_are_answered_with_all_their_reasons(make: Make) -> None:
+    shop = make()
+    client = shop.connect()
+    shop.run(10)
+    answer = shop.ask(client, {"request": "arm", "token": 5, "facts": [], "program_digest": "x" * 1000})
+    codes = {refusal["code"] for refusal in answer["refused"]}
+    assert {"AuthRequired", "ProgramMismatch", "NotCommissioned"} <= codes
+    assert shop.ask(client, b"[1, 2]")["code"] == "BadRequest"
+    assert "'sing'" in shop.ask(client, {"request": "sing"})["text"]
+    assert "no name" in shop.ask(client, {"request": ["arm"]})["text"]
+
+
+def test_one_decision_of_a_client_waits_but_a_disarm_takes_its_place(make: Make) -> None:
+    shop = make()
+    client = shop.connect()
+    shop.run(5)
+    client.send(b"".join(b'{"request": "%s", "id": %d}\n' % (kind, k) for k, kind in enumerate(
+        [b"arm", b"adopt", b"disarm", b"disarm"])))  # fmt: skip
+    told = [shop.answer(client, syncing=False)]
+    while len(told) < 3:
+        told.append(shop.answer(client, syncing=False))
+    assert [(answer["id"], answer["code"]) for answer in told] == [(1, "GuardBusy"), (0, "GuardBusy"), (3, "GuardBusy")]
+    assert shop.answer(client)["ok"]
+
+
+def test_a_table_waits_for_the_one_before_and_a_long_one_for_the_end(make: Make) -> None:
+    shop = make()
+    client, other = shop.into_the_cut(), shop.connect()
+    zeros = dict.fromkeys("XY", [0] * 3000)
+    pieces = [table.seal(table.encode("XY", zeros, zeros, "another", first)) for first in (0, 600)]
+    long = table.seal(bytes(1 << 19))
+    try:
+        assert shop.ask(other, {"request": "table"}, pieces[0])["code"] == "TableBusy"
+        assert shop.ask(other, {"request": "table"}, pieces[1])["code"] == "ProgramMismatch"
+        assert shop.ask(other, {"request": "table"}, long)["code"] == "TableBusy"
+        assert shop.ask(other, {"request": "table"})["code"] == "CorruptFile"
+        assert shop.ask(other, {"request": "table"})["code"] == "CorruptFile"
+        assert shop.state == "ACTIVE"
+        shop.ask(client, {"request": "disarm"})
+        shop.run(200)
+        for each in (client, other):
+            socket.send_fds(each, [b'{"request": "table"}\n'], [pieces[0]])
+        answers = [shop.answer(client, syncing=False), shop.answer(other, syncing=False)]
+        assert sorted(answer.get("code", "") for answer in answers) == ["", "TableBusy"]
+    finally:
+        for descriptor in (*pieces, long):
+            os.close(descriptor)
+    assert sum(event["event"] == "table_refused" for event in shop.events()) == 5  # the same twice is told once
+
+
+def test_rows_that_break_a_limit_are_refused_with_its_class(make: Make) -> None:
+    shop = make()
+    client = shop.connect()
+    demand, steep = dict.fromkeys("XY", [0] * 100), {"X": [0] * 100, "Y": [0] * 50 + [800] * 50}
+    sealed = table.seal(table.encode("XY", demand, steep, DIGEST))
+    assert shop.ask(client, {"request": "table"}, sealed)["code"] == "OffsetRate"
+    os.close(sealed)
+    assert shop.ask(client, {"request": "status"})["rows"] is None
+
+
+def test_a_boot_up_is_told_and_the_comparison_that_follows_is_asked_for(make: Make) -> None:
+    shop = make()
+    client = shop.connect()
+    shop.run(60)
+    shop.wire.feed([(0x701, b"\x00", 0.0)])
+    shop.run(5)
+    assert [event["axis"] for event in shop.events() if event["event"] == "record_void"] == ["X"]
+    asked = {"request": "compared", "axes": {"X": ["no text"], "Z": "none of these"}}
+    assert "AuthRequired" in str(shop.ask(client, asked))
+    law = {**LAW._asdict(), "dry": 1.5}
+    for wrong in ({"X": LAW._asdict()}, {"X": law, "Y": law}, {"X": 1, "Y": [law]}, {"X": {"speed": []}, "Y": {}}):
+        answer = shop.ask(client, {"request": "feedforward", "token": TOKEN, "laws": wrong, "facts": FACTS})
+        assert "FeedforwardOff" in str(answer["refused"])
+
+
+# --- connections ---
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Iterator[Control]:
+    made = Control(tmp_path)
+    yield made
+    made.close()
+
+
+def connected(desk: Control, now_s: float = 0.0) -> socket.socket:
+    client = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    client.connect(str(desk.path))
+    assert desk.serve({desk.fileno()}, now_s) is None
+    return client
+
+
+def serve(desk: Control, now_s: float = 1.0) -> list[dict[str, Any]]:
+    """Serve until nobody has anything left to say."""
+    served = []
+    for _ in range(50):
+        found = desk.serve({client.fileno() for client in desk.clients}, now_s)
+        if found is not None:
+            served.append(found[1])
+            found[0].settle()
+        desk.drop_gone()
+    return served
+
+
+def test_one_request_a_turn_and_the_clients_in_turn(desk: Control) -> None:
+    with connected(desk) as one, connected(desk) as other:
+        one.send(b'{"n": 1}\n{"n": 2}\n{"n":')
+        other.send(b'{"n": 10}\n')
+        ready = {client.fileno() for client in desk.clients}
+        found = [desk.serve(ready, 1.0), desk.serve(ready, 1.0), desk.serve(set(), 1.0), desk.serve(set(), 1.0)]
+        assert [None if each is None else each[1]["n"] for each in found] == [1, 10, 2, None]
+        assert not desk.pending
+
+
+def test_idle_connections_make_room_but_never_the_one_that_armed(desk: Control) -> None:
+    idle = [connected(desk, float(k)) for k in range(MAX_CLIENTS)]
+    desk.clients[0].armed = True
+    with connected(desk, 99.0):
+        desk.drop_gone()
+        assert len(desk.clients) == MAX_CLIENTS
+        assert desk.clients[0].armed
+        assert idle[1].recv(1) == b""  # silent for longest, but for the one that armed
+    for each in idle:
+        each.close()
+
+
+def test_a_line_without_end_and_a_client_that_went_are_let_go(desk: Control) -> None:
+    with connected(desk) as long:
+        long.setblocking(False)
+        for _ in range(2):
+            long.send(b"x" * (MAX_LINE_BYTES // 2 + 10))
+            serve(desk)
+        assert desk.clients == []
+    connected(desk).close()
+    serve(desk)
+    assert desk.clients == []
+
+
+def test_a_client_that_does_not_take_its_answers_is_not_read(desk: Control) -> None:
+    with connected(desk) as client:
+        client.send(b'{"n": 1}\n{"n": 2}\n')
+        ready = {each.fileno() for each in desk.clients}
+        found = desk.serve(ready, 1.0)
+        assert found is not None
+        found[0].reply({"id": 1}, text="x" * 1_000_000)
+        assert found[0].outbox
+        assert not desk.pending
+        assert [desk.serve(ready, 1.0) for _ in range(5)] == [None] * 5
+        served: list[dict[str, Any]] = []
+        while not served:
+            client.recv(1 << 20)
+            served = serve(desk)
+        assert [document["n"] for document in served] == [2]
+    desk.clients[0].outbox += b"x"
+    desk.clients[0].flush()
+    assert desk.clients[0].gone
+
+
+def test_descriptors_that_nobody_asked_for_are_closed(desk: Control) -> None:
+    def count() -> int:
+        return len(list(Path("/proc/self/fd").iterdir()))
+
+    with connected(desk) as client:
+        before = count()
+        ends = os.pipe()
+        socket.send_fds(client, [b'{"n": 1}\n{"n"'], [ends[0]] * 100)
+        socket.send_fds(client, [b": 2}\n"], [ends[1]])
+        assert [document["n"] for document in serve(desk)] == [1, 2]
+        socket.send_fds(client, [b'{"n": 3'], [ends[0]])
+        serve(desk)
+        os.close(ends[0])
+        os.close(ends[1])
+        assert desk.clients[0].descriptor is not None
+    serve(desk)
+    desk._closer.end()
+    assert count() == before - 2  # both ends of the client's connection
+
+
+def test_another_user_is_let_in_only_where_the_settings_name_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    user = os.getuid() + 4711
+    real = struct.unpack
+
+    def unpack(layout: str, data: bytes) -> tuple[Any, ...]:
+        return (1, user, 1) if layout == "3i" else real(layout, data)
+
+    monkeypatch.setattr(control.struct, "unpack", unpack)
+    for peer_uid, allowed in ((None, 0), (user + 1, 0), (user, 1)):
+        desk = Control(tmp_path, peer_uid)
+        assert desk.path.stat().st_mode & 0o777 == (0o600 if peer_uid is None else 0o660)
+        connected(desk).close()
+        assert len(desk.clients) == allowed
+        desk.close()
+
+
+def test_a_directory_without_room_for_the_socket_is_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(DeviceError, match="nothing is sent"):
+        Control(tmp_path / "missing")
+
+
+def test_accepting_what_has_gone_is_nothing(desk: Control) -> None:
+    desk._accept(0.0)
+    assert desk.clients == []
+
+
+def test_an_answer_to_who_has_gone_is_dropped() -> None:
+    near, far = socket.socketpair()
+    far.close()
+    closer = Closer()
+    client = Client(near, 0.0, closer)
+    client.reply({}, ok=True)
+    assert client.gone
+    client.close()
+    client._receive()  # its socket is no more
+    assert client.gone
+    closer.take(1 << 20)
+    closer.end()
+
+
+# --- journal and systemd ---
+
+
+def test_one_full_queue_does_not_silence_the_watchdog(tmp_path: Path) -> None:
+    """Systemd does not read for a while: what was to be said is said with the next watchdog, and no more often."""
+    address = str(tmp_path / "notify")
+    systemd = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    systemd.bind(address)
+    systemd.setblocking(False)
+    notifier = Notifier(address)
+    sent = 0
+    while not notifier._untold:
+        notifier.tell(f"STATUS={sent}")
+        sent += 1
+    notifier.tell("READY=1")
+    for now_s in (1.0, 1.2, 2.0, 3.0):
+        notifier.alive(now_s)
+    got = [systemd.recv(100).decode() for _ in range(sent - 1)]
+    assert got == [f"STATUS={k}" for k in range(sent - 1)]
+    notifier.alive(4.0)
+    assert [systemd.recv(100).decode() for _ in range(3)] == [f"STATUS={sent - 1}", "READY=1", "WATCHDOG=1"]
+    systemd.close()
+    (tmp_path / "notify").unlink()
+    notifier.alive(5.0)
+    again = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    again.bind(address)
+    notifier.alive(6.0)
+    assert again.recv(100) == b"WATCHDOG=1"
+    notifier.close()
+    notifier.alive(7.0)
+    again.close()
+
+
+def test_outside_a_unit_and_in_the_abstract_namespace() -> None:
+    silent = Notifier(None)
+    silent.alive(10.0)
+    silent.close()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind("\0fdhil-test-notify")
+        notifier = Notifier("@fdhil-test-notify")
+        notifier.tell("STATUS=\ud800")
+        assert systemd.recv(100) == b"STATUS=?"
+        notifier.close()
+
+
+def test_a_journal_that_nobody_reads_costs_lines_and_no_time() -> None:
+    read, write = os.pipe()
+    journal = Journal(write)
+    for _ in range(100):
+        journal.write("long", text="\u20ac" * 4000)
+    assert 0 < journal.dropped < 100
+    lines = os.read(read, 1 << 20).splitlines()
+    assert all(json.loads(line)["text"] == "\u20ac" * 500 for line in lines)
+    os.close(read)
+    journal.write("gone")
+    assert len(journal.recent) == 32
+    os.close(write)
