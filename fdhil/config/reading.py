@@ -102,7 +102,9 @@ def _faults(error: ValidationError) -> list[ConfigFault]:
                 where, _, what = line.partition(": ")
                 faults.append(ConfigFault(where, what))
         elif item["type"] in OUT_OF_RANGE and (bounds := _bounds(item["loc"])):
-            faults.append(ConfigFault(path, f"must be {bounds}, not {_shown(item['input'])}", _describe(item["loc"])))
+            kind = "a finite number " if item["type"] == "finite_number" else ""
+            what = f"must be {kind}{bounds}, not {_shown(item['input'])}"
+            faults.append(ConfigFault(path, what, _describe(item["loc"])))
         else:
             shown = f", not {_shown(item['input'])}" if isinstance(item["input"], str | int | float | bool) else ""
             faults.append(ConfigFault(path, item["msg"].removeprefix("Value error, ") + shown, _describe(item["loc"])))
