@@ -31,7 +31,7 @@ def read_csv_text(path: Path) -> str:
 
 
 def check_lengths(lines: Sequence[str], first: int, source: str) -> None:
-    """Refuse a line of columns that is too long to be one, before it is taken apart; ``first`` is its 1-based number."""
+    """Refuse a line that is too long for columns before it is taken apart; ``first`` is its 1-based number."""
     for number, line in enumerate(lines, first):
         if len(line) > MAX_LINE_CHARS:
             raise RecordingError(
