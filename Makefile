@@ -2,9 +2,13 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
+KERNELS := $(shell grep -rl --include='*.py' njit fdhil)
 VCAN   := bash tests/integration/vcan-vm.sh -t 900
 
-.PHONY: help setup demo test test-vcan test-full lint bench study lock clean
+# a child process need not translate fdhil anew
+unexport PYTHONDONTWRITEBYTECODE
+
+.PHONY: help setup demo test test-vcan test-full loaded lint bench study lock clean
 
 help:            ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/\1|\2/p' $(MAKEFILE_LIST) | awk -F'|' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -23,7 +27,13 @@ $(VENV)/.ok: pyproject.toml requirements.lock
 	fi
 	@touch $@
 
-setup: $(VENV)/.ok  ## make .venv with everything in it
+$(VENV)/.kernels: $(VENV)/.ok $(KERNELS)
+	@echo "compiling the kernels (once, about a minute)"
+	@find fdhil -name '*.nb[ic]' -delete # a kernel that was compiled into another one is not looked at again
+	@$(BIN)/python -m fdhil.cli.kernels
+	@touch $@
+
+setup: $(VENV)/.kernels ## make .venv with everything in it, kernels compiled
 
 demo: setup      ## the whole loop on the simulated machine; the report is out/report.html
 	@$(BIN)/fdhil demo --out out
@@ -37,6 +47,9 @@ test-vcan: setup ## the integration suite and the socket tests on a real SocketC
 test-full: test  ## adds the tests against LinuxCNC (Debian package linuxcnc-uspace)
 	@command -v rs274 >/dev/null || { echo "make test-full needs rs274: apt-get install linuxcnc-uspace" >&2; exit 1; }
 	@$(BIN)/python -m pytest -q -m debian
+
+loaded: setup    ## make demo and make test, five times each beside four busy loops
+	@.ci/loaded "$(MAKE) -s demo" "$(MAKE) -s test"
 
 lint: setup      ## ruff, mypy, import-linter, deptry, codespell, and the house rules
 	@$(BIN)/ruff check .

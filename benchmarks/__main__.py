@@ -1,17 +1,22 @@
-"""``make bench``: run every benchmark as a process of its own and write docs/benchmarks.md.
+"""``make bench``: run every benchmark as a process of its own; figures go to docs/benchmarks.json, the page beside it.
 
-python -m benchmarks [NAME...]
+python -m benchmarks [NAME...]   run these, or all; the others keep the figures they have
+python -m benchmarks --pages     write the page anew from the figures that are there
 """
 
 from __future__ import annotations
 
+import json
+import os
 import platform
 import subprocess
 import sys
-from datetime import UTC, datetime
-from pathlib import Path
+from collections.abc import Mapping
+from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
+from studies.pages import ROOT, paragraph, provenance
+
+FIGURES = ROOT / "docs" / "benchmarks.json"
 BENCHMARKS = {
     "closed_loop": "The closed-loop kernel against the same kernel in C -O3, and against real time",
     "identification": "From the last sample of a rapid to validated parameters",
@@ -26,9 +31,10 @@ BENCHMARKS = {
 }
 
 
-def run(name: str) -> str:
-    """Run one benchmark and return what it printed; a failing one ends the run."""
+def run(name: str) -> dict[str, Any]:
+    """Run one benchmark and return what it printed, and what it ran on; a failing one ends the run."""
     print(f"{name}: {BENCHMARKS[name]} ...", flush=True)
+    told = provenance(f"python -m benchmarks.{name}") | {"host": f"{platform.machine()}, {os.cpu_count()} cores"}
     done = subprocess.run(
         [sys.executable, "-m", f"benchmarks.{name}"], capture_output=True, text=True, cwd=ROOT, check=False
     )
@@ -36,23 +42,37 @@ def run(name: str) -> str:
     if done.returncode != 0:
         print(done.stderr, file=sys.stderr)
         sys.exit(f"benchmark {name} failed")
-    return done.stdout.strip()
+    return {"run": told, "output": done.stdout.strip().splitlines()}
+
+
+def page(figures: Mapping[str, Any]) -> str:
+    """Return the page of the benchmarks' figures."""
+    lines = ["# Benchmarks", ""]
+    lines += paragraph(
+        """Written by `make bench` from [benchmarks.json](benchmarks.json). A host that is shared with other work
+        measures less than it can: read the ratios, and compare within one run."""
+    )
+    for name, title in BENCHMARKS.items():
+        if name in figures:
+            told = figures[name]["run"]
+            where = f"{told['date']}, commit {told['commit']}, {told['versions']}, {told['host']}."
+            lines += [f"## {title}", "", *paragraph(f"`{told['command']}`, {where}")]
+            lines += ["```text", *figures[name]["output"], "```", ""]
+    return "\n".join(lines).rstrip() + "\n"
 
 
 def main() -> None:
-    """Run the named benchmarks, or all of them and write the page."""
-    names = sys.argv[1:] or list(BENCHMARKS)
-    parts = [
-        "# Benchmarks",
-        "",
-        "Written by `make bench`. Figures of a shared two-core machine: read the ratios, and compare within one run.",
-        "",
-        f"{datetime.now(UTC):%Y-%m-%d}, Python {platform.python_version()}, {platform.machine()}.",
-    ]
+    """Run the named benchmarks, or all of them, and write the page."""
+    names = [] if sys.argv[1:] == ["--pages"] else sys.argv[1:] or list(BENCHMARKS)
+    unknown = [name for name in names if name not in BENCHMARKS]
+    if unknown:
+        sys.exit(f"no benchmark is called {', '.join(unknown)}: choose from {', '.join(BENCHMARKS)}")
+    figures = json.loads(FIGURES.read_text("utf-8")) if FIGURES.exists() else {}
     for name in names:
-        parts += ["", f"## {BENCHMARKS[name]}", "", f"`python -m benchmarks.{name}`", "", "```text", run(name), "```"]
-    if names == list(BENCHMARKS):
-        (ROOT / "docs" / "benchmarks.md").write_text("\n".join(parts) + "\n", "utf-8")
+        figures[name] = run(name)
+        in_order = {key: figures[key] for key in BENCHMARKS if key in figures}
+        FIGURES.write_text(json.dumps(in_order, indent=1) + "\n", "utf-8")
+    FIGURES.with_suffix(".md").write_text(page(figures), "utf-8")
 
 
 if __name__ == "__main__":

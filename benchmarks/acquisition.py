@@ -3,13 +3,12 @@
     python benchmarks/acquisition.py [--frames 1000000] [--seconds 20]
 
 A second process plays the hub (socketcand protocol on loopback): SYNC with counter and the default mapping of three
-axes, 7.8 frames per millisecond. Prints a table and one JSON line.
+axes, 7.8 frames per millisecond. Prints a table.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing as mp
 import socket
 import struct
@@ -155,7 +154,6 @@ def main() -> None:
     for name, r in results.items():
         cpu = "-" if "fit" in name else f"{r['cpu_percent']:.1f}"
         print(f"{name:22}{r['frames']:>10}{r['frames_per_s']:>12.0f}{cpu:>8}{r['us_per_frame']:>10.2f}{r['lost']:>6}")
-    print(json.dumps({"benchmark": "acquisition", "results": results}))
 
 
 if __name__ == "__main__":

@@ -3,14 +3,13 @@
     python benchmarks/guard_latency.py [--cycles 5000]
 
 A hub of the socketcand protocol in this process plays NC and drives in lockstep; the guard runs as its own process and
-is armed at the begin of a path. Prints a table and one JSON line. Loopback TCP is part of the figure.
+is armed at the begin of a path. Prints a table. Loopback TCP is part of the figure.
 """
 
 from __future__ import annotations
 
 import argparse
 import hashlib
-import json
 import socket
 import struct
 import subprocess
@@ -182,7 +181,6 @@ def main() -> None:
     }
     for name, value in result.items():
         print(f"{name:20} {value}")
-    print(json.dumps(result))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Generate what can be generated: configs/machine-template.toml and docs/reference/ (config, commands, errors).
+"""Generate what can be generated: configs/machine-template.toml and docs/reference/ (config, commands, errors, faults).
 
 ``python docs/generate.py`` writes them; a test fails when they are not what the code says.
 """
@@ -6,11 +6,14 @@
 from __future__ import annotations
 
 import inspect
+import re
 import sys
 import types
 import typing
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import click
@@ -19,65 +22,82 @@ from pydantic_core import PydanticUndefined
 
 from fdhil import config, errors
 from fdhil.cli.main import cli
+from fdhil.sim.fault_kinds import FAULTS
 
 ROOT = Path(__file__).resolve().parent.parent
-EXAMPLES: Mapping[str, Any] = {  # of required keys: the bench machine
+EXAMPLES: Mapping[str, Any] = {  # of keys without a default: the bench machine
     "machine.name": "my machine",
-    "screw_pitch_mm": 20.0, "rapid_speed_mm_s": 500.0, "max_acceleration_mm_s2": 4000.0,
+    "screw_pitch_mm": 20.0, "rapid_speed_mm_s": 500.0, "max_acceleration_mm_s2": 4000.0, "max_jerk_mm_s3": 160000.0,
     "R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0,
     "position_gain_per_s": 50.0, "speed_kp": 23.562, "speed_ki": 1184.35, "current_limit_a": 200.0,
     "current_kp": 12.566, "current_ki": 1256.64, "voltage_limit_v": 300.0,
+    "node_id": 1, "speed_limit_mm_s": 500.0, "method": "maximum_likelihood", "run_directory": "/run/fdhil",
+    "commissioning_key": "/etc/fdhil/commissioning.key",
 }  # fmt: skip
 NAMES = {"axis": "X", "bus": "can0"}  # the user's own names in the template
-OPTIONAL = {  # sections whose absence means something
-    "axis.X.correction": "Without this section nothing is ever sent to the drive; with it, what the guard lets pass.",
-    "axis.X.temperature": "Without this section the drift is told against time alone.",
-}
 
 
-def keys(section: type[config.Section], path: str = "") -> Iterator[tuple[str, str, FieldInfo]]:
-    """Yield (section path, key, field) of every key, section by section."""
-    inner: list[tuple[str, type[config.Section]]] = []
-    for key, field in section.model_fields.items():
-        below = _section_of(field.annotation)
-        if below is None:
-            yield path, key, field
-        else:
+@dataclass(frozen=True)
+class Table:
+    """A table of the configuration file: its path, what it is, whether it may be left out, and its own keys."""
+
+    path: str
+    section: type[config.Section]
+    optional: bool
+    keys: tuple[tuple[str, FieldInfo], ...]
+
+    @property
+    def meaning(self) -> str:
+        """The section's own words, without the name in front."""
+        words = re.sub(r"^\[.*?\](: )?", "", inspect.getdoc(self.section) or "")
+        return words[:1].upper() + words[1:]
+
+
+def sections(section: type[config.Section], path: str = "", optional: bool = False) -> Iterator[Table]:
+    """Yield every table of the file, outer ones first."""
+    fields = [(key, field, _section_of(field.annotation)) for key, field in section.model_fields.items()]
+    if path:
+        own = tuple((key, field) for key, field, below in fields if below is None)
+        yield Table(path, section, optional, own)
+    for key, field, below in fields:
+        if below is not None:
             named = f"{key}.{NAMES.get(key, key)}" if _is_mapping(field.annotation) else key
-            inner.append((f"{path}.{named}" if path else named, below))
-    for name, below in inner:
-        yield from keys(below, name)
+            absent = field.default is None or key == "sim"
+            yield from sections(below, f"{path}.{named}" if path else named, optional or absent)
 
 
 def template() -> str:
-    """Return the commented machine configuration: required keys set, the others at their defaults, commented out."""
+    """Return the commented machine configuration: required keys set, everything else commented out."""
     lines = [
-        "# A machine for fdhil. What is not commented out is required; what is shows its default.",
+        "# A machine for fdhil. The lines without a # in front are required: put your machine's values there.",
+        "# A line that begins with # and no space is a setting at its default, or an example where it has none.",
+        "# To change it, take the # away. The comment above each line says what it is.",
         "# A key that fdhil does not know is refused, with a suggestion.",
     ]
-    current = ""
-    for path, key, field in keys(config.MachineConfig):
-        if path != current:
-            current = path
-            lines += ["", *_heading(path)]
-        value = _example(path, key, field)
-        text = f"{key} = {_toml(value)}" if value is not None else f"{key} ="
-        required = field.is_required() and "sim" not in path
-        shown = text if required else f"# {text}"
-        lines.append(f"{shown:<44} # {field.description or ''}".rstrip())
+    for table in sections(config.MachineConfig):
+        lines.append("")
+        if table.meaning:
+            lines += wrap(table.meaning, 118, initial_indent="# ", subsequent_indent="# ")
+        lines.append(f"{'#' if table.optional else ''}[{table.path}]")
+        for key, field in table.keys:
+            lines += wrap(field.description or "", 118, initial_indent="# ", subsequent_indent="# ")
+            set_by_user = field.is_required() and not table.optional
+            lines.append(f"{'' if set_by_user else '#'}{key} = {_toml(_example(table.path, key, field))}")
     return "\n".join(lines) + "\n"
 
 
 def config_reference() -> str:
     """Return the table of every configuration key as Markdown."""
-    lines = ["# Configuration keys", "", "Generated from `fdhil/config/`. Unknown keys are refused.", ""]
-    current = None
-    for path, key, field in keys(config.MachineConfig):
-        if path != current:
-            current = path
-            lines += ["", f"## [{path}]", "", "| key | default | meaning |", "|---|---|---|"]
-        default = "required" if field.is_required() else f"`{_toml(_default(field))}`"
-        lines.append(f"| `{key}` | {default} | {field.description or ''} |")
+    lines = ["# Configuration keys", "", "Generated from `fdhil/config/`. Unknown keys are refused."]
+    for table in sections(config.MachineConfig):
+        lines += ["", f"## [{table.path}]", ""]
+        if table.meaning:
+            lines += [table.meaning, ""]
+        lines += ["| key | default | meaning |", "|---|---|---|"]
+        for key, field in table.keys:
+            default = _default(field)
+            shown = "required" if field.is_required() else f"`{_toml(default)}`" if default is not None else "left out"
+            lines.append(f"| `{key}` | {shown} | {field.description or ''} |")
     return "\n".join(lines) + "\n"
 
 
@@ -105,8 +125,24 @@ def error_reference() -> str:
     ]
     for name, item in vars(errors).items():
         if inspect.isclass(item) and issubclass(item, errors.FdhilError):
-            meaning = (inspect.getdoc(item) or "").splitlines()[0]
+            meaning = " ".join((inspect.getdoc(item) or "").partition("\n\n")[0].split())
             lines.append(f"| `{name}` | {item.exit_code} | {meaning} |")
+    return "\n".join(lines) + "\n"
+
+
+def fault_reference() -> str:
+    """Return the faults of the simulated machine as Markdown."""
+    lines = [
+        "# Faults of the simulated machine",
+        "",
+        "Generated from `fdhil/sim/fault_kinds.py`. How to use them is in [the how-to](../how-to/simulate.md).",
+        "",
+        "| fault | value | axis |",
+        "|---|---|---|",
+    ]
+    for name, kind in FAULTS.items():
+        value = kind.value.meaning if kind.value else "none"
+        lines.append(f"| `{name}` | {value} | {'needed' if kind.needs_axis else 'not needed'} |")
     return "\n".join(lines) + "\n"
 
 
@@ -115,24 +151,13 @@ GENERATED = {
     ROOT / "docs" / "reference" / "config.md": config_reference,
     ROOT / "docs" / "reference" / "commands.md": command_reference,
     ROOT / "docs" / "reference" / "errors.md": error_reference,
+    ROOT / "docs" / "reference" / "faults.md": fault_reference,
 }
 
 
-def _heading(path: str) -> list[str]:
-    if path in OPTIONAL:
-        return [
-            "# Without this section nothing is ever sent to the drive; with it, what the guard lets pass.",
-            f"# [{path}]",
-        ]
-    if path.startswith("sim"):
-        return [f"# [{path}]"]
-    return [f"[{path}]"]
-
-
 def _example(path: str, key: str, field: FieldInfo) -> Any:
-    if field.is_required():
-        return EXAMPLES[f"{path}.{key}" if f"{path}.{key}" in EXAMPLES else key]
-    return _default(field)
+    default = _default(field)
+    return EXAMPLES.get(f"{path}.{key}", EXAMPLES.get(key)) if default is None else default
 
 
 def _default(field: FieldInfo) -> Any:
@@ -141,8 +166,6 @@ def _default(field: FieldInfo) -> Any:
 
 
 def _toml(value: Any) -> str:
-    if value is None:
-        return ""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):

@@ -88,6 +88,10 @@ class RecordingError(FdhilError):
     """A recording cannot be read: it is truncated, empty, misses a column, or holds text where a number belongs."""
 
 
+class OutputError(FdhilError):
+    """A file that a command was asked to write cannot be written; what stood there before is kept."""
+
+
 class ProgramError(FdhilError):
     """An NC program cannot be interpreted; ``line`` is the 1-based source line (0: the
     whole file), ``word`` the word at fault."""

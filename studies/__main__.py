@@ -1,15 +1,25 @@
-"""``make study``: run the Monte-Carlo studies and write their pages to docs/studies. python -m studies [NAME...]"""
+"""``make study``: run the Monte-Carlo studies and write their figures and pages to docs/studies.
+
+python -m studies [NAME...]      measure, with the studies' own defaults
+python -m studies --pages        write the pages anew from the figures that are there
+"""
 
 from __future__ import annotations
 
 import sys
 from importlib import import_module
 
+from studies.pages import FOLDER, write_page
+
 STUDIES = ("estimators", "comparison", "drift", "verdicts", "slow_sensor")
 
 
 def main() -> None:
     """Run the named studies, or all of them, each with its own defaults."""
+    if sys.argv[1:] == ["--pages"]:
+        for path in sorted(FOLDER.glob("*.json")):
+            write_page(path)
+        return
     names = sys.argv[1:] or list(STUDIES)
     unknown = [name for name in names if name not in STUDIES]
     if unknown:

@@ -8,12 +8,13 @@ low-passes. Values are taken before anything is withheld, so that what ruins a m
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ from fdhil.identification.filtering import zero_phase
 from fdhil.identification.normal import solve
 from fdhil.records import PARAMETERS, Recording, Window, frozen
 from fdhil.store.recording_csv import parse_recording
-from studies import bench
+from studies import bench, pages
 from studies.comparison_page import figure, text
 from studies.estimators import TRUTH, Array, bound, noisy
 
@@ -32,7 +33,6 @@ NOISES = (0.001, 0.005, 0.01)
 PERIODS_S = (0.25e-3, 1e-3, 2e-3)
 # the second is what the product uses where nothing else is set
 FILTERS_HZ = {"none": 1e6, "40 Hz": Identification().lowpass_hz, "150 Hz": 150.0}
-ONE_SIDED = "40 Hz, not on the voltage"
 METHODS = (*OPERATORS, "partial_moments", "instrumental_variables", "maximum_likelihood")
 CHUNK = 10
 SURE_95 = 1.96
@@ -151,20 +151,39 @@ def compare(runs: int, processes: int) -> list[Figures]:
     ]
 
 
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """Return the figures of all cases, and what their axes are."""
+    found = [asdict(figures) for figures in compare(options.runs, options.processes)]
+    return {"runs": options.runs, "methods": METHODS, "filters": list(FILTERS_HZ), "cases": found}
+
+
+def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
+    """Return the study's page."""
+    return text(run, told(figures), (figures["methods"], figures["filters"], PARAMETERS), figures["runs"])
+
+
+def draw(figures: Mapping[str, Any], path: Path) -> None:
+    """Draw the plot."""
+    from matplotlib import rc_context
+
+    with rc_context({"svg.hashsalt": "fdhil"}):
+        drawing = figure(told(figures), (figures["methods"], figures["filters"], PARAMETERS))
+        drawing.savefig(path, metadata={"Date": None})
+
+
+def told(figures: Mapping[str, Any]) -> list[Figures]:
+    """Return the cases of a page's figures."""
+    numbers = ("rms", "bias", "rejected", "one_sided", "bound")
+    return [
+        Figures(**{**case, **{k: np.array(case[k], dtype=np.float64) for k in numbers}}) for case in figures["cases"]
+    ]
+
+
 def main() -> None:
-    """Run the comparison and write its page and plot."""
+    """Run the comparison."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=100)
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=Path("docs/studies"))
-    options = parser.parse_args()
-    found = compare(options.runs, options.processes)
-    options.out.mkdir(parents=True, exist_ok=True)
-    names = (METHODS, tuple(FILTERS_HZ), PARAMETERS)
-    figure(found, names).savefig(options.out / "comparison.svg", metadata={"Date": None})
-    page = text(found, names, options.runs, ONE_SIDED)
-    (options.out / "comparison.md").write_text(page)
-    print(page)
+    pages.conduct("comparison", parser, lambda o: f"0 to {o.runs - 1} in each case", measure)
 
 
 if __name__ == "__main__":

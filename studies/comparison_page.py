@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
-from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from studies.pages import Run, grid, head, listed, of, paragraph
 
 if TYPE_CHECKING:
     from studies.comparison import Figures
     from studies.estimators import Array
 
 Names = tuple[Sequence[str], Sequence[str], Sequence[str]]
+RAW, USUAL = 0, 1  # places of no low-pass and of the usual one among the filters
+USABLE = 5.0  # per cent of Jt
+SMALL = {"R": 0.1, "L": 0.1, "K": 0.1, "Jt": 1.0}  # per cent
 PAPER_OPERATORS = ("zero_forcing_1", "zero_forcing_3_tap", "central", "backward")
 SHORT = {
     "zero_forcing_1": "LS, zero forcing #1",
@@ -33,107 +38,131 @@ def overall(f: Figures) -> Array:
     return mean
 
 
-def text(found: Sequence[Figures], names: Names, runs: int, one_sided: str) -> str:
+def text(run: Run, found: Sequence[Figures], names: Names, runs: int) -> str:
     """Return the page."""
-    lines = ["# The paper's comparison, reproduced", "", "Written by `python -m studies.comparison`.", ""]
+    lines = head("The paper's comparison, reproduced", "comparison", run)
     lines += paragraph(
         f"""One 0.4 m rapid of the bench, {runs} runs per case, the same noisy rows for every method. The noise is
         white, in per cent of 60 V, 50 A and 150 rad/s on every sample; the low-pass is zero-phase and the same on
         every signal; for the partial moments it sets the horizon (one period of its corner, at least 8 samples).
-        Maximum likelihood uses no low-pass. The bound is that of Cramer and Rao for the same rows. 40 Hz is what
-        the product uses by default."""
+        Maximum likelihood uses no low-pass. The bound is that of Cramer and Rao for the same rows. The product uses
+        {names[1][USUAL]} where nothing else is set."""
     )
-    lines += [*_best_operator(found, names), *_moments(found, names), *_same_filter(found, names, one_sided)]
+    lines += [*_best_operator(found, names), *_moments(found, names), *_same_filter(found, names)]
     lines += [*_hausman(found, names), "![RMS error over the bound, and bias](comparison.svg)", ""]
     lines += ["## All figures", "", "RMS error (bias), both in % of the true value.", ""]
     for f in found:
         lines += _table(f, names)
-    return "\n".join(lines).rstrip() + "\n"
-
-
-def paragraph(words: str) -> list[str]:
-    """Return words as lines of a page, and the empty line after them."""
-    return [*wrap(" ".join(words.split()), 120, break_on_hyphens=False), ""]
+    return "\n".join(lines)
 
 
 def _best_operator(found: Sequence[Figures], names: Names) -> list[str]:
     methods, filters, parameters = names
     four = [methods.index(name) for name in PAPER_OPERATORS]
-    rows, wins = [], np.zeros((len(filters), len(four)), dtype=int)
-    for k, name in enumerate(filters):
-        for f in found:
-            ratios = overall(f)[k, four]
-            wins[k, ratios.argmin()] += 1
-            cells = [f"{r:.2f}" for r in ratios]
-            rows.append(
-                [name, f"{1e3 * f.period_s:g}", f"{100 * f.noise:g}", *cells, SHORT[PAPER_OPERATORS[ratios.argmin()]]]
-            )
-    told = ", ".join(f"{name}: {wins[k, 0]} of {len(found)}" for k, name in enumerate(filters))
-    shifts = _largest(found, 1, four, parameters.index("R"))
-    raw = _largest(found, 0, four, parameters.index("Jt"))
-    head = ["low-pass", "period ms", "noise %", *(SHORT[n] for n in PAPER_OPERATORS), "best"]
+    ratios = np.array([[overall(f)[k, four] for f in found] for k in range(len(filters))])
+    first = ratios.argmin(axis=-1)
+    rows = [
+        [name, *_place(f), *(f"{r:.2f}" for r in ratios[k, c]), SHORT[PAPER_OPERATORS[first[k, c]]]]
+        for k, name in enumerate(filters)
+        for c, f in enumerate(found)
+    ]
+    by_filter = [_claim(name, first[k], found) for k, name in enumerate(filters)]
+    ordered = np.sort(ratios[USUAL], axis=-1)
+    shifts = _largest(found, USUAL, four, parameters.index("R"))
+    raw = _largest(found, RAW, four, parameters.index("Jt"))
+    usable = sum(float(worst) < USABLE for worst in raw)
     lines = ["## Is zero forcing #1 the best of four operators?", ""]
     lines += paragraph(
         f"""The paper does not name the other three; here they are zero forcing with 3 taps, central and backward. Zero
-        forcing #1 comes first, by low-pass, in {told} cases. So the paper's claim holds with a low-pass as low as
-        the paper's method needs anyway, and most of all at low noise. It does not hold without one, and at 150 Hz
-        only at low noise or a short period: there the noise decides, and the central difference lets less than a
-        fifth of it through. With a good low-pass the two are close: both are second-order accurate, and they
-        differ in L. Zero forcing with 3 taps and backward are first-order accurate, so they answer a fraction of a
-        sample off, which no low-pass mends (largest bias of R at 40 Hz, in the order of the table: {shifts} %). No
-        operator can be used without a low-pass (largest bias of Jt: {raw} %)."""
+        forcing #1 is the best {"; ".join(by_filter)}."""
     )
-    return [*lines, "RMS error over the bound, geometric mean over the six parameters:", "", *grid(head, rows), ""]
+    lines += paragraph(
+        f"""With {filters[USUAL]} the second best is {np.median(ordered[:, 1] / ordered[:, 0]):.2f} times as far off as
+        the best (median). There the largest bias of R is {listed(shifts)} %, in the order of the table: zero forcing #1
+        and central are accurate to second order, zero forcing with 3 taps and backward to first order. Without a
+        low-pass the largest bias of Jt is {listed(raw)} %: {usable or "none"} of the four can do without one (stay
+        below {USABLE:g} %)."""
+    )
+    columns = ["low-pass", "period ms", "noise %", *(SHORT[n] for n in PAPER_OPERATORS), "best"]
+    return [*lines, "RMS error over the bound, geometric mean over the six parameters:", "", *grid(columns, rows), ""]
 
 
-def _largest(found: Sequence[Figures], k: int, methods: Sequence[int], parameter: int) -> str:
-    """Return the largest bias over the cases of each method with low-pass ``k``, as words."""
-    return ", ".join(f"{max(abs(f.bias[k, m, parameter]) for f in found):.2g}" for m in methods)
+def _claim(name: str, first: Array, found: Sequence[Figures]) -> str:
+    """Tell in how many cases the first operator is the best with one low-pass, and which is where it is not."""
+    won = int((first == 0).sum())
+    where = [
+        f"{period} ms and {noise} %" for k, (period, noise) in zip(first, map(_place, found), strict=True) if not k
+    ]
+    others = Counter(SHORT[PAPER_OPERATORS[k]].removeprefix("LS, ") for k in first if k)
+    told = [f"at {listed(where)}"] if 0 < won < len(found) else []
+    told += [f"otherwise {listed([f'{other} in {count}' for other, count in others.most_common()])}"] if others else []
+    place = f" ({'; '.join(told)})" if told else ""
+    return f"{with_filter(name)} {of(won, len(found))} cases{place}"
 
 
-def grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return a table of a page."""
-    return ["| " + " | ".join(head) + " |", "|---" * len(head) + "|", *("| " + " | ".join(row) + " |" for row in rows)]
+def with_filter(name: str) -> str:
+    """Return the words for one of the low-passes."""
+    return "without a low-pass" if name == "none" else f"with {name}"
+
+
+def _place(f: Figures) -> tuple[str, str]:
+    return f"{1e3 * f.period_s:g}", f"{100 * f.noise:g}"
+
+
+def _largest(found: Sequence[Figures], k: int, methods: Sequence[int], parameter: int) -> list[str]:
+    """Return the largest bias over the cases of each method with low-pass ``k``."""
+    return [f"{max(abs(f.bias[k, m, parameter]) for f in found):.2g}" for m in methods]
 
 
 def _moments(found: Sequence[Figures], names: Names) -> list[str]:
     methods, filters, parameters = names
     ls, pm = methods.index("zero_forcing_1"), methods.index("partial_moments")
-    rows = []
-    for k, name in enumerate(filters):
-        won = np.array([f.rms[k, ls] < f.rms[k, pm] for f in found]).sum(axis=0)
-        together = sum(bool(overall(f)[k, ls] < overall(f)[k, pm]) for f in found)
-        rows.append([name, *(f"{w} of {len(found)}" for w in (*won, together))])
-    worst = _largest(found, 1, (ls, pm), parameters.index("Jt"))
+    places = range(len(filters))
+    won = np.array([[f.rms[k, ls] < f.rms[k, pm] for f in found] for k in places]).sum(axis=1)
+    together = np.array([[overall(f)[k, ls] < overall(f)[k, pm] for f in found] for k in places]).sum(axis=1)
+    rows = [[name, *(f"{w} of {len(found)}" for w in (*won[k], together[k]))] for k, name in enumerate(filters)]
+    better = [p for p, count in zip(parameters, won[USUAL], strict=True) if 2 * count > len(found)]
+    worst = _largest(found, USUAL, (ls, pm), parameters.index("Jt"))
     lines = ["## Does least squares beat the reinitialised partial moments?", ""]
     lines += paragraph(
-        f"""Mostly, with the low-pass that it needs, and through Jt above all (largest bias at 40 Hz by least squares
-        and by the moments: {worst} %). It does not for ft and Cd, and it does not without a low-pass: the moments
-        bring one of their own, their horizon."""
+        f"""With {filters[USUAL]} it does {of(int(together[USUAL]), len(found))} cases over all six parameters; in most
+        cases for {listed(better, "no parameter")}, not for {listed([p for p in parameters if p not in better])}. There
+        the largest bias of Jt is {worst[0]} % by least squares and {worst[1]} % by the moments. Without a low-pass it
+        does {of(int(together[RAW]), len(found))} cases: the moments bring one of their own, their horizon."""
     )
-    head = ["low-pass", *parameters, "all six together"]
-    return [*lines, "Cases in which zero forcing #1 has the smaller RMS error:", "", *grid(head, rows), ""]
+    columns = ["low-pass", *parameters, "all six together"]
+    return [*lines, "Cases in which zero forcing #1 has the smaller RMS error:", "", *grid(columns, rows), ""]
 
 
-def _same_filter(found: Sequence[Figures], names: Names, one_sided: str) -> list[str]:
+def _same_filter(found: Sequence[Figures], names: Names) -> list[str]:
     methods, filters, parameters = names
-    ls = methods.index("zero_forcing_1")
+    ls, one_sided = methods.index("zero_forcing_1"), f"{filters[USUAL]}, not on the voltage"
+    at_1_ms = [f for f in found if f.period_s == 1e-3]
     rows = []
-    for f in (f for f in found if f.period_s == 1e-3):
+    for f in at_1_ms:
         noise = f"{100 * f.noise:g}"
         rows += [[noise, name, *_cells(f.bias[k, ls], f.rms[k, ls])] for k, name in enumerate(filters)]
         rows.append([noise, one_sided, *_cells(f.one_sided[1], f.one_sided[0])])
+    biases = {name: np.abs([f.bias[k, ls] for f in at_1_ms]) for k, name in enumerate(filters)}
+    biases[one_sided] = np.abs([f.one_sided[1] for f in at_1_ms])
+    biases = {f"{with_filter(name)[0].upper()}{with_filter(name)[1:]}": bias for name, bias in biases.items()}
+    words = [f"{name}: {_unbiased(bias, parameters)}" for name, bias in biases.items()]
+    growth = [f"{abs(f.bias[USUAL, ls, parameters.index('Jt')]):.2g}" for f in at_1_ms]
     lines = ["## Does the same low-pass on every signal keep the identification unbiased?", ""]
     lines += paragraph(
-        """It holds for 40 Hz: raw noise ruins Jt and L, and the low-pass brings R, L and K back to within a tenth of
-        a per cent and Jt to within 1 %. It must be on the voltage too: left raw, L is off by more than 1.5 % at
-        any noise, R by 0.1 %. It does not hold for any low-pass: at 150 Hz the noise that is left on Dw still
-        costs Jt dearly, and at 40 Hz the bias of Jt still grows with the noise, because no filter makes least
-        squares consistent."""
+        f"""Call it unbiased where R, L and K are less than {SMALL["R"]:g} % off and Jt less than {SMALL["Jt"]:g} %, at
+        every noise. {". ".join(words)}. No filter makes least squares consistent: with {filters[USUAL]} on every signal
+        Jt is {listed(growth)} % off as the noise grows."""
     )
-    head = ["noise %", "low-pass", *parameters]
+    columns = ["noise %", "low-pass", *parameters]
     told = "Bias of zero forcing #1 at a period of 1 ms, % of the true value (RMS error):"
-    return [*lines, told, "", *grid(head, rows), ""]
+    return [*lines, told, "", *grid(columns, rows), ""]
+
+
+def _unbiased(bias: Array, parameters: Sequence[str]) -> str:
+    """Tell by the largest of ``bias`` (noises, 6) which parameters are biased."""
+    most = dict(zip(parameters, bias.max(axis=0), strict=True))
+    return listed([f"{p} is up to {most[p]:.2g} % off" for p in SMALL if most[p] >= SMALL[p]], "unbiased")
 
 
 def _cells(bias: Array, rms: Array) -> list[str]:
@@ -148,21 +177,40 @@ def _hausman(found: Sequence[Figures], names: Names) -> list[str]:
     for k, name in enumerate(filters):
         for f in found:
             cells = [" / ".join(f"{100 * f.rejected[k, methods.index(n), j]:.0f}" for j in pair) for n in shown]
-            rows.append([name, f"{1e3 * f.period_s:g}", f"{100 * f.noise:g}", *cells])
+            rows.append([name, *_place(f), *cells])
     lines = ["## Durbin-Wu-Hausman test against maximum likelihood", ""]
-    instruments = methods.index("instrumental_variables")
-    told = [[f.rejected[k, instruments, j] for k in range(len(filters)) for f in found] for j in pair]
-    mean, most = (", ".join(f"{100 * pick(shares):.0f}" for shares in told) for pick in (np.mean, np.max))
     lines += paragraph(
         f"""Maximum likelihood is consistent, so an estimate that differs from it by more than chance is biased. The
-        test at 5 % tells 5 % of the rapids for a method without bias. Least squares is told wherever the low-pass
-        leaves noise on a derivative. Instrumental variables are told as seldom as chance has it (mean over the
-        cases for L, Jt: {mean} %; at most {most} %, at 0.1 % noise, where stencils and likelihood take the
-        voltage's course within a sample differently): their instruments follow the NC's demand and know nothing of
-        the sensors. They pay with a spread that grows with the noise let through, in ft and Cd most."""
+        test at 5 % tells 5 % of the rapids for a method without bias. {_told_for("zero_forcing_1", found, names)}.
+        {_told_for("instrumental_variables", found, names)}: its instruments follow the NC's demand and know nothing of
+        the sensors. {_price(found, names)}"""
     )
-    head = ["low-pass", "period ms", "noise %", *(SHORT[n] for n in shown)]
-    return [*lines, "Rejections, % of the rapids, for L / Jt:", "", *grid(head, rows), ""]
+    columns = ["low-pass", "period ms", "noise %", *(SHORT[n] for n in shown)]
+    return [*lines, "Rejections, % of the rapids, for L / Jt:", "", *grid(columns, rows), ""]
+
+
+def _told_for(method: str, found: Sequence[Figures], names: Names) -> str:
+    """Tell how often the test rejects a method, by low-pass, and where most."""
+    methods, filters, parameters = names
+    m, pair = methods.index(method), [parameters.index("L"), parameters.index("Jt")]
+    shares = 100 * np.array([[f.rejected[k, m, pair] for f in found] for k in range(len(filters))])
+    means = [" / ".join(f"{x:.0f}" for x in share.mean(axis=0)) for share in shares]
+    by_filter = [f"{mean} {with_filter(name)}" for mean, name in zip(means, filters, strict=True)]
+    k, case, j = np.unravel_index(shares.argmax(), shares.shape)
+    period, noise = _place(found[case])
+    most = f"{shares.max():.0f} % ({('L', 'Jt')[j]} {with_filter(filters[k])} at {period} ms and {noise} %)"
+    name = SHORT[method].replace("LS,", "least squares with")
+    return f"It tells {name}, for L / Jt in % of the rapids, {', '.join(by_filter)}; at most {most}"
+
+
+def _price(found: Sequence[Figures], names: Names) -> str:
+    """Tell what the instruments cost in ft and Cd, beside the likelihood."""
+    methods, filters, parameters = names
+    iv, ml = methods.index("instrumental_variables"), methods.index("maximum_likelihood")
+    pair = [parameters.index("ft"), parameters.index("Cd")]
+    times = [np.median([f.rms[k, iv, pair] / f.rms[k, ml, pair] for f in found]) for k in range(len(filters))]
+    told = listed([f"{t:.1f} times {with_filter(name)}" for t, name in zip(times, filters, strict=True)])
+    return f"In ft and Cd their RMS error is, beside the likelihood's, {told} (median)."
 
 
 def _table(f: Figures, names: Names) -> list[str]:
@@ -172,8 +220,8 @@ def _table(f: Figures, names: Names) -> list[str]:
         for j, parameter in enumerate(parameters):
             cells = [f"{f.rms[k, m, j]:.3g} ({f.bias[k, m, j]:+.2g})" for m in range(len(methods))]
             rows.append([name, parameter, *cells, f"{f.bound[j]:.3f}"])
-    head = ["low-pass", "", *(SHORT[n] for n in methods), "bound"]
-    return [f"### {1e3 * f.period_s:g} ms, {100 * f.noise:g} % noise", "", *grid(head, rows), ""]
+    columns = ["low-pass", "", *(SHORT[n] for n in methods), "bound"]
+    return [f"### {1e3 * f.period_s:g} ms, {100 * f.noise:g} % noise", "", *grid(columns, rows), ""]
 
 
 def figure(found: Sequence[Figures], names: Names) -> Any:

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import argparse
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,8 +22,8 @@ from fdhil.pipeline import AxisPipeline
 from fdhil.records import PARAMETERS, Notice, ParameterSet, Window, WindowOutcome
 from fdhil.store.recording_csv import parse_recording
 from fdhil.validation import analyse, pool
-from studies import bench
-from studies.comparison_page import grid, paragraph
+from studies import bench, pages
+from studies.pages import grid, paragraph
 
 Array = bench.Array
 NOISE = 0.005
@@ -161,19 +160,25 @@ def due(seed: int) -> tuple[bool, bool, float]:
     return True, reached.low <= 100.0 <= reached.high, reached.at - 100.0
 
 
-def page(run: Callable[[Callable[[int], Any], int], list[Any]], counts: dict[str, int]) -> str:
-    """Return the study's page; ``run`` maps a function over seeds."""
-    lines = ["# Drift, load and pools", "", "Written by `python -m studies.drift`.", ""]
+def measure(run: Callable[[Callable[[int], Any], int], list[Any]], counts: Mapping[str, int]) -> dict[str, list[Any]]:
+    """Return what came of every repetition of every part; ``run`` maps a function over seeds."""
+    parts = {"warming": warming, "steps": stepped, "quiet": quiet, "pools": pooled, "due": due}
+    return {name: run(part, counts[name]) for name, part in parts.items()}
+
+
+def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
+    """Return the study's page."""
+    lines = pages.head("Drift, load and pools", "drift", run)
     lines += paragraph(
         f"""Simulated rapids of 0.4 m at 0.5 m/s with {100 * NOISE:g} % noise, of drives whose parameters are each
         drawn up to 15 % off the bench's. Every window goes the daemon's way: found, identified, validated,
         tracked."""
     )
-    lines += _warming(np.array(run(warming, counts["warming"])))
-    lines += _steps(run(stepped, counts["steps"]), run(quiet, counts["quiet"]))
-    lines += _pools(100 * np.array(run(pooled, counts["pools"])))
-    lines += _due(run(due, counts["due"]))
-    return "\n".join(lines).rstrip() + "\n"
+    lines += _warming(np.array(figures["warming"], dtype=np.float64))
+    lines += _steps(figures["steps"], figures["quiet"])
+    lines += _pools(100 * np.array(figures["pools"], dtype=np.float64))
+    lines += _due(figures["due"])
+    return "\n".join(lines)
 
 
 def _warming(found: Array) -> list[str]:
@@ -194,7 +199,8 @@ def _warming(found: Array) -> list[str]:
     return [*lines, *grid(head, rows), ""]
 
 
-def _steps(found: list[tuple[tuple[str, ...], int, bool]], silent: list[tuple[int, Counter[str], int]]) -> list[str]:
+def _steps(found: Sequence[Any], silent: Sequence[Any]) -> list[str]:
+    """``found``: (codes, rapids, alone) of each step; ``silent``: (windows, notices, steps) of each quiet history."""
     runs = len(found)
     first = Counter(", ".join(codes) or "nothing" for codes, _, _ in found)
     later = Counter(published for _, published, _ in found)
@@ -236,34 +242,35 @@ def _pools(errors: Array) -> list[str]:
     return [*lines, *paragraph(told_), *grid(head, rows), ""]
 
 
-def _due(found: list[tuple[bool, bool, float]]) -> list[str]:
+def _due(found: Sequence[Any]) -> list[str]:
     dated = [(held, error) for told_, held, error in found if told_]
-    errors = np.abs([error for _, error in dated])
     lines = ["## The date of a maintenance limit", ""]
-    return lines + paragraph(
-        f"""Cd wears by 0.5 % a day; after 30 daily rapids, 70 days ahead of the limit, a date is told in {len(dated)}
-        of {len(found)} histories, {np.median(errors):.1f} days off in the median; the 95 % interval holds the true
-        day in {100 * np.mean([held for held, _ in dated]):.0f} %."""
-    )
+    told_ = f"""Cd wears by 0.5 % a day; after 30 daily rapids, 70 days ahead of the limit, a date is told in
+        {len(dated)} of {len(found)} histories"""
+    if dated:
+        told_ += f""", {np.median(np.abs([error for _, error in dated])):.1f} days off in the median; the 95 % interval
+        holds the true day in {100 * np.mean([held for held, _ in dated]):.0f} %"""
+    return lines + paragraph(told_ + ".")
 
 
 def main() -> None:
-    """Run the study and write its page."""
+    """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__)
     counts = {"warming": 50, "steps": 100, "quiet": 100, "pools": 200, "due": 60}
     for name, count in counts.items():
         parser.add_argument(f"--{name}", type=int, default=count)
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=Path("docs/studies/drift.md"))
-    options = parser.parse_args()
-    with ProcessPoolExecutor(options.processes) as executor:
-        text = page(
-            lambda work, count: list(executor.map(work, range(count), chunksize=2)),
-            {name: getattr(options, name) for name in counts},
-        )
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(text)
-    print(text)
+
+    def measured(options: argparse.Namespace) -> dict[str, list[Any]]:
+        with ProcessPoolExecutor(options.processes) as executor:
+            return measure(
+                lambda work, count: list(executor.map(work, range(count), chunksize=2)),
+                {name: getattr(options, name) for name in counts},
+            )
+
+    def seeds(options: argparse.Namespace) -> str:
+        return "; ".join(f"{name} 0 to {getattr(options, name) - 1}" for name in counts)
+
+    pages.conduct("drift", parser, seeds, measured)
 
 
 if __name__ == "__main__":

@@ -7,27 +7,34 @@ rows allows. It goes to ``docs/studies/estimators.md`` with a plot beside it.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.signal import lfilter
 
 from fdhil import tables
 from fdhil.config import Identification
+from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.estimators.maximum_likelihood import jacobian, pose, typical
 from fdhil.identification.motion import Noise, prepare
 from fdhil.identification.windows import find_windows
 from fdhil.records import PARAMETERS, Estimate, Recording, Window
 from fdhil.store.recording_csv import parse_recording
-from studies import bench
+from studies import bench, pages
 
 Array = npt.NDArray[np.float64]
 Method = Callable[[list[Window]], Estimate]
 TRUTH = np.array([bench.Plant().truth()[name] for name in PARAMETERS])
 SIZES = np.array([60.0, 50.0, 150.0])
+NOISES = (0.005, 0.001)
+LASTING_ROWS = (1.0, 2.0, 5.0, 10.0, 20.0)
+QUIET = 1e-5
+PERIODS_S = (1e-3, 0.5e-3)
 
 
 def clean() -> Recording:
@@ -58,6 +65,38 @@ def bound(recording: Recording, noise: float) -> Array:
     return deviations
 
 
+def lasting(recording: Recording, rows: float, seed: int) -> list[Window]:
+    """Return the rapids with 0.5 % noise whose correlation falls to 1/e within ``rows``."""
+    pole = np.exp(-1 / rows)
+    white = np.random.default_rng(seed).standard_normal((3, 200 + recording.speed_rad_s.size))
+    scatter = NOISES[0] * SIZES[:, None] * np.sqrt(1 - pole**2) * lfilter([1.0], [1.0, -pole], white, axis=1)[:, 200:]
+    return find_windows(
+        replace(
+            recording,
+            voltage_v=recording.voltage_v + scatter[0],
+            current_a=recording.current_a + scatter[1],
+            speed_rad_s=recording.speed_rad_s + scatter[2],
+        )
+    )
+
+
+def coverage(recording: Recording, rows: float, runs: int) -> Array:
+    """Return the share (6,) of the likelihood's 95 % intervals that hold the truth where noise lasts ``rows``."""
+    inside = []
+    for seed in range(runs):
+        estimate = maximum_likelihood.estimate(lasting(recording, rows, seed), Identification())
+        inside.append(np.abs(estimate.values - TRUTH) <= 1.96 * np.sqrt(np.diag(estimate.covariance)))
+    share: Array = np.mean(inside, axis=0)
+    return share
+
+
+def left_over(period_s: float) -> Array:
+    """Return the likelihood's relative errors (6,) where there is hardly any noise."""
+    signals = bench.run(bench.Plant(), bench.shuttle(), dt_s=period_s)
+    windows = noisy(parse_recording(bench.as_csv(signals, 0.0)), QUIET, 0)
+    return maximum_likelihood.estimate(windows, Identification()).values / TRUTH - 1
+
+
 def methods() -> dict[str, Method]:
     """Return the listed estimators by name, each with the product's settings."""
     settings = Identification()
@@ -78,26 +117,82 @@ def monte_carlo(method: Method, recording: Recording, noise: float, runs: int) -
     return told.mean(axis=0), np.sqrt((told**2).mean(axis=0)), np.mean(inside, axis=0)
 
 
-def page(runs: int) -> tuple[str, dict[str, Array]]:
-    """Return the study's page and, for the plot, each method's RMS error over the bound at 0.5 % noise."""
+def measure(runs: int) -> dict[str, Any]:
+    """Return for each noise the bound, and bias, RMS error and share of intervals of each method."""
     recording = clean()
-    lines = ["# Estimators on one rapid of the bench", "", "Written by `python -m studies.estimators`.", ""]
-    drawn: dict[str, Array] = {}
-    for noise in (0.005, 0.001):
-        limit = bound(recording, noise) / TRUTH
-        lines += [f"## {100 * noise:g} % noise, {runs} runs", ""]
+    found = []
+    for noise in NOISES:
+        told = {name: monte_carlo(method, recording, noise, runs) for name, method in methods().items()}
+        rows = {name: dict(zip(("bias", "rms", "share"), figures, strict=True)) for name, figures in told.items()}
+        found.append({"noise": noise, "bound": bound(recording, noise) / TRUTH, "methods": rows})
+    return {
+        "runs": runs,
+        "noises": found,
+        "lasting": [{"rows": rows, "share": coverage(recording, rows, runs)} for rows in LASTING_ROWS],
+        "quiet": [{"period_s": period, "error": left_over(period)} for period in PERIODS_S],
+    }
+
+
+def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
+    """Return the study's page."""
+    lines = pages.head("Estimators on one rapid of the bench", "estimators", run)
+    for part in figures["noises"]:
+        limit = np.array(part["bound"])
+        ratios = {name: _ratios(told, limit) for name, told in part["methods"].items()}
+        lines += [f"## {100 * part['noise']:g} % noise, {figures['runs']} runs", "", *pages.paragraph(_best(ratios))]
         lines += ["RMS error over the bound (bias in % of the truth; share of 95 % intervals that hold the truth)", ""]
-        lines += ["| method | " + " | ".join(PARAMETERS) + " |", "|---" * 7 + "|"]
-        lines.append("| bound, % | " + " | ".join(f"{100 * x:.3f}" for x in limit) + " |")
-        for name, method in methods().items():
-            bias, rms, share = monte_carlo(method, recording, noise, runs)
-            told = zip(rms / limit, bias, share, strict=True)
-            cells = [_cell(*figures) for figures in told]
-            lines.append(f"| {name} | " + " | ".join(cells) + " |")
-            if noise == 0.005:
-                drawn[name] = rms / limit
-        lines.append("")
-    return "\n".join(lines), drawn
+        rows = [["bound, %", *(f"{100 * x:.3f}" for x in limit)]]
+        for name, told in part["methods"].items():
+            told_ = zip(ratios[name], _numbers(told["bias"]), _numbers(told["share"]), strict=True)
+            rows.append([name, *(_cell(*one) for one in told_)])
+        lines += [*pages.grid(["method", *PARAMETERS], rows), ""]
+    lines += ["![RMS error over the bound](estimators.svg)", ""]
+    return "\n".join([*lines, *_lasting(figures["lasting"], figures["runs"]), *_quiet(figures["quiet"])])
+
+
+def _lasting(found: Sequence[Mapping[str, Any]], runs: int) -> list[str]:
+    shares = 100 * np.array([told["share"] for told in found])
+    means = pages.listed([f"{mean:.0f} %" for mean in shares.mean(axis=1)])
+    k, j = np.unravel_index(shares.argmin(), shares.shape)
+    lines = ["## Noise that lasts", ""]
+    lines += pages.paragraph(
+        f"""Maximum likelihood takes noise for white. Where {100 * NOISES[0]:g} % noise lasts (its correlation falls to
+        1/e within so many rows), its 95 % intervals hold the truth in {means} of {runs} runs: the mean of the six, in
+        the order of the table. The worst is {PARAMETERS[j]} at {found[k]["rows"]:g} rows: {shares[k, j]:.0f} %."""
+    )
+    rows = [[f"{told['rows']:g}", *(f"{x:.0f} %" for x in share)] for told, share in zip(found, shares, strict=True)]
+    return [*lines, *pages.grid(["rows", *PARAMETERS], rows), ""]
+
+
+def _quiet(found: Sequence[Mapping[str, Any]]) -> list[str]:
+    lines = ["## What is left without noise", ""]
+    lines += pages.paragraph(
+        f"""The voltage's mean over a sample leaves its course within the sample open. So maximum likelihood is off even
+        at {100 * QUIET:g} % noise, by so many per cent of the truth; its intervals hold that as a doubt."""
+    )
+    rows = [[f"{1e3 * told['period_s']:g}", *(f"{100 * x:+.4f}" for x in told["error"])] for told in found]
+    return [*lines, *pages.grid(["period ms", *PARAMETERS], rows), ""]
+
+
+def _best(ratios: Mapping[str, Array]) -> str:
+    """Say which method has the smallest error, and how near to the bound the best come."""
+    table = np.array(list(ratios.values()))
+    table = np.where(np.isfinite(table), table, np.inf)
+    first = [list(ratios)[k] for k in table.argmin(axis=0)]
+    wins = [f"{name} of {pages.listed([p for p, n in zip(PARAMETERS, first, strict=True) if n == name])}"
+            for name in dict.fromkeys(first)]  # fmt: skip
+    least = table.min(axis=0)
+    reach = f"{least.min():.2f} to {least.max():.2f}"
+    return f"Smallest error: {'; '.join(wins)}. The best of each parameter is {reach} times its bound off."
+
+
+def _ratios(told: Mapping[str, Any], limit: Array) -> Array:
+    ratios: Array = _numbers(told["rms"]) / limit
+    return ratios
+
+
+def _numbers(values: Any) -> Array:
+    return np.array(values, dtype=np.float64)
 
 
 def _cell(ratio: float, bias: float, share: float) -> str:
@@ -106,35 +201,30 @@ def _cell(ratio: float, bias: float, share: float) -> str:
     return f"{ratio:.2f} ({100 * bias:+.2f}; {100 * share:.0f} %)"
 
 
-def plot(drawn: dict[str, Array], path: Path) -> None:
-    """Draw each method's RMS error over the bound."""
-    import matplotlib
+def draw(figures: Mapping[str, Any], path: Path) -> None:
+    """Draw each method's RMS error over the bound at the larger noise."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(figsize=(9, 4.5), layout="constrained")
-    for k, (name, ratio) in enumerate(drawn.items()):
-        axes.plot(range(6), ratio, marker="o", label=name, zorder=2 + k)
+    part = figures["noises"][0]
+    drawing = Figure(figsize=(9, 4.5), layout="constrained")
+    axes = drawing.subplots()
+    for k, (name, told) in enumerate(part["methods"].items()):
+        axes.plot(range(6), _ratios(told, np.array(part["bound"])), marker="o", label=name, zorder=2 + k)
     axes.axhline(1.0, color="black", linewidth=0.8)
     axes.set_yscale("log")
     axes.set_xticks(range(6), PARAMETERS)
     axes.set_ylabel("RMS error / bound")
     axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    figure.savefig(path)
+    with rc_context({"svg.hashsalt": "fdhil"}):
+        drawing.savefig(path, metadata={"Date": None})
 
 
 def main() -> None:
-    """Run the study and write its page and plot."""
+    """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=200)
-    parser.add_argument("--out", type=Path, default=Path("docs/studies"))
-    options = parser.parse_args()
-    text, drawn = page(options.runs)
-    options.out.mkdir(parents=True, exist_ok=True)
-    plot(drawn, options.out / "estimators.svg")
-    (options.out / "estimators.md").write_text(text + "\n![RMS error over the bound](estimators.svg)\n")
-    print(text)
+    pages.conduct("estimators", parser, lambda o: f"0 to {o.runs - 1}", lambda o: measure(o.runs))
 
 
 if __name__ == "__main__":

@@ -6,14 +6,18 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
+
+from scipy.stats import beta
 
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.validation import analyse, pool
 from studies import faults
+from studies.pages import grid, paragraph
 
 GOOD = "good"
+NAMED = 0.9  # kinds that are named rightly less often are told by name
 Made = TypeVar("Made")
 
 
@@ -37,17 +41,22 @@ class Judged:
 
 @dataclass
 class Tally:
-    """What became of the recordings of one kind."""
+    """What became of the recordings of one kind; ``least`` is the smallest severity, ``wrong`` holds seeds."""
 
     count: int = 0
     accepted: int = 0
     right: int = 0
     windows: int = 0
     refused: int = 0
-    severities: list[float] = field(default_factory=list)
+    least: float | None = None
     codes: Counter[str] = field(default_factory=Counter)
     left_open: Counter[str] = field(default_factory=Counter)
     wrong: list[int] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, told: Mapping[str, Any]) -> Tally:
+        """Return what a page's figures tell."""
+        return cls(**{**told, "codes": Counter(told["codes"]), "left_open": Counter(told["left_open"])})
 
 
 def judge(kind: str, seed: int, spoilt: faults.Spoilt) -> Judged:
@@ -91,7 +100,7 @@ def tally(judged: Iterable[Judged], kinds: Mapping[str, faults.Kind]) -> dict[st
         entry.accepted += one.accepted
         entry.windows += one.windows
         entry.refused += one.refused
-        entry.severities.append(one.severity)
+        entry.least = one.severity if entry.least is None else min(entry.least, one.severity)
         entry.codes.update(one.codes)
         entry.left_open.update(one.left_open)
         is_good = one.kind == GOOD
@@ -101,36 +110,52 @@ def tally(judged: Iterable[Judged], kinds: Mapping[str, faults.Kind]) -> dict[st
     return counted
 
 
-def tables(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Kind]) -> str:
-    """Return what became of good recordings, and a table of the bad ones."""
-    fine = counted[GOOD]
-    lines = [
-        f"Good: {fine.windows} windows of {fine.count} recordings, {fine.refused} windows refused "
-        f"({fine.refused / max(1, fine.windows):.2%}), {len(fine.wrong)} recordings without a validated pool. "
-        f"Reasons: {listed(fine.codes) or 'none'}.",
-    ]
+def report(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Kind]) -> list[str]:
+    """Return what became of good recordings and of bad ones, in words and as a table."""
+    fine, bad = counted[GOOD], [counted[name] for name in kinds]
+    recordings, accepted, right = (sum(getattr(e, part) for e in bad) for part in ("count", "accepted", "right"))
+    lines = paragraph(
+        f"""Good: {fine.windows} windows of {fine.count} recordings, {fine.refused} windows refused
+        ({_percent(fine.refused, fine.windows)}; {_at_most(fine.refused, fine.windows)}), {len(fine.wrong)} recordings
+        without a validated pool. Reasons: {listed(fine.codes) or "none"}."""
+    )
     if fine.left_open:
         nulls = ", ".join(f"{count} without {names}" for names, count in fine.left_open.most_common())
-        lines.append(f"{fine.left_open.total()} windows are accepted with a null and its reason: {nulls}.")
-    lines += [
-        "",
-        "| fault | matrix | recordings | smallest severity | accepted | named rightly | reasons given |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    for name, kind in kinds.items():
-        entry = counted[name]
-        if entry.count:
-            least = f"{min(entry.severities):.3g} {kind.unit}" if kind.unit else ""
-            lines.append(
-                f"| {name} | {kind.matrix} | {entry.count} | {least} | {entry.accepted} "
-                f"| {entry.right / entry.count:.0%} | {listed(entry.codes)} |"
-            )
-    bad_ones = [counted[name] for name in kinds]
-    lines.append(
-        f"| all | | {sum(e.count for e in bad_ones)} | | {sum(e.accepted for e in bad_ones)} "
-        f"| {sum(e.right for e in bad_ones) / max(1, sum(e.count for e in bad_ones)):.0%} | |"
+        lines += paragraph(f"{fine.left_open.total()} windows are accepted with a null and its reason: {nulls}.")
+    lines += paragraph(
+        f"""Bad: {recordings} recordings, {accepted} accepted ({_at_most(accepted, recordings)}),
+        {_percent(right, recordings)} named rightly. {_worst(counted, kinds)}"""
     )
-    return "\n".join(lines) + "\n"
+    wrong = [f"{name} {', '.join(map(str, entry.wrong))}" for name, entry in counted.items() if entry.wrong]
+    lines += paragraph(f"Judged wrongly, by seed: {'; '.join(wrong) or 'none'}.")
+    rows = [_row(name, kind, counted[name]) for name, kind in kinds.items() if counted[name].count]
+    columns = ["fault", "matrix", "recordings", "smallest severity", "accepted", "named rightly", "reasons given"]
+    return [*lines, *grid(columns, rows), ""]
+
+
+def _row(name: str, kind: faults.Kind, entry: Tally) -> list[str]:
+    least = f"{entry.least:.3g} {kind.unit}" if kind.unit else ""
+    right = f"{entry.right / entry.count:.0%}"
+    return [name, kind.matrix, str(entry.count), least, str(entry.accepted), right, listed(entry.codes)]
+
+
+def _worst(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Kind]) -> str:
+    """Name the kinds that are named rightly least often."""
+    shares = {name: counted[name].right / counted[name].count for name in kinds if counted[name].count}
+    least = sorted((name for name, share in shares.items() if share < NAMED), key=shares.__getitem__)
+    told = [f"{name} ({shares[name]:.0%})" for name in least]
+    return f"Named rightly in less than {NAMED:.0%}: {', '.join(told) or 'no kind'}."
+
+
+def _percent(part: int, whole: int) -> str:
+    return f"{part / max(1, whole):.2%}"
+
+
+def _at_most(count: int, total: int) -> str:
+    """Tell the share that is not exceeded with 95 % certainty (Clopper and Pearson)."""
+    if count >= total:
+        return "nothing can be told of the share"
+    return f"with 95 % certainty less than {float(beta.ppf(0.95, count + 1, total - count)):.2%}"
 
 
 def listed(codes: Counter[str]) -> str:

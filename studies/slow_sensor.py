@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from pathlib import Path
+from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -20,9 +22,9 @@ from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.windows import find_windows
 from fdhil.records import PARAMETERS, SlowVoltage, VoltageSampling, Window, frozen
 from fdhil.store.recording_csv import parse_recording
-from studies import bench
+from studies import bench, pages
 from studies.drives import Array
-from studies.judging import GOOD, Judged, judge, survey, tables, tally
+from studies.judging import GOOD, Judged, Tally, judge, report, survey, tally
 from studies.slow_recordings import KINDS, PERIODS_S, TO_AND_FRO, recording_of, sampled
 
 SETTINGS = Identification()
@@ -85,29 +87,19 @@ def one_fit(case: Case, seed: int) -> tuple[Array, Array, float]:
     return errors, np.append(np.sqrt(np.diag(estimate.covariance)), late_std), spent
 
 
-def intervals_page(seeds: range, processes: int) -> str:
-    """Return the table of errors and coverage."""
-    lines = [
-        "RMS error in % of the truth (the delay's in us); in brackets the share of 95 % intervals that hold the truth.",
-        "A parameter that is not published in a run is left out of its figures, and counted.",
-        "",
-        "| voltage | sensor | noise | " + " | ".join(PARAMETERS) + " | delay | not published | a fit |",
-        "|---" * 12 + "|",
-    ]
-    for sampling in SAMPLINGS:
-        for period in PERIODS_S:
-            for noise in NOISES:
-                case = Case(sampling, period, noise)
-                made = list(survey(seeds, partial(one_fit, case), processes))
-                errors, stds = np.array([m[0] for m in made]), np.array([m[1] for m in made])
-                share = np.nanmean(np.where(np.isfinite(errors), np.abs(errors) <= 1.96 * stds, np.nan), axis=0)
-                rms = np.sqrt(np.nanmean(errors**2, axis=0)) / np.append(TRUTH / 100, 1e-6)
-                cells = [f"{r:.3g} ({100 * s:.0f} %)" for r, s in zip(rms, share, strict=True)]
-                head = f"| {sampling.replace('_', ' ')}s | {1 / period:g} Hz | {100 * noise:g} % | "
-                tail = f" | {int(np.isnan(errors).sum())} | {1e3 * np.median([m[2] for m in made]):.0f} ms |"
-                lines.append(head + " | ".join(cells) + tail)
-                print(lines[-1], flush=True)
-    return "\n".join(lines)
+def intervals(seeds: range, processes: int) -> list[dict[str, Any]]:
+    """Return for each setting RMS errors (7,), the shares (7,) of 95 % intervals that hold, and a fit's time."""
+    found = []
+    for sampling, period, noise in product(SAMPLINGS, PERIODS_S, NOISES):
+        made = list(survey(seeds, partial(one_fit, Case(sampling, period, noise)), processes))
+        errors, stds = np.array([m[0] for m in made]), np.array([m[1] for m in made])
+        share = np.nanmean(np.where(np.isfinite(errors), np.abs(errors) <= 1.96 * stds, np.nan), axis=0)
+        found.append({
+            "sampling": sampling, "period_s": period, "noise": noise, "share": share,
+            "rms": np.sqrt(np.nanmean(errors**2, axis=0)) / np.append(TRUTH / 100, 1e-6),
+            "not_published": int(np.isnan(errors).sum()), "fit_ms": 1e3 * float(np.median([m[2] for m in made])),
+        })  # fmt: skip
+    return found
 
 
 def good(seed: int, study: int) -> Judged:
@@ -121,69 +113,94 @@ def bad(seed: int, study: int) -> Judged:
     return judge(name, seed, recording_of(seed, study, name))
 
 
-def verdicts_page(seeds_of_good: range, seeds_of_bad: range, study: int, processes: int) -> str:
-    """Return the table of verdicts, and print the recordings that were judged wrongly."""
+def verdicts(seeds_of_good: range, seeds_of_bad: range, study: int, processes: int) -> dict[str, Any]:
+    """Return what became of the recordings, by kind, and print those that were judged wrongly."""
     results = list(survey(seeds_of_good, partial(good, study=study), processes))
     results += survey(seeds_of_bad, partial(bad, study=study), processes)
     for one in results:
         if one.refused if one.kind == GOOD else one.accepted:
             print(f"judged wrongly: {one.kind}, seed {one.seed}, {one.severity:.3g}", *one.texts, flush=True)
-    return tables(tally(results, KINDS), KINDS).rstrip()
+    return {name: vars(entry) for name, entry in tally(results, KINDS).items()}
 
 
-PAGE = """# A voltage sensor slower than the drive
+def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
+    """Return the study's page."""
+    lines = pages.head("A voltage sensor slower than the drive", "slow_sensor", run)
+    lines += pages.paragraph(
+        """The sensor samples on a grid of its own, later or earlier than it says by up to 0.6 of its samples, which the
+        fit finds as a seventh parameter."""
+    )
+    lines += ["## How well the parameters are known", ""]
+    lines += pages.paragraph(
+        f"{figures['runs']} runs a row: one rapid of the bench, rows at 1 kHz. {_told(figures['intervals'])}"
+    )
+    lines += pages.paragraph(
+        """RMS error in % of the truth (the delay's in us); in brackets the share of 95 % intervals that hold the truth.
+        A parameter that is not published in a run is left out of its figures, and counted."""
+    )
+    columns = ["voltage", "sensor", "noise", *PARAMETERS, "delay", "not published", "a fit"]
+    lines += [*pages.grid(columns, [_row(told) for told in figures["intervals"]]), ""]
+    lines += ["## Good windows refused, bad windows accepted", ""]
+    lines += pages.paragraph(
+        """Random drives and rapids as in [the verdicts](verdicts.md), rows 0.25 to 1 ms apart, seeds of their own:
+        every kind of fault that is drawn there, and the slow sensor's own. Every other good recording holds a rapid to
+        and one fro. R and L are told by the voltage's course alone: where so slow a sensor leaves them open, they are
+        null with the reason, and the window is accepted all the same. So the parameter that moves between two rapids is
+        Jt or K; and a current or speed that sticks does so for three samples of the voltage at least, which alone may
+        tell."""
+    )
+    return "\n".join([*lines, *report({k: Tally.of(v) for k, v in figures["verdicts"].items()}, KINDS)])
 
-Written by `python -m studies.slow_sensor`. The sensor samples on a grid of its own, later or earlier than it says by up
-to 0.6 of its samples, which the fit finds as a seventh parameter.
 
-## How well the parameters are known
-
-One rapid of the bench, rows at 1 kHz.
-
-{intervals}
-
-## Good windows refused, bad windows accepted
-
-Random drives and rapids as in [the verdicts](verdicts.md), rows 0.25 to 1 ms apart, seeds of their own: every kind of
-fault that is drawn there, and the slow sensor's own. Every other good recording holds a rapid to and one fro. R and L
-are told by the voltage's course alone: where so slow a sensor leaves them open, they are null with the reason, and the
-window is accepted all the same. So the parameter that moves between two rapids is Jt or K; and a current or speed that
-sticks does so for three samples of the voltage at least, which alone may tell.
-
-{verdicts}
-"""
+def _told(found: Sequence[Mapping[str, Any]]) -> str:
+    """Say how far the parameters are off by each way of sampling, and the least share of intervals that hold them."""
+    words = []
+    for sampling in dict.fromkeys(told["sampling"] for told in found):
+        rms = np.array([told["rms"] for told in found if told["sampling"] == sampling], dtype=np.float64)
+        most = [f"{name} {worst:.2g}" for name, worst in zip(PARAMETERS, rms.max(axis=0), strict=False)]
+        words.append(f"{sampling.replace('_', ' ')}s at most {', '.join(most)} %")
+    shares = [(share, name, told) for told in found for share, name in _shares(told)]
+    share, name, told = min(shares, key=lambda one: one[0])
+    place = f"{told['sampling'].replace('_', ' ')}s at {1 / told['period_s']:g} Hz and {100 * told['noise']:g} % noise"
+    return f"""RMS errors: {"; ".join(words)}. Of all 95 % intervals that of {name} holds the truth least often:
+        {100 * share:.0f} % ({place})."""
 
 
-def parts_of(page: str) -> tuple[str, str]:
-    """Return the two tables of a page that this study wrote; empty where there is none."""
-    begin, rest = PAGE.split("{intervals}")
-    middle, end = rest.split("{verdicts}")
-    if not page.startswith(begin) or page.count(middle) != 1:
-        return "", ""
-    intervals, verdicts = page.removeprefix(begin).split(middle)
-    return intervals, verdicts.removesuffix(end)
+def _shares(told: Mapping[str, Any]) -> list[tuple[float, str]]:
+    named = zip(told["share"], (*PARAMETERS, "the delay"), strict=True)
+    return [(share, name) for share, name in named if share is not None]
+
+
+def _row(told: Mapping[str, Any]) -> list[str]:
+    figures = np.array([told["rms"], told["share"]], dtype=np.float64).T
+    cells = [f"{rms:.3g} ({100 * share:.0f} %)" for rms, share in figures]
+    first = [f"{told['sampling'].replace('_', ' ')}s", f"{1 / told['period_s']:g} Hz", f"{100 * told['noise']:g} %"]
+    return [*first, *cells, str(told["not_published"]), f"{told['fit_ms']:.0f} ms"]
 
 
 def main() -> None:
-    """Run the study, or a part of it, and write its page; the other part of the page stays as it is."""
+    """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--part", choices=("intervals", "verdicts"), help="make one table only")
     parser.add_argument("--runs", type=int, default=100, help="rapids for each row of the first table")
     parser.add_argument("--good", type=int, default=800, help="good recordings of the second table")
     parser.add_argument("--bad", type=int, default=1140, help="bad recordings of the second table")
     parser.add_argument("--first", type=int, default=1000, help="the first seed")
     parser.add_argument("--study", type=int, default=7, help="seed of the drives of the second table")
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=Path("docs/studies/slow_sensor.md"))
-    options = parser.parse_args()
-    runs, good, bad = (range(options.first, options.first + n) for n in (options.runs, options.good, options.bad))
-    intervals, verdicts = parts_of(options.out.read_text()) if options.part and options.out.exists() else ("", "")
-    if options.part != "verdicts":
-        intervals = intervals_page(runs, options.processes)
-    if options.part != "intervals":
-        verdicts = verdicts_page(good, bad, options.study, options.processes)
-        print(verdicts)
-    options.out.write_text(PAGE.format(intervals=intervals, verdicts=verdicts))
+
+    def seeds(options: argparse.Namespace) -> str:
+        last = [options.first + count - 1 for count in (options.runs, options.good, options.bad)]
+        told = [f"{what} {options.first} to {k}" for what, k in zip(("rapids", "good", "bad"), last, strict=True)]
+        return f"study {options.study}; {', '.join(told)}"
+
+    def measured(options: argparse.Namespace) -> dict[str, Any]:
+        runs, good, bad = (range(options.first, options.first + n) for n in (options.runs, options.good, options.bad))
+        return {
+            "runs": options.runs,
+            "intervals": intervals(runs, options.processes),
+            "verdicts": verdicts(good, bad, options.study, options.processes),
+        }
+
+    pages.conduct("slow_sensor", parser, seeds, measured)
 
 
 if __name__ == "__main__":

@@ -7,13 +7,14 @@ gets one fault of random severity. The table goes to ``docs/studies/verdicts.md`
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from studies import faults
-from studies.judging import GOOD, Judged, judge, survey, tables, tally
+from studies import faults, pages
+from studies.judging import GOOD, Judged, Tally, judge, report, survey, tally
 
 
 def good(seed: int, study: int = 1) -> Judged:
@@ -28,37 +29,43 @@ def bad(seed: int, study: int = 1) -> Judged:
     return judge(name, seed, faults.KINDS[name].make(np.random.default_rng([study, 2, seed])))
 
 
-INTRODUCTION = """# Good windows refused, bad windows accepted
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """Return for each study what became of its recordings, by kind."""
+    found: dict[str, Any] = {}
+    for study in options.study:
+        results = list(survey(range(options.good), partial(good, study=study), options.processes))
+        results += survey(range(options.bad), partial(bad, study=study), options.processes)
+        found[str(study)] = {name: vars(entry) for name, entry in tally(results, faults.KINDS).items()}
+    return found
 
-Written by `python -m studies.verdicts`. Every recording is simulated anew: drives from 15 to 250 V and 3 to 150 A,
-windings of 3 to 20 ms, inertia and friction to match, pitch 5 to 40 mm, rapids of 9 to 60 m/min at 1.5 to 8 m/s2 with
-5 to 60 ms smoothing, rows 0.25 to 2 ms apart, voltage as means or instants, noise 0.1 to 0.5 %, sensors in steps of
-0.001 to 0.2 % of their peak, positions in 0.1 to 5 um. Each bad recording has one fault of random severity, whose
-smallest is listed. "Named rightly" means that one of the reasons given is the class of that fault. Seeds of recordings
-that were judged wrongly are printed.
-"""
+
+def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
+    """Return the study's page."""
+    lines = pages.head("Good windows refused, bad windows accepted", "verdicts", run)
+    lines += pages.paragraph(
+        """Every recording is simulated anew: drives from 15 to 250 V and 3 to 150 A, windings of 3 to 20 ms, inertia
+        and friction to match, pitch 5 to 40 mm, rapids of 9 to 60 m/min at 1.5 to 8 m/s2 with 5 to 60 ms smoothing,
+        rows 0.25 to 2 ms apart, voltage as means or instants, noise 0.1 to 0.5 %, sensors in steps of 0.001 to 0.2 % of
+        their peak, positions in 0.1 to 5 um. Each bad recording has one fault of random severity, whose smallest is
+        listed. "Named rightly" means that one of the reasons given is the class of that fault."""
+    )
+    for study, counted in figures.items():
+        lines += [f"## Study {study}", "", *report({k: Tally.of(v) for k, v in counted.items()}, faults.KINDS)]
+    return "\n".join(lines)
+
+
+def _seeds(options: argparse.Namespace) -> str:
+    studies = pages.listed([str(study) for study in options.study])
+    return f"study {studies}, good recordings 0 to {options.good - 1}, bad ones 0 to {options.bad - 1}"
 
 
 def main() -> None:
-    """Run the study and write its page."""
+    """Run the study."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--good", type=int, default=1500, help="recordings; each holds one or two windows")
     parser.add_argument("--bad", type=int, default=3000)
     parser.add_argument("--study", type=int, nargs="+", default=[1], help="seeds of whole studies")
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=Path("docs/studies/verdicts.md"))
-    options = parser.parse_args()
-    parts = [INTRODUCTION]
-    for study in options.study:
-        results = list(survey(range(options.good), partial(good, study=study), options.processes))
-        results += survey(range(options.bad), partial(bad, study=study), options.processes)
-        kinds = tally(results, faults.KINDS)
-        parts.append(f"## Study {study}\n\n{tables(kinds, faults.KINDS)}")
-        print(parts[-1])
-        wrong = {name: entry.wrong for name, entry in kinds.items() if entry.wrong}
-        print("judged wrongly, by seed:", wrong, flush=True)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text("\n".join(parts))
+    pages.conduct("verdicts", parser, _seeds, measure)
 
 
 if __name__ == "__main__":

@@ -69,9 +69,35 @@ def test_limits_that_cannot_be_ramped_down_in_time_are_refused() -> None:
     document["axis"]["X"]["correction"] = {
         "max_offset_um": 250.0,
         "max_speed_mm_s": 2.0,
-        "max_acceleration_mm_s2": 250.0,
+        "max_acceleration_mm_s2": 400.0,
     }
     assert "from the largest offset to zero these limits need" in faults(document)
+
+
+@pytest.mark.parametrize(
+    ("per_turn", "limits", "told"),
+    [
+        (2000, (50.0, 2.0, 2000.0), "2,000 increments per turn are too coarse: max_acceleration_mm_s2 is 0.2"),
+        (2000, (50.0, 2.0, 2000.0), "set the drive to 10,000 or more per turn, or raise max_acceleration_mm_s2"),
+        (15_000, (50.0, 1.0, 2000.0), "max_speed_mm_s is 0.75 of an increment per SYNC cycle (set the drive to 20,000"),
+        (10_000, (50.0, 2.0, 2000.0), ""),
+        (65_536, (50.0, 2.0, 250.0), "set the drive to 80,000 or more per turn"),
+        (100, (50.0, 20.0, 2000.0), "set the drive to 10,000 or more per turn"),
+        (65_536, (50.0, 1e-9, 2000.0), "no resolution would do"),
+    ],
+)
+def test_increments_too_coarse_for_the_limits_are_refused(
+    per_turn: int, limits: tuple[float, float, float], told: str
+) -> None:
+    """With the resolution that would do: rounded up to one increment per SYNC they would be other limits."""
+    document = bench_document("X")
+    names = ("max_offset_um", "max_speed_mm_s", "max_acceleration_mm_s2")
+    document["axis"]["X"]["correction"] = dict(zip(names, limits, strict=True))
+    document["axis"]["X"]["drive"] = {"increments_per_rev": per_turn}
+    if told:
+        assert told in faults(document)
+    else:
+        assert config.OffsetLimits.of(config.parse(document).axis["X"], 0.001).whole[1:3] == (1, 1)
 
 
 def test_two_drives_with_one_node_id_are_refused() -> None:

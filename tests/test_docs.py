@@ -5,13 +5,17 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import tarfile
+import tomllib
 from pathlib import Path
 
 import pytest
+from hatchling.builders.sdist import SdistBuilder
 
-from fdhil import config
+from fdhil import config, tables
 
 ROOT = Path(__file__).parents[1]
+TEMPLATE = ROOT / "configs" / "machine-template.toml"
 PAGES = sorted(path for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 
 
@@ -22,10 +26,67 @@ def test_the_generated_files_are_current() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_the_template_is_a_config_with_every_key() -> None:
-    machine = config.load(ROOT / "configs" / "machine-template.toml")
+def uncommented(text: str, *chosen: str) -> str:
+    """Return the template with the # taken from the chosen settings, and from all of the chosen sections."""
+    lines, section = [], ""
+    for line in text.splitlines():
+        bare = line[1:] if re.match(r"#[A-Za-z\[]", line) else line
+        section = bare if bare.startswith("[") else section
+        lines.append(bare if bare in chosen or section in chosen else line)
+    return "\n".join(lines)
+
+
+def loaded(tmp_path: Path, text: str) -> config.MachineConfig:
+    path = tmp_path / "machine.toml"
+    path.write_text(text, "utf-8")
+    return config.load(path)
+
+
+def test_the_template_as_it_stands_sends_nothing() -> None:
+    machine = config.load(TEMPLATE)
     assert list(machine.axis) == ["X"]
     assert machine.axis["X"].correction is None
+    assert machine.axis["X"].feedforward is None
+    assert machine.axis["X"].temperature is None
+
+
+def test_each_optional_block_of_the_template_may_be_uncommented(tmp_path: Path) -> None:
+    text = TEMPLATE.read_text("utf-8")
+    blocks = re.findall(r"^#(\[.*\])$", text, re.MULTILINE)
+    assert {"[axis.X.correction]", "[axis.X.feedforward]", "[axis.X.temperature]", "[sim]"} <= set(blocks)
+    for block in blocks:
+        assert loaded(tmp_path, uncommented(text, block)).digest, block
+    machine = loaded(tmp_path, uncommented(text, "[axis.X.feedforward]"))
+    assert machine.axis["X"].feedforward == config.FeedforwardLimits()
+
+
+def test_each_section_of_the_template_may_be_uncommented_and_shows_its_defaults(tmp_path: Path) -> None:
+    text = TEMPLATE.read_text("utf-8")
+    sections = re.findall(r"^#?(\[.*\])$", text, re.MULTILINE)
+    everything, as_it_stands = loaded(tmp_path, uncommented(text, *sections)), config.load(TEMPLATE)
+    assert everything.nc == as_it_stands.nc
+    assert everything.guard == as_it_stands.guard
+    for section in sections:
+        assert loaded(tmp_path, uncommented(text, section)).digest, section
+
+
+@pytest.mark.parametrize("model", [config.Thermometer, config.FeedforwardLimits, config.CanBus, config.SimAxis])
+def test_comments_stand_right_above_what_they_explain(model: type[config.Section]) -> None:
+    text = TEMPLATE.read_text("utf-8")
+    header, _, words = (model.__doc__ or "").partition(": ")
+    name = header.replace("NAME", "can0")
+    assert f"\n\n# {words[0].upper()}{words[1:]}\n{name}\n" in text.replace(f"#{name}", name)
+    block = text.split(f"{name}\n")[1].split("\n\n")[0]
+    keys = [f"# {field.description}\n#{key} = " for key, field in model.model_fields.items()]
+    assert [key for key in keys if key not in block] == []
+
+
+def test_every_error_of_the_reference_is_told_to_the_end_of_its_sentence() -> None:
+    rows = re.findall(
+        r"^\| `\w+` \| \d \| (.*) \|$", (ROOT / "docs/reference/errors.md").read_text("utf-8"), re.MULTILINE
+    )
+    assert len(rows) > 10
+    assert [row for row in rows if not row.endswith(".")] == []
 
 
 @pytest.mark.parametrize("path", sorted(ROOT.glob("configs/*.toml")), ids=lambda path: path.name)
@@ -37,3 +98,45 @@ def test_every_shipped_config_is_valid(path: Path) -> None:
 def test_every_link_between_documents_leads_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text("utf-8")):
         assert (page.parent / target).exists(), f"{page}: {target}"
+
+
+@pytest.mark.parametrize("table", [name for name in vars(tables) if name.isupper()])
+def test_being_listed_is_being_tested(table: str) -> None:
+    """Each table has a suite that runs over all its entries; a new entry is in it by being listed."""
+    runs_over_all = re.compile(rf"(parametrize\(.*|params=list\(|for name in )tables\.{table}\b")
+    assert any(runs_over_all.search(path.read_text("utf-8")) for path in (ROOT / "tests").glob("**/test_*.py"))
+
+
+def test_the_papers_that_a_stranger_looks_for_are_there() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+    shipped = project["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
+    assert [name for name in shipped if not (ROOT / name[1:]).exists()] == []
+    assert project["project"]["license-files"] == ["LICENSE"]
+    assert "MIT License" in (ROOT / "LICENSE").read_text("utf-8")
+    citation = (ROOT / "CITATION.cff").read_text("utf-8")
+    assert f"\nversion: {project['project']['version']}\n" in citation
+    assert "\ncff-version: 1.2.0\n" in f"\n{citation}"
+
+
+def test_the_index_of_decisions_lists_every_page_once_in_order() -> None:
+    folder = ROOT / "docs" / "decisions"
+    listed = re.findall(r"^(\d+)\. \[(.*)\]\((.*)\)$", (folder / "README.md").read_text("utf-8"), re.MULTILINE)
+    assert [target for _, _, target in listed] == sorted(path.name for path in folder.glob("0*.md"))
+    for number, title, target in listed:
+        assert target.startswith(f"{int(number):04}-")
+        assert (folder / target).read_text("utf-8").startswith(f"# {number}. {title}")
+
+
+def test_the_source_archive_holds_what_is_needed_and_nothing_else(tmp_path: Path) -> None:
+    archive = next(iter(SdistBuilder(str(ROOT)).build(directory=str(tmp_path))))
+    with tarfile.open(archive) as opened:
+        names = {name.partition("/")[2] for name in opened.getnames()}
+    needed = {"LICENSE", "CITATION.cff", "SECURITY.md", "README.md", "CHANGELOG.md", "Makefile", "requirements.lock"}
+    needed |= {
+        "systemd/fdhil-guard.service",
+        "configs/machine-template.toml",
+        "docs/studies/drift.json",
+        "tests/bench.py",
+    }
+    assert needed <= names
+    assert [name for name in names if re.search(r"__pycache__|\.venv|fdhil-data|\.parquet$|^out/|^\.git/", name)] == []

@@ -11,7 +11,7 @@ from fdhil.config import Identification
 from fdhil.records import frozen
 from fdhil.store.recording_csv import parse_recording
 from studies import bench, comparison, drift, estimators, faults, judging
-from studies.comparison_page import paragraph
+from studies.pages import paragraph
 
 SHUTTLE = parse_recording(bench.as_csv(bench.run(bench.Plant(), bench.shuttle(moves=2)), 0.001, 1))
 
@@ -65,9 +65,11 @@ def test_what_is_accepted_or_named_wrongly_is_counted_for_good_and_bad_alike() -
     counted = judging.tally(made, kinds)
     assert counted[judging.GOOD].wrong == [2]
     assert counted["stuck"].wrong == [4]
-    told = judging.tables(counted, kinds)
-    assert "Good: 3 windows of 2 recordings, 1 windows refused (33.33%), 1 recordings without" in told
+    told = " ".join("\n".join(judging.report(counted, kinds)).split())
+    assert "Good: 3 windows of 2 recordings, 1 windows refused (33.33%" in told
     assert "1 windows are accepted with a null and its reason: 1 without L." in told
+    assert "Bad: 2 recordings, 1 accepted" in told
+    assert "Judged wrongly, by seed: good 2; stuck 4." in told
     assert "| stuck | B11 | 2 | 0.01 s | 1 | 50% | 1 StuckValue |" in told
 
 

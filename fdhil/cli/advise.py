@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fdhil.cli.options import Positive
+from fdhil.cli.compiling import forewarn
+from fdhil.cli.options import OutputFile, Positive
 from fdhil.cli.prediction import FILE, inputs
 
 if TYPE_CHECKING:
@@ -21,11 +22,6 @@ if TYPE_CHECKING:
     from fdhil.prediction.advise import Advice, Held
     from fdhil.prediction.feeds import Source
     from fdhil.records import Float, Parameters, Trajectory
-
-BRACKETED = (
-    "the averages of [nc] smoothing_s did not make this demand: the lower feed holds where the NC keeps its smoothing,"
-    " the higher one if its accelerations fell with the square of the feed"
-)
 
 
 @click.command()
@@ -39,6 +35,7 @@ BRACKETED = (
     required=True,
     help="Largest contour error allowed.",
 )
+@click.option("--out", type=OutputFile(), help="Write PROGRAM with these feeds, those without the correction.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
 def advise(
     program: Path,
@@ -46,20 +43,26 @@ def advise(
     model_path: Path | None,
     from_history: bool,
     tolerance_um: float,
+    out: Path | None,
     as_json: bool,
 ) -> int:
     """Tell the highest feed within a tolerance for each line of a PROGRAM (NC program), or zone of a demand CSV.
 
-    Only what leaves the tolerance as programmed is listed: where and why, and the highest feed without and with the
-    inverse correction. All these feeds together were predicted to keep the tolerance.
+    Only what leaves the tolerance as programmed is listed, lines that follow each other in one range: F as programmed
+    and as it may be (mm/min), the worst place and why, and the highest feed there with the inverse correction. All
+    these feeds together were predicted to keep the tolerance. --json lists every line; --out writes the program with
+    its F words replaced and everything else kept.
 
     Exit codes: 0 every line can be held by some feed, 1 some line cannot, 2 wrong option, model or configuration, 3 a
-    file cannot be read.
+    file cannot be read or written.
     """
+    if out is not None:
+        _check_out(program, out)
     reference, models, config = inputs(program, config_path, model_path, from_history)
     from fdhil.prediction import advise as advising
 
     corrects = all(config.axis[axis].correction is not None for axis in reference.axes)
+    forewarn("predict", *(["correct"] if corrects else []))
     sure, hopeful = _sources(program, reference, models, config, tolerance_um)
     sure, hopeful = _telling(sure), hopeful and _telling(hopeful)
     judge = (lambda slower: _corrected(slower, models, config)) if corrects else None
@@ -69,13 +72,38 @@ def advise(
         most = {a.start_s: a for a in advising.advise(hopeful, models, config, tolerance_um, judge)}
     if sys.stderr.isatty():
         click.echo(err=True)
+    if not as_json:
+        from fdhil.cli.advise_view import show
+
+        show(advice, most, tolerance_um, corrects, lambda line: sure.feed_mm_min(line) > 0.0)
+    if out is not None:
+        _write(program, advice, config, out)
     if as_json:
         document = {"schema": "fdhil-advise-1", "program": str(program), "tolerance_um": tolerance_um}
         lines = [_entry(a, most) for a in advice]
-        click.echo(json.dumps(document | {"lines": lines}, allow_nan=False))
-    else:
-        _show(advice, most, tolerance_um, corrects)
+        written = None if out is None else str(out)
+        click.echo(json.dumps(document | {"lines": lines, "written": written}, allow_nan=False))
+    elif out is not None:
+        click.echo(f"written to {out}", err=True)
     return 1 if any(a.plain.share is None and (a.corrected is None or a.corrected.share is None) for a in advice) else 0
+
+
+def _check_out(program: Path, out: Path) -> None:
+    if program.suffix.lower() == ".csv":
+        raise click.UsageError("--out writes an NC program, and a demand has no F words; give the program")
+    if out.exists() and program.exists() and out.samefile(program):
+        raise click.UsageError("--out is the program itself; choose another name")
+
+
+def _write(program: Path, advice: Sequence[Advice], config: MachineConfig, out: Path) -> None:
+    """Write the program with the feeds that were found to hold together."""
+    from fdhil.program import Budget
+    from fdhil.program.feed_words import with_feeds
+    from fdhil.store.output import open_output
+
+    content = with_feeds(program, {a.line: a.plain.run for a in advice}, Budget.of(config.nc))
+    with open_output(out) as file:
+        file.write(content)
 
 
 def _sources(
@@ -166,42 +194,3 @@ def _held(name: str, held: Held | None, feed_mm_min: float) -> dict[str, float |
 
 def _feed(held: Held | None, feed_mm_min: float) -> float | None:
     return None if held is None or held.share is None else held.share * feed_mm_min
-
-
-def _show(advice: Sequence[Advice], most: Mapping[float, Advice] | None, tolerance_um: float, corrects: bool) -> None:
-    if not advice:
-        click.echo(f"the whole path stays within {tolerance_um:g} um as programmed")
-    for a in advice:
-        name = f"line {a.line}" if a.line else f"{a.start_s:.2f} s .. {a.end_s:.2f} s"
-        click.echo(
-            f"{name}: {a.error_um:.1f} um at {a.where} ({a.cause}, most of it axis {a.axis})"
-            f" at {a.feed_mm_min:.0f} mm/min"
-        )
-        axis, what, share = a.load
-        if share > 1.0:
-            click.echo(f"  the drive of axis {axis} is asked for {share * 100:.0f} % of its {what} limit")
-        other = (most or {}).get(a.start_s, a)
-        click.echo(f"  without correction: {_told(a.plain, other.plain, a.feed_mm_min)}")
-        if a.corrected:
-            click.echo(f"  with the correction: {_told(a.corrected, other.corrected, a.feed_mm_min)}")
-    if most:
-        click.echo(BRACKETED)
-    if advice and not corrects:
-        click.echo("the correction was not tried: an axis has no section [axis.X.correction]")
-
-
-def _told(held: Held, most: Held | None, feed_mm_min: float) -> str:
-    feed = _feed(held, feed_mm_min)
-    if feed is None:
-        left = f": {held.left_um:.1f} um are left there" if math.isfinite(held.left_um) else ""
-        with_it = f"; the others hold with it at {_rounded(held.run * feed_mm_min)}" if held.run > held.tried else ""
-        return f"no feed down to {_rounded(held.tried * feed_mm_min)} mm/min holds it{left}{with_it}"
-    reach = _feed(most, feed_mm_min)
-    more = f", perhaps {_rounded(reach)}" if reach and reach > 1.02 * feed else ""
-    return f"at most {_rounded(feed)} mm/min{more}"
-
-
-def _rounded(feed_mm_min: float) -> str:
-    """A feed cut to three digits: rounded up it would not be held."""
-    unit = 10.0 ** (math.floor(math.log10(feed_mm_min)) - 2) if feed_mm_min > 0.0 else 1.0
-    return f"{math.floor(feed_mm_min / unit * (1 + 1e-9)) * unit:g}"

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+from fdhil.cli.compiling import forewarn
+from fdhil.cli.failing import error_document
 from fdhil.config import Identification
+from fdhil.errors import FdhilError
 from fdhil.identification.windows import find_windows
-from fdhil.records import Estimate, Verdict, Window, WindowOutcome
+from fdhil.records import Estimate, Reason, Verdict, Window, WindowOutcome
 from fdhil.store.recording_csv import read_recording
 from fdhil.validation import analyse, pool
 
@@ -27,13 +31,14 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, slots=True)
 class FileResult:
-    """One recording: its windows analysed, and their pool."""
+    """One recording: its windows analysed, and their pool; one that cannot be read has an ``error`` and no axis."""
 
     file: str
-    axis: str
+    axis: str | None
     outcomes: tuple[WindowOutcome, ...]
     pooled: Estimate | None
     verdict: Verdict
+    error: Mapping[str, Any] | None = None
 
 
 def unseen(share: float) -> None:
@@ -46,7 +51,7 @@ def analyse_files(
     rapid_speeds_rad_s: dict[str, float],
     progress: Progress = unseen,
 ) -> Iterator[FileResult]:
-    """Yield the result of each recording in order; RecordingError at the first that cannot be read.
+    """Yield the result of each recording in order, also of those that cannot be read.
 
     ``rapid_speeds_rad_s`` maps an axis to the machine's rapid speed, for recordings that do not say theirs.
     ``progress`` is told the share of a file that each step was: a window of it, or the whole.
@@ -55,6 +60,7 @@ def analyse_files(
         for path in paths:
             yield analyse_file(path, settings, rapid_speeds_rad_s, progress)
         return
+    forewarn("identify")
     work = partial(analyse_file, settings=settings, rapid_speeds_rad_s=rapid_speeds_rad_s)
     with _processes() as executor:
         for result in executor.map(work, paths, chunksize=CHUNK):
@@ -65,8 +71,15 @@ def analyse_files(
 def analyse_file(
     path: Path, settings: Identification, rapid_speeds_rad_s: dict[str, float], progress: Progress = unseen
 ) -> FileResult:
-    """Return the windows of one recording analysed, and their pool; RecordingError as :func:`read_recording`."""
-    recording = read_recording(path)
+    """Return the windows of one recording analysed, and their pool, or why it cannot be read."""
+    try:
+        recording = read_recording(path)
+    except FdhilError as error:
+        progress(1.0)
+        reason = Reason(type(error).__name__, str(error))
+        return FileResult(str(path), None, (), None, Verdict(False, None, (reason,)), error_document(error))
+    if multiprocessing.parent_process() is None:
+        forewarn("identify")
     outcomes = []
     windows = find_windows(recording, rapid_speeds_rad_s.get(recording.axis))
     for outcome in _outcomes(windows, settings):

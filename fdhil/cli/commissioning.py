@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import config as machine_config
-from fdhil.errors import ConfigError, ConfigFault, DriveFault
+from fdhil.errors import ConfigError, ConfigFault, DeviceError, DriveFault
+from fdhil.guard.control import SOCKET_NAME
 
 if TYPE_CHECKING:
     from fdhil.config import MachineConfig
@@ -50,7 +51,7 @@ FEEDFORWARD: Mapping[bool | None, str] = {
 
 @click.command()
 @CONFIG
-@click.option("--eds", "places", multiple=True, type=click.Path(exists=True, path_type=Path),
+@click.option("--eds", "places", multiple=True, type=click.Path(path_type=Path),
               help="EDS or DCF file, or a folder of them; left out: the folder of CONFIG.")  # fmt: skip
 @AS_JSON
 def scan(config: Path, places: tuple[Path, ...], as_json: bool) -> None:
@@ -139,12 +140,50 @@ def check(config: Path, as_json: bool) -> int:
     from fdhil.drivers.config_check import check_machine
 
     found = check_machine(machine, _progress)
+    _tell_compared(machine, found)
     differ = sum(finding.ok is False for _, finding in found)
     if as_json:
         click.echo(json.dumps(_check_document(found)))
     else:
         _show_check(found)
     return int(differ > 0)
+
+
+def _tell_compared(machine: MachineConfig, found: Sequence[Place]) -> None:
+    """Drives that are as they were commissioned have their records hold again, others void; a running guard is told."""
+    from fdhil.drivers import commissioning_compare, commissioning_void
+
+    directory, seen = machine.store.directory, {}
+    for place, finding in found:
+        if finding.point == commissioning_compare.POINT:
+            axis = place.removeprefix("axis ")
+            seen[axis] = finding.found if finding.ok else ""
+            if not finding.ok:
+                commissioning_void.void_record(directory, axis, finding.cause)
+    refused = _guard_told(machine, seen)
+    for axis, digest in seen.items():
+        if digest and axis not in refused:
+            commissioning_void.confirm_record(directory, axis)
+
+
+def _guard_told(machine: MachineConfig, seen: Mapping[str, str]) -> set[str]:
+    """Tell the guard, where one runs, which drives were compared; return the axes whose records stay void there."""
+    from fdhil.cli.guard import operator_token
+    from fdhil.guard.client import GuardClient
+
+    run_directory = machine.store.run_directory or machine.store.directory / "run"
+    if not seen or not (run_directory / SOCKET_NAME).exists():
+        return set()
+    try:
+        with GuardClient(run_directory) as guard:
+            answer = guard.compared(operator_token(run_directory), seen)
+    except DeviceError as error:
+        click.echo(f"the guard was not told: {error}", err=True)
+        return set()
+    told = [each for each in answer.get("refused", []) if seen.get(each["axis"]) != ""]
+    for each in told:
+        click.echo(f"{each['code']}: {each['text']}; stop fdhil-guard and start it again", err=True)
+    return {each["axis"] for each in told}
 
 
 def _check_document(found: Sequence[Place]) -> dict[str, Any]:
@@ -236,7 +275,7 @@ def _stopped_like_ctrl_c() -> Iterator[None]:
 
 def _commission_axis(machine: MachineConfig, axis: str, yes: bool, quiet: bool) -> dict[str, Any]:
     """Run all steps for one axis and save its record; DriveFault when it is refused."""
-    from fdhil.cli.guard import lock_bus
+    from fdhil.cli.bus_lock import lock_bus
     from fdhil.drivers import commissioning
 
     with lock_bus(machine.bus[machine.axis[axis].drive.bus]):  # the guard reads the record when it starts

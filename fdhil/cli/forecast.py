@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fdhil.records import INTERVAL_95
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -158,8 +160,9 @@ def show_compared(found: Mapping[str, Any] | None) -> None:
     click.echo(f"{since}: {rms['before']:.1f} -> {rms['now']:.1f} um RMS")
     for zone in sorted(beyond, key=lambda z: -abs(z["change_um"]))[:MANY_CHANGES]:
         line = f"line {zone['line']}, " if zone["line"] else ""
+        half_um = INTERVAL_95 * zone["std_um"]
         click.echo(
-            f"  {zone['change_um']:+.1f} +- {2 * zone['std_um']:.1f} um at {line}{zone['where']} ({zone['cause']},"
+            f"  {zone['change_um']:+.1f} ± {half_um:.1f} um at {line}{zone['where']} ({zone['cause']},"
             f" {zone['before_um']:.1f} -> {zone['now_um']:.1f}){_because(zone)}"
         )
     if len(beyond) > MANY_CHANGES:
@@ -245,23 +248,31 @@ def crossings(
     models: Mapping[str, Parameters],
     tolerance_um: float,
 ) -> list[dict[str, Any]]:
-    """Return per zone when it leaves the tolerance as JSON has it: ``state`` is over, foreseen or not_foreseen."""
+    """Return per zone when it leaves the tolerance as JSON has it: ``state`` is over, foreseen, not_foreseen within
+    ``within_days``, or not_enough_history, of which there are ``span_days``.
+    """
+    from fdhil.identification.trends import reach_days
     from fdhil.prediction import forecast
 
     newest = max((found[-1].stamp.wall_s for found in past.revisions.values() if found), default=0.0)
-    slopes = {
-        axis: forecast.slopes_per_day([r.set for r in past.revisions[axis]], _days(past.revisions[axis], newest))
+    courses = {
+        axis: forecast.course([r.set for r in past.revisions[axis]], _days(past.revisions[axis], newest))
         for axis in predicted.reference.axes
         if past.revisions.get(axis)
     }
+    span_days = forecast.span_days(courses)
+    within_days = min(reach_days(span_days), FAR_DAYS)
     told: list[dict[str, Any]] = []
     for zone, per_axis in zip(predicted.zones, um_per_percent, strict=True):
         if zone.max_um > tolerance_um:
             told.append({"state": "over"})
             continue
-        found = forecast.crossing(zone, per_axis, models, slopes, tolerance_um)
-        if found is None or found.days > FAR_DAYS:
-            told.append({"state": "not_foreseen"})
+        if not within_days:
+            told.append({"state": "not_enough_history", "span_days": span_days})
+            continue
+        found = forecast.crossing(zone, per_axis, models, courses, tolerance_um)
+        if found is None or found.days > within_days:
+            told.append({"state": "not_foreseen", "within_days": within_days})
             continue
         told.append(
             {
@@ -295,8 +306,13 @@ def crossing_text(entry: Mapping[str, Any], tolerance_um: float) -> str:
     """Return the sentence for one zone."""
     if entry["state"] == "over":
         return f"is over {tolerance_um:g} um"
+    if entry["state"] == "not_enough_history":
+        return (
+            f"when it leaves {tolerance_um:g} um cannot be told, not enough history: {_span(entry['span_days'])},"
+            " a forecast wants a day or more"
+        )
     if entry["state"] == "not_foreseen":
-        return f"is not foreseen to leave {tolerance_um:g} um"
+        return f"is not foreseen to leave {tolerance_um:g} um within {_span(entry['within_days'])}"
     latest = entry["latest"] or "later"
     if entry["date"] < datetime.datetime.now(datetime.UTC).date().isoformat():
         return (
@@ -307,3 +323,10 @@ def crossing_text(entry: Mapping[str, Any], tolerance_um: float) -> str:
         f"leaves {tolerance_um:g} um about {entry['date']} ({entry['earliest']} to {latest}),"
         f" driven by {entry['parameter']} of axis {entry['axis']}"
     )
+
+
+def _span(days: float) -> str:
+    """Return a time as people say it."""
+    if days >= 2.0:
+        return f"{days:.0f} days"
+    return f"{days * 24:.0f} h" if days >= 1 / 12 else f"{days * 1440:.0f} min"

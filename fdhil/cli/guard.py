@@ -3,31 +3,33 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import os
+import pwd
 import socket
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from fdhil import config as machine_config
 from fdhil.cia402 import PdoEntry
+from fdhil.cli.bus_lock import lock_bus
 from fdhil.cli.main import run_safely
-from fdhil.config import Axis, CanBus, MachineConfig
+from fdhil.config import Axis, CanBus, MachineConfig, OffsetLimits
 from fdhil.errors import ConfigError, ConfigFault, ConnectError, DeviceError, ProtocolError, StoreError
 from fdhil.guard.feedforward import Limits as FeedforwardLimits
 from fdhil.guard.limits import Limits
-from fdhil.guard.settings import AxisSettings, Feedforward, Layout, Pdo, Settings, to_json
+from fdhil.guard.settings import AxisSettings, Feedforward, Layout, Pdo, Settings, from_json, to_json
 
 if TYPE_CHECKING:
     from fdhil.drivers.commissioning_record import CommissioningRecord
     from fdhil.drivers.profile import DriveProfile, PdoSpec
 
 SETTINGS_NAME = "guard.json"
-VARIATION_MM = 3.0
 CONNECT_S = 5.0
 SPEED_STEPS = 2.0  # times the motor's power: room for the load's own inertia and for the sensor's noise
 HEARTBEATS_AWAITED = 2.0  # periods of the drive's heartbeat until it counts as lost
@@ -45,20 +47,36 @@ def guard(config: Path, check: bool) -> None:
     """
     machine = machine_config.load(config)
     name = corrected_bus(machine, str(config))
-    run_directory = machine.store.run_directory or machine.store.directory / "run"
-    token = operator_token(run_directory)
-    settings = settings_of(machine, name, run_directory, hashlib.sha256(token.encode()).hexdigest())
-    file = run_directory / SETTINGS_NAME
-    _write(file, to_json(settings))
+    daemons = machine.store.run_directory or machine.store.directory / "run"
+    token, run_directory = operator_token(daemons), machine.guard.run_directory or daemons
+    _make(run_directory)
+    text = to_json(settings_of(machine, name, run_directory, hashlib.sha256(token.encode()).hexdigest()))
+    from_json(text, str(config))  # what the guard would refuse is refused before it is started
+    file, bus = run_directory / SETTINGS_NAME, machine.bus[name]
     if check:
-        click.echo(f"{file}: {len(settings.axes)} axes on {name}")
+        _write(file, text)
+        click.echo(f"{file}: what the guard would be told of {name}")
         return
-    with lock_bus(machine.bus[name]) as lock, open_bus(name, machine.bus[name]) as transmit:
-        lock.set_inheritable(True)
+    with connect_bus(name, bus) as transmit, lock_bus(bus, transmit, run_directory) as lock:
+        _compare_again(machine, name)
+        text = to_json(settings_of(machine, name, run_directory, hashlib.sha256(token.encode()).hexdigest()))
+        _write(file, text)
+        greet(name, bus, transmit)
+        os.set_inheritable(lock.fileno(), True)
         transmit.set_inheritable(True)
         arguments = ["-m", "fdhil.guard", "--settings", str(file), "--descriptor", str(transmit.fileno())]
         sys.stdout.flush()
         os.execv(sys.executable, [sys.executable, *arguments])
+
+
+def _compare_again(machine: MachineConfig, bus: str) -> None:
+    """Where no NC runs the bus, ask the commissioned drives whether they still are what was signed off."""
+    from fdhil.drivers.commissioning_compare import compare_again  # late, as below
+
+    def tell(text: str) -> None:
+        click.echo(json.dumps({"event": "record_void", "text": text}))
+
+    compare_again(machine, bus, tell)
 
 
 def corrected_bus(machine: MachineConfig, source: str) -> str:
@@ -88,22 +106,23 @@ def settings_of(machine: MachineConfig, bus: str, run_directory: Path, token_sha
         token_sha256=token_sha256,
         run_directory=str(run_directory),
         axes=tuple(axes),
+        daemon_uid=_user_id(machine.guard.daemon_user),
     )
+
+
+def _user_id(name: str | None) -> int | None:
+    if name is None:
+        return None
+    try:
+        return pwd.getpwnam(name).pw_uid
+    except KeyError:
+        fault = ConfigFault("guard.daemon_user", f"there is no user {name!r}", "the user of fdhil.service")
+        raise ConfigError("config", [fault]) from None
 
 
 def limits_of(axis: Axis, sync_period_s: float) -> Limits:
-    """Return the config's limits in whole increments per SYNC cycle, rounded down, rate and acceleration at least 1."""
-    assert axis.correction is not None
-    per_mm = axis.scaling.increments_per_mm
-    rate = axis.correction.max_speed_mm_s * per_mm * sync_period_s
-    acceleration = axis.correction.max_acceleration_mm_s2 * per_mm * sync_period_s**2
-    return Limits(
-        offset=max(1, math.floor(axis.correction.max_offset_um * 1e-3 * per_mm + 1e-9)),
-        rate=max(1, math.floor(rate + 1e-9)),
-        acceleration=max(1, math.floor(acceleration + 1e-9)),
-        variation=max(1, math.floor(VARIATION_MM * per_mm)),
-        window=max(10, round(1.0 / sync_period_s)),
-    )
+    """Return the config's limits in whole increments per SYNC cycle, as the planner has them, rounded down."""
+    return Limits(*OffsetLimits.of(axis, sync_period_s).whole)
 
 
 def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
@@ -126,6 +145,8 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
         offset=_pdo(offset, node_id),
         tpdos=tuple(_pdo(spec, node_id) for spec in profile.tpdos if spec.valid),
         increments_per_mm=axis.scaling.increments_per_mm,
+        max_speed_mm_s=axis.top_speed_mm_s,
+        max_acceleration_mm_s2=axis.max_acceleration_mm_s2,
         sign=axis.drive.sign,
         limits=limits_of(axis, period_s),
         window=round(axis.drive.following_error_window_mm * axis.scaling.increments_per_mm),
@@ -135,7 +156,18 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
         speed_count=abs(profile.speed_rad_s_per_count(axis)) * per_rad * period_s,
         speed_step=SPEED_STEPS * _largest_acceleration_rad_s2(axis) * per_rad * period_s**2,
         travel=None if record is None else record.travel,
+        **_commissioned(machine, name, record),
     )
+
+
+def _commissioned(machine: MachineConfig, name: str, record: CommissioningRecord | None) -> dict[str, Any]:
+    """The fingerprint of the drive as it was signed off, and whether something against that was seen since."""
+    from fdhil.drivers.commissioning_record import holds  # late, as above
+    from fdhil.drivers.commissioning_void import is_void
+
+    if record is None or not holds(record, machine, name):
+        return {}
+    return {"record": record.fingerprint, "record_void": is_void(machine.store.directory, name)}
 
 
 def _largest_acceleration_rad_s2(axis: Axis) -> float:
@@ -207,46 +239,56 @@ def _layout(entries: tuple[PdoEntry, ...]) -> Layout:
 
 
 def operator_token(run_directory: Path) -> str:
-    """Return the token that arming needs, made at the first start of guard or daemon. DeviceError."""
-    from fdhil.daemon.token import ensure_token  # late, as above
+    """Return the token that arming needs, made at the first start of guard or daemon. DeviceError.
 
-    try:
-        run_directory.mkdir(parents=True, exist_ok=True, mode=0o700)
-    except OSError as error:
-        text = f"cannot be made ({error.strerror}); check [store] run_directory and its rights"
-        raise DeviceError(str(run_directory), text) from None
+    Under a user of its own the guard is given it by systemd (LoadCredential=token:...).
+    """
+    from fdhil.daemon.token import TOKEN_NAME, ensure_token, read_token  # late, as above
+
+    given = os.environ.get("CREDENTIALS_DIRECTORY")
+    if given and (Path(given) / TOKEN_NAME).exists():
+        return read_token(Path(given))
+    _make(run_directory)
     return ensure_token(run_directory)
+
+
+def _make(directory: Path) -> None:
+    try:
+        directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+    except OSError as error:
+        text = f"cannot be made ({error.strerror}), and nothing is sent; check run_directory and its rights"
+        raise DeviceError(str(directory), text) from None
 
 
 def _write(file: Path, text: str) -> None:
     temporary = file.with_suffix(".new")
     try:
-        temporary.write_text(text, "utf-8")
+        temporary.unlink(missing_ok=True)
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        with os.fdopen(descriptor, "w", encoding="utf-8") as written:
+            written.write(text)
         temporary.replace(file)
     except OSError as error:
         raise DeviceError(str(file), f"cannot be written ({error.strerror}); check the run directory") from None
 
 
-def lock_bus(bus: CanBus) -> socket.socket:
-    """Hold the name of this bus for as long as the process lives; DeviceError (``BusLocked``) when another has it."""
-    place = f"{bus.interface}:{bus.host}:{bus.port}:{bus.channel}" if bus.interface != "socketcan" else bus.channel
-    lock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    try:
-        lock.bind(f"\0fdhil-guard:{place}")
-    except OSError:
-        lock.close()
-        raise DeviceError(
-            place, "BusLocked: another guard already owns this bus, and nothing was sent; stop that one first"
-        ) from None
-    return lock
-
-
 def open_bus(name: str, bus: CanBus) -> socket.socket:
-    """Open the transmit descriptor; ConnectError when the bus cannot be had."""
+    """Return a descriptor on which frames can be sent; ConnectError when the bus cannot be had."""
+    transmit = connect_bus(name, bus)
+    greet(name, bus, transmit)
+    return transmit
+
+
+def connect_bus(name: str, bus: CanBus) -> socket.socket:
+    """Open the transmit descriptor; a hub still has to be greeted. ConnectError when the bus cannot be had."""
     if bus.interface == "socketcan":
         return _open_raw(name, bus.channel)
     if bus.interface == "socketcand":
-        return _open_socketcand(name, bus)
+        try:
+            return socket.create_connection((bus.host, bus.port), timeout=CONNECT_S)
+        except OSError as error:
+            text = f"no hub answers at {bus.host} port {bus.port} ({error.strerror or error}); start the hub first"
+            raise ConnectError(f"bus {name}", text) from None
     text = f"the interface {bus.interface!r} lives inside one process; set socketcan or socketcand"
     raise ConnectError(f"bus {name}", text)
 
@@ -255,6 +297,7 @@ def _open_raw(name: str, channel: str) -> socket.socket:
     raw = None
     try:
         raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        raw.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")  # what comes before the guard listens is old
         raw.bind((channel,))
     except OSError as error:
         if raw is not None:
@@ -264,14 +307,11 @@ def _open_raw(name: str, channel: str) -> socket.socket:
     return raw
 
 
-def _open_socketcand(name: str, bus: CanBus) -> socket.socket:
-    """Connect to the hub and go through its greeting, byte by byte, so that no frame is swallowed."""
+def greet(name: str, bus: CanBus, hub: socket.socket) -> None:
+    """Go through the greeting of a hub, byte by byte, so that no frame is swallowed."""
+    if bus.interface != "socketcand":
+        return
     deadline_s = time.monotonic() + CONNECT_S
-    try:
-        hub = socket.create_connection((bus.host, bus.port), timeout=CONNECT_S)
-    except OSError as error:
-        text = f"no hub answers at {bus.host} port {bus.port} ({error.strerror or error}); start the hub first"
-        raise ConnectError(f"bus {name}", text) from None
     hub.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     try:
         _expect(hub, "hi", deadline_s)
@@ -282,7 +322,6 @@ def _open_socketcand(name: str, bus: CanBus) -> socket.socket:
         hub.close()
         text = f"the hub at {bus.host} port {bus.port} broke off its greeting ({error}); check that it is a socketcand"
         raise ConnectError(f"bus {name}", text) from None
-    return hub
 
 
 def _expect(hub: socket.socket, word: str, deadline_s: float) -> None:

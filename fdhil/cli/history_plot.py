@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fdhil.errors import FdhilError
-from fdhil.records import UNITS
+from fdhil.records import INTERVAL_95, UNITS
+from fdhil.store.output import open_output
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SIGMAS_95 = 1.96
 DAY_S = 86_400.0
 
 
@@ -107,7 +107,7 @@ def _known(windows: Sequence[Mapping[str, Any]], name: str) -> list[Mapping[str,
 
 def _points(panel: Any, at: Sequence[Any], windows: Sequence[Mapping[str, Any]], name: str, colour: str) -> None:
     values = [window["parameters"][name]["value"] for window in windows]
-    bars = [SIGMAS_95 * window["parameters"][name]["std"] for window in windows]
+    bars = [INTERVAL_95 * window["parameters"][name]["std"] for window in windows]
     panel.errorbar(at, values, bars, fmt=".", color=colour, alpha=0.35, markersize=4, linewidth=0.7)
 
 
@@ -119,11 +119,9 @@ def _fan(panel: Any, ends: Sequence[Any], away: Sequence[float], line: Mapping[s
 
 
 def write_plot(rows: Sequence[Mapping[str, Any]], health: Mapping[str, Mapping[str, Any]], path: Path) -> None:
-    """Write the courses as a PNG. FdhilError when there is nothing to plot or the file cannot be written."""
+    """Write the courses as PNG, SVG or PDF, by the name's suffix. FdhilError when there is nothing to plot."""
     if not rows and not health:
         raise FdhilError("there is nothing to plot: no parameters were published yet; let the daemon see some rapids")
     figure = courses(rows, health)
-    try:
-        figure.savefig(path, format="png", dpi=120)
-    except OSError as error:
-        raise FdhilError(f"the plot {path} cannot be written: {error.strerror}; choose another name") from None
+    with open_output(path) as file:
+        figure.savefig(file, format=path.suffix.lower().removeprefix("."), dpi=120)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.cli.history_trends import moved, slope_rows
-from fdhil.cli.status_view import with_interval
+from fdhil.cli.parameter_view import DISPLAY, MEANING, cell, half_of
 from fdhil.config import MachineConfig
 
 
@@ -30,18 +30,18 @@ def _axis_section(axis: str, rows: Sequence[Mapping[str, Any]], told: Mapping[st
 
     names = list(rows[0]["parameters"])
     table = Table(
-        head=["revision", "time (UTC)", "degC", "windows", *names],
+        head=["revision", "time (UTC)", "degC", "windows", *(f"{name} {DISPLAY[name][0]}" for name in names)],
         rows=[
             [
                 str(row["revision"]),
                 row["time"][:19].replace("T", " "),
                 "" if row["temperature_c"] is None else f"{row['temperature_c']:.2f}",
                 str(row["windows_used"]),
-                *(with_interval(row["parameters"][name]) for name in names),
+                *(cell(name, its["value"], half_of(its), " ") for name, its in row["parameters"].items()),
             ]
             for row in rows
         ],
-        caption=f"Published parameter sets of axis {axis}",
+        caption=f"Published parameter sets of axis {axis}; {MEANING}",
     )
     tables = [table] if told is None else [table, *_health_tables(told)]
     return Section(
@@ -59,7 +59,7 @@ def _health_tables(told: Mapping[str, Any]) -> list[Any]:
     slopes = Table(
         head=["parameter", "per kelvin", "per day", "maintenance limit"],
         rows=slope_rows(told),
-        caption="Slopes since the last change, with 95 % intervals",
+        caption=f"Slopes since the last change; {MEANING}",
     )
     changes = Table(
         head=["time", "window", "parameters", "likely cause"],

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+from fdhil.cli.parameter_view import DISPLAY, cell, half_of
 from fdhil.records import PARAMETERS, RATIOS, UNITS
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def of_axis(
             rest["at_constant_temperature"] = held
             told["trends"][symbol] = {"per_day": line.value, "std": line.std, **_interval(line.interval())} | rest
             if symbol in limits:
-                told["limits"] |= _limit(symbol, line, limits[symbol], float(time_s[-1]))
+                told["limits"] |= _limit(symbol, line, limits[symbol], float(time_s[-1]), span_s / DAY_S)
     return told | {"windows": _rows(windows, values, stds, symbols)}
 
 
@@ -111,14 +112,16 @@ def _date(seconds: float) -> str:
     return datetime.fromtimestamp(float(seconds), UTC).isoformat(timespec="seconds")
 
 
-def _limit(symbol: str, line: Any, limit: tuple[float, float], newest_s: float) -> dict[str, dict[str, Any]]:
+def _limit(
+    symbol: str, line: Any, limit: tuple[float, float], newest_s: float, span_days: float
+) -> dict[str, dict[str, Any]]:
     """Return when the line reaches the limit that lies ahead of it, and nothing when no date can be told."""
-    from fdhil.identification.trends import crossing
+    from fdhil.identification.trends import crossing, reach_days
 
     first, share = limit
     value = first + abs(first) * (share if line.value > 0 else -share)
     reached = crossing(line, value)
-    if reached is None or reached.at - newest_s / DAY_S > FARTHEST_DAYS:
+    if reached is None or reached.at - newest_s / DAY_S > min(reach_days(span_days), FARTHEST_DAYS):
         return {}
     return {symbol: {"limit": value, "reached": reached.at * DAY_S <= newest_s, **_dates(reached, newest_s)}}
 
@@ -178,52 +181,50 @@ def _rows(windows: Sequence[StoredWindow], values: Float, stds: Float, symbols: 
 
 def show_health(told: Mapping[str, Mapping[str, Any]], console: Console | None = None) -> None:
     """Print slopes, limits and changes of every axis, where there are any."""
-    from rich.table import Table
-
-    from fdhil.cli.status_view import open_console
+    from fdhil.cli.status_view import narrow_table, open_console
 
     out = console or open_console()
     for axis, its in told.items():
         if rows := slope_rows(its):
-            table = Table(title=f"axis {axis}: slopes with 95 % intervals", show_edge=False, pad_edge=False)
-            for head in ("parameter", "change per kelvin of the slide-way", "change per day", "maintenance limit"):
-                table.add_column(head)
+            table = narrow_table(f"axis {axis}: slopes")
+            for text in ("parameter", "per kelvin of\nthe slide-way", "per day", "maintenance limit"):
+                table.add_column(text)
             for row in rows:
                 table.add_row(*row)
             out.print(table)
         for change in its["changes"]:
-            out.print(
-                f"axis {axis}, window {change['window']} at {change['time']}: {moved(change)}: {change['cause']}",
-                highlight=False,
-            )
+            at = change["time"][:16].replace("T", " ")
+            out.print(f"axis {axis}, window {change['window']} at {at}: {change['cause']}", highlight=False)
+            out.print(f"  {moved(change)}", highlight=False)
 
 
 def slope_rows(told: Mapping[str, Any]) -> list[list[str]]:
     """Return a row per parameter that has a slope: per kelvin, per day, and its limit's date."""
-    from fdhil.cli.status_view import with_interval
-
     slopes, trends, limits = (told[key] for key in ("slopes", "trends", "limits"))
     rows = []
     for name in (*PARAMETERS, *RATIOS):
         if name in slopes or name in trends:
             cells = [
-                with_interval({"value": line[key], **line}) if (line := lines.get(name)) else "-"
+                cell(name, line[key], half_of(line), " ") if (line := lines.get(name)) else "-"
                 for lines, key in ((slopes, "per_kelvin"), (trends, "per_day"))
             ]
-            rows.append([f"{name} {UNITS[name]}", *cells, _when(limits.get(name))])
+            rows.append([f"{name} {DISPLAY[name][0]}", *cells, _when(name, limits.get(name))])
     return rows
 
 
 def moved(change: Mapping[str, Any]) -> str:
     """Return what moved in a change, in words."""
-    parts = change["parameters"].items()
-    return ", ".join(f"{name} {p['before']:.4g} -> {p['after']:.4g} {p['unit']}" for name, p in parts)
+    parts = ((name, DISPLAY[name], p) for name, p in change["parameters"].items())
+    return ", ".join(
+        f"{name} {p['before'] * factor:.4g} -> {p['after'] * factor:.4g} {unit}" for name, (unit, factor), p in parts
+    )
 
 
-def _when(limit: Mapping[str, Any] | None) -> str:
+def _when(name: str, limit: Mapping[str, Any] | None) -> str:
     if limit is None:
         return "-"
+    value = f"{limit['limit'] * DISPLAY[name][1]:.4g}"
     if limit["reached"]:
-        return f"{limit['limit']:.4g} has been reached"
+        return f"{value} has been reached"
     latest = limit["latest"][:10] if limit["latest"] else "open"
-    return f"{limit['limit']:.4g} on {limit['date'][:10]} ({limit['earliest'][:10]} to {latest})"
+    return f"{value} on {limit['date'][:10]}\n({limit['earliest'][:10]} to {latest})"

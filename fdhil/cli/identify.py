@@ -1,4 +1,4 @@
-"""``fdhil identify``: from recordings to parameters, each with its standard deviation, or the reason why not."""
+"""``fdhil identify``: from recordings to parameters, each with its interval, or the reason why not."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import tables
+from fdhil.cli.parameter_view import MEANING, cell, head
+from fdhil.records import INTERVAL_95
 
 if TYPE_CHECKING:
     from fdhil.cli.batch import FileResult
@@ -20,15 +22,7 @@ if TYPE_CHECKING:
     from fdhil.records import Estimate, Parameters, Verdict, WindowOutcome
 
 SCHEMA = "fdhil-identify-1"
-# what people read: unit and factor
-DISPLAY = {
-    "R": ("mohm", 1e3),
-    "L": ("mH", 1e3),
-    "K": ("N.m/A", 1.0),
-    "Jt": ("g.m2", 1e3),
-    "ft": ("mN.m.s", 1e3),
-    "Cd": ("N.m", 1.0),
-}
+UNREADABLE = 3
 
 
 @click.command()
@@ -42,7 +36,8 @@ def identify(recordings: tuple[Path, ...], config_path: Path | None, method: str
     Each rapid is a window: it is checked, the six parameters are estimated from it, and the model is validated. The
     accepted windows of a file together give its pooled parameters. With --config they are also compared with the axis'
     nominal values: a sensor whose gain is wrong all along shows in no other way. Exit codes: 0 every file's pool is
-    validated, 1 some pool is not, 2 wrong option or configuration, 3 a recording cannot be read.
+    validated, 1 some pool is not, 2 wrong option or configuration, 3 a recording cannot be read (the others are
+    identified all the same).
     """
     settings, rapid_speeds, nominal = _settings(config_path, method)
     results = [_against_data_sheet(r, nominal) for r in _analyse(recordings, settings, rapid_speeds)]
@@ -51,6 +46,8 @@ def identify(recordings: tuple[Path, ...], config_path: Path | None, method: str
         click.echo(json.dumps(document, allow_nan=False))
     else:
         _show(results)
+    if any(result.error for result in results):
+        return UNREADABLE
     return 0 if all(r.verdict.accepted for r in results) else 1
 
 
@@ -99,7 +96,7 @@ def _analyse(paths: Sequence[Path], settings: Identification, speeds: dict[str, 
 
 
 def _file_document(result: FileResult) -> dict[str, Any]:
-    return {
+    document = {
         "file": result.file,
         "axis": result.axis,
         "windows": [_window_document(outcome) for outcome in result.outcomes],
@@ -110,6 +107,7 @@ def _file_document(result: FileResult) -> dict[str, Any]:
             "reasons": [str(reason) for reason in result.verdict.reasons],
         },
     }
+    return document if result.error is None else document | {"error": result.error}
 
 
 def _used(result: FileResult) -> int:
@@ -170,12 +168,17 @@ def _show(results: Sequence[FileResult]) -> None:
 
     console = Console()
     for result in results:
+        if result.error is not None:
+            click.echo(f"fdhil: {result.error['text']}", err=True)
+            if len(results) > 1:
+                console.print(f"{result.file}: not identified, it cannot be read", highlight=False, markup=False)
+            continue
         # a terminal of 80 columns holds all of it
         table = Table(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
-        console.print(f"{result.file}: axis {result.axis}", style="italic", highlight=False, markup=False)
+        console.print(f"{result.file}: axis {result.axis}; {MEANING}", style="italic", highlight=False, markup=False)
         table.add_column("rapid\ns", no_wrap=True)
         for name in PARAMETERS:
-            table.add_column(f"{name}\n{DISPLAY[name][0]}", justify="right", no_wrap=True)
+            table.add_column(head(name), justify="right", no_wrap=True)
         table.add_column("fit\n%", justify="right", no_wrap=True)
         table.add_column("valid", no_wrap=True)
         for outcome in result.outcomes:
@@ -192,14 +195,9 @@ def _show(results: Sequence[FileResult]) -> None:
 def _cells(estimate: Estimate | None, verdict: Verdict) -> list[str]:
     from fdhil.records import PARAMETERS
 
-    cells = []
-    for name in PARAMETERS:
-        if estimate is None or not math.isfinite(estimate.value(name)):
-            cells.append("-")
-            continue
-        value, std = estimate.value(name) * DISPLAY[name][1], estimate.std(name) * DISPLAY[name][1]
-        digits = min(6, max(0, -math.floor(math.log10(max(std, 1e-6)))))
-        cells.append(f"{value:.{digits}f}\n±{std:.{digits}f}")
+    cells = ["-"] * len(PARAMETERS)
+    if estimate is not None:
+        cells = [cell(name, estimate.value(name), INTERVAL_95 * estimate.std(name)) for name in PARAMETERS]
     fit = "-" if verdict.fit_percent is None else f"{verdict.fit_percent:.2f}"
     return [*cells, fit, "yes" if verdict.accepted else "no"]
 
@@ -213,8 +211,8 @@ def _show_reasons(console: Any, result: FileResult) -> None:
     for outcome in result.outcomes:
         delay = _delay(outcome.estimate) if outcome.window.slow_voltage is not None else None
         if delay is not None:
-            at = outcome.window.start_s
-            text = f"  voltage is late by {1e3 * delay['value']:.3f} ± {1e3 * delay['std']:.3f} ms from {at:.2f} s on"
+            late_ms, half_ms = 1e3 * delay["value"], 1e3 * INTERVAL_95 * delay["std"]
+            text = f"  voltage is late by {late_ms:.3f} ± {half_ms:.3f} ms from {outcome.window.start_s:.2f} s on"
             console.print(text, highlight=False, markup=False)
     for reason in dict.fromkeys(told):
         advice = f"; {reason.advice}" if reason.advice else ""

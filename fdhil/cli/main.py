@@ -1,14 +1,18 @@
-"""Entry point: the list of commands, and how an error becomes one sentence and an exit code."""
+"""Entry point: the list of commands."""
 
 from __future__ import annotations
 
+import os
 import sys
+import warnings
 from collections.abc import Mapping
 from importlib import import_module
 
 import click
 
-from fdhil.errors import ConfigError, FdhilError
+from fdhil.cli.failing import run_safely
+
+__all__ = ["COMMANDS", "cli", "main", "run_safely"]
 
 # command -> ("module:function", the line of `fdhil --help`); listed here so that --help imports none of them
 COMMANDS: Mapping[str, tuple[str, str]] = {
@@ -20,6 +24,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "status": ("fdhil.cli.service:status", "Ask the running daemon how it is."),
     "arm": ("fdhil.cli.service:arm", "Arm the correction of one program."),
     "disarm": ("fdhil.cli.service:disarm", "Ramp the correction to zero and disarm."),
+    "adopt": ("fdhil.cli.service:adopt", "Ramp to zero what an earlier correction may have left in the drives."),
     "sim": ("fdhil.cli.sim:sim", "Run the simulated machine: drives, sensors, NC."),
     "record": ("fdhil.cli.record:record", "Record the demand of an air cut from the bus, by listening."),
     "identify": ("fdhil.cli.identify:identify", "Identify a drive from recordings."),
@@ -70,30 +75,10 @@ def cli() -> None:
 
 def main() -> None:
     """Run the command line; an error of fdhil is one sentence on stderr and its exit code."""
+    if not sys.warnoptions:  # advice of libraries is for developers, who ask for it with -W
+        warnings.simplefilter("ignore")
+        os.environ.setdefault("PYTHONWARNINGS", "ignore")  # of the processes started from here, too
     sys.exit(run_safely(cli))
-
-
-def run_safely(command: click.Command) -> int:
-    """Run a click command and return the exit code, with errors told as sentences."""
-    try:
-        result = command.main(standalone_mode=False)
-    except click.ClickException as error:
-        error.show()
-        return error.exit_code
-    except click.exceptions.Abort:
-        click.echo("stopped by the operator", err=True)
-        return 130
-    except ConfigError as error:
-        click.echo(f"fdhil: {error.source} cannot be used:", err=True)
-        for fault in error.faults:
-            click.echo(f"  {fault}", err=True)
-        return error.exit_code
-    except FdhilError as error:
-        click.echo(f"fdhil: {error}", err=True)
-        return error.exit_code
-    except BrokenPipeError:
-        return 0
-    return int(result or 0)
 
 
 if __name__ == "__main__":

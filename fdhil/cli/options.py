@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import click
+
+from fdhil.store.output import check_output
 
 
 class Positive(click.FloatRange):
@@ -20,3 +23,19 @@ class Positive(click.FloatRange):
         if not math.isfinite(number):
             self.fail(f"{value} is no finite number.", param, ctx)
         return number
+
+
+class OutputFile(click.Path):
+    """A file to be written, looked at before the work is done; with ``suffixes`` its name must end in one of them."""
+
+    def __init__(self, *suffixes: str) -> None:
+        super().__init__(path_type=Path)
+        self._suffixes = suffixes
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """Return the path; OutputError where nothing can be written there, BadParameter for an unknown suffix."""
+        path = Path(value)
+        if self._suffixes and path.suffix.lower() not in self._suffixes:
+            self.fail(f"{value}: the name must end in {', '.join(self._suffixes)}.", param, ctx)
+        check_output(path)
+        return path

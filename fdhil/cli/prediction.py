@@ -12,16 +12,21 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import tables
-from fdhil.cli.options import Positive
+from fdhil.cli.compiling import forewarn
+from fdhil.cli.options import OutputFile, Positive
+from fdhil.cli.parameter_view import MEANING
+from fdhil.records import INTERVAL_95
 
 if TYPE_CHECKING:
     from fdhil.cli.forecast import Past
     from fdhil.config import MachineConfig
     from fdhil.prediction.forecast import Step
+    from fdhil.prediction.gain import Gain
     from fdhil.records import Correction, Float, Parameters, Prediction, Reason, Trajectory
 
 FILE = click.Path(path_type=Path)
 MANY_ZONES = 12
+RECENT_MOVES = 3  # whose skill bounds what can be reached
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +58,10 @@ def _shared(wanted: Callable[..., int]) -> Callable[..., int]:
             ),
             click.option("--model", "model_path", type=FILE, help="Parameters of each axis (JSON)."),
             click.option("--from-history", is_flag=True, help="Use the newest validated parameters of the store."),
-            click.option("--out", type=FILE, help="Write a CSV with a row per SYNC period."),
-            click.option("--report", type=FILE, help="Write an HTML page: a map of the error, its worst places."),
+            click.option("--out", type=OutputFile(), help="Write a CSV with a row per SYNC period."),
+            click.option(
+                "--report", type=OutputFile(), help="Write an HTML page: a map of the error, its worst places."
+            ),
             click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else."),
         )
     ):
@@ -88,6 +95,7 @@ def predict(asked: Asked, sensitivity: bool, tolerance_um: float | None, since: 
     reference, models, config = inputs(asked.program, asked.config_path, asked.model_path, asked.from_history)
     from fdhil import prediction
 
+    forewarn("predict")
     predicted = prediction.predict(reference, models, config)
     columns = _prediction_columns(predicted)
     document = {"schema": "fdhil-predict-1", "program": str(asked.program), **_prediction_document(predicted)}
@@ -164,19 +172,38 @@ def correct(asked: Asked, method: str | None) -> int:
     reference, models, config = inputs(asked.program, asked.config_path, asked.model_path, asked.from_history)
     from fdhil import correction
 
+    forewarn("predict", "correct")
     planned = correction.plan(reference, models, config, method)
+    predicted = _gain(planned, models, config, asked.from_history)
     if asked.out is not None:
         _write(asked.out, _correction_columns(planned))
     if asked.report is not None:
-        _report(asked.report, asked, config, planned)
+        _report(asked.report, asked, config, planned, predicted)
     if asked.as_json:
-        click.echo(json.dumps(_correction_document(str(asked.program), planned), allow_nan=False))
+        click.echo(json.dumps(_correction_document(str(asked.program), planned, predicted), allow_nan=False))
     else:
-        _show_correction(planned)
+        _show_correction(planned, predicted)
     return 1 if planned.refused else 0
 
 
-def _report(path: Path, asked: Asked, config: MachineConfig, found: Prediction | Correction) -> None:
+def _gain(planned: Correction, models: Mapping[str, Parameters], config: MachineConfig, from_history: bool) -> Gain:
+    """Return what is predicted to be gained, with the uncertainty that the history knows."""
+    from fdhil.prediction.gain import gain
+
+    if not from_history:
+        return gain(planned, models, config, {}, {})
+    from fdhil.store.history import History
+
+    with History.read(config.store.directory) as history:
+        newest = {axis: history.revisions(axis, limit=1) for axis in config.axis}
+        skills = {axis: history.skills(axis, limit=RECENT_MOVES) for axis in config.axis}
+    covariances = {axis: found[0].set.covariance for axis, found in newest.items() if found}
+    return gain(planned, models, config, covariances, skills)
+
+
+def _report(
+    path: Path, asked: Asked, config: MachineConfig, found: Prediction | Correction, predicted: Gain | None = None
+) -> None:
     """Write the page of a prediction or correction; FdhilError without the extra ``report``."""
     from fdhil.records import Prediction
     from fdhil.report import require, write
@@ -193,7 +220,7 @@ def _report(path: Path, asked: Asked, config: MachineConfig, found: Prediction |
     if isinstance(found, Prediction):
         write(prediction_page(name, machine, found, parameters), path)
     else:
-        write(correction_page(name, machine, found, parameters), path)
+        write(correction_page(name, machine, found, parameters, predicted), path)
 
 
 def inputs(
@@ -259,18 +286,16 @@ def _correction_columns(planned: Correction) -> dict[str, tuple[Float, int]]:
 
 
 def _write(path: Path, columns: Mapping[str, tuple[Float, int]]) -> None:
-    """Write columns as CSV whose first line is the header; RecordingError when the file cannot be written."""
+    """Write columns as CSV whose first line is the header; OutputError when the file cannot be written."""
     import numpy as np
 
-    from fdhil.errors import RecordingError
+    from fdhil.store.output import open_output
 
     # adding 0 after rounding turns -0.0000 into 0.0000
     values = np.column_stack([np.round(values, decimals) + 0.0 for values, decimals in columns.values()])
     formats = [f"%.{decimals}f" for _, decimals in columns.values()]
-    try:
-        np.savetxt(path, values, fmt=formats, delimiter=",", header=",".join(columns), comments="")
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be written ({error.strerror}); check the folder") from None
+    with open_output(path) as file:
+        np.savetxt(file, values, fmt=formats, delimiter=",", header=",".join(columns), comments="")
 
 
 def _contour(predicted: Prediction) -> dict[str, float]:
@@ -311,7 +336,7 @@ def _reasons(reasons: Sequence[Reason]) -> list[dict[str, str]]:
     return [{"code": r.code, "text": r.text, "advice": r.advice} for r in reasons]
 
 
-def _correction_document(program: str, planned: Correction) -> dict[str, Any]:
+def _correction_document(program: str, planned: Correction, predicted: Gain) -> dict[str, Any]:
     before, after = _contour(planned.before), _contour(planned.after)
     return {
         "schema": "fdhil-correct-1",
@@ -319,8 +344,9 @@ def _correction_document(program: str, planned: Correction) -> dict[str, Any]:
         "method": planned.method,
         **_prediction_document(planned.before),
         "before": before,
-        "after": after,
+        "after": {**after, "uncertainty_um": predicted.half_um},
         "gain": before["rms_um"] / after["rms_um"] if after["rms_um"] > 0 else 1.0,
+        "gain_at_least": predicted.at_least,
         "delay_s": planned.delay_s,
         "max_offset_um": {axis: float(abs(offset).max()) for axis, offset in planned.offset_um.items()},
         "refused": _reasons(planned.refused),
@@ -332,16 +358,17 @@ def _show_prediction(
     predicted: Prediction, told: Sequence[Mapping[str, Any]] | None = None, tolerance_um: float | None = None
 ) -> None:
     from fdhil.cli.forecast import crossing_text
+    from fdhil.prediction.gain import plus_minus
 
     contour = _contour(predicted)
     click.echo(
         f"{predicted.reference.time_s[-1]:.2f} s of path: contour error {contour['rms_um']:.1f} um RMS,"
-        f" {contour['max_um']:.1f} um at most"
+        f" {contour['max_um']:.1f} um at most" + (f"; {MEANING}" if told and "std_um" in told[0] else "")
     )
     entries = _zones(predicted) if told is None else told
     shown = sorted(sorted(entries, key=lambda zone: -zone["max_um"])[:MANY_ZONES], key=lambda zone: zone["start_s"])
     for zone in shown:
-        std = f" +- {2 * zone['std_um']:.1f}" if "std_um" in zone else ""
+        std = f" {plus_minus(INTERVAL_95 * zone['std_um'])}" if "std_um" in zone else ""
         line = f"line {zone['line']}, " if zone["line"] else ""
         click.echo(
             f"  {zone['start_s']:8.3f} s .. {zone['end_s']:8.3f} s  {zone['max_um']:8.1f}{std} um  {zone['cause']:12}"
@@ -364,16 +391,13 @@ def _driver(per_axis: Mapping[str, Mapping[str, float]]) -> str:
     return f"1 % more {name} of axis {axis} changes it by {rise:+.2f} um"
 
 
-def _show_correction(planned: Correction) -> None:
+def _show_correction(planned: Correction, predicted: Gain) -> None:
     _show_prediction(planned.before)
     for reason in planned.warnings:
         click.echo(f"warning, {reason}; {reason.advice}", err=True)
     for reason in planned.refused:
         click.echo(f"refused, {reason}; {reason.advice}")
     if not planned.refused:
-        after = _contour(planned.after)
-        gain = _contour(planned.before)["rms_um"] / max(after["rms_um"], 1e-12)
-        click.echo(
-            f"with the {planned.method} correction: {after['rms_um']:.2f} um RMS, {after['max_um']:.1f} um at most,"
-            f" {gain:.0f} times better"
-        )
+        sure = "" if predicted.at_least is None else f", at least {predicted.at_least:.1f} times better"
+        most = f"{_contour(planned.after)['max_um']:.1f} um at most"
+        click.echo(f"predicted with the {planned.method} correction: {predicted}; {most}{sure}")

@@ -9,18 +9,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import config as machine_config
-from fdhil.cli.options import Positive
+from fdhil.cli.options import OutputFile, Positive
 
 if TYPE_CHECKING:
     from fdhil.drivers.demand_recorder import DemandRecorder, RecordedDemand
 
-_FILE = click.Path(dir_okay=False, path_type=Path)
 _SHOWN_GAPS = 5
 
 
 @click.command()
-@click.argument("config", type=_FILE)
-@click.option("--out", required=True, type=_FILE, help="The demand CSV to write.")
+@click.argument("config", type=click.Path(path_type=Path))
+@click.option("--out", required=True, type=OutputFile(), help="The demand CSV to write.")
 @click.option("--seconds", type=Positive(), help="Record no longer than this.")
 @click.option(
     "--rest",
@@ -49,8 +48,10 @@ def record(config: Path, out: Path, seconds: float | None, rest: float, with_gap
     written = recorded is not None and (with_gaps or recorded.complete)
     if recorded is not None and written:
         from fdhil.program import write_demand_csv
+        from fdhil.store.output import open_output
 
-        write_demand_csv(recorded.reference, out)
+        with open_output(out) as file:
+            write_demand_csv(recorded.reference, file)
     if as_json:
         click.echo(json.dumps(_document(out, recorded, written)))
     else:

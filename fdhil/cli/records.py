@@ -12,6 +12,8 @@ import click
 
 from fdhil import config as machine_config
 from fdhil import tables
+from fdhil.cli.compiling import forewarn
+from fdhil.cli.options import OutputFile
 from fdhil.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -69,6 +71,7 @@ def _replayed(
                 settings = machine or _config_of(window)
                 if window.axis not in settings.axis:
                     raise RecordingError(f"{path} is of axis {window.axis}, which --config does not have; use its own")
+                forewarn("identify")
                 pipelines[window.axis] = AxisPipeline(window.axis, settings, method, with_skill=machine is not None)
             outcomes += pipelines[window.axis].feed(window)
         replayed.append((path, outcomes))
@@ -106,7 +109,9 @@ def _config_of(window: Window) -> machine_config.MachineConfig:
 @click.command()
 @click.argument("config", type=FILE)
 @click.option("--axis", help="One axis only.")
-@click.option("--plot", type=FILE, help="Also write the parameters over time and temperature as a PNG.")
+@click.option(
+    "--plot", type=OutputFile(".png", ".svg", ".pdf"), help="Also draw the parameters over time and temperature."
+)
 @AS_JSON
 def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) -> None:
     """Show how the identified parameters of CONFIG's machine moved: revisions, slopes, changes, maintenance dates."""
@@ -163,8 +168,9 @@ def _row(revision: Revision) -> dict[str, Any]:
 
 @click.command()
 @click.argument("recording", type=FILE)
-@click.option("--out", required=True, type=FILE, help="The CSV file to write.")
-def export(recording: Path, out: Path) -> None:
+@click.option("--out", required=True, type=OutputFile(), help="The CSV file to write.")
+@AS_JSON
+def export(recording: Path, out: Path, as_json: bool) -> None:
     """Write a stored window (.parquet) as CSV of the recording format."""
     from fdhil.store.export import export_csv
     from fdhil.store.windows import read_window
@@ -173,14 +179,21 @@ def export(recording: Path, out: Path) -> None:
     if out.exists() and out.samefile(recording):
         raise click.UsageError("--out is the recording itself; choose another name")
     export_csv(window, out)
+    if as_json:
+        told = {"recording": str(recording), "file": str(out), "axis": window.axis, "rows": window.n}
+        click.echo(json.dumps({"schema": "fdhil-export-1"} | told))
 
 
 @click.command()
 @click.argument("config", type=FILE)
-@click.option("--out", required=True, type=FILE, help="The HTML file to write.")
-def report(config: Path, out: Path) -> None:
+@click.option("--out", required=True, type=OutputFile(), help="The HTML file to write.")
+@AS_JSON
+def report(config: Path, out: Path, as_json: bool) -> None:
     """Write an HTML report of the stored history of CONFIG's machine."""
     machine = machine_config.load(config)
     from fdhil.cli.history_report import write_report
 
-    write_report(machine, *_history(machine, None), out)
+    rows, told = _history(machine, None)
+    write_report(machine, rows, told, out)
+    if as_json:
+        click.echo(json.dumps({"schema": "fdhil-report-1", "file": str(out), "revisions": len(rows)}))

@@ -1,18 +1,23 @@
-"""``fdhil run``, ``status``, ``arm`` and ``disarm``: the daemon, and talking to it."""
+"""``fdhil run``, ``status``, ``arm``, ``disarm`` and ``adopt``: the daemon, and talking to it and to the guard."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from fdhil import config as machine_config
 from fdhil import tables
+from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
+
+if TYPE_CHECKING:
+    from fdhil.guard.client import GuardClient
 
 CONFIG = click.argument("config", type=click.Path(path_type=Path))
+DISARM_S = 15.0  # the daemon waits for the guard's answer and for the ramp
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 
 
@@ -24,16 +29,22 @@ def run_directory(config: machine_config.MachineConfig) -> Path:
 @click.command()
 @CONFIG
 @click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Left out: the config's, else the best.")
-def run(config: Path, method: str | None) -> None:
+@click.option("--json", "as_json", is_flag=True, help="Write each line as a JSON object to stdout.")
+def run(config: Path, method: str | None, as_json: bool) -> int:
     """Run the daemon of the machine in CONFIG: listen, identify, predict; correct only when armed.
 
-    Writes one line per outcome to stderr. Stops on SIGTERM or Ctrl-C, with the correction ramped to zero first.
+    Writes one line per outcome to stderr, with --json to stdout. Stops on SIGTERM or Ctrl-C, with the correction ramped
+    to zero first. Exit 3 when an offset may still be applied then: the last line says which, and what to do.
     """
     machine = machine_config.load(config)
-    from fdhil.daemon import service  # late: --help imports nothing heavy
+    from fdhil.cli.compiling import forewarn
+    from fdhil.daemon import journal, service  # late: --help imports nothing heavy
     from fdhil.drivers import open_machine
 
-    service.run(machine, open_machine, method)
+    forewarn("identify", "predict", "correct")
+    with journal.lines_as_json(as_json):
+        stands = service.run(machine, open_machine, method)
+    return 0 if stands.nothing else 3
 
 
 def _ask(
@@ -126,8 +137,76 @@ class _Shown:
 @CONFIG
 @AS_JSON
 def disarm(config: Path, as_json: bool) -> None:
-    """Ramp the correction to zero and disarm."""
-    _tell(_ask(config, {"request": "disarm"}), as_json)
+    """Ramp the correction to zero, disarm, and wait until zero is read back.
+
+    Where the daemon does not answer, the guard itself is asked. Exit 1 when zero is not reached: what may still be
+    applied is told, and what to do.
+    """
+    try:
+        answer: Mapping[str, Any] = _ask(config, {"request": "disarm"}, DISARM_S)
+    except (ConnectError, DeviceTimeout) as silent:
+        answer = _disarm_at_the_guard(config, silent)
+    _tell(answer, as_json)
+
+
+def _disarm_at_the_guard(config: Path, silent: DeviceError) -> Mapping[str, Any]:
+    """Ask the guard without the daemon; ``silent`` is why. ConnectError when neither answers."""
+    machine = machine_config.load(config)
+    from fdhil.daemon.standing import landed, verdict
+    from fdhil.guard.client import GuardClient
+
+    try:
+        with GuardClient(run_directory(machine)) as guard:
+            answer = guard.disarm()
+            return {**verdict(landed(guard)), "asked": "guard"} if answer["ok"] else answer
+    except DeviceError as error:
+        text = f"{silent}; nor does the guard answer ({error}): it is unknown what is applied"
+        raise ConnectError("machine", text) from None
+
+
+@click.command()
+@CONFIG
+@click.option("--yes", is_flag=True, help="Do not ask.")
+@AS_JSON
+def adopt(config: Path, yes: bool, as_json: bool) -> None:
+    """Ramp to zero what an earlier correction may have left in the drives of CONFIG (the guard's state FROZEN).
+
+    Says what may still be applied, asks, and has the guard take it over and ramp it to zero. The guard is asked itself:
+    no daemon is needed. Hold the feed first. Exit 0 only when zero was read back, 1 when the guard refuses or zero is
+    not reached, 3 without a guard.
+    """
+    if as_json and not yes:
+        raise click.UsageError("--json cannot ask: give --yes too")
+    machine = machine_config.load(config)
+    from fdhil.daemon.token import read_token
+    from fdhil.guard.client import GuardClient
+
+    directory = run_directory(machine)
+    with GuardClient(directory) as guard:
+        answer = _adopted(guard, lambda: read_token(directory), yes, quiet=as_json)
+    _tell(answer, as_json)
+
+
+def _adopted(guard: GuardClient, token: Callable[[], str], yes: bool, quiet: bool) -> Mapping[str, Any]:
+    """Have what stands ramped to zero, where anything does and the operator wants it; return the answer."""
+    from fdhil.daemon.standing import AT_REST, landed, standing, verdict
+
+    status = guard.status()
+    stands, state = standing(status), status["state"]
+    if state not in AT_REST:
+        text = f"the guard is {state}, a correction is on"
+        return {"ok": False, "code": "NotOff", "text": text, "advice": "run fdhil disarm", "state": state}
+    if state == "OFF" and stands.nothing:
+        return verdict(status) | {"text": f"guard: OFF, {stands}: there is nothing to adopt"}
+    if not quiet:
+        click.echo(f"the guard is {state}: {stands}", err=True)
+    if not yes:
+        click.confirm("Is the feed held? Ramp it to zero now?", abort=True, err=True)
+    try:
+        answer = guard.adopt(token())
+        return verdict(landed(guard)) if answer["ok"] else {**answer, "may_stand_um": dict(stands.offset_um)}
+    except DeviceError as error:
+        raise ConnectError("adoption", f"{error}; {stands}") from None
 
 
 def _tell(answer: Mapping[str, Any], as_json: bool) -> None:
@@ -140,7 +219,11 @@ def _tell(answer: Mapping[str, Any], as_json: bool) -> None:
         advice = f"; {answer['advice']}" if answer.get("advice") else ""
         click.echo(f"refused: {answer['code']}: {answer['text']}{advice}", err=True)
         for more in answer.get("refused", [])[1:]:
-            if isinstance(more, str):
-                click.echo(f"also: {more}", err=True)
+            click.echo(f"also: {more if isinstance(more, str) else _reason(more)}", err=True)
     if not answer["ok"]:
         click.get_current_context().exit(1)
+
+
+def _reason(told: Mapping[str, Any]) -> str:
+    """Return a refusal of the guard as one line."""
+    return f"{told['code']}: {told['text']}; {told['advice']}"

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from fdhil.cli.options import OutputFile
+
 if TYPE_CHECKING:
     from fdhil.config import MachineConfig
     from fdhil.records import Trajectory
 
-_FILE = click.Path(dir_okay=False, path_type=Path)
+_FILE = click.Path(path_type=Path)
 
 
 @click.command()
@@ -21,7 +23,7 @@ _FILE = click.Path(dir_okay=False, path_type=Path)
 @click.option("--faults", type=_FILE, help="A fault script: what breaks when (TOML).")
 @click.option("--demand", type=_FILE, help="A demand CSV that the NC plays at once.")
 @click.option("--program", type=_FILE, help="An NC program that the NC plays at once.")
-@click.option("--trace", type=_FILE, help="Record what is played first: reference, true table and offset (CSV).")
+@click.option("--trace", type=OutputFile(), help="Record what is played first: reference, true table and offset (CSV).")
 def sim(
     config: Path, as_json: bool, faults: Path | None, demand: Path | None, program: Path | None, trace: Path | None
 ) -> None:

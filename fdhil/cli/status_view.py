@@ -2,79 +2,162 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from fdhil.cli.parameter_view import MEANING, cell, half_of, head
+from fdhil.records import PARAMETERS
+
 BARS = "▁▂▃▄▅▆▇█"
-COURSE = 14  # revisions in a row of bars: what fits the column of a value with its interval
+COURSE = 7  # revisions in a row of bars: what fits the column of a value
+SHOWN_PASSES = 3
+LIVE_S = 1.0
+GUARD_LIVE_S = 2.0  # the daemon asks it twice a second
+COUNTED = {
+    "records_dropped": "records dropped",
+    "ring_overflow": "not read in time",
+    "kernel_drops": "dropped by the kernel",
+    "sync_missed": "SYNC missed",
+    "sync_duplicates": "SYNC doubled",
+    "sync_out_of_order": "SYNC out of order",
+    "pdo_lost": "PDO lost",
+    "pdo_short": "PDO too short",
+    "pdo_long": "PDO too long",
+    "pdo_duplicates": "PDO doubled",
+    "pdo_ambiguous": "PDO of uncertain SYNC",
+    "failures": "polls failed",
+}
 
 
 def open_console() -> Console:
-    """Return a console for stdout: as wide as the terminal, or wide enough for the tables where there is none."""
-    console = Console()
-    return console if console.is_terminal else Console(width=150)
+    """Return a console for stdout: as wide as the terminal or as COLUMNS says, 80 columns where there is neither."""
+    return Console(width=shutil.get_terminal_size((80, 24)).columns)
 
 
 def show(status: Mapping[str, Any], console: Console | None = None) -> None:
     """Print the status document."""
     out = console or open_console()
-    source, sync, guard = status["source"], status["sync"], status.get("guard") or {}
-    rate = "no SYNC yet" if sync["rate_hz"] is None else f"SYNC {sync['rate_hz']:.1f} Hz of {sync['expected_hz']:.0f}"
-    out.print(f"[bold]{escape(status['machine'])}[/bold]: {source['state']}, {rate}, up {status['uptime_s']:.0f} s")
-    counted = ", ".join(f"{name} {value}" for name, value in _flat(status.get("counters", {})))
-    out.print(f"frames: {counted or 'none'}")
+    guard = status.get("guard") or {}
+    out.print(f"[bold]{escape(status['machine'])}[/bold]: {_heard(status)}, up {_ago(status['uptime_s'])}")
+    out.print(counted(status.get("counters", {})))
     loads = "".join(f", {bus} loaded {load:.0f} %" for bus, load in status["bus_load_percent"].items())
-    out.print(
-        f"correction: {escape(status['state'])}, guard {escape(str(guard.get('state', 'absent')))}{escape(loads)}"
-    )
+    out.print(escape(f"correction: {status['state']}, guard {_guard(guard)}{loads}"))
+    stands = status.get("may_stand", {"nothing": True})
+    if guard.get("state") == "lost":
+        out.print(f"[red]{escape(guard['text'])}[/red]")
+    elif not stands["nothing"] and guard.get("state") in ("OFF", "FROZEN"):
+        out.print(f"[red]{escape(stands['text'])}[/red]; hold the feed, then run fdhil adopt")
     if guard.get("shadow_um"):
         would = ", ".join(f"{axis} {offset:+.1f} um" for axis, offset in guard["shadow_um"].items())
         out.print(escape(f"in shadow, not sent: {would}"))
-    for refused in ((status.get("armed") or {}).get("check") or {}).get("refused", []):
+    armed = status.get("armed") or {}
+    if armed.get("promise"):
+        out.print(escape(f"armed: {armed['program']}, {armed['promise']}"))
+    for refused in (armed.get("check") or {}).get("refused", []):
         out.print(f"[red]the correction ends early: {escape(refused)}[/red]")
+    for told in status.get("passes", [])[-SHOWN_PASSES:]:
+        out.print(escape(told["text"]))
     if checking := status.get("checking"):
         out.print(escape(f"checking {checking['program']}: {checking['checked_s']:.0f} s, line {checking['line']}"))
     if status["store"]["fault"]:
         out.print(f"[red]store: {escape(status['store']['fault'])}[/red], in shadow")
+    for trouble in status.get("troubles", []):
+        where = f"{trouble['axis']}: " if trouble["axis"] else ""
+        out.print(f"[red]{escape(where + trouble['code'])}[/red]: {escape(trouble['text'])}")
     out.print(_axes_table(status["axes"]))
+    for axis, told in status["axes"].items():
+        if unused := _unused(told):
+            out.print(escape(f"{axis}: {unused}"))
     for notice in status["notices"][-5:]:
         axis = f"{notice['axis']}: " if notice["axis"] else ""
         out.print(
-            escape(f"{notice['age_s']:8.0f} s ago  {notice['severity']:5}  {axis}{notice['code']}: {notice['text']}")
+            escape(f"{_ago(notice['age_s']):>9} ago  {notice['severity']:5}  {axis}{notice['code']}: {notice['text']}")
         )
 
 
-def _flat(counters: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    flat: list[tuple[str, Any]] = []
-    for name, value in counters.items():
-        flat += _flat(value, f"{prefix}{name} ") if isinstance(value, Mapping) else [(f"{prefix}{name}", value)]
-    return flat
+def _heard(status: Mapping[str, Any]) -> str:
+    """Say what is heard of the machine now, and since when what is not heard any more."""
+    source, sync = status["source"], status["sync"]
+    state = source["state"]
+    if state != "listening":
+        state = f"[red]{state}[/red] for {_ago(source['heard_s_ago'] if state == 'silent' else source['since_s'])}"
+    quiet = [f"{bus} silent for {_ago(age_s)}" for bus, age_s in source["buses"].items() if age_s > LIVE_S]
+    if state == "listening" and quiet:
+        state = f"{state}, [red]{escape(', '.join(quiet))}[/red]"
+    if sync["rate_hz"] is not None:
+        return f"{state}, SYNC {sync['rate_hz']:.1f} Hz of {sync['expected_hz']:.0f}"
+    last_s = sync["heard_s_ago"]
+    return f"{state}, " + ("no SYNC yet" if last_s is None else f"no SYNC for {_ago(last_s)}")
+
+
+def _guard(guard: Mapping[str, Any]) -> str:
+    """Say in which state the guard is; one that has not answered for a while may be in another by now."""
+    state, heard_s = str(guard.get("state", "absent")), guard.get("heard_s_ago")
+    if state == "absent" or heard_s is None:
+        return state
+    if state == "lost":
+        return f"lost, heard {_ago(heard_s)} ago in state {guard.get('last_state')}"
+    return state if heard_s <= GUARD_LIVE_S else f"{state} when it answered last, {_ago(heard_s)} ago"
+
+
+def _ago(seconds: float) -> str:
+    """Return an age as a person says it."""
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.1f} h"
+
+
+def grouped(count: int) -> str:
+    """Return a count in groups of three digits."""
+    return f"{count:,}".replace(",", " ")
+
+
+def counted(counters: Mapping[str, Any]) -> str:
+    """Return the source's counters in words: what was received and lost, and what else is not 0."""
+    if not counters:
+        return "frames: none"
+    told = f"frames received {grouped(counters.get('frames', 0))}, lost {grouped(counters.get('lost', 0))}"
+    parts = []
+    for name, count in counters.items():
+        where, _, what = name.rpartition(".")
+        if count and what in COUNTED:
+            parts.append(f"{where}: {COUNTED[what]} {grouped(count)}" if where else f"{COUNTED[what]} {grouped(count)}")
+    return escape(f"{told} ({'; '.join(parts)})" if parts else told)
+
+
+def _unused(axis: Mapping[str, Any]) -> str:
+    """Say which moves of an axis were not used, and why."""
+    moves = axis.get("moves") or {}
+    reasons = [f"{count} refused: {code}" for code, count in axis.get("refused_by", {}).items()]
+    if moves.get("too_slow"):
+        reasons.insert(0, f"{moves['too_slow']} too slow (the fastest at {moves['fastest_mm_s']:.4g} mm/s)")
+    if moves.get("without_plateau"):
+        reasons.append(f"{moves['without_plateau']} too short for a plateau")
+    return f"{moves.get('seen', 0)} moves seen; not used: {', '.join(reasons)}" if reasons else ""
 
 
 def _axes_table(axes: Mapping[str, Any]) -> Table:
-    table = Table(show_edge=False, pad_edge=False)
-    for head in ("axis", "windows", "revision", "R ohm", "L mH", "K N.m/A", "Jt kg.m2", "ft N.m.s", "Cd N.m"):
-        table.add_column(head)
+    table = narrow_table()
+    for text in ("axis", "windows\nok/not", "rev", *map(head, PARAMETERS)):
+        table.add_column(text, no_wrap=True)
     for name, axis in axes.items():
-        windows = f"{axis['accepted']} accepted, {axis['refused']} refused"
         told = axis["parameters"]
-        cells = [with_interval(told[p], 1e3 if p == "L" else 1) for p in told] if told else ["-"] * 6
-        table.add_row(name, windows, str(axis["revision"] or "-"), *cells)
+        cells = [cell(p, told[p]["value"], half_of(told[p])) for p in PARAMETERS] if told else ["-"] * len(PARAMETERS)
+        table.add_row(name, f"{axis['accepted']}/{axis['refused']}", str(axis["revision"] or "-"), *cells)
     return table
 
 
-def with_interval(parameter: Mapping[str, Any], factor: float = 1.0) -> str:
-    """Return ``value ±half`` of the 95 % interval, or why there is none."""
-    if parameter["value"] is None:
-        return "?"
-    if parameter.get("low") is None:
-        return f"{parameter['value'] * factor:.4g} (no interval)"
-    half = (parameter["high"] - parameter["low"]) / 2 * factor
-    return f"{parameter['value'] * factor:.4g} ±{half:.1g}"
+def narrow_table(title: str | None = None) -> Table:
+    """Return a table whose columns of parameters fit 80 columns, and which says what ± means in it."""
+    table = Table(title=title, title_justify="left", caption=MEANING, caption_justify="left", box=box.SIMPLE_HEAD)
+    table.show_edge, table.pad_edge, table.collapse_padding = False, False, True
+    return table
 
 
 def sparkline(values: Sequence[float]) -> str:
@@ -91,16 +174,15 @@ def show_history(rows: Sequence[Mapping[str, Any]], console: Console | None = No
         of_axis = [row for row in rows if row["axis"] == axis]
         names = list(of_axis[0]["parameters"])
         first, last = (of_axis[k]["time"][:10] for k in (0, -1))
-        title = f"axis {axis}: {len(of_axis)} revisions, {first} to {last}"
-        table = Table(title=title, show_edge=False, pad_edge=False)
-        for head in ("revision", "time", "degC", "windows", *names):
-            table.add_column(head)
+        table = narrow_table(f"axis {axis}: {len(of_axis)} revisions, {first} to {last}")
+        for text in ("rev", "time", "degC", "win", *map(head, names)):
+            table.add_column(text, no_wrap=True)
         for row in of_axis[-newest:]:
-            degrees = "-" if row["temperature_c"] is None else f"{row['temperature_c']:.2f}"
-            cells = [with_interval(row["parameters"][name]) for name in names]
-            time = row["time"][5:16].replace("T", " ")
+            degrees = "-" if row["temperature_c"] is None else f"{row['temperature_c']:.1f}"
+            cells = [cell(name, told["value"], half_of(told)) for name, told in row["parameters"].items()]
+            time = row["time"][5:16].replace("T", "\n")
             table.add_row(str(row["revision"]), time, degrees, str(row["windows_used"]), *cells)
         courses = [sparkline([row["parameters"][name]["value"] for row in of_axis[-COURSE:]]) for name in names]
         table.add_section()
-        table.add_row("course", "", "", "", *courses)
+        table.add_row("", "course", "", "", *courses)
         out.print(table)

@@ -20,6 +20,7 @@ from fdhil.config.axis import (
 )
 from fdhil.config.controller import G0, Identification, Nc
 from fdhil.config.machine import Machine, MachineConfig
+from fdhil.config.offset_limits import VARIATION_MM, OffsetLimits
 from fdhil.config.reading import MAX_CONFIG_BYTES, load, parse, toml_document, unlikely
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import AxisName, Finite, Fraction, NotNegative, Positive, Section
@@ -32,6 +33,7 @@ __all__ = [
     "CEILING_SPEED_MM_S",
     "G0",
     "MAX_CONFIG_BYTES",
+    "VARIATION_MM",
     "Axis",
     "AxisName",
     "CanBus",
@@ -49,6 +51,7 @@ __all__ = [
     "Noise",
     "Nominal",
     "NotNegative",
+    "OffsetLimits",
     "Positive",
     "Regulators",
     "Section",

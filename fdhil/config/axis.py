@@ -55,7 +55,7 @@ class Drive(Section):
     node_id: int | None = Field(
         None, ge=1, le=127, description="CANopen node-ID; left out: 1 for the first axis, 2 for the next"
     )
-    profile: str = Field("fdhil_twin", description="the vendor profile, a name of the DRIVE_PROFILES table")
+    profile: str = Field("fdhil_twin", description=f"the vendor profile: {', '.join(tables.DRIVE_PROFILES)}")
     increments_per_rev: int = Field(
         65536, ge=4, le=2**31 - 1, description="encoder and set-point increments per revolution"
     )
@@ -68,6 +68,11 @@ class Drive(Section):
     speed_limit_mm_s: Positive | None = Field(
         None, ge=1e-3, le=1e5, description="the axis maximum; left out: the rapid speed"
     )
+
+    @field_validator("profile")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        return listed(name, tables.DRIVE_PROFILES)
 
 
 class Voltage(Section):
@@ -89,12 +94,12 @@ class Voltage(Section):
 
 
 class Thermometer(Section):
-    """[axis.X.temperature]: the slide-way's thermometer, a float32 in two Modbus input registers."""
+    """[axis.X.temperature]: the slide-way's thermometer (Modbus). Without this section drift is told by time alone."""
 
     host: str = Field("127.0.0.1", description="address of the thermometer")
     port: int = Field(502, ge=1, le=65535, description="TCP port")
     unit: int = Field(1, ge=0, le=247, description="unit identifier")
-    address: int = Field(8, ge=0, le=65534, description="the first of its two registers, high word first")
+    address: int = Field(8, ge=0, le=65534, description="first of its two input registers (float32, high word first)")
     period_s: Positive = Field(1.0, ge=1e-2, le=3600, description="how often it is asked")
     timeout_s: Positive = Field(0.5, ge=1e-3, le=60, description="how long an answer may take")
 
@@ -128,6 +133,11 @@ class Axis(Section):
     def scaling(self) -> Scaling:
         """Between millimetres and the drive's increments."""
         return Scaling(self.drive.increments_per_rev, self.screw_pitch_mm, self.drive.sign)
+
+    @property
+    def top_speed_mm_s(self) -> float:
+        """The axis maximum."""
+        return self.drive.speed_limit_mm_s or self.rapid_speed_mm_s
 
     @property
     def rapid_speed_rad_s(self) -> float:

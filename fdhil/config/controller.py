@@ -51,7 +51,7 @@ class G0(Section):
 class Identification(Section):
     """[identification]"""
 
-    method: str | None = Field(None, description="a name of the ESTIMATORS table; left out: the best there is")
+    method: str | None = Field(None, description=f"{', '.join(tables.ESTIMATORS)}; left out: the best there is")
     lowpass_hz: Positive = Field(
         40.0, ge=0.01, le=1e5, description="least_squares: corner of the zero-phase low-pass on every signal"
     )

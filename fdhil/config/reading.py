@@ -63,13 +63,9 @@ def parse(
     ``made_up``: its axes need not be those of a machine that can be.
     """
     try:
-        config = MachineConfig.model_validate(document)
+        config = MachineConfig.model_validate(document, context={"made_up": made_up})
     except ValidationError as error:
         raise ConfigError(source, _faults(error)) from None
-    found = [] if made_up else [(name, doubt) for name, axis in config.axis.items() for doubt in doubts(axis)]
-    impossible = [ConfigFault(f"axis.{name}.{doubt.key}", doubt.text) for name, doubt in found if not doubt.possible]
-    if impossible:
-        raise ConfigError(source, impossible)
     directory = folder / config.store.directory
     run, key = config.store.run_directory, config.store.commissioning_key
     store = config.store.model_copy(
@@ -79,7 +75,9 @@ def parse(
             "commissioning_key": folder / key if key else None,
         }
     )
-    return config.model_copy(update={"store": store})
+    guard_run = config.guard.run_directory
+    guard = config.guard.model_copy(update={"run_directory": folder / guard_run if guard_run else None})
+    return config.model_copy(update={"store": store, "guard": guard})
 
 
 def unlikely(config: MachineConfig) -> list[str]:

@@ -13,7 +13,7 @@ from fdhil.config.section import NotNegative, Positive, Section, listed
 class Regulators(Section):
     """[axis.X.regulators]: the drive's nested loops."""
 
-    structure: str = Field("p_pi_pi", description="the regulators' structure, a name of the REGULATORS table")
+    structure: str = Field("p_pi_pi", description=f"the regulators' structure: {', '.join(tables.REGULATORS)}")
     position_gain_per_s: Positive = Field(ge=1e-2, le=1e5, description="Kv of the position loop, 1/s")
     speed_feedforward: Annotated[float, Field(ge=0, le=1.5)] = Field(
         1.0, description="share of the demand's speed fed forward"

@@ -35,5 +35,5 @@ class Section(BaseModel):
 def listed(name: str, table: Mapping[str, str]) -> str:
     if name not in table:
         near = difflib.get_close_matches(name, table, n=1)
-        raise ValueError(f"{name!r} is none of {', '.join(table)}" + (f"; did you mean {near[0]!r}?" if near else ""))
+        raise ValueError(f"must be one of {', '.join(table)}" + (f"; did you mean {near[0]!r}?" if near else ""))
     return name

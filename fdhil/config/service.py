@@ -24,7 +24,7 @@ class Store(Section):
     """[store]"""
 
     directory: Path = Field(Path("fdhil-data"), description="recordings and history; relative to the config's folder")
-    run_directory: Path | None = Field(None, description="sockets and the guard's table; left out: <directory>/run")
+    run_directory: Path | None = Field(None, description="sockets and token; left out: <directory>/run")
     commissioning_key: Path | None = Field(
         None,
         description="key that seals the commissioning records, mode 0600; left out: <directory>/commissioning.key",
@@ -40,6 +40,10 @@ class Guard(Section):
     clock: Literal["monotonic", "sync"] = Field(
         "monotonic",
         description="sync: time is SYNC count x period, for a simulated machine that does not run in real time",
+    )
+    run_directory: Path | None = Field(None, description="the guard's socket and settings; left out: that of [store]")
+    daemon_user: str | None = Field(
+        None, description="the daemon's user, where the guard runs under one of its own; left out: the same user"
     )
 
 

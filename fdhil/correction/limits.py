@@ -11,14 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdhil.config import Axis
+from fdhil.config import VARIATION_MM, Axis, OffsetLimits
 from fdhil.correction import kernels
 from fdhil.records import Bool, Float, Int, Reason
 
-AXIS_SPEED_SHARE = 0.10  # an offset never takes more than this of the axis' own speed
-AXIS_ACCELERATION_SHARE = 0.50
-VARIATION_MM = 3.0
-VARIATION_S = 1.0
 # rounding a curve to whole increments moves its first difference by up to 1, its second by up to 2
 ROUNDING_RATE, ROUNDING_ACCELERATION = 1.0, 2.0
 _PASSES = 8
@@ -40,21 +36,10 @@ class Limits:
     @staticmethod
     def of(axis: Axis, sync_period_s: float) -> Limits:
         """Return the limits of an axis; ValueError when writing is off (no ``[axis.X.correction]``)."""
-        if axis.correction is None:
-            raise ValueError("writing is off for this axis")
-        scale = axis.scaling.increments_per_mm
-        top_speed = axis.drive.speed_limit_mm_s or axis.rapid_speed_mm_s
-        speed = min(axis.correction.max_speed_mm_s, AXIS_SPEED_SHARE * top_speed)
-        acceleration = min(
-            axis.correction.max_acceleration_mm_s2, AXIS_ACCELERATION_SHARE * axis.max_acceleration_mm_s2
-        )
+        derived = OffsetLimits.of(axis, sync_period_s)
+        um_per_increment = 1e3 / axis.scaling.increments_per_mm
         return Limits(
-            offset=axis.correction.max_offset_um * 1e-3 * scale,
-            rate=speed * scale * sync_period_s,
-            acceleration=acceleration * scale * sync_period_s**2,
-            variation=VARIATION_MM * scale,
-            window=round(VARIATION_S / sync_period_s),
-            um_per_increment=1e3 / scale,
+            derived.offset, derived.rate, derived.acceleration, derived.variation, derived.window, um_per_increment
         )
 
     @property

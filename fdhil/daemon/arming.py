@@ -21,6 +21,7 @@ from fdhil.daemon.streamed import FIRST_S, Checked, Piece, Stream, longer_than_r
 from fdhil.drivers.commissioning_feeding import feedforward_object
 from fdhil.drivers.commissioning_record import CommissioningRecord, axis_digest, load_record
 from fdhil.drivers.profile import load_profile
+from fdhil.prediction.gain import Gain, gain, skill_of
 from fdhil.program import load_trajectory, program_digest
 from fdhil.records import Correction, CorrectionTable, Float, Parameters, ParameterSet, Reason, Skill
 
@@ -51,6 +52,12 @@ class Armament:
     correction: Correction
     table: CorrectionTable
     facts: dict[str, bool]
+    predicted: Gain
+
+    @property
+    def rows(self) -> int:
+        """How many rows the table has."""
+        return int(self.correction.before.contour_um.size)
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -74,14 +81,19 @@ class Armament:
 
     def summary(self) -> dict[str, Any]:
         """Return what the operator is told."""
-        before, after = self.correction.before, self.correction.after
+        before, after, predicted = self.correction.before, self.correction.after, self.predicted
         return {
             "program": self.program,
             "program_digest": self.table.program_digest,
             "method": self.correction.method,
-            "rows": int(before.contour_um.size),
-            "before": {"rms_um": rms(before.contour_um), "max_um": float(before.contour_um.max())},
-            "after": {"rms_um": rms(after.contour_um), "max_um": float(after.contour_um.max())},
+            "rows": self.rows,
+            "before": {"rms_um": predicted.before_um, "max_um": float(before.contour_um.max())},
+            "after": {
+                "rms_um": predicted.after_um,
+                "max_um": float(after.contour_um.max()),
+                "uncertainty_um": predicted.half_um,
+            },
+            "promise": _promise(predicted),
             "warnings": [str(reason) for reason in self.correction.warnings],
             "facts": dict(self.facts),
         }
@@ -91,7 +103,8 @@ class Armament:
 class StreamedArmament:
     """A long program: its first rows, ready for the guard, and the stream of all that passed and will pass the gate.
 
-    ``begun_um`` is what the rows promised that were checked when it was armed.
+    ``begun_um`` is what the rows promised that were checked when it was armed, ``skill_um`` how well the last moves
+    were predicted.
     """
 
     program: str
@@ -99,6 +112,12 @@ class StreamedArmament:
     begin: Piece
     facts: dict[str, bool]
     begun_um: float
+    skill_um: float | None = None
+
+    @property
+    def rows(self) -> int | None:
+        """How many rows the program has; None until that is known."""
+        return self.stream.checked.rows if self.stream.checked.whole else None
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -129,7 +148,10 @@ class StreamedArmament:
             "rows": checked.rows,
             "streamed": True,
             "before": dict(checked.errors["before"]),
-            "after": dict(checked.errors["after"]),
+            "after": {**checked.errors["after"], "uncertainty_um": self.skill_um},
+            "promise": _promise(
+                Gain(checked.errors["before"]["rms_um"], checked.errors["after"]["rms_um"], self.skill_um)
+            ),
             "check": self.stream.status(),
             "warnings": [],
             "facts": dict(self.facts),
@@ -150,6 +172,10 @@ class Refused:
     """Why nothing is armed, the weightiest reason first."""
 
     reasons: tuple[Reason, ...]
+
+
+def _promise(predicted: Gain) -> str:
+    return f"contour error {predicted.before_um:.1f} um RMS is predicted to become {predicted}"
 
 
 def rms(values: Float) -> float:
@@ -186,7 +212,9 @@ def prepare(
     facts = standing_facts(reference.axes, config, known, promised_um(planned))
     largest_um = max(float(np.abs(offset).max()) for offset in planned.offset_um.values())
     facts |= _commissioned(tuple(planned.offset_um), largest_um, config)
-    return Armament(str(program), planned, table, facts)
+    covariances = {axis: found.published.covariance for axis, found in known.items() if found.published is not None}
+    predicted = gain(planned, models, config, covariances, {axis: found.skills for axis, found in known.items()})
+    return Armament(str(program), planned, table, facts, predicted)
 
 
 def may_begin(checked: Checked, config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> bool:
@@ -209,7 +237,8 @@ def prepare_stream(
     stream, gain_um = Stream(checked, long.program_digest, config.machine.sync_period_s), checked.gain_um
     facts = standing_facts(stream.axes, config, known, gain_um)
     facts |= _commissioned(stream.axes, checked.largest_um, config)
-    return StreamedArmament(str(long.program), stream, stream.take(FIRST_S), facts, gain_um)
+    skill_um = skill_of({axis: found.skills for axis, found in known.items()}, stream.axes)
+    return StreamedArmament(str(long.program), stream, stream.take(FIRST_S), facts, gain_um, skill_um)
 
 
 @dataclass(frozen=True, slots=True)

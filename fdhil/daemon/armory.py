@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import hmac
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -28,20 +29,21 @@ from fdhil.daemon.arming import (
 )
 from fdhil.daemon.checking import Check
 from fdhil.daemon.control import Answer, refusal
-from fdhil.daemon.guard_link import REST, GuardLink
+from fdhil.daemon.guard_link import GONE, REST, GuardLink
 from fdhil.daemon.keeping import Keeper, boot_id
+from fdhil.daemon.passes import Passes
+from fdhil.daemon.standing import ADOPT, START_AND_ADOPT, Standing, verdict
 from fdhil.daemon.streamed import Checked
 from fdhil.daemon.supply import Supply
 from fdhil.daemon.token import ensure_token
 from fdhil.errors import DeviceError
-from fdhil.records import Notice, Outcome, ParameterSet, Skill, Temperature
+from fdhil.records import AxisSamples, Notice, Outcome, ParameterSet, Skill, Temperature
 from fdhil.store.history import Revision
 
 STREAM_S = 0.05
 ALIVE_S = 0.1  # the guard calls us lost after 0.5 s
 REFRESH_S = 0.5
 LANDING_S = 1.0  # what ended a moment ago is off within it: ramp, zeros and their read-back take 0.3 s at most
-STAND_DOWN_S = 3.0  # the longest ramp to zero takes 0.12 s
 NO_GUARD = "start fdhil-guard with this machine's config"
 
 Tell = Callable[[Sequence[Notice]], None]
@@ -63,9 +65,11 @@ class Armory:
         self._arming = asyncio.Lock()
         self._armed: tuple[Armament | StreamedArmament | Feeding, Mapping[str, Any]] | None = None
         self._check = Check(config)
+        self._passes = Passes(config)
         self._supply: Supply | None = None
         self._given_up = False
-        self.guard = GuardLink(run_directory)
+        self._disarming: asyncio.Future[Answer] | None = None
+        self.guard = GuardLink(config.guard.run_directory or run_directory)
 
     def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
         """Start from what the history knows; the token is made where there is none. DeviceError when it cannot be."""
@@ -94,6 +98,15 @@ class Armory:
     def note_temperature(self, reading: Temperature) -> None:
         """Take a temperature."""
         self._temperature[reading.axis] = reading.celsius
+
+    def hear(self, samples: AxisSamples) -> None:
+        """Take samples: those of a pass of the armed program are compared with what was predicted."""
+        self._passes.take(samples)
+
+    @property
+    def passes(self) -> list[Mapping[str, Any]]:
+        """What the last passes under a correction measured, oldest first."""
+        return list(self._passes.told)
 
     @property
     def temperatures(self) -> Mapping[str, float]:
@@ -137,6 +150,10 @@ class Armory:
             if not await self._landed():
                 text = f"what was armed before is still on, in state {self.guard.state}"
                 return refusal("NotOff", text, "run fdhil disarm or wait until it has ended, then arm again")
+            if self.guard.state in ("FROZEN", "lost"):
+                return refusal(
+                    "OffsetStands", f"the guard is {self.guard.state}: {self.guard.standing}", self._way_out()
+                )
             if feeding:
                 return await self._feed_forward(token)
             return await self._arm(Path(str(program)), method, token, request.get("whole") is True)
@@ -152,7 +169,14 @@ class Armory:
             self._release()
         return self.guard.state in REST
 
+    def _way_out(self) -> str:
+        """Return what to do about what may still be applied before anything is armed."""
+        return f"{ADOPT if self.guard.connected else START_AND_ADOPT}, then arm again"
+
     def _release(self) -> None:
+        if self._armed is not None and not isinstance(self._armed[0], Feeding):
+            cause = "GuardLost" if self.guard.state in GONE else (self.guard.status.get("cause") or {}).get("code", "")
+            self._passes.end(cause, self._armed[0].summary())
         self._armed = self._supply = None
 
     async def _feed_forward(self, token: str) -> Answer:
@@ -174,11 +198,15 @@ class Armory:
         if self._given_up:
             return refusal("Abandoned", "the arming was abandoned while it was prepared", "arm again when it is wanted")
         prepared.facts["journal_writable"] = self._keeper.fault is None
+        if not isinstance(prepared, Feeding):
+            self._passes.begin(prepared.first().demand, prepared.rows)
         try:
             answer = await asyncio.to_thread(ask, prepared, token)
         except DeviceError as error:
-            return refusal("GuardAbsent", str(error), NO_GUARD)
+            self._passes.forget()
+            return self._without_guard(error)
         if not answer["ok"]:
+            self._passes.forget()
             return dict(answer) | {"planned": summary}
         self._armed = (prepared, summary)
         self._supply = Supply(prepared, self.guard) if isinstance(prepared, StreamedArmament) else None
@@ -193,13 +221,11 @@ class Armory:
         answer = await self._hand_over(self.guard.arm, prepared, summary, token)
         if not answer["ok"]:
             return answer
-        text = (
-            f"armed {program.name} by {summary['method']}: contour error {summary['before']['rms_um']:.1f} um RMS is"
-            f" predicted to become {summary['after']['rms_um']:.1f}"
-        )
+        text = f"armed {program.name} by {summary['method']}: {summary['promise']}"
         if not summary.get("check", {"whole": True})["whole"]:
             text += f" in its first {summary['check']['checked_s']:.0f} s; the check of the rest goes on ahead of it"
-        return {"ok": True, "state": answer.get("state", "ARMED"), "text": f"{text}; start the program", **summary}
+        text += "; start the program, its error is measured as it runs"
+        return {"ok": True, "state": answer.get("state", "ARMED"), "text": text, **summary}
 
     async def _checked(self, long: Long, whole: bool) -> StreamedArmament | Refused:
         """Have a long program checked as far as arming asks, or as a ``whole``; it is armed with its first rows."""
@@ -223,15 +249,33 @@ class Armory:
         return self._supply is None and self._check.abandon()
 
     async def disarm(self) -> Answer:
-        """Have the guard ramp to zero; a program that is still being planned or checked is not armed."""
+        """Have the guard ramp to zero: ok only when it is reached. What is being planned or checked is not armed."""
         self._supply = None  # no more rows, no more words about them
         abandoned = self.abandon()
+        if self._disarming is None:  # who asks again meanwhile waits for the same ramp
+            self._disarming = asyncio.ensure_future(self._to_zero())
+            self._disarming.add_done_callback(self._disarmed)
+        answer = await asyncio.shield(self._disarming)
+        return {**answer, "text": f"{answer['text']}; the check was abandoned"} if abandoned else answer
+
+    def _disarmed(self, _: asyncio.Future[Answer]) -> None:
+        self._disarming = None
+
+    async def _to_zero(self) -> Answer:
         try:
             answer = await asyncio.to_thread(self.guard.disarm)
         except DeviceError as error:
+            return self._without_guard(error)
+        if not answer["ok"]:
+            return answer
+        return verdict(self.guard.status)
+
+    def _without_guard(self, error: DeviceError) -> Answer:
+        """Return the refusal without a guard; what the last one may have left is told."""
+        stands = self.guard.standing
+        if stands.nothing:
             return refusal("GuardAbsent", str(error), NO_GUARD)
-        text = f"guard: {self.guard.state}" + ("; the check was abandoned" if abandoned else "")
-        return dict(answer) | ({"text": text} if answer["ok"] else {})
+        return refusal("OffsetStands", f"{error}; {stands}", START_AND_ADOPT)
 
     async def attend(self, tell: Tell) -> None:
         """Tell the guard that this loop turns and what is still vouched for, and the log what the guard does.
@@ -258,6 +302,7 @@ class Armory:
             await asyncio.sleep(STREAM_S)
             if self._supply is not None:
                 tell(await asyncio.to_thread(self._supply.go_on))
+            tell(await asyncio.to_thread(self._passes.digest))
             await self._check.attend()
 
     def _facts(self) -> Mapping[str, bool] | None:
@@ -271,22 +316,16 @@ class Armory:
             facts = standing_facts(armed.axes, self._config, self._known(), armed.gain_um)
         return facts | {"journal_writable": self._keeper.fault is None}
 
-    async def stand_down(self) -> str:
-        """Have a running correction ramped to zero and wait for it; return the state that was reached."""
+    async def stand_down(self) -> Standing:
+        """Have a running correction ramped to zero and wait for it; return what may still be applied."""
         self._supply = None
         self.abandon()
-        if self.guard.connected and self.guard.state not in REST:
-            await self.disarm()
-            for _ in range(round(STAND_DOWN_S / ALIVE_S)):
-                if self.guard.state in REST:
-                    break
-                self.guard.say_alive(None)
-                await asyncio.sleep(ALIVE_S)
-                await asyncio.to_thread(self.guard.refresh)
-        state = self.guard.state
+        if self.guard.connected:
+            with contextlib.suppress(DeviceError):
+                await asyncio.to_thread(self.guard.disarm if self.guard.state not in REST else self.guard.look)
         await self._check.close()
         await asyncio.to_thread(self.guard.close)
-        return state
+        return self.guard.standing
 
 
 def _refused(refused: Refused) -> Answer:

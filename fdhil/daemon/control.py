@@ -3,7 +3,8 @@
 A request is {"request": "status" | "arm" | "disarm" | "stop", ...}; an answer is {"ok": true, ...} or
 {"ok": false, "code", "text", "advice"}. With "progress": true lines {"progress": {...}} come before an answer that
 takes its time; who closes the connection meanwhile abandons what is checked for him. The socket is mode 0600: who may
-open it may read; arming needs the token.
+open it may read; arming needs the token. Of sixteen connections the one that has been idle for longest makes room for
+one more; where all wait for their answers, four more may ask for ``status`` and ``disarm``.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from fdhil.errors import ConnectError, DeviceTimeout, FdhilError
 SOCKET_NAME = "daemon.sock"
 MAX_LINE = 64 * 1024
 MAX_CLIENTS = 16
+RESERVE = 4  # more, for who must be heard while all others wait for their answers
+ALWAYS_HEARD = ("disarm", "status")
 IDLE_S = 60.0
 PROGRESS_S = 0.5
 
@@ -42,8 +45,9 @@ class ControlServer:
     def __init__(self, handle: Handler, progress: Progress, abandon: Callable[[], object]) -> None:
         """``progress`` tells how far what takes long is, ``abandon`` ends it."""
         self._handle, self._progress, self._abandon = handle, progress, abandon
-        self._clients: set[asyncio.Task[None]] = set()
-        self.refused_clients = 0
+        # the clients in the order of their last answers, the longest idle first, and those that wait for one
+        self._clients: dict[asyncio.Task[None], None] = {}
+        self._busy: set[asyncio.Task[None]] = set()
 
     @asynccontextmanager
     async def serving(self, path: Path) -> AsyncIterator[None]:
@@ -71,26 +75,41 @@ class ControlServer:
                 path.unlink()
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if len(self._clients) >= MAX_CLIENTS:
-            self.refused_clients += 1
-            writer.close()
-            return
         task = asyncio.current_task()
         assert task is not None
-        self._clients.add(task)
+        if not self._has_room():
+            writer.close()
+            return
+        self._clients[task] = None
         try:
-            await self._converse(reader, writer)
+            await self._converse(task, reader, writer)
         except (OSError, asyncio.LimitOverrunError, ValueError, TimeoutError):
             pass  # a client that left, talks too much or never reads loses its connection, nothing else
         except asyncio.CancelledError:
-            pass  # the daemon stops; the stream's own callback must not see a cancelled task
+            pass  # the daemon stops, or another has this place; the stream's own callback must not see it
         finally:
-            self._clients.discard(task)
+            self._clients.pop(task, None)
+            self._busy.discard(task)
             writer.close()
 
-    async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    def _has_room(self) -> bool:
+        """Whether one more may come; the connection that has been idle for longest is closed for it."""
+        if len(self._clients) < MAX_CLIENTS:
+            return True
+        idle = next((client for client in self._clients if client not in self._busy), None)
+        if idle is not None:
+            self._clients.pop(idle)
+            idle.cancel()
+        return len(self._clients) < MAX_CLIENTS + RESERVE
+
+    async def _converse(
+        self, task: asyncio.Task[None], reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
         while line := await asyncio.wait_for(reader.readline(), IDLE_S):
+            self._busy.add(task)
             answer = await self._attended(line, reader, writer)
+            self._busy.discard(task)
+            self._clients[task] = self._clients.pop(task, None)
             writer.write(json.dumps(answer).encode() + b"\n")
             await asyncio.wait_for(writer.drain(), IDLE_S)
 
@@ -115,6 +134,8 @@ class ControlServer:
     async def _answer(self, request: Any) -> Answer:
         if not isinstance(request, dict) or not isinstance(request.get("request"), str):
             return refusal("BadRequest", "the request has no text under 'request'", "status, arm, disarm or stop")
+        if len(self._busy) > MAX_CLIENTS and request["request"] not in ALWAYS_HEARD:
+            return refusal("Busy", f"{MAX_CLIENTS} others wait for their answers", "wait for one of them to end")
         try:
             return await self._handle(request)
         except FdhilError as error:

@@ -9,10 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from fdhil.records import PARAMETERS, UNITS, Notice, Outcome, ParameterSet, Skill, WindowOutcome
+from fdhil.records import INTERVAL_95, PARAMETERS, UNITS, Notice, Outcome, ParameterSet, Skill, WindowOutcome
 from fdhil.store.history import described
-
-INTERVAL_95 = 1.959963984540054
 
 
 def parameters_status(published: ParameterSet) -> Mapping[str, Mapping[str, Any]]:

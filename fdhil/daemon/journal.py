@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import datetime
 from typing import Literal
 
 from fdhil.records import PARAMETERS, UNITS, Notice, Outcome, ParameterSet, Skill, WindowOutcome
@@ -15,6 +19,8 @@ _PRIORITY = {"info": 6, "minor": 4, "MAJOR": 3}
 BURST = 20  # lines of one class that are written before a flood of it is only counted
 REFILL_PER_S = 1.0
 
+_for_programs = threading.Event()  # whether lines are JSON
+
 Log = Callable[[str, Severity], None]
 
 
@@ -23,9 +29,27 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
+@contextmanager
+def lines_as_json(wanted: bool) -> Iterator[None]:
+    """Write each line as a JSON object to stdout meanwhile, for programs, where that is wanted."""
+    if wanted:
+        _for_programs.set()
+    try:
+        yield
+    finally:
+        _for_programs.clear()
+
+
 def write_line(text: str, severity: Severity = "info") -> None:
-    """Write one line to stderr, with a journal prefix when stderr is the journal."""
-    prefix = f"<{_PRIORITY[severity]}>" if os.environ.get("JOURNAL_STREAM") else ""
+    """Write one line to stderr with the local time; to the journal, which has the time, with its priority."""
+    now = datetime.now().astimezone()
+    if _for_programs.is_set():
+        line = {"time": now.isoformat(timespec="milliseconds"), "severity": severity, "text": text}
+        sys.stdout.write(json.dumps(line) + "\n")
+        sys.stdout.flush()
+        return
+    stamp = f"{now:%Y-%m-%d %H:%M:%S}.{now.microsecond // 1000:03d} "
+    prefix = f"<{_PRIORITY[severity]}>" if os.environ.get("JOURNAL_STREAM") else stamp
     sys.stderr.write(f"{prefix}{printable(text)}\n")
     sys.stderr.flush()
 

@@ -19,21 +19,24 @@ from fdhil.config import MachineConfig, unlikely
 from fdhil.daemon import blackbox, journal
 from fdhil.daemon.armory import Armory
 from fdhil.daemon.control import SOCKET_NAME, Answer, ControlServer, refusal
-from fdhil.daemon.guard_link import TRIPPED
+from fdhil.daemon.guard_link import TRIPPED, VOIDING
 from fdhil.daemon.keeping import Keeper
 from fdhil.daemon.lock import sole_owner
 from fdhil.daemon.notify import notify
+from fdhil.daemon.standing import ADOPT, START_AND_ADOPT, Standing
 from fdhil.daemon.status import Watch
 from fdhil.daemon.warm import warm
-from fdhil.errors import DeviceError, FdhilError
+from fdhil.drivers.commissioning_void import void_record
+from fdhil.errors import DeviceError, FdhilError, StoreError
 from fdhil.pipeline import AxisPipeline, Record
-from fdhil.records import Notice, Outcome, Temperature, TickTimes
+from fdhil.records import AxisSamples, Notice, Outcome, Temperature, TickTimes
 
 QUEUE_RECORDS = 4000  # per axis: more than half a minute of blocks; beyond it the newest are dropped and counted
 NOTICE_QUEUE = 200
 FIRST_RETRY_S = 0.1
 LAST_RETRY_S = 5.0
 WATCHDOG_S = 2.0
+LISTEN_S = 0.25
 STUCK_S = 60.0  # a batch that is digested for so long hangs
 
 
@@ -79,22 +82,34 @@ class Service:
         self._source: Source | None = None
         self._frames_seen = -1
 
-    async def run(self) -> None:
-        """Serve until SIGTERM or SIGINT. BusLocked when another daemon serves this config."""
+    async def run(self) -> Standing:
+        """Serve until SIGTERM or SIGINT; return what may still be applied. BusLocked when another daemon serves it."""
         loop = asyncio.get_running_loop()
         with sole_owner(self._run_directory):
             for number in (signal.SIGTERM, signal.SIGINT):
                 loop.add_signal_handler(number, self._stop.set)
-            state = "absent"
             try:
                 await self._serve()
             finally:
                 notify("STOPPING=1")
-                state = await self._armory.stand_down()
+                stands = await self._armory.stand_down()
                 await asyncio.to_thread(self._keeper.close)
                 for number in (signal.SIGTERM, signal.SIGINT):
                     loop.remove_signal_handler(number)
-        self._log("stopped, " + ("offset 0" if state in {"OFF", "absent"} else f"the guard is in state {state}"))
+                self._say_stopped(stands)
+        return stands
+
+    def _say_stopped(self, stands: Standing) -> None:
+        if stands.nothing:
+            self._log(f"stopped, {stands}")
+        else:
+            advice = START_AND_ADOPT if self._armory.guard.state == "lost" else ADOPT
+            self._log(f"stopped, {stands}; {advice}", "MAJOR")
+
+    @property
+    def standing(self) -> Standing:
+        """What may still be applied, as far as the daemon knows."""
+        return self._armory.guard.standing
 
     async def _serve(self) -> None:
         self._say(await asyncio.to_thread(self._keeper.open))
@@ -108,6 +123,7 @@ class Service:
             others.append(tasks.create_task(self._armory.attend(self._tell), name="guard"))
             others.append(tasks.create_task(self._armory.stream(self._tell), name="stream"))
             others.append(tasks.create_task(self._feed_watchdog(), name="watchdog"))
+            others.append(tasks.create_task(self._listen(), name="listen"))
             others.append(tasks.create_task(self._say_ready(), name="ready"))
             await self._stop.wait()
             notify("STOPPING=1")
@@ -149,7 +165,7 @@ class Service:
             try:
                 async with self._open_source(self._config) as source:
                     self._source = source
-                    self._watch.source_opened(time.monotonic())
+                    self._watch.hearing.source_opened(time.monotonic())
                     self._opened.set()
                     async for record in source.records():
                         delay_s = FIRST_RETRY_S
@@ -160,19 +176,21 @@ class Service:
                     raise
                 cause = str(error)
             self._source = None
-            self._watch.source_lost(time.monotonic())
+            self._watch.hearing.source_lost(time.monotonic())
             text = f"{cause}; it is opened again in {delay_s:.1f} s, what was learnt is kept."
             self._tell([Notice("SourceLost", "MAJOR", text)])
             await asyncio.sleep(delay_s)
             delay_s = min(LAST_RETRY_S, 2 * delay_s)
 
     def _take(self, record: Record | Notice) -> None:
-        self._watch.record_came(record, time.monotonic())
+        self._watch.hearing.record_came(record, time.monotonic())
         if isinstance(record, Notice):
             self._tell([record])
             return
         if isinstance(record, Temperature):
             self._armory.note_temperature(record)
+        elif isinstance(record, AxisSamples):
+            self._armory.hear(record)
         for axis in self._config.axis if isinstance(record, TickTimes) else (record.axis,):
             if axis in self._queues:
                 if self._queues[axis].full():
@@ -212,10 +230,19 @@ class Service:
         while True:
             notice = await self._notices.get()
             self._say(await asyncio.to_thread(self._keeper.keep, [notice]))
+            if notice.code in VOIDING:
+                await asyncio.to_thread(self._void, notice)
             if notice.code == TRIPPED and self._source is not None:
                 code, store = notice.text.partition(":")[0], self._config.store.directory
                 self._say([await asyncio.to_thread(blackbox.dump, store, code, self._source.black_box)])
             self._notices.task_done()
+
+    def _void(self, notice: Notice) -> None:
+        """Mark the axis' commissioning record: the guard that is started next must know of it."""
+        try:
+            void_record(self._config.store.directory, notice.axis, notice.text)
+        except StoreError as error:
+            self._log(str(error), "MAJOR")
 
     def _say(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
         """Show outcomes: one log line each (a flood becomes a count), the newest in the status. Return those shown."""
@@ -242,10 +269,18 @@ class Service:
         if any(now_s - since_s > STUCK_S for since_s in self._busy_since_s.values()):
             return False
         counters = self._source.counters() if self._source is not None else {}
-        self._watch.counted(counters, now_s)
         frames = int(counters.get("frames", 0))
         moved, self._frames_seen = frames != self._frames_seen, frames
-        return moved or self._watch.source_alive(now_s, period_s)
+        return moved or self._watch.hearing.alive(now_s, period_s)
+
+    async def _listen(self) -> None:
+        """Look a few times a second whether the machine is heard, and tell what is not as the config says."""
+        while True:
+            await asyncio.sleep(LISTEN_S)
+            now_s = time.monotonic()
+            if self._source is not None:
+                self._watch.hearing.counted(self._source.counters(), now_s)
+            self._tell(self._watch.troubles(now_s))
 
     # control ---------------------------------------------------------------------------------------------------
 
@@ -276,14 +311,16 @@ class Service:
             status["axes"][axis]["slideway_c"] = celsius
         return {
             "ok": True,
-            "state": guard.state if guard.connected else "OFF(SHADOW)",
+            "state": "OFF(SHADOW)" if guard.state == "absent" else guard.state,
             **status,
             "frames": {"received": counters.get("frames", 0), "lost": counters.get("lost", 0)},
             "counters": counters,
             "dropped": self._dropped,
             "guard": dict(guard.status),
+            "may_stand": {"nothing": guard.standing.nothing, "text": str(guard.standing)},
             "armed": self._armory.armed,
             "checking": self._armory.checking,
+            "passes": self._armory.passes,
             "store": store,
         }
 
@@ -295,17 +332,21 @@ def _told(answer: Answer) -> Notice:
     return Notice("ArmRefused", "minor", f"{answer['code']}: {answer['text']}")
 
 
-def run(config: MachineConfig, open_source: OpenSource, method: str | None = None) -> None:
-    """Run the daemon until it is told to stop. FdhilError when it cannot start or meets what it must not survive."""
+def run(config: MachineConfig, open_source: OpenSource, method: str | None = None) -> Standing:
+    """Run the daemon until it is told to stop; return what may still be applied.
+
+    FdhilError when it cannot start or meets what it must not survive.
+    """
+    service = Service(config, open_source, method)
     try:
-        asyncio.run(Service(config, open_source, method).run())
+        return asyncio.run(service.run())
     except ExceptionGroup as group:
         first = _first(group)
         if isinstance(first, FdhilError):
             raise first from None
         for line in "".join(traceback.format_exception(group)).splitlines():
             journal.write_line(line, "MAJOR")
-        text = f"InternalError: {first!r} ended the daemon and nothing is sent any more; report the lines above"
+        text = f"InternalError: {first!r} ended the daemon; {service.standing}; report the lines above"
         raise InternalError(text) from None
 
 

@@ -8,8 +8,11 @@ import numpy as np
 
 from fdhil import correction
 from fdhil.config import Axis, MachineConfig
+from fdhil.correction.kernels import project
 from fdhil.pipeline import AxisPipeline
 from fdhil.records import Float, Parameters, Stages, Trajectory, Window, frozen, frozen_ints
+from fdhil.validation.bridging import Crossing
+from fdhil.validation.readings import log_chance
 
 
 def warm(config: MachineConfig, method: str | None = None) -> None:
@@ -27,6 +30,15 @@ def warm(config: MachineConfig, method: str | None = None) -> None:
     reference = Trajectory(dt_s, frozen(np.arange(rows) * dt_s), demand, still.astype(np.bool_), frozen_ints(still))
     models = {name: Parameters(**axis.nominal.model_dump()) for name, axis in config.axis.items()}
     correction.plan(reference, models, config)
+    _warm_what_is_rare()
+
+
+def _warm_what_is_rare() -> None:
+    """Call the kernels that a sound drive seldom needs: offsets at their limits, readings that stand still."""
+    project(np.linspace(0.0, 2.0, 8), np.ones(3), np.zeros(2))
+    log_chance(np.arange(12.0), 4, 8, 3, 3, 2, 1.0)
+    theta, rows = np.array([0.5, 0.005, 0.8, 0.075, 0.05, 5.0, 0.0]), np.ones((4, 3))
+    assert Crossing(theta, 0.001, np.ones(4), rows, rows, rows, 0, 0, 0).free
 
 
 def nominal_rapid(name: str, axis: Axis, dt_s: float, direction: int = 1, seed: int = 1) -> Window:

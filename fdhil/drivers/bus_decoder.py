@@ -46,7 +46,7 @@ class BusDecoder:
         return [Notice("SyncLost", "info", "SYNC is back.")] if was and not silent else []
 
     def counters(self) -> dict[str, int]:
-        """What was missed, duplicated or discarded on this bus."""
+        """What was missed, duplicated or discarded on this bus, and how many frames each drive sent."""
         counters = [decoder.counters for decoder in self.decoders.values()]
         return {
             "sync_missed": self.grid.missed,
@@ -57,4 +57,5 @@ class BusDecoder:
             "pdo_long": sum(c.long for c in counters),
             "pdo_duplicates": sum(c.duplicates for c in counters),
             "pdo_ambiguous": sum(c.ambiguous for c in counters),
+            **{f"{axis}.heard": watch.heard for axis, watch in self.watches.items()},
         }

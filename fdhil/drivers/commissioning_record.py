@@ -12,12 +12,13 @@ import json
 import os
 import secrets
 import stat
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 from fdhil.config import MachineConfig
+from fdhil.drivers.commissioning_void import confirm_record
 from fdhil.errors import StoreError
 
 SCHEMA = "fdhil-commissioning-2"
@@ -60,6 +61,12 @@ class CommissioningRecord:
         return None if low is None or high is None else (low, high)
 
     @property
+    def fingerprint(self) -> str:
+        """The drive as it was signed off, in 16 hexadecimal digits: what a comparison must find again."""
+        who = (self.vendor_id, self.product_code, self.revision, self.serial)
+        return fingerprint(who, self.mapping_fingerprint, self.options)
+
+    @property
     def digest(self) -> str:
         """SHA-256 over all that the record says."""
         return hashlib.sha256(self._text()).hexdigest()
@@ -70,6 +77,18 @@ class CommissioningRecord:
 
     def _text(self) -> bytes:
         return json.dumps({"schema": SCHEMA, **asdict(self)}, sort_keys=True).encode()
+
+
+def fingerprint(identity: Sequence[int], mapping_fingerprint: str, options: Mapping[str, int]) -> str:
+    """SHA-256, 16 hexadecimal digits, of a drive's identity, PDOs and options; an RPDO's COB-ID is in the PDOs."""
+    own = {key: value for key, value in options.items() if not key.startswith("14")}
+    text = json.dumps([list(identity), mapping_fingerprint, own], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def holds(record: CommissioningRecord | None, config: MachineConfig, axis: str) -> bool:
+    """Whether there is a record and it was made with this configuration."""
+    return record is not None and record.readback_ok and record.config_digest == axis_digest(config, axis)
 
 
 def axis_digest(config: MachineConfig, axis: str) -> str:
@@ -109,6 +128,7 @@ def save_record(record: CommissioningRecord, directory: Path, key: Path | None =
         temporary.replace(path)
     except OSError as error:
         raise StoreError(f"{path} cannot be written ({error.strerror}); check the directory and free space") from None
+    confirm_record(directory, record.axis)
     return path
 
 

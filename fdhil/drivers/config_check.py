@@ -12,12 +12,14 @@ from collections.abc import Awaitable, Callable, Iterator
 from fdhil.cia402 import PdoEntry
 from fdhil.config import MachineConfig
 from fdhil.drivers.bus_scan import LISTEN_S, Ear, Traffic
-from fdhil.drivers.commissioning_checks import Finding, read_optional, survey
+from fdhil.drivers.commissioning_checks import Finding, Survey, read_optional, survey
+from fdhil.drivers.commissioning_compare import POINT, compare_record
 from fdhil.drivers.commissioning_master import Master
+from fdhil.drivers.commissioning_record import load_record
 from fdhil.drivers.modbus_link import ModbusLink, float32
 from fdhil.drivers.modbus_voltage import ALL_REGISTERS, parse_block
 from fdhil.drivers.profile import DriveProfile, PdoSpec, load_profile
-from fdhil.errors import DeviceError
+from fdhil.errors import DeviceError, StoreError
 
 RATE_TOLERANCE = 0.1
 PERIOD_TOLERANCE = 0.02
@@ -77,9 +79,22 @@ def compare_asked(config: MachineConfig, axis: str) -> list[Finding]:
                 _heartbeat(found.options.get("1017")),
                 *_rapid(config, master.profile, lambda: read_optional(master, *master.profile.digital_inputs)),
                 *_voltage_object(config, axis, master.profile, master),
+                *_record(config, axis, found),
             ]
         except DeviceError as error:
             return [_unreachable("drive", node, error)]
+
+
+def _record(config: MachineConfig, axis: str, found: Survey) -> Iterator[Finding]:
+    """Whether the drive is the one that was signed off; nothing where none was."""
+    try:
+        record = load_record(config.store.directory, axis, config.store.commissioning_key, may_lack_key=True)
+    except StoreError as error:
+        cause, _, advice = str(error).partition("; ")
+        yield Finding(POINT, "as signed off", "cannot be read", False, cause, advice)
+        return
+    if record is not None:
+        yield compare_record(record, found)
 
 
 def _unreachable(point: str, expected: str, error: DeviceError) -> Finding:

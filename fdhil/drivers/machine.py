@@ -237,9 +237,12 @@ class MachineSource:
         used = dict.fromkeys(axis.drive.bus for axis in config.axis.values())
         self._buses = {name: BusSource(name, config) for name in used}
         self._sensors = {
-            axis: SensorSource(ModbusVoltage(axis, config), self._buses[settings.drive.bus].ticks)
+            axis: SensorSource(
+                tables.load(tables.VOLTAGE_SOURCES, settings.voltage.source)(axis, config),
+                self._buses[settings.drive.bus].ticks,
+            )
             for axis, settings in config.axis.items()
-            if settings.voltage.source == "modbus"
+            if settings.voltage.source != "drive"  # the drive's own comes with its TPDOs
         }
         self._sensors |= {
             f"{axis}.temperature": SensorSource(

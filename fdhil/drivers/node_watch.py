@@ -6,7 +6,10 @@ heartbeat that stops, and believes an NMT command as soon as it is sent.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Literal
+
+import numpy as np
 
 from fdhil.cia402 import COB_EMCY, COB_HEARTBEAT, Nmt
 from fdhil.drivers.frames import Frames
@@ -14,6 +17,9 @@ from fdhil.records import Notice
 
 _MAX_EMCY_CODES = 32
 _HEARTBEATS_TO_LEARN = 3
+_BACK_NS = 2_000_000_000  # of regular heartbeats after which an outage is over: until then it is one and the same
+# what a node itself sends in CiA 301's predefined set: EMCY, TPDO1 to 4, SDO answers, heartbeat
+_OWN_COB_IDS = (0x080, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700)
 _NMT_STATES = frozenset(int(state) for state in Nmt)
 
 # error classes of CiA 301, 7.2.7.1
@@ -66,10 +72,15 @@ class NodeWatch:
         self._codes: set[int] = set()
         self._beats: list[int] = []
         self._lost = False
+        self._period_ns = 0
+        self._back_since_ns: int | None = None
+        self._own_ids = np.array([cob_id + node_id for cob_id in _OWN_COB_IDS], dtype=np.uint32)
+        self.heard = 0
 
     def feed(self, frames: Frames, now_ns: int) -> list[Notice]:
         """Take a block of frames; ``now_ns`` is the host's monotonic time."""
         notices = []
+        self.heard += int(np.count_nonzero(np.isin(frames["id"], self._own_ids)))
         for frame in frames[frames["id"] == COB_EMCY + self._node_id]:
             notices += self._emergency(int(frame["dlc"]), int(frame["data"]))
         for frame in frames[frames["id"] == COB_HEARTBEAT + self._node_id]:
@@ -104,18 +115,31 @@ class NodeWatch:
             text = "left the NMT state Operational, it takes no set-points; see what the NC did."
             notices.append(self._notice("NmtStateWrong", "MAJOR", text))
         if self._lost:
-            self._lost, self._beats = False, []
-            notices.append(self._notice("HeartbeatLost", "info", "sends its heartbeat again."))
+            notices += self._after_an_outage(t_ns)
         self._beats = [*self._beats, t_ns][-_HEARTBEATS_TO_LEARN - 1 :]
         self.nmt = Nmt(state) if state in _NMT_STATES else self.nmt
         return notices
 
+    def _after_an_outage(self, t_ns: int) -> list[Notice]:
+        """Say that the heartbeat is back once it has been regular for a while: an outage is two lines."""
+        if self._back_since_ns is None or t_ns - self._beats[-1] > self._longest_gap_ns():
+            self._back_since_ns, self._beats = t_ns, []
+            return []
+        if t_ns - self._back_since_ns < _BACK_NS:
+            return []
+        self._lost, self._back_since_ns = False, None
+        return [self._notice("HeartbeatLost", "info", "sends its heartbeat again.")]
+
+    def _longest_gap_ns(self) -> int:
+        """Three learned periods and 0.1 s; the period is the longest of those heard, some may have come in a burst."""
+        return 3 * self._period_ns + 100_000_000
+
     def _silence(self, now_ns: int) -> list[Notice]:
-        """Three learned periods and 0.1 s without a heartbeat are silence; a drive that sends none is not judged."""
+        """Tell a heartbeat that stops; a drive that sends none is not judged."""
         if self._lost or len(self._beats) <= _HEARTBEATS_TO_LEARN:
             return []
-        period_ns = (self._beats[-1] - self._beats[0]) / _HEARTBEATS_TO_LEARN
-        if now_ns - self._beats[-1] <= 3 * period_ns + 100_000_000:
+        self._period_ns = max(b - a for a, b in pairwise(self._beats))
+        if now_ns - self._beats[-1] <= self._longest_gap_ns():
             return []
         self._lost = True
         text = "sends no heartbeat any more and may be dead; check its supply and the bus."

@@ -1,6 +1,6 @@
 """``python -m fdhil.guard --settings FILE --descriptor N``: the guard on an open transmit descriptor.
 
-``fdhil-guard`` starts it; on its own it can open nothing but its control socket and the table file.
+``fdhil-guard`` starts it; on its own it opens nothing but its settings and its control socket.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 from fdhil.errors import FdhilError
+from fdhil.guard import signals
 from fdhil.guard.can_socket import adopt_descriptor
 from fdhil.guard.frames import Listener
 from fdhil.guard.journal import Journal, Notifier
@@ -25,11 +26,12 @@ def main() -> int:
     parser.add_argument("--settings", type=Path, required=True, help="the settings file that fdhil-guard wrote")
     parser.add_argument("--descriptor", type=int, required=True, help="the open CAN_RAW or socketcand descriptor")
     options = parser.parse_args()
+    wake = signals.catch()
     try:
         settings = load(options.settings)
         wanted = Listener(settings).wanted_ids()
         can = adopt_descriptor(settings.transport, options.descriptor, settings.sent_ids, wanted)
-        guard = Guard(settings, can, Journal(), Notifier(os.environ.get("NOTIFY_SOCKET")))
+        guard = Guard(settings, can, Journal(), Notifier(os.environ.get("NOTIFY_SOCKET")), wake)
     except FdhilError as error:
         sys.stderr.write(f"fdhil-guard: {error}\n")
         return error.exit_code

@@ -27,6 +27,7 @@ CAN_SFF_ONLY = 0xC00007FF
 RETRY = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EINTR)
 FULL = (errno.ENOBUFS, errno.EAGAIN, errno.EWOULDBLOCK)
 MAX_PENDING_BYTES = 1 << 16
+MOST_FRAMES = 256  # of one call: a flood must not keep the loop from sending
 
 
 class BusDown(Exception):
@@ -52,7 +53,7 @@ class CanSocket(ABC):
 
     @abstractmethod
     def receive(self) -> list[Frame]:
-        """Return all frames that wait, without waiting; BusDown when the bus is gone."""
+        """Return the frames that wait, a few hundred at most, without waiting; BusDown when the bus is gone."""
 
     def send(self, cob_id: int, data: bytes) -> bool:
         """Send one frame now; False when the queue is full. BusDown, ForbiddenFrame."""
@@ -87,9 +88,9 @@ class RawCan(CanSocket):
         self._overflow = 0
 
     def receive(self) -> list[Frame]:
-        """Return all frames that wait, error frames as controller states."""
+        """Return the frames that wait, error frames as controller states."""
         frames: list[Frame] = []
-        while True:
+        for _ in range(MOST_FRAMES):
             try:
                 data, ancillary, _, _ = self._socket.recvmsg(16, 64)
             except OSError as error:
@@ -102,6 +103,7 @@ class RawCan(CanSocket):
                 frames += [(ERROR, name.encode(), stamp_s) for name in controller_states(can_id, payload)]
             elif can_id <= 0x7FF:
                 frames.append((can_id, payload[:length], stamp_s))
+        return frames
 
     def _ancillary(self, ancillary: list[tuple[int, int, bytes]]) -> float:
         stamp_s = 0.0
@@ -148,21 +150,16 @@ class SocketcandText(CanSocket):
         self._rest = b""
 
     def receive(self) -> list[Frame]:
-        """Return the wanted frames of everything that waits."""
-        chunks = [self._rest]
-        while True:
-            try:
-                chunk = self._socket.recv(1 << 16)
-            except OSError as error:
-                if error.errno in RETRY:
-                    break
-                raise BusDown(error.strerror or str(error)) from None
-            if not chunk:
-                raise BusDown("the hub closed the connection")
-            chunks.append(chunk)
-            if len(chunk) < 1 << 16:
-                break
-        *pieces, self._rest = b"".join(chunks).split(b">")
+        """Return the wanted frames of what waits."""
+        try:
+            chunk = self._socket.recv(MOST_FRAMES * 64)
+        except OSError as error:
+            if error.errno in RETRY:
+                return []
+            raise BusDown(error.strerror or str(error)) from None
+        if not chunk:
+            raise BusDown("the hub closed the connection")
+        *pieces, self._rest = (self._rest + chunk).split(b">")
         if len(self._rest) > MAX_PENDING_BYTES:
             raise BusDown("the hub does not speak the socketcand protocol")
         return [frame for piece in pieces if (frame := self._parse(piece)) is not None]

@@ -7,6 +7,7 @@ own: a daemon that hangs must look dead. The connection that armed is the one wh
 from __future__ import annotations
 
 import json
+import os
 import socket
 import threading
 import time
@@ -18,8 +19,7 @@ from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
 from fdhil.guard import table
 from fdhil.guard.control import SOCKET_NAME
 
-TABLE_NAME = "guard.table"
-ANSWER_S = 8.0  # the guard answers a request at a SYNC, or when it has missed it for up to 5 s
+ANSWER_S = 13.0  # the guard answers a request at a SYNC, or when it has missed it for up to 10 s
 
 
 class GuardLost(DeviceError):
@@ -35,7 +35,6 @@ class GuardClient:
     """
 
     def __init__(self, run_directory: Path, timeout_s: float = ANSWER_S) -> None:
-        self._table = run_directory / TABLE_NAME
         self._timeout_s = timeout_s
         self._asking, self._sending = threading.Lock(), threading.Lock()
         self._number = 0
@@ -63,14 +62,17 @@ class GuardClient:
         first: int = 0,
         final: bool = True,
     ) -> dict[str, Any]:
-        """Write a table (or with ``first`` and ``final`` a piece of a streamed one) and have it checked and loaded.
+        """Hand a table over (or with ``first`` and ``final`` a piece of a streamed one); have it checked and loaded.
 
         Rows per axis: demand and offset in drive increments (sequences of int or numpy integer arrays). StoreError when
-        the file cannot be written, ValueError when a value is no 32 bit integer.
+        it is too long or there is no memory for it, ValueError when a value is no 32 bit integer.
         """
         body = table.encode(axes, demand, offset, program_digest, first, final)
-        table.write(self._table, body)
-        return self.ask({"request": "table"}, timeout_s=self._timeout_s + len(body) / 1e6)
+        descriptor = table.seal(body)
+        try:
+            return self.ask({"request": "table"}, self._timeout_s + len(body) / 2e5, descriptor)
+        finally:
+            os.close(descriptor)
 
     def arm(self, token: str, program_digest: str, facts: Mapping[str, bool]) -> dict[str, Any]:
         """Arm the loaded table; ``facts`` as in ``interlocks.FACTS``."""
@@ -92,6 +94,10 @@ class GuardClient:
         """Take over what the drives hold and ramp it to zero (after FROZEN, or a stale offset)."""
         return self.ask({"request": "adopt", "token": token})
 
+    def compared(self, token: str, axes: Mapping[str, str]) -> dict[str, Any]:
+        """Tell which drives were compared with their records; a fingerprint that is not the record's voids it."""
+        return self.ask({"request": "compared", "token": token, "axes": dict(axes)})
+
     def alive(self, facts: Mapping[str, bool] | None = None) -> None:
         """Say that the daemon is well, and what it still vouches for; GuardLost when the guard is gone."""
         message: dict[str, Any] = {"request": "alive"}
@@ -99,22 +105,27 @@ class GuardClient:
             message["facts"] = dict(facts)
         self._send(message)
 
-    def ask(self, request: Mapping[str, Any], timeout_s: float | None = None) -> dict[str, Any]:
-        """Send one request and wait for its answer."""
+    def ask(
+        self, request: Mapping[str, Any], timeout_s: float | None = None, descriptor: int | None = None
+    ) -> dict[str, Any]:
+        """Send one request, and with it a descriptor, and wait for the answer."""
         with self._asking:
             self._number += 1
             number = self._number
-            self._send({**request, "id": number})
+            self._send({**request, "id": number}, descriptor)
             deadline_s = time.monotonic() + (timeout_s or self._timeout_s)
             while True:
                 answer = self._line(deadline_s)
                 if answer.pop("id", None) == number:
                     return answer
 
-    def _send(self, message: Mapping[str, Any]) -> None:
+    def _send(self, message: Mapping[str, Any], descriptor: int | None = None) -> None:
+        line = json.dumps(message).encode() + b"\n"
         try:
             with self._sending:
-                self._socket.sendall(json.dumps(message).encode() + b"\n")
+                if descriptor is not None:  # it goes with the first byte
+                    line = line[socket.send_fds(self._socket, [line], [descriptor]) :]
+                self._socket.sendall(line)
         except OSError as error:
             raise self._lost(error.strerror or str(error)) from None
 

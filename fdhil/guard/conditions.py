@@ -23,10 +23,17 @@ from fdhil.guard.state import AxisInput, AxisState, BusView
 View = tuple[AxisSettings, AxisInput, AxisState]
 """One axis: what it is set to, what it showed, and what is remembered of it."""
 Good = Callable[[AxisSettings, AxisInput, AxisState], bool]
+AGREEING = 3
+"""TPDOs in a row that must show the same offset before it is known."""
 
 
 def _status(bit: int, wanted: bool) -> Good:
     return lambda _own, seen, _axis: seen.statusword is not None and bool(seen.statusword & bit) is wanted
+
+
+def known(axis: AxisState) -> int | None:
+    """Return the offset that the drive holds, None as long as it is not shown or not shown alike."""
+    return axis.read_back if axis.readings >= AGREEING else None
 
 
 def _enabled(_own: AxisSettings, seen: AxisInput, _axis: AxisState) -> bool:
@@ -52,6 +59,7 @@ AXIS_INTERLOCKS: tuple[tuple[str, Good], ...] = (
     ("NotFollowing", _status(STATUS_FOLLOWS_DEMAND, True)),
     ("LimitActive", _status(STATUS_INTERNAL_LIMIT, False)),
     ("NotCsp", lambda _own, seen, _axis: seen.mode == Mode.CYCLIC_SYNC_POSITION),
+    ("ReadBackStale", lambda _own, seen, _axis: seen.read_back_age <= 2),
     ("EchoMismatch", lambda _own, _seen, axis: axis.echo_misses < 2 and axis.feed_misses < 2),
     ("Implausible", lambda _own, _seen, axis: axis.implausible < 2),
     ("PdoLength", lambda _own, seen, _axis: seen.short_frames < 3),
@@ -69,6 +77,9 @@ BUS_INTERLOCKS: tuple[tuple[str, Callable[[BusView], bool]], ...] = (
 # needed to arm only: per axis
 ARMING_INTERLOCKS: tuple[tuple[str, Good], ...] = (
     ("StaleOffset", lambda _own, _seen, axis: not axis.read_back and not any(axis.fed_back)),
+    ("ReadBackStale", lambda _own, _seen, axis: known(axis) is not None),
+    ("NotCommissioned", lambda own, _seen, _axis: bool(own.record)),
+    ("RecordVoid", lambda _own, _seen, axis: not axis.record_void),
     ("PdoMapping", lambda _own, seen, _axis: seen.long_frames == 0),
     ("LimitBeyondWindow", lambda own, _seen, _axis: own.limits.offset <= own.window / 4),
 )

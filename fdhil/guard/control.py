@@ -1,70 +1,122 @@
-"""The guard's UNIX stream socket: JSON lines from the daemon, a few clients, none of which can block the loop."""
+"""The guard's UNIX stream socket: JSON lines from a few clients, none of which can block the loop or fill its memory.
+
+Each turn of the loop serves one client at most, by one request at most. A client whose answers wait is not read.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import os
+import queue
+import select
 import socket
 import struct
+import threading
+from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from fdhil.errors import DeviceError
+from fdhil.guard.requests import Document, parse_line
 
 SOCKET_NAME = "guard.sock"
 MAX_CLIENTS = 8
-MAX_LINE_BYTES = 1 << 16
-MAX_QUEUE_BYTES = 1 << 18
+MAX_LINE_BYTES = 1 << 15
 SO_PEERCRED = getattr(socket, "SO_PEERCRED", 17)
+MOST_DESCRIPTORS = 253  # the kernel's limit: what does not fit the buffer would be closed in this thread
+ANCILLARY_BYTES = socket.CMSG_SPACE(MOST_DESCRIPTORS * 4)
+
+
+class Closer:
+    """Closes what clients sent or left, in a thread: closing a socket that lingers or a hung server's file may wait."""
+
+    def __init__(self) -> None:
+        self._left: queue.SimpleQueue[int | None] = queue.SimpleQueue()
+        self._thread: threading.Thread | None = None
+
+    def take(self, descriptor: int) -> None:
+        """Close a descriptor some time."""
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="closer", daemon=True)
+            self._thread.start()
+        self._left.put(descriptor)
+
+    def _run(self) -> None:
+        while (descriptor := self._left.get()) is not None:
+            with contextlib.suppress(OSError):
+                os.close(descriptor)
+
+    def end(self) -> None:
+        """Wait a moment for what is left; what still waits then is closed by the process' end."""
+        if self._thread is not None:
+            self._left.put(None)
+            self._thread.join(0.5)
 
 
 @dataclass(slots=True, eq=False)
 class Client:
-    """One connection; ``heard_s`` is when it last said anything (monotonic)."""
+    """One connection; ``heard_s`` is when its last request came (monotonic), ``armed`` whether it is the one in charge.
+
+    ``descriptor`` came with the requests that are read now; only a request that asks for it takes it.
+    """
 
     socket: socket.socket
     heard_s: float
-    inbox: bytearray = field(default_factory=bytearray)
+    closer: Closer
+    inbox: bytes = b""
     outbox: bytearray = field(default_factory=bytearray)
+    descriptor: int | None = None
+    armed: bool = False
     gone: bool = False
 
     def fileno(self) -> int:
         """The descriptor, for poll."""
         return self.socket.fileno()
 
-    def read(self, now_s: float) -> list[dict[str, Any]]:
-        """Return the complete requests that wait; a line that is no JSON object is answered at once."""
-        try:
-            chunk = self.socket.recv(1 << 16)
-        except BlockingIOError:
-            return []
-        except OSError:
-            chunk = b""
-        if not chunk:
-            self.gone = True
-            return []
-        self.heard_s = now_s
-        self.inbox += chunk
-        *lines, rest = bytes(self.inbox).split(b"\n")
-        self.inbox = bytearray(rest)
-        self.gone = len(rest) > MAX_LINE_BYTES
-        return [request for line in lines if (request := self._parse(line)) is not None]
+    def read(self, now_s: float) -> Document | None:
+        """Return the next complete request, None when there is none; a line that is no request is answered at once."""
+        if b"\n" not in self.inbox:
+            self._receive()
+        line, newline, rest = self.inbox.partition(b"\n")
+        if not newline:
+            self.gone = self.gone or len(line) > MAX_LINE_BYTES
+            return None
+        self.inbox, self.heard_s = rest, now_s
+        document = parse_line(line)
+        if document is None:
+            self.reply({}, ok=False, code="BadRequest", text="the line is no request", advice="send a JSON object")
+        return document
 
-    def _parse(self, line: bytes) -> dict[str, Any] | None:
+    def _receive(self) -> None:
         try:
-            request = json.loads(line)
-        except (ValueError, RecursionError):
-            request = None
-        if isinstance(request, dict):
-            return request
-        self.reply({}, ok=False, code="BadRequest", text="the line is no JSON object", advice="send one per line")
-        return None
+            chunk, ancillary, _, _ = self.socket.recvmsg(MAX_LINE_BYTES, ANCILLARY_BYTES, socket.MSG_CMSG_CLOEXEC)
+        except BlockingIOError:
+            return
+        except OSError:
+            chunk, ancillary = b"", []
+        for _, _, data in ancillary:
+            for descriptor in array("i", data):
+                self.release()
+                self.descriptor = descriptor
+        self.gone = not chunk
+        self.inbox += chunk
+
+    def settle(self) -> None:
+        """After a request was handled: a descriptor that none of the requests read so far asked for is closed."""
+        if not self.inbox:
+            self.release()
+
+    def release(self) -> None:
+        """Let the descriptor go."""
+        if self.descriptor is not None:
+            self.closer.take(self.descriptor)
+            self.descriptor = None
 
     def reply(self, request: Mapping[str, Any], **answer: Any) -> None:
-        """Queue an answer to ``request``, with its ``id``; a client that does not read is dropped."""
+        """Queue an answer to ``request``, with its ``id``."""
         if "id" in request:
             answer["id"] = request["id"]
         self.outbox += json.dumps(answer).encode() + b"\n"
@@ -79,19 +131,28 @@ class Client:
             pass
         except OSError:
             self.gone = True
-        self.gone = self.gone or len(self.outbox) > MAX_QUEUE_BYTES
+
+    def close(self) -> None:
+        """Close the connection, and with it what was sent over it and never read."""
+        self.release()
+        self.closer.take(self.socket.detach())
 
 
 class Control:
-    """The listening socket ``guard.sock`` (mode 0600) and its clients; DeviceError when it cannot be made."""
+    """The listening socket ``guard.sock`` and its clients; DeviceError when it cannot be made.
 
-    def __init__(self, run_directory: Path) -> None:
+    The file is the guard's alone (0600), or its group's too (0660) where the daemon runs as another user, ``peer_uid``.
+    """
+
+    def __init__(self, run_directory: Path, peer_uid: int | None = None) -> None:
         self.path = run_directory / SOCKET_NAME
         self.clients: list[Client] = []
+        self._trusted = {0, os.getuid(), *([] if peer_uid is None else [peer_uid])}
+        self._closer = Closer()
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             self.path.unlink(missing_ok=True)  # the bus lock is ours already: no other guard listens here
-            mask = os.umask(0o177)
+            mask = os.umask(0o177 if peer_uid is None else 0o117)
             try:
                 self._listener.bind(str(self.path))
             finally:
@@ -99,42 +160,72 @@ class Control:
             self._listener.listen(MAX_CLIENTS)
         except OSError as error:
             self._listener.close()
-            raise DeviceError(
-                str(self.path),
-                f"the control socket cannot be made ({error.strerror or error}); check the run directory",
-            ) from None
+            text = f"the control socket cannot be made ({error.strerror or error}), and nothing is sent"
+            raise DeviceError(str(self.path), f"{text}; check the run directory") from None
         self._listener.setblocking(False)
 
     def fileno(self) -> int:
         """The listener's descriptor, for poll."""
         return self._listener.fileno()
 
-    def accept(self, now_s: float) -> None:
-        """Take one connection of the same user or root; others, and more than a few, are closed."""
+    @property
+    def pending(self) -> bool:
+        """Whether requests wait that were read already."""
+        return any(b"\n" in client.inbox and not client.outbox for client in self.clients)
+
+    def register(self, poll: select.poll) -> None:
+        """Have ``poll`` look at the listener and at every client: what it sends, or whether it takes its answer."""
+        poll.register(self, select.POLLIN)
+        for client in self.clients:
+            poll.register(client, select.POLLOUT if client.outbox else select.POLLIN)
+
+    def serve(self, ready: set[int], now_s: float) -> tuple[Client, Document] | None:
+        """Take one connection, and one request of the client that has waited longest."""
+        if self.fileno() in ready:
+            self._accept(now_s)
+        for client in self.clients:
+            if client.fileno() in ready or (b"\n" in client.inbox and not client.outbox):
+                self.clients.remove(client)
+                self.clients.append(client)
+                client.flush()
+                document = None if client.outbox else client.read(now_s)
+                if document is not None:
+                    return client, document
+                client.settle()
+                return None
+        return None
+
+    def _accept(self, now_s: float) -> None:
+        """Take one connection of a trusted user; when there are too many, the one that was silent longest ends."""
         try:
             connection, _ = self._listener.accept()
         except OSError:
             return
-        credentials = connection.getsockopt(socket.SOL_SOCKET, SO_PEERCRED, 12)
-        _, uid, _ = struct.unpack("3i", credentials)
-        if uid not in (0, os.getuid()) or len(self.clients) >= MAX_CLIENTS:
-            connection.close()
-            return
         connection.setblocking(False)
-        self.clients.append(Client(connection, now_s))
+        client = Client(connection, now_s, self._closer)
+        credentials = connection.getsockopt(socket.SOL_SOCKET, SO_PEERCRED, 12)
+        if struct.unpack("3i", credentials)[1] not in self._trusted:
+            client.close()
+            return
+        if len(self.clients) >= MAX_CLIENTS:
+            silent = min((c for c in self.clients if not c.armed), key=lambda c: c.heard_s)
+            silent.gone = True
+        self.clients.append(client)
 
     def drop_gone(self) -> None:
         """Close and forget the clients that have gone."""
         for client in self.clients:
             if client.gone:
-                client.socket.close()
+                client.close()
         self.clients = [client for client in self.clients if not client.gone]
 
     def close(self) -> None:
         """Close everything and remove the socket's file."""
         for client in self.clients:
             client.flush()
-            client.socket.close()
+            client.close()
+        self.clients = []
+        self._closer.end()
         self._listener.close()
         with contextlib.suppress(OSError):
             self.path.unlink()

@@ -8,9 +8,21 @@ path, the motion of the offset, and a check of the frame by other formulas than 
 from __future__ import annotations
 
 from fdhil.guard import feedforward
-from fdhil.guard.conditions import View, failing, not_ready, withheld
+from fdhil.guard.adoption import (
+    adopt_at_start,
+    adopt_refusals,
+    adopting,
+    at_rest,
+    ceiling,
+    compared,
+    frozen,
+    measure,
+    unread,
+)
+from fdhil.guard.adoption import may_stand as may_stand
+from fdhil.guard.conditions import AGREEING, View, failing, not_ready, withheld
 from fdhil.guard.feedforward import FeedMode
-from fdhil.guard.feeding import go_on, is_fed
+from fdhil.guard.feeding import go_on
 from fdhil.guard.interlocks import FACTS, FEEDFORWARD_FACTS, Alarm, Reaction
 from fdhil.guard.limits import brake, follow, violation
 from fdhil.guard.observe import behind, observe
@@ -41,7 +53,8 @@ def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outpu
     state = state._replace(good_for=0 if alarms else state.good_for + inputs.sync)
     state, refused = _request(state, inputs, alarms, views, settings)
     state = _react(state, inputs, alarms, settings)
-    state = _adopt_at_start(state, inputs, alarms, settings)
+    state = adopt_at_start(state, inputs, alarms, views, settings)
+    state = measure(state, alarms, views, settings)
     if inputs.sync:
         state = rest(_follow_path(state, inputs, alarms, settings))
     state, output = _move(state, inputs, settings)
@@ -86,8 +99,10 @@ def _request(
         fed = state._replace(feed=feedforward.armed(request.laws))
         return fed if request.kind == "feedforward" else _armed(state, inputs), ()
     if request.kind == "adopt":
-        refused = _adopt_refusals(state, request, alarms, settings)
-        return (state, refused) if refused else (_adopting(state, settings), ())
+        refused = adopt_refusals(state, request, alarms, views)
+        return (state, refused) if refused else (adopting(state, settings), ())
+    if request.kind == "compared":
+        return compared(state, request, settings)
     cause = Alarm("Disarmed" if request.kind == "disarm" else "Stopped")
     if state.mode in IN_CHARGE:
         state = _ramp_down(state, cause)
@@ -117,7 +132,7 @@ def _refusals(
     path = inputs.path
     if path is None or not request.program_digest or path.program_digest != request.program_digest or path.first:
         refused.append(Alarm("ProgramMismatch"))
-    return tuple(refused)
+    return tuple(dict.fromkeys(refused))
 
 
 def _armed(state: State, inputs: Inputs) -> State:
@@ -126,35 +141,11 @@ def _armed(state: State, inputs: Inputs) -> State:
         mode=Mode.ARMED,
         program_digest=inputs.path.program_digest,
         start_row=inputs.path.standing_rows(),
-        axes=tuple([_at_rest(axis, 0) for axis in state.axes]),
+        axes=tuple([at_rest(axis, 0) for axis in state.axes]),
         places=(),
         held_for=0,
         cause=None,
     )
-
-
-def _adopt_refusals(state: State, request: Request, alarms: Alarms, settings: Settings) -> Alarms:
-    refused = [alarm for alarm in alarms if alarm.reaction is Reaction.FREEZE]
-    for setting, axis in zip(settings.axes, state.axes, strict=True):
-        if setting.reads_back and axis.read_back is None:
-            refused.append(Alarm("StaleData", setting.name, "its offset was not read yet"))
-    if state.mode not in (Mode.OFF, Mode.FROZEN) or state.feed.mode is not FeedMode.OFF:
-        refused.append(Alarm("NotOff", detail=state.mode.value))
-    if request.token_valid is not True:
-        refused.append(Alarm("AuthRequired"))
-    return tuple(refused)
-
-
-def _adopting(state: State, settings: Settings) -> State:
-    """Take over what the drives hold: the first value sent is the value read; speed and torque get zeros."""
-    cause = Alarm("StaleOffset")
-    axes = tuple([_at_rest(axis, axis.sent[0] if axis.read_back is None else axis.read_back) for axis in state.axes])
-    feed = feedforward.zeroing(len(axes), cause) if is_fed(state) and settings.feeds else state.feed
-    return state._replace(mode=Mode.ADOPT, axes=axes, zeros_sent=0, adopt_checked=True, cause=cause, feed=feed)
-
-
-def _at_rest(axis: AxisState, offset: int) -> AxisState:
-    return axis._replace(offset=offset, rate=0, sent=(offset,) * len(axis.sent), echo_misses=0, zero_shown=False)
 
 
 # --- reactions ---
@@ -164,24 +155,21 @@ def _ramp_down(state: State, cause: Alarm) -> State:
     return state._replace(mode=Mode.RAMP_DOWN, cause=cause, places=(), zeros_sent=0)
 
 
-def _frozen(state: State, cause: Alarm) -> State:
-    """Stop sending: what the drive holds is unknown, unless only zeros were sent."""
-    if not any(any(axis.sent) for axis in state.axes):
-        return state._replace(mode=Mode.OFF, cause=cause, places=())
-    unread = tuple([axis._replace(read_back=None) for axis in state.axes])
-    return state._replace(mode=Mode.FROZEN, cause=cause, places=(), axes=unread)
-
-
 def _react(state: State, inputs: Inputs, alarms: Alarms, settings: Settings) -> State:
     """Freeze or ramp down, whichever the worst alarm asks for; a lost daemon is one."""
+    hijack = next((alarm for alarm in inputs.alarms if alarm.code == "OffsetHijack"), None)
+    if hijack is not None or any(alarm.code == "NodeRebooted" for alarm in inputs.alarms):
+        state = unread(state)
     if state.mode not in SENDING:
         return state
     worst = max(alarms, key=lambda alarm: _reaction(alarm, settings), default=None)
     reaction = Reaction.REFUSE if worst is None else _reaction(worst, settings)
     if worst is not None and reaction is Reaction.FREEZE:
-        return _frozen(state, worst)
+        return frozen(state, worst)
     if state.failed_run >= 2 * FAILED_SENDS:
-        return _frozen(state, Alarm("TxQueueFull"))
+        return frozen(state, Alarm("TxQueueFull"))
+    if hijack is not None:
+        return _ramp_down(state, hijack)._replace(measuring=max(1, state.measuring))
     if state.mode not in IN_CHARGE:
         return state
     if worst is not None and reaction is Reaction.RAMP_DOWN:
@@ -196,18 +184,6 @@ def _reaction(alarm: Alarm, settings: Settings) -> Reaction:
     if alarm.code == "SyncLost" and not settings.offset_synchronous:
         return Reaction.RAMP_DOWN
     return alarm.reaction
-
-
-def _adopt_at_start(state: State, inputs: Inputs, alarms: Alarms, settings: Settings) -> State:
-    """Once after the start: a drive that already holds an offset gets it ramped to zero, by us, from its value."""
-    if state.adopt_checked or state.mode is not Mode.OFF or not inputs.sync:
-        return state
-    unsafe = any(a.code in ("SyncJitter", "OffsetHijack", "BusLocked") or a.reaction is Reaction.FREEZE for a in alarms)
-    if unsafe or any(axis.read_back is None for axis in state.axes):
-        return state
-    if any(axis.read_back for axis in state.axes) or is_fed(state):
-        return _adopting(state, settings)
-    return state._replace(adopt_checked=True)
 
 
 # --- the place on the path ---
@@ -255,7 +231,7 @@ def _held(state: State, alarm: Alarm, settings: Settings) -> State:
 
 def _move(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Output]:
     """Compute, check and hand out the next offsets; a step that is too late sends nothing and stands still."""
-    if state.mode not in SENDING:
+    if state.mode not in SENDING or state.measuring:
         return state, Output()
     if not inputs.sync and (settings.offset_synchronous or not inputs.bus.silent):
         return state, Output()
@@ -267,9 +243,9 @@ def _move(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outp
         offsets, _ = _next_offsets(state, inputs.path, settings)
     wrong = _wrong_frame(state, offsets, settings)
     if wrong is not None:
-        return _frozen(state, wrong), Output()
+        return frozen(state, wrong), Output()
     axes = tuple([_sent(axis, o, s) for axis, o, s in zip(state.axes, offsets, settings.axes, strict=True)])
-    state = _arrived(state._replace(axes=axes), inputs.path, settings)
+    state = _arrived(state._replace(axes=axes), inputs.path)
     heartbeat = state.tick % settings.heartbeat_cycles == 0
     return state, Output(offsets, heartbeat)
 
@@ -300,7 +276,8 @@ def _next_offsets(state: State, path: Path | None, settings: Settings) -> tuple[
 def _wrong_frame(state: State, offsets: tuple[int, ...], settings: Settings) -> Alarm | None:
     """Check the frames by the limits alone, whatever made them; they are wrong only if this program is."""
     for s, axis, offset in zip(settings.axes, state.axes, offsets, strict=True):
-        if type(offset) is not int or violation(s.limits, axis.offset, axis.rate, offset) is not None:
+        broken = type(offset) is not int or violation(s.limits, axis.offset, axis.rate, offset) is not None
+        if broken or not abs(offset) <= ceiling(s):
             return Alarm("InternalError", s.name, f"{axis.offset} + {axis.rate} -> {offset}")
     return None
 
@@ -321,7 +298,7 @@ def _stands(axis: AxisState) -> AxisState:
     return axis._replace(rate=0, sent=(axis.sent[0], *axis.sent[:-1]))
 
 
-def _arrived(state: State, path: Path | None, settings: Settings) -> State:
+def _arrived(state: State, path: Path | None) -> State:
     """Leave RAMPING when on the table, and a landing when the drives show 0."""
     if state.mode is Mode.RAMPING and path is not None and len(state.places) == 1:
         on_table = tuple([axis.offset for axis in state.axes]) == path.offsets_at(state.places[0].row + 1)
@@ -331,9 +308,9 @@ def _arrived(state: State, path: Path | None, settings: Settings) -> State:
     if any(axis.offset or axis.rate for axis in state.axes):
         return state._replace(zeros_sent=0)
     sent = state.zeros_sent + 1
-    shown = all(a.zero_shown or not s.reads_back for s, a in zip(settings.axes, state.axes, strict=True))
-    if sent > ZEROS and shown:
-        return state._replace(mode=Mode.OFF, axes=tuple([_at_rest(axis, 0) for axis in state.axes]), zeros_sent=sent)
+    if sent > ZEROS and all(axis.zero_shown for axis in state.axes):
+        axes = tuple([at_rest(axis, 0)._replace(readings=AGREEING, zero_shown=True) for axis in state.axes])
+        return state._replace(mode=Mode.OFF, axes=axes, zeros_sent=sent)
     if sent > ZEROS_UNCONFIRMED:
-        return state._replace(mode=Mode.FROZEN, cause=Alarm("EchoMismatch", detail="no zero was read back"))
+        return unread(state)._replace(mode=Mode.FROZEN, cause=Alarm("EchoMismatch", detail="no zero was read back"))
     return state._replace(zeros_sent=sent)

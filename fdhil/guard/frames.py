@@ -7,11 +7,22 @@ latches is the last one that came before it.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median
 
-from fdhil.cia402 import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SYNC, Nmt, NmtCommand, PdoEntry, pdo_length, unpack
+from fdhil.cia402 import (
+    COB_EMCY,
+    COB_HEARTBEAT,
+    COB_NMT,
+    COB_SDO_REQUEST,
+    COB_SYNC,
+    Nmt,
+    NmtCommand,
+    PdoEntry,
+    pdo_length,
+    unpack,
+)
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.settings import AxisSettings, Pdo, Settings
 from fdhil.guard.state import AxisInput, BusView
@@ -21,21 +32,32 @@ NEVER = 1 << 30
 INTERVALS = 32
 FOREIGN_CYCLES = 3
 TARGET, POSITION, READ_BACK, STATUSWORD, MODE, FOLLOWING = 0x607A, 0x6064, 0x60B0, 0x6041, 0x6061, 0x60F4
-SPEED_OFFSET, TORQUE_OFFSET, SPEED = 0x60B1, 0x60B2, 0x606C
+SPEED_OFFSET, TORQUE_OFFSET, SPEED, DEMAND = 0x60B1, 0x60B2, 0x606C, 0x6062
+PDO_SET_UP = range(0x1400, 0x1C00)
+# what a commissioning record relies on besides: its options, the scale, the cycle, and "restore the defaults"
+SET_UP = frozenset((0x1005, 0x1011, 0x1016, 0x1017, 0x6007, 0x605A, 0x605E, 0x6065, 0x6066, 0x6075, 0x607D, 0x607E))
+SET_UP |= {0x6085, 0x608F, 0x6091, 0x6092, 0x60C2}
 
 
 @dataclass(slots=True)
 class _PdoState:
-    """One PDO that is listened to: its last content and age in SYNC cycles, and what is wrong with it."""
+    """One PDO that is listened to: its last content and age in SYNC cycles, and what is wrong with it.
+
+    ``early``: it came again long before it was due, ``twice``: with another content; ``sure_age`` is that of the last
+    that came when it was due.
+    """
 
     axis: int
     entries: tuple[PdoEntry, ...]
     length: int
     every_sync: int
     where: dict[int, int]
+    needed: bool = False
     data: bytes = b""
     age: int = NEVER
+    sure_age: int = NEVER
     fresh: bool = False
+    early: bool = False
     twice: bool = False
     twice_run: int = 0
     short: int = 0
@@ -49,16 +71,21 @@ class _PdoState:
             return
         self.long += len(data) > self.length
         self.short = 0
-        if self.fresh and data != self.data:
-            self.twice = True
-        self.data, self.fresh, self.age = data, True, 0
-        self.values = unpack(self.entries, data)  # now, and not at the SYNC, when there is no time
+        if self.fresh and data == self.data:
+            return
+        if 2 * self.age <= self.every_sync:
+            self.early = True
+            self.twice = self.twice or data != self.data
+        self.fresh, self.age = True, 0
+        if data != self.data:
+            self.data, self.values = data, unpack(self.entries, data)  # now: at the SYNC there is no time
 
     def at_sync(self) -> None:
         """Age by one cycle."""
-        self.twice_run = self.twice_run + 1 if self.twice else 0
+        if self.fresh:
+            self.twice_run = self.twice_run + 1 if self.twice else 0
         self.age += 1
-        self.twice = False
+        self.sure_age = 1 if self.fresh and not self.early else self.sure_age + 1
 
     def get(self, index: int) -> int | None:
         """The last value of an object, None when it was never heard or is not mapped here."""
@@ -69,13 +96,14 @@ class _PdoState:
 def _pdo_state(axis: int, pdo: Pdo) -> _PdoState:
     entries = pdo.entries
     where = {entry.index: k for k, entry in enumerate(entries) if entry.sub == 0}
-    return _PdoState(axis, entries, pdo_length(entries), max(1, pdo.every_sync), where)
+    return _PdoState(axis, entries, pdo_length(entries), max(1, pdo.every_sync), where, bool(_NEEDED & where.keys()))
 
 
 @dataclass(slots=True)
 class _Node:
     nmt: int | None = None
     heartbeat_at_s: float = -INF
+    touched: int = 0
 
 
 @dataclass(slots=True)
@@ -93,10 +121,11 @@ class Listener:
     emergencies: int = 0
     _pdos: dict[int, _PdoState] = field(default_factory=dict)
     _tpdos: list[list[_PdoState]] = field(default_factory=list)
+    _carriers: list[Mapping[int, _PdoState]] = field(default_factory=list)
     _targets: list[_PdoState] = field(default_factory=list)
     _nodes: list[_Node] = field(default_factory=list)
     _node_of: dict[int, int] = field(default_factory=dict)
-    _alarms: list[Alarm] = field(default_factory=list)
+    _alarms: dict[tuple[str, str], Alarm] = field(default_factory=dict)
     _counter: int | None = None
     _last_sync_s: tuple[float, float] | None = None
     _intervals: deque[float] = field(default_factory=lambda: deque(maxlen=INTERVALS))
@@ -106,6 +135,7 @@ class Listener:
             target = _pdo_state(k, axis.target)
             self._targets.append(target)
             self._tpdos.append([_pdo_state(k, pdo) for pdo in axis.tpdos])
+            self._carriers.append(_carriers(self._tpdos[k]))
             self._pdos[axis.target.cob_id] = target
             self._pdos.update(zip([pdo.cob_id for pdo in axis.tpdos], self._tpdos[k], strict=True))
             self._nodes.append(_Node())
@@ -116,7 +146,7 @@ class Listener:
         """All COB-IDs that the guard must hear, for a receive filter."""
         nodes = list(self._node_of)
         ids = {COB_NMT, COB_SYNC, *self._pdos, *self.foreign_ids}
-        return tuple(sorted(ids | {COB_EMCY + n for n in nodes} | {COB_HEARTBEAT + n for n in nodes}))
+        return tuple(sorted(ids | {base + n for n in nodes for base in (COB_EMCY, COB_HEARTBEAT, COB_SDO_REQUEST)}))
 
     def take(self, cob_id: int, data: bytes, now_s: float) -> None:
         """Take any frame but SYNC; ``now_s`` is monotonic time."""
@@ -128,6 +158,8 @@ class Listener:
             self._alarm(Alarm(code, detail=f"{cob_id:03X} {data.hex()}"))
         elif cob_id == COB_NMT:
             self._nmt_command(data)
+        elif COB_SDO_REQUEST < cob_id <= COB_SDO_REQUEST + 127 and cob_id - COB_SDO_REQUEST in self._node_of:
+            self._sdo_request(self._node_of[cob_id - COB_SDO_REQUEST], data)
         elif cob_id > COB_HEARTBEAT and cob_id - COB_HEARTBEAT in self._node_of:
             self._heartbeat(self._node_of[cob_id - COB_HEARTBEAT], data, now_s)
         elif COB_EMCY < cob_id <= COB_EMCY + 127 and cob_id - COB_EMCY in self._node_of:
@@ -141,8 +173,7 @@ class Listener:
         self.bus_state = state
 
     def _alarm(self, alarm: Alarm) -> None:
-        if len(self._alarms) < 16:  # a flood is one alarm
-            self._alarms.append(alarm)
+        self._alarms.setdefault((alarm.code, alarm.axis), alarm)  # a flood is one alarm
 
     def _nmt_command(self, data: bytes) -> None:
         if len(data) < 2 or data[0] == NmtCommand.START:
@@ -157,7 +188,18 @@ class Listener:
         node, state = self._nodes[axis], data[0] & 0x7F
         node.nmt, node.heartbeat_at_s = state, now_s
         if state == Nmt.BOOT_UP:
+            node.touched += 1
             self._alarm(Alarm("NodeRebooted", self.settings.axes[axis].name))
+
+    def _sdo_request(self, axis: int, data: bytes) -> None:
+        """Any master's write to the drive (CiA 301 7.2.4, initiate download, plain or block): it may be another now."""
+        if len(data) < 4 or not (data[0] >> 5 == 1 or data[0] & 0xE1 == 0xC0):
+            return
+        index, name = int.from_bytes(data[1:3], "little"), self.settings.axes[axis].name
+        if index == READ_BACK:
+            self._alarm(Alarm("OffsetHijack", name, f"by SDO, {data.hex()}"))
+        elif index in SET_UP or index in PDO_SET_UP:
+            self._nodes[axis].touched += 1
 
     def _emergency(self, axis: int, data: bytes) -> None:
         code = int.from_bytes(data[:2], "little")
@@ -181,7 +223,7 @@ class Listener:
 
     def alarms(self) -> tuple[Alarm, ...]:
         """Return and forget the events since the last call."""
-        alarms, self._alarms = tuple(self._alarms), []
+        alarms, self._alarms = tuple(self._alarms.values()), {}
         return alarms
 
     def forget_sync(self) -> None:
@@ -227,46 +269,51 @@ class Listener:
         target = target_pdo.get(TARGET) if target_pdo.fresh else None
         seen = self._axis_input(k, axis, now_s, target)
         for pdo in (target_pdo, *self._tpdos[k]):
-            pdo.fresh = False
+            pdo.fresh = pdo.early = pdo.twice = False
         return seen
 
     def _axis_input(self, k: int, axis: AxisSettings, now_s: float, target: int | None) -> AxisInput:
-        tpdos, node = self._tpdos[k], self._nodes[k]
+        tpdos, of, node = self._tpdos[k], self._carriers[k], self._nodes[k]
+        shown = of.get(READ_BACK)
         return AxisInput(
             target,
-            _fresh(tpdos, POSITION),
-            _fresh(tpdos, READ_BACK),
-            _fresh(tpdos, FOLLOWING),
-            _last(tpdos, STATUSWORD),
-            _last(tpdos, MODE),
+            _fresh(of, POSITION),
+            _fresh(of, READ_BACK) if shown is not None and not shown.early else None,
+            _fresh(of, FOLLOWING),
+            _last(of, STATUSWORD),
+            _last(of, MODE),
             node.nmt,
             _age(tpdos),
             now_s - node.heartbeat_at_s,
             max([pdo.short for pdo in tpdos], default=0),
             max([pdo.long for pdo in tpdos], default=0),
-            (_fresh(tpdos, SPEED_OFFSET), _fresh(tpdos, TORQUE_OFFSET)),
-            _fresh(tpdos, SPEED),
+            (_fresh(of, SPEED_OFFSET), _fresh(of, TORQUE_OFFSET)),
+            _fresh(of, SPEED),
+            NEVER if shown is None else -(-shown.sure_age // shown.every_sync),
+            _fresh(of, DEMAND),
+            node.touched,
         )
 
 
-def _fresh(pdos: Sequence[_PdoState], index: int) -> int | None:
-    for pdo in pdos:
-        if pdo.fresh and index in pdo.where:
-            return pdo.get(index)
-    return None
+def _carriers(pdos: Sequence[_PdoState]) -> dict[int, _PdoState]:
+    """Return of each object the TPDO that carries it, the most frequent one."""
+    rarest_first = sorted(pdos, key=lambda pdo: -pdo.every_sync)
+    return {index: pdo for pdo in rarest_first for index in pdo.where}
 
 
-def _last(pdos: Sequence[_PdoState], index: int) -> int | None:
-    for pdo in pdos:
-        if index in pdo.where:
-            return pdo.get(index)
-    return None
+def _fresh(of: Mapping[int, _PdoState], index: int) -> int | None:
+    pdo = of.get(index)
+    return pdo.get(index) if pdo is not None and pdo.fresh else None
+
+
+def _last(of: Mapping[int, _PdoState], index: int) -> int | None:
+    pdo = of.get(index)
+    return None if pdo is None else pdo.get(index)
 
 
 def _age(pdos: Sequence[_PdoState]) -> float:
     """Age of the oldest TPDO that carries a signal of the guard, in units of its own rate, rounded up."""
-    ages = [-(-pdo.age // pdo.every_sync) for pdo in pdos if _NEEDED & pdo.where.keys()]
-    return max(ages, default=NEVER)
+    return max([-(-pdo.age // pdo.every_sync) for pdo in pdos if pdo.needed], default=NEVER)
 
 
 _NEEDED = frozenset({STATUSWORD, POSITION, MODE})

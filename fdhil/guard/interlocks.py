@@ -46,6 +46,8 @@ class Alarm:
     @property
     def action(self) -> str:
         """What the operator does next."""
+        if self.code == "NotOff" and self.detail == "FROZEN":
+            return "hold the feed, then run fdhil adopt"
         return CATALOGUE[self.code][2]
 
     def sentence(self, off: bool = False) -> str:
@@ -74,12 +76,17 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     "TargetLost": (_H, "no new target (0x607A) came with this SYNC", "check that the NC streams its targets"),
     "HeartbeatLost": (_R, "the drive's heartbeat is missing", "check the drive, or its 0x1017"),
     "NmtStateWrong": (_F, "the drive is not Operational", "hold the feed, find the NMT master, then adopt"),
-    "NodeRebooted": (_F, "the drive has rebooted", "hold the feed, check the commissioning record, then adopt"),
+    "NodeRebooted": (_F, "the drive has rebooted", "hold the feed, run fdhil check with the NC off, then fdhil adopt"),
     "DriveNotEnabled": (_R, "the drive is not in Operation enabled", "clear its fault and enable it"),
     "NotFollowing": (_R, "the drive does not follow its demand (statusword bit 12)", "check the drive's limits"),
     "LimitActive": (_R, "an internal limit is active (statusword bit 11)", "leave the limit"),
     "FollowingError": (_R, "the following error exceeds half its window", "check load, gains and 0x6065"),
     "NotCsp": (_R, "the drive does not show cyclic synchronous position mode", "set 0x6060 to 8"),
+    "ReadBackStale": (
+        _R,
+        "the drive's offset (0x60B0) is not shown, so that it is unknown",
+        "check the drive and that one of its TPDOs maps 0x60B0",
+    ),
     "EchoMismatch": (_R, "the drive's offset is not the one that was sent", "check the PDO mapping and the scaling"),
     "Implausible": (
         _R,
@@ -90,6 +97,11 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     "PdoLength": (_R, "a PDO is shorter than its mapping", "compare the drive's mapping with the profile"),
     "PdoMapping": (_N, "a PDO is longer than its mapping", "compare the drive's mapping with the profile"),
     "StaleOffset": (_N, "the drive already holds an offset", "adopt it, so that it is ramped to zero"),
+    "OffsetDoubtful": (
+        _F,
+        "what the drive holds as offset may not be believed",
+        "hold the feed, switch the drive off and on, run fdhil check with the NC off, then fdhil adopt",
+    ),
     # other nodes
     "ForeignProducer": (_R, "two nodes send as this drive or NC", "find and remove the second node"),
     "OffsetHijack": (_R, "another node sends our offset COB-ID", "hold the feed, find and remove that node"),
@@ -104,10 +116,15 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     "OffsetEnergy": (_R, "the offsets travel more than allowed in one second", "plan a smoother correction"),
     "SoftwareLimit": (_N, "the path is too near to a software limit", "lower max_offset_um, or move the work"),
     "CorruptFile": (_N, "the correction table cannot be read", "plan it again"),
-    "TableBusy": (_N, "a whole table cannot be changed while a correction runs", "disarm first"),
+    "TableBusy": (_N, "a whole table cannot be changed while a correction runs", "disarm, or adopt first"),
     "ProgramMismatch": (_N, "no table of this program is loaded", "plan and load the correction of this program"),
     # what the daemon vouches for
     "NotCommissioned": (_N, "there is no valid commissioning record", "run fdhil commission"),
+    "RecordVoid": (
+        _N,
+        "the drive has rebooted or was set up anew since it was commissioned",
+        "switch the NC off and run fdhil check, which compares it again",
+    ),
     "FeedforwardUnknown": (_N, "it is unknown whether the offset enters the feed-forward", "run fdhil commission"),
     "FeedforwardOff": (_N, "this drive is not set up for speed and torque offsets", "run fdhil commission"),
     "ModelNotValidated": (_N, "the model was not validated", "record a rapid move of each axis"),
@@ -119,8 +136,9 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     "LimitBeyondWindow": (_N, "the largest offset exceeds a quarter of the window", "lower max_offset_um"),
     "AuthRequired": (_N, "the operator's token is missing or wrong", "use the token of the run directory"),
     # the guard itself
-    "NotOff": (_N, "a correction is already armed or ramping", "disarm it first"),
+    "NotOff": (_N, "what was armed before has not ended", "disarm it first"),
     "NotSettled": (_N, "the interlocks were not all good for 100 SYNC", "wait a moment and arm again"),
+    "GuardBusy": (_N, "a request of this connection still waits", "wait for its answer, then ask again"),
     "MainLost": (_R, "the daemon is gone or does not answer", "restart the daemon, then arm again"),
     "Disarmed": (_R, "disarmed", "arm when it is wanted again"),
     "Stopped": (_R, "the guard was told to stop", "start it again when it is wanted"),

@@ -11,6 +11,8 @@ from collections import deque
 from typing import Any
 
 KEPT_EVENTS = 32
+WATCHDOG = "WATCHDOG=1"
+MOST_CHARACTERS = 500  # of a text, so that a line is never longer than the pipe takes at once
 
 
 class Journal:
@@ -25,7 +27,9 @@ class Journal:
 
     def write(self, event: str, **fields: Any) -> None:
         """Write an event with its monotonic and wall time."""
-        record = {"event": event, "mono_s": round(time.monotonic(), 6), "wall_s": round(time.time(), 6), **fields}
+        stamps = {"mono_s": round(time.monotonic(), 6), "wall_s": round(time.time(), 6)}
+        short = {key: value[:MOST_CHARACTERS] if isinstance(value, str) else value for key, value in fields.items()}
+        record = {"event": event, **stamps, **short}
         self.recent.append(record)
         line = json.dumps(record).encode()[: select.PIPE_BUF - 1] + b"\n"
         ready = self._writable.poll(0)
@@ -38,26 +42,31 @@ class Journal:
 
 
 class Notifier:
-    """systemd's sd_notify; does nothing outside a unit."""
+    """systemd's sd_notify; does nothing outside a unit. What cannot be sent now is sent with the next watchdog."""
 
     def __init__(self, address: str | None) -> None:
-        self._address = address
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) if address else None
+        self._address = None if address is None else "\0" + address[1:] if address.startswith("@") else address
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        self._untold: deque[str] = deque(maxlen=4)
         self._watchdog_s = 0.0
 
     def tell(self, text: str) -> None:
         """Send one notification, such as READY=1."""
-        if self._socket is None or self._address is None:
-            return
-        address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
-        try:
-            self._socket.sendto(text.encode(), address)
-        except OSError:
-            self._socket.close()
-            self._socket = None
+        if self._address is not None:
+            self._untold.append(text)
+            self._send()
 
     def alive(self, now_s: float) -> None:
         """Feed the unit's watchdog, twice a second."""
-        if self._socket is not None and now_s - self._watchdog_s >= 0.5:
+        if now_s - self._watchdog_s >= 0.5:
             self._watchdog_s = now_s
-            self.tell("WATCHDOG=1")
+            self._untold = deque([text for text in self._untold if text != WATCHDOG], maxlen=4)
+            self.tell(WATCHDOG)
+
+    def _send(self) -> None:
+        try:
+            while self._untold:
+                self._socket.sendto(self._untold[0].encode("utf-8", "replace"), str(self._address))
+                self._untold.popleft()
+        except OSError:  # its queue is full, or systemd begins anew: what is left waits
+            return

@@ -7,8 +7,14 @@ The check of a frame (``violation``) shares no formula with the motion (``follow
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isqrt
+from math import floor, isqrt
 
+# the ceilings: what no settings file can raise
+CEILING_OFFSET_UM = 250.0
+CEILING_SPEED_MM_S = 20.0
+CEILING_ACCELERATION_MM_S2 = 2000.0
+CEILING_VARIATION_MM = 3.0  # in any second
+SPEED_SHARE, ACCELERATION_SHARE = 0.10, 0.50  # of the axis' own
 # a table is a rounded curve: its first difference may be 1, its second 2 increments beyond the curve's own
 ROUNDING_RATE = 1
 ROUNDING_ACCELERATION = 2
@@ -41,6 +47,21 @@ class Limits:
     def ramp_cycles(self, offset: int) -> int:
         """Return the bound on the cycles from ``offset`` at any rate to rest at 0: 1 + |o|/S + 3 S/A."""
         return 1 + -(-abs(offset) // self.rate) + 3 * -(-self.rate // self.acceleration)
+
+
+def ceilings(
+    increments_per_mm: float, sync_period_s: float, max_speed_mm_s: float, max_acceleration_mm_s2: float
+) -> Limits:
+    """Return the most that settings may allow an axis of that speed and acceleration, rounded down; 0: too coarse."""
+    speed = min(CEILING_SPEED_MM_S, SPEED_SHARE * max_speed_mm_s)
+    acceleration = min(CEILING_ACCELERATION_MM_S2, ACCELERATION_SHARE * max_acceleration_mm_s2)
+    return Limits(
+        offset=floor(CEILING_OFFSET_UM * 1e-3 * increments_per_mm + 1e-9),
+        rate=floor(speed * increments_per_mm * sync_period_s + 1e-9),
+        acceleration=floor(acceleration * increments_per_mm * sync_period_s**2 + 1e-9),
+        variation=floor(CEILING_VARIATION_MM * increments_per_mm + 1e-9),
+        window=round(1.0 / sync_period_s),
+    )
 
 
 def stopping(rate: int, acceleration: int) -> int:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from fdhil.guard.conditions import AGREEING
 from fdhil.guard.feedforward import Pair
 from fdhil.guard.settings import AxisSettings, Settings
-from fdhil.guard.state import NOT_SHOWN, SENDING, AxisInput, AxisState, Inputs, Mode, Shown, State
+from fdhil.guard.state import NOT_SHOWN, ON_PATH, SENDING, AxisInput, AxisState, Inputs, Mode, Shown, State
 
 
 def observe(state: State, inputs: Inputs, settings: Settings) -> State:
     """Take in what was sampled: failed frames, read-backs, following errors, the targets just latched."""
-    axes, failed = state.axes, 0
+    axes, failed = tuple(map(_touched, state.axes, inputs.axes)), 0
     if not inputs.transmitted:
-        axes, failed = tuple(map(_not_sent, state.axes)), state.failed_run + 1
+        axes, failed = tuple(map(_not_sent, axes)), state.failed_run + 1
         state = behind(state)
     if not inputs.sync:
         return state._replace(axes=axes, failed_run=failed, tick=state.tick + (not settings.offset_synchronous))
@@ -35,8 +36,18 @@ def observe(state: State, inputs: Inputs, settings: Settings) -> State:
         targets=history,
         failed_run=failed,
         missed=state.missed + (inputs.late and state.mode in SENDING),
-        missed_run=state.missed_run + 1 if inputs.late else 0,
+        missed_run=state.missed_run + 1 if inputs.late and _counts(state, settings) else 0,
     )
+
+
+def _touched(axis: AxisState, seen: AxisInput) -> AxisState:
+    """A drive that has rebooted, or that another master wrote to, may not be as it was commissioned."""
+    return axis if seen.touched == axis.touched else axis._replace(touched=seen.touched, record_void=True)
+
+
+def _counts(state: State, settings: Settings) -> bool:
+    """Whether a late step is the loop's fault: a simulated machine runs ahead until offsets come, then it waits."""
+    return settings.clock == "monotonic" or state.mode in ON_PATH
 
 
 def _not_sent(axis: AxisState) -> AxisState:
@@ -59,16 +70,30 @@ def _sampled(
     elif seen.position is not None and latched is not None:
         error = latched[k] + axis.sent[1 + setting.setpoint_delay_cycles] - seen.position
     if seen.read_back is None:
-        return axis if error == axis.following_error else axis._replace(following_error=error)
+        readings = 0 if seen.read_back_age > 1 else axis.readings
+        if error == axis.following_error and readings == axis.readings:
+            return axis
+        return axis._replace(following_error=error, readings=readings)
     late = seen.read_back != axis.sent[1] and seen.read_back in axis.sent[2:4]
     wrong = seen.read_back != axis.sent[1] and not late
     return axis._replace(
         following_error=error,
         read_back=seen.read_back,
+        readings=min(axis.readings, AGREEING - 1) + 1 if seen.read_back == axis.read_back else 1,
+        off_demand=_off_demand(seen, k, history),
         echo_misses=axis.echo_misses + 1 if wrong else 0,
         late_echoes=axis.late_echoes + late,
         zero_shown=axis.zero_shown or (seen.read_back == 0 and not any(axis.sent[:2])),
     )
+
+
+def _off_demand(seen: AxisInput, k: int, history: tuple[tuple[int, ...] | None, ...]) -> float:
+    """How far the read-back is from what the drive adds to its last targets, told by 0x6062 where that came with it."""
+    if seen.demand is None or seen.read_back is None:
+        return 0.0
+    targets = [latched[k] for latched in history[1:] if latched is not None]
+    without = seen.demand - seen.read_back
+    return max(min(targets) - without, without - max(targets), 0) if targets else float("inf")
 
 
 def _believed(axis: AxisState, seen: AxisInput, setting: AxisSettings, tick: int) -> AxisState:

@@ -1,54 +1,58 @@
 """The guard's shell: one loop over the bus, the daemon's socket and the signals; all decisions are the core's.
 
-At a SYNC the offset frames leave in the same turn and before anything else is done. Nothing here waits.
+At a SYNC the offset frames leave in the same turn and before anything else is done. Nothing here waits for a client:
+after each request that was served the clients rest, so that however many they send, every SYNC finds the loop waiting.
 """
 
 from __future__ import annotations
 
 import select
-import signal
 import socket
 import time
 from collections import deque
+from collections.abc import Mapping
 from pathlib import Path as FilePath
 from typing import Any
 
 from fdhil.cia402 import COB_HEARTBEAT, COB_SYNC, Nmt, pack
-from fdhil.guard import core, table
+from fdhil.guard import core, status
 from fdhil.guard.can_socket import ERROR, BusDown, CanSocket
 from fdhil.guard.control import Client, Control
 from fdhil.guard.feedforward import FeedMode
 from fdhil.guard.frames import Listener
+from fdhil.guard.intake import Intake
 from fdhil.guard.interlocks import FACTS, WITHDRAWABLE, Alarm
 from fdhil.guard.journal import Journal, Notifier
-from fdhil.guard.path import Path
-from fdhil.guard.requests import parse_request
+from fdhil.guard.landing import land
+from fdhil.guard.requests import Document, parse_request
 from fdhil.guard.settings import Settings
 from fdhil.guard.shadow import Shadow
 from fdhil.guard.state import Inputs, Mode, Output, Request, initial
 
-TABLE_NAME = "guard.table"
 IDLE_S = 0.05
-ROWS_PER_TURN = 64
-ROWS_PER_IDLE_TURN = 1024
-MAX_RUNNING_PIECE_BYTES = 1 << 18
+REST_S = 0.001
+DECIDED = ("arm", "feedforward", "disarm", "adopt", "compared")
 
 
 class Guard:
-    """The process; ``run`` returns its exit code: 0 off, 3 when it had to stop with an offset perhaps applied."""
+    """The process; ``run`` returns its exit code: 0 when it is known that nothing is applied, 3 otherwise.
 
-    def __init__(self, settings: Settings, can: CanSocket, journal: Journal, notifier: Notifier) -> None:
+    ``wake`` becomes readable when a signal asks to stop.
+    """
+
+    def __init__(
+        self, settings: Settings, can: CanSocket, journal: Journal, notifier: Notifier, wake: socket.socket
+    ) -> None:
         self.settings = settings
         self.state = initial(settings)
-        self.control = Control(FilePath(settings.run_directory))
+        self.control = Control(FilePath(settings.run_directory), settings.daemon_uid)
+        self.intake = Intake(settings, journal)
         self._can = can
         self._journal = journal
         self._notifier = notifier
         self._listener = Listener(settings)
         self._entries = [axis.offset.entries for axis in settings.axes]
-        self._path: Path | None = None
-        self._loading: tuple[table.Loading, Client, dict[str, Any]] | None = None
-        self._requests: deque[tuple[Client | None, dict[str, Any], Request]] = deque()
+        self._requests: deque[tuple[Client | None, Document, Request]] = deque()
         self._owner: Client | None = None
         self._withdrawn: tuple[Alarm, ...] = ()
         self._transmitted = True
@@ -56,63 +60,75 @@ class Guard:
         self._shadow = Shadow()
         self._last_sync_s = time.monotonic()
         self._stepped_s = 0.0
+        self._rested_s = 0.0
         self._silent = True
         self._stopping = False
         self._lost_seen = 0
-        self.wake, self._signalled = socket.socketpair()
+        self._wake = wake
 
     # --- the loop ---
 
     def run(self) -> int:
         """Serve until a signal asks to stop and the offset is at zero, or cannot be brought there."""
-        self._catch_signals()
         self._notifier.tell("READY=1")
         self._journal.write("ready", bus=self.settings.bus, axes=[axis.name for axis in self.settings.axes])
-        while not (self._stopping and not self.state.sending and not self._requests):
-            self._turn()
-        off = self.state.mode is Mode.OFF
-        self._journal.write("stopped", state=self.state.mode.value, offset_um=self._offsets_um())
+        try:
+            while not (self._stopping and not self.state.sending and not self._requests):
+                self._turn()
+        except Exception as error:  # noqa: BLE001 - the guard's supervisor: whatever has failed, the offset is taken away
+            self._failed(error)
+            return 3
+        standing_um = status.may_stand_um(self.state, self.settings)
+        self._stopped(standing_um, status.offset_um(self.state, self.settings))
+        return 3 if any(um != 0 for um in standing_um.values()) else 0
+
+    def _failed(self, error: Exception) -> None:
+        """Ramp to zero from what was sent last, without serving anybody any more, and say what was the matter."""
+        cause = Alarm("InternalError", detail=f"{type(error).__name__}: {error}"[:200])
+        effect = "the offset is ramped to zero from what was sent last, and the guard ends"
+        text = f"{cause.cause}; {effect}; {cause.action}"
+        self._journal.write("failed", code=cause.code, state=self.state.mode.value, text=text)
+        self._notifier.tell("STOPPING=1")
+        sending, sent = self.state.sending, land(self.state, self.settings, self._can)
+        standing_um = status.may_stand_um(self.state, self.settings)
+        if sending:  # nothing was read back on the way
+            standing_um = dict.fromkeys(standing_um)
+        self._stopped(standing_um, status.in_um(sent, self.settings))
+
+    def _stopped(self, standing_um: Mapping[str, float | None], sent_um: Mapping[str, float | None]) -> None:
+        left = status.sentence(standing_um)
+        told = {"text": f"the guard has stopped; {left}; hold the feed, start it again and adopt"} if left else {}
+        state = self.state.mode.value
+        self._journal.write("stopped", state=state, offset_um=sent_um, may_stand_um=standing_um, **told)
         self.control.close()
-        return 0 if off else 3
 
     def _turn(self) -> None:
         now_s = time.monotonic()
         self._notifier.alive(now_s)
-        ready = self._wait()
+        ready = self._wait(now_s)
         if self._can.fileno() in ready:
             self._bus()
         self._local_timer()
-        if self.control.fileno() in ready:
-            self.control.accept(time.monotonic())
-        for client in self.control.clients:
-            if client.fileno() in ready:
-                self._client(client)
-        self.control.drop_gone()
-        if self.wake.fileno() in ready:
+        if self._wake.fileno() in ready:
             self._stop()
-        self._load()
+        self._serve(ready)
 
-    def _wait(self) -> set[int]:
+    def _wait(self, now_s: float) -> set[int]:
         poll = select.poll()
+        poll.register(self._wake, select.POLLIN)
         if self._listener.bus_state != "down":
             poll.register(self._can, select.POLLIN)
-        poll.register(self.control, select.POLLIN)
-        poll.register(self.wake, select.POLLIN)
-        for client in self.control.clients:
-            poll.register(client, select.POLLIN | (select.POLLOUT if client.outbox else 0))
         busy = self.state.sending or self._requests
-        wait_s = 0.0 if self._loading else min(IDLE_S, self.settings.sync_period_s) if busy else IDLE_S
+        wait_s = min(IDLE_S, self.settings.sync_period_s) if busy else IDLE_S
+        if now_s < self._rested_s:
+            wait_s = min(wait_s, self._rested_s - now_s)
+        else:
+            self.control.register(poll)
+            wait_s = 0.0 if self.intake.busy or self.control.pending else wait_s
         return {descriptor for descriptor, _ in poll.poll(wait_s * 1000)}
 
-    def _catch_signals(self) -> None:
-        self.wake.setblocking(False)
-        self._signalled.setblocking(False)
-        signal.set_wakeup_fd(self._signalled.fileno(), warn_on_full_buffer=False)
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: None)
-
     def _stop(self) -> None:
-        self.wake.recv(64)
+        self._wake.recv(64)
         if not self._stopping:
             self._stopping = True
             self._notifier.tell("STOPPING=1")
@@ -178,25 +194,34 @@ class Guard:
         client, document, request = self._requests.popleft() if self._requests and not late else (None, {}, None)
         arming = request is not None and request.kind in ("arm", "feedforward")
         alive, alarms = self._alive(client if arming else self._owner, now_s), self._listener.alarms()
-        told = (late, self._transmitted, alive, alarms, self._withdrawn, self._path, request)
-        inputs = Inputs(seen.sync, seen.axes, seen.bus, *told)
+        heard = (late, self._transmitted, alive, alarms, self._withdrawn, self.intake.path, request)
+        inputs = Inputs(seen.sync, seen.axes, seen.bus, *heard)
+        before = self.state.axes
         self.state, output = core.step(self.state, inputs, self.settings)
         self._transmitted = self._send(output)
         self._inputs, self._stepped_s = inputs, now_s
         if inputs.sync:
-            self._shadow.follow(self.state, self._path)
+            self._shadow.follow(self.state, self.intake.path)
         if arming and not output.refused:
-            self._owner, self._withdrawn = client, ()
+            self._own(client)
         if output.refused is not None and client is not None:
             self._answer(client, document, output.refused)
         if output.transition is not None and not {*output.transition[:2]} <= {Mode.RAMPING, Mode.ACTIVE}:
             self._tell(*output.transition)
         if output.feed_transition is not None:
             self._tell_feed(*output.feed_transition)
+        for own, was, axis in zip(self.settings.axes, before, self.state.axes, strict=True):
+            if axis.record_void and not was.record_void:
+                self._journal.write("record_void", axis=own.name, text=Alarm("RecordVoid", own.name).sentence())
 
     def _alive(self, owner: Client | None, now_s: float) -> bool:
         """Whether the daemon that armed is connected and says so often enough."""
         return owner is not None and not owner.gone and now_s - owner.heard_s <= self.settings.daemon_lost_s
+
+    def _own(self, client: Client | None) -> None:
+        for each in self.control.clients:
+            each.armed = each is client
+        self._owner, self._withdrawn = client, ()
 
     def _send(self, output: Output) -> bool:
         sent = True
@@ -216,14 +241,16 @@ class Guard:
         return sent
 
     def _tell(self, before: Mode, mode: Mode, cause: Alarm | None) -> None:
-        off = mode is Mode.OFF
+        standing_um = status.may_stand_um(self.state, self.settings)
+        off = mode is Mode.OFF and not status.sentence(standing_um)
         told = {"code": cause.code, "axis": cause.axis, "text": cause.sentence(off)} if cause else {}
         self._journal.write(
             "state",
             before=before.value,
             state=mode.value,
             tick=self.state.tick,
-            offset_um=self._offsets_um(),
+            offset_um=status.offset_um(self.state, self.settings),
+            may_stand_um=standing_um,
             missed=self.state.missed,
             **told,
         )
@@ -235,122 +262,71 @@ class Guard:
         self._journal.write("feedforward", before=before.value, state=mode.value, tick=self.state.tick, **told)
         self._notifier.tell(f"STATUS=feed-forward {mode.value}" + (f": {cause.cause}" if cause else ""))
 
-    def _offsets_um(self) -> dict[str, float]:
-        """What is applied per axis as far as is known, in the axis' direction."""
-        return self._in_um(tuple([axis.offset for axis in self.state.axes]))
+    # --- the clients ---
 
-    def _in_um(self, offsets: tuple[int, ...]) -> dict[str, float]:
-        pairs = zip(self.settings.axes, offsets, strict=True)
-        return {s.name: round(s.sign * offset / s.increments_per_mm * 1e3, 3) for s, offset in pairs}
+    def _serve(self, ready: set[int]) -> None:
+        """Serve one client and check some rows of a table; then both rest, and the loop waits for the bus alone."""
+        asked = ready - {self._can.fileno(), self._wake.fileno()}
+        now_s = time.monotonic()
+        if now_s < self._rested_s or not (asked or self.control.pending or self.intake.busy):
+            return
+        served = self.control.serve(asked, now_s)
+        if served is not None:
+            self._request(*served)
+            served[0].settle()
+        self.control.drop_gone()
+        self.intake.check(self.state)
+        self._rested_s = time.monotonic() + REST_S
 
-    # --- the daemon ---
+    def _request(self, client: Client, document: Document) -> None:
+        kind = document.get("request")
+        if kind == "status":
+            client.reply(document, ok=True, **self.status())
+        elif kind == "alive":
+            self._withdraw(client, document)
+        elif kind == "table":
+            self.intake.begin(client, document, self.state)
+        elif kind in DECIDED:
+            self._queue(client, document, parse_request(kind, document, self.settings))
+        else:
+            told = f"{kind[:40]!r} is no request" if isinstance(kind, str) else "the request has no name"
+            client.reply(document, ok=False, code="BadRequest", text=told, advice=f"use one of {', '.join(DECIDED)}")
 
-    def _client(self, client: Client) -> None:
-        client.flush()
-        for document in client.read(time.monotonic()):
-            kind = document.get("request")
-            if kind == "status":
-                client.reply(document, ok=True, **self.status())
-            elif kind == "alive":
-                self._withdraw(client, document)
-            elif kind == "table":
-                self._begin_loading(client, document)
-            elif kind in ("arm", "feedforward", "disarm", "adopt"):
-                self._requests.append((client, document, parse_request(kind, document, self.settings)))
-            else:
-                text, advice = f"{kind!r} is no request", "use status, alive, table, arm, disarm or adopt"
-                client.reply(document, ok=False, code="BadRequest", text=text, advice=advice)
+    def _queue(self, client: Client, document: Document, request: Request) -> None:
+        """Have a step decide; one request of a client waits at a time, but a disarm takes the place of another."""
+        waiting = next((waits for waits in self._requests if waits[0] is client), None)
+        if waiting is not None and (request.kind != "disarm" or waiting[2].kind == "disarm"):
+            self._answer(client, document, (Alarm("GuardBusy"),))
+            return
+        if waiting is not None:
+            self._requests.remove(waiting)
+            self._answer(client, waiting[1], (Alarm("GuardBusy"),))
+        self._requests.append((client, document, request))
 
-    def _withdraw(self, client: Client, document: dict[str, Any]) -> None:
+    def _withdraw(self, client: Client, document: Document) -> None:
         """The daemon's keep-alive; what it no longer vouches for ends the correction."""
         facts = document.get("facts")
         if client is self._owner and isinstance(facts, dict):
             self._withdrawn = tuple(Alarm(FACTS[f]) for f in WITHDRAWABLE if f in facts and facts[f] is not True)
 
-    def _answer(self, client: Client, document: dict[str, Any], refused: tuple[Alarm, ...]) -> None:
+    def _answer(self, client: Client, document: Document, refused: tuple[Alarm, ...]) -> None:
         if not refused:
             client.reply(document, ok=True, state=self.state.mode.value)
             return
-        told = list(map(_told, refused))
+        told = list(map(status.told, refused))
         client.reply(document, ok=False, state=self.state.mode.value, **told[0], refused=told)
 
     def status(self) -> dict[str, Any]:
         """Return what the guard knows, for the daemon's status."""
-        state, path, cause = self.state, self._path, self.state.cause or self.state.feed.cause
         shadow = self._shadow.offsets()
         not_good: tuple[Alarm, ...] = (Alarm("SyncLost"),)
         if self._inputs is not None and not self._silent:
-            not_good = core.standing(state, self._inputs, self.settings)
+            not_good = core.standing(self.state, self._inputs, self.settings)
         return {
-            "state": state.mode.value if state.feed.mode is FeedMode.OFF else "FEEDFORWARD",
-            "cause": _told(cause) if cause else None,
-            "feedforward": {
-                "state": state.feed.mode.value,
-                "cause": _told(state.feed.cause) if state.feed.cause else None,
-                "limited_cycles": state.feed.limited,
-                "applied": {s.name: list(p) for s, p in zip(self.settings.axes, state.feed.applied, strict=False)},
-            },
+            **status.document(self.state, self.settings, self.intake.path, not_good),
             "sync_heard": not self._silent,
-            "tick": state.tick,
-            "good_for": state.good_for,
-            "row": state.places[0].row if state.places else None,
-            "rows": [path.first, path.end] if path else None,
-            "table_sequence": path.sequence if path else 0,
-            "program_digest": path.program_digest if path else "",
-            "offset_um": self._offsets_um(),
-            "shadow_um": None if shadow is None else self._in_um(shadow),
-            "missed_cycles": state.missed,
-            "late_frames": {s.name: a.late_echoes for s, a in zip(self.settings.axes, state.axes, strict=True)},
+            "shadow_um": None if shadow is None else status.in_um(shadow, self.settings),
             "emergencies": self._listener.emergencies,
             "journal_dropped": self._journal.dropped,
-            "not_good": [_told(alarm) for alarm in not_good],
             "events": list(self._journal.recent),
         }
-
-    # --- the table ---
-
-    def _begin_loading(self, client: Client, document: dict[str, Any]) -> None:
-        running = self.state.sending or self.state.mode is not Mode.OFF
-        loaded = self._path
-        found = table.read(FilePath(self.settings.run_directory) / TABLE_NAME, loaded.sequence if loaded else 0)
-        try:
-            if found is None:
-                raise table.TableRefused("CorruptFile", "the run directory holds no new valid table; write it again")
-            if self._loading is not None or (running and len(found[1]) > MAX_RUNNING_PIECE_BYTES):
-                raise table.TableRefused("TableBusy", Alarm("TableBusy").cause)
-            keep = self.state.places[0].row - 2 if running and self.state.places else 0
-            axes = self.settings.axes
-            limits, travel = tuple(axis.limits for axis in axes), tuple(axis.travel for axis in axes)
-            loading = table.begin(found[1], found[0], [axis.name for axis in axes], limits, loaded, keep, travel)
-            if running and loading.joined.first == 0 and loading.next_row == 0:
-                raise table.TableRefused("TableBusy", Alarm("TableBusy").cause)
-        except table.TableRefused as refusal:
-            self._refuse_table(client, document, refusal)
-            return
-        self._loading = (loading, client, document)
-
-    def _load(self) -> None:
-        """Check the next rows of the table on its way in; a few at a time while frames have to leave in time."""
-        if self._loading is None:
-            return
-        loading, client, document = self._loading
-        try:
-            loading.check(ROWS_PER_TURN if self.state.sending else ROWS_PER_IDLE_TURN)
-        except table.TableRefused as refusal:
-            self._loading = None
-            self._refuse_table(client, document, refusal)
-            return
-        if loading.done:
-            self._loading, self._path = None, loading.joined
-            client.reply(
-                document, ok=True, sequence=loading.joined.sequence, rows=[loading.joined.first, loading.joined.end]
-            )
-
-    def _refuse_table(self, client: Client, document: dict[str, Any], refusal: table.TableRefused) -> None:
-        self._journal.write("table_refused", code=refusal.code, text=str(refusal))
-        advice = Alarm(refusal.code).action
-        client.reply(document, ok=False, code=refusal.code, text=str(refusal), advice=advice)
-
-
-def _told(alarm: Alarm) -> dict[str, str]:
-    return {"code": alarm.code, "axis": alarm.axis, "text": alarm.cause, "advice": alarm.action}

@@ -1,9 +1,13 @@
-"""From the JSON of a request to the record that the core decides on; what is none becomes one that is refused."""
+"""From the bytes of a request to the record that the core decides on; what is none becomes one that is refused.
+
+Whatever the bytes are, nothing is raised here.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import hmac
+import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,19 +15,50 @@ from fdhil.guard.feedforward import Law
 from fdhil.guard.settings import Settings
 from fdhil.guard.state import Request
 
+Document = dict[str, Any]
 MOST_WEIGHTS = 64
 MOST_WEIGHT = 1 << 48
+MOST_CHARACTERS = 200
+
+
+def parse_line(line: bytes) -> Document | None:
+    """Return the JSON object of a line, None when it is none; its ``id`` stays only where it can be given back."""
+    try:
+        document = json.loads(line, parse_constant=_refuse)
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(document, dict):
+        return None
+    mark = document.get("id")
+    if not (type(mark) is int and abs(mark) < 1 << 53) and not (isinstance(mark, str) and len(mark) <= MOST_CHARACTERS):
+        document.pop("id", None)
+    return document
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is no JSON")
 
 
 def parse_request(kind: Any, document: Mapping[str, Any], settings: Settings) -> Request:
     """Return the request; the token is compared by its hash alone."""
     facts = document.get("facts")
-    digest = hashlib.sha256(str(document.get("token", "")).encode()).hexdigest()
+    digest = hashlib.sha256(_text(document, "token").encode("utf-8", "surrogatepass")).hexdigest()
     valid = bool(settings.token_sha256) and hmac.compare_digest(digest, settings.token_sha256)
-    program = str(document.get("program_digest", ""))
-    return Request(
-        kind, valid, program, facts if isinstance(facts, dict) else {}, _laws(document.get("laws"), settings)
-    )
+    facts = facts if isinstance(facts, dict) else {}
+    laws, program = _laws(document.get("laws"), settings), _text(document, "program_digest")
+    return Request(kind, valid, program, facts, laws, _compared(document.get("axes"), settings))
+
+
+def _text(document: Mapping[str, Any], key: str) -> str:
+    """The text of a key, empty when it holds none of a sensible length."""
+    value = document.get(key)
+    return value if isinstance(value, str) and len(value) <= MOST_CHARACTERS else ""
+
+
+def _compared(given: object, settings: Settings) -> dict[str, str]:
+    """The fingerprints of the drives that were compared; what is no text is no drive's."""
+    found = given if isinstance(given, dict) else {}
+    return {axis.name: _text(found, axis.name) for axis in settings.axes if axis.name in found}
 
 
 def _laws(given: object, settings: Settings) -> tuple[Law, ...]:

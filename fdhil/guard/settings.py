@@ -7,6 +7,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import re
+import stat
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,12 +18,15 @@ from typing import Any, Literal
 from fdhil.cia402 import PdoEntry, lay_out
 from fdhil.errors import ConfigError, ConfigFault
 from fdhil.guard import feedforward
-from fdhil.guard.limits import Limits
+from fdhil.guard.limits import Limits, ceilings
 
-SCHEMA = "fdhil-guard-settings-1"
-MAX_CHARS = 1024 * 1024
+SCHEMA = "fdhil-guard-settings-2"
+MAX_BYTES = 1 << 20
+MOST_INCREMENTS_PER_MM = 1e6
 Layout = tuple[tuple[int, int, int, bool], ...]
 """Entries (index, sub-index, bits, signed) of a PDO, one behind the other."""
+OFFSET_LAYOUT: Layout = ((0x60B0, 0, 32, True),)
+FEED_LAYOUT: Layout = ((0x60B1, 0, 32, True), (0x60B2, 0, 16, True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +55,14 @@ class Feedforward:
 class AxisSettings:
     """One axis: ``target`` is the NC's RPDO with 0x607A, ``offset`` our own RPDO with 0x60B0 alone.
 
-    ``window`` is the drive's following error window (0x6065) in increments; ``limits`` in increments per SYNC cycle.
+    ``window`` is the drive's following error window (0x6065) in increments; ``limits`` in increments per SYNC cycle,
+    which the axis' own ``max_speed_mm_s`` and ``max_acceleration_mm_s2`` bound as well.
     ``speed_count`` is one count of 0x606C in increments per SYNC cycle, ``speed_step`` by how much of that the motor's
     speed can change in one cycle; 0: not judged.
     ``travel`` are the drive's software limits (0x607D), None: it has none.
     ``heartbeat_timeout_s`` 0: the drive has no heartbeat, and its PDOs alone show that it is Operational.
+    ``record`` is the fingerprint of the drive as it was commissioned, empty: it was not; ``record_void`` says that
+    something against it was seen since.
     """
 
     name: str
@@ -62,6 +71,8 @@ class AxisSettings:
     offset: Pdo
     tpdos: tuple[Pdo, ...]
     increments_per_mm: float
+    max_speed_mm_s: float
+    max_acceleration_mm_s2: float
     sign: int
     limits: Limits
     window: int
@@ -71,11 +82,14 @@ class AxisSettings:
     speed_count: float = 0.0
     speed_step: float = 0.0
     travel: tuple[int, int] | None = None
+    record: str = ""
+    record_void: bool = False
 
     @property
-    def reads_back(self) -> bool:
-        """Whether a TPDO shows the offset in force."""
-        return any(entry[0] == 0x60B0 for pdo in self.tpdos for entry in pdo.layout)
+    def read_back_every(self) -> int:
+        """With every how many SYNC a TPDO shows the offset in force; 0: none does."""
+        shown = [pdo.every_sync for pdo in self.tpdos if any(entry[:2] == (0x60B0, 0) for entry in pdo.layout)]
+        return max(1, min(shown)) if shown else 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +98,8 @@ class Settings:
 
     ``clock`` "sync": time is SYNC count x period (a simulated machine need not run in real time). ``token_sha256`` is
     the hash of the operator's token, empty: nothing can be armed. ``offset_synchronous``: the drive applies our RPDO
-    at the next SYNC, so that without SYNC nothing can be ramped.
+    at the next SYNC, so that without SYNC nothing can be ramped. ``daemon_uid`` is the user of the daemon where it is
+    another than the guard's.
     """
 
     bus: str
@@ -97,19 +112,20 @@ class Settings:
     run_directory: str
     axes: tuple[AxisSettings, ...]
     offset_synchronous: bool = True
+    daemon_uid: int | None = None
 
     @property
     def silence_s(self) -> float:
-        """How long the bus may be without SYNC: four periods; 5 s of wall clock where time is the SYNC count.
+        """How long the bus may be without SYNC: four periods; 10 s of wall clock where time is the SYNC count.
 
         A simulated machine stands still between two SYNCs, and its slowest listener may hold it up.
         """
-        return 5.0 if self.clock == "sync" else 4 * self.sync_period_s
+        return 10.0 if self.clock == "sync" else 4 * self.sync_period_s
 
     @property
     def daemon_lost_s(self) -> float:
         """How long the daemon may say nothing while it has something armed."""
-        return 5.0 if self.clock == "sync" else 0.5
+        return 10.0 if self.clock == "sync" else 0.5
 
     @property
     def heartbeat_cycles(self) -> int:
@@ -141,9 +157,9 @@ def to_json(settings: Settings) -> str:
 
 
 def from_json(text: str, source: str = "settings") -> Settings:
-    """Read settings back; ConfigError when the text is not what ``to_json`` writes."""
+    """Read settings back; ConfigError when the text is not what ``to_json`` writes, or asks for more than a ceiling."""
     try:
-        document = json.loads(text)
+        document = json.loads(text, parse_constant=_refuse)
         if document.pop("schema") != SCHEMA:
             raise ValueError(f"schema is not {SCHEMA}")
         document.pop("digest", None)
@@ -157,10 +173,16 @@ def from_json(text: str, source: str = "settings") -> Settings:
 
 
 def load(path: Path) -> Settings:
-    """Read the settings file; ConfigError when it cannot be read or used, or is not as it was written."""
+    """Read the settings file; ConfigError when it cannot be read or used, or is not as it was written.
+
+    What is no plain file is not waited for.
+    """
     try:
-        with path.open(encoding="utf-8") as file:
-            text = file.read(MAX_CHARS + 1)
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+        with os.fdopen(descriptor, "rb") as file:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise OSError("it is no plain file")
+            text = file.read(MAX_BYTES).decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(str(path), [ConfigFault("file", f"cannot be read: {error}", "run fdhil-guard")]) from None
     settings = from_json(text, str(path))
@@ -170,9 +192,34 @@ def load(path: Path) -> Settings:
     return settings
 
 
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is no number")
+
+
+def _whole(value: object, low: int, high: int, what: str) -> int:
+    if type(value) is not int or not low <= value <= high:
+        raise ValueError(f"{what} is no whole number from {low} to {high}")
+    return value
+
+
+def _number(value: object, low: float, high: float, what: str) -> None:
+    if type(value) not in (int, float) or not low <= value <= high:  # type: ignore[operator] # it is a number
+        raise ValueError(f"{what} is no number from {low:g} to {high:g}")
+
+
+def _word(value: object, pattern: str, what: str) -> None:
+    if not isinstance(value, str) or not re.fullmatch(pattern, value):
+        raise ValueError(f"{what} is none")
+
+
 def _pdo(document: Mapping[str, Any]) -> Pdo:
-    layout = tuple((int(i), int(s), int(b), bool(signed)) for i, s, b, signed in document["layout"])
-    return Pdo(int(document["cob_id"]), layout, int(document["every_sync"]))
+    entries = [
+        (_whole(i, 1, 0xFFFF, "index"), _whole(s, 0, 255, "sub-index"), _whole(b, 1, 64, "bits"), signed is True)
+        for i, s, b, signed in document["layout"]
+    ]
+    lay_out(entries)
+    cob_id = _whole(document["cob_id"], 1, 0x7FF, "a COB-ID")
+    return Pdo(cob_id, tuple(entries), _whole(document["every_sync"], 1, 255, "every_sync"))
 
 
 def _axis(document: dict[str, Any]) -> AxisSettings:
@@ -181,10 +228,11 @@ def _axis(document: dict[str, Any]) -> AxisSettings:
     limits, feed = Limits(**document.pop("limits")), document.pop("feedforward")
     travel = document.pop("travel")
     if travel is not None:
-        low, high = map(int, travel)
+        low, high = (_whole(end, -(2**31), 2**31 - 1, "travel") for end in travel)
         document["travel"] = (low, high)
     if feed is not None:
-        feed = Feedforward(_pdo(feed["pdo"]), feedforward.Limits(*map(int, feed["limits"])))
+        most = [_whole(limit, 1, 2**31 - 1, "a limit of the feed-forward") for limit in feed["limits"]]
+        feed = Feedforward(_pdo(feed["pdo"]), feedforward.Limits(*most))
     return AxisSettings(target=target, offset=offset, tpdos=tpdos, limits=limits, feedforward=feed, **document)
 
 
@@ -192,31 +240,56 @@ def _check(settings: Settings) -> None:
     """Refuse what would make the guard's own arithmetic wrong; ValueError names it."""
     if not settings.axes:
         raise ValueError("no axis may be corrected (an [axis.NAME.correction] section switches writing on)")
-    if not 0 < settings.sync_period_s <= 1 or not 0 < settings.heartbeat_s <= 10:
-        raise ValueError("sync_period_s or heartbeat_s is out of range")
-    if settings.clock not in ("monotonic", "sync") or settings.transport not in ("can_raw", "socketcand"):
-        raise ValueError("unknown clock or transport")
-    if len(settings.sent_ids) != 1 + len(settings.axes) + sum(a.feedforward is not None for a in settings.axes):
-        raise ValueError("two of our PDOs share one COB-ID")
+    _number(settings.sync_period_s, 1e-5, 1.0, "sync_period_s")
+    _number(settings.heartbeat_s, 1e-3, 10.0, "heartbeat_s")
+    _whole(settings.node_id, 1, 127, "node_id")
+    _word(settings.clock, "monotonic|sync", "clock")
+    _word(settings.transport, "can_raw|socketcand", "transport")
+    _word(settings.token_sha256, "(?:[0-9a-f]{64})?", "token_sha256")
+    _word(settings.bus, ".{1,64}", "bus")
+    _word(settings.run_directory, r"[^\0]{0,4096}", "run_directory")
+    if type(settings.offset_synchronous) is not bool:
+        raise ValueError("offset_synchronous is neither true nor false")
+    if settings.daemon_uid is not None:
+        _whole(settings.daemon_uid, 0, 2**32 - 2, "daemon_uid")
     for axis in settings.axes:
         _check_axis(axis)
+        _check_limits(axis, settings.sync_period_s)
+    if len(settings.sent_ids) != 1 + len(settings.axes) + sum(a.feedforward is not None for a in settings.axes):
+        raise ValueError("two of our PDOs share one COB-ID")
 
 
 def _check_axis(axis: AxisSettings) -> None:
-    if [(entry[0], entry[1]) for entry in axis.offset.layout] != [(0x60B0, 0)]:
-        raise ValueError(f"axis {axis.name}: the offset RPDO must map 0x60B0:00 and nothing else")
-    feed = axis.feedforward
-    if feed is not None and [entry[:2] for entry in feed.pdo.layout] != [(0x60B1, 0), (0x60B2, 0)]:
-        raise ValueError(f"axis {axis.name}: the feed-forward's RPDO must map 0x60B1:00 and 0x60B2:00 and nothing else")
-    if feed is not None and not (0x180 <= feed.pdo.cob_id < 0x580 and min(feed.limits) >= 1):
-        raise ValueError(f"axis {axis.name}: the feed-forward has no RPDO, or a limit below 1")
-    if not all(type(value) is int and value >= 1 for value in asdict(axis.limits).values()):
-        raise ValueError(f"axis {axis.name}: limits must be whole increments, at least 1")
-    if not 0x180 <= axis.offset.cob_id < 0x580 or type(axis.window) is not int or axis.window < 1:
-        raise ValueError(
-            f"axis {axis.name}: {axis.offset.cob_id:#x} is no RPDO, or the window is no number of increments"
-        )
-    if not 0.0 <= axis.speed_step < 2**31 or not 0.0 <= axis.speed_count < 2**31:
-        raise ValueError(f"axis {axis.name}: speed_count or speed_step is out of range")
-    if type(axis.setpoint_delay_cycles) is not int or not 0 <= axis.setpoint_delay_cycles <= 16:
-        raise ValueError(f"axis {axis.name}: setpoint_delay_cycles is out of range")
+    where = f"axis {axis.name}: "
+    _word(axis.name, "[A-Z]", "an axis' name")
+    _whole(axis.node_id, 1, 127, where + "node_id")
+    _whole(axis.window, 1, 2**32, where + "window")
+    _whole(axis.setpoint_delay_cycles, 0, 16, where + "setpoint_delay_cycles")
+    if axis.sign not in (1, -1):
+        raise ValueError(f"{where}sign is neither 1 nor -1")
+    _number(axis.heartbeat_timeout_s, 0.0, 3600.0, where + "heartbeat_timeout_s")
+    _number(axis.speed_step, 0.0, 2.0**31, where + "speed_step")
+    _number(axis.speed_count, 0.0, 2.0**31, where + "speed_count")
+    _word(axis.record, ".{0,200}", where + "record")
+    if type(axis.record_void) is not bool:
+        raise ValueError(f"{where}record_void is neither true nor false")
+    _check_sent(axis.offset, OFFSET_LAYOUT, f"{where}the offset RPDO must map 0x60B0:00 and nothing else")
+    if axis.feedforward is not None:
+        text = f"{where}the feed-forward's RPDO must map 0x60B1:00 and 0x60B2:00 and nothing else"
+        _check_sent(axis.feedforward.pdo, FEED_LAYOUT, text)
+
+
+def _check_sent(pdo: Pdo, layout: Layout, text: str) -> None:
+    if pdo.layout != layout or not 0x180 <= pdo.cob_id < 0x580:
+        raise ValueError(f"{text} ({pdo.cob_id:#x})")
+
+
+def _check_limits(axis: AxisSettings, sync_period_s: float) -> None:
+    """The ceilings are this program's: the file can only lower them, and not below one increment."""
+    _number(axis.increments_per_mm, 1.0, MOST_INCREMENTS_PER_MM, f"axis {axis.name}: increments_per_mm")
+    for value in (axis.max_speed_mm_s, axis.max_acceleration_mm_s2):
+        _number(value, 1e-3, 1e9, f"axis {axis.name}: max_speed_mm_s or max_acceleration_mm_s2")
+    most = ceilings(axis.increments_per_mm, sync_period_s, axis.max_speed_mm_s, axis.max_acceleration_mm_s2)
+    for name, ceiling in asdict(most).items():
+        value = getattr(axis.limits, name)
+        _whole(value, 1 if name != "window" else ceiling, ceiling, f"axis {axis.name}: the limit {name}")

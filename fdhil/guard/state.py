@@ -40,13 +40,17 @@ SENDING = IN_CHARGE | LANDING
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What the operator or the daemon asks for; only an arm and an adopt need the operator's token."""
+    """What the operator or the daemon asks for; all but a disarm and a stop need the operator's token.
 
-    kind: Literal["arm", "feedforward", "disarm", "adopt", "stop"]
+    ``compared`` are the fingerprints, per axis, of drives that were found to be as they were commissioned.
+    """
+
+    kind: Literal["arm", "feedforward", "disarm", "adopt", "compared", "stop"]
     token_valid: bool = False
     program_digest: str = ""
     facts: Mapping[str, object] = field(default_factory=dict)
     laws: tuple[Law, ...] = ()
+    compared: Mapping[str, str] = field(default_factory=dict)
 
 
 class AxisInput(NamedTuple):
@@ -54,7 +58,8 @@ class AxisInput(NamedTuple):
 
     ``target`` is the 0x607A that this SYNC latched, ``position`` and ``read_back`` what was sampled at the SYNC before
     (None when no frame came). Ages are infinite when never heard;
-    ``feedback_age`` is that of the older of statusword and position, in units of its own rate.
+    ``feedback_age`` is that of the older of statusword and position, ``read_back_age`` that of 0x60B0, each in units of
+    its own rate. ``demand`` is 0x6062; ``touched`` counts boot-ups, and writes to what the commissioning relies on.
     """
 
     target: int | None = None
@@ -70,6 +75,9 @@ class AxisInput(NamedTuple):
     long_frames: int = 0
     fed_back: Shown = NOT_SHOWN
     speed: int | None = None
+    read_back_age: float = float("inf")
+    demand: int | None = None
+    touched: int = 0
 
 
 class BusView(NamedTuple):
@@ -103,7 +111,8 @@ class Inputs(NamedTuple):
 class AxisState(NamedTuple):
     """One axis' offset: ``offset`` in force or about to be, moving at ``rate``; ``sent`` the last values, newest first.
 
-    ``read_back`` is what the drive last showed (None: never), ``zeros_shown`` whether it showed 0 since we send 0.
+    ``read_back`` is what the drive last showed (None: never), in ``readings`` TPDOs in a row, by ``off_demand`` away
+    from what 0x6062 says; ``zero_shown``: it showed 0 since we send 0. ``record_void``: it may not be as commissioned.
     ``fed_back`` is the same of speed and torque offset. ``believed`` are the last position, speed (increments per
     cycle) and tick that agreed with those before, ``implausible`` the samples since then that did not.
     """
@@ -113,6 +122,10 @@ class AxisState(NamedTuple):
     sent: tuple[int, ...] = (0,) * 4
     travel: Travel = AT_REST
     read_back: int | None = None
+    readings: int = 0
+    off_demand: float = 0.0
+    record_void: bool = False
+    touched: int = 0
     echo_misses: int = 0
     late_echoes: int = 0
     zero_shown: bool = False
@@ -128,7 +141,9 @@ class State(NamedTuple):
 
     ``places`` are the rows of the path that the machine may be at, best first; ``anchor`` the last row that the
     targets agreed with. ``rest`` are the last targets heard, ``rested_for`` the cycles since they came to stand there.
-    ``cause`` is why the correction went off, kept until the next arming.
+    ``cause`` is why the correction went off, kept until the next arming. ``measuring`` counts the cycles in which
+    nothing is sent because another node changed the offset: the ramp starts from what the drives show.
+    ``unknown_for`` counts those after the start in which a drive showed an offset that could not be believed yet.
     """
 
     mode: Mode
@@ -145,6 +160,8 @@ class State(NamedTuple):
     held_for: int = 0
     resuming: bool = False
     zeros_sent: int = 0
+    measuring: int = 0
+    unknown_for: int = 0
     adopt_checked: bool = False
     cause: Alarm | None = None
     missed: int = 0
@@ -175,5 +192,7 @@ class Output(NamedTuple):
 
 def initial(settings: Settings) -> State:
     """Return the state at start: off, nothing known."""
-    axes = [AxisState(sent=(0,) * (axis.setpoint_delay_cycles + 4)) for axis in settings.axes]
+    axes = [
+        AxisState(sent=(0,) * (axis.setpoint_delay_cycles + 4), record_void=axis.record_void) for axis in settings.axes
+    ]
     return State(Mode.OFF, tuple(axes))

@@ -1,30 +1,27 @@
-"""The file through which a correction table reaches the guard: two slots {sequence, length, CRC-32, body}.
+"""A correction table on its way into the guard: handed over as an open descriptor of sealed memory, checked row by row.
 
-The writer fills the older slot and its header last; the reader takes the valid slot with the highest sequence. A
-slot whose CRC is wrong is no table. Both use plain positioned reads and writes: the pages are the same as a mapping's,
-but a file that someone truncates is an error value here, where a mapping would end the guard by SIGBUS.
+Memory that is sealed cannot change, shrink or block while it is read, whoever still holds it.
 """
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import struct
 import sys
-import zlib
 from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path as FilePath
 from typing import Any, Protocol
 
 from fdhil.errors import StoreError
 from fdhil.guard.limits import Limits, violation
 from fdhil.guard.path import Path
 
-MAGIC = b"FDHT"
-SLOT_BYTES = 32 << 20
-_HEADER = struct.Struct("<4sIQI")  # magic, length of the body, sequence, CRC-32 of length, sequence and body
+MAX_TABLE_BYTES = 16 << 20
+MAX_HEAD_BYTES = 4096
+SEALED = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_WRITE
 _LENGTH = struct.Struct("<I")
 
 
@@ -91,15 +88,19 @@ def decode(body: bytes, sequence: int = 0) -> tuple[tuple[str, ...], Path]:
     """Return the axes and the rows of a body; TableRefused (``CorruptFile``) when it is not what ``encode`` writes."""
     try:
         (length,) = _LENGTH.unpack_from(body)
+        if length > MAX_HEAD_BYTES:
+            raise ValueError("its header is too long")
         head = json.loads(body[4 : 4 + length])
-        axes, rows, first = tuple(map(str, head["axes"])), int(head["rows"]), int(head["first"])
+        axes, rows, first, program = head["axes"], head["rows"], head["first"], head["program"]
+        if not (type(rows) is type(first) is int and 0 <= first < 1 << 31 and isinstance(program, str)):
+            raise ValueError("its header counts no rows, or names no program")
+        if not isinstance(axes, list) or not all(isinstance(axis, str) for axis in axes):
+            raise ValueError("its header names no axes")
         columns = _columns(body[4 + length :], rows, 2 * len(axes))
-        path = Path(
-            first, columns[: len(axes)], columns[len(axes) :], head["final"] is True, str(head["program"]), sequence
-        )
-    except (struct.error, ValueError, KeyError, TypeError) as error:
+    except (struct.error, ValueError, KeyError, TypeError, RecursionError) as error:
         raise TableRefused("CorruptFile", f"the correction table cannot be read ({error}); plan it again") from None
-    return axes, path
+    demand, offset = columns[: len(axes)], columns[len(axes) :]
+    return tuple(axes), Path(first, demand, offset, head.get("final") is True, program, sequence)
 
 
 def _columns(data: bytes, rows: int, count: int) -> tuple[Sequence[int], ...]:
@@ -115,87 +116,44 @@ def _columns(data: bytes, rows: int, count: int) -> tuple[Sequence[int], ...]:
     return tuple(columns)
 
 
-def write(file: FilePath, body: bytes, slot_bytes: int = SLOT_BYTES) -> int:
-    """Write a body into the older slot and return its sequence; StoreError when it does not fit or cannot be written.
-
-    One writer at a time. The header goes last, so that a torn write is a slot with a wrong CRC.
-    """
-    if _HEADER.size + len(body) > slot_bytes:
-        raise StoreError(f"{file}: a table of {len(body)} bytes does not fit its slot; stream it in pieces")
+def seal(body: bytes) -> int:
+    """Return a descriptor of sealed memory that holds a body; StoreError when it is too long or there is no memory."""
+    if len(body) > MAX_TABLE_BYTES:
+        raise StoreError(f"a correction table of {len(body)} bytes is too long for the guard; stream it in pieces")
     try:
-        descriptor = os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        descriptor = os.memfd_create("fdhil-table", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         try:
-            sequences = [_valid_sequence(descriptor, slot, slot_bytes) for slot in (0, 1)]
-            slot = 0 if sequences[0] <= sequences[1] else 1
-            sequence = max(sequences) + 1
-            _write_all(descriptor, body, slot * slot_bytes + _HEADER.size)
-            _write_all(descriptor, _header(body, sequence), slot * slot_bytes)
-        finally:
+            view = memoryview(body)
+            while view:
+                view = view[os.write(descriptor, view) :]
+            fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, SEALED)
+        except OSError:
             os.close(descriptor)
+            raise
     except OSError as error:
-        raise StoreError(f"{file}: the correction table cannot be written ({error.strerror}); free the disk") from None
-    return sequence
+        text = f"the correction table cannot be handed over ({error.strerror}), and nothing was loaded; free memory"
+        raise StoreError(text) from None
+    return descriptor
 
 
-def read(file: FilePath, newer_than: int = 0, slot_bytes: int = SLOT_BYTES) -> tuple[int, bytes] | None:
-    """Return (sequence, body) of the newest valid slot whose sequence is above ``newer_than``, or None."""
+def read_sealed(descriptor: int | None, most_bytes: int = MAX_TABLE_BYTES) -> bytes:
+    """Return what sealed memory holds; TableRefused (``CorruptFile``, ``TableBusy`` above ``most_bytes``).
+
+    The seals are asked for first: only memory has any, so that whatever else came (a FIFO, a socket) is not touched.
+    """
     try:
-        descriptor = os.open(file, os.O_RDONLY | os.O_CLOEXEC)
+        sealed = descriptor is not None and fcntl.fcntl(descriptor, fcntl.F_GET_SEALS) & SEALED == SEALED
     except OSError:
-        return None
-    try:
-        order = sorted(((_sequence(descriptor, slot, slot_bytes), slot) for slot in (0, 1)), reverse=True)
-        for sequence, slot in order:
-            if sequence <= newer_than:
-                return None
-            body = _body(descriptor, slot, slot_bytes)
-            if body is not None:
-                return sequence, body
-    except OSError:
-        return None
-    finally:
-        os.close(descriptor)
-    return None
-
-
-def _header(body: bytes, sequence: int) -> bytes:
-    return _HEADER.pack(MAGIC, len(body), sequence, _crc(body, sequence))
-
-
-def _crc(body: bytes, sequence: int) -> int:
-    return zlib.crc32(body, zlib.crc32(struct.pack("<IQ", len(body), sequence)))
-
-
-def _write_all(descriptor: int, data: bytes, position: int) -> None:
-    view = memoryview(data)
-    while view:
-        written = os.pwrite(descriptor, view, position)
-        view, position = view[written:], position + written
-
-
-def _sequence(descriptor: int, slot: int, slot_bytes: int) -> int:
-    """The sequence that a slot's header claims; 0 when it is no header."""
-    raw = os.pread(descriptor, _HEADER.size, slot * slot_bytes)
-    if len(raw) < _HEADER.size:
-        return 0
-    magic, length, sequence, _ = _HEADER.unpack(raw)
-    return int(sequence) if magic == MAGIC and _HEADER.size + length <= slot_bytes else 0
-
-
-def _valid_sequence(descriptor: int, slot: int, slot_bytes: int) -> int:
-    """The sequence of a slot whose CRC is right, else 0: a damaged slot is the first to be written over."""
-    return 0 if _body(descriptor, slot, slot_bytes) is None else _sequence(descriptor, slot, slot_bytes)
-
-
-def _body(descriptor: int, slot: int, slot_bytes: int) -> bytes | None:
-    raw = os.pread(descriptor, _HEADER.size, slot * slot_bytes)
-    if len(raw) < _HEADER.size:
-        return None
-    magic, length, sequence, crc = _HEADER.unpack(raw)
-    if magic != MAGIC or _HEADER.size + length > slot_bytes:
-        return None
-    body = os.pread(descriptor, length, slot * slot_bytes + _HEADER.size)
-    return body if len(body) == length and _crc(body, sequence) == crc else None
+        sealed = False
+    if descriptor is None or not sealed:
+        text = "the correction table did not come as a descriptor of sealed memory, and it was not read; load it again"
+        raise TableRefused("CorruptFile", text)
+    size = os.fstat(descriptor).st_size
+    if size > MAX_TABLE_BYTES:
+        raise TableRefused("CorruptFile", f"a correction table of {size} bytes is too long; stream it in pieces")
+    if size > most_bytes:
+        raise TableRefused("TableBusy", "a table this long cannot be checked while a correction runs; disarm first")
+    return os.pread(descriptor, size, 0)
 
 
 def check_rows(limits: Limits, offsets: Sequence[int], start: int, stop: int) -> str | None:
@@ -288,6 +246,10 @@ def begin(
     if path.first != loaded.end or path.program_digest != loaded.program_digest or loaded.final:
         raise TableRefused("ProgramMismatch", f"row {path.first} does not continue the loaded table; load it anew")
     cut = max(0, min(keep_from, loaded.end - limits[0].window - 3) - loaded.first)
+    if 8 * len(names) * (path.end - loaded.first - cut) > MAX_TABLE_BYTES:
+        raise TableRefused(
+            "TableBusy", "the guard holds as many rows as it can; wait until the machine has passed some"
+        )
     joined = Path(
         loaded.first + cut,
         _join(loaded.demand, path.demand, cut),
@@ -300,4 +262,9 @@ def begin(
 
 
 def _join(old: Sequence[Sequence[int]], new: Sequence[Sequence[int]], cut: int) -> tuple[Sequence[int], ...]:
-    return tuple(array("i", [*before[cut:], *after]) for before, after in zip(old, new, strict=True))
+    columns = []
+    for before, after in zip(old, new, strict=True):
+        column = array("i", before[cut:])
+        column.extend(after)
+        columns.append(column)
+    return tuple(columns)

@@ -16,7 +16,7 @@ from numba import njit
 from fdhil.identification import slow_voltage
 from fdhil.identification.motion import BROKEN, DIFFUSE, UNKNOWN, Motion, Noise
 from fdhil.model.feed_drive import transition
-from fdhil.records import Float, Parameters
+from fdhil.records import Float, Parameters, read_only
 
 NOTHING: Float = np.zeros(0)
 
@@ -188,12 +188,12 @@ def innovations(
         motion.dt_s,
         motion.mode,
         motion.observed,
-        motion.delayed(delay_s),
+        read_only(motion.delayed(delay_s)),
         NOTHING if means else motion.voltage_rise,
         emf_share if means else emf_share - 1.0,
         load,
-        motion.current,
-        motion.speed,
+        read_only(motion.current),
+        read_only(motion.speed),
         gains.gains,
         gains.whiteners,
     ).ravel()

@@ -22,7 +22,7 @@ from numba import njit
 
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.motion import DIFFUSE, UNKNOWN, Motion
-from fdhil.records import Float
+from fdhil.records import Float, read_only
 
 STATES = 4
 NO_SAMPLE = -1
@@ -267,9 +267,9 @@ def innovations_of(
         motion.mode,
         spread_of(motion, variances) if spread is None else spread,
         np.zeros(0) if load_nm is None else load_nm,
-        motion.current,
-        motion.speed,
-        motion.voltage_mean,
+        read_only(motion.current),
+        read_only(motion.speed),
+        read_only(motion.voltage_mean),
         motion.voltage_sampling == "instant",
         motion.slow.period_s,
         marks.row,

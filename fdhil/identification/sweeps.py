@@ -15,7 +15,7 @@ from fdhil.identification.innovations import Gains
 from fdhil.identification.motion import BROKEN, DIFFUSE, UNKNOWN, Motion
 from fdhil.identification.slow_voltage import innovations_of
 from fdhil.model.feed_drive import transition
-from fdhil.records import Float
+from fdhil.records import Float, read_only
 
 LOAD, VOLTAGE, CURRENT, SPEED = 0, 1, 2, 3  # what a course changes
 LOG_ROWS = 16  # determinants, at most DIFFUSE^2 of the measurement's, that are multiplied before a logarithm is taken
@@ -159,8 +159,8 @@ def whiten(motion: Motion, thetas: Float, variances: Float) -> tuple[Float, Floa
         np.array(voltages),
         np.zeros(0) if means else motion.voltage_rise,
         1.0 if means else 0.0,
-        motion.current,
-        motion.speed,
+        read_only(motion.current),
+        read_only(motion.speed),
         motion.speed_walk,
     )
     return white.reshape(len(thetas), -1).T, logdet

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdhil.records import PARAMETERS, Float
+from fdhil.records import INTERVAL_95, PARAMETERS, Float
 
-SURE_95 = 1.959963984540054
 LEAST_ROWS = 3
 LEAST_STRETCH = 3  # rows on either side of a step: fewer may be one bad estimate
 NEWEST = 2  # rows after the newest step: two that agree are believed, as they are when they are taken in
@@ -21,6 +20,10 @@ ENOUGH_FOR_DRIFT = 8  # rows from which on a steady drift is told apart from a s
 ENOUGH_FOR_CURVE = 16
 NEAR = 8  # rows on either side in which a step must be seen too
 BEYOND_CHANCE = 5.0
+# a date is told only of a slope that is so sure, seen over so long, and only so far ahead
+SURE_SLOPE = 3.0  # standard deviations
+LEAST_DAYS = 1.0
+FARTHEST_SPANS = 5.0
 COLLINEAR = 1e-4  # share of a covariate that the others must leave
 # a smaller step is not told: drift that is no straight line looks like one
 LEAST_STEP: dict[str, float] = {"R": 0.05, "L": 0.08, "K": 0.03, "Jt": 0.02, "ft": 0.15, "Cd": 0.10}
@@ -71,8 +74,8 @@ class Step:
 def student_95(freedom: float) -> float:
     """Return the quantile of Student's t that leaves 2.5 % on either side (Cornish-Fisher; within 1 % from 3 on)."""
     if math.isinf(freedom):
-        return SURE_95
-    z, v = SURE_95, max(freedom, 1.0)
+        return INTERVAL_95
+    z, v = INTERVAL_95, max(freedom, 1.0)
     terms = (z, (z**3 + z) / 4, (5 * z**5 + 16 * z**3 + 3 * z) / 96, (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384)
     return sum(term / v**k for k, term in enumerate(terms))
 
@@ -118,16 +121,23 @@ def _without(other: Float, column: Float) -> Float:
 
 
 def crossing(line: Slope, limit: float) -> Crossing | None:
-    """Return where the line reaches ``limit``, by Fieller's theorem; None when the slope may as well be nil."""
+    """Return where the line reaches ``limit``, by Fieller's theorem; None when the slope may as well be nil: it is less
+    than ``SURE_SLOPE`` standard deviations.
+    """
     sure = student_95(line.freedom) ** 2
+    if line.value**2 <= sure * (SURE_SLOPE / INTERVAL_95 * line.std) ** 2:
+        return None
     apart = limit - line.level
     a = line.value**2 - sure * line.std**2
-    if not a > 0:
-        return None
     b = line.value * apart
     c = apart**2 - sure * line.level_std**2
     root = math.sqrt(max(b * b - a * c, 0.0))
     return Crossing(line.at + apart / line.value, line.at + (b - root) / a, line.at + (b + root) / a)
+
+
+def reach_days(span_days: float) -> float:
+    """Return how many days ahead a slope may be followed that was seen over ``span_days``; 0 when that is too short."""
+    return FARTHEST_SPANS * span_days if span_days >= LEAST_DAYS else 0.0
 
 
 def steps(

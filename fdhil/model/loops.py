@@ -17,7 +17,7 @@ from fdhil.config import Axis
 from fdhil.model import kernels
 from fdhil.model.closed_loop import Commands, Response, State
 from fdhil.model.leap import leap
-from fdhil.records import Float, Parameters
+from fdhil.records import Float, Parameters, read_only
 
 
 @lru_cache(maxsize=64)
@@ -96,13 +96,13 @@ class Drive:
         end = state.copy()
         torque = commands.torque_offset_nm
         out = kernels.run(
-            commands.reference_mm,
-            commands.speed_offset_rad_s,
+            read_only(commands.reference_mm),
+            read_only(commands.speed_offset_rad_s),
             torque / self.nominal_k if torque.size else torque,
             first,
             commands.reference_mm.size - first if rows is None else rows,
             self.plant,
-            self.leap,
+            read_only(self.leap),
             self.gains,
             self.shape,
             end,

@@ -9,7 +9,7 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.identification import trends
-from fdhil.identification.trends import LEAST_STEP, Slope, slope
+from fdhil.identification.trends import LEAST_STEP, Slope, reach_days, slope
 from fdhil.prediction.predict import contour_um, predict
 from fdhil.records import PARAMETERS, Float, Parameters, ParameterSet, Prediction, Zone
 
@@ -66,6 +66,14 @@ class Crossing:
     latest_days: float
     axis: str
     parameter: str
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """The slope per day of each of an axis' parameters that has one, and over how many days it was seen."""
+
+    slopes: Mapping[str, Slope]
+    span_days: float
 
 
 def moved(before: ParameterSet, now: ParameterSet) -> dict[str, tuple[str, ...]]:
@@ -186,34 +194,45 @@ def _rms(values: Float) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def slopes_per_day(sets: Sequence[ParameterSet], days: Float) -> dict[str, Slope]:
-    """Return the slope of each parameter over time, after the last step, of sets published on ``days`` (n,)."""
+def course(sets: Sequence[ParameterSet], days: Float) -> Course:
+    """Return how an axis' parameters go on, from its sets published on ``days`` (n,): what came before the last step
+    says nothing of it, and what follows the temperature, where that is known, is no course in time.
+    """
     step = last_step(sets)
     first = 0 if step is None else step + 1
+    newest = sets[first:]
+    celsius = np.array([np.nan if s.temperature_c is None else s.temperature_c for s in newest], dtype=np.float64)
+    beside = celsius if np.isfinite(celsius).all() and np.ptp(celsius) > 0 else None
     found = {}
     for k, name in enumerate(PARAMETERS):
-        values = np.array([getattr(s.parameters, name) for s in sets[first:]])
-        stds = np.array([np.sqrt(max(float(np.nan_to_num(s.covariance[k, k])), 0.0)) for s in sets[first:]])
-        line = slope(values, days[first:], stds if (stds > 0).all() else None)
+        values = np.array([getattr(s.parameters, name) for s in newest])
+        stds = np.array([np.sqrt(max(float(np.nan_to_num(s.covariance[k, k])), 0.0)) for s in newest])
+        line = slope(values, days[first:], stds if (stds > 0).all() else None, beside)
         if line is not None:
             found[name] = line
-    return found
+    return Course(found, float(np.ptp(days[first:])))
+
+
+def span_days(courses: Mapping[str, Course]) -> float:
+    """Return the days that every axis with a course has been watched; 0 without any."""
+    return min((known.span_days for known in courses.values() if known.slopes), default=0.0)
 
 
 def crossing(
     zone: Zone,
     um_per_percent: Mapping[str, Mapping[str, float]],
     models: Mapping[str, Parameters],
-    slopes: Mapping[str, Mapping[str, Slope]],
+    courses: Mapping[str, Course],
     tolerance_um: float,
 ) -> Crossing | None:
     """Return when the zone's largest error crosses the tolerance, to first order; None where that is not foreseeable:
-    it falls, or its slope may as well be nil. It must be within the tolerance now.
+    it falls, its slope may as well be nil, or the day is farther ahead than the history reaches. It must be within the
+    tolerance now.
     """
     rates: dict[tuple[str, str], float] = {}
     variance = 0.0
-    for axis, lines in slopes.items():
-        for name, line in lines.items():
+    for axis, known in courses.items():
+        for name, line in known.slopes.items():
             value = abs(float(getattr(models[axis], name)))
             if value == 0.0:
                 continue
@@ -223,10 +242,10 @@ def crossing(
     rate = sum(rates.values())
     if rate <= 0.0:
         return None
-    freedom = min(line.freedom for lines in slopes.values() for line in lines.values())
-    course = Slope(rate, float(np.sqrt(variance)), at=0.0, level=zone.max_um, freedom=freedom)
-    found = trends.crossing(course, tolerance_um)
-    if found is None:
+    freedom = min(line.freedom for known in courses.values() for line in known.slopes.values())
+    line = Slope(rate, float(np.sqrt(variance)), at=0.0, level=zone.max_um, freedom=freedom)
+    found = trends.crossing(line, tolerance_um)
+    if found is None or found.at > reach_days(span_days(courses)):
         return None
     axis, name = max(rates, key=rates.__getitem__)
     return Crossing(found.at, found.low, found.high, axis, name)

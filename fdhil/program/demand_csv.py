@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -109,13 +110,13 @@ def _check_speeds(path: Path, columns: Mapping[str, Float], config: MachineConfi
         logging.getLogger("fdhil").warning(text, path, _SMALL_MM, _TOO_SLOW)
 
 
-def write_demand_csv(trajectory: Trajectory, path: Path) -> None:
+def write_demand_csv(trajectory: Trajectory, file: Path | IO[bytes]) -> None:
     """Write a reference as demand CSV: mm with 9 decimals. RecordingError when the file cannot be written."""
     decimals = max(6, min(12, 1 - math.floor(math.log10(trajectory.dt_s))))
     table = np.column_stack([trajectory.time_s, *trajectory.position_mm.values()])
     header = ",".join(["time_s", *(f"{axis}_mm" for axis in trajectory.axes)])
     formats = [f"%.{decimals}f", *("%.9f" for _ in trajectory.axes)]
     try:
-        np.savetxt(path, table, fmt=formats, delimiter=",", header=header, comments="")
+        np.savetxt(file, table, fmt=formats, delimiter=",", header=header, comments="")
     except OSError as error:
-        raise RecordingError(f"{path} cannot be written ({error.strerror}); check the folder") from None
+        raise RecordingError(f"{file} cannot be written ({error.strerror}); check the folder") from None

@@ -20,12 +20,25 @@ from fdhil.records.signals import (
     VoltageSampling,
     Window,
 )
-from fdhil.records.values import PARAMETERS, RATIOS, UNITS, Bool, Float, Int, Parameters, frozen, frozen_ints
+from fdhil.records.values import (
+    INTERVAL_95,
+    PARAMETERS,
+    RATIOS,
+    UNITS,
+    Bool,
+    Float,
+    Int,
+    Parameters,
+    frozen,
+    frozen_ints,
+    read_only,
+)
 from fdhil.records.verdicts import Estimate, Notice, ParameterSet, Reason, Result, Verdict, WindowOutcome
 
 Outcome = WindowOutcome | ParameterSet | Skill | Notice
 
 __all__ = [
+    "INTERVAL_95",
     "PARAMETERS",
     "RATIOS",
     "UNITS",
@@ -60,4 +73,5 @@ __all__ = [
     "Zone",
     "frozen",
     "frozen_ints",
+    "read_only",
 ]

@@ -14,6 +14,8 @@ Bool = npt.NDArray[np.bool_]
 
 PARAMETERS = ("R", "L", "K", "Jt", "ft", "Cd")
 RATIOS = ("Jt/K", "ft/K", "Cd/K")  # what current and speed alone tell
+INTERVAL_95 = 1.959963984540054
+"""Half the width of a 95 % interval, in standard deviations of a normal distribution."""
 UNITS: Mapping[str, str] = {
     "R": "ohm",
     "L": "H",
@@ -32,6 +34,13 @@ def frozen(values: npt.ArrayLike) -> Float:
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array
+
+
+def read_only(values: Float) -> Float:
+    """Return a read-only view, not a copy: a kernel that only reads is compiled for this one kind of array."""
+    view = values.view()
+    view.setflags(write=False)
+    return view
 
 
 def frozen_ints(values: npt.ArrayLike) -> Int:

@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from fdhil.errors import FdhilError
+from fdhil.store.output import open_output
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,17 +54,12 @@ def require() -> None:
 
 
 def write(page: Page, path: Path) -> None:
-    """Render ``page`` to ``path`` (a temporary name first, so that a reader never sees half a page)."""
+    """Render ``page`` to ``path``, whole or not at all. OutputError when it cannot be written."""
     require()
     from jinja2 import Environment
 
     template = files("fdhil.report").joinpath("page.html.j2").read_text("utf-8")
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     text = environment.from_string(template).render(page=page, is_word=_is_word)
-    part = path.with_suffix(path.suffix + ".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(text, "utf-8")
-        part.replace(path)
-    except OSError as error:
-        raise FdhilError(f"the report {path} cannot be written: {error.strerror}; choose another path") from None
+    with open_output(path) as file:
+        file.write(text.encode())

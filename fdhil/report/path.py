@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fdhil.prediction.contour import WINDOW_S
+from fdhil.prediction.gain import Gain, plus_minus
 from fdhil.records import Correction, Float, Prediction, Trajectory, Zone
 from fdhil.report import figures
 from fdhil.report.figures import Curve
@@ -33,8 +34,13 @@ def prediction_page(name: str, machine: str, predicted: Prediction, parameters: 
     )
 
 
-def correction_page(name: str, machine: str, planned: Correction, parameters: str = "") -> Page:
-    """Lay a correction out, before and after; a refused one with its reasons. ``parameters`` says whose they are."""
+def correction_page(
+    name: str, machine: str, planned: Correction, parameters: str = "", predicted: Gain | None = None
+) -> Page:
+    """Lay a correction out, before and after; a refused one with its reasons. ``parameters`` says whose they are.
+
+    ``predicted`` is the gain with what its prediction knows of itself; without it no factor is told.
+    """
     before, after = planned.before, planned.after
     if planned.refused:
         cases = [("uncorrected", before)]
@@ -43,11 +49,11 @@ def correction_page(name: str, machine: str, planned: Correction, parameters: st
     else:
         cases = [("uncorrected", before), (f"{planned.method} correction", after)]
         told = ""
-        verdict = [*_figures("corrected", after), ("smaller by", f"{_rms(before) / max(_rms(after), 1e-12):.0f} x")]
+        verdict = [*_figures("corrected, predicted", after), *_promise(predicted)]
     return Page(
         title=f"Correction of {name}",
         subtitle=f"Planned for {machine} with the method {planned.method}{_with(parameters)}; nothing was sent.",
-        headline=[*_figures("uncorrected", before), *verdict],
+        headline=[*_figures("uncorrected, predicted", before), *verdict],
         sections=[
             *([Section("Why it was refused", told)] if told else []),
             _along(cases),
@@ -55,6 +61,15 @@ def correction_page(name: str, machine: str, planned: Correction, parameters: st
             _zones(before, None if planned.refused else after),
         ],
     )
+
+
+def _promise(predicted: Gain | None) -> list[tuple[str, str]]:
+    """Say how far the prediction of the gain goes; the model against itself is no gain."""
+    if predicted is None or predicted.half_um is None:
+        return [("how well the model fits this machine", "not known here")]
+    sure = predicted.at_least
+    spread = [("95 % interval of it, RMS", plus_minus(predicted.half_um, 2) + " um")]
+    return [*spread, ("predicted smaller by at least", "not sure" if sure is None else f"{sure:.1f} x")]
 
 
 def _with(parameters: str) -> str:

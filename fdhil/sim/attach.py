@@ -52,6 +52,11 @@ class Attachment(Protocol):
         """Whether the bus takes no more for the moment."""
         ...
 
+    @property
+    def senders_left(self) -> int:
+        """How many parties left the bus after they had sent frames, as far as the bus can tell."""
+        ...
+
     def readers(self) -> Sequence[Selectable]:
         """What to select for reading."""
         ...
@@ -101,6 +106,8 @@ class SocketCan:
 
     ``lost`` counts frames that were given up because the transmit queue stayed full.
     """
+
+    senders_left = 0
 
     def __init__(self, name: str, bus: CanBus) -> None:
         self._channel = bus.channel
@@ -177,6 +184,8 @@ class SocketCan:
 
 class Virtual:
     """python-can's ``virtual`` bus inside this process; a thread wakes the loop for what comes."""
+
+    senders_left = 0
 
     def __init__(self, name: str, bus: CanBus) -> None:
         import can

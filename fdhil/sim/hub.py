@@ -69,6 +69,7 @@ class _Client:
     opened: bool = False
     raw: bool = False
     gone: bool = False
+    sends: bool = False
     moved_s: float = 0.0
 
 
@@ -76,12 +77,14 @@ class Hub:
     """The bus ``channel`` on a TCP port of ``host``, port 0 for any free one; ConnectError when it cannot be had.
 
     Not thread-safe: one loop selects on :meth:`readers` and :meth:`writers`, calls :meth:`pump`, then :meth:`flush`.
-    ``lost_clients`` counts those that were disconnected because they read nothing, ``malformed`` what was no command.
+    ``lost_clients`` counts those that were disconnected because they read nothing, ``senders_left`` those that are gone
+    after they had sent frames, ``malformed`` what was no command.
     """
 
     def __init__(self, channel: str, host: str = "127.0.0.1", port: int = 0, queue_bytes: int = QUEUE_BYTES) -> None:
         self.channel = channel
         self.lost_clients = 0
+        self.senders_left = 0
         self.malformed = 0
         self._queue_bytes = queue_bytes
         self._clients: list[_Client] = []
@@ -153,6 +156,7 @@ class Hub:
             for client in self._clients:
                 if client.gone:
                     client.socket.close()
+                    self.senders_left += client.sends
             self._clients = [client for client in self._clients if not client.gone]
 
     def close(self) -> None:
@@ -202,6 +206,7 @@ class Hub:
             if frame is None:
                 self.malformed += 1
                 return
+            client.sends = True
             if len(self._clients) > 1:
                 self.send((frame,), client)
             handler(frame)

@@ -23,6 +23,7 @@ from fdhil.sim.unit import Stream, Unit
 
 SYNC = 0x80
 OFFSET_RPDO = 2
+OFFSET_OBJECTS = (0x60B0, 0x60B1, 0x60B2)
 _THERMAL_CYCLES = 100  # the temperature moves slowly: the drive learns of it this often
 
 
@@ -100,7 +101,8 @@ class Machine:
     # -- frames
 
     def power_on(self) -> list[BusFrame]:
-        """Switch the drives on; they boot into pre-operational."""
+        """Switch the drives on; they boot into pre-operational, and no SYNC will find anything still to be compiled."""
+        next(iter(self.units.values())).drive.physics.rehearse()
         for unit in self.units.values():
             unit.power(True)
         return self._take_outbox()
@@ -226,6 +228,10 @@ class Machine:
                 for (axis, number), stream in self._streams.items()
             )
         return any(unit.drive.rpdos_heard_before - unit.drive.rpdos_heard for unit in self.units.values())
+
+    def holds_offset(self) -> bool:
+        """Whether a drive was given an offset of position, speed or torque that is not zero: its sender goes on."""
+        return any(unit.drive.dictionary.number(i, 0) for unit in self.units.values() for i in OFFSET_OBJECTS)
 
     # -- what was played
 

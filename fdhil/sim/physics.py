@@ -233,6 +233,23 @@ class Physics:
         self._plant = np.array([parameters.R, parameters.L, parameters.K, parameters.Jt, parameters.ft, parameters.Cd])
         self._phi = discretise(self._plant, self.step_s)
 
+    def rehearse(self) -> None:
+        """Run one cycle on a copy of the state: when this returns the kernels are compiled, which takes seconds."""
+        state, voltage = self._state.copy(), self.voltage_v.copy()
+        still = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        run_cycle(
+            state,
+            self._loops,
+            self._plant,
+            self._phi,
+            voltage,
+            False,
+            still,
+            self.load_torque_nm,
+            self._half_backlash,
+            self.step_s,
+        )
+
     def cycle(self, enabled: bool, command: tuple[float, float, float, float, float, float, float, float]) -> None:
         """Run one SYNC cycle of :func:`run_cycle`; ``enabled`` False means that no current flows."""
         if not enabled:

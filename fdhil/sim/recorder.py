@@ -20,6 +20,8 @@ class Recorder:
         self.path = path
         self._period_s = period_s
         self._rows = 0
+        if path.exists() and not path.is_file():
+            raise StoreError(f"the trace {path} is no regular file, which is never replaced: name a file")
         self._part = path.with_name(f".{path.name}.{os.getpid()}.part")
         try:
             self._file = self._part.open("w", encoding="ascii", newline="\n")

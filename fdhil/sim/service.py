@@ -2,7 +2,8 @@
 
 In ``realtime`` the NC's SYNC follows the host's monotonic clock, and a late host makes it slip instead of hurrying
 after. In ``lockstep`` the next SYNC goes out as soon as every RPDO that belongs into the cycle has arrived, and an idle
-machine does not run faster than its period.
+machine does not run faster than its period. A sender that stops after a zero is waited for briefly; one whose offset is
+in force is waited for as long as it may sleep on a busy host, unless it has left the bus.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ Emit = Callable[[dict[str, Any]], None]
 
 WALL_CLOCK_S = 0.004  # how often heartbeats and their time-outs are looked at
 LOCKSTEP_WAIT_S = 0.5
+LOCKSTEP_HOLDING_WAIT_S = 8.0  # a listener takes ten seconds without SYNC for a bus that is dead
 _MIN_SPACING = 0.75  # of a period, between two SYNCs after a late one
 _MAX_WAIT_S = 0.25
 
@@ -46,10 +48,13 @@ class Pace:
         self._next_s = 0.0
         self._last_s = 0.0
 
-    def due_s(self, *, waits: bool, idle: bool) -> float:
-        """Return the time of the next SYNC. ``waits``: an awaited RPDO has not come; ``idle``: nothing is played."""
+    def due_s(self, *, waits: bool, idle: bool, holds: bool = False) -> float:
+        """Return the time of the next SYNC.
+
+        ``waits``: an awaited RPDO has not come; ``holds``: an offset is in force; ``idle``: nothing is played.
+        """
         if self._lockstep and waits:
-            return self._last_s + LOCKSTEP_WAIT_S
+            return self._last_s + (LOCKSTEP_HOLDING_WAIT_S if holds else LOCKSTEP_WAIT_S)
         return self._next_s if idle or not self._lockstep else 0.0
 
     def sent(self, now_s: float) -> None:
@@ -94,6 +99,7 @@ class SimService:
         self._wake_read, self._wake_write = os.pipe()
         os.set_blocking(self._wake_read, False)
         os.set_blocking(self._wake_write, False)
+        self._left = 0
         self._pace = Pace(config.machine.sync_period_s, lockstep=config.sim.pace == "lockstep")
         self._buses: dict[str, Attachment] = {}
         self._handlers: dict[str, Handler] = {}
@@ -220,6 +226,7 @@ class SimService:
             self._wall_clock(now_s)
         if self._sync_due_s() <= now_s:
             self._pace.sent(now_s)
+            self._left = self._senders_left()
             self._send(self.machine.cycle())
         for event in self.machine.take_events():
             self._emit(event)
@@ -246,7 +253,11 @@ class SimService:
         machine = self.machine
         if not machine.nc.on or any(bus.congested for bus in self._buses.values()):
             return float("inf")
-        return self._pace.due_s(waits=machine.waits(), idle=not machine.nc.busy)
+        waits = machine.waits() and self._senders_left() == self._left
+        return self._pace.due_s(waits=waits, idle=not machine.nc.busy, holds=waits and machine.holds_offset())
+
+    def _senders_left(self) -> int:
+        return sum(bus.senders_left for bus in self._buses.values())
 
     def _wall_clock(self, now_s: float) -> None:
         """Let the drives' own time pass. When the host was late it passes slower: a drive has no such pauses."""

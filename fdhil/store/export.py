@@ -10,7 +10,7 @@ import numpy as np
 
 from fdhil.errors import RecordingError
 from fdhil.records import Float, SlowVoltage, Window
-from fdhil.store.atomic import write_file
+from fdhil.store.output import open_output
 
 COLUMNS = "time_s,voltage_V,current_A,speed_rad_per_s,position_m,demand_m"
 
@@ -68,5 +68,7 @@ def _held(window: Window, slow: SlowVoltage) -> Float:
 
 
 def export_csv(window: Window, path: Path) -> None:
-    """Write a window as CSV, whole or not at all. StoreError when it cannot be written."""
-    write_file(path, ("\n".join(csv_lines(window)) + "\n").encode())
+    """Write a window as CSV, whole or not at all. OutputError when it cannot be written."""
+    content = "\n".join(csv_lines(window)) + "\n"
+    with open_output(path) as file:
+        file.write(content.encode())

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 from pathlib import Path
 
 import pytest
 
+from tests.bench import bench_toml
 from tests.cli.test_predict import _bench as _bench
 from tests.cli.test_predict import invoke
 
@@ -25,7 +28,54 @@ def test_lists_the_lines_that_leave_the_tolerance(bench: Path, tolerance: float,
         assert entry["cause"] == "corner"
         assert entry["advised_feed_mm_min"] == pytest.approx(entry["feed_share"] * 15000)
         assert entry["advised_feed_mm_min"] < entry["corrected_feed_mm_min"] == 15000
-    assert ("line 3" in invoke(*arguments).stdout) == (lines > 0)
+    shown = invoke(*arguments).stdout
+    assert ("line 3: F15000 -> F" in shown or "lines 2-3: F15000 -> F" in shown) == (lines > 0)
+
+
+@pytest.fixture(scope="module")
+def wave(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a closed curve of 400 short lines."""
+    folder = tmp_path_factory.mktemp("wave")
+    (folder / "bench.toml").write_text(bench_toml())
+    lines = ["%", "(a wave; F1)", "G21 G90 G64 F6000"]
+    for k in range(400):
+        angle = k / 40 * 2 * math.pi
+        radius = 30 + 8 * math.sin(5 * angle)
+        lines.append(f"N{k} G1 X{radius * math.cos(angle) - 30:.3f} Y{radius * math.sin(angle):.3f} ; k")
+    (folder / "wave.ngc").write_bytes("\r\n".join([*lines, "M2", "%", ""]).encode())
+    return folder
+
+
+def test_many_lines_become_few_ranges_and_a_program_that_keeps_the_tolerance(wave: Path) -> None:
+    """The new program, predicted, stays within it; without its new F words it is the old one."""
+    program, out, config = wave / "wave.ngc", wave / "new.ngc", wave / "bench.toml"
+    arguments = ["advise", program, "--config", config, "--tolerance-um", 40]
+    result = invoke(*arguments, "--out", out)
+    assert result.exit_code == 0, result.stderr
+    assert re.search(
+        r"lines \d+-\d+: F6000 -> F[\d.]+, with the correction F[\d.]+, worst [\d.]+ um at line \d+", result.stdout
+    )
+    assert len(result.stdout.splitlines()) <= 25
+    document = json.loads(invoke(*arguments, "--json").stdout)
+    assert len(document["lines"]) > 60
+    predicted = json.loads(invoke("predict", out, "--config", config, "--json").stdout)
+    assert predicted["contour"]["max_um"] <= 40
+    before, after = (path.read_bytes().split(b"\n") for path in (program, out))
+    changed = {k for k, (one, other) in enumerate(zip(before, after, strict=True), 1) if one != other}
+    assert {entry["line"] for entry in document["lines"] if entry["feed_share"] < 0.99} <= changed
+    assert all(
+        re.sub(rb" F[\d.]+", b"", other) == one for one, other in zip(before, after, strict=True) if other != one
+    )
+
+
+def test_what_cannot_be_written_is_told_before_anything_is(bench: Path) -> None:
+    program, config = bench / "corner.ngc", bench / "bench.toml"
+    program.write_text("G21 G90 G64\nG1 X0 Y30 F15000\nG1 X40\nM2\n")
+    arguments = ["--config", config, "--tolerance-um", 60, "--out"]
+    assert invoke("advise", program, *arguments, program).exit_code == 2
+    assert invoke("advise", bench / "demand.csv", *arguments, bench / "new.ngc").exit_code == 2
+    assert invoke("advise", program, *arguments, bench).exit_code == 3
+    assert program.read_text().startswith("G21")
 
 
 @pytest.mark.parametrize("tolerance", ["0", "-3", "nan", "inf", "wide"])

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fdhil.program import write_demand_csv
+from fdhil.records import Skill
+from fdhil.store.history import History, Stamp
 from tests.cli.test_predict import _bench as _bench
-from tests.cli.test_predict import invoke
+from tests.cli.test_predict import invoke, remember
 from tests.paths import bench_trajectory
 
 
@@ -47,10 +50,34 @@ def test_a_refusal_writes_zeros_and_exits_1(bench: Path) -> None:
 
 
 def test_text_for_people(bench: Path) -> None:
-    """The gain in words."""
+    """A model that is measured against itself alone is not called better."""
     result = invoke("correct", bench / "demand.csv", "--config", bench / "bench.toml", "--method", "mirror")
     assert result.exit_code == 0
-    assert "times better" in result.stdout
+    assert "predicted with the mirror correction: " in result.stdout
+    assert "by the model alone, how well it fits this machine is not known here" in result.stdout
+    assert "times better" not in result.stdout
+
+
+def test_with_a_history_a_gain_has_its_uncertainty_and_a_spread_below_the_digits_is_not_zero(bench: Path) -> None:
+    """Parameters known to 1e-6 promise no more than the last moves were predicted to."""
+    remember(bench, [{}], known_to=1e-6)
+    with History.open(bench / "fdhil-data") as history:
+        for axis in "XY":
+            history.add_skill(Skill(axis, 1, 0.4, 1.0, 0.0, 30.0), Stamp(0.0, "boot", 0))
+    arguments = ["correct", bench / "demand.csv", "--config", bench / "bench.toml", "--from-history"]
+    text = invoke(*arguments).stdout
+    assert re.search(
+        r"predicted with the inverse correction: \d\.\d\d ± 0\.57 um RMS; .* at least \d+\.\d times better", text
+    )
+    document = json.loads(invoke(*arguments, "--json").stdout)
+    assert document["after"]["uncertainty_um"] == pytest.approx(0.4 * 2**0.5, rel=1e-3)
+    assert 1 < document["gain_at_least"] < document["gain"]
+    page = bench / "correct.html"
+    assert invoke(*arguments, "--report", page).exit_code == 0
+    assert "predicted smaller by at least" in page.read_text("utf-8")
+    text = invoke("predict", *arguments[1:]).stdout
+    assert "± <0.1 um" in text
+    assert "± 0.0" not in text
 
 
 def test_an_unknown_method_is_refused(bench: Path) -> None:
@@ -85,7 +112,7 @@ def test_the_default_method_is_the_best_one(bench: Path) -> None:
 
 def test_a_report_shows_before_and_after(bench: Path) -> None:
     """``predict`` and ``correct`` write a page of their own."""
-    for command, shown in (("predict", "predicted, RMS"), ("correct", "smaller by")):
+    for command, shown in (("predict", "predicted, RMS"), ("correct", "not known here")):
         page = bench / f"{command}.html"
         arguments = [command, bench / "demand.csv", "--config", bench / "bench.toml", "--report", page]
         assert invoke(*arguments).exit_code == 0

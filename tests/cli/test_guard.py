@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import pwd
 import signal
 import socket
 import stat
@@ -16,11 +17,12 @@ from pathlib import Path
 import pytest
 
 from fdhil import config as machine_config
-from fdhil.cli.guard import guard, heartbeat_timeout_s, limits_of, lock_bus, open_bus, settings_of
+from fdhil.cli.bus_lock import lock_bus
+from fdhil.cli.guard import guard, heartbeat_timeout_s, limits_of, open_bus, settings_of
 from fdhil.cli.main import cli, run_safely
 from fdhil.config import CanBus, CorrectionLimits
 from fdhil.drivers.commissioning_record import CommissioningRecord, save_record
-from fdhil.errors import ConnectError, DeviceError, ProtocolError
+from fdhil.errors import ConnectError, ProtocolError
 from fdhil.guard.limits import Limits
 from fdhil.guard.settings import from_json, load, to_json
 from tests.guard.machine import DEMAND_AT_REST
@@ -52,7 +54,7 @@ def test_check_writes_the_settings_and_a_token(
 ) -> None:
     config = write_config(tmp_path, 1)
     assert run(monkeypatch, str(config), "--check") == 0
-    assert "2 axes on can0" in capsys.readouterr().out
+    assert "guard.json" in capsys.readouterr().out
     directory = tmp_path / "fdhil-data" / "run"
     settings = load(directory / "guard.json")
     token = (directory / "token").read_text()
@@ -66,11 +68,12 @@ def test_check_writes_the_settings_and_a_token(
     assert settings.axes[0].window == 32768
 
 
-def test_default_limits_are_whole_increments(tmp_path: Path) -> None:
+def test_limits_are_whole_increments_rounded_down(tmp_path: Path) -> None:
     config = machine_config.load(write_config(tmp_path, 1))
     axis = config.axis["X"].model_copy(update={"correction": CorrectionLimits()})
-    assert limits_of(axis, 0.001) == Limits(163, 6, 1, 9830, 1000)
     assert limits_of(axis, 0.002) == Limits(163, 13, 3, 9830, 500)
+    slow = config.axis["X"].model_copy(update={"rapid_speed_mm_s": 100.0, "max_acceleration_mm_s2": 1000.0})
+    assert limits_of(slow, 0.001) == Limits(819, 32, 1, 9830, 1000)  # 10 mm/s and 500 mm/s2: the axis' shares
 
 
 RECORD = CommissioningRecord(
@@ -148,13 +151,6 @@ def test_a_peer_that_is_no_hub(greeting: bytes, error: type[Exception]) -> None:
         thread.join()
 
 
-def test_one_guard_per_bus() -> None:
-    bus = CanBus(port=47)
-    with lock_bus(bus), pytest.raises(DeviceError, match="BusLocked"):
-        lock_bus(bus)
-    lock_bus(bus).close()
-
-
 def test_no_drive_is_commissioned_while_a_guard_owns_the_bus(
     tmp_path: Path, peer: Peer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -167,20 +163,26 @@ def test_no_drive_is_commissioned_while_a_guard_owns_the_bus(
 
 
 def test_it_becomes_the_guard_owns_its_bus_and_stops_cleanly(tmp_path: Path, peer: Peer) -> None:
+    """A second one, by another name of the same hub and from another directory, exits with 3 and sends nothing."""
     config = write_config(tmp_path, peer.port)
+    (tmp_path / "other").mkdir()
+    other = write_config(tmp_path / "other", peer.port)
+    other.write_text(other.read_text().replace("127.0.0.1", "localhost"))
     command = [sys.executable, "-m", "fdhil.cli.guard", str(config)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         ready = json.loads(process.stdout.readline())
-        assert (ready["event"], ready["axes"]) == ("ready", ["X", "Y"])
-        second = subprocess.run(command, capture_output=True, text=True, timeout=60)
-        assert second.returncode == 3
-        assert "BusLocked" in second.stderr
-        assert len(second.stderr.splitlines()) == 1
+        seconds = [
+            subprocess.run([*command[:-1], str(again)], capture_output=True, text=True, timeout=60)
+            for again in (config, other)
+        ]
         process.send_signal(signal.SIGTERM)
         told = [json.loads(line) for line in process.stdout]
         assert process.wait(20) == 0
         assert told[-1]["event"] == "stopped"
+    assert (ready["event"], ready["axes"]) == ("ready", ["X", "Y"])
+    assert [second.returncode for second in seconds] == [3, 3]
+    assert all("BusLocked" in second.stderr and len(second.stderr.splitlines()) == 1 for second in seconds)
     assert peer.sent == []
 
 
@@ -190,3 +192,26 @@ def test_the_process_alone_refuses_what_it_cannot_use(tmp_path: Path) -> None:
     assert refused.returncode == 2
     assert "run fdhil-guard" in refused.stderr
     assert len(refused.stderr.splitlines()) == 1
+
+
+def test_a_guard_under_a_user_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its files are in a directory of its own, the token is given to it by systemd, and it knows the daemon's user."""
+    config = write_config(tmp_path, 1)
+    config.write_text(config.read_text() + 'run_directory = "own"\ndaemon_user = "daemon"\n')
+    given = tmp_path / "credentials"
+    given.mkdir()
+    (given / "token").write_text("the operator's")
+    (given / "token").chmod(0o400)
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(given))
+    assert run(monkeypatch, str(config), "--check") == 0
+    settings = load(tmp_path / "own" / "guard.json")
+    assert settings.token_sha256 == hashlib.sha256(b"the operator's").hexdigest()
+    assert settings.daemon_uid == pwd.getpwnam("daemon").pw_uid
+    assert settings.run_directory == str(tmp_path / "own")
+    assert stat.S_IMODE((tmp_path / "own" / "guard.json").stat().st_mode) == 0o600
+    assert not (tmp_path / "fdhil-data").exists()
+    config.write_text(config.read_text().replace('"daemon"', '"nobody of that name"'))
+    assert run(monkeypatch, str(config), "--check") == 2
+    assert "there is no user 'nobody of that name'" in capsys.readouterr().err

@@ -88,12 +88,14 @@ def test_the_date_of_a_limit_comes_with_its_interval(worn: Path, capsys: Any) ->
     assert _days(limit["date"]) == pytest.approx(due, rel=0.05)
     assert not limit["reached"]
     _, out, _ = fdhil("history", worn, capsys=capsys)
-    assert f"on {limit['date'][:10]} ({limit['earliest'][:10]} to {limit['latest'][:10]})" in out
+    assert f"on {limit['date'][:10]}" in out
+    assert f"({limit['earliest'][:10]} to {limit['latest'][:10]})" in out
     assert "a changed load" in out
 
 
 def test_the_plot_and_the_report_show_it(worn: Path, tmp_path: Path, capsys: Any) -> None:
     assert fdhil("history", worn, "--plot", tmp_path / "plot.png", capsys=capsys)[::2] == (0, "")
+    assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
     assert (tmp_path / "plot.png").stat().st_size > 50_000
     assert fdhil("report", worn, "--out", tmp_path / "report.html", capsys=capsys)[0] == 0
     page = (tmp_path / "report.html").read_text()
@@ -107,3 +109,17 @@ def test_an_axis_that_there_is_not_is_refused(worn: Path, capsys: Any) -> None:
     code, _, told = fdhil("history", worn, "--axis", "Q", capsys=capsys)
     assert code == 2
     assert "Q is no axis" in told
+
+
+def test_every_table_fits_80_columns_and_says_what_its_intervals_are(worn: Path, capsys: Any) -> None:
+    out = fdhil("history", worn, capsys=capsys)[1]
+    assert max(map(len, out.splitlines())) <= 80
+    assert "…" not in out
+    assert out.count("half the width of the 95 % interval") == 2
+    document = json.loads(fdhil("history", worn, "--json", capsys=capsys)[1])
+    told = document["revisions"][-1]["parameters"]["Jt"]
+    (newest,) = (line for line in out.splitlines() if line.startswith("120 "))
+    assert f"{1e3 * told['value']:.0f}" in newest.split()
+    half = (told["high"] - told["low"]) / 2
+    assert f"±{1e3 * half:.0f}" in out.splitlines()[out.splitlines().index(newest) + 1].split()
+    assert half == pytest.approx(1.96 * told["std"], rel=1e-3)

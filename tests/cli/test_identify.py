@@ -121,6 +121,30 @@ def _config(rapid: float) -> str:
     return bench_toml("X", rapid_speed_mm_s=rapid)
 
 
+def test_one_bad_recording_does_not_end_a_batch(shuttle: Path, tmp_path: Path) -> None:
+    """The others are identified; the bad one has its error in the document, in the table and on stderr."""
+    bad, absent = tmp_path / "bad.csv", tmp_path / "absent.csv"
+    bad.write_bytes(b"time_s,voltage_V\n1,two\n")
+    result = _invoke(bad, shuttle, absent, "--json")
+    assert result.return_value == 3
+    first, good, last = _document(result)["files"]
+    assert good["pooled"]["validated"] is True
+    assert "error" not in good
+    for told, path in ((first, bad), (last, absent)):
+        assert set(told) == {*good, "error"}
+        assert (told["file"], told["axis"], told["windows"]) == (str(path), None, [])
+        assert told["pooled"]["validated"] is False
+        assert told["pooled"]["windows_used"] == 0
+        assert told["pooled"]["parameters"]["R"]["value"] is None
+        assert told["pooled"]["reasons"] == [f"RecordingError: {told['error']['text']}"]
+        assert told["error"]["class"] == "RecordingError"
+    shown = _invoke(bad, shuttle, absent)
+    assert shown.return_value == 3
+    assert "all 2" in shown.stdout
+    assert " ".join(shown.stdout.split()).count("not identified") == 2
+    assert [line.split(" cannot")[0].split(":")[0] for line in shown.stderr.splitlines()] == ["fdhil", "fdhil"]
+
+
 def test_unreadable_recording_is_exit_3_in_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -96,20 +96,25 @@ def test_history_gives_parameters_and_their_uncertainty(bench: Path) -> None:
         assert max(float(row["contour_std_um"]) for row in csv.DictReader(file)) > 0.1
 
 
-def remember(folder: Path, revisions: list[dict[str, float]]) -> None:
+def remember(folder: Path, revisions: list[dict[str, float]], known_to: float = 0.003) -> None:
     """Store equal revisions of X and Y, one a day, with some values other than nominal."""
     for number, changed in enumerate(revisions, 1):
         for axis in "XY":
-            publish(folder, axis, number, **changed)
+            publish(folder, axis, number, known_to, **changed)
 
 
-def publish(folder: Path, axis: str, number: int, **changed: float) -> None:
-    """Store one more revision of an axis, known to 0.3 %."""
+def publish(
+    folder: Path, axis: str, number: int, known_to: float = 0.003, *, days: float | None = None, **changed: float
+) -> None:
+    """Store one more revision of an axis, whose values are known to a share of themselves.
+
+    One a day, or ``days`` after the epoch.
+    """
     nominal = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
-    covariance = np.diag([(0.003 * value) ** 2 for value in nominal.values()])
+    covariance = np.diag([(known_to * value) ** 2 for value in nominal.values()])
     with History.open(folder / "fdhil-data") as history:
         known = ParameterSet(axis, number, Parameters(**nominal | changed), frozen(covariance), 3, 0, None, "digest")
-        history.add_revision(known, [], Stamp(86400.0 * number, "boot", 0))
+        history.add_revision(known, [], Stamp(86400.0 * (number if days is None else days), "boot", 0))
 
 
 def test_history_tells_what_a_fixture_costs(bench: Path) -> None:
@@ -209,6 +214,24 @@ def test_history_tells_when_a_zone_leaves_the_tolerance(bench: Path) -> None:
     text = invoke(*arguments, "--tolerance-um", 98).stdout
     assert "is over 98 um" in text
     assert "will have left 98 um about 1970-" in text  # the newest parameters are of January 1970
+
+
+@pytest.mark.parametrize(
+    ("days", "state", "words"),
+    [(6 / 1440, "not_enough_history", "not enough history: 6 min"), (3.0, "not_foreseen", "within 15 days")],
+)
+def test_no_day_is_told_that_the_history_cannot_know(bench: Path, days: float, state: str, words: str) -> None:
+    """A slope as sure as can be, of six minutes or of three days: neither reaches the weeks that it takes."""
+    for number in range(1, 13):
+        at = 20.0 + days * (number - 1) / 11
+        for axis in "XY":
+            publish(bench, axis, number, days=at, Jt=0.075 * (1 + 0.002 * min(1.0, days) * number / 12))
+    arguments = ["predict", bench / "demand.csv", "--config", bench / "bench.toml", "--from-history"]
+    document = json.loads(invoke(*arguments, "--tolerance-um", 105, "--json").stdout)
+    assert {zone["crosses"]["state"] for zone in document["zones"]} == {state}
+    text = invoke(*arguments, "--tolerance-um", 105).stdout
+    assert words in text
+    assert "about 19" not in text
 
 
 def test_a_date_that_has_passed_is_told_as_such() -> None:

@@ -143,11 +143,11 @@ def test_history_as_json_has_intervals_and_every_bit(machine: Path, capsys: Any)
 
 
 def test_history_as_a_table_and_a_plot(machine: Path, tmp_path: Path, capsys: Any) -> None:
-    code, out, err = fdhil("history", machine, "--plot", tmp_path / "plot.png", capsys=capsys)
+    code, out, err = fdhil("history", machine, "--plot", tmp_path / "plot.SVG", capsys=capsys)
     assert (code, err) == (0, "")
     assert "axis X: 2 revisions" in out
     assert "▁" in out
-    assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
+    assert b"<svg" in (tmp_path / "plot.SVG").read_bytes()
     code, _, err = fdhil("history", machine, "--plot", tmp_path / "no" / "such" / "plot.png", capsys=capsys)
     assert code == 3
     assert "cannot be written" in err
@@ -169,7 +169,7 @@ def test_history_says_how_the_parameters_follow_the_temperature(tmp_path: Path, 
     assert told["ft"]["per_kelvin"] == pytest.approx(-0.005)
     assert told["ft"]["high"] < 0.0
     assert told["Jt"]["low"] <= 0.0 <= told["Jt"]["high"]
-    assert "change per kelvin of the slide-way" in fdhil("history", path, capsys=capsys)[1]
+    assert "per kelvin of" in fdhil("history", path, capsys=capsys)[1]
 
 
 def test_history_of_nothing_is_told(tmp_path: Path, capsys: Any) -> None:

@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from fdhil.cli.status_view import sparkline, with_interval
+from fdhil.cli.parameter_view import cell, half_of
+from fdhil.cli.status_view import sparkline
 from fdhil.daemon.status import Watch
 from fdhil.daemon.token import ensure_token
 from fdhil.records import Notice
@@ -67,12 +68,45 @@ def test_status_as_a_table_and_as_json(machine: Path, tmp_path: Path, capsys: An
     with answering(machine, status_of(tmp_path)) as requests:
         code, out, err = fdhil("status", machine, capsys=capsys)
     assert (code, err, requests) == (0, "", [{"request": "status"}])
-    for words in ("bench", "no SYNC yet", "frames 7", "1 accepted, 0 refused", "DiskFull", "[red]Jt rose[/red]", "OFF"):
+    heard = ("bench", "no SYNC yet", "frames received 7, lost 0")
+    for words in (*heard, "1/0", "DiskFull", "[red]Jt rose[/red]", "OFF"):
         assert words in out, (words, out)
     (machine.parent / "fdhil-data" / "run" / "daemon.sock").unlink()
     with answering(machine, status_of(tmp_path)):
         code, out, _ = fdhil("status", machine, "--json", capsys=capsys)
     assert json.loads(out)["axes"]["X"]["parameters"]["K"]["value"] == 0.8
+
+
+@pytest.mark.parametrize(
+    ("guard", "shown"),
+    [
+        (
+            {"state": "lost", "last_state": "ACTIVE", "heard_s_ago": 20.0, "text": "the guard is gone; -38 um stands"},
+            ("guard lost, heard 20 s ago in state ACTIVE", "the guard is gone; -38 um stands"),
+        ),
+        (
+            {"state": "FROZEN", "heard_s_ago": 0.3},
+            ("guard FROZEN", "-4.6 um on axis X may still be applied; hold the feed, then run fdhil adopt"),
+        ),
+        ({"state": "ACTIVE", "heard_s_ago": 7.0}, ("guard ACTIVE when it answered last, 7 s ago",)),
+    ],
+)
+def test_status_says_what_may_still_be_applied_and_how_old_the_guards_word_is(
+    guard: dict[str, Any], shown: tuple[str, ...], machine: Path, tmp_path: Path, capsys: Any
+) -> None:
+    stands = {"nothing": False, "text": "-4.6 um on axis X may still be applied"}
+    with answering(machine, {**status_of(tmp_path), "state": guard["state"], "guard": guard, "may_stand": stands}):
+        _, out, _ = fdhil("status", machine, capsys=capsys)
+    assert all(text in " ".join(out.split()) for text in shown), out
+
+
+def test_status_shows_what_was_promised_and_what_was_measured(machine: Path, tmp_path: Path, capsys: Any) -> None:
+    armed = {"program": "p.ngc", "promise": "contour error 23.5 um RMS is predicted to become 0.30 ± 0.40 um RMS"}
+    passes = [{"text": f"pass {k} of p.ngc: contour error measured 0.70 um RMS"} for k in range(5)]
+    with answering(machine, {**status_of(tmp_path), "armed": armed, "passes": passes}):
+        _, out, _ = fdhil("status", machine, capsys=capsys)
+    assert "armed: p.ngc, contour error 23.5 um RMS is predicted to become 0.30 ± 0.40 um RMS" in " ".join(out.split())
+    assert ("pass 4 of p.ngc" in out, "pass 1 of p.ngc" in out) == (True, False)
 
 
 def test_status_names_what_the_check_of_an_armed_program_refused(machine: Path, tmp_path: Path, capsys: Any) -> None:
@@ -150,6 +184,6 @@ def test_run_on_a_bus_that_is_not_there_is_3_and_one_sentence(tmp_path: Path, ca
 def test_small_pictures() -> None:
     assert sparkline([1.0, 2.0, 3.0]) == "▁▅█"
     assert sparkline([1.0, 1.0]) == "▁▁"
-    assert with_interval({"value": 0.5, "low": 0.49, "high": 0.51}) == "0.5 ±0.01"
-    assert with_interval({"value": 0.5, "low": None, "high": None}) == "0.5 (no interval)"
-    assert with_interval({"value": None}) == "?"
+    assert cell("R", 0.5, half_of({"low": 0.488, "high": 0.512}), " ") == "500 ±12"
+    assert cell("K", 0.8, half_of({"low": None, "high": None}), " ") == "0.8 (no ±)"
+    assert cell("K", None, None) == "-"

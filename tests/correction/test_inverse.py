@@ -238,3 +238,11 @@ def test_a_rest_across_blocks(rest_s: float) -> None:
     assert correction.refused == ()
     assert_within_limits(correction)
     assert rms(correction.before.contour_um) > 30 * rms(correction.after.contour_um)
+
+
+def test_an_offset_that_is_a_cycle_late_leaves_more_than_ten_times_the_error() -> None:
+    reference = bench_trajectory(10)
+    correction = plan(reference, MODELS, CONFIG, "inverse")
+    late = {axis: np.concatenate([[0.0], offset[:-1]]) for axis, offset in correction.offset_um.items()}
+    shifted = predict_corrected(reference, MODELS, CONFIG, late)
+    assert rms(shifted.contour_um) > 10 * rms(correction.after.contour_um)

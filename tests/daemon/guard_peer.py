@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import socket
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-FINE: Mapping[str, Any] = {"state": "ACTIVE", "cause": None, "ok": True}
+ZERO: Mapping[str, Any] = {"X": 0.0, "Y": 0.0}
+FINE: Mapping[str, Any] = {"state": "ACTIVE", "cause": None, "ok": True, "may_stand_um": ZERO}
 Says = Callable[[str], Mapping[str, Any] | None]
 
 
 class Guard:
-    """What listens at ``guard.sock`` instead of the guard: answers by ``says``, None: not at all."""
+    """What listens at ``guard.sock`` instead of the guard: answers by ``says``, None: not at all.
+
+    ``descriptor`` came with the requests that are answered now.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.says: Says = lambda _kind: FINE
         self.heard: list[str] = []
+        self.descriptor: int | None = None
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._listener.bind(str(folder / "guard.sock"))
         self._listener.listen()
@@ -41,13 +47,30 @@ class Guard:
             self._begin(self._serve, peer)
 
     def _serve(self, peer: socket.socket) -> None:
-        with peer, peer.makefile("rb") as lines:
-            for line in lines:
-                request = json.loads(line)
-                self.heard.append(request["request"])
-                answer = self.says(request["request"]) if "id" in request else None
-                if answer is not None:
-                    peer.sendall(json.dumps({**answer, "id": request["id"]}).encode() + b"\n")
+        with contextlib.suppress(ConnectionError), peer:
+            inbox = b""
+            while chunk := self._receive(peer):
+                *lines, inbox = (inbox + chunk).split(b"\n")
+                for line in lines:
+                    self._take(peer, json.loads(line))
+                self._let_go()
+
+    def _receive(self, peer: socket.socket) -> bytes:
+        chunk, descriptors, _, _ = socket.recv_fds(peer, 1 << 16, 1)
+        if descriptors:
+            self.descriptor = descriptors[0]
+        return chunk
+
+    def _let_go(self) -> None:
+        if self.descriptor is not None:
+            os.close(self.descriptor)
+            self.descriptor = None
+
+    def _take(self, peer: socket.socket, request: Mapping[str, Any]) -> None:
+        self.heard.append(request["request"])
+        answer = self.says(request["request"]) if "id" in request else None
+        if answer is not None:
+            peer.sendall(json.dumps({**answer, "id": request["id"]}).encode() + b"\n")
 
     def close(self) -> None:
         """End all connections."""

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.guard import table
-from fdhil.guard.client import TABLE_NAME
-from tests.daemon.guard_peer import Guard
+from tests.daemon.guard_peer import ZERO, Guard
 
 RESERVE_ROWS = 1000
 Answer = Mapping[str, Any]
@@ -21,7 +20,6 @@ class Mill:
         self.state, self.row, self.cause = "OFF", 0, ""
         self.rows: list[tuple[int, ...]] = []
         self.final = False
-        self._table, self._sequence = folder / TABLE_NAME, 0
         self._peer = Guard(folder)
         self._peer.says = self._answer
 
@@ -34,13 +32,11 @@ class Mill:
             self.state, self.cause = "OFF", "Disarmed"
         cause = {"code": self.cause, "text": "", "axis": ""} if self.cause else None
         rows = [0, len(self.rows)] if self.rows else None
-        return {"ok": True, "state": self.state, "row": self.row or None, "rows": rows, "cause": cause}
+        known = {"cause": cause, "may_stand_um": ZERO}
+        return {"ok": True, "state": self.state, "row": self.row or None, "rows": rows, **known}
 
     def _load(self) -> Answer:
-        found = table.read(self._table, self._sequence)
-        assert found is not None
-        self._sequence, body = found
-        _, path = table.decode(body)
+        _, path = table.decode(table.read_sealed(self._peer.descriptor))
         if path.first == 0:
             self.rows = []
         if path.first != len(self.rows):

@@ -98,6 +98,12 @@ class Shop:
         self.wait(done)
         return found
 
+    def told(self, words: str, times: int = 1) -> None:
+        """Wait until the daemon's log has said so for the n-th time, and what it told of is over."""
+        log = self.folder / "daemon.log"
+        self.wait(lambda: log.read_text().count(words) >= times)
+        self.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
+
     def nc_on(self) -> None:
         """Switch the NC on: SYNC, NMT, drives enabled."""
         self.twin.command("nc", on=True)

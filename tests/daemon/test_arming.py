@@ -160,7 +160,7 @@ async def test_the_operators_token_decides_and_a_missing_guard_is_told(config: M
     assert (await armory.arm(request | {"token": token, "method": "magic"}))["code"] == "BadRequest"
     assert (await armory.arm({"request": "arm", "token": token}))["code"] == "BadRequest"
     assert (await armory.disarm())["code"] == "GuardAbsent"
-    assert await armory.stand_down() == "absent"
+    assert not (await armory.stand_down()).heard
 
 
 def test_a_changed_load_is_remembered_until_new_parameters_come(config: MachineConfig, tmp_path: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import re
 import socket
 import threading
 from collections.abc import Iterator, Mapping
@@ -12,7 +14,7 @@ from typing import Any
 import pytest
 
 from fdhil.daemon import journal
-from fdhil.daemon.control import ControlServer, ask
+from fdhil.daemon.control import MAX_CLIENTS, ControlServer, ask
 from fdhil.daemon.journal import BURST, FloodGate, line_of, printable
 from fdhil.daemon.lock import BusLocked, sole_owner
 from fdhil.daemon.notify import notify
@@ -82,6 +84,46 @@ async def test_what_takes_its_time_tells_its_progress_and_ends_when_nobody_waits
         await asyncio.wait_for(abandoned.wait(), 30.0)
 
 
+async def test_idle_connections_make_room_and_those_that_wait_leave_some_for_disarm(tmp_path: Path) -> None:
+    """Three times as many connections as there are places, idle ones and such that wait for an answer."""
+    free, waiting = asyncio.Event(), asyncio.Semaphore(0)
+
+    async def handle(request: Mapping[str, Any]) -> Mapping[str, Any]:
+        if request["request"] == "arm":
+            waiting.release()
+            await free.wait()
+        return {"ok": True}
+
+    path = tmp_path / "c"
+    idle: list[socket.socket] = []
+    async with ControlServer(handle, lambda: None, free.set).serving(path):
+        for _ in range(3 * MAX_CLIENTS):
+            idle.append(socket.socket(socket.AF_UNIX))
+            idle[-1].connect(str(path))
+        assert await asyncio.to_thread(ask, path, {"request": "disarm"}) == {"ok": True}
+        assert await asyncio.to_thread(idle[0].recv, 1) == b""  # the longest idle made room
+        idle[-1].setblocking(False)
+        with pytest.raises(BlockingIOError):
+            idle[-1].recv(1)
+        arming = []
+        for _ in range(MAX_CLIENTS + 1):
+            reader, writer = await asyncio.open_unix_connection(str(path))
+            writer.write(b'{"request": "arm"}\n')
+            arming.append((reader, writer))
+        for _ in range(MAX_CLIENTS):
+            await asyncio.wait_for(waiting.acquire(), 60.0)
+        assert b"Busy" in await asyncio.wait_for(arming[-1][0].readline(), 60.0)
+        for request in ("disarm", "status", "disarm", "status", "disarm"):
+            assert await asyncio.to_thread(ask, path, {"request": request}) == {"ok": True}
+        free.set()
+        for reader, writer in arming[:-1]:
+            assert json.loads(await reader.readline()) == {"ok": True}
+            writer.close()
+        arming[-1][1].close()
+    for each in idle:
+        each.close()
+
+
 @pytest.mark.parametrize("abstract", [False, True])
 def test_notify_speaks_the_protocol(abstract: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
@@ -116,7 +158,8 @@ def test_lines_carry_priorities_in_the_journal_and_no_escapes_anywhere(
     journal.write_line("bad \x1b[31m\nforged", "MAJOR")
     monkeypatch.delenv("JOURNAL_STREAM")
     journal.write_line("Öl µm", "info")
-    assert capsys.readouterr().err == "<3>bad \\x1b[31m\\nforged\nÖl µm\n"
+    line = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3} Öl µm"
+    assert re.fullmatch(rf"<3>bad \\x1b\[31m\\nforged\n{line}\n", capsys.readouterr().err)
     assert printable("\u202e") == "\\u202e"
 
 

@@ -123,7 +123,30 @@ def test_a_heartbeat_that_stops_is_noticed_and_its_return_too() -> None:
     assert watch.feed(frames_of([]), 650 * MS) == []
     assert [n.code for n in watch.feed(frames_of([]), 750 * MS)] == ["HeartbeatLost"]
     assert watch.feed(frames_of([]), 2000 * MS) == []
-    assert [n.severity for n in watch.feed(frames_of(beats([2100])), 2100 * MS)] == ["info"]
+    back = [n for t in range(2100, 6000, 100) for n in watch.feed(frames_of(beats([t])), t * MS)]
+    assert [n.severity for n in back] == ["info"]
+    assert [n.code for n in watch.feed(frames_of([]), 7000 * MS)] == ["HeartbeatLost"]
+
+
+def test_a_heartbeat_that_comes_and_goes_is_one_outage() -> None:
+    """Four at 20 ms each second, for half a minute: two lines, not two a second."""
+    watch = NodeWatch("X", 1)
+    told = []
+    for t in range(0, 30_000, 1000):
+        told += watch.feed(frames_of(beats([t, t + 20, t + 40, t + 60])), (t + 60) * MS)
+        told += watch.feed(frames_of([]), (t + 500) * MS)
+    assert [n.severity for n in told] == ["MAJOR"]
+    told = [n for t in range(30_000, 36_000, 20) for n in watch.feed(frames_of(beats([t])), t * MS)]
+    assert [n.severity for n in told] == ["info"]
+
+
+def test_what_each_node_sends_is_counted() -> None:
+    decoder = BusDecoder("can0", machine())
+    decoder.feed(frames_of(beats([0, 100])), 100 * MS)
+    axis = decoder.axes[0]
+    assert decoder.counters()[f"{axis}.heard"] == 2
+    decoder.feed(frames_of(syncs([0, 1])), 200 * MS)
+    assert decoder.counters()[f"{axis}.heard"] == 2
 
 
 def test_a_boot_and_a_lost_state_are_noticed() -> None:

@@ -14,9 +14,10 @@ from fdhil import tables
 from fdhil.config import MachineConfig
 from fdhil.drivers import machine as machine_module
 from fdhil.drivers.counter_clock import CounterClock
-from fdhil.drivers.machine import Outlet, SensorSource
+from fdhil.drivers.machine import MachineSource, Outlet, SensorSource
 from fdhil.drivers.modbus_link import ModbusLink
 from fdhil.drivers.modbus_voltage import ModbusVoltage, SensorBlock, parse_block
+from fdhil.drivers.profile import load_profile
 from fdhil.drivers.tick_clock import TickClock
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
 from fdhil.records import Notice, Temperature, TickTimes, VoltageSamples
@@ -226,5 +227,19 @@ def test_late_stamps_of_sync_do_not_move_the_samples() -> None:
 
 
 @pytest.mark.parametrize("name", tables.VOLTAGE_SOURCES)
-def test_every_listed_source_can_be_loaded(name: str) -> None:
-    assert callable(tables.load(tables.VOLTAGE_SOURCES, name))
+async def test_every_listed_source_tells_the_voltage_of_its_axis(name: str) -> None:
+    """``drive`` is an object in a TPDO; every other is a sensor of its own, which the machine reaches and polls."""
+    async with sensor_peer() as peer:
+        settings = machine(voltage={"source": name, "port": peer.port, "timeout_s": 0.2})
+        assert ("modbus.X.samples" in MachineSource(settings).counters()) == (name != "drive")
+        if name == "drive":
+            profile = load_profile(settings.axis["X"].drive.profile)
+            assert tables.load(tables.VOLTAGE_SOURCES, name)("X", settings, profile).key == profile.voltage
+            return
+        sensor = tables.load(tables.VOLTAGE_SOURCES, name)("X", settings)
+        await sensor.link.connect()
+        records = await sensor.poll(TickClock(0.001))
+        sensor.link.close()
+    assert {r.axis for r in records if isinstance(r, VoltageSamples)} == {"X"}
+    assert sensor.samples > 0
+    assert not sensor.link.connected

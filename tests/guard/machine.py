@@ -19,6 +19,7 @@ Frame = tuple[int, bytes]
 ENABLED = 0x1237
 FACTS_GIVEN: Mapping[str, bool] = dict.fromkeys(FACTS, True)
 DIGEST = "program-1"
+RECORD = "as commissioned"
 LIMITS = Limits(offset=819, rate=65, acceleration=6, variation=9830, window=1000)
 
 
@@ -36,10 +37,13 @@ def axis_settings(name: str, node_id: int, limits: Limits = LIMITS) -> AxisSetti
             Pdo(0x480 + node_id, ((0x60FD, 0, 32, False), (0x6061, 0, 8, True), (0x6077, 0, 16, True)), 10),
         ),
         increments_per_mm=3276.8,
+        max_speed_mm_s=500.0,
+        max_acceleration_mm_s2=4000.0,
         sign=1,
         limits=limits,
         window=32768,
         setpoint_delay_cycles=2,
+        record=RECORD,
     )
 
 
@@ -59,10 +63,16 @@ def settings(axes: Sequence[str] = ("X", "Y"), limits: Limits = LIMITS, **change
     return replace(made, **changes)  # type: ignore[arg-type] # any field of Settings
 
 
+def commissioned(made: Settings) -> Settings:
+    """The same settings, every drive signed off."""
+    return replace(made, axes=tuple(replace(axis, record=RECORD) for axis in made.axes))
+
+
 @dataclass
 class Drive:
     """What a drive holds and shows; ``answers`` False: it is silent; ``scale`` 0: it ignores its offset.
 
+    ``remapped``: TPDO 380 carries its two objects the other way round.
     ``fed`` are speed and torque offset in force, in TPDO 1A0 when ``shows_fed``; ``takes_fed``: what it makes of them.
     """
 
@@ -79,9 +89,15 @@ class Drive:
     fed: Pair = (0, 0)
     received_fed: Pair | None = None
     shows_fed: bool = False
+    remapped: bool = False
     takes_fed: Callable[[Pair], Pair] = lambda pair: pair
     followed: int | None = None
     queue: list[tuple[int, int]] = field(default_factory=list)
+
+    def hold(self, offset: int) -> None:
+        """Hold an offset that somebody wrote some time ago."""
+        self.offset = self.received_offset = offset
+        self.queue = [(target, offset) for target, _ in self.queue]
 
     def at_sync(self, tick: int) -> list[Frame]:
         """Latch what was received, then sample all TPDOs."""
@@ -95,7 +111,7 @@ class Drive:
             return []
         followed, before = sum(self.queue[0]), self.followed
         self.followed = followed
-        speed = 0 if before is None else (followed - before) * 1000
+        speed = 0 if before is None else max(-(2**31), min((followed - before) * 1000, 2**31 - 1))
         n = self.node_id
         frames = [
             (0x180 + n, struct.pack("<ii", followed - self.position_error, speed)),
@@ -104,7 +120,8 @@ class Drive:
         if self.shows_fed:
             frames.append((0x1A0 + n, struct.pack("<ih", *self.fed)))
         if tick % 10 == 0:
-            frames.append((0x380 + n, struct.pack("<ii", followed, self.offset)))
+            shown = (self.offset, followed) if self.remapped else (followed, self.offset)
+            frames.append((0x380 + n, struct.pack("<ii", *shown)))
             frames.append((0x480 + n, struct.pack("<Ibh", 0, self.mode, 0)))
         return frames
 
@@ -112,6 +129,8 @@ class Drive:
 @dataclass
 class Bench:
     """Drives, the NC's stream of targets, and the guard's core behind its listener; ``frames`` is the bus trace.
+
+    ``held`` is what the drives held at each SYNC, whatever the guard thinks of it.
 
     ``row`` of the demand that the NC sends next; before ``playing`` it stands at row 0.
     """
@@ -127,6 +146,7 @@ class Bench:
     row: int = 0
     main_alive: bool = True
     frames: list[tuple[int, tuple[int, ...]]] = field(default_factory=list)
+    held: list[tuple[int, ...]] = field(default_factory=list)
     heartbeats: list[int] = field(default_factory=list)
     alarms: list[Alarm] = field(default_factory=list)
     outputs: list[Output] = field(default_factory=list)
@@ -168,6 +188,22 @@ class Bench:
     def hear(self, cob_id: int, data: bytes) -> None:
         self.listener.take(cob_id, data, self.tick * 1e-3)
 
+    def inject(self, cob_id: int, data: bytes) -> None:
+        """Another node's frame on the bus, an offset by PDO or SDO included: the drives take it as the guard's."""
+        self.hear(cob_id, data)
+        for drive in self.drives:
+            if cob_id == 0x300 + drive.node_id and len(data) >= 4:
+                drive.received_offset = int.from_bytes(data[:4], "little", signed=True)
+            elif cob_id == 0x600 + drive.node_id and data[:4] == b"\x23\xb0\x60\x00" and len(data) == 8:
+                drive.received_offset = int.from_bytes(data[4:], "little", signed=True)
+
+    def reboot(self, number: int) -> None:
+        """A drive boots: its power-on values, and the frame that says so."""
+        drive = self.drives[number]
+        drive.hold(0)
+        drive.received_offset = None
+        self.hear(0x700 + drive.node_id, b"\0")
+
     def sync(
         self,
         request: Request | None = None,
@@ -188,6 +224,7 @@ class Bench:
         self.tick += 1
         self.counter = self.counter % 240 + 1
         sampled = [frame for drive in self.drives for frame in drive.at_sync(self.tick)]
+        self.held.append(tuple([drive.offset for drive in self.drives]))
         axes, bus = self.listener.at_sync(bytes([self.counter]), self.tick * 1e-3, self.tick * 1e-3)
         inputs = Inputs(
             True,

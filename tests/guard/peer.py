@@ -64,15 +64,26 @@ class Peer(threading.Thread):
             client, _ = self._server.accept()
         except TimeoutError:
             return
+        try:
+            self._greet(client)
+        except OSError:  # it has gone again
+            client.close()
+        else:
+            self._client = client
+
+    @staticmethod
+    def _greet(client: socket.socket) -> None:
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client.sendall(b"< hi >")
         for command in (b"< open can0 >", b"< rawmode >"):
             got = b""
             while not got.endswith(b">"):
-                got += client.recv(1)
+                byte = client.recv(1)
+                if not byte:
+                    raise ConnectionError
+                got += byte
             assert got == command
             client.sendall(b"< ok >")
-        self._client = client
 
     def inject(self, *frames: Frame) -> None:
         """Put frames of another node on the bus."""
@@ -139,7 +150,7 @@ class Peer(threading.Thread):
         """(SYNC count, increments) of the offset frames to one node."""
         return [(k, int.from_bytes(d, "little", signed=True)) for k, i, d in list(self.sent) if i == 0x300 + node]
 
-    def wait(self, condition: Callable[[], bool], what: str, limit_s: float = 20.0) -> None:
+    def wait(self, condition: Callable[[], bool], what: str, limit_s: float = 100.0) -> None:
         """Wait until something has come about."""
         deadline_s = time.monotonic() + limit_s
         while not condition():

@@ -28,6 +28,7 @@ AXIS_CHANGES: dict[str, Change] = {
     "FollowingError": lambda axis: axis._replace(statusword=(axis.statusword or 0) | 0x2000),
     "DriveNotEnabled": lambda axis: axis._replace(statusword=(axis.statusword or 0) & ~0x0004),
     "NotCsp": lambda axis: axis._replace(mode=1),
+    "ReadBackStale": lambda axis: axis._replace(read_back=None, read_back_age=3),
     "PdoLength": lambda axis: axis._replace(short_frames=3),
     "TargetLost": lambda axis: axis._replace(target=None),
 }
@@ -138,8 +139,8 @@ def test_not_twice_and_not_by_itself() -> None:
 
 GOOD: View = (
     replace(axis_settings("X", 1), heartbeat_timeout_s=0.5),
-    AxisInput(target=0, statusword=0x1237, mode=8, nmt=5, feedback_age=1, heartbeat_age_s=0.0),
-    AxisState(following_error=0.0, read_back=0),
+    AxisInput(target=0, statusword=0x1237, mode=8, nmt=5, feedback_age=1, heartbeat_age_s=0.0, read_back_age=1),
+    AxisState(following_error=0.0, read_back=0, readings=3),
 )
 
 
@@ -169,6 +170,9 @@ def changed(change: dict[str, Any]) -> View:
         ({"heartbeat_age_s": 0.501}, "HeartbeatLost"),
         ({"statusword": None}, "DriveNotEnabled"),
         ({"mode": None}, "NotCsp"),
+        ({"read_back_age": float("nan")}, "ReadBackStale"),
+        ({"read_back_age": float("inf")}, "ReadBackStale"),
+        ({"read_back_age": 3}, "ReadBackStale"),
         ({"nmt": 0}, "NmtStateWrong"),
         ({"echo_misses": 2}, "EchoMismatch"),
         ({"feed_misses": 2}, "EchoMismatch"),
@@ -188,6 +192,9 @@ def test_unknown_is_never_good(change: dict[str, Any], code: str) -> None:
     [
         ({"read_back": 5}, "StaleOffset"),
         ({"fed_back": (0, 3)}, "StaleOffset"),
+        ({"readings": 2}, "ReadBackStale"),
+        ({"record": ""}, "NotCommissioned"),
+        ({"record_void": True}, "RecordVoid"),
         ({"long_frames": 1}, "PdoMapping"),
         ({"window": 4 * 819 - 1}, "LimitBeyondWindow"),
     ],
@@ -212,6 +219,7 @@ def test_each_class_has_cause_effect_and_action(code: str) -> None:
     "change",
     [
         {"feedback_age": 1.0},
+        {"read_back_age": 2.0},
         {"heartbeat_age_s": 0.5},
         {"following_error": 16384.0},
         {"following_error": -16384.0},
@@ -220,7 +228,6 @@ def test_each_class_has_cause_effect_and_action(code: str) -> None:
         {"implausible": 1},
         {"short_frames": 2},
         {"nmt": None},
-        {"read_back": None},
         {"fed_back": (None, 0)},
         {"window": 4 * 819},
     ],

@@ -51,8 +51,17 @@ def test_adopting_is_for_off_and_frozen_alone() -> None:
     machine = active()
     refused = machine.sync(Request("adopt", token_valid=True)).refused
     assert refused is not None
-    assert [alarm.code for alarm in refused] == ["NotOff"]
+    assert "NotOff" in {alarm.code for alarm in refused}
     assert machine.state.mode is Mode.ACTIVE
+
+
+def test_who_arms_in_frozen_is_told_to_adopt_and_not_to_disarm() -> None:
+    machine = active()
+    machine.listener.error("off")
+    machine.until(Mode.FROZEN)
+    told = next(alarm for alarm in machine.arm() if alarm.code == "NotOff")
+    assert "adopt" in told.action
+    assert "armed or ramping" not in told.cause
 
 
 def test_adopting_waits_for_the_drives_own_word() -> None:

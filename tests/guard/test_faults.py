@@ -9,10 +9,11 @@ from dataclasses import replace
 
 import pytest
 
+from fdhil.guard.interlocks import Alarm
 from fdhil.guard.limits import Limits
 from fdhil.guard.path import Path
 from fdhil.guard.state import ON_PATH, Mode, Request
-from tests.guard.machine import DIGEST, Bench, Drive, bench
+from tests.guard.machine import DIGEST, RECORD, Bench, Drive, bench
 
 Fault = Callable[[Bench], None]
 
@@ -72,7 +73,6 @@ RAMPED: dict[str, tuple[Fault, str, int]] = {
     "A9": (_counter(100), "SyncCollision", 1),
     "A10": (_drive(answers=False), "StaleData", 5),
     "A15": (_short, "PdoLength", 1),
-    "A19": (_hear(0x301, b"\x01\0\0\0"), "OffsetHijack", 1),
     "A20": (_hear(0x081, b"\x30\x81"), "DriveEmergency", 1),
     "A20 short": (_hear(0x081, b"\x30"), "DriveEmergency", 1),
     "E6": (_shift, "Misaligned", 12),
@@ -91,7 +91,6 @@ FROZEN: dict[str, tuple[Fault, str]] = {
     "A1": (_bus("off"), "BusOff"),
     "A3": (_bus("restarted"), "BusRestarted"),
     "A4": (_bus("down"), "BusDown"),
-    "A23": (_hear(0x701, b"\x00"), "NodeRebooted"),
     "A24 NMT": (_hear(0x000, b"\x80\x00"), "NmtStateWrong"),
     "A24 heartbeat": (_hear(0x701, b"\x04"), "NmtStateWrong"),
 }
@@ -163,6 +162,24 @@ def test_fault_freezes_at_once_and_only_the_operator_leads_out(cutting: Bench, r
     assert abs(cutting.frames[count][1][0] - held[0]) <= cutting.settings.axes[0].limits.rate
     cutting.until(Mode.OFF)
     assert cutting.drives[0].offset == 0
+
+
+def test_a_reboot_freezes_until_the_drive_was_compared_and_adopted(cutting: Bench) -> None:
+    """A23: what the drive holds and how it is set up is unknown; nothing is sent until both are known again."""
+    count = len(cutting.frames)
+    cutting.reboot(0)
+    cutting.run(30)
+    cutting.hear(0x701, b"\x05")
+    cutting.run(30)
+    assert cutting.mode is Mode.FROZEN
+    assert [alarm.code for alarm in cutting.alarms] == ["NodeRebooted"]
+    assert len(cutting.frames) == count
+    adopt = Request("adopt", token_valid=True)
+    assert cutting.sync(adopt).refused == (Alarm("RecordVoid", "X"),)
+    assert cutting.sync(Request("compared", True, compared={"X": RECORD})).refused == ()
+    assert cutting.sync(adopt).refused == ()
+    cutting.until(Mode.OFF)
+    assert [drive.offset for drive in cutting.drives] == [0, 0]
 
 
 def test_silence_freezes_a_synchronous_offset(cutting: Bench) -> None:
@@ -261,6 +278,29 @@ def test_many_missed_cycles_ramp_down(cutting: Bench) -> None:
     assert cutting.alarms[-1].code == "LoopOverrun"
 
 
+def test_a_simulated_machine_that_runs_ahead_of_a_guard_without_offsets_is_no_overrun() -> None:
+    """By the host's clock the guard may sleep: the machine waits for its frames as soon as it sends offsets."""
+    machine = bench()
+    machine.settle()
+    for _ in range(300):
+        machine.sync(late=True)
+    assert (machine.state.missed_run, machine.state.good_for > 300) == (0, True)
+    machine.arm()
+    for _ in range(300):
+        machine.sync(late=True)
+    machine.run(30)
+    machine.play()
+    machine.until(Mode.ACTIVE)
+
+
+def test_on_a_real_machine_a_late_loop_is_told_before_it_is_armed() -> None:
+    machine = bench(clock="monotonic")
+    machine.settle()
+    for _ in range(11):
+        machine.sync(late=True)
+    assert (machine.state.missed_run, machine.state.good_for) == (11, 0)
+
+
 @pytest.mark.parametrize(("failures", "mode"), [(1, Mode.ACTIVE), (3, Mode.OFF), (6, Mode.FROZEN)])
 def test_full_transmit_queue(cutting: Bench, failures: int, mode: Mode) -> None:
     for _ in range(failures):
@@ -280,7 +320,7 @@ def test_late_frame_is_counted_not_feared(cutting: Bench) -> None:
 
 def test_adopts_what_the_drive_holds_at_start() -> None:
     machine = bench()
-    machine.drives[1].offset = machine.drives[1].received_offset = -500
+    machine.drives[1].hold(-500)
     machine.until(Mode.ADOPT)
     assert abs(machine.frames[0][1][1] + 500) <= machine.settings.axes[1].limits.acceleration
     machine.until(Mode.OFF)

@@ -13,14 +13,13 @@ from typing import Any
 import pytest
 
 from fdhil.guard import table
-from fdhil.guard.can_socket import SocketcandText
-from fdhil.guard.control import Client
+from fdhil.guard.control import Client, Closer
 from fdhil.guard.feedforward import FeedMode, Pair, armed, violates
+from fdhil.guard.intake import Intake
 from fdhil.guard.interlocks import FEEDFORWARD_FACTS, Alarm
-from fdhil.guard.journal import Journal, Notifier
-from fdhil.guard.process import TABLE_NAME, Guard
+from fdhil.guard.journal import Journal
 from fdhil.guard.settings import Pdo, from_json, to_json
-from fdhil.guard.state import Mode, Request
+from fdhil.guard.state import Mode, Request, initial
 from tests.guard import machine
 from tests.guard.fed import FACTS, LAW, LIMITS, fed_bench, fed_settings, request, switched_on
 from tests.guard.machine import Bench, arm_request
@@ -311,14 +310,14 @@ def _answer_to_a_table(folder: Path, mode: FeedMode) -> dict[str, Any]:
     folder.mkdir()
     made = replace(fed_settings(), run_directory=str(folder))
     zeros = {axis.name: [0] * 50 for axis in made.axes}
-    table.write(folder / TABLE_NAME, table.encode(list(zeros), zeros, zeros, "digest"))
     here, there = socket.socketpair()
-    with here, there, socket.socket() as bus, (folder / "journal").open("wb") as lines:
-        guard = Guard(made, SocketcandText(bus, made.sent_ids, ()), Journal(lines.fileno()), Notifier(None))
-        guard.state = guard.state._replace(feed=armed((LAW, LAW))._replace(mode=mode))
-        guard._begin_loading(Client(here, 0.0), {})
-        guard._load()
-        guard.control.close()
-        guard.wake.close()
-        guard._signalled.close()
+    with here, there, (folder / "journal").open("wb") as lines:
+        intake = Intake(made, Journal(lines.fileno()))
+        state = initial(made)
+        state = state._replace(feed=armed((LAW, LAW))._replace(mode=mode))
+        closer = Closer()
+        sealed = table.seal(table.encode(list(zeros), zeros, zeros, "digest"))
+        intake.begin(Client(here, 0.0, closer, descriptor=sealed), {}, state)
+        intake.check(state)
+        closer.end()
         return dict(json.loads(there.recv(10_000)))

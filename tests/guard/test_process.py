@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
@@ -20,7 +20,7 @@ from fdhil import config as machine_config
 from fdhil.cli.guard import open_bus, settings_of
 from fdhil.guard.client import GuardClient, GuardLost
 from fdhil.guard.settings import to_json
-from tests.guard.machine import DIGEST, FACTS_GIVEN, LIMITS, smooth_path
+from tests.guard.machine import DIGEST, FACTS_GIVEN, LIMITS, commissioned, smooth_path
 from tests.guard.peer import Peer, write_config
 
 DEMAND, OFFSET = smooth_path(rows=800)
@@ -30,15 +30,16 @@ TOKEN = "the operator's"
 class Rig:
     """Peer, guard process and a daemon's client that says it is alive."""
 
-    def __init__(self, folder: Path, clock: str = "sync") -> None:
+    def __init__(self, folder: Path, clock: str = "sync", program: Sequence[str] = ("-m", "fdhil.guard")) -> None:
         self.peer = Peer(DEMAND)
         self.peer.start()
         self.config = machine_config.load(write_config(folder, self.peer.port, clock))
         self.run_directory = folder
+        self.program = program
         self.settings = folder / "guard.json"
         token = hashlib.sha256(TOKEN.encode()).hexdigest()
-        self.settings.write_text(to_json(settings_of(self.config, "can0", folder, token)))
-        self.journal = (folder / "journal").open("w+")
+        self.settings.write_text(to_json(commissioned(settings_of(self.config, "can0", folder, token))))
+        self.journal = (folder / "journal").open("a")
         self.process = self.start()
         self.client: GuardClient | None = None
         self.alive = threading.Event()
@@ -50,7 +51,7 @@ class Rig:
         with open_bus("can0", self.config.bus["can0"]) as bus:
             arguments = ["--settings", str(self.settings), "--descriptor", str(bus.fileno())]
             return subprocess.Popen(
-                [sys.executable, "-m", "fdhil.guard", *arguments],
+                [sys.executable, *self.program, *arguments],
                 stdout=self.journal,
                 stderr=subprocess.PIPE,
                 pass_fds=[bus.fileno()],
@@ -93,9 +94,19 @@ class Rig:
         self.peer.playing = True
         self.peer.wait(lambda: self.peer.row > 330, "the path")
 
+    def into_the_cut_blindly(self) -> None:
+        """The same of a guard that cannot be asked for its status."""
+        client = self.connect()
+        columns = [dict(zip("XY", rows, strict=True)) for rows in (DEMAND, OFFSET)]
+        assert client.load("XY", columns[0], columns[1], DIGEST)["ok"]
+        self.peer.wait(lambda: client.arm(TOKEN, DIGEST, FACTS_GIVEN)["ok"], "arming")
+        self.peer.wait(lambda: len(self.peer.offsets_sent()) > 30, "zeros")
+        self.peer.playing = True
+        self.peer.wait(lambda: self.peer.row > 330, "the path")
+
     def events(self) -> list[dict[str, object]]:
-        self.journal.seek(0)
-        return [json.loads(line) for line in self.journal.read().splitlines()]
+        lines = Path(self.journal.name).read_text().split("\n")
+        return [json.loads(line) for line in lines[:-1]]  # the last one may still be on its way
 
     def close(self) -> None:
         self._ended.set()

@@ -1,7 +1,12 @@
-"""The table file: what is damaged is no table, whatever byte it is."""
+"""The table that is handed over: what is not as it must be is no table, and one class says so."""
 
 from __future__ import annotations
 
+import fcntl
+import json
+import os
+import socket
+import struct
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -16,7 +21,6 @@ from fdhil.guard.path import Path
 from fdhil.guard.table import TableRefused
 from tests.guard.machine import LIMITS
 
-SLOT = 4096
 ROWS = {"X": [0, 1, 3, 6], "Y": [5, 5, 5, 5]}
 OFFSETS = {"X": [0, 1, 2, 3], "Y": [0, 0, -1, -1]}
 
@@ -49,48 +53,103 @@ def test_numpy_integers_are_taken_and_floats_are_not() -> None:
         table.encode("X", {"X": [1]}, {"X": [1, 2]}, "p")
 
 
-def test_slots_take_turns_and_the_newest_wins(tmp_path: FilePath) -> None:
-    file = tmp_path / "guard.table"
-    assert table.read(file) is None
-    for sequence in range(1, 6):
-        assert table.write(file, body(str(sequence)), SLOT) == sequence
-        assert table.read(file, 0, SLOT) == (sequence, body(str(sequence)))
-        assert table.read(file, sequence, SLOT) is None
+def sealed(seals: int, content: bytes = b"") -> int:
+    descriptor = os.memfd_create("test", os.MFD_ALLOW_SEALING)
+    os.write(descriptor, content)
+    fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, seals)
+    return descriptor
 
 
-def test_every_flipped_byte_of_the_newest_slot_is_no_new_table(tmp_path: FilePath) -> None:
-    file = tmp_path / "guard.table"
-    table.write(file, body("old"), SLOT)
-    table.write(file, body("new"), SLOT)
-    good = file.read_bytes()
-    for place in range(SLOT, SLOT + 20 + len(body("new"))):
-        for mask in (0x01, 0x80, 0xFF):
-            bad = bytearray(good)
-            bad[place] ^= mask
-            file.write_bytes(bad)
-            assert table.read(file, 1, SLOT) is None, place
-            assert table.read(file, 0, SLOT) == (1, body("old")), place
-    file.write_bytes(bytes(bad))
-    assert table.write(file, body("again"), SLOT) == 2  # the damaged slot is the one to be written over
-    assert table.read(file, 1, SLOT) == (2, body("again"))
+def test_a_table_is_handed_over_in_sealed_memory() -> None:
+    descriptor = table.seal(body("p"))
+    try:
+        assert table.read_sealed(descriptor) == body("p")
+        with pytest.raises(PermissionError):
+            os.pwrite(descriptor, b"x", 0)
+        with pytest.raises(TableRefused) as refusal:
+            table.read_sealed(descriptor, len(body("p")) - 1)
+        assert refusal.value.code == "TableBusy"
+    finally:
+        os.close(descriptor)
 
 
-def test_a_table_cut_off_at_any_length_is_no_new_table(tmp_path: FilePath) -> None:
-    file = tmp_path / "guard.table"
-    table.write(file, body("old"), SLOT)
-    table.write(file, body("new"), SLOT)
-    good = file.read_bytes()
-    for length in range(0, len(good), 7):
-        file.write_bytes(good[:length])
-        found = table.read(file, 0, SLOT)
-        assert found in (None, (1, body("old")))
+def test_what_is_no_sealed_memory_is_not_read(tmp_path: FilePath) -> None:
+    """Neither opened, nor waited for, nor read: a FIFO, a socket, a file, memory that can still change, nothing."""
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "file").write_bytes(body())
+    near, far = socket.socketpair()
+    wrong: list[int | None] = [None, near.detach(), far.detach(), 1 << 20]
+    wrong += [os.open(tmp_path / "fifo", os.O_RDWR), os.open(tmp_path / "file", os.O_RDONLY), *os.pipe()]
+    every = [fcntl.F_SEAL_SEAL, fcntl.F_SEAL_SHRINK, fcntl.F_SEAL_GROW, fcntl.F_SEAL_WRITE]
+    wrong += [sealed(sum(every) - seal, body()) for seal in every]
+    long = os.memfd_create("long", os.MFD_ALLOW_SEALING)
+    os.truncate(long, table.MAX_TABLE_BYTES + 1)
+    fcntl.fcntl(long, fcntl.F_ADD_SEALS, table.SEALED)
+    for descriptor in [*wrong, long]:
+        with pytest.raises(TableRefused) as refusal:
+            table.read_sealed(descriptor)
+        assert refusal.value.code == "CorruptFile"
+        if descriptor not in (None, 1 << 20):
+            os.close(int(descriptor or 0))
 
 
-def test_what_does_not_fit_or_cannot_be_written_is_an_error(tmp_path: FilePath) -> None:
+def test_what_is_too_long_or_finds_no_memory_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(StoreError, match="stream it in pieces"):
-        table.write(tmp_path / "guard.table", bytes(SLOT), SLOT)
-    with pytest.raises(StoreError, match="cannot be written"):
-        table.write(tmp_path / "missing" / "guard.table", body(), SLOT)
+        table.seal(bytes(table.MAX_TABLE_BYTES + 1))
+    before = open_descriptors()
+    monkeypatch.setattr(os, "write", refuse)
+    with pytest.raises(StoreError, match="nothing was loaded"):
+        table.seal(body())
+    assert open_descriptors() == before
+
+
+def open_descriptors() -> int:
+    return len(list(FilePath("/proc/self/fd").iterdir()))
+
+
+def refuse(*_: object) -> int:
+    raise OSError(12, "Cannot allocate memory")
+
+
+WRONG: tuple[object, ...] = (None, -1, 1.5, [], {}, [1], "", [["X"]], True)
+HEAD = {"axes": ["X"], "first": 0, "rows": 2, "final": True, "program": "p"}
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        '{"axes": ["X"], "first": 0, "rows": Infinity, "final": true, "program": "p"}',
+        '{"axes": ["X"], "first": 0, "rows": NaN, "final": true, "program": "p"}',
+        '{"axes": ["X"], "first": 0, "rows": 1e999, "final": true, "program": "p"}',
+        '{"axes": ["X"], "first": 0, "rows": ' + "9" * 4000 + ', "final": true, "program": "p"}',
+        "[" * 4000,
+        '{"axes":' * 500,
+        "[" * 5000,
+        "\ud800",
+        "null",
+        "[]",
+        *(json.dumps({**HEAD, key: value}) for key in HEAD for value in WRONG),
+    ],
+)
+def test_whatever_the_header_holds_it_is_one_class(head: str) -> None:
+    raw = head.encode("utf-8", "surrogatepass")
+    assert decoded(struct.pack("<I", len(raw)) + raw + bytes(16)) in ("CorruptFile", (("X",), 2))
+
+
+def decoded(whole: bytes) -> object:
+    """The class that refuses it, or axes and rows."""
+    try:
+        names, path = table.decode(whole)
+    except TableRefused as refusal:
+        return refusal.code
+    return names, path.end
+
+
+def test_a_program_named_by_no_text_is_told_in_plain_letters() -> None:
+    """A lone surrogate is text to JSON: it is carried along, and what is told of it can be encoded."""
+    raw = json.dumps({**HEAD, "program": "\ud800"}).encode()
+    _, path = table.decode(struct.pack("<I", len(raw)) + raw + bytes(16))
+    assert json.dumps(path.program_digest) == '"\\ud800"'
 
 
 @given(st.binary(max_size=200))

@@ -189,7 +189,7 @@ def test_controller_states(can_id: int, detail: int, states: list[str]) -> None:
 
 
 def test_settings_survive_their_file() -> None:
-    made = settings(token_sha256="ab", offset_synchronous=False)
+    made = settings(token_sha256="ab" * 32, offset_synchronous=False, daemon_uid=7)
     assert from_json(to_json(made)) == made
 
 
@@ -238,6 +238,6 @@ def test_two_axes_on_one_offset_are_refused() -> None:
 def test_what_may_be_sent_and_how_long_silence_is() -> None:
     made: Settings = settings()
     assert made.sent_ids == {0x301, 0x302, 0x764}
-    assert made.silence_s == 5.0
+    assert made.silence_s == 10.0
     assert settings(clock="monotonic").silence_s == pytest.approx(0.004)
     assert made.heartbeat_cycles == 20

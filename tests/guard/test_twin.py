@@ -17,7 +17,7 @@ from fdhil import config as machine_config
 from fdhil.cli.guard import open_bus, settings_of
 from fdhil.guard.client import GuardClient
 from fdhil.guard.settings import to_json
-from tests.guard.machine import FACTS_GIVEN
+from tests.guard.machine import FACTS_GIVEN, commissioned
 from tests.guard.peer import write_config
 
 ROWS = 900
@@ -94,7 +94,8 @@ def test_each_row_of_the_table_is_applied_at_its_own_cycle(tmp_path: Path) -> No
     config = machine_config.load(twin.config)
     bus = config.bus["can0"].model_copy(update={"port": twin.port})
     settings = tmp_path / "guard.json"
-    settings.write_text(to_json(settings_of(config, "can0", tmp_path, hashlib.sha256(TOKEN.encode()).hexdigest())))
+    made = settings_of(config, "can0", tmp_path, hashlib.sha256(TOKEN.encode()).hexdigest())
+    settings.write_text(to_json(commissioned(made)))
     with open_bus("can0", bus) as far:
         command = [sys.executable, "-m", "fdhil.guard", "--settings", str(settings), "--descriptor", str(far.fileno())]
         guard = subprocess.Popen(command, stdout=subprocess.PIPE, pass_fds=[far.fileno()])

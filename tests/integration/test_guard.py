@@ -15,7 +15,7 @@ from fdhil.cli.demo.processes import Process
 from fdhil.daemon.token import read_token
 from fdhil.guard.client import GuardClient
 from fdhil.guard.interlocks import FACTS
-from tests.integration.conftest import PATIENCE_S, Bench
+from tests.integration.conftest import PATIENCE_S, Bench, sign_off
 
 pytestmark = pytest.mark.timeout(240)
 
@@ -42,6 +42,7 @@ def client(bench: Bench, tmp_path: Path) -> Iterator[GuardClient]:
     path.write_text(toml(document), "utf-8")
     run = bench.config.store.run_directory
     assert run is not None
+    sign_off(bench.config)
     with Process("guard", ["fdhil.cli.guard", str(path)], tmp_path / "guard.log") as guard:
         guard.event("ready", PATIENCE_S)
         guard_client = GuardClient(run)

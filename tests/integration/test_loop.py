@@ -49,7 +49,7 @@ def shuttle(folder: Path) -> Path:
 
 def test_nothing_is_lost_and_the_drives_are_identified(bench: Bench, tmp_path: Path) -> None:
     records, counters = asyncio.run(recorded(bench, shuttle(tmp_path)))
-    assert counters["lost"] == 0
+    assert counters["lost"] == 0, counters
     for axis in bench.config.axis:
         blocks = [r for r in records if isinstance(r, AxisSamples) and r.axis == axis]
         tick = np.concatenate([block.tick for block in blocks])

@@ -34,7 +34,7 @@ def bench(bench: Bench) -> Bench:
 
 def test_what_is_accepted_is_right(bench: Bench, tmp_path: Path) -> None:
     records, counters = asyncio.run(recorded(bench, shuttle(tmp_path)))
-    assert counters["lost"] == 0
+    assert counters["lost"] == 0, counters
     assert any(isinstance(r, VoltageSamples) for r in records)
     for axis in bench.config.axis:
         pipeline = AxisPipeline(axis, bench.config)

@@ -39,7 +39,7 @@ def bench(bench: Bench) -> Bench:
 def outcomes_of(bench: Bench, folder: Path) -> dict[str, list[Outcome]]:
     """Return what each axis' pipeline makes of a shuttle."""
     records, counters = asyncio.run(recorded(bench, shuttle(folder)))
-    assert counters["lost"] == 0
+    assert counters["lost"] == 0, counters
     assert not any(counters[f"modbus.{axis}.lost"] for axis in bench.config.axis)
     return {axis: digested(AxisPipeline(axis, bench.config), records) for axis in bench.config.axis}
 

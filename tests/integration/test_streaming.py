@@ -31,7 +31,7 @@ from tests.paths import bench_demand, rms
 
 pytestmark = pytest.mark.timeout(300)
 __all__ = ["client", "sections"]
-PASSES = 10
+PASSES = 6
 
 
 @pytest.fixture
@@ -138,14 +138,14 @@ def played(bench: Bench, client: GuardClient, demand: Path, stream: Stream) -> t
 def test_rows_end_before_a_place_that_is_refused(bench: Bench, client: GuardClient, tmp_path: Path) -> None:
     """Armed while the check goes on: corrected until a second before the block with the place, none beyond, no jump."""
     there, hard = bench_demand(10), bench_demand(20, (0.030, 0.015))
-    path = np.concatenate([np.repeat(there[:1], 300, axis=0), *[there, there[::-1]] * 3, hard])
+    path = np.concatenate([np.repeat(there[:1], 300, axis=0), *[there, there[::-1]] * 2, hard])
     place = len(path) - len(hard)
     demand = written(tmp_path, path)
     (tmp_path / "rows").touch()
     checked = Checked(tmp_path / "rows", "XY")
     checking = threading.Thread(target=grow, args=(checked, demand, tmp_path / "rows", bench.config))
     checking.start()
-    while checked.rows < 12_000:
+    while checked.rows < 10_000:
         time.sleep(0.01)
     stream = Stream(checked, DIGEST, 0.001)
     played(bench, client, demand, stream)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fdhil.prediction import predict, sensitivity_um
-from fdhil.prediction.forecast import crossing, last_step, slopes_per_day, step_costs, zone_changes
+from fdhil.prediction.forecast import Course, course, crossing, last_step, step_costs, zone_changes
 from fdhil.prediction.models import nominal_models
 from fdhil.records import PARAMETERS, Parameters, ParameterSet, Trajectory, frozen, frozen_ints
 from tests.bench import bench_config
@@ -103,13 +103,13 @@ def test_the_day_on_which_a_zone_leaves_the_tolerance() -> None:
     days = np.arange(-20.0, 1.0)
     random = np.random.default_rng(3)
     sets = [published("Y", k, Jt=0.075 * (1 + 0.001 * day) + random.normal(0, 3e-5)) for k, day in enumerate(days)]
-    slopes = {"Y": {"Jt": slopes_per_day(sets, days)["Jt"]}}
+    courses = {"Y": only_jt(course(sets, days))}
     models = {"X": NOMINAL, "Y": NOMINAL}
     predicted = predict(reference, models, CONFIG)
     k = next(k for k, zone in enumerate(predicted.zones) if zone.cause == "corner")
     zone, told = predicted.zones[k], sensitivity_um(predicted, models, CONFIG)[k]
     tolerance = zone.max_um + 4.0
-    found = crossing(zone, told, models, slopes, tolerance)
+    found = crossing(zone, told, models, courses, tolerance)
     assert found is not None
     assert (found.axis, found.parameter) == ("Y", "Jt")
     assert found.earliest_days < found.days < found.latest_days
@@ -117,6 +117,14 @@ def test_the_day_on_which_a_zone_leaves_the_tolerance() -> None:
     rows = (reference.time_s >= zone.start_s) & (reference.time_s < zone.end_s)
     error = predict(reference, {"X": NOMINAL, "Y": then}, CONFIG).contour_um[rows].max()
     assert error == pytest.approx(tolerance, abs=0.5)
+    # the same slope, seen for a fifth of the time that it would have to be followed at most, foresees nothing
+    short = {"Y": replace(courses["Y"], span_days=0.19 * found.days)}
+    assert crossing(zone, told, models, short, tolerance) is None
+
+
+def only_jt(known: Course) -> Course:
+    """Leave the other parameters out of a course."""
+    return replace(known, slopes={"Jt": known.slopes["Jt"]})
 
 
 def test_what_may_stand_still_is_not_foreseen() -> None:
@@ -127,19 +135,20 @@ def test_what_may_stand_still_is_not_foreseen() -> None:
     k = next(k for k, zone in enumerate(predicted.zones) if zone.cause == "corner")
     zone, told = predicted.zones[k], sensitivity_um(predicted, models, CONFIG)[k]
     days = np.arange(-9.0, 1.0)
-    for course in (np.zeros(10), -0.001 * days):
-        sets = [published("Y", n, Jt=0.075 * (1 + rise)) for n, rise in enumerate(course)]
-        slopes = {"Y": {"Jt": slopes_per_day(sets, days)["Jt"]}}
-        rising = told["Y"]["Jt"] * slopes["Y"]["Jt"].value > 0 and course.any()
-        assert (crossing(zone, told, models, slopes, zone.max_um + 4.0) is not None) == rising
+    for rises in (np.zeros(10), -0.001 * days):
+        sets = [published("Y", n, Jt=0.075 * (1 + rise)) for n, rise in enumerate(rises)]
+        courses = {"Y": only_jt(course(sets, days))}
+        rising = told["Y"]["Jt"] * courses["Y"].slopes["Jt"].value > 0 and rises.any()
+        assert (crossing(zone, told, models, courses, zone.max_um + 4.0) is not None) == rising
 
 
 def test_slopes_begin_behind_the_last_step() -> None:
     """A step is not a slope."""
-    course = [0.075] * 6 + [0.085] * 6
-    slopes = slopes_per_day([published("X", k, Jt=jt) for k, jt in enumerate(course)], np.arange(12.0))
-    assert abs(slopes["Jt"].value) < 1e-9
-    assert set(slopes) == set(PARAMETERS)
+    values = [0.075] * 6 + [0.085] * 6
+    found = course([published("X", k, Jt=jt) for k, jt in enumerate(values)], np.arange(12.0))
+    assert abs(found.slopes["Jt"].value) < 1e-9
+    assert set(found.slopes) == set(PARAMETERS)
+    assert found.span_days == 5.0
 
 
 def test_a_parameter_set_without_covariance_still_has_steps() -> None:

@@ -28,7 +28,7 @@ def test_a_written_demand_reads_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["bench_10m.ngc", "bench_20m.ngc", "bench_rounded_10m.ngc", "shuttle.ngc"])
 def test_the_programs_that_come_along_can_be_planned(name: str) -> None:
     reference = load_trajectory(PROGRAMS / name, bench_config())
-    assert reference.position_mm["X"].max() >= 250.0
+    assert reference.position_mm["X"].max() >= 250.0 - 1e-9
     assert reference.rapid.any() == (name == "shuttle.ngc")
 
 

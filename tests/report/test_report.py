@@ -77,8 +77,8 @@ def test_the_page_needs_nothing_from_elsewhere(tmp_path: Path) -> None:
             Section("One", "text", [Table(["a", "b"], [["1", "2"]], "caption")], [("figure", FIGURES["corner"]())])
         ],
     )
-    write(page, tmp_path / "deep" / "report.html")
-    text = (tmp_path / "deep" / "report.html").read_text("utf-8")
+    write(page, tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text("utf-8")
     assert "A &lt;machine&gt;" in text
     assert "3.5 um" in text
     assert "<td>2</td>" in text

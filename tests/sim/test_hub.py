@@ -164,8 +164,8 @@ def test_a_client_that_never_reads_is_disconnected(monkeypatch: pytest.MonkeyPat
             time.sleep(0.01)
         thread.each_turn = lambda hub: None
         assert hub.lost_clients == 1
-        time.sleep(0.01)
-        assert hub.clients == 0
+        while hub.clients:
+            time.sleep(0.01)
 
 
 def test_what_is_no_socketcand_client_does_not_disturb() -> None:

@@ -16,6 +16,7 @@ from fdhil.sim.modbus_sensor import SensorFaults
 from fdhil.sim.panel import Panel, PanelError
 from fdhil.sim.sensors import DriveFaults
 from fdhil.sim.service import Pace
+from tests.guard.machine import settings
 from tests.sim.bench_twin import PERIOD_S, TwinInHand, corner, trajectory, twin_config
 
 PER_MM = 65536 / 20
@@ -356,11 +357,13 @@ def test_a_late_host_slips_and_does_not_hurry_after() -> None:
     assert sent[-1] - sent[0] > 0.0201 + 97 * 0.001
 
 
-def test_lockstep_runs_when_everything_is_there_and_waits_half_a_second() -> None:
+def test_lockstep_runs_when_everything_is_there_and_waits_longer_for_who_holds_an_offset() -> None:
     pace = Pace(0.001, lockstep=True)
     pace.sent(10.0)
     assert pace.due_s(waits=False, idle=False) <= 10.0
     assert pace.due_s(waits=True, idle=False) == 10.5
+    assert pace.due_s(waits=True, idle=False, holds=True) == 18.0
+    assert settings(clock="sync").silence_s > 8.0 + 1.0, "a guard must not take the wait for a dead bus"
     assert pace.due_s(waits=False, idle=True) == pytest.approx(10.001, abs=3e-4)
 
 

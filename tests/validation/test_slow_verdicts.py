@@ -14,7 +14,7 @@ from fdhil.validation import analyse, pool
 from fdhil.validation.slow_readings import slow_voltage_faults
 from studies.judging import GOOD
 from studies.slow_recordings import recording_of
-from studies.slow_sensor import PAGE, SETTINGS, parts_of, slow_windows
+from studies.slow_sensor import SETTINGS, slow_windows
 
 
 def _analysed(seed: int, kind: str) -> WindowOutcome:
@@ -79,12 +79,6 @@ def test_a_current_that_is_off_is_seen_where_the_axis_stands() -> None:
     # 2.5 % of the peak: friction imitates it in [2], and R and K in [1] but at standstill
     codes = {reason.code for reason in _analysed(297, "offset").verdict.reasons}
     assert codes == {"CalibrationSuspect"}
-
-
-def test_a_part_of_the_page_is_written_beside_the_other() -> None:
-    page = PAGE.format(intervals="one\ntable", verdicts="the other\n\n| a |")
-    assert parts_of(page) == ("one\ntable", "the other\n\n| a |")
-    assert parts_of("something else") == ("", "")
 
 
 @pytest.mark.parametrize("kind", ["voltage turned", "wrong sign"])

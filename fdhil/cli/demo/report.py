@@ -81,11 +81,11 @@ def page(loop: Loop) -> Page:
         title="From rapid moves to a corrected path",
         subtitle="A simulated two-axis machine, identified while it moved, predicted, and corrected over its own bus.",
         headline=[
-            ("contour error before, RMS", f"{before.rms_um:.1f} um"),
+            ("contour error measured before, RMS", f"{before.rms_um:.1f} um"),
             ("predicted before it was cut", f"{_rms(loop.predicted.contour_um):.1f} um"),
-            ("with the paper's mirror", f"{mirror.rms_um:.2f} um"),
-            ("with the inverse, RMS", f"{after.rms_um:.2f} um"),
-            ("smaller by", f"{before.rms_um / after.rms_um:.0f} x"),
+            ("measured with the paper's mirror", f"{mirror.rms_um:.2f} um"),
+            ("measured with the inverse, RMS", f"{after.rms_um:.2f} um"),
+            ("smaller by, as measured", f"{before.rms_um / after.rms_um:.0f} x"),
         ],
         sections=[
             _identified(loop),

@@ -1,0 +1,127 @@
+"""What ``fdhil advise`` tells people: lines that follow each other in one range, the worst of each by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import click
+
+from fdhil.program.feed_words import cut
+
+if TYPE_CHECKING:
+    from fdhil.prediction.advise import Advice, Held
+
+BRACKETED = (
+    "the averages of [nc] smoothing_s did not make this demand: the lower feed holds where the NC keeps its smoothing,"
+    " the higher one if its accelerations fell with the square of the feed"
+)
+MANY = 20  # ranges that are shown
+SPREADS = (1.1, 1.5, 2.0, 4.0, math.inf)  # highest to lowest feed within one range
+Range = list["Advice"]
+
+
+def show(
+    advice: Sequence[Advice],
+    most: Mapping[float, Advice] | None,
+    tolerance_um: float,
+    corrects: bool,
+    feeds: Callable[[int], bool],
+) -> None:
+    """Print a line per range; ``feeds`` tells whether a line of the program orders a feed at all."""
+    if not advice:
+        click.echo(f"the whole path stays within {tolerance_um:g} um as programmed")
+        return
+    found = ranges(advice, feeds)
+    worst = sorted(found, key=lambda one: -_worst(one).error_um)[:MANY]
+    for one in sorted(worst, key=lambda one: one[0].start_s):
+        _show_range(one, most)
+    if len(found) > len(worst):
+        click.echo(f"and {len(found) - len(worst)} ranges that leave it less (--json lists every line)")
+    if most:
+        click.echo(BRACKETED)
+    if not corrects:
+        click.echo("the correction was not tried: an axis has no section [axis.X.correction]")
+
+
+def ranges(advice: Sequence[Advice], feeds: Callable[[int], bool]) -> list[Range]:
+    """Return lines that follow each other together: at feeds as near each other as leaves not too many ranges."""
+    found: list[Range] = []
+    for spread in SPREADS:
+        found = list(_runs(advice, feeds, spread))
+        if len(found) <= MANY:
+            break
+    return found
+
+
+def _runs(advice: Sequence[Advice], feeds: Callable[[int], bool], spread: float) -> Iterator[Range]:
+    run: Range = []
+    low = high = 0.0
+    for a in advice:
+        feed = a.plain.run * a.feed_mm_min
+        wide = max(high, feed) > spread * min(low, feed)
+        if run and (wide or not (_follows(run[-1], a, feeds) and (_alike(run[-1], a) or math.isinf(spread)))):
+            yield run
+            run = []
+        low, high = (min(low, feed), max(high, feed)) if run else (feed, feed)
+        run.append(a)
+    yield run
+
+
+def _follows(before: Advice, after: Advice, feeds: Callable[[int], bool]) -> bool:
+    """Whether no line that feeds stands between two; zones of a demand are never taken together."""
+    return 0 < before.line < after.line and not any(map(feeds, range(before.line + 1, after.line)))
+
+
+def _alike(one: Advice, other: Advice) -> bool:
+    """Whether two lines have the same feed as programmed, and are both held by another one or both not."""
+    return one.feed_mm_min == other.feed_mm_min and (one.plain.share is None) == (other.plain.share is None)
+
+
+def _worst(one: Range) -> Advice:
+    return max(one, key=lambda a: a.error_um)
+
+
+def _show_range(one: Range, most: Mapping[float, Advice] | None) -> None:
+    worst, first, last = _worst(one), one[0], one[-1]
+    at = f"at line {worst.line}, {worst.where}" if last is not first else f"at {worst.where}"
+    name = f"lines {first.line}-{last.line}" if last is not first else f"line {first.line}"
+    if not first.line:
+        name = f"{first.start_s:.2f} s .. {first.end_s:.2f} s"
+    fast = worst.corrected if worst.corrected and worst.corrected.share is not None else None
+    better = "" if fast is None else f", with the correction F{cut(fast.run * worst.feed_mm_min):g}"
+    click.echo(
+        f"{name}: F{_span([a.feed_mm_min for a in one])} -> F{_span([cut(a.plain.run * a.feed_mm_min) for a in one])}"
+        f"{better}, worst {worst.error_um:.1f} um {at} ({worst.cause}, most of it axis {worst.axis})"
+    )
+    axis, what, share = max((a.load for a in one), key=lambda load: load[2])
+    if share > 1.0:
+        click.echo(f"  the drive of axis {axis} is asked for {share * 100:.0f} % of its {what} limit")
+    other = (most or {}).get(worst.start_s, worst)
+    for kind, held, hopeful in (
+        ("without correction", worst.plain, other.plain),
+        ("with the correction", worst.corrected, other.corrected),
+    ):
+        if held is not None and (held.share is None or _hopes(held, hopeful)):
+            click.echo(f"  {kind}: {_told(held, hopeful, worst.feed_mm_min)}")
+
+
+def _span(feeds: Sequence[float]) -> str:
+    low, high = min(feeds), max(feeds)
+    return f"{high:g}" if cut(low) == cut(high) else f"{low:g}..{high:g}"
+
+
+def _told(held: Held, most: Held | None, feed_mm_min: float) -> str:
+    if held.share is None:
+        left = f": {held.left_um:.1f} um are left there" if math.isfinite(held.left_um) else ""
+        with_it = f"; the others hold with it at {cut(held.run * feed_mm_min):g}" if held.run > held.tried else ""
+        return f"no feed down to {cut(held.tried * feed_mm_min):g} mm/min holds it{left}{with_it}"
+    hopeful = most.share * feed_mm_min if most and most.share and _hopes(held, most) else None
+    more = "" if hopeful is None else f", perhaps {cut(hopeful):g}"
+    return f"at most {cut(held.share * feed_mm_min):g} mm/min{more}"
+
+
+def _hopes(held: Held, most: Held | None) -> bool:
+    """Whether the higher of two feeds is worth telling."""
+    return bool(most and most.share and held.share and most.share > 1.02 * held.share)

@@ -1,0 +1,130 @@
+"""One owner per bus: a lock on the place that a bus leads to, whatever its name, in a file that others cannot reach.
+
+It covers every process of the same user, and root with the guard's own user. It does not cover what looks like another
+place: two addresses of one distant hub, a tunnel, two interfaces on one cable, another computer. There the guards see
+each other's heartbeat on the bus (``BusLocked``).
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import ipaddress
+import os
+import pwd
+import socket
+import stat
+import struct
+from pathlib import Path
+from typing import IO
+
+from fdhil.config import CanBus
+from fdhil.errors import ConnectError, DeviceError
+
+SHARED_DIRECTORY = Path("/run/fdhil-guard")
+LOCK_NAME = "bus.lock"
+
+
+def lock_bus(bus: CanBus, transmit: socket.socket | None = None, run_directory: Path | None = None) -> IO[bytes]:
+    """Own a bus, and a run directory, until the returned file is closed or the process ends.
+
+    ``transmit`` is the open socket; without it the config's host is looked up. DeviceError (``BusLocked``) when another
+    process has it, ConnectError when the bus cannot be found.
+    """
+    places = [endpoint(bus, transmit)]
+    if run_directory is not None:
+        places.append(f"directory {run_directory.resolve()}")
+    try:
+        file = os.fdopen(_open(_directory()), "rb")
+    except (OSError, KeyError) as error:
+        text = f"the lock of the bus cannot be made ({error}), and nothing was sent; give this user a home directory"
+        raise DeviceError(str(SHARED_DIRECTORY), text) from None
+    try:
+        for place in places:
+            _lock(file, place)
+    except DeviceError:
+        file.close()
+        raise
+    return file
+
+
+def endpoint(bus: CanBus, transmit: socket.socket | None = None) -> str:
+    """Return where a bus leads to: an interface of this network namespace, or a channel behind a hub's port.
+
+    All addresses of this computer are one.
+    """
+    here = f"this computer (network {Path('/proc/self/ns/net').stat().st_ino})"
+    try:
+        if bus.interface == "socketcan":
+            index = socket.if_nametoindex(transmit.getsockname()[0] if transmit else bus.channel)
+            return f"interface {index} of {here}"
+        if bus.interface == "virtual":
+            return f"{bus.channel} in process {os.getpid()}"
+        if transmit is not None:
+            address = transmit.getpeername()[0]
+        else:
+            address = socket.getaddrinfo(bus.host, bus.port, type=socket.SOCK_STREAM)[0][4][0]
+    except OSError as error:
+        name = bus.channel if bus.interface == "socketcan" else bus.host
+        text = f"cannot be found ({error.strerror}), and nothing was sent; check [bus] channel and host"
+        raise ConnectError(name, text) from None
+    place = here if _is_here(str(address)) else address
+    return f"{bus.channel} behind port {bus.port} of {place}"
+
+
+def _is_here(address: str) -> bool:
+    """Whether an address is one of this computer: then it is also what a packet to it would come from."""
+    found = ipaddress.ip_address(address.partition("%")[0])
+    if isinstance(found, ipaddress.IPv6Address) and found.ipv4_mapped is not None:
+        found = found.ipv4_mapped
+    if found.is_loopback or found.is_unspecified:
+        return True
+    with socket.socket(socket.AF_INET if found.version == 4 else socket.AF_INET6, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((str(found), 9))  # sends nothing: it only asks for the route
+        except OSError:
+            return False
+        return ipaddress.ip_address(probe.getsockname()[0].partition("%")[0]) == found
+
+
+def _directory() -> Path:
+    """The directory of the guard's unit where this user owns it (root: whoever does), else one in the user's home.
+
+    Not $HOME, nor one below /tmp: the place must be the same for every process of a user, and no one else's to make.
+    """
+    user = os.getuid()
+    if user == 0:
+        SHARED_DIRECTORY.mkdir(mode=0o755, exist_ok=True)
+    if _is_ours(SHARED_DIRECTORY, user):
+        return SHARED_DIRECTORY
+    home = Path(pwd.getpwuid(user).pw_dir) / ".cache" / "fdhil"
+    home.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if not _is_ours(home, user):
+        raise PermissionError(1, "others may write there", str(home))
+    return home
+
+
+def _is_ours(directory: Path, user: int) -> bool:
+    try:
+        found = directory.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(found.st_mode) and user in (0, found.st_uid) and not found.st_mode & 0o022
+
+
+def _open(directory: Path) -> int:
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    descriptor = os.open(directory / LOCK_NAME, flags, 0o600)
+    if os.getuid() == 0:  # what root makes must not lock the guard's own user out
+        os.fchown(descriptor, directory.stat().st_uid, -1)
+    return descriptor
+
+
+def _lock(file: IO[bytes], place: str) -> None:
+    """Lock the one byte of the file that stands for a place, on the open file: it stays locked over an exec."""
+    byte = int.from_bytes(hashlib.sha256(place.encode()).digest()[:8], "big") >> 2
+    try:
+        fcntl.fcntl(file, fcntl.F_OFD_SETLK, struct.pack("hhqqi", fcntl.F_WRLCK, os.SEEK_SET, byte, 1, 0))
+    except OSError:
+        text = "BusLocked: another guard, or a commissioning, owns it, and nothing was sent; stop that one first"
+        raise DeviceError(place, text) from None

@@ -1,0 +1,47 @@
+"""Says beforehand that the numerics must be compiled, which happens once and takes seconds of silence."""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from importlib.util import find_spec
+from pathlib import Path
+
+import click
+
+# what a command needs -> its compiled modules, and about how many seconds each takes
+NEEDS: Mapping[str, Mapping[str, float]] = {
+    "predict": {"fdhil.model.kernels": 4, "fdhil.prediction.kernels": 1},
+    "correct": {"fdhil.correction.kernels": 10},
+    "identify": {"fdhil.identification.sweeps": 9, "fdhil.identification.innovations": 5, "fdhil.model.feed_drive": 2},
+}
+
+
+@functools.cache
+def forewarn(*needs: str) -> None:
+    """Tell on stderr, once, how long the kernels that ``needs`` name will compile; nothing when they are there."""
+    seconds = sum(s for need in needs for module, s in NEEDS[need].items() if not compiled(module))
+    if seconds:
+        click.echo(f"compiling the numerics, once, about {seconds:.0f} s", err=True)
+
+
+def compiled(module: str) -> bool:
+    """Whether numba's cache holds something of a module that is newer than its source; looked at without numba."""
+    spec = find_spec(module)
+    assert spec is not None
+    assert spec.origin is not None
+    source = Path(spec.origin)
+    changed_s = source.stat().st_mtime
+    pattern = f"{source.stem}.*.py{sys.version_info.major}{sys.version_info.minor}.nbi"
+    return any(index.stat().st_mtime >= changed_s for folder in _caches(source) for index in folder.glob(pattern))
+
+
+def _caches(source: Path) -> Iterator[Path]:
+    """Yield where numba may keep what it compiled of a source file, by its own rules."""
+    if own := os.environ.get("NUMBA_CACHE_DIR"):
+        yield from Path(own).glob(f"{source.parent.name}_*")
+        return
+    yield source.parent / "__pycache__"
+    yield from (Path.home() / ".cache" / "numba").glob(f"{source.parent.name}_*")

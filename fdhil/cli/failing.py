@@ -1,0 +1,115 @@
+"""How an error becomes one sentence, or one JSON document, and an exit code."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+import click
+
+from fdhil.errors import ConfigError, ConfigFault, FdhilError
+
+SCHEMA = "fdhil-error-1"
+STOPPED = 130
+TROUBLE = 3
+NO_CACHE = (
+    "compiled code can be kept neither beside fdhil nor in the home of this user; nothing was started; "
+    "set NUMBA_CACHE_DIR to a folder that this user may write"
+)
+
+
+def run_safely(command: click.Command) -> int:
+    """Run a click command and return the exit code; errors are told on stderr, with ``--json`` on stdout."""
+    try:
+        result = command.main(standalone_mode=False)
+        sys.stdout.flush()
+    except click.exceptions.NoArgsIsHelpError as error:
+        error.show()
+        return error.exit_code
+    except click.exceptions.Abort:
+        return tell("Stopped", "stopped by the operator", STOPPED)
+    except click.ClickException as error:
+        return tell(type(error).__name__, _usage(error), error.exit_code)
+    except ConfigError as error:
+        return _tell_config(error)
+    except FdhilError as error:
+        return tell(type(error).__name__, str(error), error.exit_code, _details(error))
+    except (SystemExit, BrokenPipeError):  # whoever read the answer has seen enough of it; click raises the former
+        _drop_stdout()
+        return 0
+    except OSError as error:
+        _drop_stdout()
+        place = f"{error.filename}: " if error.filename else ""
+        text = f"{place}{error.strerror or error}; nothing more was done, check the disk, the path and its rights"
+        return tell(type(error).__name__, text, TROUBLE)
+    except MemoryError:
+        return tell("MemoryError", "the memory is used up; give a smaller file, or free memory", TROUBLE)
+    except RuntimeError as error:
+        if "no locator available" not in str(error):  # numba's words
+            raise
+        return tell("NoCache", NO_CACHE, TROUBLE)
+    return int(result or 0)
+
+
+def tell(kind: str, text: str, code: int, details: dict[str, Any] | None = None) -> int:
+    """Tell an error of class ``kind`` to whoever called, a person or a program; return its exit code."""
+    if wants_json():
+        document = {"schema": SCHEMA, "error": {"class": kind, "text": text} | (details or {})}
+        with contextlib.suppress(OSError):
+            click.echo(json.dumps(document))
+    else:
+        click.echo(f"fdhil: {text}", err=True)
+    return code
+
+
+def wants_json(arguments: Sequence[str] | None = None) -> bool:
+    """Whether the command was asked for JSON; known also where its options could not be read."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    return "--json" in (given[: given.index("--")] if "--" in given else given)
+
+
+def error_document(error: FdhilError) -> dict[str, Any]:
+    """Return what the ``error`` of a JSON document says."""
+    return {"class": type(error).__name__, "text": str(error)} | _details(error)
+
+
+def _details(error: FdhilError) -> dict[str, Any]:
+    """Return what an error knows beside its sentence: the device, the line and word, the faults of a config."""
+    known = vars(error)
+    told: dict[str, Any] = {name: value for name, value in known.items() if isinstance(value, str | int)}
+    if faults := known.get("faults"):
+        told["faults"] = [asdict(fault) for fault in faults if isinstance(fault, ConfigFault)]
+    return told
+
+
+def _tell_config(error: ConfigError) -> int:
+    """Tell every fault of a configuration, one a line."""
+    if wants_json():
+        return tell(type(error).__name__, str(error), error.exit_code, _details(error))
+    if len(error.faults) == 1:
+        return tell("", f"{error.source} cannot be used: {error.faults[0]}", error.exit_code)
+    click.echo(f"fdhil: {error.source} cannot be used:", err=True)
+    for fault in error.faults:
+        click.echo(f"  {fault}", err=True)
+    return error.exit_code
+
+
+def _usage(error: click.ClickException) -> str:
+    """Return what is wrong with a call, and where to read how it goes."""
+    context = getattr(error, "ctx", None) or click.get_current_context(silent=True)
+    command = context.command_path if context is not None else "fdhil"
+    text = " ".join(error.format_message().split()).rstrip(".")
+    return f"{text}; {command} --help tells how it is called"
+
+
+def _drop_stdout() -> None:
+    """Let nothing more be written to an output that takes nothing: the interpreter would complain at its end."""
+    with contextlib.suppress(OSError, ValueError):
+        descriptor = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(descriptor, sys.stdout.fileno())
+        os.close(descriptor)

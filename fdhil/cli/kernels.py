@@ -1,0 +1,51 @@
+"""``python -m fdhil.cli.kernels``: compile all kernels once, so that no command is silent for half a minute later.
+
+``make setup`` runs it. The kernels are kept where numba keeps them: beside the code, or in ``NUMBA_CACHE_DIR``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from fdhil import config as machine_config
+from fdhil import tables
+from fdhil.config import MachineConfig
+from fdhil.daemon.warm import nominal_rapid, warm
+from fdhil.records import SlowVoltage, Window, frozen
+from fdhil.sim.machine import Machine
+from fdhil.validation import analyse
+
+SLOW_ROWS = 5
+
+
+def compile_all() -> None:
+    """Send made-up rapids through everything that computes: estimators, checks, corrections, the simulated drive."""
+    config = machine_config.load(Path(__file__).with_name("demo") / "machine.toml")
+    for method in (None, *tables.ESTIMATORS):
+        warm(config, method)
+    for window in _unusual(config):
+        analyse(window, config.identification)
+    Machine(config).power_on()
+
+
+def _unusual(config: MachineConfig) -> Iterator[Window]:
+    """Yield windows that take the ways which a sound rapid does not: a stuck sensor, a slow one, an instant one."""
+    axis = config.axis["X"]
+    sound = nominal_rapid("X", axis, config.machine.sync_period_s)
+    speed = np.round(sound.speed_rad_s, 2)
+    speed[200:230] = speed[200]
+    yield replace(sound, speed_rad_s=frozen(speed))
+    yield replace(sound, voltage_sampling="instant")
+    assert sound.voltage_v is not None
+    rows = sound.n // SLOW_ROWS * SLOW_ROWS
+    means = sound.voltage_v[:rows].reshape(-1, SLOW_ROWS).mean(axis=1)
+    slow = SlowVoltage(0.0, SLOW_ROWS * sound.dt_s, 0.2 * sound.dt_s, frozen(means))
+    yield replace(sound, voltage_v=None, slow_voltage=slow)
+
+
+if __name__ == "__main__":
+    compile_all()

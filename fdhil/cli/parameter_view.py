@@ -1,0 +1,52 @@
+"""How parameters are shown to people: one unit each, and one meaning of ±, in every table."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from fdhil.records import UNITS
+
+MEANING = "± is half the width of the 95 % interval"
+# what people read: unit and factor; the ratios to K and all of JSON stay in SI units
+DISPLAY: Mapping[str, tuple[str, float]] = {name: (unit, 1.0) for name, unit in UNITS.items()} | {
+    "R": ("mohm", 1e3),
+    "L": ("mH", 1e3),
+    "Jt": ("g.m2", 1e3),
+    "ft": ("mN.m.s", 1e3),
+}
+
+
+def head(name: str) -> str:
+    """Return the head of a parameter's column: its symbol above its unit."""
+    return f"{name}\n{DISPLAY[name][0]}"
+
+
+def half_of(told: Mapping[str, Any]) -> float | None:
+    """Return half the width of a value's 95 % interval as JSON has it; None where it has none."""
+    if told.get("low") is None or told.get("high") is None:
+        return None
+    return float(told["high"] - told["low"]) / 2
+
+
+def cell(name: str, value: float | None, half: float | None, between: str = "\n") -> str:
+    """Return a value and half of its interval in the parameter's unit, both to the place where the half begins."""
+    if value is None or not math.isfinite(value):
+        return "-"
+    shown = value * DISPLAY[name][1]
+    if half is None or not math.isfinite(half):
+        return f"{shown:.4g}{between}(no ±)"
+    width = half * DISPLAY[name][1]
+    if width <= 0.0:
+        return f"{shown:.6g}{between}±0"
+    digits = -math.floor(math.log10(width))
+    if -1 <= digits <= 6:
+        places = max(0, digits)
+        return f"{shown:.{places}f}{between}±{width:.{places}f}"
+    return f"{shown:.{max(1, min(6, _figures(shown, width)))}g}{between}±{width:.1g}"
+
+
+def _figures(value: float, width: float) -> int:
+    """How many figures of a value say something beside an interval of this width."""
+    return math.floor(math.log10(abs(value) / width)) + 2 if abs(value) > width else 1

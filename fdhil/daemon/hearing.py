@@ -1,0 +1,178 @@
+"""What is heard of the machine, now: frames, SYNC and samples with their ages, and what is not as the config says.
+
+Pure but for the times it is given. What was not heard within the last second is silent, whatever came before.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from fdhil.config import MachineConfig
+from fdhil.daemon.moves import Moves
+from fdhil.pipeline import Record
+from fdhil.records import AxisSamples, Notice, TickTimes
+
+LIVE_S = 1.0
+LOAD_S = 1.0  # over which the load of a bus is told
+SYNC_INTERVALS = 500
+RATE_NS = 1_000_000_000  # of the newest SYNCs, over which their rate is told
+FEW_SYNCS = 32
+PERIOD_TOLERANCE = 0.02
+PATIENCE_S = 3.0  # until what is wrong, or missing, is told
+START_S = 10.0  # until a drive samples when SYNC runs
+FRAME_BITS = 121  # 8 data bytes, 11 bit identifier, stuffing between none and the worst case
+SILENCES = {"BusSilent", "BusDown", "SyncLost"}
+
+Trouble = tuple[str, str]
+
+
+class Hearing:
+    """Listens to the listeners: fed with every record and, a few times a second, with the source's counters."""
+
+    def __init__(self, config: MachineConfig, now_s: float) -> None:
+        self._config = config
+        self.open = False
+        self.opened_s = now_s
+        self.lost_times = 0
+        self.moves = {axis: Moves(axis, config) for axis in config.axis}
+        self._realtime = config.guard.clock == "monotonic" and config.sim.pace == "realtime"
+        self._buses = tuple(dict.fromkeys(axis.drive.bus for axis in config.axis.values()))
+        self._last_record_s: float | None = None
+        self._silent: set[str] = set()
+        self._forget(now_s)
+
+    def _forget(self, now_s: float) -> None:
+        """Begin anew: what was counted before belongs to another source."""
+        self._frames: dict[str, int] = {}
+        self._heard_s = dict.fromkeys(("", *self._buses), now_s)
+        self._counters: Mapping[str, Any] = {}
+        self._loads: tuple[float, dict[str, int]] = (now_s, {})
+        self.load_percent: dict[str, float] = {}
+        self._sync: deque[tuple[int, int]] = deque(maxlen=SYNC_INTERVALS + 1)
+        self._sync_s: float | None = None
+        self._samples_s: dict[str, float] = {}
+        self._since_s: dict[Trouble, float] = {}
+        self._silent.clear()
+
+    def source_opened(self, now_s: float) -> None:
+        """The machine can be listened to."""
+        self.open, self.opened_s = True, now_s
+        self._forget(now_s)
+
+    def source_lost(self, now_s: float) -> None:
+        """The machine cannot be listened to until the source is opened again."""
+        self.open, self.opened_s = False, now_s
+        self.lost_times += 1
+        self._forget(now_s)
+
+    def alive(self, now_s: float, silence_s: float) -> bool:
+        """Whether records arrive, or it is known why they cannot (the source is lost, the bus is silent)."""
+        latest = max(self.opened_s, self._last_record_s or self.opened_s)
+        return not self.open or bool(self._silent) or now_s - latest <= silence_s
+
+    def record_came(self, record: Record | Notice, now_s: float) -> None:
+        """Note when SYNC and samples came, and what the source itself says is silent."""
+        self._last_record_s = now_s
+        if isinstance(record, TickTimes):
+            self._sync.extend(zip(record.tick.tolist(), record.t_ns.tolist(), strict=True))
+            self._sync_s = now_s
+        elif isinstance(record, AxisSamples) and record.axis in self.moves:
+            self._samples_s[record.axis] = now_s
+            self.moves[record.axis].feed(record, now_s)
+        elif isinstance(record, Notice) and record.code in SILENCES:
+            if record.severity == "info":
+                self._silent.discard(record.code)
+            else:
+                self._silent.add(record.code)
+
+    def counted(self, counters: Mapping[str, Any], now_s: float) -> None:
+        """Take the source's counters: where they grow, something is heard."""
+        self._counters = counters
+        frames = {bus: int(counters.get(f"{bus}.frames" if bus else "frames", 0)) for bus in self._heard_s}
+        for bus, count in frames.items():
+            if count != self._frames.get(bus, 0):
+                self._heard_s[bus] = now_s
+        self._frames = frames
+        then_s, before = self._loads
+        if before and now_s - then_s < LOAD_S:
+            return
+        for bus in self._buses if before else ():
+            bits = max(0, frames[bus] - before[bus]) * FRAME_BITS / (now_s - then_s)
+            self.load_percent[bus] = round(100 * bits / self._config.bus[bus].bitrate, 1)
+        self._loads = now_s, frames
+
+    def sync_rate_hz(self, now_s: float) -> float | None:
+        """Return the SYNC rate over the newest arrivals; None while too few came, or none within the last second."""
+        if self._sync_s is None or now_s - self._sync_s > LIVE_S:
+            return None
+        newest_tick, newest_ns = self._sync[-1]
+        recent = [(tick, t_ns) for tick, t_ns in self._sync if newest_ns - t_ns <= RATE_NS and tick <= newest_tick]
+        span_s = (newest_ns - recent[0][1]) * 1e-9
+        return (newest_tick - recent[0][0]) / span_s if len(recent) >= FEW_SYNCS and span_s > 0 else None
+
+    def status(self, now_s: float) -> dict[str, Any]:
+        """Return the part of the status document that says what is heard, with ages."""
+        rate = self.sync_rate_hz(now_s)
+        heard = {bus: round(now_s - at_s, 3) for bus, at_s in self._heard_s.items()}
+        heard_s_ago = heard.pop("")
+        state = "reconnecting" if not self.open else "listening" if heard_s_ago <= LIVE_S else "silent"
+        return {
+            "source": {
+                "state": state,
+                "since_s": round(now_s - self.opened_s, 3),
+                "lost_times": self.lost_times,
+                "heard_s_ago": heard_s_ago,
+                "buses": heard if self.open else {},
+                "last_record_age_s": None if self._last_record_s is None else round(now_s - self._last_record_s, 3),
+            },
+            "sync": {
+                "rate_hz": None if rate is None else round(rate, 3),
+                "expected_hz": round(1 / self._config.machine.sync_period_s, 3),
+                "heard_s_ago": None if self._sync_s is None else round(now_s - self._sync_s, 3),
+                "tick": self._sync[-1][0] if self._sync else None,
+            },
+            "bus_load_percent": self.load_percent if heard_s_ago <= LIVE_S else {},
+        }
+
+    def samples_s_ago(self, axis: str, now_s: float) -> float | None:
+        """Return how long ago the last samples of an axis came; None when none did."""
+        at_s = self._samples_s.get(axis)
+        return None if at_s is None else round(now_s - at_s, 3)
+
+    # what is not as the config says ----------------------------------------------------------------------------
+
+    def troubles(self, windows: Mapping[str, int], now_s: float) -> dict[Trouble, str]:
+        """Return what has been wrong for a while: (class, axis) -> cause and next action. ``windows``: found so far."""
+        found = dict(self._found(windows, now_s)) if self.open else {}
+        self._since_s = {trouble: self._since_s.get(trouble, now_s) for trouble in found}
+        patience = {"NoSamples": START_S, "MovesNotUsed": 0.0, "ScaleSuspect": 0.0, "PitchSuspect": 0.0}
+        lasting = {t for t, since_s in self._since_s.items() if now_s - since_s >= patience.get(t[0], PATIENCE_S)}
+        return {trouble: text for trouble, text in found.items() if trouble in lasting}
+
+    def _found(self, windows: Mapping[str, int], now_s: float) -> Iterator[tuple[Trouble, str]]:
+        rate, expected = self.sync_rate_hz(now_s), 1 / self._config.machine.sync_period_s
+        if self._realtime and rate is not None and abs(rate / expected - 1) > PERIOD_TOLERANCE:
+            text = f"SYNC comes at {rate:.4g} Hz where the config says {expected:.4g}: what is identified is wrong"
+            yield ("SyncPeriodSuspect", ""), f"{text}; set sync_period_s = {1 / rate:.4g}, or correct the NC's"
+        for axis, settings in self._config.axis.items():
+            missing = self._missing(axis, settings.drive.bus, rate is not None, now_s)
+            if missing is not None:
+                yield (missing[0], axis), missing[1]
+            elif (unused := self.moves[axis].trouble(windows.get(axis, 0), now_s)) is not None:
+                yield (unused[0], axis), unused[1]
+
+    def _missing(self, axis: str, bus: str, synced: bool, now_s: float) -> tuple[str, str] | None:
+        """Return what is not heard of a drive while its bus is."""
+        if now_s - self._heard_s[bus] > LIVE_S:
+            return None
+        node = f"node {self._config.node_id(axis)} on {bus}"
+        if self._counters.get(f"{bus}.{axis}.heard") == 0:
+            text = f"the drive ({node}) was never heard, nothing is known of its axis"
+            return "NodeNeverHeard", f"{text}; check node_id in the config, its supply and its wiring"
+        age_s = self.samples_s_ago(axis, now_s)
+        if synced and (age_s is None or age_s > LIVE_S):
+            text = f"the drive ({node}) sends no samples though SYNC runs"
+            return "NoSamples", f"{text}; check that it is Operational, and its TPDO mapping with fdhil check"
+        return None

@@ -1,0 +1,156 @@
+"""The moves of an axis as the bus shows them: what they are worth to identification, and whether the scales agree.
+
+Nothing is identified here: it is counted what never becomes a window, so that silence has a reason. Pure.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from fdhil.config import MachineConfig
+from fdhil.drivers import g0_inferred
+from fdhil.identification.windows import PLATEAU_BAND, PLATEAU_S, RAPID_SHARE, RUN_SHARE
+from fdhil.records import AxisSamples, Float, Int
+
+REST_S = 0.1  # a demand that stands for so long has ended the move
+FEW = 3  # moves that say something about all
+TOO_FAST = 1.05  # of the rapid speed: no override goes there unseen
+SCALE_TOLERANCE = 0.02
+SCALE_TRAVEL_MM = 50.0  # by which position and the integral of speed are compared
+LEAST_MM, LONGEST_GAP_S = 0.2, 0.1  # of a block that is compared
+PATIENCE_S = 5.0  # until a move that is over has become a window
+
+
+def _columns(samples: AxisSamples) -> tuple[Int, Float, Float, Float]:
+    return samples.tick, samples.demand_mm, samples.position_mm, samples.speed_rad_s
+
+
+class Moves:
+    """What the demand of one axis does, from rest to rest."""
+
+    def __init__(self, axis: str, config: MachineConfig) -> None:
+        settings = config.axis[axis]
+        self._period_s = config.machine.sync_period_s
+        self._rapid_mm_s = settings.rapid_speed_mm_s
+        self._mm_per_rad = settings.screw_pitch_mm / (2 * math.pi)
+        self._source = config.g0.source
+        self._needed = g0_inferred.RAPID_SHARE if self._source == "inferred" else RAPID_SHARE
+        # one increment per cycle is the rounding of the set-point, not a motion
+        self._still_mm_s = max(RUN_SHARE * self._rapid_mm_s, 2 / settings.scaling.increments_per_mm / self._period_s)
+        self._last: AxisSamples | None = None
+        self._rest_rows = max(1, round(REST_S / self._period_s))
+        self._speed_mm_s, self._peak_mm_s, self._level_mm_s = 0.0, 0.0, 0.0
+        self._level_rows = self._still = 0
+        self._agreement = [0.0, 0.0, 0.0]  # position by speed, speed by speed, travel
+        self.seen = self.slow = self.short = 0
+        self.fastest_mm_s = 0.0
+        self.usable = 0
+        self.usable_s = -math.inf
+
+    def feed(self, samples: AxisSamples, now_s: float) -> None:
+        """Take a block of samples that came now."""
+        if samples.tick.size == 0:
+            return
+        last = self._last
+        self._last = samples
+        if last is not None and samples.tick[0] > last.tick[-1]:
+            columns: list[Any] = [np.append(a[-1], b) for a, b in zip(_columns(last), _columns(samples), strict=True)]
+        else:
+            columns = list(_columns(samples))
+        tick, demand, position, speed = columns
+        if tick.size < 2:
+            return
+        seconds = np.diff(tick) * self._period_s
+        self._follow(np.abs(np.diff(demand)) / seconds, now_s)
+        self._compare(float(position[-1] - position[0]), speed, seconds)
+
+    def _follow(self, speed_mm_s: Float, now_s: float) -> None:
+        """Follow the demand's speed (n,): a move is over when it has stood for a while."""
+        after = np.append(self._speed_mm_s, speed_mm_s)
+        self._speed_mm_s = float(after[-1])
+        for mm_s in np.fmin(after[1:], after[:-1]).tolist():  # a jump, as drives are enabled, is no speed
+            if not mm_s > self._still_mm_s:
+                self._still += 1
+                if self._still == self._rest_rows and self._peak_mm_s > 0.0:
+                    self._over(now_s)
+                continue
+            self._still = 0
+            if mm_s > self._level_mm_s * (1 + PLATEAU_BAND):
+                self._level_mm_s, self._level_rows = mm_s, 0
+            self._level_rows += mm_s >= self._level_mm_s * (1 - PLATEAU_BAND)
+            self._peak_mm_s = max(self._peak_mm_s, mm_s)
+
+    def _over(self, now_s: float) -> None:
+        self.seen += 1
+        self.fastest_mm_s = max(self.fastest_mm_s, self._peak_mm_s)
+        if self._peak_mm_s < self._needed * self._rapid_mm_s:
+            self.slow += 1
+        elif self._level_rows * self._period_s < PLATEAU_S:
+            self.short += 1
+        else:
+            self.usable, self.usable_s = self.usable + 1, now_s
+        self._peak_mm_s, self._level_mm_s, self._level_rows = 0.0, 0.0, 0
+
+    def _compare(self, moved_mm: float, speed_rad_s: Float, seconds: Float) -> None:
+        """Regress the position's way on the speed's, block by block; what hardly moves, or has a gap, tells nothing."""
+        turned_mm = float(np.sum((speed_rad_s[1:] + speed_rad_s[:-1]) / 2 * seconds)) * self._mm_per_rad
+        far = max(abs(turned_mm), abs(moved_mm))
+        if LEAST_MM < far < math.inf and seconds.max() <= LONGEST_GAP_S:
+            self._agreement[0] += moved_mm * turned_mm
+            self._agreement[1] += turned_mm**2
+            self._agreement[2] += far
+
+    @property
+    def scale(self) -> float | None:
+        """How far the position goes by what the speed says; None until the axis has gone far enough."""
+        across, own, travel_mm = self._agreement
+        return across / own if travel_mm >= SCALE_TRAVEL_MM and own > 0.0 else None
+
+    def status(self) -> dict[str, Any]:
+        """Return the counts, and how fast the fastest move was."""
+        return {
+            "seen": self.seen,
+            "too_slow": self.slow,
+            "without_plateau": self.short,
+            "fastest_mm_s": round(self.fastest_mm_s, 3),
+            "position_by_speed": None if self.scale is None else round(self.scale, 5),
+        }
+
+    def trouble(self, windows: int, now_s: float) -> tuple[str, str] | None:
+        """Return class and sentence of what keeps the moves from being used; None when nothing does.
+
+        ``windows`` is how many of them became one.
+        """
+        scale, fastest = self.scale, self.fastest_mm_s
+        if scale is not None and abs(scale - 1.0) > SCALE_TOLERANCE:
+            text = f"the position goes {scale:.3g} times as far as the speed says"
+            return "ScaleSuspect", f"{text}; correct increments_per_rev, the drive's profile or its sign"
+        if self.seen >= FEW and fastest > TOO_FAST * self._rapid_mm_s:
+            return "PitchSuspect", (
+                f"moves reach {fastest:.4g} mm/s, {fastest / self._rapid_mm_s:.2f} times the rapid speed of the"
+                " config; correct screw_pitch_mm, increments_per_rev or rapid_speed_mm_s"
+            )
+        if self.seen < FEW or windows:
+            return None
+        return self._unused(now_s)
+
+    def _unused(self, now_s: float) -> tuple[str, str] | None:
+        if self.slow:
+            return "MovesNotUsed", (
+                f"{self.seen} moves seen, none used: {self.slow} stay below {self._needed:.0%} of the rapid speed of"
+                f" {self._rapid_mm_s:g} mm/s, the fastest at {self.fastest_mm_s:.4g}; make rapids at full override, or"
+                " correct rapid_speed_mm_s or screw_pitch_mm"
+            )
+        if self.usable >= FEW and now_s - self.usable_s > PATIENCE_S:
+            return "MovesNotUsed", (
+                f"{self.usable} fast moves seen, none used: no event of the G0 source {self._source} came; correct"
+                ' [g0] or use source = "inferred"'
+            )
+        if self.short >= FEW and not self.usable:
+            return "MovesNotUsed", (
+                f"{self.short} fast moves seen, none used: no plateau of {PLATEAU_S:g} s; make longer rapids"
+            )
+        return None

@@ -1,0 +1,236 @@
+"""What a correction really leaves: the contour error of each pass of the armed program, by the drives' own feedback.
+
+The daemon hears the NC's targets and the drives' positions; from the first motion after the arming to the program's
+end they are compared as a prediction is. Samples are taken in the loop, all else is done in ``digest``, in a thread.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fdhil.config import MachineConfig
+from fdhil.prediction import contour_error_um
+from fdhil.prediction.contour import WINDOW_S
+from fdhil.prediction.gain import plus_minus
+from fdhil.records import AxisSamples, Float, Int, Notice
+
+Rows = tuple[Int, Float, Float]
+"""Tick, demand and position (n,) of an axis."""
+KEPT = 20
+CHUNK_S = 2.0  # that is compared at once
+LATE_S = 0.5  # by which samples may come behind the guard's word
+MOST_BLOCKS = 1000
+MOST_LEAD_S = 10.0
+TOLERANCE_INCREMENTS = 2.5
+WORSE = 1.05  # times the error predicted without a correction
+
+
+class _Ended(NamedTuple):
+    """A pass that the guard has ended; its last samples may come until ``due_s``."""
+
+    running: Pass
+    due_s: float
+    cause: str
+    summary: Mapping[str, Any]
+
+
+class Passes:
+    """The pass that runs, and what the last ones measured."""
+
+    def __init__(self, config: MachineConfig) -> None:
+        self._config = config
+        self._count = Counter[str]()
+        self._running: Pass | None = None
+        self._ended: deque[_Ended] = deque()
+        self._taken: deque[AxisSamples] = deque()
+        self.told: deque[Mapping[str, Any]] = deque(maxlen=KEPT)
+
+    def begin(self, demand: Mapping[str, Sequence[int]], rows: int | None) -> None:
+        """A program is about to be armed: the first rows of its table in increments, and how many there are."""
+        self._running = Pass(self._config, demand, rows)
+
+    def forget(self) -> None:
+        """It was not armed."""
+        self._running = None
+
+    def take(self, samples: AxisSamples) -> None:
+        """Take samples while a pass may run."""
+        if self._running is not None or self._ended:
+            self._taken.append(samples)
+
+    def end(self, cause: str, summary: Mapping[str, Any]) -> None:
+        """The guard has ended the correction."""
+        if self._running is not None:
+            self._ended.append(_Ended(self._running, time.monotonic() + LATE_S, cause, summary))
+            self._running = None
+
+    def digest(self) -> list[Notice]:
+        """Go on with what was taken (in a thread); return what the passes that are over have shown."""
+        hearing = [each.running for each in tuple(self._ended)]
+        if self._running is not None:
+            hearing.append(self._running)
+        while self._taken:
+            samples = self._taken.popleft()
+            for each in hearing:
+                each.take(samples)
+        notices = []
+        while self._ended and time.monotonic() >= self._ended[0].due_s:
+            ended = self._ended.popleft()
+            measured = ended.running.measured()
+            notices += [] if measured is None else [self._tell(ended, measured)]
+        return notices
+
+    def _tell(self, ended: _Ended, measured: Mapping[str, Any]) -> Notice:
+        summary = ended.summary
+        digest = str(summary["program_digest"])
+        self._count[digest] += 1
+        told = {
+            "program": summary["program"],
+            "program_digest": digest,
+            "pass": self._count[digest],
+            "ended_by": ended.cause,
+            **measured,
+            "predicted": {key: summary["after"].get(key) for key in ("rms_um", "uncertainty_um")},
+            "predicted_without": {"rms_um": summary["before"]["rms_um"]},
+        }
+        text = _text(told)
+        self.told.append({**told, "text": text})
+        return _notice(told, text)
+
+
+class Pass:
+    """One pass: rows of all axes of the table, joined by their ticks; ``rows`` None: to the program's end."""
+
+    def __init__(self, config: MachineConfig, demand: Mapping[str, Sequence[int]], rows: int | None) -> None:
+        self._left = rows if rows is not None else sys.maxsize
+        self._axes = tuple(demand)
+        self._dt_s = config.machine.sync_period_s
+        self._margin = round(WINDOW_S / self._dt_s)
+        scales = [config.axis[a].scaling.sign * config.axis[a].scaling.increments_per_mm for a in self._axes]
+        path = np.column_stack([np.asarray(demand[a], dtype=np.float64) for a in self._axes]) / scales
+        self._tolerance_mm = TOLERANCE_INCREMENTS / np.abs(scales)
+        self._start_mm: Float = path[0]
+        leaves = np.flatnonzero(self._away(path))
+        self._lead = min(int(leaves[0]) if leaves.size else 0, round(MOST_LEAD_S / self._dt_s))
+        self._waiting: dict[str, list[Rows]] = {axis: [] for axis in self._axes}
+        self._demand: Float = np.empty((0, len(self._axes)))
+        self._position: Float = np.empty((0, len(self._axes)))
+        self._first = 0  # row of the buffer from which on nothing was compared yet
+        self._begun = self._at_start = False
+        self._rows, self._squares, self._max_um = 0, 0.0, 0.0
+        self._following = np.zeros(len(self._axes))
+
+    def _away(self, rows_mm: Float) -> Any:
+        return np.any(np.abs(rows_mm - self._start_mm) > self._tolerance_mm, axis=1)
+
+    def take(self, samples: AxisSamples) -> None:
+        """Take a block of one axis; the rows that all axes have by then go on."""
+        if samples.axis not in self._waiting or samples.tick.size == 0:
+            return
+        self._waiting[samples.axis].append((samples.tick, samples.demand_mm, samples.position_mm))
+        if not all(self._waiting.values()):
+            if len(self._waiting[samples.axis]) > MOST_BLOCKS:  # another axis is not heard at all
+                self._waiting[samples.axis].clear()
+            return
+        blocks = {axis: _joined(waiting) for axis, waiting in self._waiting.items()}
+        self._waiting = {axis: [] for axis in self._axes}
+        if any(np.any(np.diff(tick) <= 0) for tick, _, _ in blocks.values()):  # the SYNC count began anew
+            return
+        last = min(int(tick[-1]) for tick, _, _ in blocks.values())
+        for axis, (tick, demand, position) in blocks.items():
+            if (later := tick > last).any():
+                self._waiting[axis].append((tick[later], demand[later], position[later]))
+        self._add(*_common([(t[t <= last], d[t <= last], p[t <= last]) for t, d, p in blocks.values()]))
+
+    def _add(self, demand: Float, position: Float) -> None:
+        left = None if self._begun else self._departure(demand)
+        self._demand = np.concatenate([self._demand, demand])
+        self._position = np.concatenate([self._position, position])
+        if left is not None:
+            self._begun = True
+            self._first = max(0, len(self._demand) - len(demand) + left - self._lead)
+        if not self._begun:
+            keep = self._lead + 2 * self._margin
+            self._demand, self._position = self._demand[-keep:], self._position[-keep:]
+            return
+        while len(self._demand) >= self._first + self._margin + round(CHUNK_S / self._dt_s):
+            self._compare(len(self._demand) - self._margin)
+
+    def _departure(self, demand: Float) -> int | None:
+        """Return the row in which the demand leaves the program's start, having stood there; None while it does not."""
+        away = self._away(demand)
+        stood = np.concatenate([[self._at_start], ~away[:-1]])
+        leaves = np.flatnonzero(away & stood)
+        self._at_start = not away[-1] if away.size else self._at_start
+        return int(leaves[0]) if leaves.size else None
+
+    def _compare(self, end: int) -> None:
+        """Add the errors of the rows up to ``end``; what no later row needs is dropped."""
+        end = max(self._first, min(end, self._first + self._left))
+        if end > self._first:
+            position = self._position[self._first : end]
+            error = contour_error_um(self._demand, position, self._dt_s, self._first)
+            self._rows, self._left = self._rows + error.size, self._left - error.size
+            self._squares += float(error @ error)
+            self._max_um = max(self._max_um, float(error.max()))
+            self._following += np.sum((position - self._demand[self._first : end]) ** 2, axis=0) * 1e6
+        drop = max(0, end - self._margin) if self._left else len(self._demand)
+        self._demand, self._position, self._first = self._demand[drop:], self._position[drop:], max(0, end - drop)
+
+    def measured(self) -> Mapping[str, Any] | None:
+        """Return what was measured so far; None when the program has not begun."""
+        if self._begun:
+            self._compare(len(self._demand))
+        if not self._rows:
+            return None
+        following = np.sqrt(self._following / self._rows)
+        return {
+            "rows": self._rows,
+            "measured": {"rms_um": math.sqrt(self._squares / self._rows), "max_um": self._max_um},
+            "following_rms_um": dict(zip(self._axes, following.tolist(), strict=True)),
+        }
+
+
+def _joined(blocks: Sequence[Rows]) -> Rows:
+    tick, demand, position = (np.concatenate([block[k] for block in blocks]) for k in range(3))
+    return tick, demand, position
+
+
+def _common(axes: Sequence[Rows]) -> tuple[Float, Float]:
+    """Return demand and position (n, axes) of the ticks that all axes have, whole rows only."""
+    ticks = axes[0][0]
+    for tick, _, _ in axes[1:]:
+        ticks = np.intersect1d(ticks, tick, assume_unique=True)
+    rows = [np.searchsorted(tick, ticks) for tick, _, _ in axes]
+    demand = np.column_stack([axis[1][at] for axis, at in zip(axes, rows, strict=True)])
+    position = np.column_stack([axis[2][at] for axis, at in zip(axes, rows, strict=True)])
+    whole = np.isfinite(demand).all(axis=1) & np.isfinite(position).all(axis=1)
+    return demand[whole], position[whole]
+
+
+def _text(told: Mapping[str, Any]) -> str:
+    """Return what a pass measured beside what was predicted, as one line."""
+    name, measured, half = Path(told["program"]).name, told["measured"], told["predicted"]["uncertainty_um"]
+    spread = "" if half is None else f" {plus_minus(half, 2)}"
+    text = f"pass {told['pass']} of {name}: contour error measured {measured['rms_um']:.2f} um RMS,"
+    text += f" {measured['max_um']:.1f} at most (predicted {told['predicted']['rms_um']:.2f}{spread};"
+    text += f" without correction {told['predicted_without']['rms_um']:.1f} predicted)"
+    return text if told["ended_by"] == "Finished" else f"{text}; it was ended by {told['ended_by']}"
+
+
+def _notice(told: Mapping[str, Any], text: str) -> Notice:
+    """Say what was measured, and louder where it is not what was promised."""
+    measured, half = told["measured"]["rms_um"], told["predicted"]["uncertainty_um"]
+    if measured > WORSE * told["predicted_without"]["rms_um"]:
+        return Notice("PassMeasured", "MAJOR", f"{text}: worse than without; leave it off and identify again")
+    if half is not None and measured > told["predicted"]["rms_um"] + half:
+        return Notice("PassMeasured", "minor", f"{text}: more than predicted; identify again")
+    return Notice("PassMeasured", "info", text)

@@ -1,0 +1,195 @@
+"""What a drive holds of our offset, and whether it may be believed. Pure, part of the core.
+
+A value is known when three TPDOs in a row showed it, each at its own time. It is believed, and only then sent, when it
+is also within the compiled ceiling, agrees with the drive's own demand (0x6062), and the drive is as it was
+commissioned.
+"""
+
+from __future__ import annotations
+
+from fdhil.guard import feedforward
+from fdhil.guard.conditions import AGREEING, ARMING_INTERLOCKS, View, known
+from fdhil.guard.feedforward import FeedMode
+from fdhil.guard.feeding import is_fed
+from fdhil.guard.interlocks import Alarm, Reaction
+from fdhil.guard.path import EPS
+from fdhil.guard.settings import AxisSettings, Settings
+from fdhil.guard.state import SENDING, AxisState, Inputs, Mode, Request, State
+
+Views = tuple[View, ...]
+Alarms = tuple[Alarm, ...]
+
+CEILING_MM = 0.25
+PERIODS_AWAITED = 2 * AGREEING
+"""TPDOs in which a value must have become known: three in a row, and as many that were in doubt."""
+IMPLAUSIBLE = frozenset({"StaleData", "TargetLost", "FollowingError", "Implausible", "PdoLength"})
+OF_THE_RECORD = frozenset({"NotCommissioned", "RecordVoid", "PdoMapping"})
+
+
+def ceiling(own: AxisSettings) -> int:
+    """Return the largest offset, in increments, that may ever be sent, whatever was read or configured."""
+    return int(CEILING_MM * own.increments_per_mm + 1e-9)
+
+
+def patience(settings: Settings) -> int:
+    """How many SYNC to wait for a value to become known."""
+    return PERIODS_AWAITED * max([axis.read_back_every for axis in settings.axes])
+
+
+def doubts(views: Views, alarms: Alarms) -> Alarms:
+    """Return all that forbids believing what the drives hold; empty: it may be ramped to zero from there."""
+    found = [alarm for alarm in alarms if alarm.code in IMPLAUSIBLE]
+    for view in views:
+        found += [
+            Alarm(code, view[0].name) for code, good in ARMING_INTERLOCKS if code in OF_THE_RECORD and not good(*view)
+        ]
+        why = _doubt(view)
+        if why:
+            found.append(Alarm("OffsetDoubtful", view[0].name, why))
+    return tuple(found)
+
+
+def _doubt(view: View) -> str:
+    own, _seen, axis = view
+    held = known(axis)
+    if held is None:
+        return "three TPDOs in a row do not agree on it"
+    if not abs(held) <= ceiling(own):
+        return f"{_um(own, held)}: beyond the ceiling of {CEILING_MM * 1e3:.0f} um"
+    if not axis.off_demand <= EPS:
+        return f"{_um(own, held)}: its demand (0x6062) says otherwise"
+    return ""
+
+
+def _um(own: AxisSettings, held: int) -> str:
+    return f"{own.sign * held / own.increments_per_mm * 1e3:.1f} um may still be applied"
+
+
+def in_doubt(views: Views, doubtful: Alarms) -> Alarm:
+    """Return the cause of freezing: the axis that shows an offset, how much, and the first thing that is wrong."""
+    own, _, axis = next((view for view in views if view[2].read_back), views[0])
+    told = next((a for a in doubtful if a.axis == own.name and a.code == "OffsetDoubtful"), None)
+    if told is not None:
+        return told
+    shown = "" if axis.read_back is None else f"{_um(own, axis.read_back)}: "
+    return Alarm("OffsetDoubtful", own.name, shown + doubtful[0].cause)
+
+
+def may_stand(state: State, settings: Settings) -> tuple[int | None, ...]:
+    """Return what may still be applied in each drive, in increments; 0: it is known that nothing is, None: unknown."""
+    return tuple([_may_stand(state, axis) for axis, _ in zip(state.axes, settings.axes, strict=True)])
+
+
+def _may_stand(state: State, axis: AxisState) -> int | None:
+    if state.mode in SENDING and not state.measuring:
+        return axis.read_back if axis.echo_misses else axis.sent[0]
+    held = known(axis)
+    if held is None and state.adopt_checked and is_zero(axis):
+        return 0
+    if held is None and state.mode is Mode.FROZEN:
+        return axis.sent[0] or None  # the last that was sent; zeros that were not read back say nothing
+    return held
+
+
+def is_zero(axis: AxisState) -> bool:
+    """Whether nothing but zeros was sent, and the drive has shown one since."""
+    return not any(axis.sent) and (axis.zero_shown or known(axis) == 0)
+
+
+def adopt_refusals(state: State, request: Request, alarms: Alarms, views: Views) -> Alarms:
+    refused = [alarm for alarm in alarms if alarm.reaction is Reaction.FREEZE]
+    if not _nothing_held(state):
+        refused += doubts(views, alarms)
+    if state.mode not in (Mode.OFF, Mode.FROZEN) or state.feed.mode is not FeedMode.OFF:
+        refused.append(Alarm("NotOff", detail=state.mode.value))
+    if request.token_valid is not True:
+        refused.append(Alarm("AuthRequired"))
+    return tuple(refused)
+
+
+def _nothing_held(state: State) -> bool:
+    """Whether all drives are known to hold nothing: then there is nothing to send either."""
+    return not is_fed(state) and all(known(axis) == 0 for axis in state.axes)
+
+
+def adopting(state: State, settings: Settings) -> State:
+    """Take over what the drives hold: the ramp starts from the value read; speed and torque get zeros."""
+    cause = Alarm("StaleOffset")
+    if _nothing_held(state):
+        axes = tuple([axis._replace(sent=(0,) * len(axis.sent), offset=0, rate=0) for axis in state.axes])
+        return state._replace(mode=Mode.OFF, axes=axes, adopt_checked=True, cause=cause)
+    feed = feedforward.zeroing(len(state.axes), cause) if is_fed(state) and settings.feeds else state.feed
+    state = state._replace(mode=Mode.ADOPT, zeros_sent=0, adopt_checked=True, cause=cause, feed=feed)
+    return _from_measured(state)
+
+
+def _from_measured(state: State) -> State:
+    return state._replace(axes=tuple([at_rest(axis, known(axis) or 0) for axis in state.axes]), measuring=0)
+
+
+def compared(state: State, request: Request, settings: Settings) -> tuple[State, Alarms]:
+    """A record holds again where the drive was found to be the one signed off; where it is another, it is void."""
+    refused = [] if request.token_valid is True else [Alarm("AuthRequired")]
+    if state.sending:
+        refused.append(Alarm("NotOff", detail=state.mode.value))
+    if refused:
+        return state, tuple(refused)
+    axes = []
+    for own, axis in zip(settings.axes, state.axes, strict=True):
+        found = request.compared.get(own.name)
+        void = axis.record_void if found is None else not own.record or found != own.record
+        if found is not None and void:
+            refused.append(Alarm("RecordVoid", own.name, "it differs from the record that this guard knows"))
+        axes.append(axis._replace(record_void=void))
+    return state._replace(axes=tuple(axes)), tuple(refused)
+
+
+def at_rest(axis: AxisState, offset: int) -> AxisState:
+    return axis._replace(offset=offset, rate=0, sent=(offset,) * len(axis.sent), echo_misses=0, zero_shown=False)
+
+
+def unread(state: State) -> State:
+    """What the drives hold is to be read anew."""
+    return state._replace(
+        axes=tuple([axis._replace(read_back=None, readings=0, zero_shown=False) for axis in state.axes])
+    )
+
+
+def frozen(state: State, cause: Alarm) -> State:
+    """Stop sending: what the drive holds is unknown, unless only zeros were sent and shown."""
+    if not state.measuring and all(map(is_zero, state.axes)):
+        return state._replace(mode=Mode.OFF, cause=cause, places=())
+    axes = tuple([axis._replace(read_back=None, readings=0) for axis in state.axes])
+    return state._replace(mode=Mode.FROZEN, cause=cause, places=(), axes=axes, measuring=0)
+
+
+def adopt_at_start(state: State, inputs: Inputs, alarms: Alarms, views: Views, settings: Settings) -> State:
+    """Once after the start: an offset that a drive holds is ramped to zero from its value, or frozen if in doubt."""
+    if state.adopt_checked or state.mode is not Mode.OFF or not inputs.sync:
+        return state
+    unsafe = any(a.code in ("SyncJitter", "OffsetHijack", "BusLocked") or a.reaction is Reaction.FREEZE for a in alarms)
+    if unsafe:
+        return state
+    if _nothing_held(state):
+        return state._replace(adopt_checked=True)
+    if not is_fed(state) and not any(axis.read_back for axis in state.axes):
+        return state._replace(unknown_for=0)
+    doubtful = doubts(views, alarms)
+    if not doubtful:
+        return adopting(state, settings)
+    if state.unknown_for < patience(settings):
+        return state._replace(unknown_for=state.unknown_for + 1)
+    return state._replace(mode=Mode.FROZEN, cause=in_doubt(views, doubtful), adopt_checked=True)
+
+
+def measure(state: State, alarms: Alarms, views: Views, settings: Settings) -> State:
+    """After another node's offset frame nothing is sent until the drives show what they hold; then from there to 0."""
+    if not state.measuring:
+        return state
+    views = tuple([(own, seen, axis) for (own, seen, _), axis in zip(views, state.axes, strict=True)])
+    doubtful = doubts(views, alarms)
+    if not doubtful:
+        return _from_measured(state)
+    if state.measuring < patience(settings):
+        return state._replace(measuring=state.measuring + 1)
+    return frozen(state, in_doubt(views, doubtful))

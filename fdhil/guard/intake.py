@@ -1,0 +1,81 @@
+"""The table on its way in: taken from its descriptor, then checked a few rows a turn, so that no SYNC waits for it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fdhil.guard import table
+from fdhil.guard.control import Client
+from fdhil.guard.interlocks import Alarm
+from fdhil.guard.journal import Journal
+from fdhil.guard.path import Path
+from fdhil.guard.requests import Document
+from fdhil.guard.settings import Settings
+from fdhil.guard.state import Mode, State
+
+ROWS_PER_TURN = 64
+ROWS_PER_IDLE_TURN = 1024
+MAX_RUNNING_PIECE_BYTES = 1 << 18
+
+
+class Intake:
+    """``path`` is the table in force; one more at a time is on its way in."""
+
+    def __init__(self, settings: Settings, journal: Journal) -> None:
+        self.path: Path | None = None
+        self._settings = settings
+        self._journal = journal
+        self._loading: tuple[table.Loading, Client, Document] | None = None
+        self._taken = 0
+        self._refused = ""
+
+    @property
+    def busy(self) -> bool:
+        """Whether a table is on its way in."""
+        return self._loading is not None
+
+    def begin(self, client: Client, document: Document, state: State) -> None:
+        """Take the table that came with a request; the answer follows when its rows are checked."""
+        running = state.sending or state.mode is not Mode.OFF
+        try:
+            if self._loading is not None:
+                raise table.TableRefused("TableBusy", "another table is being checked; wait for its answer")
+            most_bytes = MAX_RUNNING_PIECE_BYTES if running else table.MAX_TABLE_BYTES
+            loading = self._joined(table.read_sealed(client.descriptor, most_bytes), state, running)
+            if running and loading.joined.first == 0 and loading.next_row == 0:
+                raise table.TableRefused("TableBusy", Alarm("TableBusy").cause)
+        except table.TableRefused as refusal:
+            self._refuse(client, document, refusal)
+        else:
+            self._taken += 1
+            self._loading = loading, client, document
+        client.release()
+
+    def _joined(self, body: bytes, state: State, running: bool) -> table.Loading:
+        axes = self._settings.axes
+        keep = state.places[0].row - 2 if running and state.places else 0
+        limits, travel = tuple(axis.limits for axis in axes), tuple(axis.travel for axis in axes)
+        return table.begin(body, self._taken + 1, [axis.name for axis in axes], limits, self.path, keep, travel)
+
+    def check(self, state: State) -> None:
+        """Check the next rows of the table on its way in; a few at a time while frames have to leave in time."""
+        if self._loading is None:
+            return
+        loading, client, document = self._loading
+        try:
+            loading.check(ROWS_PER_TURN if state.sending else ROWS_PER_IDLE_TURN)
+        except table.TableRefused as refusal:
+            self._loading = None
+            self._refuse(client, document, refusal)
+            return
+        if loading.done:
+            self._loading, self.path = None, loading.joined
+            rows = [loading.joined.first, loading.joined.end]
+            client.reply(document, ok=True, sequence=loading.joined.sequence, rows=rows)
+
+    def _refuse(self, client: Client, document: dict[str, Any], refusal: table.TableRefused) -> None:
+        if str(refusal) != self._refused:  # the same again and again is told once
+            self._journal.write("table_refused", code=refusal.code, text=str(refusal))
+        self._refused = str(refusal)
+        advice = Alarm(refusal.code).action
+        client.reply(document, ok=False, code=refusal.code, text=str(refusal), advice=advice)

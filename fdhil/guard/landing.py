@@ -1,0 +1,56 @@
+"""The last way to zero, when the loop itself has failed: from what was sent last, by the limits alone, at each SYNC."""
+
+from __future__ import annotations
+
+import select
+import time
+
+from fdhil.cia402 import COB_SYNC, pack
+from fdhil.guard.can_socket import BusDown, CanSocket
+from fdhil.guard.feedforward import FeedMode
+from fdhil.guard.limits import follow
+from fdhil.guard.settings import Settings
+from fdhil.guard.state import SENDING, State
+
+ZEROS = 5
+
+
+def land(state: State, settings: Settings, can: CanSocket) -> tuple[int, ...]:
+    """Ramp the offsets to zero and return what was sent last, in increments per axis; it stops when SYNC or bus stop.
+
+    Speed and torque offsets are set to zero at once. Nothing is judged and nothing is read back.
+    """
+    moving = [(axis.offset, axis.rate) for axis in state.axes]
+    feeds = () if state.feed.mode is FeedMode.OFF else settings.feeds
+    zeros = 0 if state.sending else ZEROS
+    try:
+        while zeros < ZEROS and _sync(can, settings.silence_s):
+            if state.mode in SENDING:
+                moving = _step(settings, can, moving)
+            for feed in feeds:
+                can.send(feed.pdo.cob_id, pack(feed.pdo.entries, (0, 0)))
+            zeros += not any(offset for offset, _ in moving)
+    except BusDown:
+        pass
+    return tuple([offset for offset, _ in moving])
+
+
+def _step(settings: Settings, can: CanSocket, moving: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Send the next offsets; return them with their rates. What does not leave stands."""
+    stepped = []
+    for axis, (offset, rate) in zip(settings.axes, moving, strict=True):
+        following = follow(axis.limits, offset, rate, 0, 0)
+        left = can.send(axis.offset.cob_id, pack(axis.offset.entries, (following,)))
+        stepped.append((following, following - offset) if left else (offset, 0))
+    return stepped
+
+
+def _sync(can: CanSocket, silence_s: float) -> bool:
+    """Wait for the next SYNC; False when none comes for too long."""
+    poll = select.poll()
+    poll.register(can, select.POLLIN)
+    end_s = time.monotonic() + silence_s
+    while (left_s := end_s - time.monotonic()) > 0:
+        if poll.poll(left_s * 1000) and any(cob_id == COB_SYNC for cob_id, _, _ in can.receive()):
+            return True
+    return False

@@ -1,0 +1,68 @@
+"""What the guard says about itself: its status document, and offsets in the units and the direction of the axis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from fdhil.guard.adoption import may_stand
+from fdhil.guard.feedforward import FeedMode
+from fdhil.guard.interlocks import Alarm
+from fdhil.guard.path import Path
+from fdhil.guard.settings import Settings
+from fdhil.guard.state import State
+
+
+def told(alarm: Alarm) -> dict[str, str]:
+    """Return an alarm as it is given to clients."""
+    return {"code": alarm.code, "axis": alarm.axis, "text": alarm.cause, "advice": alarm.action}
+
+
+def in_um(offsets: Sequence[int | None], settings: Settings) -> dict[str, float | None]:
+    """Return increments per axis as um in the axis' direction; None stays."""
+    pairs = zip(settings.axes, offsets, strict=True)
+    return {s.name: None if o is None else round(s.sign * o / s.increments_per_mm * 1e3, 3) for s, o in pairs}
+
+
+def offset_um(state: State, settings: Settings) -> dict[str, float | None]:
+    """Return what was sent last."""
+    return in_um([axis.offset for axis in state.axes], settings)
+
+
+def may_stand_um(state: State, settings: Settings) -> dict[str, float | None]:
+    """Return what may still be applied in each drive: 0.0 when it is known that nothing is, None when it is unknown."""
+    return in_um(may_stand(state, settings), settings)
+
+
+def sentence(standing_um: Mapping[str, float | None]) -> str:
+    """Say what may still be applied; empty when it is known that nothing is."""
+    left = [
+        f"{'an unknown offset' if um is None else f'{um:.1f} um'} on {x}" for x, um in standing_um.items() if um != 0
+    ]
+    return f"{' and '.join(left)} may still be applied" if left else ""
+
+
+def document(state: State, settings: Settings, path: Path | None, not_good: Sequence[Alarm]) -> dict[str, Any]:
+    """Return what state and table say; the loop adds what it alone knows."""
+    cause, feed = state.cause or state.feed.cause, state.feed
+    return {
+        "state": state.mode.value if feed.mode is FeedMode.OFF else "FEEDFORWARD",
+        "cause": told(cause) if cause else None,
+        "feedforward": {
+            "state": feed.mode.value,
+            "cause": told(feed.cause) if feed.cause else None,
+            "limited_cycles": feed.limited,
+            "applied": {s.name: list(p) for s, p in zip(settings.axes, feed.applied, strict=False)},
+        },
+        "tick": state.tick,
+        "good_for": state.good_for,
+        "row": state.places[0].row if state.places else None,
+        "rows": [path.first, path.end] if path else None,
+        "table_sequence": path.sequence if path else 0,
+        "program_digest": path.program_digest if path else "",
+        "offset_um": offset_um(state, settings),
+        "may_stand_um": may_stand_um(state, settings),
+        "missed_cycles": state.missed,
+        "late_frames": {s.name: a.late_echoes for s, a in zip(settings.axes, state.axes, strict=True)},
+        "not_good": [told(alarm) for alarm in not_good],
+    }

@@ -1,0 +1,175 @@
+"""Other feeds for the lines of a program: its F words are replaced, everything else is kept byte for byte."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from fdhil.errors import ProgramError
+from fdhil.program.budget import Budget
+from fdhil.program.interpreter import Interpreter, interpret
+from fdhil.program.modal import MM_PER_INCH
+from fdhil.program.motions import Arc, Feed, Motion
+
+_COMMENT = re.compile(r"\([^)]*\)?|;.*")
+_NUMBER = re.compile(r"[+-]?\s*(?:\d[\d\s]*\.?[\d\s]*|\.[\d\s]+)")
+_UNITS = re.compile(r"[Gg]\s*0*(2[01])(?![\d.])")
+_DIGITS = 3
+_SAME = 1e-6  # relative, of a feed that is written and read again
+
+
+@dataclass(frozen=True, slots=True)
+class Word:
+    """A word's letter, and where its value stands in the line."""
+
+    letter: str
+    start: int
+    end: int
+
+
+def with_feeds(program: Path, shares: Mapping[int, float], budget: Budget) -> bytes:
+    """Return the program with the feed of each line in ``shares`` times its share (0..1, cut to three digits).
+
+    The new program is interpreted again: it orders the same motions, and of the other lines the same feeds.
+    ProgramError where that cannot be had by F words alone, and for a program in more files than one.
+    """
+    run = Interpreter(program, budget, False)
+    motions = list(run.run())
+    if len(run.files) > 1:
+        text = "its subroutines lie in files of their own, whose feeds cannot be written; write them by hand"
+        raise ProgramError(0, "", f"{program}: {text}")
+    feeds = _feeds(motions)
+    raw = io.BytesIO(program.read_bytes()).readlines()
+    line = 0
+    for everywhere in (False, True):
+        made = _Writer(feeds, shares, everywhere).lines(raw)
+        found = _first_difference(motions, made, shares, budget)
+        if found is None:
+            return b"".join(made)
+        line = found
+    text = "its new feed cannot be written as an F word, since other passes over it share that word; write it by hand"
+    raise ProgramError(line, "", text)
+
+
+def cut(value: float) -> float:
+    """Return a feed cut to three digits: rounded up it would not be held."""
+    if value <= 0.0:
+        return 0.0
+    unit = 10.0 ** (math.floor(math.log10(value)) - _DIGITS + 1)
+    return math.floor(value / unit * (1 + 1e-9)) * unit
+
+
+def words(text: str) -> Iterator[Word]:
+    """Yield the words of a line whose comments are blanked; parameters that it sets are none."""
+    at = 0
+    while at < len(text):
+        letter = text[at].lower()
+        if letter.isalpha():
+            end = _value_end(text, at + 1)
+            yield Word(letter, at + 1, end)
+            at = max(end, at + 1)
+        elif letter in "#=":
+            at = _value_end(text, at if letter == "#" else at + 1)
+        else:
+            at += 1
+
+
+def _value_end(text: str, at: int) -> int:
+    """Return where the value that begins at ``at`` ends: a number, a parameter, brackets, a function of brackets."""
+    while at < len(text) and text[at].isspace():
+        at += 1
+    if number := _NUMBER.match(text, at):
+        return at + len(number.group().rstrip())
+    while at < len(text) and (text[at] in "#+-" or text[at].isalpha() or text[at].isspace()):
+        at += 1
+    if text.startswith("<", at):
+        return max(text.find(">", at) + 1, at + 1)
+    if number := _NUMBER.match(text, at):
+        return at + len(number.group().rstrip())
+    return _brackets_end(text, at)
+
+
+def _brackets_end(text: str, at: int) -> int:
+    depth = 0
+    while at < len(text):
+        depth += (text[at] == "[") - (text[at] == "]")
+        at += 1
+        if depth <= 0 and not text.startswith("/[", at):  # ATAN[y]/[x]
+            return at
+    return at
+
+
+class _Writer:
+    """Writes the lines anew in their order; ``everywhere`` gives each line that feeds a feed of its own."""
+
+    def __init__(self, feeds: Mapping[int, float], shares: Mapping[int, float], everywhere: bool) -> None:
+        self._feeds, self._shares, self._everywhere = feeds, shares, everywhere
+        self._in_force = ""  # the F word's value as the program has it
+        self._changed = False  # another one is in force in what is written
+        self._scale = 1.0
+
+    def lines(self, raw: Sequence[bytes]) -> list[bytes]:
+        """Return the new lines."""
+        return [self._line(line.decode("latin-1"), k).encode("latin-1") for k, line in enumerate(raw, 1)]
+
+    def _line(self, raw: str, number: int) -> str:
+        code = _COMMENT.sub(lambda found: " " * len(found.group()), raw.rstrip("\r\n"))
+        if units := _UNITS.search(code):
+            self._scale = MM_PER_INCH if units.group(1) == "20" else 1.0
+        feed = next((word for word in words(code) if word.letter == "f"), None)
+        share = self._shares.get(number, 1.0) if number in self._feeds else 1.0
+        if feed is not None:
+            self._in_force = code[feed.start : feed.end].strip()
+            self._changed = share < 1.0
+            return raw if share == 1.0 else f"{raw[: feed.start]}{self._value(number, share)}{raw[feed.end :]}"
+        if number not in self._feeds or not (share < 1.0 or self._changed or self._everywhere):
+            return raw
+        self._changed = share < 1.0
+        end = len(code.rstrip())
+        return f"{raw[:end]} F{self._value(number, share)}{raw[end:]}"
+
+    def _value(self, number: int, share: float) -> str:
+        """Return the value of an F word that gives a line its share of the feed it has."""
+        if _NUMBER.fullmatch(self._in_force) is None and not self._everywhere:
+            return f"[{_text(cut(share))} * {self._in_force}]" if share < 1.0 else self._in_force
+        value = self._feeds[number] / self._scale if self._everywhere else float("".join(self._in_force.split()))
+        if share == 1.0:
+            return _text(value) if self._everywhere else self._in_force
+        return _text(cut(value * share))
+
+
+def _text(value: float) -> str:
+    """Return a number as programs have it: no exponent."""
+    return f"{value:.9f}".rstrip("0").rstrip(".")
+
+
+def _feeds(motions: Sequence[Motion]) -> dict[int, float]:
+    return {motion.line: motion.feed for motion in motions if isinstance(motion, Feed | Arc)}
+
+
+def _first_difference(
+    motions: Sequence[Motion], made: Sequence[bytes], shares: Mapping[int, float], budget: Budget
+) -> int | None:
+    """Return the first line at which the new program does not what it must; None when it does."""
+    try:
+        new = list(interpret((line.decode("latin-1") for line in made), budget))
+    except ProgramError as error:
+        return error.line
+    for before, now in zip(motions, new, strict=False):
+        if not _as_wanted(before, now, shares):
+            return before.line
+    return None if len(motions) == len(new) else motions[min(len(motions), len(new)) - 1].line
+
+
+def _as_wanted(before: Motion, now: Motion, shares: Mapping[int, float]) -> bool:
+    """Whether a motion is the same but for a feed that is its share, cut to three digits."""
+    if not isinstance(before, Feed | Arc) or not isinstance(now, Feed | Arc):
+        return before == now
+    share = shares.get(before.line, 1.0)
+    most = before.feed * share * (1 + _SAME)
+    least = before.feed * share * (1 - (_SAME if share == 1.0 else 2 * 10.0 ** (1 - _DIGITS)))
+    return least <= now.feed <= most and replace(now, feed=before.feed) == before

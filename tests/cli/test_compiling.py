@@ -1,0 +1,40 @@
+"""Seconds of silence are foretold: when the numerics are not compiled yet, and only then."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from fdhil.cli import compiling
+from fdhil.correction import kernels
+
+
+def test_a_cold_cache_is_told_once_with_its_seconds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    compiling.forewarn.cache_clear()
+    for _ in range(2):
+        compiling.forewarn("predict", "correct")
+    compiling.forewarn.cache_clear()
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err == "compiling the numerics, once, about 15 s\n"
+
+
+def test_what_numba_keeps_is_found_where_it_keeps_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A kernel that this process compiled, or found compiled: its cache is the one that is looked at."""
+    source = Path(kernels.__file__)
+    assert Path(kernels._differences.stats.cache_path) in list(compiling._caches(source))  # type: ignore[attr-defined]
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    folder = tmp_path / f"{source.parent.name}_0"
+    folder.mkdir()
+    version = f"py{sys.version_info.major}{sys.version_info.minor}"
+    made = folder / f"kernels._solve_plain-51.{version}.nbi"
+    made.touch()
+    assert compiling.compiled("fdhil.correction.kernels")
+    os.utime(made, (0, 0))  # older than the source: numba compiles anew
+    assert not compiling.compiled("fdhil.correction.kernels")

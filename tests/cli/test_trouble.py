@@ -1,0 +1,194 @@
+"""Every command and every wrong input: the exit code, one sentence, no traceback, and the same as JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+
+from fdhil.cli.main import COMMANDS, cli
+from tests.bench import axis_toml, bench_toml
+from tests.daemon.shop import fdhil
+
+DONE, USAGE, TROUBLE = 0, 2, 3
+RECORDING = "time_s,voltage_V,current_A,speed_rad_per_s,position_m\n"
+# what a command is called with where the configuration is what is wrong
+WITH_CONFIG = {
+    "scan": ["{config}"],
+    "check": ["{config}"],
+    "commission": ["{config}"],
+    "run": ["{config}"],
+    "status": ["{config}"],
+    "arm": ["{config}", "part.ngc"],
+    "disarm": ["{config}"],
+    "sim": ["{config}"],
+    "record": ["{config}", "--out", "out.csv"],
+    "history": ["{config}"],
+    "report": ["{config}", "--out", "out.html"],
+    "identify": ["shuttle.csv", "--config", "{config}"],
+    "predict": ["part.ngc", "--config", "{config}"],
+    "correct": ["part.ngc", "--config", "{config}"],
+    "advise": ["part.ngc", "--config", "{config}", "--tolerance-um", "50"],
+    "replay": ["shuttle.csv", "--config", "{config}"],
+}
+WITHOUT_CONFIG = {"demo": ["--out", "out"], "interpret": ["part.ngc"], "export": ["w.parquet", "--out", "out.csv"]}
+# what a command is called with where the file that it works on is what is wrong
+WITH_FILE = {
+    "identify": ["{file}"],
+    "replay": ["{file}"],
+    "export": ["{file}", "--out", "out.csv"],
+    "interpret": ["{file}"],
+    "predict": ["{file}", "--config", "bench.toml"],
+    "correct": ["{file}", "--config", "bench.toml"],
+    "advise": ["{file}", "--config", "bench.toml", "--tolerance-um", "50"],
+}
+SUFFIXES = {"identify": [".csv"], "replay": [".csv", ".parquet"], "export": [".parquet"], "interpret": [".ngc"]}
+# what a command is called with where the file that it is to write cannot be
+WITH_OUT = {
+    "predict": ["part.ngc", "--config", "bench.toml", "--out", "{out}"],
+    "correct": ["part.ngc", "--config", "bench.toml", "--report", "{out}"],
+    "advise": ["part.ngc", "--config", "bench.toml", "--tolerance-um", "50", "--out", "{out}"],
+    "export": ["w.parquet", "--out", "{out}"],
+    "report": ["bench.toml", "--out", "{out}"],
+    "record": ["bench.toml", "--out", "{out}"],
+    "sim": ["bench.toml", "--trace", "{out}"],
+    "history": ["bench.toml", "--plot", "{out}"],
+}
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with everything that is wrong in it, and what is right beside it."""
+    monkeypatch.chdir(tmp_path)
+    Path("bench.toml").write_text(bench_toml())
+    Path("part.ngc").write_text("G21 G90 G64\nG1 X10 F1000\nM2\n")
+    Path("profile.toml").write_text(f'[machine]\nname = "m"\n{axis_toml("X")}[axis.X.drive]\nprofile = "maxon_epos4"\n')
+    Path("key.toml").write_text(bench_toml().replace("screw_pitch_mm", "screw_pich_mm", 1))
+    for suffix in (".toml", ".csv", ".parquet", ".ngc"):
+        Path(f"junk{suffix}").write_bytes(bytes(range(256)) * 8)
+        Path(f"empty{suffix}").touch()
+        Path(f"folder{suffix}").mkdir()
+        Path(f"loop{suffix}").symlink_to(f"loop{suffix}")  # nobody can read it, not even root
+    for suffix in ("", ".png"):
+        os.mkfifo(f"pipe{suffix}")
+        Path(f"dir{suffix}").mkdir()
+    return tmp_path
+
+
+def told(capsys: Any, code: int, *arguments: str) -> str:
+    """Call a command with and without --json; return its sentence."""
+    said = fdhil(*arguments, capsys=capsys)
+    assert said[0] == code, said
+    assert said[1] == ""
+    first, *rest = said[2].splitlines()
+    assert first.startswith("fdhil: "), said[2]
+    assert all(line.startswith("  ") for line in rest), said[2]  # the faults of a configuration, one a line
+    assert "Traceback" not in said[2]
+    code_of_json, out, err = fdhil(*arguments, "--json", capsys=capsys)
+    assert (code_of_json, err) == (code, "")
+    document = json.loads(out)
+    if document["schema"] == "fdhil-identify-1":  # the others of a batch are told too
+        error = document["files"][0]["error"]
+    else:
+        assert set(document) == {"schema", "error"}
+        assert document["schema"] == "fdhil-error-1"
+        error = document["error"]
+    assert error["class"].isidentifier()
+    assert len(error["text"]) > 20
+    return str(said[2])
+
+
+def test_the_tables_of_this_test_know_every_command() -> None:
+    assert {*WITH_CONFIG, *WITHOUT_CONFIG} == set(COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_json_and_refuses_what_it_does_not_know(command: str, capsys: Any) -> None:
+    found = cli.get_command(click.Context(cli), command)
+    assert found is not None
+    assert any("--json" in option.opts for option in found.params)
+    arguments = [text.format(config="bench.toml") for text in (WITH_CONFIG | WITHOUT_CONFIG)[command]]
+    assert f"fdhil {command} --help" in told(capsys, USAGE, command, *arguments, "--no-such-option")
+    if command not in ("identify", "replay"):  # which take any number of files
+        assert "Got unexpected" in told(capsys, USAGE, command, *arguments, "a", "b", "c")
+
+
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [
+        ("absent.toml", "No such file"),
+        ("folder.toml", "directory"),
+        ("junk.toml", "no TOML"),
+        ("empty.toml", "missing"),
+        ("loop.toml", "symbolic links"),
+        ("key.toml", "did you mean 'screw_pitch_mm'?"),
+        ("profile.toml", "axis.X.drive.profile: must be one of fdhil_twin"),
+    ],
+)
+def test_a_wrong_configuration_is_2(config: str, words: str, capsys: Any) -> None:
+    for command, arguments in WITH_CONFIG.items():
+        assert words in told(capsys, USAGE, command, *(text.format(config=config) for text in arguments)), command
+
+
+@pytest.mark.parametrize("kind", ["absent", "folder", "junk", "empty", "loop"])
+def test_a_file_that_cannot_be_read_is_3(kind: str, capsys: Any) -> None:
+    for command, arguments in WITH_FILE.items():
+        for suffix in SUFFIXES.get(command, [".ngc", ".csv"]):
+            told(capsys, TROUBLE, command, *(text.format(file=kind + suffix) for text in arguments))
+    assert not Path("out.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("out", "words"), [("dir", "a folder"), ("pipe", "a pipe"), ("no/such/file", "there is no folder")]
+)
+def test_a_file_that_cannot_be_written_is_3_and_found_at_once(out: str, words: str, capsys: Any) -> None:
+    for command, arguments in WITH_OUT.items():
+        name = f"{out}.png" if command == "history" else out
+        assert words in told(capsys, TROUBLE, command, *(text.format(out=name) for text in arguments))
+    assert Path("dir").is_dir()
+    assert Path("pipe").is_fifo()
+
+
+def test_a_picture_of_an_unknown_kind_is_2(capsys: Any) -> None:
+    assert ".png, .svg, .pdf" in told(capsys, USAGE, "history", "bench.toml", "--plot", "drift.bmp")
+
+
+def test_the_null_device_is_written_to_and_stays(capsys: Any) -> None:
+    device = Path(os.devnull).stat().st_rdev
+    assert fdhil("predict", "part.ngc", "--config", "bench.toml", "--out", os.devnull, capsys=capsys)[0] == DONE
+    assert Path(os.devnull).stat().st_rdev == device
+    assert Path(os.devnull).is_char_device()
+
+
+def test_a_port_that_is_taken_is_3(capsys: Any) -> None:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen()
+        port = listener.getsockname()[1]
+        Path("taken.toml").write_text(bench_toml() + f'[bus.can0]\ninterface = "socketcand"\nport = {port}\n')
+        assert str(port) in told(capsys, TROUBLE, "sim", "taken.toml")
+
+
+@pytest.mark.parametrize("command", ["scan", "check", "commission", "record", "run"])
+def test_a_bus_that_is_not_there_is_3(command: str, capsys: Any) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    Path("absent_bus.toml").write_text(bench_toml() + f'[bus.can0]\ninterface = "socketcand"\nport = {port}\n')
+    arguments = [text.format(config="absent_bus.toml") for text in WITH_CONFIG[command]]
+    told(capsys, TROUBLE, command, *arguments)
+
+
+@pytest.mark.parametrize("command", ["status", "arm", "disarm"])
+def test_a_daemon_that_does_not_run_is_3(command: str, capsys: Any) -> None:
+    told(capsys, TROUBLE, command, *(text.format(config="bench.toml") for text in WITH_CONFIG[command]))
+
+
+def test_no_history_is_3(capsys: Any) -> None:
+    for command in ("history", "report"):
+        told(capsys, TROUBLE, command, *(text.format(config="bench.toml") for text in WITH_CONFIG[command]))

@@ -1,0 +1,243 @@
+"""What is heard now, and what is not as the config says: told with its reason, in the status and as a notice."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil import config as machine_config
+from fdhil.cli.status_view import counted, open_console, show
+from fdhil.config import MachineConfig
+from fdhil.daemon.hearing import Hearing
+from fdhil.daemon.status import Watch
+from fdhil.drivers import open_machine
+from fdhil.pipeline import Record
+from fdhil.records import AxisSamples, Notice, TickTimes, frozen, frozen_ints
+from fdhil.sim.hub import encode
+from tests.bench import bench_axis
+from tests.daemon.machine import Machine, config_of, rapids
+from tests.daemon.test_service import serving, status_when
+from tests.drivers.wire import Wire
+
+WRONG = {"SyncPeriodSuspect", "NodeNeverHeard"}
+STEP_S = 0.002  # of the SYNC on the wire, where the config says 1 ms
+
+
+class Line:
+    """A hub that sends what a wire shows: SYNC every 2 ms and the frames of node 1, until it is cut."""
+
+    def __init__(self) -> None:
+        self._cut = threading.Event()
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listener.getsockname()[1]
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        with contextlib.suppress(OSError):
+            peer, _ = self._listener.accept()
+            with peer:
+                peer.sendall(b"< hi >")
+                for _ in ("open", "rawmode"):
+                    peer.recv(256)
+                    peer.sendall(b"< ok >")
+                self._send(peer)
+                peer.recv(1)  # the bus is dead, the hub is not
+
+    def _send(self, peer: socket.socket) -> None:
+        begun_s, sent = time.time(), 0
+        rows = Wire(4000, period_ns=round(STEP_S * 1e9), start_ns=0).rows()
+        while not self._cut.is_set() and sent < len(rows):
+            text = b""
+            while sent < len(rows) and rows[sent][0] * 1e-9 <= time.time() - begun_s:
+                t_ns, can_id, data = rows[sent]
+                text += encode([(can_id, data)], begun_s + t_ns * 1e-9)
+                sent += 1
+            peer.sendall(text)
+            time.sleep(0.05)
+
+    def cut(self) -> None:
+        """Send nothing more."""
+        self._cut.set()
+
+    def close(self) -> None:
+        """End the connection."""
+        self.cut()
+        self._listener.close()
+
+
+@pytest.fixture
+def line() -> Iterator[Line]:
+    """A bus with SYNC and one drive."""
+    made = Line()
+    yield made
+    made.close()
+
+
+@pytest.fixture(autouse=True)
+def _quick_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fdhil.daemon.service.warm", lambda config, method: None)
+
+
+def shown(status: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> str:
+    """Return the status as a person sees it."""
+    capsys.readouterr()
+    show(status, open_console())
+    return " ".join(capsys.readouterr().out.split())
+
+
+class Opens:
+    """The real drivers, as ``serving`` wants a machine."""
+
+    open = staticmethod(open_machine)
+
+
+async def test_a_wrong_period_a_node_never_heard_and_a_dead_bus_are_told(
+    line: Line, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Over the hub: SYNC at half the rate of the config, one drive of two; then nothing more."""
+    bus = {"can0": {"interface": "socketcand", "port": line.port}}
+    config = config_of(tmp_path, ("X", "Y"), bus=bus)
+    async with serving(config, Opens()) as path:  # type: ignore[arg-type]
+        told = await status_when(path, lambda s: {t["code"] for t in s["troubles"]} >= WRONG)
+        assert told["source"]["state"] == "listening"
+        assert told["sync"]["rate_hz"] == pytest.approx(500.0, rel=0.01)
+        troubles = {(each["code"], each["axis"]): each["text"] for each in told["troubles"]}
+        expected = (
+            r"SYNC comes at (499\.\d|500(\.\d)?) Hz where the config says 1000: .* set sync_period_s = 0\.00(2|1999)"
+        )
+        assert re.search(expected, troubles["SyncPeriodSuspect", ""])
+        assert "the drive (node 2 on can0) was never heard" in troubles["NodeNeverHeard", "Y"]
+        assert {notice["code"] for notice in told["notices"]} >= WRONG
+        text = shown(told, capsys)
+        assert re.search(r"listening, SYNC (499|500)\.\d Hz of 1000", text)
+        assert "Y: NodeNeverHeard: the drive (node 2 on can0) was never heard" in text
+        line.cut()
+        told = await status_when(path, lambda s: s["source"]["state"] == "silent" and s["sync"]["rate_hz"] is None)
+        assert told["source"]["heard_s_ago"] > 1.0
+        assert told["sync"]["heard_s_ago"] > 1.0
+        text = shown(told, capsys)
+        assert "silent for" in text
+        assert "no SYNC for" in text
+        assert "Hz of" not in text
+
+
+def test_the_rate_is_of_what_is_heard_now(tmp_path: Path) -> None:
+    hearing = Hearing(config_of(tmp_path), 0.0)
+    hearing.source_opened(0.0)
+    ticks = np.arange(400)
+    hearing.record_came(TickTimes(frozen_ints(ticks), frozen_ints(ticks * 1_370_000)), 0.6)
+    assert hearing.sync_rate_hz(1.0) == pytest.approx(730.0, rel=0.001)
+    assert hearing.sync_rate_hz(21.0) is None
+    assert hearing.status(21.0)["sync"]["heard_s_ago"] == pytest.approx(20.4)
+    hearing.counted({"frames": 5, "can0.frames": 5}, 1.0)
+    assert hearing.status(1.9)["source"]["state"] == "listening"
+    hearing.counted({"frames": 5, "can0.frames": 5}, 2.1)
+    assert hearing.status(2.1)["source"]["state"] == "silent"
+    assert hearing.status(2.1)["source"]["buses"] == {"can0": 1.1}
+    hearing.source_lost(3.0)
+    assert hearing.status(3.0)["source"]["state"] == "reconnecting"
+
+
+def test_a_drive_that_answers_but_does_not_sample_is_told_once_and_its_end_too(tmp_path: Path) -> None:
+    watch = Watch(config_of(tmp_path), 0.0)
+    watch.hearing.source_opened(0.0)
+    told: list[tuple[float, Notice]] = []
+    for k in range(1, 120):
+        now_s, ticks = k * 0.25, np.arange(k * 250, k * 250 + 250)
+        watch.hearing.record_came(TickTimes(frozen_ints(ticks), frozen_ints(ticks * 1_000_000)), now_s)
+        watch.hearing.counted({"frames": k, "can0.frames": k, "can0.X.heard": k}, now_s)
+        if now_s > 20.0:
+            still, tick = frozen(np.zeros(250)), frozen_ints(ticks)
+            samples = AxisSamples("X", tick, still, still, still, still, None, still, tick)
+            watch.hearing.record_came(samples, now_s)
+        told += [(now_s, notice) for notice in watch.troubles(now_s)]
+    assert [(n.code, n.severity, n.axis) for _, n in told] == [("NoSamples", "MAJOR", "X"), ("NoSamples", "info", "X")]
+    assert 10.0 <= told[0][0] <= 11.0
+
+
+def fed(config: MachineConfig, records: list[Record], windows: int = 0) -> dict[tuple[str, str], str]:
+    """Return the troubles that a machine of ``config`` sees in the records of another."""
+    hearing = Hearing(config, 0.0)
+    hearing.source_opened(0.0)
+    now_s = 0.0
+    for record in records:
+        if isinstance(record, TickTimes):
+            now_s = float(record.tick[-1]) * 1e-3
+        hearing.record_came(record, now_s)
+    return hearing.troubles({"X": windows}, now_s + 6.0)
+
+
+def other(folder: Path, **axis: Any) -> MachineConfig:
+    """Return the bench's config but for the keys of axis X."""
+    document = {"machine": {"name": "bench"}, "axis": {"X": bench_axis(**axis)}}
+    return machine_config.parse(document, "test", folder)
+
+
+def test_moves_that_are_seen_and_not_used_have_their_reason(tmp_path: Path) -> None:
+    true = config_of(tmp_path)
+    records = rapids(true, count=4)
+    assert fed(true, records, windows=4) == {}
+    ((key, text),) = fed(other(tmp_path, rapid_speed_mm_s=1000.0), records).items()
+    assert key == ("MovesNotUsed", "X")
+    assert "4 moves seen, none used: 4 stay below 90% of the rapid speed of 1000 mm/s, the fastest at 5" in text
+    assert "correct rapid_speed_mm_s or screw_pitch_mm" in text
+    ((key, text),) = fed(true, records).items()
+    assert key == ("MovesNotUsed", "X")
+    assert "no event of the G0 source inferred came" in text
+    ((key, text),) = fed(other(tmp_path, rapid_speed_mm_s=250.0), records, windows=4).items()
+    assert key == ("PitchSuspect", "X")
+    assert "times the rapid speed" in text
+    ((key, text),) = fed(other(tmp_path, screw_pitch_mm=10.0), records, windows=4).items()
+    assert key == ("ScaleSuspect", "X")
+    assert "the position goes 2 times as far as the speed says" in text
+
+
+def test_moves_without_a_plateau_are_told_as_such(tmp_path: Path) -> None:
+    config = config_of(tmp_path)
+    period_s = config.machine.sync_period_s
+    moves: list[Record] = []
+    ramp = np.linspace(0.0, 480.0, 120)
+    speed = np.concatenate([np.zeros(200), ramp, ramp[::-1], np.zeros(200)] * 4) * np.repeat([1, -1, 1, -1], 640)
+    place = np.cumsum(speed) * period_s
+    ticks = np.arange(speed.size)
+    pitch = config.axis["X"].screw_pitch_mm
+    for start in range(0, speed.size, 40):
+        part = slice(start, start + 40)
+        tick = frozen_ints(ticks[part])
+        zeros = frozen(np.zeros(tick.size))
+        position, turning = frozen(place[part]), frozen(speed[part] / pitch * 2 * np.pi)
+        moves.append(TickTimes(tick, frozen_ints(ticks[part] * 1_000_000)))
+        moves.append(AxisSamples("X", tick, position, position, turning, zeros, None, zeros, frozen_ints(zeros)))
+    ((key, text),) = fed(config, moves).items()
+    assert key == ("MovesNotUsed", "X")
+    assert "no plateau of 0.1 s; make longer rapids" in text
+
+
+async def test_the_daemon_tells_moves_it_cannot_use_instead_of_0_accepted_0_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    records = rapids(config_of(tmp_path), count=3)
+    async with serving(other(tmp_path, rapid_speed_mm_s=1000.0), Machine(records)) as path:
+        told = await status_when(path, lambda s: s["troubles"] and s["axes"]["X"]["moves"]["seen"] == 3)
+        text = shown(told, capsys)
+    assert [notice["code"] for notice in told["notices"]].count("MovesNotUsed") == 1
+    assert "0 accepted, 0 refused" in text
+    assert "X: MovesNotUsed: 3 moves seen, none used" in text
+    assert "X: 3 moves seen; not used: 3 too slow (the fastest at 5" in text
+
+
+def test_counters_are_told_in_words() -> None:
+    counters = {"frames": 41230, "lost": 2, "can0.frames": 41230, "can0.pdo_lost": 2, "can0.sync_missed": 0}
+    assert counted(counters) == "frames received 41 230, lost 2 (can0: PDO lost 2)"
+    assert counted({"frames": 7}) == "frames received 7, lost 0"
+    assert counted({}) == "frames: none"

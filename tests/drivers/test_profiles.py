@@ -1,0 +1,61 @@
+"""What every listed drive profile must say, so that a drive of that kind can be heard, judged and corrected."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+
+from fdhil import tables
+from fdhil.drivers.cia402_drive import Cia402Decoder
+from fdhil.drivers.profile import DriveProfile, load_profile
+from tests.drivers.wire import machine
+
+MAX_BITS = 64
+
+
+@pytest.fixture(params=list(tables.DRIVE_PROFILES))
+def profile(request: pytest.FixtureRequest) -> DriveProfile:
+    """A listed profile."""
+    return load_profile(str(request.param))
+
+
+def test_it_is_listed_under_its_own_name(profile: DriveProfile) -> None:
+    assert load_profile(profile.name) is profile
+
+
+def test_what_must_be_heard_is_in_a_tpdo(profile: DriveProfile) -> None:
+    for key in (profile.position, profile.speed, profile.current, profile.statusword):
+        found = profile.find_tpdo(key)
+        assert found is not None
+        assert found[0].valid
+        assert found[0].every_sync == 1
+    if profile.voltage is not None:
+        assert profile.find_tpdo(profile.voltage) is not None
+        assert profile.voltage_v_per_count > 0
+    assert Cia402Decoder("X", machine(), profile).profile is profile
+
+
+def test_the_offset_can_be_sent_and_read_back(profile: DriveProfile) -> None:
+    """The NC's target and our offset never share an RPDO: who sends one would overwrite the other."""
+    target, offset = profile.find_rpdo(profile.target), profile.find_rpdo(profile.offset)
+    assert target is not None
+    assert offset is not None
+    assert target[0].cob_base != offset[0].cob_base
+    assert (offset[1].bits, offset[1].signed) == (32, True)
+    assert profile.find_tpdo(profile.offset) is not None
+
+
+def test_no_pdo_is_longer_than_a_frame_or_overlaps(profile: DriveProfile) -> None:
+    pdos = [*profile.rpdos, *profile.tpdos]
+    assert len({spec.cob_base for spec in pdos}) == len(pdos)
+    for spec in pdos:
+        assert spec.length * 8 <= MAX_BITS
+        assert spec.cob_base % 0x80 == 0
+        for before, after in pairwise(spec.entries):
+            assert before.bit_offset + before.bits <= after.bit_offset
+
+
+def test_a_drive_that_is_left_alone_can_be_told_to_stop(profile: DriveProfile) -> None:
+    assert profile.strict_abort_options
+    assert set(profile.strict_abort_options) <= {1, 2, 3}

@@ -1,0 +1,230 @@
+"""What must not end the guard, nor cost it a SYNC: garbage, floods and signals beside a running correction."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from fdhil.guard import table
+from fdhil.guard.control import MAX_CLIENTS, MAX_LINE_BYTES
+from tests.guard.test_process import DEMAND, OFFSET, Rig, check_limits
+
+STOPPING = (signal.SIGHUP, signal.SIGQUIT, signal.SIGINT, signal.SIGXCPU)
+SURROGATE = "\\ud800"
+VALUES = [
+    "null", "true", "-1", "1e999", "-0.0", "9" * 4000, '""', f'"{SURROGATE}"', '"\\u0000"', "[]", "{}", "[[1]]",
+    '{"a": {"b": []}}', "[" * 900 + "]" * 900, '"' + "x" * 5000 + '"', '"arm"',
+]  # fmt: skip
+REQUESTS = ["status", "alive", "table", "arm", "feedforward", "disarmed", "adopt", "stop", SURROGATE, ""]
+FIELDS = ["token", "facts", "laws", "program_digest", "id", "axes", "request"]
+LAW = '{"speed": %s, "torque": %s, "pace": %s, "dry": %s}'
+
+
+def garbage() -> Iterator[bytes]:
+    """Lines of which none is a request that may be granted, and none a disarm."""
+    yield from (b"", b"\xff\xfe", b"NaN", b"[" * 20_000, b'{"a":' * 5_000, b"{", b'{"request": }', b"\0" * 100)
+    for value in VALUES:
+        yield value.encode()
+        yield f'{{"request": {value}}}'.encode()
+        law = LAW % ((value,) * 4)
+        yield f'{{"request": "feedforward", "laws": {{"X": {law}, "Y": {law}}}}}'.encode()
+        for request in REQUESTS:
+            for field in FIELDS[:-1]:
+                yield f'{{"request": "{request}", "{field}": {value}}}'.encode()
+    for word in ("NaN", "Infinity", "-Infinity"):
+        yield f'{{"request": "status", "id": {word}}}'.encode()
+
+
+def connection(rig: Rig) -> socket.socket:
+    made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    try:
+        made.connect(str(rig.run_directory / "guard.sock"))
+    except OSError:
+        made.close()
+        raise
+    made.setblocking(False)
+    return made
+
+
+def flood(rig: Rig, send: Callable[[socket.socket], object], ended: threading.Event) -> None:
+    """Send as much as goes, over a connection that is made again whenever it ends, and read nothing."""
+    client = connection(rig)
+    while not ended.wait(0.001):
+        try:
+            send(client)
+        except BlockingIOError:
+            continue
+        except OSError:
+            client.close()
+            client = connection(rig)
+    client.close()
+
+
+def answer(client: socket.socket) -> dict[str, object]:
+    client.setblocking(True)
+    client.settimeout(20.0)
+    text = b""
+    while not text.endswith(b"\n"):
+        text += client.recv(1 << 16)
+    return dict(json.loads(text))
+
+
+def many(text: str) -> Callable[[socket.socket], object]:
+    line = text.encode() + b"\n"
+    return lambda client: client.send(line * (100_000 // len(line)))
+
+
+def descriptors(folder: Path) -> list[int]:
+    """What a table may come as that is none: not one of them may be read, nor be waited for."""
+    os.mkfifo(folder / "fifo")
+    near, far = socket.socketpair()
+    return [os.open(folder / "fifo", os.O_RDWR), near.detach(), far.detach(), os.memfd_create("unsealed"), *os.pipe()]
+
+
+def memory_kb(rig: Rig) -> int:
+    """The most that the process ever held."""
+    text = Path(f"/proc/{rig.process.pid}/status").read_text()
+    return int(text.split("VmHWM:")[1].split()[0])
+
+
+def open_descriptors(rig: Rig) -> int:
+    return len(list(Path(f"/proc/{rig.process.pid}/fd").iterdir()))
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    made = Rig(tmp_path)
+    yield made
+    made.close()
+
+
+def test_neither_garbage_nor_floods_nor_signals_cost_a_running_correction_one_sync(rig: Rig, tmp_path: Path) -> None:
+    rig.arm()
+    before_kb, before = memory_kb(rig), open_descriptors(rig)
+    wrong = descriptors(tmp_path)
+    lines = list(garbage())
+    ended = threading.Event()
+    zeros = {"X": [0] * 900, "Y": [0] * 900}
+    piece = table.seal(table.encode("XY", zeros, zeros, "another", 800, False))
+    whole = table.seal(table.encode("XY", {a: [0] * 40_000 for a in "XY"}, {a: [0] * 40_000 for a in "XY"}, "other"))
+    cursor = iter(lines * 1000)
+    floods = [
+        many('{"request": "status"}'),
+        many('{"request": "arm", "token": "x"}'),
+        many("x" * (MAX_LINE_BYTES + 10)),
+        lambda client: client.send(next(cursor) + b"\n"),
+        lambda client: socket.send_fds(client, [b'{"request": "table"}\n'], wrong),
+        lambda client: socket.send_fds(client, [b'{"request": "alive"}\n'], wrong * 20),
+        lambda client: socket.send_fds(client, [b'{"request": "table"}\n'], [piece]),
+        lambda client: socket.send_fds(client, [b'{"request": "table"}\n'], [whole]),
+        lambda client: client.shutdown(socket.SHUT_RDWR),
+    ]
+    threads = [threading.Thread(target=flood, args=(rig, send, ended)) for send in floods]
+    ignored = signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM, *STOPPING} | {32, 33}
+    try:
+        for thread in threads:
+            thread.start()
+        rig.peer.playing = True
+        for row in range(100, 700, 60):
+            rig.peer.wait(lambda row=row: rig.peer.row > row, "the path")  # type: ignore[misc] # the loop's row
+            for number in ignored:
+                os.kill(rig.process.pid, number)
+        rig.peer.wait(lambda: any(event.get("code") == "Finished" for event in rig.events()), "the end")
+        rig.peer.wait(lambda: any(event.get("state") == "OFF" for event in rig.events()), "off")
+    finally:
+        ended.set()
+        for thread in threads:
+            thread.join()
+        for descriptor in (*wrong, piece, whole):
+            os.close(descriptor)
+    told = rig.events()
+    assert not any(event["event"] == "failed" for event in told)
+    assert [event["missed"] for event in told if event.get("state") == "OFF"] == [0]
+    ticks = [tick for tick, _ in rig.peer.offsets_sent()]
+    assert ticks == list(range(ticks[0], ticks[0] + len(ticks)))
+    rows = {target: k for k, target in enumerate(DEMAND[0])}
+    moving = [(t, o) for _, t, o in rig.peer.latched if DEMAND[0][50] < t[0] < DEMAND[0][-50]]
+    assert [o for _, o in moving] == [(OFFSET[0][rows[t[0]]], OFFSET[1][rows[t[0]]]) for t, _ in moving]
+    check_limits(rig)
+    assert memory_kb(rig) - before_kb < 16_000
+    client = rig.client
+    assert client is not None
+    assert client.status()["may_stand_um"] == {"X": 0.0, "Y": 0.0}
+    rig.peer.wait(lambda: client.status()["ok"] and open_descriptors(rig) <= before + MAX_CLIENTS, "closed descriptors")
+
+
+def test_what_asks_it_to_stop_has_it_ramp_first(rig: Rig) -> None:
+    """A closed terminal, an interrupt, the kernel's warning before its limit: any of them, and all at once."""
+    rig.into_the_cut()
+    assert abs(rig.peer.offsets_sent()[-1][1]) > 100
+    for number in STOPPING:
+        rig.process.send_signal(number)
+    assert rig.process.wait(20) == 0
+    assert rig.peer.offsets_sent()[-1][1] == 0
+    check_limits(rig)
+    assert rig.events()[-1]["may_stand_um"] == {"X": 0.0, "Y": 0.0}
+
+
+BROKEN = """
+import sys
+from fdhil.guard import process, __main__
+def fail(*_):
+    raise {error}
+process.Guard.status = fail
+sys.exit(__main__.main())
+"""
+
+
+@pytest.mark.parametrize("error", ["RuntimeError('lost')", "MemoryError"])
+def test_whatever_breaks_the_loop_the_offset_is_ramped_to_zero(tmp_path: Path, error: str) -> None:
+    rig = Rig(tmp_path, program=("-c", BROKEN.format(error=error)))
+    try:
+        client = connection(rig) if wait_for_ready(rig) else None
+        assert client is not None
+        with client:
+            rig.into_the_cut_blindly()
+            assert abs(rig.peer.offsets_sent()[-1][1]) > 100
+            client.send(b'{"request": "status"}\n')
+            assert rig.process.wait(20) == 3
+        assert [offset for _, offset in rig.peer.offsets_sent()[-3:]] == [0, 0, 0]
+        check_limits(rig)
+        failed, stopped = rig.events()[-2:]
+        assert (failed["event"], failed["code"]) == ("failed", "InternalError")
+        assert error.split("(")[0] in str(failed["text"])
+        assert stopped["may_stand_um"] == {"X": None, "Y": None}
+        assert "may still be applied" in str(stopped["text"])
+    finally:
+        rig.close()
+
+
+def wait_for_ready(rig: Rig) -> bool:
+    rig.peer.wait(lambda: any(e["event"] == "ready" for e in rig.events()), "the guard")
+    return True
+
+
+def test_a_second_request_waits_for_the_answer_to_the_first(rig: Rig) -> None:
+    """But a disarm takes the place of what waits, and idle connections make room for new ones."""
+    rig.connect()
+    idle = [connection(rig) for _ in range(2 * MAX_CLIENTS)]
+    rig.peer.syncing = False
+    with connection(rig) as client:
+        client.send(b'{"request": "arm", "id": 1}\n{"request": "arm", "id": 2}\n')
+        told = answer(client)
+        assert (told["id"], told["code"]) == (2, "GuardBusy")
+        client.send(b'{"request": "disarm", "id": 3}\n')
+        told = answer(client)
+        assert (told["id"], told["code"]) == (1, "GuardBusy")
+        rig.peer.syncing = True
+        told = answer(client)
+        assert (told["id"], told["ok"]) == (3, True)
+        client.send(b'{"request": "sing", "id": "4"}\n{"request": ["status"], "id": 5.5}\n')
+        assert [answer(client)["code"] for _ in range(1)] == ["BadRequest"]
+    for each in idle:
+        each.close()

@@ -1,0 +1,162 @@
+"""One derivation of the limits for planner and guard, and ceilings that no file can raise."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fdhil import config as machine_config
+from fdhil.cli.guard import settings_of
+from fdhil.config import CEILING_ACCELERATION_MM_S2, CEILING_OFFSET_UM, CEILING_SPEED_MM_S, VARIATION_MM, OffsetLimits
+from fdhil.correction import Limits, check
+from fdhil.correction.limits import fit, to_increments
+from fdhil.errors import ConfigError
+from fdhil.guard import limits as guard_limits
+from fdhil.guard.settings import AxisSettings, from_json, to_json
+from fdhil.guard.table import check_rows
+from tests.bench import bench_document
+from tests.guard.machine import LIMITS
+from tests.guard.machine import settings as made_settings
+
+
+def test_config_and_guard_have_the_same_ceilings() -> None:
+    """The guard has them of its own: it does not import the config."""
+    ours = (CEILING_OFFSET_UM, CEILING_SPEED_MM_S, CEILING_ACCELERATION_MM_S2, VARIATION_MM)
+    assert ours == (
+        guard_limits.CEILING_OFFSET_UM,
+        guard_limits.CEILING_SPEED_MM_S,
+        guard_limits.CEILING_ACCELERATION_MM_S2,
+        guard_limits.CEILING_VARIATION_MM,
+    )
+    assert guard_limits.ceilings(3276.8, 0.001, 500.0, 4000.0) == LIMITS  # the bench is at all of them
+
+
+def documents() -> st.SearchStrategy[dict[str, Any]]:
+    def document(per_turn: int, pitch: float, speed: float, hard: float, given: list[float], period: float) -> Any:
+        made = bench_document("X")
+        axis = made["axis"]["X"]
+        made["machine"]["sync_period_s"] = period
+        axis |= {"screw_pitch_mm": pitch, "rapid_speed_mm_s": speed, "max_acceleration_mm_s2": hard}
+        axis["drive"] = {"increments_per_rev": per_turn}
+        names = ("max_offset_um", "max_speed_mm_s", "max_acceleration_mm_s2")
+        axis["correction"] = dict(zip(names, given, strict=True))
+        return made
+
+    most = (CEILING_OFFSET_UM, CEILING_SPEED_MM_S, CEILING_ACCELERATION_MM_S2)
+    return st.builds(
+        document,
+        st.sampled_from([4096, 10_000, 65_536, 131_072, 1_000_000, 1 << 23]),
+        st.floats(1.0, 60.0),
+        st.floats(20.0, 2000.0),
+        st.floats(200.0, 20_000.0),
+        st.tuples(*[st.floats(0.02 * each, each) for each in most]).map(list),
+        st.sampled_from([0.0005, 0.001, 0.002, 0.004]),
+    )
+
+
+@settings(max_examples=150, deadline=None)
+@given(documents(), st.integers(0, 2**32 - 1))
+def test_planner_and_guard_agree_on_every_axis_and_nothing_exceeds_a_ceiling(
+    document: dict[str, Any], seed: int
+) -> None:
+    """Whatever is wanted: what the planner makes of it, the guard takes; what it holds to is within the ceilings."""
+    machine = parsed(document)
+    if isinstance(machine, str):
+        assert "too coarse" in machine or "from the largest offset to zero" in machine
+        return
+    axis, period = machine.axis["X"], machine.machine.sync_period_s
+    whole = settings_of(machine, "can0", Path(), "").axes[0].limits
+    planned = Limits.of(axis, period)
+    assert (whole.offset, whole.rate, whole.acceleration, whole.variation, whole.window) == OffsetLimits.of(
+        axis, period
+    ).whole
+    per_mm = axis.scaling.increments_per_mm
+    assert whole.offset <= planned.offset + 1e-6 <= CEILING_OFFSET_UM * 1e-3 * per_mm + 1e-3
+    assert whole.rate <= planned.rate + 1e-6 <= min(20.0, 0.1 * axis.rapid_speed_mm_s) * per_mm * period + 1e-3
+    hardest = min(2000.0, 0.5 * axis.max_acceleration_mm_s2) * per_mm * period**2
+    assert whole.acceleration <= planned.acceleration + 1e-6 <= hardest + 1e-3
+    random = np.random.default_rng(seed)
+    wanted = planned.offset * random.uniform(0.1, 3) * np.sin(np.arange(400) * random.uniform(0.001, 1.5))
+    wanted[200:] += planned.offset * random.choice([-1.0, 0.0, 1.0])
+    rows = to_increments(fit(wanted, planned))
+    assert check(rows, planned) == []
+    assert check_rows(whole, [0, *rows.tolist()], 0, rows.size + 1) is None  # from rest, as the planner has it
+
+
+def parsed(document: dict[str, Any]) -> machine_config.MachineConfig | str:
+    """The config, or why it is refused."""
+    try:
+        return machine_config.parse(document)
+    except ConfigError as error:
+        return str(error)
+
+
+def altered(**changes: object) -> str:
+    """A settings file in which somebody has changed a limit of the first axis, or another value of it."""
+    document = json.loads(to_json(made_settings()))
+    axis = document["axes"][0]
+    for key, value in changes.items():
+        (axis["limits"] if key in axis["limits"] else axis)[key] = value
+    return json.dumps(document)
+
+
+@pytest.mark.parametrize("name", ["offset", "rate", "acceleration", "variation", "window"])
+def test_a_settings_file_can_raise_no_limit_above_its_ceiling(name: str) -> None:
+    value = getattr(LIMITS, name)
+    assert from_json(altered(**{name: value})).axes[0].limits == LIMITS
+    wrongs: tuple[object, ...] = (value + 1, 10 * value, 2**62, 0, -1, value + 0.5, True, None, "1", [], math.inf)
+    for wrong in wrongs:
+        with pytest.raises(ConfigError, match="let fdhil-guard write it"):
+            from_json(altered(**{name: wrong}))
+
+
+def test_the_axis_own_speed_and_the_scale_bound_it_too() -> None:
+    for changes in (
+        {"max_speed_mm_s": 100.0},
+        {"max_acceleration_mm_s2": 1000.0},
+        {"increments_per_mm": 3000.0},
+        {"increments_per_mm": 1e7},
+        {"increments_per_mm": -3276.8},
+        {"increments_per_mm": "3276.8"},
+        {"max_speed_mm_s": None},
+    ):
+        with pytest.raises(ConfigError):
+            from_json(altered(**changes))
+
+
+def test_no_value_of_any_kind_in_any_field_is_anything_but_a_refusal() -> None:
+    """Every key of the file, at every depth, given what does not belong there."""
+    clean = json.loads(to_json(made_settings()))
+    paths = list(_paths(clean))
+    assert len(paths) > 100
+    wrongs: tuple[object, ...] = ("\ud800", -1, 1e300, [], {}, [[[]]], None, True, 10**400)
+    for path, wrong in itertools.product(paths, wrongs):
+        document = json.loads(to_json(made_settings()))
+        inner = document
+        for key in path[:-1]:
+            inner = inner[key]
+        inner[path[-1]] = wrong
+        try:
+            read = from_json(json.dumps(document))
+        except ConfigError:
+            continue
+        assert all(_inside(axis) for axis in read.axes)
+
+
+def _paths(value: Any, before: tuple[Any, ...] = ()) -> Any:
+    keys = value if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ()
+    for key in keys:
+        yield (*before, key)
+        yield from _paths(value[key], (*before, key))
+
+
+def _inside(axis: AxisSettings) -> bool:
+    return axis.limits == LIMITS and axis.offset.layout == ((0x60B0, 0, 32, True),)

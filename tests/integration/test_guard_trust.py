@@ -1,0 +1,162 @@
+"""What the guard believes of a drive on the bus: a foreign set-up, a reboot, a read-back at another place."""
+
+from __future__ import annotations
+
+import json
+import struct
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+from click.testing import CliRunner
+
+from fdhil.cli.demo.processes import Process
+from fdhil.cli.main import cli
+from fdhil.daemon.token import read_token
+from fdhil.drivers.commissioning_void import is_void, void_record
+from fdhil.guard.client import GuardClient
+from fdhil.guard.interlocks import FACTS
+from tests.integration.conftest import PATIENCE_S, Bench, sign_off
+from tests.integration.test_guard import toml
+
+pytestmark = pytest.mark.timeout(240)
+WINDOW = 0x6065
+
+
+@pytest.fixture
+def transport() -> str:
+    """Processes are joined."""
+    return "hub"
+
+
+@pytest.fixture
+def sections() -> dict[str, Any]:
+    """One axis; the guard counts time in SYNCs, as the twin does."""
+    return {"sim": {"pace": "lockstep", "modbus": False}, "guard": {"clock": "sync"}}
+
+
+class Shop:
+    """The twin, its config as a file, and a guard that can be started again."""
+
+    def __init__(self, bench: Bench, folder: Path) -> None:
+        self.bench, self.folder, self.config = bench, folder, folder / "machine.toml"
+        self.config.write_text(toml(json.loads(bench.config.model_dump_json(exclude_none=True))), "utf-8")
+        self.store = bench.config.store.directory
+        assert bench.config.store.run_directory is not None
+        self.run = bench.config.store.run_directory
+        sign_off(bench.config)
+
+    @contextmanager
+    def guard(self) -> Iterator[GuardClient]:
+        with Process("guard", ["fdhil.cli.guard", str(self.config)], self.folder / "guard.log") as process:
+            process.event("ready", PATIENCE_S)
+            with GuardClient(self.run) as client:
+                yield client
+
+    def nc(self, on: bool) -> None:
+        """Switch the NC; that it stops because a drive is gone is no error here."""
+        self.bench.command(json.dumps({"command": "nc", "on": on}))
+        while (event := self.bench.events.get(timeout=PATIENCE_S))["event"] != "nc" or event["on"] is not on:
+            pass
+
+    def fault(self, **fault: object) -> None:
+        self.bench.command(json.dumps({"command": "fault", **fault}))
+
+    def write(self, bus: can.BusABC, index: int, value: int, specifier: int = 0x23) -> None:
+        """Another master's SDO download to drive X, of four bytes or (2B) of two."""
+        bus.send(
+            can.Message(
+                arbitration_id=0x601, data=struct.pack("<BHBI", specifier, index, 0, value), is_extended_id=False
+            )
+        )
+
+    def refused(self, client: GuardClient) -> set[tuple[str, str]]:
+        """What forbids arming, by class and axis; that nothing is loaded is none of it."""
+        answer = client.arm(read_token(self.run), "0" * 64, dict.fromkeys(FACTS, True))
+        return {(told["code"], told["axis"]) for told in answer["refused"]} - {
+            ("ProgramMismatch", ""),
+            ("MainLost", ""),
+        }
+
+    def until(self, client: GuardClient, wanted: set[tuple[str, str]]) -> None:
+        """Wait until arming is refused for these reasons, and maybe others; with none wanted for none."""
+        deadline = time.monotonic() + PATIENCE_S
+        while not (found := self.refused(client)) >= wanted or (found and not wanted):
+            assert time.monotonic() < deadline, found
+            time.sleep(0.05)
+
+    def check(self) -> int:
+        found = CliRunner().invoke(cli, ["check", str(self.config), "--json"], standalone_mode=False)
+        assert found.exception is None, found.output
+        return int(found.return_value)
+
+
+@pytest.fixture
+def shop(bench: Bench, tmp_path: Path) -> Shop:
+    return Shop(bench, tmp_path)
+
+
+VOID = {("RecordVoid", "X")}
+
+
+def test_a_record_holds_until_something_against_it_was_seen(shop: Shop) -> None:
+    with shop.guard() as client, shop.bench.join() as bus:
+        shop.nc(on=True)
+        shop.until(client, set())
+        shop.write(bus, WINDOW, 0xFFFFFFFF)
+        shop.until(client, VOID)
+        shop.nc(on=False)
+        assert shop.check() == 1
+        assert is_void(shop.store, "X")
+        shop.write(bus, WINDOW, 32768)
+        assert shop.check() == 0
+        assert not is_void(shop.store, "X")
+        shop.nc(on=True)
+        shop.until(client, set())
+        shop.fault(axis="X", fault="reboot")
+        shop.until(client, VOID | {("NmtStateWrong", "X")})
+        shop.nc(on=False)
+        assert shop.check() == 0
+        shop.nc(on=True)
+        shop.until(client, set())
+    shop.nc(on=False)
+    with shop.bench.join() as bus:
+        shop.write(bus, 0x6007, 0, 0x2B)
+    with shop.guard() as client:  # it is compared before the guard starts, which has not heard of it
+        assert is_void(shop.store, "X")
+        shop.nc(on=True)
+        shop.until(client, VOID)
+
+
+def test_a_void_record_outlives_the_guard_beside_a_running_nc(shop: Shop) -> None:
+    shop.nc(on=True)
+    void_record(shop.store, "X", "booted")
+    with shop.guard() as client:
+        shop.until(client, VOID)
+
+
+def test_a_remapped_read_back_at_100_mm_moves_nothing(shop: Shop, tmp_path: Path) -> None:
+    """0x60B0 and 0x6062 in each other's place: a guard that starts reads the axis' position as its offset."""
+    rows = 450
+    demand = tmp_path / "demand.csv"
+    way = [100 * (10 * t**3 - 15 * t**4 + 6 * t**5) for t in (min(k / (rows - 10), 1.0) for k in range(rows))]
+    demand.write_text("time_s,X_mm,Y_mm\n" + "".join(f"{k * 1e-3:.3f},{x:.6f},0\n" for k, x in enumerate(way)))
+    shop.nc(on=True)
+    shop.bench.command(json.dumps({"command": "play", "file": str(demand)}))
+    shop.bench.event("finished")
+    shop.fault(axis="X", fault="remap", value=3)
+    with shop.bench.join() as bus:
+        bus.set_filters([{"can_id": i, "can_mask": 0x7FF, "extended": False} for i in (0x301, 0x302, 0x764)])
+        with shop.guard() as client:
+            deadline = time.monotonic() + PATIENCE_S
+            while (status := client.status())["state"] != "FROZEN":
+                assert time.monotonic() < deadline, status
+                time.sleep(0.05)
+            assert status["cause"]["code"] == "OffsetDoubtful"
+            assert "100000.0 um may still be applied" in status["cause"]["text"]
+            assert not client.adopt(read_token(shop.run))["ok"]
+        assert bus.recv(0.1) is None

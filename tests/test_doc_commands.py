@@ -1,0 +1,184 @@
+"""Every command that a document shows is one that fdhil has, and those that need no machine run as they stand."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import tomllib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+
+from fdhil import config
+from fdhil.cli.guard import guard
+from fdhil.cli.main import cli
+from fdhil.daemon.keeping import Keeper
+from fdhil.daemon.warm import nominal_rapid
+from fdhil.store.windows import encode_window
+from studies import bench
+from tests.bench import bench_document
+from tests.daemon.shop import fdhil
+from tests.store.made import published
+
+ROOT = Path(__file__).parents[1]
+PAGES = [
+    path
+    for path in sorted([ROOT / "README.md", *ROOT.glob("docs/**/*.md")])
+    if path.parent.name not in ("studies", "reference")
+]
+NEEDS_A_MACHINE = {"sim", "run", "status", "demo"}
+WINDOW = "configs/fdhil-data/windows/w00000001-X.parquet"
+
+
+def blocks(page: Path, language: str) -> Iterator[str]:
+    """Yield the page's fenced blocks of a language."""
+    for found, body in re.findall(r"^```(\w+)\n(.*?)^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL):
+        if found == language:
+            yield body
+
+
+def lines(page: Path) -> list[str]:
+    """Return the commands of the page's shell blocks, fenced or indented, in order, without comments."""
+    text = page.read_text("utf-8")
+    indented = re.findall(r"^    (.*)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.MULTILINE)
+    shown = "\n".join([*blocks(page, "sh"), *indented])
+    return [line.partition("  #")[0].strip() for line in shown.splitlines() if re.match(r"fdhil(-guard)? ", line)]
+
+
+def mentions(page: Path) -> list[str]:
+    """Return the commands that stand within a sentence; what they work on may be left out there."""
+    found = re.findall(r"`(fdhil(?:-guard)? [^`]*)`", " ".join(page.read_text("utf-8").split()))
+    return [line for line in found if not line.startswith("fdhil --")]
+
+
+def chosen(line: str) -> tuple[click.Command, list[str]]:
+    """Return the command of a line and its arguments; UsageError where fdhil has none of that name."""
+    program, *words = shlex.split(line)
+    if program == "fdhil-guard":
+        return guard, words
+    command = cli.get_command(click.Context(cli), words[0])
+    if command is None:
+        raise click.UsageError(f"there is no command {words[0]}")
+    return command, words[1:]
+
+
+def faults(line: str, whole: bool) -> str:
+    """Return what is wrong with a command line; options and, where it is ``whole``, the number of arguments."""
+    try:
+        command, words = chosen(line)
+        context = click.Context(command)
+        values, rest, _ = command.make_parser(context).parse_args(list(words))
+    except click.UsageError as error:
+        return f"{line}: {error}"
+    for parameter in command.params:
+        value = values.get(parameter.name or "")
+        if isinstance(parameter.type, click.Choice) and isinstance(value, str) and value not in parameter.type.choices:
+            return f"{line}: {value} is none of {', '.join(parameter.type.choices)}"
+        missing = (
+            isinstance(parameter, click.Argument)
+            and parameter.required
+            and not (isinstance(value, str | tuple) and value)
+        )
+        if whole and (missing or rest):
+            return f"{line}: {parameter.name} is missing, or {rest} is too much"
+    return ""
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_command_of_a_document_is_one_that_fdhil_has(page: Path) -> None:
+    assert [wrong for line in lines(page) if (wrong := faults(line, whole=True))] == []
+    assert [wrong for line in mentions(page) if (wrong := faults(line, whole=False))] == []
+
+
+def test_a_command_that_fdhil_does_not_have_is_seen() -> None:
+    assert faults("fdhil predict part.ngc --config machine.toml", whole=True) == ""
+    assert "foretell" in faults("fdhil foretell part.ngc", whole=True)
+    assert "--colour" in faults("fdhil predict part.ngc --colour red", whole=False)
+    assert "rain" in faults("fdhil correct part.ngc --method rain", whole=False)
+    assert "missing" in faults("fdhil predict --config machine.toml", whole=True)
+
+
+@pytest.fixture
+def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of configs/ with a store in which one rapid and a set of parameters are kept, as after ``fdhil run``."""
+    shutil.copytree(ROOT / "configs", tmp_path / "configs")
+    machine = config.load(tmp_path / "configs" / "sim.toml")
+    keeper = Keeper(machine)
+    keeper.open()
+    keeper.keep([published(1), published(1, "Y")])
+    keeper.close()
+    rapid = encode_window(nominal_rapid("X", machine.axis["X"], machine.machine.sync_period_s), machine.digest)
+    (tmp_path / WINDOW).parent.mkdir(exist_ok=True)
+    (tmp_path / WINDOW).write_bytes(rapid)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/tutorial/first-identification.md"])
+def test_the_first_commands_run_as_they_stand(page: str, house: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    ran = 0
+    for line in lines(ROOT / page):
+        line = line.replace("*.parquet", Path(WINDOW).name).replace("FILE.parquet", Path(WINDOW).name)
+        name = shlex.split(line)[1]
+        if line.startswith("fdhil ") and name not in NEEDS_A_MACHINE and "machine.toml" not in line:
+            code, out, err = fdhil(*shlex.split(line)[1:], capsys=capsys)
+            assert code == 0, f"{line}: {out}{err}"
+            ran += 1
+    assert ran >= 6
+    assert [path.name for path in house.glob("*.csv")] != []
+
+
+def spoilt(text: str, change: Callable[[list[list[str]]], list[list[str]]]) -> str:
+    """Return a recording's text with its rows changed."""
+    head, _, body = text.partition("time_s")
+    names, *rows = [line.split(",") for line in f"time_s{body}".splitlines()]
+    return head + "\n".join(",".join(row) for row in [names, *change(rows)]) + "\n"
+
+
+def scaled(column: int) -> Callable[[list[list[str]]], list[list[str]]]:
+    """Return the change that multiplies a column by 1.2."""
+    return lambda rows: [[*row[:column], f"{1.2 * float(row[column]):.6f}", *row[column + 1 :]] for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda rows: rows[:350] + rows[390:], "StaleData"),
+        (lambda rows: [[*row[:2], rows[300][2], *row[3:]] if 300 <= k < 360 else row for k, row in enumerate(rows)],
+         "StuckValue"),
+        (scaled(3), "CalibrationSuspect"),
+        (scaled(2), ""),
+    ],
+    ids=["rows deleted", "value repeated", "speed x 1.2", "current x 1.2"],
+)  # fmt: skip
+def test_the_tutorial_says_what_becomes_of_a_spoilt_rapid(
+    change: Callable[[list[list[str]]], list[list[str]]], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Without the data sheet a gain that is wrong all the time is another drive; all else is refused by name."""
+    text = bench.as_csv(bench.run(bench.Plant(), bench.shuttle()), 0.001)
+    assert text.partition("time_s")[2].startswith(",voltage_V,current_A,speed_rad_per_s,")
+    (tmp_path / "rapid.csv").write_text(spoilt(text, change))
+    code, out, _ = fdhil("identify", tmp_path / "rapid.csv", capsys=capsys)
+    assert (code, told in out) == (1 if told else 0, True), out
+    assert not told or told in (ROOT / "docs/tutorial/first-identification.md").read_text("utf-8")
+
+
+def merged(document: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """Return a document with a part of another file put in."""
+    for key, value in changes.items():
+        document[key] = merged(document.get(key, {}), value) if isinstance(value, dict) else value
+    return document
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_piece_of_a_configuration_can_be_put_into_one(page: Path) -> None:
+    for text in blocks(page, "toml"):
+        piece = tomllib.loads(text)
+        if "fault" not in piece:  # the simulated machine's own script
+            assert config.parse(merged(bench_document(), piece)).axis
+    for text in blocks(page, "python"):
+        compile(text, str(page), "exec")

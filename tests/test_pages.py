@@ -1,0 +1,121 @@
+"""The pages under docs/ that commands write: each is what its figures say, and other figures make other words."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks import __main__ as benchmarks
+from studies.pages import FOLDER, plain, provenance, rendered
+
+ROOT = Path(__file__).parents[1]
+STUDIES = sorted(path.stem for path in FOLDER.glob("*.md"))
+Figures = dict[str, Any]
+
+
+def document(study: str) -> Figures:
+    told: Figures = json.loads((FOLDER / f"{study}.json").read_text("utf-8"))
+    return told
+
+
+def prose(page: str) -> str:
+    """Return a page's words without its tables, in one line."""
+    return " ".join(line for line in page.splitlines() if not line.startswith("|"))
+
+
+@pytest.mark.parametrize("study", STUDIES)
+def test_a_page_is_what_its_figures_say(study: str) -> None:
+    figures = document(study)
+    page = (FOLDER / f"{study}.md").read_text("utf-8")
+    assert rendered(figures) == page
+    words = prose(page)
+    assert figures["study"] == study
+    for told in ("command", "seeds", "commit", "date"):
+        assert figures["run"][told] in words
+    for library in ("Python", "numpy", "scipy", "numba"):
+        assert f"{library} " in figures["run"]["versions"]
+    assert "local changes" not in figures["run"]["commit"]
+
+
+def test_the_benchmarks_page_is_what_its_figures_say() -> None:
+    figures = json.loads(benchmarks.FIGURES.read_text("utf-8"))
+    assert list(figures) == list(benchmarks.BENCHMARKS)
+    assert benchmarks.page(figures) == (ROOT / "docs" / "benchmarks.md").read_text("utf-8")
+
+
+def _least_squares_without_bias(figures: Figures) -> None:
+    """A world in which raw least squares is right and the product's other choices are not."""
+    names = figures["methods"]
+    for case in figures["cases"]:
+        for k in range(len(figures["filters"])):
+            first, second = names.index("zero_forcing_1"), names.index("central")
+            case["rms"][k][first] = [2 * error for error in case["rms"][k][second]]
+            case["bias"][k][first] = [0.0] * 6
+        case["rejected"] = [[[1.0] * 6] * len(names)] * len(figures["filters"])
+
+
+def _moments_win(figures: Figures) -> None:
+    for part in figures["noises"]:
+        part["methods"]["partial moments"]["rms"] = [1e-9] * 6
+
+
+def _history_blind(figures: Figures) -> None:
+    figures["steps"] = [[[], 0, False] for _ in figures["steps"]]
+    figures["due"] = [[False, False, None] for _ in figures["due"]]
+
+
+def _some_accepted(figures: Figures) -> None:
+    (first, *_) = figures.values()
+    first["backlash"] |= {"accepted": 3, "right": 0, "wrong": [24, 54, 84]}
+
+
+def _intervals_lie(figures: Figures) -> None:
+    figures["intervals"][0]["share"][3] = 0.02
+    figures["verdicts"]["good"] |= {"refused": 77}
+
+
+@pytest.mark.parametrize(
+    ("study", "other", "gone", "told"),
+    [
+        (
+            "comparison",
+            _least_squares_without_bias,
+            "",
+            ("with 40 Hz in none of 9 cases (otherwise central in 9)", "With 150 Hz: unbiased", "100 / 100 with 40 Hz"),
+        ),
+        ("estimators", _moments_win, "Smallest error: maximum likelihood", ("partial moments of R, L, K,",)),
+        (
+            "drift",
+            _history_blind,
+            "95 % interval holds",
+            ("nothing: 100 of 100", "not within 5: 100", "in 0 of 100", "told in 0 of 60 histories."),
+        ),
+        ("verdicts", _some_accepted, "backlash (100%)", (" 3 accepted (", "backlash (0%)", "backlash 24, 54, 84")),
+        ("slow_sensor", _intervals_lie, "", ("that of Jt holds the truth least often: 2 %", " 77 windows refused")),
+    ],
+)
+def test_other_figures_make_other_conclusions(
+    study: str, other: Callable[[Figures], None], gone: str, told: tuple[str, ...]
+) -> None:
+    figures = document(study)
+    before = prose(rendered(figures))
+    other(changed := copy.deepcopy(figures["figures"]))
+    after = prose(rendered({**figures, "figures": changed}))
+    for words in told:
+        assert words not in before
+        assert words in after
+    assert not gone or gone not in after
+
+
+def test_every_study_of_the_page_has_a_case_above() -> None:
+    assert STUDIES == ["comparison", "drift", "estimators", "slow_sensor", "verdicts"]
+
+
+def test_figures_survive_the_file() -> None:
+    assert plain({"a": (float("nan"), 1.23456789), "n": 3, "s": "R"}) == {"a": [None, 1.23457], "n": 3, "s": "R"}
+    assert provenance("python -m studies.x")["versions"].startswith("Python 3.")
