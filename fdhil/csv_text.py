@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from fdhil.errors import RecordingError
 
 MAX_BYTES = 256 * 1024 * 1024  # an hour of six columns at 1 kHz
 MAX_ROWS = 8_000_000  # more than two hours at 1 kHz
+MAX_LINE_CHARS = 64 * 1024
 SHOWN_CHARS = 40
 LINE_ENDS = "\n\r\v\f\x1c\x1d\x1e\x85\u2028\u2029"  # of str.splitlines
 
@@ -26,6 +28,15 @@ def read_csv_text(path: Path) -> str:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise RecordingError(f"{path} is no text file: export it as CSV in UTF-8") from None
+
+
+def check_lengths(lines: Sequence[str], first: int, source: str) -> None:
+    """Refuse a line that is too long for columns before it is taken apart; ``first`` is its 1-based number."""
+    for number, line in enumerate(lines, first):
+        if len(line) > MAX_LINE_CHARS:
+            raise RecordingError(
+                f"{source} line {number} has {len(line)} characters, which no row has: export it again"
+            )
 
 
 def shown(text: str) -> str:

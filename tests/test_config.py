@@ -83,7 +83,7 @@ def test_limits_that_cannot_be_ramped_down_in_time_are_refused() -> None:
         (10_000, (50.0, 2.0, 2000.0), ""),
         (65_536, (50.0, 2.0, 250.0), "set the drive to 80,000 or more per turn"),
         (100, (50.0, 20.0, 2000.0), "set the drive to 10,000 or more per turn"),
-        (65_536, (50.0, 1e-300, 2000.0), "no resolution would do"),
+        (65_536, (50.0, 1e-9, 2000.0), "no resolution would do"),
     ],
 )
 def test_increments_too_coarse_for_the_limits_are_refused(

@@ -122,6 +122,20 @@ def test_a_replayed_window_gives_the_same_bits_through_a_file(config: MachineCon
     assert numbers(AxisPipeline("X", config).feed(stored)) == numbers(live)
 
 
+def test_a_gain_that_is_wrong_all_along_is_told_once_against_the_data_sheet(config: MachineConfig) -> None:
+    """No window can show it; the sets are published all the same, since the data sheet may be what is wrong."""
+    records = [
+        replace(r, voltage_v=frozen(1.2 * r.voltage_v)) if isinstance(r, AxisSamples) and r.voltage_v is not None else r
+        for r in rapids(config, count=2)
+    ]
+    outcomes = fed(AxisPipeline("X", config), records)
+    assert sum(isinstance(outcome, ParameterSet) for outcome in outcomes) == 2
+    (notice,) = [outcome for outcome in outcomes if isinstance(outcome, Notice)]
+    assert notice.code == "CalibrationSuspect"
+    assert "the voltage is read 1.20 times as large as it is" in notice.text
+    assert not any(isinstance(o, Notice) for o in fed(AxisPipeline("X", config, with_skill=False), records))
+
+
 def test_lost_samples_are_nan_and_listed_and_refused(config: MachineConfig) -> None:
     records = rapids(config, count=1)
     lost = range(800, 812)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, model_validator
 
 from fdhil.config.axis import Axis
 from fdhil.config.controller import G0, Identification, Nc
 from fdhil.config.offset_limits import limit_faults
+from fdhil.config.plausible import doubts
 from fdhil.config.regulators import period_faults
 from fdhil.config.section import AxisName, Positive, Section
 from fdhil.config.service import CanBus, Guard, Maintenance, Store
@@ -38,14 +39,18 @@ class MachineConfig(Section):
     sim: Sim = Sim()
 
     @model_validator(mode="after")
-    def _consistent(self) -> MachineConfig:
+    def _consistent(self, info: ValidationInfo) -> MachineConfig:
         period = self.machine.sync_period_s
         faults: list[str] = []
         for name, axis in self.axis.items():
             if axis.drive.bus not in self.bus:
                 faults.append(f"axis.{name}.drive.bus: there is no [bus.{axis.drive.bus}]")
             faults += [f"axis.{name}.regulators.{fault}" for fault in period_faults(axis.regulators, period)]
-            faults += [f"axis.{name}.correction: {fault}" for fault in limit_faults(axis, period)]
+            limits = [f"axis.{name}.correction: {fault}" for fault in limit_faults(axis, period)]
+            # a number in another unit makes limits wrong too, and says so better
+            found = [] if (info.context or {}).get("made_up") else doubts(axis)
+            faults += [f"axis.{name}.{doubt.key}: {doubt.text}" for doubt in found if limits or not doubt.possible]
+            faults += limits
         ids = [self.node_id(name) for name in self.axis]
         if len({(self.axis[n].drive.bus, i) for n, i in zip(self.axis, ids, strict=True)}) < len(ids):
             faults.append("axis: two drives of one bus have the same node_id")

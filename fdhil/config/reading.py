@@ -63,13 +63,9 @@ def parse(
     ``made_up``: its axes need not be those of a machine that can be.
     """
     try:
-        config = MachineConfig.model_validate(document)
+        config = MachineConfig.model_validate(document, context={"made_up": made_up})
     except ValidationError as error:
         raise ConfigError(source, _faults(error)) from None
-    found = [] if made_up else [(name, doubt) for name, axis in config.axis.items() for doubt in doubts(axis)]
-    impossible = [ConfigFault(f"axis.{name}.{doubt.key}", doubt.text) for name, doubt in found if not doubt.possible]
-    if impossible:
-        raise ConfigError(source, impossible)
     directory = folder / config.store.directory
     run, key = config.store.run_directory, config.store.commissioning_key
     store = config.store.model_copy(
@@ -104,7 +100,9 @@ def _faults(error: ValidationError) -> list[ConfigFault]:
                 where, _, what = line.partition(": ")
                 faults.append(ConfigFault(where, what))
         elif item["type"] in OUT_OF_RANGE and (bounds := _bounds(item["loc"])):
-            faults.append(ConfigFault(path, f"must be {bounds}, not {_shown(item['input'])}", _describe(item["loc"])))
+            kind = "a finite number " if item["type"] == "finite_number" else ""
+            what = f"must be {kind}{bounds}, not {_shown(item['input'])}"
+            faults.append(ConfigFault(path, what, _describe(item["loc"])))
         else:
             shown = f", not {_shown(item['input'])}" if isinstance(item["input"], str | int | float | bool) else ""
             faults.append(ConfigFault(path, item["msg"].removeprefix("Value error, ") + shown, _describe(item["loc"])))

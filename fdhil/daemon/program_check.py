@@ -47,7 +47,7 @@ MOST_REFUSED = 20  # places that are listed
 TELL_S = 0.5
 NICENESS = 10
 # what the rows depend on: their code and the libraries that compute them
-ROOMS = ("program", "correction", "prediction", "model", "records", "config", "tables.py", "cia402.py")
+ROOMS = ("program", "correction", "prediction", "model", "records", "config", "tables.py", "cia402.py", "csv_text.py")
 OWN = "daemon/program_check.py"
 LIBRARIES = (np, scipy, numba)
 

@@ -99,7 +99,7 @@ def _records(config: MachineConfig, bus: str) -> list[CommissioningRecord]:
     for name, axis in config.axis.items():
         if axis.correction is not None and axis.drive.bus == bus:
             try:
-                record = load_record(config.store.directory, name)
+                record = load_record(config.store.directory, name, config.store.commissioning_key)
             except StoreError:
                 continue  # one that cannot be read is none, and is told when something is armed
             records += [record] if record is not None else []

@@ -88,7 +88,7 @@ def compare_asked(config: MachineConfig, axis: str) -> list[Finding]:
 def _record(config: MachineConfig, axis: str, found: Survey) -> Iterator[Finding]:
     """Whether the drive is the one that was signed off; nothing where none was."""
     try:
-        record = load_record(config.store.directory, axis)
+        record = load_record(config.store.directory, axis, config.store.commissioning_key, may_lack_key=True)
     except StoreError as error:
         cause, _, advice = str(error).partition("; ")
         yield Finding(POINT, "as signed off", "cannot be read", False, cause, advice)

@@ -20,11 +20,13 @@ from fdhil.pipeline.ring import Ring, Stretch
 from fdhil.prediction import skill
 from fdhil.records import (
     AxisSamples,
+    Estimate,
     Float,
     MoveEvent,
     MoveKind,
     Notice,
     Outcome,
+    Parameters,
     ParameterSet,
     Recording,
     Skill,
@@ -36,6 +38,7 @@ from fdhil.records import (
     WindowOutcome,
     frozen,
 )
+from fdhil.validation.data_sheet import gain_error
 
 RING_S = 30.0  # a rapid that is longer than this is cut short, and then refused for its missing stage
 LEAD_S = 0.25  # standstill wanted before a rapid
@@ -79,7 +82,7 @@ class AxisPipeline:
     ) -> None:
         """``method`` names an estimator (None: the config's choice); ``known`` is where an earlier run left off.
 
-        ``with_skill`` False leaves the closed loop out, for a recording whose regulators are not known.
+        ``with_skill`` False leaves out what needs the axis' own section, for a recording of which none is known.
         """
         self.axis = axis
         self._config = config
@@ -97,6 +100,7 @@ class AxisPipeline:
         self._tracker = DriftTracker(config.maintenance, axis)
         self._tracker.resume(known.first.parameters if known.first else None, known.points)
         self._with_skill = with_skill
+        self._gain_suspected = False
 
     @property
     def published(self) -> ParameterSet | None:
@@ -260,7 +264,18 @@ class AxisPipeline:
             temperature_c=newest.temperature_c,
             config_digest=self._config.digest,
         )
-        return [self._published]
+        return [self._published, *self._against_data_sheet(estimate, newest.start_tick)]
+
+    def _against_data_sheet(self, estimate: Estimate, tick: int) -> list[Notice]:
+        """Tell once, and again after it was gone, that only a sensor's gain explains how the set is off nominal."""
+        if not self._with_skill:  # the axis' section is made up
+            return []
+        nominal = Parameters(**self._config.axis[self.axis].nominal.model_dump())
+        reason, before = gain_error(estimate, nominal), self._gain_suspected
+        self._gain_suspected = reason is not None
+        if reason is None or before:
+            return []
+        return [Notice(reason.code, "minor", f"{reason.text}; {reason.advice}", self.axis, tick)]
 
     def _judge(self, window: Window, published: ParameterSet | None) -> Skill | None:
         """Compare the move with what the set that was valid before it predicts; None where that cannot be done."""

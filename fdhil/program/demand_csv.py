@@ -11,7 +11,7 @@ from typing import IO
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.csv_text import read_csv_text
+from fdhil.csv_text import check_lengths, read_csv_text
 from fdhil.errors import ConfigError, ConfigFault, RecordingError
 from fdhil.records import Float, Trajectory, frozen, frozen_ints
 
@@ -56,6 +56,7 @@ def read_demand_csv(path: Path, config: MachineConfig) -> Trajectory:
 
 def _numbers(path: Path, text: str, width: int) -> Float:
     rows = text.splitlines()[1:]
+    check_lengths(rows, 2, str(path))
     if not any(row.strip() for row in rows):
         raise RecordingError(f"{path}: there is no row of data; record or export it again")
     try:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdhil.csv_text import MAX_ROWS, read_csv_text, shown
+from fdhil.csv_text import MAX_ROWS, check_lengths, read_csv_text, shown
 from fdhil.errors import RecordingError
 from fdhil.records import Float, Recording, SlowVoltage, VoltageSampling, frozen
 
@@ -16,6 +16,7 @@ COLUMNS = ("time_s", "voltage_V", "current_A", "speed_rad_per_s", "position_m", 
 REQUIRED = ("format", "sample_rate_hz", "voltage_sampling", "axis", "pitch_m_per_rev")
 STEP_TOLERANCE = 0.01
 MIN_ROWS = 16
+MAX_SAMPLES_CHARS = 16 * 1024 * 1024
 PITCH_M = (1e-5, 0.8)
 RATE_HZ = (1.0, 1e6)
 RAPID_M_S = (1e-4, 20.0)
@@ -74,6 +75,8 @@ def _slow_voltage(headers: dict[str, str], start_s: float, dt_s: float, source: 
         raise RecordingError(
             f"{source} has voltage samples {period:g} s apart, closer than its rows: give voltage_period_s in seconds"
         )
+    if len(headers["voltage_samples_V"]) > MAX_SAMPLES_CHARS:
+        raise RecordingError(f"{source} has more voltage samples than a recording has: cut it into parts")
     try:
         told = np.array(headers["voltage_samples_V"].split(), dtype=np.float64)
     except ValueError:
@@ -98,6 +101,7 @@ def _split(text: str, source: str) -> tuple[dict[str, str], int, list[str]]:
             headers[key.strip()] = value.strip()
     if k == len(lines):
         raise RecordingError(f"{source} is truncated: it has headers but no columns; record it again")
+    check_lengths(lines[k:], k + 1, source)
     missing = [key for key in REQUIRED if not headers.get(key)]
     if missing:
         raise RecordingError(f"{source} has no header {', '.join(missing)}: add a line such as '# {missing[0]}: ...'")

@@ -7,13 +7,13 @@ import json
 import os
 import random
 import stat
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from fdhil.drivers import commissioning_record
 from fdhil.drivers.commissioning_record import (
     KEY_NAME,
     SCHEMA,
@@ -69,18 +69,30 @@ def test_a_record_of_the_time_before_the_key_asks_for_commissioning(tmp_path: Pa
         load_record(tmp_path, "X")
 
 
+def _link(key: Path) -> None:
+    key.rename(key.with_suffix(".old"))
+    key.symlink_to(key.with_suffix(".old"))
+
+
+def _fifo(key: Path) -> None:
+    key.unlink()
+    os.mkfifo(key, 0o600)
+
+
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
         (lambda key: key.chmod(0o644), "can be read by others"),
         (lambda key: key.unlink(), "cannot be read"),
         (lambda key: key.write_text("short"), "is damaged"),
-        (lambda key: (key.unlink(), os.mkfifo(key, 0o600)), "can be read by others"),
-        (lambda key: (key.rename(key.with_suffix(".old")), key.symlink_to(key.with_suffix(".old"))), "cannot be read"),
+        (_fifo, "can be read by others"),
+        (_link, "cannot be read"),
     ],
     ids=["readable", "missing", "short", "fifo", "link"],
 )
-def test_a_key_that_keeps_no_secret_vouches_for_nothing(spoil: Any, words: str, tmp_path: Path) -> None:
+def test_a_key_that_keeps_no_secret_vouches_for_nothing(
+    spoil: Callable[[Path], object], words: str, tmp_path: Path
+) -> None:
     save_record(RECORD, tmp_path)
     spoil(tmp_path / KEY_NAME)
     with pytest.raises(StoreError, match=words) as error:
@@ -97,7 +109,7 @@ def test_who_may_not_read_the_key_believes_the_digest_alone_if_it_says_so(
         assert Path(path).name == KEY_NAME
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr(commissioning_record.os, "open", refuse)
+    monkeypatch.setattr(os, "open", refuse)
     with pytest.raises(StoreError, match="may not be read by this user"):
         load_record(tmp_path, "X")
     assert load_record(tmp_path, "X", may_lack_key=True) == RECORD

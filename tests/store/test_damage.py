@@ -16,7 +16,7 @@ import pytest
 from fdhil.daemon.keeping import Keeper
 from fdhil.errors import RecordingError, StoreError
 from fdhil.records import Notice, Parameters, Skill
-from fdhil.store import schema, windows
+from fdhil.store import schema
 from fdhil.store.history import FILE_NAME, Comparison, History, UsedParameters, latest_parameters
 from fdhil.store.windows import decode_window, encode_window
 from tests.daemon.machine import config_of
@@ -215,9 +215,6 @@ def test_a_file_that_would_take_more_than_a_window_is_refused_before_it_is_read(
     def unread(*_: Any, **__: Any) -> None:
         raise AssertionError("the columns were read")
 
-    class Watched(pq.ParquetFile):
-        read = unread
-
-    monkeypatch.setattr(windows.pq, "ParquetFile", Watched)
+    monkeypatch.setattr(pq.ParquetFile, "read", unread)
     with pytest.raises(RecordingError, match=words):
         decode_window(content)
