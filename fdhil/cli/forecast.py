@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fdhil.cli.parameter_view import INTERVAL_95
+from fdhil.cli.parameter_view import INTERVAL_95, within
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -161,7 +161,7 @@ def show_compared(found: Mapping[str, Any] | None) -> None:
         line = f"line {zone['line']}, " if zone["line"] else ""
         half_um = INTERVAL_95 * zone["std_um"]
         click.echo(
-            f"  {zone['change_um']:+.1f} ± {half_um:.1f} um at {line}{zone['where']} ({zone['cause']},"
+            f"  {zone['change_um']:+.1f} ± {within(half_um)} um at {line}{zone['where']} ({zone['cause']},"
             f" {zone['before_um']:.1f} -> {zone['now_um']:.1f}){_because(zone)}"
         )
     if len(beyond) > MANY_CHANGES:

@@ -31,6 +31,11 @@ def half_of(told: Mapping[str, Any]) -> float | None:
     return float(told["high"] - told["low"]) / 2
 
 
+def within(half: float) -> str:
+    """Return half an interval: one decimal, a smaller one to its first figure, never 0.0 for what is not 0."""
+    return f"{half:.1f}" if half >= 0.1 or half == 0.0 else f"{half:.1g}"
+
+
 def cell(name: str, value: float | None, half: float | None, between: str = "\n") -> str:
     """Return a value and half of its interval in the parameter's unit, both to the place where the half begins."""
     if value is None or not math.isfinite(value):

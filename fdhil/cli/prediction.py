@@ -14,7 +14,7 @@ import click
 from fdhil import tables
 from fdhil.cli.compiling import forewarn
 from fdhil.cli.options import OutputFile, Positive
-from fdhil.cli.parameter_view import INTERVAL_95, MEANING
+from fdhil.cli.parameter_view import INTERVAL_95, MEANING, within
 
 if TYPE_CHECKING:
     from fdhil.cli.forecast import Past
@@ -344,7 +344,7 @@ def _show_prediction(
     entries = _zones(predicted) if told is None else told
     shown = sorted(sorted(entries, key=lambda zone: -zone["max_um"])[:MANY_ZONES], key=lambda zone: zone["start_s"])
     for zone in shown:
-        std = f" ± {INTERVAL_95 * zone['std_um']:.1f}" if "std_um" in zone else ""
+        std = f" ± {within(INTERVAL_95 * zone['std_um'])}" if "std_um" in zone else ""
         line = f"line {zone['line']}, " if zone["line"] else ""
         click.echo(
             f"  {zone['start_s']:8.3f} s .. {zone['end_s']:8.3f} s  {zone['max_um']:8.1f}{std} um  {zone['cause']:12}"

@@ -181,7 +181,7 @@ def test_a_bus_that_is_not_there_is_3(command: str, capsys: Any) -> None:
         port = free.getsockname()[1]
     Path("absent_bus.toml").write_text(bench_toml() + f'[bus.can0]\ninterface = "socketcand"\nport = {port}\n')
     arguments = [text.format(config="absent_bus.toml") for text in WITH_CONFIG[command]]
-    told(capsys, TROUBLE, command, *arguments)
+    assert f"127.0.0.1:{port} cannot be reached" in told(capsys, TROUBLE, command, *arguments)
 
 
 @pytest.mark.parametrize("command", ["status", "arm", "disarm"])
