@@ -154,6 +154,20 @@ def test_a_file_that_cannot_be_written_is_3_and_found_at_once(out: str, words: s
     assert Path("pipe").is_fifo()
 
 
+def test_nothing_is_written_over_what_is_read(capsys: Any) -> None:
+    Path("w.parquet").write_bytes(b"window")
+    for command, arguments in WITH_OUT.items():
+        read = next(text for text in arguments if "." in text)
+        if command not in ("history", "sim"):
+            before = Path(read).read_bytes()
+            assert "choose another name" in told(
+                capsys, USAGE, command, *(text.format(out=f"./{read}") for text in arguments)
+            )
+            assert Path(read).read_bytes() == before
+    both = ["--out", "once.csv", "--report", "once.csv"]
+    told(capsys, USAGE, "predict", "part.ngc", "--config", "bench.toml", *both)
+
+
 def test_a_picture_of_an_unknown_kind_is_2(capsys: Any) -> None:
     assert ".png, .svg, .pdf" in told(capsys, USAGE, "history", "bench.toml", "--plot", "drift.bmp")
 
