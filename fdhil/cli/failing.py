@@ -19,6 +19,10 @@ from fdhil.errors import ConfigError, ConfigFault, FdhilError
 SCHEMA = "fdhil-error-1"
 STOPPED = 130
 TROUBLE = 3
+NO_CACHE = (
+    "compiled code can be kept neither beside fdhil nor in the home of this user; nothing was started; "
+    "set NUMBA_CACHE_DIR to a folder that this user may write"
+)
 
 
 def run_safely(command: click.Command) -> int:
@@ -45,6 +49,10 @@ def run_safely(command: click.Command) -> int:
         place = f"{error.filename}: " if error.filename else ""
         text = f"{place}{error.strerror or error}; nothing more was done, check the disk, the path and its rights"
         return tell(type(error).__name__, text, TROUBLE)
+    except RuntimeError as error:
+        if "no locator available" not in str(error):  # numba's words
+            raise
+        return tell("NoCache", NO_CACHE, TROUBLE)
     except MemoryError:
         return tell("MemoryError", "the memory is used up; give a smaller file, or free memory", TROUBLE)
     return int(result or 0)

@@ -14,6 +14,7 @@ import pytest
 
 from fdhil.cli.parameter_view import cell, half_of
 from fdhil.cli.status_view import sparkline
+from fdhil.daemon import journal
 from fdhil.daemon.status import Watch
 from fdhil.daemon.token import ensure_token
 from fdhil.records import Notice
@@ -154,3 +155,14 @@ def test_small_pictures() -> None:
     assert cell("R", 0.5, half_of({"low": 0.488, "high": 0.512}), " ") == "500 ±12"
     assert cell("K", 0.8, half_of({"low": None, "high": None}), " ") == "0.8 (no ±)"
     assert cell("K", None, None) == "-"
+
+
+def test_lines_of_the_daemon_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    """For programs: one object a line on stdout, only while it is asked for."""
+    with journal.lines_as_json(True):
+        journal.write_line("X: LoadChanged", "MAJOR")
+    with journal.lines_as_json(False):
+        journal.write_line("X: said to a person")
+    said = capsys.readouterr()
+    assert json.loads(said.out) == {"severity": "MAJOR", "text": "X: LoadChanged"}
+    assert "said to a person" in said.err

@@ -39,6 +39,7 @@ WITH_CONFIG = {
 WITHOUT_CONFIG = {"demo": ["--out", "out"], "interpret": ["part.ngc"], "export": ["w.parquet", "--out", "out.csv"]}
 # what a command is called with where the file that it works on is what is wrong
 WITH_FILE = {
+    "arm": ["bench.toml", "{file}"],
     "identify": ["{file}"],
     "replay": ["{file}"],
     "export": ["{file}", "--out", "out.csv"],
@@ -47,7 +48,13 @@ WITH_FILE = {
     "correct": ["{file}", "--config", "bench.toml"],
     "advise": ["{file}", "--config", "bench.toml", "--tolerance-um", "50"],
 }
-SUFFIXES = {"identify": [".csv"], "replay": [".csv", ".parquet"], "export": [".parquet"], "interpret": [".ngc"]}
+SUFFIXES = {
+    "arm": [".ngc"],
+    "identify": [".csv"],
+    "replay": [".csv", ".parquet"],
+    "export": [".parquet"],
+    "interpret": [".ngc"],
+}
 # what a command is called with where the file that it is to write cannot be
 WITH_OUT = {
     "predict": ["part.ngc", "--config", "bench.toml", "--out", "{out}"],
