@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,7 @@ def _same_file(path: Path, there: Path) -> bool:
     """Whether two names are of one regular file, one that is there or one that is to be."""
     if path.exists():
         return path.is_file() and there.exists() and path.samefile(there)
-    return path.resolve() == there.resolve()
+    return os.path.realpath(path) == os.path.realpath(there)
 
 
 def _paths(value: Any) -> list[Path]:
