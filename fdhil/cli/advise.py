@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil.cli.compiling import forewarn
-from fdhil.cli.options import OutputFile, Positive
+from fdhil.cli.options import OutputFile, Positive, Writing
 from fdhil.cli.prediction import FILE, inputs
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from fdhil.records import Float, Parameters, Trajectory
 
 
-@click.command()
+@click.command(cls=Writing)
 @click.argument("program", type=FILE, metavar="PROGRAM|DEMAND.csv")
 @click.option("--config", "config_path", type=FILE, required=True, help="The machine's configuration (TOML).")
 @click.option("--model", "model_path", type=FILE, help="Parameters of each axis (JSON).")
@@ -56,8 +56,8 @@ def advise(
     Exit codes: 0 every line can be held by some feed, 1 some line cannot, 2 wrong option, model or configuration, 3 a
     file cannot be read or written.
     """
-    if out is not None:
-        _check_out(program, out)
+    if out is not None and program.suffix.lower() == ".csv":
+        raise click.UsageError("--out writes an NC program, and a demand has no F words; give the program")
     reference, models, config = inputs(program, config_path, model_path, from_history)
     from fdhil.prediction import advise as advising
 
@@ -86,13 +86,6 @@ def advise(
     elif out is not None:
         click.echo(f"written to {out}", err=True)
     return 1 if any(a.plain.share is None and (a.corrected is None or a.corrected.share is None) for a in advice) else 0
-
-
-def _check_out(program: Path, out: Path) -> None:
-    if program.suffix.lower() == ".csv":
-        raise click.UsageError("--out writes an NC program, and a demand has no F words; give the program")
-    if out.exists() and program.exists() and out.samefile(program):
-        raise click.UsageError("--out is the program itself; choose another name")
 
 
 def _write(program: Path, advice: Sequence[Advice], config: MachineConfig, out: Path) -> None:

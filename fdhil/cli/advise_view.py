@@ -18,7 +18,7 @@ BRACKETED = (
     " the higher one if its accelerations fell with the square of the feed"
 )
 MANY = 20  # ranges that are shown
-SPREADS = (1.1, 1.5, 2.0, 4.0, math.inf)  # highest to lowest feed within one range
+SPREADS = (1.1, 1.5, 2.0, 4.0)  # highest to lowest feed within one range
 Range = list["Advice"]
 
 
@@ -34,11 +34,14 @@ def show(
         click.echo(f"the whole path stays within {tolerance_um:g} um as programmed")
         return
     found = ranges(advice, feeds)
+    if len(found) > MANY:
+        slowest = min(cut(a.plain.run * a.feed_mm_min) for a in advice)
+        click.echo(f"{len(advice)} lines in {len(found)} ranges, down to F{slowest:g}; the {MANY} worst of them:")
     worst = sorted(found, key=lambda one: -_worst(one).error_um)[:MANY]
     for one in sorted(worst, key=lambda one: one[0].start_s):
         _show_range(one, most)
     if len(found) > len(worst):
-        click.echo(f"and {len(found) - len(worst)} ranges that leave it less (--json lists every line)")
+        click.echo("--json lists every line")
     if most:
         click.echo(BRACKETED)
     if not corrects:
@@ -61,7 +64,7 @@ def _runs(advice: Sequence[Advice], feeds: Callable[[int], bool], spread: float)
     for a in advice:
         feed = a.plain.run * a.feed_mm_min
         wide = max(high, feed) > spread * min(low, feed)
-        if run and (wide or not (_follows(run[-1], a, feeds) and (_alike(run[-1], a) or math.isinf(spread)))):
+        if run and (wide or not (_alike(run[-1], a) and _follows(run[-1], a, feeds))):
             yield run
             run = []
         low, high = (min(low, feed), max(high, feed)) if run else (feed, feed)

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 CONFIG = click.argument("config", type=click.Path(path_type=Path))
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+SCAN_HEAD = ("node\naxis", "NMT state\nheartbeat", "device\nprofile", "vendor\nproduct", "revision\nserial", "EDS")
 STATES: Mapping[bool | None, tuple[str, str]] = {
     True: ("ok", "green"),
     False: ("differs", "red"),
@@ -93,6 +94,7 @@ def _progress(text: str) -> None:
 
 
 def _show_scans(scans: Sequence[BusScan]) -> None:
+    from rich import box
     from rich.table import Table
     from rich.text import Text
 
@@ -103,26 +105,27 @@ def _show_scans(scans: Sequence[BusScan]) -> None:
         nc = f"an NC runs it ({found.master} heard), so no node was asked" if found.master else "no NC is heard"
         period = f", SYNC every {found.sync_period_s * 1e3:.3f} ms" if found.sync_period_s else ""
         out.print(Text(f"bus {found.bus}: {nc}{period}; {len(found.nodes)} nodes"))
-        table = Table("node", "axis", "NMT state", "heartbeat", "device", "vendor", "product", "revision", "serial",
-                      "profile", "EDS")  # fmt: skip
+        table = Table(*SCAN_HEAD, box=box.SIMPLE_HEAD, pad_edge=False)
         for node in found.nodes:
             table.add_row(*map(Text, _node_row(node)))
         out.print(table)
         for node in found.nodes:
             for emergency in node.emergencies:
-                out.print(Text(f"node {node.node_id} reports {emergency}"))
+                out.print(Text(f"node {node.node_id} reports {emergency}"), soft_wrap=True)
 
 
 def _node_row(node: Node) -> list[str]:
+    """Return the cells of a node, two figures above each other in most, so that a row fits 80 columns."""
     period = node.heartbeat_s or (node.answers.heartbeat_s if node.answers else None)
-    heard = [str(node.node_id), node.axis or "", node.nmt or "unknown", f"{period * 1e3:.0f} ms" if period else "none"]
+    beat = f"{period * 1e3:.0f} ms" if period else "none"
+    heard = [f"{node.node_id}\n{node.axis or ''}", f"{node.nmt or 'unknown'}\n{beat}"]
     if node.answers is None:
-        return [*heard, "not asked", "", "", "", "", "", ""]
+        return [*heard, "not asked", "", "", ""]
     said, who = node.answers, node.answers.identity
     profile = "CiA 402" if said.is_drive else str(said.device_type & 0xFFFF or "none")
-    eds = f"{said.eds.file} ({said.eds.fit})" if said.eds else "none fits"
-    numbers = [f"{number:08X}" for number in (who.vendor_id, who.product_code, who.revision)]
-    return [*heard, said.name or "unnamed", *numbers, str(who.serial), profile, eds]
+    eds = f"{said.eds.file}\n({said.eds.fit})" if said.eds else "none fits"
+    ids = (f"{who.vendor_id:08X}\n{who.product_code:08X}", f"{who.revision:08X}\n{who.serial}")
+    return [*heard, f"{said.name or 'unnamed'}\n{profile}", *ids, eds]
 
 
 @click.command()
@@ -209,12 +212,14 @@ def _check_document(found: Sequence[Place]) -> dict[str, Any]:
 
 
 def _show_check(found: Sequence[Place]) -> None:
+    from rich import box
     from rich.table import Table
     from rich.text import Text
 
     from fdhil.cli.status_view import open_console
 
-    out, table = open_console(), Table("", "point", "result", "expected", "found")
+    out = open_console()
+    table = Table("", "point", "result", "expected", "found", box=box.SIMPLE_HEAD, pad_edge=False)
     for place, finding in found:
         state, colour = STATES[finding.ok]
         row = (place, finding.point, Text(state, colour), finding.expected, finding.found)
@@ -222,7 +227,7 @@ def _show_check(found: Sequence[Place]) -> None:
     out.print(table)
     for place, finding in found:
         if finding.ok is False:
-            out.print(Text(f"{place}: {finding.cause}; {finding.advice}"))
+            out.print(Text(f"{place}: {finding.cause}; {finding.advice}"), soft_wrap=True)
     differ, open_ = (sum(finding.ok is state for _, finding in found) for state in (False, None))
     rest = f", {open_} could not be compared beside the NC" if open_ else ""
     out.print(f"{len(found) - differ - open_} points ok, {differ} differ{rest}")

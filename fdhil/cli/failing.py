@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import click
@@ -47,6 +49,10 @@ def run_safely(command: click.Command) -> int:
         place = f"{error.filename}: " if error.filename else ""
         text = f"{place}{error.strerror or error}; nothing more was done, check the disk, the path and its rights"
         return tell(type(error).__name__, text, TROUBLE)
+    except RuntimeError as error:
+        if "no locator available" not in str(error):  # numba's words
+            raise
+        return tell("NoCache", NO_CACHE, TROUBLE)
     except MemoryError:
         return tell("MemoryError", "the memory is used up; give a smaller file, or free memory", TROUBLE)
     except RuntimeError as error:
@@ -54,6 +60,16 @@ def run_safely(command: click.Command) -> int:
             raise
         return tell("NoCache", NO_CACHE, TROUBLE)
     return int(result or 0)
+
+
+def prepare_streams() -> None:
+    """Make standard output and error take whatever is said: a terminal without ± shows ?, a closed one nothing."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115 (for as long as the process lives)
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 def tell(kind: str, text: str, code: int, details: dict[str, Any] | None = None) -> int:

@@ -10,7 +10,7 @@ from importlib import import_module
 
 import click
 
-from fdhil.cli.failing import run_safely
+from fdhil.cli.failing import prepare_streams, run_safely
 
 __all__ = ["COMMANDS", "cli", "main", "run_safely"]
 
@@ -75,6 +75,7 @@ def cli() -> None:
 
 def main() -> None:
     """Run the command line; an error of fdhil is one sentence on stderr and its exit code."""
+    prepare_streams()
     if not sys.warnoptions:  # advice of libraries is for developers, who ask for it with -W
         warnings.simplefilter("ignore")
         os.environ.setdefault("PYTHONWARNINGS", "ignore")  # of the processes started from here, too

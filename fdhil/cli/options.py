@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -39,3 +40,29 @@ class OutputFile(click.Path):
             self.fail(f"{value}: the name must end in {', '.join(self._suffixes)}.", param, ctx)
         check_output(path)
         return path
+
+
+class Writing(click.Command):
+    """A command that writes files: never over one that it reads, and each file once."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Compare what is written with what is read, then run."""
+        given = [(p, path) for p in self.params for path in _paths(ctx.params.get(str(p.name)))]
+        for k, (option, path) in enumerate(given):
+            for other, there in given[:k] + given[k + 1 :]:
+                if isinstance(option.type, OutputFile) and _same_file(path, there):
+                    text = f"{path} is also what {other.human_readable_name} names; choose another name"
+                    raise click.BadParameter(text, ctx, option)
+        return super().invoke(ctx)
+
+
+def _same_file(path: Path, there: Path) -> bool:
+    """Whether two names are of one regular file, one that is there or one that is to be."""
+    if path.exists():
+        return path.is_file() and there.exists() and path.samefile(there)
+    return os.path.realpath(path) == os.path.realpath(there)
+
+
+def _paths(value: Any) -> list[Path]:
+    values = value if isinstance(value, tuple) else (value,)
+    return [path for path in values if isinstance(path, Path)]

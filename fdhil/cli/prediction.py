@@ -13,7 +13,7 @@ import click
 
 from fdhil import tables
 from fdhil.cli.compiling import forewarn
-from fdhil.cli.options import OutputFile, Positive
+from fdhil.cli.options import OutputFile, Positive, Writing
 from fdhil.cli.parameter_view import MEANING
 from fdhil.records import INTERVAL_95
 
@@ -68,7 +68,7 @@ def _shared(wanted: Callable[..., int]) -> Callable[..., int]:
     return command
 
 
-@click.command()
+@click.command(cls=Writing)
 @_shared
 @click.option("--sensitivity", is_flag=True, help="Tell per zone by how many um 1 % of each parameter raises it.")
 @click.option(
@@ -159,7 +159,7 @@ def _with_history(
     return std_um, steps
 
 
-@click.command()
+@click.command(cls=Writing)
 @_shared
 @click.option("--method", type=click.Choice(list(tables.CORRECTIONS)), help="Left out: the best there is.")
 def correct(asked: Asked, method: str | None) -> int:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import config as machine_config
-from fdhil.cli.options import OutputFile, Positive
+from fdhil.cli.options import OutputFile, Positive, Writing
 
 if TYPE_CHECKING:
     from fdhil.drivers.demand_recorder import DemandRecorder, RecordedDemand
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _SHOWN_GAPS = 5
 
 
-@click.command()
+@click.command(cls=Writing)
 @click.argument("config", type=click.Path(path_type=Path))
 @click.option("--out", required=True, type=OutputFile(), help="The demand CSV to write.")
 @click.option("--seconds", type=Positive(), help="Record no longer than this.")

@@ -13,7 +13,7 @@ import click
 from fdhil import config as machine_config
 from fdhil import tables
 from fdhil.cli.compiling import forewarn
-from fdhil.cli.options import OutputFile
+from fdhil.cli.options import OutputFile, Writing
 from fdhil.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def _config_of(window: Window) -> machine_config.MachineConfig:
     return machine_config.parse({"machine": machine, "axis": {window.axis: axis}}, "recording", made_up=True)
 
 
-@click.command()
+@click.command(cls=Writing)
 @click.argument("config", type=FILE)
 @click.option("--axis", help="One axis only.")
 @click.option(
@@ -166,7 +166,7 @@ def _row(revision: Revision) -> dict[str, Any]:
     }
 
 
-@click.command()
+@click.command(cls=Writing)
 @click.argument("recording", type=FILE)
 @click.option("--out", required=True, type=OutputFile(), help="The CSV file to write.")
 @AS_JSON
@@ -176,15 +176,13 @@ def export(recording: Path, out: Path, as_json: bool) -> None:
     from fdhil.store.windows import read_window
 
     window = read_window(recording)
-    if out.exists() and out.samefile(recording):
-        raise click.UsageError("--out is the recording itself; choose another name")
     export_csv(window, out)
     if as_json:
         told = {"recording": str(recording), "file": str(out), "axis": window.axis, "rows": window.n}
         click.echo(json.dumps({"schema": "fdhil-export-1"} | told))
 
 
-@click.command()
+@click.command(cls=Writing)
 @click.argument("config", type=FILE)
 @click.option("--out", required=True, type=OutputFile(), help="The HTML file to write.")
 @AS_JSON

@@ -99,6 +99,9 @@ def arm(config: Path, program: Path | None, method: str | None, whole: bool, as_
     if program is None and method != "flatness":
         raise click.UsageError("only --method flatness needs no PROGRAM; name the program to correct")
     machine = machine_config.load(config)
+    if program is not None:
+        with program.open("rb"):  # a file that is not there is trouble, not the daemon's no
+            pass
     from fdhil.daemon.token import read_token
 
     request = {

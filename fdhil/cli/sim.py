@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fdhil.cli.options import OutputFile
+from fdhil.cli.options import OutputFile, Writing
 
 if TYPE_CHECKING:
     from fdhil.config import MachineConfig
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _FILE = click.Path(path_type=Path)
 
 
-@click.command()
+@click.command(cls=Writing)
 @click.argument("config", type=_FILE)
 @click.option("--json", "as_json", is_flag=True, help="Write events as JSON, one line each; the first is 'ready'.")
 @click.option("--faults", type=_FILE, help="A fault script: what breaks when (TOML).")

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from fdhil.cli.advise_view import show
+from fdhil.prediction.advise import Advice, Held
 from tests.bench import bench_toml
 from tests.cli.test_predict import _bench as _bench
 from tests.cli.test_predict import invoke
@@ -66,6 +68,31 @@ def test_many_lines_become_few_ranges_and_a_program_that_keeps_the_tolerance(wav
     assert all(
         re.sub(rb" F[\d.]+", b"", other) == one for one, other in zip(before, after, strict=True) if other != one
     )
+
+
+def made(line: int, feed: float, error_um: float = 30.0) -> Advice:
+    """The advice for a line of 3000 mm/min."""
+    held = Held(feed / 3000.0, feed / 3000.0, 1.0, feed / 3000.0)
+    return Advice(
+        line, line / 10, (line + 1) / 10, error_um, "X 1.0", "corner", "X", ("X", "current", 0.5), 3000.0, held, None
+    )
+
+
+def test_lines_that_follow_each_other_are_one_range(capsys: pytest.CaptureFixture[str]) -> None:
+    """Not over a line between them that keeps its feed, and not where one may run at twice the feed of another."""
+    slow = [made(line, 2100.0, 34.0 if line == 260 else 30.0) for line in range(120, 481, 2)]
+    apart = [made(line, 600.0) for line in (490, 492)]
+    show([*slow, *apart], None, 20.0, True, lambda line: line % 2 == 0)
+    assert capsys.readouterr().out.splitlines() == [
+        "lines 120-480: F3000 -> F2100, worst 34.0 um at line 260, X 1.0 (corner, most of it axis X)",
+        "lines 490-492: F3000 -> F600, worst 30.0 um at line 490, X 1.0 (corner, most of it axis X)",
+    ]
+    show([made(line, 100.0 if line % 3 else 2900.0, float(line)) for line in range(1, 16_000)], None, 20.0, True, bool)
+    first, *shown, last = capsys.readouterr().out.splitlines()
+    assert first.startswith("15999 lines in 10666 ranges, down to F100; the 20 worst of them:")
+    assert len(shown) == 20
+    assert "15999" in shown[-1]
+    assert last == "--json lists every line"
 
 
 def test_what_cannot_be_written_is_told_before_anything_is(bench: Path) -> None:

@@ -326,14 +326,6 @@ def test_an_unknown_axis_is_told(fdhil: Said, bench: Bench) -> None:
     assert "there is no axis Z (one of X, Y)" in err
 
 
-@pytest.mark.parametrize("command", ["scan", "check", "commission"])
-def test_a_hub_that_is_not_there_is_told(fdhil: Said, command: str, tmp_path: Path) -> None:
-    config = write_config(tmp_path, bus='interface = "socketcand"\nport = 1')
-    code, out, err = fdhil(command, config, *(["--yes"] if command == "commission" else []), "--json")
-    assert (code, out) == (3, "")
-    assert "the CAN hub 127.0.0.1:1 cannot be reached" in err
-
-
 def test_a_bus_without_a_node_is_told(fdhil: Said, tmp_path: Path) -> None:
     hub = HubThread(Hub("can0"))
     hub.start()

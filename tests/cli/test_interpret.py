@@ -39,7 +39,7 @@ def test_an_error_is_one_sentence_and_nothing_on_stdout(
 ) -> None:
     program = tmp_path / "p.ngc"
     program.write_text("G0 X1\nG1 X2\n")
-    assert call(monkeypatch, "interpret", str(program), "--json") == 3
+    assert call(monkeypatch, "interpret", str(program)) == 3
     shown = capsys.readouterr()
     assert shown.out == ""
     assert shown.err.count("\n") == 1

@@ -14,6 +14,7 @@ import pytest
 
 from fdhil.cli.parameter_view import cell, half_of
 from fdhil.cli.status_view import sparkline
+from fdhil.daemon import journal
 from fdhil.daemon.status import Watch
 from fdhil.daemon.token import ensure_token
 from fdhil.records import Notice
@@ -27,6 +28,7 @@ def machine(tmp_path: Path) -> Path:
     """A machine's config and its run directory with a token."""
     path = tmp_path / "machine.toml"
     path.write_text(BENCH)
+    (tmp_path / "p.ngc").touch()
     run = tmp_path / "fdhil-data" / "run"
     run.mkdir(parents=True)
     ensure_token(run)
@@ -143,13 +145,13 @@ def test_arm_shows_how_far_the_check_of_a_long_program_is(machine: Path, capsys:
     told = {"program": "p.ngc", "checked_s": 83.0, "line": 40, "times_real_time": 31.6, "refused": 2}
     refused = {"ok": False, "code": "A", "text": "one", "advice": "do", "refused": ["A: one", "B: two"]}
     with answering(machine, refused, told | {"refused": 0}, told):
-        code, out, err = fdhil("arm", machine, "p.ngc", capsys=capsys)
+        code, out, err = fdhil("arm", machine, machine.parent / "p.ngc", capsys=capsys)
     assert (code, out) == (1, "")
     assert "\rchecked 1:23 of the program, line 40, 32 x real time, 2 places refused" in err
     assert err.splitlines()[-2:] == ["refused: A: one; do", "also: B: two"]
     (machine.parent / "fdhil-data" / "run" / "daemon.sock").unlink()
     with answering(machine, refused, told):
-        code, out, err = fdhil("arm", machine, "p.ngc", "--json", capsys=capsys)
+        code, out, err = fdhil("arm", machine, machine.parent / "p.ngc", "--json", capsys=capsys)
     assert (code, json.loads(out)) == (1, refused)
     assert json.loads(err) == {"progress": told}
 
@@ -162,7 +164,7 @@ def test_without_a_daemon_it_is_3_and_how_to_start_one(command: str, machine: Pa
 
 
 def test_a_wrong_method_or_config_is_2(machine: Path, tmp_path: Path, capsys: Any) -> None:
-    assert fdhil("arm", machine, "p.ngc", "--method", "magic", capsys=capsys)[0] == 2
+    assert fdhil("arm", machine, machine.parent / "p.ngc", "--method", "magic", capsys=capsys)[0] == 2
     (tmp_path / "wrong.toml").write_text(BENCH.replace("speed_kp", "speed_kq"))
     code, _, err = fdhil("run", tmp_path / "wrong.toml", capsys=capsys)
     assert code == 2
@@ -187,3 +189,14 @@ def test_small_pictures() -> None:
     assert cell("R", 0.5, half_of({"low": 0.488, "high": 0.512}), " ") == "500 ±12"
     assert cell("K", 0.8, half_of({"low": None, "high": None}), " ") == "0.8 (no ±)"
     assert cell("K", None, None) == "-"
+
+
+def test_lines_of_the_daemon_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    """For programs: one object a line on stdout, only while it is asked for."""
+    with journal.lines_as_json(True):
+        journal.write_line("X: LoadChanged", "MAJOR")
+    with journal.lines_as_json(False):
+        journal.write_line("X: said to a person")
+    said = capsys.readouterr()
+    assert json.loads(said.out) == {"severity": "MAJOR", "text": "X: LoadChanged"}
+    assert "said to a person" in said.err

@@ -39,6 +39,7 @@ WITH_CONFIG = {
 WITHOUT_CONFIG = {"demo": ["--out", "out"], "interpret": ["part.ngc"], "export": ["w.parquet", "--out", "out.csv"]}
 # what a command is called with where the file that it works on is what is wrong
 WITH_FILE = {
+    "arm": ["bench.toml", "{file}"],
     "identify": ["{file}"],
     "replay": ["{file}"],
     "export": ["{file}", "--out", "out.csv"],
@@ -47,7 +48,13 @@ WITH_FILE = {
     "correct": ["{file}", "--config", "bench.toml"],
     "advise": ["{file}", "--config", "bench.toml", "--tolerance-um", "50"],
 }
-SUFFIXES = {"identify": [".csv"], "replay": [".csv", ".parquet"], "export": [".parquet"], "interpret": [".ngc"]}
+SUFFIXES = {
+    "arm": [".ngc"],
+    "identify": [".csv"],
+    "replay": [".csv", ".parquet"],
+    "export": [".parquet"],
+    "interpret": [".ngc"],
+}
 # what a command is called with where the file that it is to write cannot be
 WITH_OUT = {
     "predict": ["part.ngc", "--config", "bench.toml", "--out", "{out}"],
@@ -154,6 +161,20 @@ def test_a_file_that_cannot_be_written_is_3_and_found_at_once(out: str, words: s
     assert Path("pipe").is_fifo()
 
 
+def test_nothing_is_written_over_what_is_read(capsys: Any) -> None:
+    Path("w.parquet").write_bytes(b"window")
+    for command, arguments in WITH_OUT.items():
+        read = next(text for text in arguments if "." in text)
+        if command not in ("history", "sim"):
+            before = Path(read).read_bytes()
+            assert "choose another name" in told(
+                capsys, USAGE, command, *(text.format(out=f"./{read}") for text in arguments)
+            )
+            assert Path(read).read_bytes() == before
+    both = ["--out", "once.csv", "--report", "once.csv"]
+    told(capsys, USAGE, "predict", "part.ngc", "--config", "bench.toml", *both)
+
+
 def test_a_picture_of_an_unknown_kind_is_2(capsys: Any) -> None:
     assert ".png, .svg, .pdf" in told(capsys, USAGE, "history", "bench.toml", "--plot", "drift.bmp")
 
@@ -181,7 +202,7 @@ def test_a_bus_that_is_not_there_is_3(command: str, capsys: Any) -> None:
         port = free.getsockname()[1]
     Path("absent_bus.toml").write_text(bench_toml() + f'[bus.can0]\ninterface = "socketcand"\nport = {port}\n')
     arguments = [text.format(config="absent_bus.toml") for text in WITH_CONFIG[command]]
-    told(capsys, TROUBLE, command, *arguments)
+    assert f"127.0.0.1:{port} cannot be reached" in told(capsys, TROUBLE, command, *arguments)
 
 
 @pytest.mark.parametrize("command", ["status", "arm", "disarm"])

@@ -222,18 +222,18 @@ def failing(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
 def test_a_port_in_use_is_one_sentence_and_exit_code_3(failing: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as holder:
         port = holder.getsockname()[1]
-        code, text = failing(write_config(tmp_path, bus=f"port = {port}"), "--json")
+        code, text = failing(write_config(tmp_path, bus=f"port = {port}"))
         assert code == 3
         assert f"bus can0: TCP port {port}" in text
         assert text.count("\n") == 1
-        code, text = failing(write_config(tmp_path, axes="X", voltage=f"port = {port}"), "--json")
+        code, text = failing(write_config(tmp_path, axes="X", voltage=f"port = {port}"))
         assert code == 3
         assert f"voltage sensor X: TCP port {port}" in text
         assert text.count("\n") == 1
 
 
 def test_a_bus_that_does_not_exist_is_exit_code_3(failing: Callable[..., tuple[int, str]], tmp_path: Path) -> None:
-    code, text = failing(write_config(tmp_path, bus='interface = "socketcan"\nchannel = "nocan7"'), "--json")
+    code, text = failing(write_config(tmp_path, bus='interface = "socketcan"\nchannel = "nocan7"'))
     assert code == 3
     assert "socketcan nocan7 cannot be opened" in text
     assert text.count("\n") == 1

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fdhil.cli.parameter_view import DISPLAY, INTERVAL_95, cell
 from fdhil.config import MachineConfig
 from fdhil.correction import plan as plan_correction
 from fdhil.prediction import predict
@@ -108,9 +109,9 @@ def parameter_rows(loop: Loop) -> list[list[str]]:
         found = loop.published[axis][0]
         for name in PARAMETERS:
             true, value, std = getattr(truth, name), getattr(found.parameters, name), found.std[name]
-            rows.append(
-                [axis, name, f"{true:.5g} {UNITS[name]}", f"{value:.5g} +- {2 * std:.2g}", f"{_percent(value, true)}"]
-            )
+            unit, factor = DISPLAY[name]
+            found_text = cell(name, value, INTERVAL_95 * std, " ")
+            rows.append([axis, name, f"{true * factor:.5g} {unit}", found_text, _percent(value, true)])
     return rows
 
 
@@ -129,7 +130,7 @@ def cut_rows(loop: Loop) -> list[list[str]]:
 
 
 CUT_HEAD = ("pass", "slide-way degC", "RMS um", "max um", "late offsets")
-PARAMETER_HEAD = ("axis", "symbol", "true", "identified (2 sigma)", "deviation")
+PARAMETER_HEAD = ("axis", "symbol", "true", "identified (± 95 %)", "deviation")
 
 
 def _identified(loop: Loop) -> Section:
