@@ -141,8 +141,8 @@ def _disarms_what_is_refused_before_it_begins(shop: Shop, capsys: Capture) -> No
     assert code == 0, (out, err)
     assert json.loads(out)["check"]["whole"] is False
     told = shop.status_when(lambda s: any(notice["code"] == "DemandTooHigh" for notice in s["notices"]))
-    refused = next(notice for notice in told["notices"] if notice["severity"] == "MAJOR")
-    assert refused["code"] == "DemandTooHigh"
+    refused = next(notice for notice in told["notices"] if notice["code"] == "DemandTooHigh")
+    assert refused["severity"] == "MAJOR"
     line = re.match(r"line (\d+), at \d+\.\d+ s: axis [XY] has", refused["text"])
     assert line, refused
     assert 0 <= int(line[1]) - (3 + 10 * len(body)) <= 1  # its first or its second move
