@@ -55,10 +55,6 @@ def run_safely(command: click.Command) -> int:
         return tell("NoCache", NO_CACHE, TROUBLE)
     except MemoryError:
         return tell("MemoryError", "the memory is used up; give a smaller file, or free memory", TROUBLE)
-    except RuntimeError as error:
-        if "no locator available" not in str(error):  # numba's words
-            raise
-        return tell("NoCache", NO_CACHE, TROUBLE)
     return int(result or 0)
 
 

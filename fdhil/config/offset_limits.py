@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from fdhil.config.axis import Axis
+from fdhil.config.axis import CEILING_ACCELERATION_MM_S2, Axis
 
 AXIS_SPEED_SHARE = 0.10  # an offset never takes more than this of the axis' own speed
 AXIS_ACCELERATION_SHARE = 0.50
@@ -33,7 +33,10 @@ class OffsetLimits:
             raise ValueError("writing is off for this axis")
         scale, given = axis.scaling.increments_per_mm, axis.correction
         speed = min(given.max_speed_mm_s, AXIS_SPEED_SHARE * axis.top_speed_mm_s)
-        acceleration = min(given.max_acceleration_mm_s2, AXIS_ACCELERATION_SHARE * axis.max_acceleration_mm_s2)
+        acceleration = given.max_acceleration_mm_s2
+        if "max_acceleration_mm_s2" not in given.model_fields_set:  # the default is for fine increments
+            acceleration = min(max(acceleration, 1 / (scale * sync_period_s**2)), CEILING_ACCELERATION_MM_S2)
+        acceleration = min(acceleration, AXIS_ACCELERATION_SHARE * axis.max_acceleration_mm_s2)
         return OffsetLimits(
             offset=given.max_offset_um * 1e-3 * scale,
             rate=speed * scale * sync_period_s,

@@ -32,7 +32,7 @@ from fdhil.daemon.control import Answer, refusal
 from fdhil.daemon.guard_link import GONE, REST, GuardLink
 from fdhil.daemon.keeping import Keeper, boot_id
 from fdhil.daemon.passes import Passes
-from fdhil.daemon.standing import ADOPT, START_AND_ADOPT, Standing, verdict
+from fdhil.daemon.standing import ADOPT, RAMPING_DOWN, START_AND_ADOPT, Standing, verdict
 from fdhil.daemon.streamed import Checked
 from fdhil.daemon.supply import Supply
 from fdhil.daemon.token import ensure_token
@@ -43,7 +43,7 @@ from fdhil.store.history import Revision
 STREAM_S = 0.05
 ALIVE_S = 0.1  # the guard calls us lost after 0.5 s
 REFRESH_S = 0.5
-LANDING_S = 1.0  # what ended a moment ago is off within it: ramp, zeros and their read-back take 0.3 s at most
+LANDING_S = 1.0  # without a SYNC; while there is SYNC, what ended a moment ago comes to rest by itself
 NO_GUARD = "start fdhil-guard with this machine's config"
 
 Tell = Callable[[Sequence[Notice]], None]
@@ -160,9 +160,11 @@ class Armory:
 
     async def _landed(self) -> bool:
         """Wait a moment for the end of what ramps down; return whether the guard is at rest, or absent."""
-        deadline_s = time.monotonic() + LANDING_S
+        tick, moved_s = None, time.monotonic()
         await asyncio.to_thread(self.guard.look)
-        while self.guard.state not in REST and time.monotonic() < deadline_s:
+        while self.guard.state not in REST and time.monotonic() - moved_s < LANDING_S:
+            if self.guard.state in RAMPING_DOWN and self.guard.status.get("tick") != tick:
+                tick, moved_s = self.guard.status.get("tick"), time.monotonic()
             await asyncio.sleep(STREAM_S)
             await asyncio.to_thread(self.guard.look)
         if self.guard.state in REST:

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 
 AT_REST = frozenset({"OFF", "FROZEN"})
 ABSENT: Mapping[str, Any] = {"state": "absent", "text": "no guard runs: nothing can be armed, nothing is sent"}
-LANDING_S = 3.0  # the longest ramp to zero takes 0.12 s, its zeros and their read-back 0.3 s
+RAMPING_DOWN = frozenset({"RAMP_DOWN", "ADOPT"})
+LANDING_S = 3.0  # without a SYNC; the ramp and the zeros after it are counted in SYNC by the guard
 LOOK_S = 0.02
 ADOPT = "hold the feed, then run fdhil adopt"
 START_AND_ADOPT = "hold the feed, start fdhil-guard, then run fdhil adopt"
@@ -107,10 +108,11 @@ def lost(before: Mapping[str, Any], arming: bool) -> Mapping[str, Any]:
 
 
 def landed(client: GuardClient) -> Mapping[str, Any]:
-    """Wait until the guard is at rest, a few seconds at most, and return its status (blocking). DeviceError."""
-    deadline_s = time.monotonic() + LANDING_S
-    status = client.status()
-    while status["state"] not in AT_REST and time.monotonic() < deadline_s:
+    """Wait until the guard is at rest, as long as SYNC moves it on, and return its status (blocking). DeviceError."""
+    status, tick, moved_s = client.status(), None, time.monotonic()
+    while status["state"] not in AT_REST and time.monotonic() - moved_s < LANDING_S:
+        if status.get("tick") != tick:
+            tick, moved_s = status.get("tick"), time.monotonic()
         time.sleep(LOOK_S)
         status = client.status()
     return status

@@ -83,7 +83,7 @@ class Shop:
     def status(self) -> dict[str, Any] | None:
         """Return the daemon's status, None while none runs."""
         try:
-            return ask(self.run_directory / "daemon.sock", {"request": "status"}, timeout_s=60.0)
+            return ask(self.run_directory / "daemon.sock", {"request": "status"}, timeout_s=500.0)
         except ConnectError:
             return None
 
@@ -107,7 +107,7 @@ class Shop:
     def nc_on(self) -> None:
         """Switch the NC on: SYNC, NMT, drives enabled."""
         self.twin.command("nc", on=True)
-        self.twin.event("nc", 60.0)
+        self.twin.event("nc")
 
     def play(self, name: str, program: str, **options: Any) -> dict[str, Any]:
         """Write a program and let the NC play it."""

@@ -14,7 +14,6 @@ from fdhil import config as machine_config
 from fdhil.cli.demo.processes import Twin
 from tests.daemon.shop import AXIS, HEAD, Shop, fdhil
 
-pytestmark = pytest.mark.timeout(400)  # three processes, each of which compiles on the very first run
 FT_PER_KELVIN, CD_PER_KELVIN = -0.16, -0.10
 SHUTTLE = "G21 G90 G94\nG0 X300\nG4 P0.35\nG0 X0\nG4 P0.35\nM2\n"
 CELSIUS = np.linspace(20.0, 22.0, 6)

@@ -184,7 +184,7 @@ async def test_an_abandoned_check_says_so_and_leaves_nothing(config: MachineConf
     program = written(tmp_path, HEAD + SQUARE * 2000 + "M2\n")
     check = Check(config)
     running = asyncio.create_task(check.run(program, program_digest(program), nominal_models(config), whole))
-    async with asyncio.timeout(100):
+    async with asyncio.timeout(500):
         while not (check.progress or {}).get("checked_s"):  # noqa: ASYNC110 - what another process says has no event
             await asyncio.sleep(0.05)
     assert check.abandon()

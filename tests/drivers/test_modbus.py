@@ -108,7 +108,7 @@ async def test_a_source_survives_and_tells_both_edges(monkeypatch: pytest.Monkey
     codes: list[tuple[str, str]] = []
 
     async def until(code: str, severity: str) -> None:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(300):
             while (code, severity) not in codes:
                 record = await out.get()
                 if isinstance(record, Notice):

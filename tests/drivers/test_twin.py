@@ -59,7 +59,7 @@ class Twin:
     def close(self) -> None:
         if self.process.poll() is None:
             self.tell(command="quit")
-            self.process.communicate(timeout=20)
+            self.process.communicate()
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +79,7 @@ def rapid(folder: Path) -> Path:
     return path
 
 
-async def gather(source: MachineSource, until: Callable[[list[Record]], bool], seconds: float = 30) -> list[Record]:
+async def gather(source: MachineSource, until: Callable[[list[Record]], bool], seconds: float = 300) -> list[Record]:
     records: list[Record] = []
     async with asyncio.timeout(seconds):
         async for record in source.records():

@@ -15,6 +15,7 @@ from tests.guard.machine import Drive, Frame
 ANSWER_S = 0.3
 NEVER = 1 << 30
 SLOW_S = 0.02
+HOLDING_ANSWER_S = 8.0
 
 
 def encode(frames: list[Frame]) -> bytes:
@@ -26,8 +27,9 @@ class Peer(threading.Thread):
     """One client is the guard; ``sent`` lists (SYNC count, COB-ID, data) of everything it put on the bus.
 
     Each cycle: SYNC, the drives' TPDOs, then the NC's targets; while ``lockstep`` the next SYNC waits for the offset
-    frames of a guard that sent some in the cycle before. ``row`` runs over ``demand`` while ``playing``,
-    slowly from ``slow_from``, so that a test on a busy host still meets the path where it wants to.
+    frames of a guard that sent some in the cycle before: briefly after a zero, long while an offset is in force.
+    ``row`` runs over ``demand`` while ``playing``, slowly from ``slow_from``, so that a test on a busy host still meets
+    the path where it wants to.
     """
 
     def __init__(self, demand: list[list[int]], period_s: float = 0.001) -> None:
@@ -111,8 +113,9 @@ class Peer(threading.Thread):
         self._transmit(encode([sync, *sampled, *streamed]))
         before = self._offset_frames
         waits = self.lockstep and self._answered
-        deadline_s = time.monotonic() + (ANSWER_S if waits else self.period_s)
-        while time.monotonic() < deadline_s and not self.ended.is_set():
+        answer_s = HOLDING_ANSWER_S if any(drive.offset for drive in self.drives) else ANSWER_S
+        deadline_s = time.monotonic() + (answer_s if waits else self.period_s)
+        while time.monotonic() < deadline_s and not self.ended.is_set() and self._client is not None:
             if waits and self._offset_frames - before >= len(self.drives):
                 break
             self._listen(max(0.0, deadline_s - time.monotonic()))

@@ -102,7 +102,7 @@ def test_each_row_of_the_table_is_applied_at_its_own_cycle(tmp_path: Path) -> No
     assert guard.stdout is not None
     guard.stdout.readline()
     ended = threading.Event()
-    with GuardClient(tmp_path, timeout_s=20.0) as client:
+    with GuardClient(tmp_path, timeout_s=300.0) as client:
 
         def keep_alive() -> None:
             while not ended.wait(0.05):
@@ -118,7 +118,7 @@ def test_each_row_of_the_table_is_applied_at_its_own_cycle(tmp_path: Path) -> No
             ended.set()
             keeper.join()
     twin.command(command="quit")
-    assert twin.process.wait(20) == 0
+    assert twin.process.wait(300) == 0
     guard.terminate()
     guard.communicate()
     twin.process.communicate()

@@ -24,7 +24,7 @@ from fdhil.records import Notice, Outcome
 from fdhil.sim.service import SimService
 from tests.bench import bench_document
 
-PATIENCE_S = 60.0
+PATIENCE_S = 500.0
 _channel = itertools.count()
 
 

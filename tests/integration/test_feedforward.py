@@ -24,7 +24,6 @@ from tests.integration.conftest import PATIENCE_S, Bench
 from tests.integration.test_guard import toml
 from tests.paths import bench_demand
 
-pytestmark = pytest.mark.timeout(240)
 LIMITS = {"max_torque_nm": 100.0, "max_speed_rad_s": 30.0}
 
 

@@ -17,8 +17,6 @@ from fdhil.guard.client import GuardClient
 from fdhil.guard.interlocks import FACTS
 from tests.integration.conftest import PATIENCE_S, Bench, sign_off
 
-pytestmark = pytest.mark.timeout(240)
-
 DIGEST = "0" * 64
 
 

@@ -17,8 +17,6 @@ from fdhil.pipeline import AxisPipeline
 from fdhil.records import AxisSamples, ParameterSet, WindowOutcome
 from tests.integration.conftest import PATIENCE_S, Bench, digested
 
-pytestmark = pytest.mark.timeout(240)
-
 SHUTTLE = "G21 G90 G94\n" + "G0 X300 Y300\nG4 P0.3\nG0 X0 Y0\nG4 P0.3\n" * 2 + "M2\n"
 TRUE = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
 

@@ -17,8 +17,6 @@ from fdhil.records import VoltageSamples, WindowOutcome
 from tests.integration.conftest import Bench, digested, take_voltage_from_sensors
 from tests.integration.test_loop import TRUE, recorded, shuttle
 
-pytestmark = pytest.mark.timeout(240)
-
 
 @pytest.fixture
 def sections() -> dict[str, Any]:

@@ -15,8 +15,6 @@ from fdhil.records import Outcome, ParameterSet, WindowOutcome
 from tests.integration.conftest import Bench, digested, take_voltage_from_sensors
 from tests.integration.test_loop import TRUE, recorded, shuttle
 
-pytestmark = pytest.mark.timeout(240)
-
 
 @pytest.fixture
 def transport() -> str:

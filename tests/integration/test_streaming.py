@@ -29,7 +29,6 @@ from tests.integration.conftest import PATIENCE_S, Bench
 from tests.integration.test_guard import DIGEST, client, sections
 from tests.paths import bench_demand, rms
 
-pytestmark = pytest.mark.timeout(300)
 __all__ = ["client", "sections"]
 PASSES = 6
 

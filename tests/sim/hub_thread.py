@@ -62,7 +62,7 @@ def joined(hub: Hub, count: int = 1) -> Iterator[list[can.BusABC]]:
             bus.shutdown()
 
 
-def frames_of(bus: can.BusABC, count: int, timeout_s: float = 10.0) -> list[Frame]:
+def frames_of(bus: can.BusABC, count: int, timeout_s: float = 100.0) -> list[Frame]:
     """Receive ``count`` frames, fewer when they do not come in time."""
     frames: list[Frame] = []
     deadline = time.monotonic() + timeout_s

@@ -139,7 +139,7 @@ def test_nothing_is_lost_to_a_slow_reader() -> None:
         text = b"".join(b"< send 201 4 %x %x %x %x >" % tuple(struct.pack("<I", k)) for k in range(count))
         received: dict[int, list[int]] = {0: [], 1: []}
         saw_congestion = False
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + 300
         while min(map(len, received.values())) < count and time.monotonic() < deadline:
             with contextlib.suppress(BlockingIOError):
                 text = text[sender.send(text[: 1 << 18]) :]
@@ -159,7 +159,7 @@ def test_a_client_that_never_reads_is_disconnected(monkeypatch: pytest.MonkeyPat
     hub = Hub("can0", queue_bytes=1 << 16)
     with serving(hub) as thread, joined(hub, 1):
         thread.each_turn = lambda hub: None if hub.congested else hub.send([(0x181, bytes(8))] * 2000)
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 300
         while not hub.lost_clients and time.monotonic() < deadline:
             time.sleep(0.01)
         thread.each_turn = lambda hub: None

@@ -45,7 +45,7 @@ def bench() -> Iterator[Bench]:
     servers = SensorServers({"X": sensor}, {"X": ("127.0.0.1", 0)})
     servers.start()
     try:
-        with ModbusTcpClient("127.0.0.1", port=servers.ports["X"], timeout=5, retries=0) as client:
+        with ModbusTcpClient("127.0.0.1", port=servers.ports["X"], timeout=60, retries=0) as client:
             yield Bench(sensor, client, servers.ports["X"])
     finally:
         servers.stop()

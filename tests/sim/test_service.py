@@ -42,7 +42,7 @@ class ServiceThread:
 
     def event(self, name: str) -> dict[str, Any]:
         while True:
-            event = self.events.get(timeout=30)
+            event = self.events.get(timeout=300)
             if event["event"] == name:
                 return event
 
@@ -102,7 +102,7 @@ def test_what_cannot_be_read_does_not_end_the_machine(tmp_path: Path) -> None:
         twin.command("play", file="corner.csv")
         assert "switch it on first" in twin.event("error")["text"]
         twin.command("quit")
-        twin._thread.join(30)
+        twin._thread.join(300)
         assert not twin._thread.is_alive()
 
 

@@ -67,7 +67,7 @@ def test_the_canopen_library_finds_configures_and_reads(twin: TwinProcess, bus: 
     network.connect()
     try:
         node = network.add_node(1, twin.ready["drives"]["X"]["eds"])
-        assert node.nmt.wait_for_heartbeat(5) == "PRE-OPERATIONAL"
+        assert node.nmt.wait_for_heartbeat(100) == "PRE-OPERATIONAL"
         assert node.sdo[0x1000].raw == 0x00020192
         assert node.sdo["Modes of operation"].raw == 0
         node.sdo["Modes of operation"].raw = 8
@@ -76,7 +76,7 @@ def test_the_canopen_library_finds_configures_and_reads(twin: TwinProcess, bus: 
             node.sdo.upload(0x5FFF, 0)
         assert abort.value.code == 0x06020000
         node.nmt.state = "OPERATIONAL"
-        node.nmt.wait_for_heartbeat(5)
+        node.nmt.wait_for_heartbeat(100)
         assert node.nmt.state == "OPERATIONAL"
     finally:
         assert network.notifier is not None
@@ -111,7 +111,7 @@ def test_another_master_takes_over_with_the_stock_client(bus: can.BusABC) -> Non
 
 def test_any_modbus_client_reads_the_sensor(twin: TwinProcess) -> None:
     place = twin.ready["modbus"]["X"]
-    with ModbusTcpClient(place["host"], port=place["port"], timeout=5) as client:
+    with ModbusTcpClient(place["host"], port=place["port"], timeout=60) as client:
         registers = client.read_input_registers(0, count=10, device_id=place["unit"]).registers
         assert struct.unpack(">f", struct.pack(">2H", *registers[4:6])) == (1000.0,)
         assert client.read_holding_registers(500, count=1).exception_code == 2
@@ -183,7 +183,7 @@ def test_lockstep_waits_for_a_client_that_answers_every_sync(tmp_path: Path) -> 
         twin.command("trace", file=str(tmp_path / "trace.csv"))
         twin.command("play", file=str(demand))
         while not twin.happened("finished"):
-            while (message := bus.recv(5)) is not None and message.arbitration_id != 0x201:
+            while (message := bus.recv(100)) is not None and message.arbitration_id != 0x201:
                 pass
             assert message is not None
             target = struct.unpack("<i", message.data[2:6])[0]

@@ -18,7 +18,7 @@ import can
 from tests.bench import axis_toml, bench_toml
 
 COMMAND = [sys.executable, "-m", "fdhil.cli.main", "sim"]
-PATIENCE_S = 60.0
+PATIENCE_S = 500.0
 
 
 def write_config(folder: Path, sim: str = "", bus: str = "", axes: str = "XY", voltage: str = "") -> Path:

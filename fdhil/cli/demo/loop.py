@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from fdhil import config as machine_config
-from fdhil.cli.demo.processes import Process, Twin
+from fdhil.cli.demo.processes import PATIENCE_S, Process, Twin
 from fdhil.cli.demo.report import Cut, Loop, Published
 from fdhil.cli.demo.toml import to_toml
 from fdhil.config import MachineConfig
@@ -38,7 +38,6 @@ PROGRAMS: Mapping[str, str] = {
 }
 RAPIDS = 4  # of each axis in the shuttle
 WARM_C = (20.5, 21.0, 21.5, 22.0)
-READY_S = 120.0  # the kernels are compiled on the very first run
 
 
 @dataclass
@@ -50,13 +49,14 @@ class Stage:
     twin: Twin
     say: Say
     programs: Mapping[str, Path]
+    others: list[Process] = field(default_factory=list)
     cuts: list[Cut] = field(default_factory=list)
 
     def ask(self, request: str, **fields: Any) -> dict[str, Any]:
         """Ask the daemon; FdhilError with the daemon's own words when it refuses."""
         run = self.config.store.run_directory
         assert run is not None
-        answer = ask(run / SOCKET_NAME, {"request": request, **fields}, timeout_s=30.0)
+        answer = ask(run / SOCKET_NAME, {"request": request, **fields}, timeout_s=PATIENCE_S)
         if not answer.get("ok"):
             raise FdhilError(f"the daemon refuses to {request}: {answer.get('code')}: {answer.get('text')}")
         return answer
@@ -73,10 +73,10 @@ def run_loop(out: Path, realtime: bool, say: Say) -> Loop:
         stage = _start_twin(out, realtime, say, stack)
         _commission(stage)
         for name, module in (("guard", ["fdhil.cli.guard"]), ("daemon", ["fdhil", "run"])):
-            stack.enter_context(_daemon(name, [*module, str(out / "machine.toml")], out))
-        _await(lambda: _alive(stage), READY_S, "the daemon did not get ready", stage)
+            stage.others.append(stack.enter_context(_daemon(name, [*module, str(out / "machine.toml")], out)))
+        _await(lambda: _alive(stage), "the daemon did not get ready", stage)
         stage.twin.command("nc", on=True)
-        stage.twin.event("nc", 30.0)
+        stage.twin.event("nc")
         return _measure(stage)
 
 
@@ -110,12 +110,14 @@ def _alive(stage: Stage) -> bool:
         return False
 
 
-def _await(done: Callable[[], bool], timeout_s: float, failure: str, stage: Stage) -> None:
-    deadline = time.monotonic() + timeout_s
+def _await(done: Callable[[], bool], failure: str, stage: Stage) -> None:
+    """Wait for what the processes bring about; ConnectError as soon as one of them has ended."""
+    deadline = time.monotonic() + PATIENCE_S
     while not done():
-        stage.twin.check()
+        for process in (stage.twin, *stage.others):
+            process.check()
         if time.monotonic() > deadline:
-            raise DeviceTimeout("demonstration", f"{failure} within {timeout_s:.0f} s; see the logs in {stage.out}")
+            raise DeviceTimeout("demonstration", f"{failure} within {PATIENCE_S:.0f} s; see the logs in {stage.out}")
         time.sleep(0.05)
 
 
@@ -173,7 +175,7 @@ def _shuttle(stage: Stage, published: dict[str, list[Published]]) -> dict[str, t
     """Play the shuttle, wait until both axes publish, and return the last accepted window of each with its fit."""
     before = _analysed(stage)
     stage.twin.play(stage.programs["shuttle"])
-    _await(lambda: _settled(stage, before), 60.0, "the rapids of the shuttle were not analysed", stage)
+    _await(lambda: _settled(stage, before), "the rapids of the shuttle were not analysed", stage)
     newest: dict[str, tuple[Window, float | None]] = {}
     with History.read(stage.config.store.directory) as history:
         for axis in stage.config.axis:
@@ -212,7 +214,7 @@ def _corrected(stage: Stage, program: Path, trace: Path, method: str) -> dict[st
     stage.say(f"arming by {method}: predicted to help, inside the limits, drives commissioned")
     stage.ask("arm", program=str(program), method=method, token=_token(stage))
     finished = stage.twin.play(program, trace)
-    _await(lambda: stage.ask("status")["state"] == "OFF", 30.0, "the guard did not come to rest", stage)
+    _await(lambda: stage.ask("status")["state"] == "OFF", "the guard did not come to rest", stage)
     cause = stage.ask("status")["guard"]["cause"]
     if cause["code"] != "Finished":
         raise FdhilError(f"the guard ended the correction: {cause['code']}: {cause['text']}; {cause['advice']}")

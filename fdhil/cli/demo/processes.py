@@ -15,6 +15,8 @@ from typing import Any, Self
 
 from fdhil.errors import ConnectError, DeviceTimeout
 
+PATIENCE_S = 900.0  # a process that ended is told at once; this only ends what hangs, on however busy a host
+
 
 class Process:
     """A command of fdhil as a child process; stderr goes to a log file, stdout is read line by line.
@@ -48,7 +50,7 @@ class Process:
             self._lines.put(line)
         self._lines.put(None)
 
-    def event(self, kind: str, timeout_s: float) -> dict[str, Any]:
+    def event(self, kind: str, timeout_s: float = PATIENCE_S) -> dict[str, Any]:
         """Return the next event of this kind; what comes before it is dropped."""
         deadline = time.monotonic() + timeout_s
         while True:
@@ -78,7 +80,7 @@ class Process:
         if self._child.poll() is not None:
             raise ConnectError(self.name, f"ended with exit code {self._child.returncode}: {self._last_words()}")
 
-    def stop(self, timeout_s: float = 10.0) -> int:
+    def stop(self, timeout_s: float = 60.0) -> int:
         """Ask the process to end (SIGTERM), insist after ``timeout_s``, and return its exit code."""
         if self._child.poll() is None:
             self._child.terminate()
@@ -112,12 +114,12 @@ class Twin(Process):
     def __init__(self, config: Path, log: Path) -> None:
         super().__init__("simulated machine", ["fdhil", "sim", str(config), "--json"], log)
         try:
-            self.ready: Mapping[str, Any] = self.event("ready", 60.0)
+            self.ready: Mapping[str, Any] = self.event("ready")
         except BaseException:
             self.stop()
             raise
 
-    def play(self, program: Path, trace: Path | None = None, timeout_s: float = 120.0) -> dict[str, Any]:
+    def play(self, program: Path, trace: Path | None = None, timeout_s: float = PATIENCE_S) -> dict[str, Any]:
         """Let the NC play a program or demand; return its ``finished`` event (late offset frames, trace file)."""
         if trace is not None:
             self.command("trace", file=str(trace))
