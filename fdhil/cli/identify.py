@@ -70,7 +70,7 @@ def _against_data_sheet(result: FileResult, nominal: Mapping[str, Parameters]) -
 
     from fdhil.validation.data_sheet import gain_error
 
-    if result.pooled is None or not result.verdict.accepted or result.axis not in nominal:
+    if result.pooled is None or not result.verdict.accepted or result.axis is None or result.axis not in nominal:
         return result
     reason = gain_error(result.pooled, nominal[result.axis])
     return (

@@ -7,11 +7,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdhil.cli.parameter_view import DISPLAY, INTERVAL_95, cell
+from fdhil.cli.parameter_view import DISPLAY, cell
 from fdhil.config import MachineConfig
 from fdhil.correction import plan as plan_correction
 from fdhil.prediction import predict
-from fdhil.records import PARAMETERS, UNITS, Correction, Float, Parameters, Prediction, Trajectory, Window
+from fdhil.records import (
+    INTERVAL_95,
+    PARAMETERS,
+    UNITS,
+    Correction,
+    Float,
+    Parameters,
+    Prediction,
+    Trajectory,
+    Window,
+)
 from fdhil.report import Page, Section, Table, figures
 from fdhil.report.figures import Curve
 
