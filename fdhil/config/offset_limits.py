@@ -10,6 +10,7 @@ from fdhil.config.axis import CEILING_ACCELERATION_MM_S2, Axis
 AXIS_SPEED_SHARE = 0.10  # an offset never takes more than this of the axis' own speed
 AXIS_ACCELERATION_SHARE = 0.50
 VARIATION_MM = 3.0
+DEFAULT_ACCELERATION_MM_S2 = 250.0
 VARIATION_S = 1.0
 TIME_TO_SAFE_S = 0.120
 DETECTION_CYCLES = 3
@@ -33,9 +34,8 @@ class OffsetLimits:
             raise ValueError("writing is off for this axis")
         scale, given = axis.scaling.increments_per_mm, axis.correction
         speed = min(given.max_speed_mm_s, AXIS_SPEED_SHARE * axis.top_speed_mm_s)
-        acceleration = given.max_acceleration_mm_s2
-        if "max_acceleration_mm_s2" not in given.model_fields_set:  # the default is for fine increments
-            acceleration = min(max(acceleration, 1 / (scale * sync_period_s**2)), CEILING_ACCELERATION_MM_S2)
+        finest = max(DEFAULT_ACCELERATION_MM_S2, 1 / (scale * sync_period_s**2))
+        acceleration = given.max_acceleration_mm_s2 or min(finest, CEILING_ACCELERATION_MM_S2)
         acceleration = min(acceleration, AXIS_ACCELERATION_SHARE * axis.max_acceleration_mm_s2)
         return OffsetLimits(
             offset=given.max_offset_um * 1e-3 * scale,
