@@ -14,6 +14,7 @@ import pytest
 
 from fdhil.guard import table
 from fdhil.guard.control import MAX_CLIENTS, MAX_LINE_BYTES
+from tests.guard import peer
 from tests.guard.test_process import DEMAND, OFFSET, Rig, check_limits
 
 STOPPING = (signal.SIGHUP, signal.SIGQUIT, signal.SIGINT, signal.SIGXCPU)
@@ -105,7 +106,10 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
     made.close()
 
 
-def test_neither_garbage_nor_floods_nor_signals_cost_a_running_correction_one_sync(rig: Rig, tmp_path: Path) -> None:
+def test_neither_garbage_nor_floods_nor_signals_cost_a_running_correction_one_sync(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(peer, "ANSWER_S", 3.0)  # the host may be busy: only what never comes is a frame lost
     rig.arm()
     before_kb, before = memory_kb(rig), open_descriptors(rig)
     wrong = descriptors(tmp_path)
