@@ -43,7 +43,7 @@ def axis(name: str, node: int) -> AxisSettings:
     )
     target = Pdo(0x200 + node, ((0x6040, 0, 16, False), (0x607A, 0, 32, True)))
     offset = Pdo(0x300 + node, ((0x60B0, 0, 32, True),))
-    return AxisSettings(name, node, target, offset, tpdos, 3276.8, 1, LIMITS, 32768, 2)
+    return AxisSettings(name, node, target, offset, tpdos, 3276.8, 500.0, 4000.0, 1, LIMITS, 32768, 2)
 
 
 def settings(run_directory: str) -> Settings:

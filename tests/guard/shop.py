@@ -170,5 +170,7 @@ class Shop:
     def close(self) -> None:
         self.guard.control.close()
         self.notifier.close()
-        for each in (self.wire, self.wake, self.stop, self._journal, *self._clients):
+        self.wire.close()
+        self._journal.close()
+        for each in (self.wake, self.stop, *self._clients):
             each.close()

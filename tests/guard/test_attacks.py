@@ -14,6 +14,7 @@ import pytest
 
 from fdhil.guard import table
 from fdhil.guard.control import MAX_CLIENTS, MAX_LINE_BYTES
+from tests.guard import peer
 from tests.guard.test_process import DEMAND, OFFSET, Rig, check_limits
 
 STOPPING = (signal.SIGHUP, signal.SIGQUIT, signal.SIGINT, signal.SIGXCPU)
@@ -105,9 +106,12 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
     made.close()
 
 
-def test_neither_garbage_nor_floods_nor_signals_cost_a_running_correction_one_sync(rig: Rig, tmp_path: Path) -> None:
+def test_neither_garbage_nor_floods_nor_signals_cost_a_running_correction_one_sync(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(peer, "ANSWER_S", 3.0)  # the host may be busy: only what never comes is a frame lost
     rig.arm()
-    before_kb, before = memory_kb(rig), open_descriptors(rig)
+    before_kb, before, armed_at = memory_kb(rig), open_descriptors(rig), rig.peer.tick
     wrong = descriptors(tmp_path)
     lines = list(garbage())
     ended = threading.Event()
@@ -147,7 +151,7 @@ def test_neither_garbage_nor_floods_nor_signals_cost_a_running_correction_one_sy
     told = rig.events()
     assert not any(event["event"] == "failed" for event in told)
     assert [event["missed"] for event in told if event.get("state") == "OFF"] == [0]
-    ticks = [tick for tick, _ in rig.peer.offsets_sent()]
+    ticks = [tick for tick, _ in rig.peer.offsets_sent() if tick > armed_at]
     assert ticks == list(range(ticks[0], ticks[0] + len(ticks)))
     rows = {target: k for k, target in enumerate(DEMAND[0])}
     moving = [(t, o) for _, t, o in rig.peer.latched if DEMAND[0][50] < t[0] < DEMAND[0][-50]]

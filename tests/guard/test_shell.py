@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from fdhil.errors import DeviceError
-from fdhil.guard import control, process, table
+from fdhil.guard import process, table
 from fdhil.guard.control import MAX_CLIENTS, MAX_LINE_BYTES, Client, Closer, Control
 from fdhil.guard.journal import Journal, Notifier
 from fdhil.guard.landing import land
@@ -101,7 +101,8 @@ def test_a_fault_of_the_program_ramps_to_zero_and_ends_with_3(
         monkeypatch.setattr(process, "parse_request", fail)
         client.send(b'{"request": "adopt"}\n')
     else:
-        monkeypatch.setattr(*((process.core, "step") if where == "core" else (process.Listener, "at_sync")), fail)
+        broken = "fdhil.guard.core.step" if where == "core" else "fdhil.guard.frames.Listener.at_sync"
+        monkeypatch.setattr(broken, fail)
 
     def next_sync(*_: object) -> list[tuple[int, bytes, float]]:
         return [(0x080, b"", 0.0)] if len(shop.offsets()) % 3 else [(0x080, b"", 0.0), (0x181, b"", 0.0)]
@@ -158,7 +159,7 @@ def test_the_feed_forward_is_told_sent_and_set_to_zero_by_a_fault(make: Make, mo
     assert (status["state"], status["feedforward"]["state"]) == ("FEEDFORWARD", "ON")
     shop.wire.feed([(0x080, b"", 0.0)])
     monkeypatch.setattr(shop.wire, "receive", lambda: [(0x080, b"", 0.0)])
-    monkeypatch.setattr(process.core, "step", lambda *_: [][0])
+    monkeypatch.setattr("fdhil.guard.core.step", lambda *_: [][0])
     sent = len(shop.wire.sent)
     assert shop.guard.run() == 3
     assert {(cob_id, data) for cob_id, data in shop.wire.sent[sent:]} == {(0x401, bytes(6)), (0x402, bytes(6))}
@@ -363,7 +364,13 @@ def test_a_boot_up_is_told_and_the_comparison_that_follows_is_asked_for(make: Ma
     asked = {"request": "compared", "axes": {"X": ["no text"], "Z": "none of these"}}
     assert "AuthRequired" in str(shop.ask(client, asked))
     law = {**LAW._asdict(), "dry": 1.5}
-    for wrong in ({"X": LAW._asdict()}, {"X": law, "Y": law}, {"X": 1, "Y": [law]}, {"X": {"speed": []}, "Y": {}}):
+    wrongs: list[dict[str, Any]] = [
+        {"X": LAW._asdict()},
+        {"X": law, "Y": law},
+        {"X": 1, "Y": [law]},
+        {"X": {"speed": []}, "Y": {}},
+    ]
+    for wrong in wrongs:
         answer = shop.ask(client, {"request": "feedforward", "token": TOKEN, "laws": wrong, "facts": FACTS})
         assert "FeedforwardOff" in str(answer["refused"])
 
@@ -480,7 +487,7 @@ def test_another_user_is_let_in_only_where_the_settings_name_it(
     def unpack(layout: str, data: bytes) -> tuple[Any, ...]:
         return (1, user, 1) if layout == "3i" else real(layout, data)
 
-    monkeypatch.setattr(control.struct, "unpack", unpack)
+    monkeypatch.setattr("struct.unpack", unpack)
     for peer_uid, allowed in ((None, 0), (user + 1, 0), (user, 1)):
         desk = Control(tmp_path, peer_uid)
         assert desk.path.stat().st_mode & 0o777 == (0o600 if peer_uid is None else 0o660)

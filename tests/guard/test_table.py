@@ -243,7 +243,7 @@ def test_a_path_that_comes_nearer_is_no_table(demand: list[int]) -> None:
 
 def test_rows_are_little_endian_wherever_they_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
     small = body()
-    monkeypatch.setattr(table.sys, "byteorder", "big")
+    monkeypatch.setattr("sys.byteorder", "big")
     swapped = body()
     assert swapped != small
     assert list(table.decode(swapped)[1].demand[0]) == ROWS["X"]
