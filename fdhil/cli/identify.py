@@ -70,14 +70,13 @@ def _against_data_sheet(result: FileResult, nominal: Mapping[str, Parameters]) -
 
     from fdhil.validation.data_sheet import gain_error
 
-    if result.pooled is None or not result.verdict.accepted or result.axis is None or result.axis not in nominal:
+    sheet = nominal.get(result.axis or "")
+    if sheet is None or result.pooled is None or not result.verdict.accepted:
         return result
-    reason = gain_error(result.pooled, nominal[result.axis])
-    return (
-        result
-        if reason is None
-        else replace(result, verdict=replace(result.verdict, accepted=False, reasons=(reason,)))
-    )
+    reason = gain_error(result.pooled, sheet)
+    if reason is None:
+        return result
+    return replace(result, verdict=replace(result.verdict, accepted=False, reasons=(reason,)))
 
 
 def _analyse(paths: Sequence[Path], settings: Identification, speeds: dict[str, float]) -> list[FileResult]:
