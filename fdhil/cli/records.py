@@ -110,7 +110,9 @@ def _config_of(window: Window) -> machine_config.MachineConfig:
 @click.argument("config", type=FILE)
 @click.option("--axis", help="One axis only.")
 @click.option(
-    "--plot", type=OutputFile(".png", ".svg", ".pdf"), help="Also draw the parameters over time and temperature."
+    "--plot",
+    type=OutputFile(".png", ".svg", ".pdf"),
+    help="Also draw the parameters over time and temperature: .png, .svg or .pdf.",
 )
 @AS_JSON
 def history(config: Path, axis: str | None, plot: Path | None, as_json: bool) -> None:

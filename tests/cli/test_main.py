@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import os
 import subprocess
 import sys
+import warnings
 from importlib import import_module
 
 import click
 import pytest
 
-from fdhil.cli.main import COMMANDS, cli, run_safely
+from fdhil.cli.main import COMMANDS, cli, main, run_safely
 from fdhil.errors import ConfigError, ConfigFault, ConnectError
 
 
@@ -67,3 +70,32 @@ def test_errors_are_sentences_with_their_exit_code(capsys: pytest.CaptureFixture
 
 def test_the_list_is_in_the_order_of_the_workflow() -> None:
     assert cli.list_commands(click.Context(cli))[:5] == ["demo", "scan", "check", "commission", "run"]
+
+
+def test_the_entry_point_shows_no_advice_of_libraries(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is for developers, who ask for it; the processes that a command starts show none either."""
+    monkeypatch.setattr("sys.argv", ["fdhil", "--version"])
+    monkeypatch.setattr("sys.warnoptions", [])
+    monkeypatch.setenv("PYTHONWARNINGS", "")
+    monkeypatch.delenv("PYTHONWARNINGS")
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always")
+        with pytest.raises(SystemExit):
+            main()
+        warnings.warn("overflow encountered", RuntimeWarning, stacklevel=1)
+    assert shown == []
+    assert os.environ["PYTHONWARNINGS"] == "ignore"
+    assert "fdhil" in capsys.readouterr().out
+
+
+def test_ctrl_c_is_told_to_programs_too(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    @click.command()
+    @click.option("--json", "as_json", is_flag=True)
+    def stopped(as_json: bool) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sys.argv", ["fdhil", "--json"])
+    assert run_safely(stopped) == 130
+    assert json.loads(capsys.readouterr().out)["error"]["class"] == "Stopped"
