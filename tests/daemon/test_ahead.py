@@ -35,8 +35,8 @@ from tests.daemon.test_program_check import HEAD, SQUARE
 from tests.store.made import published
 
 ENDLESS = HEAD + SQUARE * 4000 + "M2\n"
-HARD_LINE = 2 + 4 * 90 + 1  # some 140 s into the program
-HARD = HEAD + SQUARE * 90 + "G1 X40 F30000\nG1 X0\nF6000\n" + SQUARE * 4 + "M2\n"
+HARD_LINE = 2 + 4 * 70 + 1  # some 110 s into the program
+HARD = HEAD + SQUARE * 70 + "G1 X40 F30000\nG1 X0\nF6000\n" + SQUARE * 4 + "M2\n"
 PATIENCE_S = 500.0  # another process computes, on a host that may be busy
 
 
@@ -243,7 +243,7 @@ async def test_a_place_that_is_refused_later_is_told_long_before_the_motion_reac
 async def test_a_whole_check_is_waited_for_when_it_is_asked_for(
     config: MachineConfig, mill: Mill, tmp_path: Path
 ) -> None:
-    program = written(tmp_path, HEAD + SQUARE * 60 + "M2\n")
+    program = written(tmp_path, HEAD + SQUARE * 45 + "M2\n")
     async with opened(config, mill) as shop:
         answer = await shop.arm(program, whole=True)
         assert answer["ok"], answer
@@ -255,7 +255,10 @@ async def test_a_whole_check_is_waited_for_when_it_is_asked_for(
         assert (len(mill.rows), mill.final, mill.state) == (answer["rows"], True, "ACTIVE")
 
 
-async def test_what_ended_a_moment_ago_is_waited_for(config: MachineConfig, mill: Mill, tmp_path: Path) -> None:
+async def test_what_ended_a_moment_ago_is_waited_for(
+    config: MachineConfig, mill: Mill, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fdhil.daemon.armory.LANDING_S", 300.0)
     program = written(tmp_path, "G21 G90 G94\nG1 X20 F6000\nG1 Y20\nG4 P0.2\nM2\n")
     async with opened(config, mill) as shop:
         mill.state = "RAMP_DOWN"
@@ -266,6 +269,7 @@ async def test_what_ended_a_moment_ago_is_waited_for(config: MachineConfig, mill
         answer = await arming
         assert answer["ok"], answer
         mill.state = "HOLD"
+        monkeypatch.setattr("fdhil.daemon.armory.LANDING_S", 0.1)
         answer = await shop.arm(program)
         assert (answer["code"], answer["advice"]) == (
             "NotOff",
