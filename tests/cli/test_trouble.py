@@ -26,6 +26,7 @@ WITH_CONFIG = {
     "status": ["{config}"],
     "arm": ["{config}", "part.ngc"],
     "disarm": ["{config}"],
+    "adopt": ["{config}", "--yes"],
     "sim": ["{config}"],
     "record": ["{config}", "--out", "out.csv"],
     "history": ["{config}"],
