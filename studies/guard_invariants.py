@@ -303,12 +303,13 @@ def main() -> None:
     options.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     options.add_argument("--out", type=Path, default=PAGE)
     given = options.parse_args()
+    version = commit()
     seen, wrong = walks(given.sync, given.seed, given.processes)
     figures: dict[str, object] = {
         "schema": "fdhil-study-1",
         "study": "guard_invariants",
         "command": f"python -m studies.guard_invariants --sync {given.sync} --seed {given.seed}",
-        "commit": commit(),
+        "commit": version,
         "python": platform.python_version(),
         "violations": wrong,
         "counts": dict(sorted(seen.items())),

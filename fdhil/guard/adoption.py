@@ -117,7 +117,7 @@ def adopting(state: State, settings: Settings) -> State:
     cause = Alarm("StaleOffset")
     if _nothing_held(state):
         axes = tuple([axis._replace(sent=(0,) * len(axis.sent), offset=0, rate=0) for axis in state.axes])
-        return state._replace(mode=Mode.OFF, axes=axes, adopt_checked=True, cause=cause)
+        return state._replace(mode=Mode.OFF, axes=axes, adopt_checked=True, cause=None)
     feed = feedforward.zeroing(len(state.axes), cause) if is_fed(state) and settings.feeds else state.feed
     state = state._replace(mode=Mode.ADOPT, zeros_sent=0, adopt_checked=True, cause=cause, feed=feed)
     return _from_measured(state)

@@ -258,6 +258,30 @@ def test_no_frame_is_beyond_the_compiled_ceiling(monkeypatch: pytest.MonkeyPatch
     assert len(machine.frames) == count
 
 
+def test_what_may_stand_while_it_sends_is_what_was_sent_or_shown() -> None:
+    machine = active()
+    assert core.may_stand(machine.state, machine.settings) == machine.frames[-1][1]
+    machine.drives[0].scale = 0.5
+    while not machine.state.axes[0].echo_misses:
+        machine.sync()
+    told = core.may_stand(machine.state, machine.settings)
+    assert told[0] == machine.state.axes[0].read_back != machine.frames[-1][1][0]
+
+
+def test_a_zero_that_was_shown_at_the_end_stays_known() -> None:
+    """Switched off after the job, the drives say nothing any more: nothing has been sent since."""
+    machine = active()
+    machine.sync(Request("disarm"))
+    machine.until(Mode.OFF)
+    for drive in machine.drives:
+        drive.answers = False
+    machine.run(50)
+    assert core.may_stand(machine.state, machine.settings) == (0, 0)
+    machine.inject(0x302, struct.pack("<i", 300))
+    machine.sync()
+    assert core.may_stand(machine.state, machine.settings) == (None, None)
+
+
 # --- out of FROZEN ---
 
 

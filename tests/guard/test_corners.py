@@ -220,3 +220,19 @@ def test_time_goes_on_without_sync_only_where_it_can_be_ramped() -> None:
     machine.silence()
     machine.silence()
     assert machine.state.tick == tick + 2
+
+
+def test_an_event_driven_offset_waits_for_the_next_sync_while_there_is_any() -> None:
+    machine = bench(offset_synchronous=False)
+    machine.settle()
+    assert machine.arm() == ()
+    seen, bus = machine.listener.in_silence(0.0, silent=False)
+    assert machine.step(Inputs(False, seen, bus, path=machine.path)).offsets is None
+
+
+def test_a_following_error_that_the_drive_tells_is_taken_as_it_is() -> None:
+    machine = bench()
+    seen = inputs_of(machine)
+    axes = tuple([axis._replace(following_error=-70) for axis in seen.axes])
+    state = observe(machine.state, seen._replace(axes=axes), machine.settings)
+    assert [axis.following_error for axis in state.axes] == [-70, -70]

@@ -54,6 +54,41 @@ def test_read_back_is_told_once() -> None:
     assert heard.at_sync(b"\x02", 0.0, 0.0)[0][0].read_back is None
 
 
+def test_a_frame_that_was_not_due_spoils_the_read_back_beside_it() -> None:
+    """TPDO3 is due every tenth SYNC: what comes within half of that, or twice in one, shows nothing for sure."""
+    heard = listener()
+    shown, ages = [], []
+    for k in range(1, 60):
+        axes, _ = heard.at_sync(bytes([k]), k * 1e-3, k * 1e-3)
+        shown.append(axes[0].read_back)
+        ages.append(axes[0].read_back_age)
+        if k % 10 == 0:
+            heard.take(0x381, struct.pack("<ii", 7, 7), 0.0)
+        if k == 20:
+            heard.take(0x381, struct.pack("<ii", 7, 7), 0.0)  # the very same frame again
+        if k in (30, 44):
+            heard.take(0x381, struct.pack("<ii", 7, 500), 0.0)
+    assert [k + 1 for k, value in enumerate(shown) if value is not None] == [11, 21, 41, 51]
+    assert 500 not in shown
+    assert ages[20] == 1
+    assert ages[30] == 2
+
+
+def test_what_is_heard_is_all_that_is_needed() -> None:
+    ids = listener().wanted_ids()
+    assert {0x000, 0x080, 0x081, 0x181, 0x201, 0x301, 0x381, 0x481, 0x601, 0x701, 0x764} <= set(ids)
+    assert ids == tuple(sorted(ids))
+
+
+def test_after_a_silence_the_counter_starts_anew() -> None:
+    heard = listener()
+    heard.at_sync(b"\x05", 0.0, 0.0)
+    heard.forget_sync()
+    _, bus = heard.at_sync(b"\x99", 9.0, 9.0)
+    assert not bus.sync_regular
+    assert heard.alarms() == ()
+
+
 def test_wrong_lengths() -> None:
     heard = listener()
     heard.take(0x281, struct.pack("<Hi", 0x1237, 0), 0.0)
