@@ -40,9 +40,13 @@ def _name(index: int, sub: int) -> str:
 
 
 class SdoLink:
-    """The SDO channel of one node. ``deliver`` is called by whoever reads the bus, all else by one other thread."""
+    """The SDO channel of one node. ``deliver`` is called by whoever reads the bus, all else by one other thread.
 
-    def __init__(self, device: str, node_id: int, bus: CanBus) -> None:
+    ``patience``: how many times as long as a real drive this one may take.
+    """
+
+    def __init__(self, device: str, node_id: int, bus: CanBus, patience: float = 1.0) -> None:
+        self._patience = patience
         self.device = device
         self.response_id = COB_SDO_RESPONSE + node_id
         self._bus = bus
@@ -51,7 +55,7 @@ class SdoLink:
         dictionary: Any = ObjectDictionary
         self._client = client(COB_SDO_REQUEST + node_id, self.response_id, dictionary())
         self._client.network = self
-        self._client.RESPONSE_TIMEOUT = RESPONSE_TIMEOUT_S
+        self._client.RESPONSE_TIMEOUT = RESPONSE_TIMEOUT_S * patience
         self._late = False
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
@@ -107,7 +111,7 @@ class SdoLink:
 
     def _segments(self, index: int, sub: int, block: bool) -> bytes:
         limit, patience = (MAX_DOMAIN_BYTES, DOMAIN_DEADLINE_S) if block else (MAX_BYTES, DEADLINE_S)
-        deadline = time.monotonic() + patience
+        deadline = time.monotonic() + patience * self._patience
         stream = self._client.open(index, sub, "rb", buffering=0, block_transfer=block)
         parts, size = [], 0
         with stream:

@@ -35,6 +35,10 @@ class Heard:
     frames: int = 0
 
 
+LOCKSTEP_WAIT_S = 8.0
+LOCKSTEP_PATIENCE = 20.0  # times as long as on a real machine: a simulated one shares its computer
+
+
 class Master:
     """A context manager around one bus and one drive; nothing is sent before ``produce_sync`` or an SDO call."""
 
@@ -47,7 +51,9 @@ class Master:
         self.period_s = config.machine.sync_period_s
         self.device = f"drive {axis}"
         self.bus = CanBus(settings.drive.bus, config.bus[settings.drive.bus], transmit=True)
-        self.sdo = SdoLink(self.device, self.node_id, self.bus)
+        self._lockstep = config.guard.clock == "sync"
+        self._patience = LOCKSTEP_PATIENCE if self._lockstep else 1.0
+        self.sdo = SdoLink(self.device, self.node_id, self.bus, self._patience)
         self.heard = Heard()
         self.cycle = 0
         self.controlword = 0
@@ -58,6 +64,7 @@ class Master:
         self._plan: deque[int] = deque()
         self._sync_counter = 0
         self._sync_overflow: int | None = None
+        self._answered, self._wait_until = 0, 0.0
         self._heartbeat_due = 0.0
         self._lock = threading.Lock()
         self._failure: DeviceError | None = None
@@ -73,12 +80,20 @@ class Master:
             while not self._stopping.is_set():
                 self._receive()
                 self._send_heartbeat()
-                if self._sync_overflow is not None:
+                if self._sync_overflow is not None and not self._awaits_drive():
                     self._send_cycle()
                 due = max(due + self.period_s, time.monotonic() - self.period_s)
                 time.sleep(max(0.0, due - time.monotonic()))
         except DeviceError as error:
             self._failure = error
+
+    def _awaits_drive(self) -> bool:
+        """Whether a simulated drive has yet to answer the last SYNC: its process may sleep, and time is the SYNC count.
+
+        One that has not answered in ``LOCKSTEP_WAIT_S`` is not waited for until it answers again.
+        """
+        behind = self.cycle - self._answered
+        return self._lockstep and 0 < behind <= 1 and time.monotonic() < self._wait_until
 
     def _send_heartbeat(self) -> None:
         now = time.monotonic()
@@ -94,6 +109,7 @@ class Master:
         else:
             self.bus.send(cia402.COB_SYNC, b"")
         self.cycle += 1
+        self._wait_until = time.monotonic() + LOCKSTEP_WAIT_S
         with self._lock:
             if self._plan:
                 self.offset = self._plan.popleft()
@@ -119,7 +135,7 @@ class Master:
             if can_id == cia402.COB_SYNC:
                 heard.sync += 1
             elif can_id in tpdos and length >= tpdos[can_id].length:
-                spec = tpdos[can_id]
+                spec, self._answered = tpdos[can_id], self.cycle
                 for entry, value in zip(spec.entries, cia402.unpack(spec.entries, data), strict=True):
                     heard.objects[entry.index, entry.sub] = value
                     heard.cycle[entry.index, entry.sub] = self.cycle
@@ -171,7 +187,7 @@ class Master:
 
     def wait(self, condition: Callable[[], bool], timeout_s: float, otherwise: str) -> None:
         """Wait until ``condition`` holds; DeviceTimeout with the sentence ``otherwise`` when it does not in time."""
-        deadline = time.monotonic() + timeout_s
+        deadline = time.monotonic() + timeout_s * self._patience
         while not condition():
             self.check()
             if time.monotonic() > deadline:

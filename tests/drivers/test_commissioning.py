@@ -64,6 +64,25 @@ def test_a_good_drive_is_signed_off_and_left_as_it_was(peer: tuple[DrivePeer, Ma
     assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == consumers
 
 
+class SleepyPeer(DrivePeer):
+    """A simulated drive whose process sleeps now and then, as on a busy computer, until its watchdog is tried."""
+
+    def take(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
+        """Sleep longer than any mean is taken over, at every 40th SYNC of the first 400."""
+        count = self.heard.count(0x080)
+        if can_id == 0x080 and count % 40 == 0 and count <= 400:
+            time.sleep(0.3)
+        return super().take(can_id, data)
+
+
+def test_a_simulated_drive_may_sleep() -> None:
+    settings = config(guard={"clock": "sync"})
+    with SleepyPeer(settings), Master(settings, "X") as master:
+        prepare(master)
+        enable(master)
+        assert sign_test(master) == pytest.approx(10.0, abs=3.0)
+
+
 def test_software_limits_are_kept_where_the_drive_has_them(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
     with Master(settings, "X") as master:
