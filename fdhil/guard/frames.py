@@ -292,6 +292,7 @@ class Listener:
             NEVER if shown is None else -(-shown.sure_age // shown.every_sync),
             _fresh(of, DEMAND),
             node.touched,
+            shown is not None and shown.early,
         )
 
 

@@ -70,7 +70,7 @@ def _sampled(
     elif seen.position is not None and latched is not None:
         error = latched[k] + axis.sent[1 + setting.setpoint_delay_cycles] - seen.position
     if seen.read_back is None:
-        readings = 0 if seen.read_back_age > 1 else axis.readings
+        readings = 0 if seen.read_back_age > 1 or seen.read_back_crowded else axis.readings
         if error == axis.following_error and readings == axis.readings:
             return axis
         return axis._replace(following_error=error, readings=readings)

@@ -59,7 +59,8 @@ class AxisInput(NamedTuple):
     ``target`` is the 0x607A that this SYNC latched, ``position`` and ``read_back`` what was sampled at the SYNC before
     (None when no frame came). Ages are infinite when never heard;
     ``feedback_age`` is that of the older of statusword and position, ``read_back_age`` that of 0x60B0, each in units of
-    its own rate. ``demand`` is 0x6062; ``touched`` counts boot-ups, and writes to what the commissioning relies on.
+    its own rate; ``read_back_crowded``: its TPDO came when it was not due, so that one of the last two may be another
+    node's. ``demand`` is 0x6062; ``touched`` counts boot-ups, and writes to what the commissioning relies on.
     """
 
     target: int | None = None
@@ -78,6 +79,7 @@ class AxisInput(NamedTuple):
     read_back_age: float = float("inf")
     demand: int | None = None
     touched: int = 0
+    read_back_crowded: bool = False
 
 
 class BusView(NamedTuple):

@@ -104,7 +104,7 @@ class Drive:
         """Latch what was received, then sample all TPDOs."""
         self.target = self.received_target
         if self.received_offset is not None:
-            self.offset = round(self.received_offset * self.scale)
+            self.offset, self.received_offset = round(self.received_offset * self.scale), None
         if self.received_fed is not None:
             self.fed = self.takes_fed(self.received_fed)
         self.queue = [*self.queue, (self.target, self.offset)][-3:]

@@ -112,6 +112,18 @@ def test_forged_frames_beside_the_drives_own_move_nothing(at: int, times: int) -
     assert machine.arm() == ()
 
 
+@pytest.mark.parametrize("phase", range(1, 10))
+def test_another_node_in_step_with_the_drive_is_not_believed(phase: int) -> None:
+    """It sends TPDO3 as often as the drive does, consistent, at a time of its own: neither of the two is known."""
+    machine = bench()
+    for _ in range(200):
+        machine.sync()
+        if machine.tick % 10 == phase:
+            machine.hear(0x381, struct.pack("<ii", 500, 500))
+    assert machine.frames == []
+    assert core.may_stand(machine.state, machine.settings)[0] != 500
+
+
 def test_an_offset_that_is_never_shown_alike_is_frozen() -> None:
     machine = bench()
     for k in range(200):
