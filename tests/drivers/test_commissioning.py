@@ -32,6 +32,8 @@ pytestmark = pytest.mark.usefixtures("quick_commissioning")
 
 
 def config(**sections: Any) -> MachineConfig:
+    """The drive shares a busy computer: it is waited for, as any simulated one."""
+    sections = {"guard": {"clock": "sync"}, **sections}
     return machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex}, **sections)
 
 
@@ -76,7 +78,7 @@ class SleepyPeer(DrivePeer):
 
 
 def test_a_simulated_drive_may_sleep() -> None:
-    settings = config(guard={"clock": "sync"})
+    settings = config()
     with SleepyPeer(settings), Master(settings, "X") as master:
         prepare(master)
         enable(master)
