@@ -46,7 +46,7 @@ def machine() -> MachineConfig:
         "nominal": bench.Plant().truth(),
         "regulators": dict.fromkeys((*gains, "current_limit_a", "voltage_limit_v"), 1.0),
     }
-    return parse({"machine": {"name": "study"}, "axis": {"X": axis}}, "study")
+    return parse({"machine": {"name": "study"}, "axis": {"X": axis}}, "study", made_up=True)
 
 
 def drawn(rng: np.random.Generator) -> bench.Plant:

@@ -19,7 +19,7 @@ from fdhil import config as machine_config
 from fdhil.cia402 import PdoEntry
 from fdhil.cli.bus_lock import lock_bus
 from fdhil.cli.main import run_safely
-from fdhil.config import Axis, CanBus, MachineConfig, OffsetLimits
+from fdhil.config import Axis, CanBus, MachineConfig, OffsetLimits, share_fault
 from fdhil.errors import ConfigError, ConfigFault, ConnectError, DeviceError, ProtocolError, StoreError
 from fdhil.guard.feedforward import Limits as FeedforwardLimits
 from fdhil.guard.limits import Limits
@@ -121,7 +121,9 @@ def _user_id(name: str | None) -> int | None:
 
 
 def limits_of(axis: Axis, sync_period_s: float) -> Limits:
-    """Return the config's limits in whole increments per SYNC cycle, as the planner has them, rounded down."""
+    """Return the limits in whole increments per SYNC cycle, as the planner has them, rounded down. ConfigError."""
+    if fault := share_fault(axis, sync_period_s):
+        raise ConfigError("config", [ConfigFault("axis.*.correction", fault, "leave this axis uncorrected")])
     return Limits(*OffsetLimits.of(axis, sync_period_s).whole)
 
 

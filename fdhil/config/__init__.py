@@ -20,7 +20,7 @@ from fdhil.config.axis import (
 )
 from fdhil.config.controller import G0, Identification, Nc
 from fdhil.config.machine import Machine, MachineConfig
-from fdhil.config.offset_limits import VARIATION_MM, OffsetLimits
+from fdhil.config.offset_limits import VARIATION_MM, OffsetLimits, share_fault
 from fdhil.config.reading import MAX_CONFIG_BYTES, load, parse, toml_document, unlikely
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import AxisName, Finite, Fraction, NotNegative, Positive, Section
@@ -63,6 +63,7 @@ __all__ = [
     "Voltage",
     "load",
     "parse",
+    "share_fault",
     "toml_document",
     "unlikely",
 ]

@@ -34,10 +34,8 @@ class CorrectionLimits(Section):
 
     max_offset_um: Positive = Field(50.0, le=CEILING_OFFSET_UM, description="largest offset")
     max_speed_mm_s: Positive = Field(2.0, le=CEILING_SPEED_MM_S, description="largest rate of the offset")
-    max_acceleration_mm_s2: Positive | None = Field(
-        None,
-        le=CEILING_ACCELERATION_MM_S2,
-        description="largest acceleration of the offset; left out: 250, or one increment per SYNC^2 where that is more",
+    max_acceleration_mm_s2: Positive = Field(
+        250.0, le=CEILING_ACCELERATION_MM_S2, description="largest acceleration of the offset"
     )
 
 

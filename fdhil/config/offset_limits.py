@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from fdhil.config.axis import CEILING_ACCELERATION_MM_S2, Axis
+from fdhil.config.axis import Axis
 
 AXIS_SPEED_SHARE = 0.10  # an offset never takes more than this of the axis' own speed
 AXIS_ACCELERATION_SHARE = 0.50
 VARIATION_MM = 3.0
-DEFAULT_ACCELERATION_MM_S2 = 250.0
 VARIATION_S = 1.0
 TIME_TO_SAFE_S = 0.120
+BRAKING_S = 0.020  # of an axis whose share is little; its braking counts three times
 DETECTION_CYCLES = 3
+LEAST_INCREMENTS = 0.5  # what is less would be more than doubled by the one increment that can be sent
 _ULPS = 1e-9  # so that 20 mm/s of 50 per mm are one increment, and not one less
 
 
@@ -28,45 +29,81 @@ class OffsetLimits:
     window: int
 
     @staticmethod
-    def of(axis: Axis, sync_period_s: float) -> OffsetLimits:
-        """Return the limits of an axis; ValueError when writing is off (no ``[axis.X.correction]``)."""
+    def given(axis: Axis, sync_period_s: float) -> OffsetLimits:
+        """Return the limits as they stand in the configuration; ValueError when writing is off."""
         if axis.correction is None:
             raise ValueError("writing is off for this axis")
-        scale, given = axis.scaling.increments_per_mm, axis.correction
-        speed = min(given.max_speed_mm_s, AXIS_SPEED_SHARE * axis.top_speed_mm_s)
-        finest = max(DEFAULT_ACCELERATION_MM_S2, 1 / (scale * sync_period_s**2))
-        acceleration = given.max_acceleration_mm_s2 or min(finest, CEILING_ACCELERATION_MM_S2)
-        acceleration = min(acceleration, AXIS_ACCELERATION_SHARE * axis.max_acceleration_mm_s2)
+        own, scale = axis.correction, axis.scaling.increments_per_mm
         return OffsetLimits(
-            offset=given.max_offset_um * 1e-3 * scale,
-            rate=speed * scale * sync_period_s,
-            acceleration=acceleration * scale * sync_period_s**2,
+            offset=own.max_offset_um * 1e-3 * scale,
+            rate=own.max_speed_mm_s * scale * sync_period_s,
+            acceleration=own.max_acceleration_mm_s2 * scale * sync_period_s**2,
             variation=VARIATION_MM * scale,
             window=round(VARIATION_S / sync_period_s),
         )
 
+    @staticmethod
+    def of(axis: Axis, sync_period_s: float) -> OffsetLimits:
+        """Return what an offset may do: the given limits within the axis' share, lowered until zero is near enough.
+
+        ValueError when writing is off (no ``[axis.X.correction]``).
+        """
+        given, scale = OffsetLimits.given(axis, sync_period_s), axis.scaling.increments_per_mm
+        share = AXIS_ACCELERATION_SHARE * axis.max_acceleration_mm_s2 * scale * sync_period_s**2
+        limits = replace(
+            given,
+            rate=min(given.rate, AXIS_SPEED_SHARE * axis.top_speed_mm_s * scale * sync_period_s),
+            acceleration=min(given.acceleration, share),
+        )
+        if not limits.too_coarse and limits.time_to_safe_s(sync_period_s) > TIME_TO_SAFE_S:
+            braking = max(1, math.floor(BRAKING_S / sync_period_s))
+            ramp = max(1, math.floor(TIME_TO_SAFE_S / sync_period_s) - DETECTION_CYCLES - 2 - 3 * braking)
+            rate = min(limits.rate, float(braking * _whole(limits.acceleration)))
+            limits = replace(limits, rate=rate, offset=min(limits.offset, float(ramp * _whole(rate))))
+        return limits
+
+    @property
+    def too_coarse(self) -> bool:
+        """Whether an increment is more than twice what a limit allows in one cycle."""
+        return min(self.offset, self.rate, self.acceleration) < LEAST_INCREMENTS
+
+    def time_to_safe_s(self, sync_period_s: float) -> float:
+        """Return how long it takes at most from a fault to zero: n_detect + 1 + L/S + 3 S/A cycles."""
+        offset, rate, acceleration, _, _ = self.whole
+        return (DETECTION_CYCLES + 1 - (-offset // rate) - 3 * (-rate // acceleration)) * sync_period_s
+
     @property
     def whole(self) -> tuple[int, int, int, int, int]:
-        """The same in whole increments, rounded down: what the guard holds every frame to."""
-        offset, rate = math.floor(self.offset + _ULPS), math.floor(self.rate + _ULPS)
-        return offset, rate, math.floor(self.acceleration + _ULPS), math.floor(self.variation + _ULPS), self.window
+        """The same in whole increments, rounded down but to one: what the guard holds every frame to."""
+        offset, rate, acceleration = map(_whole, (self.offset, self.rate, self.acceleration))
+        return offset, rate, acceleration, math.floor(self.variation + _ULPS), self.window
+
+
+def _whole(increments: float) -> int:
+    """Round down; one increment is the least that can be sent."""
+    return max(1, math.floor(increments + _ULPS))
 
 
 def limit_faults(axis: Axis, sync_period_s: float) -> list[str]:
-    """Say why the limits of an axis cannot be kept: its increments are too coarse, or the way to zero is too long."""
+    """Say why the given limits cannot be kept: the increments are too coarse, or the way to zero is too long."""
     if axis.correction is None:
         return []
-    limits = OffsetLimits.of(axis, sync_period_s)
-    offset, rate, acceleration, _, _ = limits.whole
-    if min(offset, rate, acceleration) < 1:
+    limits = OffsetLimits.given(axis, sync_period_s)
+    if limits.too_coarse:
         return [_too_coarse(axis, limits)]
-    cycles = DETECTION_CYCLES + 1 + -(-offset // rate) + 3 * -(-rate // acceleration)
-    if cycles * sync_period_s > TIME_TO_SAFE_S:
+    needed_s = limits.time_to_safe_s(sync_period_s)
+    if needed_s > TIME_TO_SAFE_S:
         return [
-            f"from the largest offset to zero these limits need {cycles * sync_period_s * 1e3:.0f} ms, 120 are allowed"
-            " (lower max_offset_um, or raise max_speed_mm_s or max_acceleration_mm_s2 where the axis allows more)"
+            f"from the largest offset to zero these limits need {needed_s * 1e3:.0f} ms, 120 are allowed"
+            " (lower max_offset_um or raise max_speed_mm_s)"
         ]
     return []
+
+
+def share_fault(axis: Axis, sync_period_s: float) -> str | None:
+    """Say why an axis so slow cannot be corrected: its share of speed or acceleration is less than one increment."""
+    limits = OffsetLimits.of(axis, sync_period_s)
+    return _too_coarse(axis, limits) if limits.too_coarse else None
 
 
 def _too_coarse(axis: Axis, limits: OffsetLimits) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from fdhil.config import MachineConfig
+from fdhil.config import MachineConfig, share_fault
 from fdhil.correction import feed
 from fdhil.records import Bool, Float, Parameters, Prediction, Reason, Trajectory
 
@@ -20,15 +20,21 @@ MASK_S, FADE_S = 0.04, 0.06  # what is left alone around a row that gets worse, 
 
 
 def writing_off(axes: Sequence[str], config: MachineConfig) -> tuple[Reason, ...]:
-    """Refuse axes without limits: writing is off by default."""
-    return tuple(
-        Reason(
+    """Refuse axes without limits (writing is off by default), and axes too slow for their increments."""
+    found = [_unwritable(axis, config) for axis in axes]
+    return tuple(reason for reason in found if reason is not None)
+
+
+def _unwritable(axis: str, config: MachineConfig) -> Reason | None:
+    if axis not in config.axis or config.axis[axis].correction is None:
+        return Reason(
             "WritingOff",
             f"axis {axis} has no section [axis.{axis}.correction]: writing to its drive is off",
             f"add [axis.{axis}.correction] with max_offset_um, max_speed_mm_s and max_acceleration_mm_s2",
         )
-        for axis in axes
-        if axis not in config.axis or config.axis[axis].correction is None
+    fault = share_fault(config.axis[axis], config.machine.sync_period_s)
+    return (
+        None if fault is None else Reason("CoarseIncrements", f"axis {axis}: {fault}", f"leave axis {axis} uncorrected")
     )
 
 

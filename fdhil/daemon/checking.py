@@ -7,6 +7,7 @@ import contextlib
 import hashlib
 import json
 import os
+import signal
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -149,7 +150,7 @@ class _Going:
     def _kill(self) -> None:
         if self._process is not None and self._process.returncode is None:
             with contextlib.suppress(ProcessLookupError):
-                self._process.kill()
+                os.kill(self._process.pid, signal.SIGKILL)  # its own kill() may take the exit code from who waits
 
     async def _follow(self, request: Mapping[str, Any]) -> None:
         """Take what the process says until it ends."""

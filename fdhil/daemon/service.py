@@ -96,7 +96,8 @@ class Service:
                 await asyncio.to_thread(self._keeper.close)
                 for number in (signal.SIGTERM, signal.SIGINT):
                     loop.remove_signal_handler(number)
-                self._say_stopped(stands)
+                if self._opened.is_set() or not stands.nothing:  # else it never ran, and the error alone is told
+                    self._say_stopped(stands)
         return stands
 
     def _say_stopped(self, stands: Standing) -> None:

@@ -14,6 +14,7 @@ CEILING_OFFSET_UM = 250.0
 CEILING_SPEED_MM_S = 20.0
 CEILING_ACCELERATION_MM_S2 = 2000.0
 CEILING_VARIATION_MM = 3.0  # in any second
+LEAST_INCREMENTS = 0.5
 SPEED_SHARE, ACCELERATION_SHARE = 0.10, 0.50  # of the axis' own
 # a table is a rounded curve: its first difference may be 1, its second 2 increments beyond the curve's own
 ROUNDING_RATE = 1
@@ -57,11 +58,16 @@ def ceilings(
     acceleration = min(CEILING_ACCELERATION_MM_S2, ACCELERATION_SHARE * max_acceleration_mm_s2)
     return Limits(
         offset=floor(CEILING_OFFSET_UM * 1e-3 * increments_per_mm + 1e-9),
-        rate=floor(speed * increments_per_mm * sync_period_s + 1e-9),
-        acceleration=floor(acceleration * increments_per_mm * sync_period_s**2 + 1e-9),
+        rate=_whole(speed * increments_per_mm * sync_period_s),
+        acceleration=_whole(acceleration * increments_per_mm * sync_period_s**2),
         variation=floor(CEILING_VARIATION_MM * increments_per_mm + 1e-9),
         window=round(1.0 / sync_period_s),
     )
+
+
+def _whole(increments: float) -> int:
+    """Round down but to one, the least that can be sent; 0 where that is more than twice as much."""
+    return max(1, floor(increments + 1e-9)) if increments >= LEAST_INCREMENTS else 0
 
 
 def stopping(rate: int, acceleration: int) -> int:

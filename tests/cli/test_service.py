@@ -7,6 +7,7 @@ import socket
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -198,5 +199,7 @@ def test_lines_of_the_daemon_as_json(capsys: pytest.CaptureFixture[str]) -> None
     with journal.lines_as_json(False):
         journal.write_line("X: said to a person")
     said = capsys.readouterr()
-    assert json.loads(said.out) == {"severity": "MAJOR", "text": "X: LoadChanged"}
+    line = json.loads(said.out)
+    assert datetime.fromisoformat(line.pop("time")).tzinfo is not None
+    assert line == {"severity": "MAJOR", "text": "X: LoadChanged"}
     assert "said to a person" in said.err

@@ -23,7 +23,7 @@ def test_limits_are_those_of_the_configuration_and_the_axis() -> None:
     assert pytest.approx(250.0 / BENCH.um_per_increment) == BENCH.offset
     assert pytest.approx(20.0 / BENCH.um_per_increment) == BENCH.rate
     slow = AXIS.model_copy(update={"rapid_speed_mm_s": 100.0, "max_acceleration_mm_s2": 1000.0})
-    assert pytest.approx(10.0 / BENCH.um_per_increment) == Limits.of(slow, 0.001).rate
+    assert Limits.of(slow, 0.001).rate == 20.0  # of 10 mm/s; with 500 mm/s2 that is what can be braked in 20 ms
     assert pytest.approx(0.5 / BENCH.um_per_increment) == Limits.of(slow, 0.001).acceleration
     with pytest.raises(ValueError, match="off"):
         Limits.of(AXIS.model_copy(update={"correction": None}), 0.001)
