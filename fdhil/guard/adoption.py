@@ -12,6 +12,7 @@ from fdhil.guard.conditions import AGREEING, ARMING_INTERLOCKS, View, known
 from fdhil.guard.feedforward import FeedMode
 from fdhil.guard.feeding import is_fed
 from fdhil.guard.interlocks import Alarm, Reaction
+from fdhil.guard.limits import CEILING_OFFSET_UM
 from fdhil.guard.path import EPS
 from fdhil.guard.settings import AxisSettings, Settings
 from fdhil.guard.state import SENDING, AxisState, Inputs, Mode, Request, State
@@ -19,7 +20,6 @@ from fdhil.guard.state import SENDING, AxisState, Inputs, Mode, Request, State
 Views = tuple[View, ...]
 Alarms = tuple[Alarm, ...]
 
-CEILING_MM = 0.25
 PERIODS_AWAITED = 2 * AGREEING
 """TPDOs in which a value must have become known: three in a row, and as many that were in doubt."""
 IMPLAUSIBLE = frozenset({"StaleData", "TargetLost", "FollowingError", "Implausible", "PdoLength"})
@@ -28,7 +28,7 @@ OF_THE_RECORD = frozenset({"NotCommissioned", "RecordVoid", "PdoMapping"})
 
 def ceiling(own: AxisSettings) -> int:
     """Return the largest offset, in increments, that may ever be sent, whatever was read or configured."""
-    return int(CEILING_MM * own.increments_per_mm + 1e-9)
+    return int(CEILING_OFFSET_UM * 1e-3 * own.increments_per_mm + 1e-9)
 
 
 def patience(settings: Settings) -> int:
@@ -55,7 +55,7 @@ def _doubt(view: View) -> str:
     if held is None:
         return "three TPDOs in a row do not agree on it"
     if not abs(held) <= ceiling(own):
-        return f"{_um(own, held)}: beyond the ceiling of {CEILING_MM * 1e3:.0f} um"
+        return f"{_um(own, held)}: beyond the ceiling of {CEILING_OFFSET_UM:.0f} um"
     if not axis.off_demand <= EPS:
         return f"{_um(own, held)}: its demand (0x6062) says otherwise"
     return ""
