@@ -136,7 +136,9 @@ def _unused(axis: Mapping[str, Any]) -> str:
     moves = axis.get("moves") or {}
     reasons = [f"{count} refused: {code}" for code, count in axis.get("refused_by", {}).items()]
     if moves.get("too_slow"):
-        reasons.insert(0, f"{moves['too_slow']} too slow (the fastest at {moves['fastest_mm_s']:.4g} mm/s)")
+        reasons.insert(
+            0, f"{moves['too_slow']} slower than a rapid (the fastest of all reached {moves['fastest_mm_s']:.4g} mm/s)"
+        )
     if moves.get("without_plateau"):
         reasons.append(f"{moves['without_plateau']} too short for a plateau")
     return f"{moves.get('seen', 0)} moves seen; not used: {', '.join(reasons)}" if reasons else ""

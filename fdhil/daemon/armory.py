@@ -44,7 +44,6 @@ STREAM_S = 0.05
 ALIVE_S = 0.1  # the guard calls us lost after 0.5 s
 REFRESH_S = 0.5
 LANDING_S = 1.0  # without a SYNC; while there is SYNC, what ended a moment ago comes to rest by itself
-NO_GUARD = "start fdhil-guard with this machine's config"
 
 Tell = Callable[[Sequence[Notice]], None]
 Prepared = TypeVar("Prepared", bound=Armament | StreamedArmament | Feeding)
@@ -276,7 +275,8 @@ class Armory:
         """Return the refusal without a guard; what the last one may have left is told."""
         stands = self.guard.standing
         if stands.nothing:
-            return refusal("GuardAbsent", str(error), NO_GUARD)
+            text, _, advice = str(error).rpartition("; ")
+            return refusal("GuardAbsent", text, advice)
         return refusal("OffsetStands", f"{error}; {stands}", START_AND_ADOPT)
 
     async def attend(self, tell: Tell) -> None:
