@@ -155,7 +155,7 @@ def _identified(loop: Loop) -> Section:
     return Section(
         "Identified during rapid moves",
         f"Voltage, current and speed were recorded over CANopen while the axes shuttled; {received:,} frames were "
-        f"received and {lost} lost. Each parameter is shown with two standard deviations, beside the twin's own.",
+        f"received and {lost} lost. Each parameter is shown with half of its 95 % interval, beside the twin's own.",
         tables=[Table(PARAMETER_HEAD, parameter_rows(loop))],
         figures=pictures,
     )
