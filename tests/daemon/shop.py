@@ -22,8 +22,9 @@ from fdhil.errors import ConnectError
 from tests.bench import axis_toml
 
 REAL = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.085, "ft": 0.05, "Cd": 5.0}
-SHUTTLE = "G21 G90 G94\n" + "G0 X300 Y300\nG4 P0.4\nG0 X0 Y0\nG4 P0.4\n" * 2 + "M2\n"
-CORNER = "G21 G90 G94\nG4 P0.5\nG1 X60 F8000\nG1 Y40\nG4 P0.3\nM2\n"
+TO_AND_FRO = "G0 X200 Y200\nG4 P0.3\nG0 X0 Y0\nG4 P0.3\n"
+SHUTTLE = "G21 G90 G94\n" + TO_AND_FRO * 2 + "M2\n"
+CORNER = "G21 G90 G94\nG4 P0.3\nG1 X60 F8000\nG1 Y40\nG4 P0.2\nM2\n"
 HEAD = """
 [machine]
 name = "bench"

@@ -15,8 +15,8 @@ from fdhil.cli.demo.processes import Twin
 from tests.daemon.shop import AXIS, HEAD, Shop, fdhil
 
 FT_PER_KELVIN, CD_PER_KELVIN = -0.16, -0.10
-SHUTTLE = "G21 G90 G94\nG0 X300\nG4 P0.35\nG0 X0\nG4 P0.35\nM2\n"
-CELSIUS = np.linspace(20.0, 22.0, 6)
+SHUTTLE = "G21 G90 G94\nG0 X200\nG4 P0.3\nG0 X0\nG4 P0.3\nM2\n"
+CELSIUS = np.linspace(20.0, 22.0, 4)
 # heavier than the data sheet says, with slide-ways that keep the temperature they are given
 TWIN = f"""
 ft_per_kelvin = {FT_PER_KELVIN}

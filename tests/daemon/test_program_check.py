@@ -12,7 +12,6 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from subprocess import PIPE
 from typing import Any
 
 import numpy as np
@@ -23,12 +22,13 @@ from fdhil import correction
 from fdhil.config import MachineConfig
 from fdhil.daemon.arming import Long, StreamedArmament, prepare, prepare_stream
 from fdhil.daemon.checking import FOLDER, Check
-from fdhil.daemon.program_check import KEPT, OWN, ROOMS, SCHEMA, check, code_digest, keep
+from fdhil.daemon.program_check import KEPT, SCHEMA, check, code_digest, keep
 from fdhil.daemon.streamed import Checked, Piece, Stream
 from fdhil.errors import ProgramError, StoreError
 from fdhil.prediction.models import nominal_models
 from fdhil.program import load_trajectory, program_digest
 from fdhil.records import Reason
+from tests.daemon.check_process import answered, asked, says_instead
 from tests.daemon.machine import config_of
 from tests.daemon.test_arming import known, save_records
 
@@ -196,15 +196,7 @@ async def test_an_abandoned_check_says_so_and_leaves_nothing(config: MachineConf
     assert not list((config.store.directory / FOLDER).glob("*.json"))
 
 
-async def test_a_broken_program_is_refused_with_its_line(config: MachineConfig, tmp_path: Path) -> None:
-    program = written(tmp_path, HEAD + SQUARE * 10 + "G1 X[1/0]\nM2\n")
-    refused = await Check(config).run(program, program_digest(program), nominal_models(config), whole)
-    assert isinstance(refused, tuple)
-    assert refused[0].code == "ProgramError"
-    assert "43" in refused[0].text
-
-
-CALLS = HEAD + "O<square> CALL\n" * 10 + "G4 P0.3\nM2\n"
+CALLS = HEAD + "O<square> CALL\n" * 3 + "G4 P0.3\nM2\n"
 BESIDE = "O<square> SUB\n" + SQUARE + "O<square> ENDSUB\n"
 
 
@@ -214,17 +206,21 @@ async def test_a_subroutine_beside_the_program_belongs_to_it(config: MachineConf
     beside.write_text(BESIDE)
     program = written(tmp_path, CALLS)
     digest, models = program_digest(program), nominal_models(config)
+    folder, key = config.store.directory / FOLDER, Check(config)._key(digest, models)
+    header = keep(folder, key, lambda body: check(program, digest, models, config, body, lambda _told: None))
+    assert header["files"] == {"square.ngc": program_digest(beside)}
     first = await Check(config).run(program, digest, models, whole)
     assert isinstance(first, Checked)
-    assert first.header is not None
-    assert first.header["files"] == {"square.ngc": program_digest(beside)}
-    (file,) = (config.store.directory / FOLDER).glob("*.rows")
+    assert [list(block[:2]) for block in first.blocks] == header["blocks"]  # it is known
+    (file,) = folder.glob("*.rows")
     assert Checked.find(file.parent, file.stem, tmp_path) is not None
     beside.write_text(BESIDE.replace("X40", "X41"))
     assert Checked.find(file.parent, file.stem, tmp_path) is None
     again = await Check(config).run(program, digest, models, whole)
     assert isinstance(again, Checked)
     assert again.blocks != first.blocks
+    assert again.header is not None
+    assert again.header["files"] == {"square.ngc": program_digest(beside)}
     beside.unlink()
     assert Checked.find(file.parent, file.stem, tmp_path) is None
 
@@ -247,10 +243,7 @@ async def test_a_process_that_dies_within_a_line_is_told(
     config: MachineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     program = written(tmp_path, LONG)
-    dying = tmp_path / "python"
-    dying.write_text('#!/bin/sh\nread line\nprintf \'{"header": {"ref\'\nexit 9\n')
-    dying.chmod(0o700)
-    monkeypatch.setattr(sys, "executable", str(dying))
+    says_instead(monkeypatch, tmp_path, 'read line\nprintf \'{"header": {"ref\'\nexit 9\n')
     refused = await Check(config).run(program, program_digest(program), nominal_models(config), whole)
     assert isinstance(refused, tuple)
     assert (refused[0].code, "exit code 9" in refused[0].text) == ("InternalError", True)
@@ -267,28 +260,25 @@ async def test_a_process_that_cannot_be_started_is_told(
     await check.attend()  # it is no fault of the daemon
 
 
-def test_the_process_ends_with_its_answer_or_with_the_daemon(config: MachineConfig, tmp_path: Path) -> None:
-    program = written(tmp_path, HEAD + "G1 X[1/0]\nM2\n")
-    request = {
-        "program": str(program),
-        "program_digest": program_digest(program),
-        "config": config.model_dump(mode="json"),
-        "models": {axis: model.as_dict() for axis, model in nominal_models(config).items()},
-        "folder": str(tmp_path / FOLDER),
-        "key": "key",
-    }
+async def test_a_broken_program_is_refused_with_its_line_by_a_process_that_ends(
+    config: MachineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It answers and ends while its stdin is open; its digest covers what it ran; the daemon makes a refusal of it."""
+    program = written(tmp_path, HEAD + SQUARE * 10 + "G1 X[1/0]\nM2\n")
+    answer = answered(asked(program, config, tmp_path), tmp_path / "stderr")
+    assert json.loads(answer.splitlines()[-1])["error"]["code"] == "ProgramError"
+    (tmp_path / "answer").write_bytes(answer)
+    says_instead(monkeypatch, tmp_path, f"read line\nexec cat '{tmp_path / 'answer'}'\n")
+    refused = await Check(config).run(program, program_digest(program), nominal_models(config), whole)
+    assert isinstance(refused, tuple)
+    assert refused[0].code == "ProgramError"
+    assert "43" in refused[0].text
+
+
+def test_the_process_ends_with_the_daemon(config: MachineConfig, tmp_path: Path) -> None:
+    program = written(tmp_path, HEAD + SQUARE * 5000 + "M2\n")
     command = [sys.executable, "-m", "fdhil.daemon.program_check"]
-    with subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=PIPE) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
-        assert process.stderr is not None
-        process.stdin.write(json.dumps(request).encode() + b"\n")
-        process.stdin.flush()
-        assert json.loads(process.stdout.read())["error"]["code"] == "ProgramError"
-        assert process.wait() == 0
-        assert process.stderr.read() == b""
-    request["program"] = str(written(tmp_path, HEAD + SQUARE * 5000 + "M2\n"))
-    done = subprocess.run(command, input=json.dumps(request).encode() + b"\n", capture_output=True, check=False)
+    done = subprocess.run(command, input=asked(program, config, tmp_path), capture_output=True, check=False)
     assert (done.returncode, done.stderr) == (1, b"")
     assert b"header" not in done.stdout
 
@@ -354,18 +344,6 @@ def test_what_other_code_made_is_checked_again(tmp_path: Path, monkeypatch: pyte
     with (home / "program" / "planner" / "smoothing.py").open("a") as file:
         file.write("# otherwise\n")
     assert Checked.find(tmp_path, "a", tmp_path) is None
-
-
-def test_the_digest_covers_all_code_that_the_check_runs() -> None:
-    """A room that the check begins to use must be in it; errors and the writing of files make no row."""
-    told = "import sys, fdhil.daemon.program_check\nprint(*(m for m in sys.modules if m.startswith('fdhil.')))"
-    done = subprocess.run([sys.executable, "-c", told], capture_output=True, check=True, text=True)
-    rooms = {name.removesuffix(".py").replace("/", ".") for name in (*ROOMS, OWN)}
-    others = {"daemon", "errors", "store", "store.atomic"}
-    modules = {name.removeprefix("fdhil.") for name in done.stdout.split()}
-    outside = {name for name in modules - others - rooms if name.split(".")[0] not in rooms}
-    assert outside == set()
-    assert len(modules) > 50
 
 
 def test_a_refused_program_is_not_kept_and_old_ones_go(tmp_path: Path) -> None:
