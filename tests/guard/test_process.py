@@ -271,10 +271,8 @@ def test_what_is_forged_foreign_or_silent_makes_no_step(rig: Rig) -> None:
     rig.into_the_cut()
     peer.inject((0x301, (-819).to_bytes(4, "little", signed=True)))
     drive.received_offset = -819
-    peer.wait(lambda: "OffsetHijack" in {event.get("code") for event in rig.events()}, "the foreign offset is noticed")
-    peer.wait(lambda: peer.offsets_sent()[-1][1] == 0, "zero")
-    peer.expected = False  # the guard falls silent, whatever the drives hold
     peer.wait(lambda: rig.state() == "OFF", "off")
+    peer.expected = False  # the guard is silent, whatever the drives hold
     assert client.status()["cause"]["code"] == "OffsetHijack"
     held = [offsets[0] for _, _, offsets in peer.latched]
     steps = [abs(b - a) for a, b in itertools.pairwise(held)]
