@@ -10,9 +10,9 @@ from typing import Any
 import can
 import pytest
 
-from fdhil.cia402 import Object, State
+from fdhil.cia402 import Mode, Object, State
 from fdhil.config import MachineConfig
-from fdhil.drivers import commissioning, commissioning_checks, commissioning_watchdog
+from fdhil.drivers import canopen_sdo, commissioning, commissioning_checks, commissioning_watchdog
 from fdhil.drivers.commissioning import (
     check_axis,
     commission,
@@ -73,7 +73,7 @@ class SleepyPeer(DrivePeer):
         """Sleep longer than any mean is taken over, at every 40th SYNC of the first 400."""
         count = self.heard.count(0x080)
         if can_id == 0x080 and count % 40 == 0 and count <= 400:
-            time.sleep(0.3)
+            time.sleep(0.15)
         return super().take(can_id, data)
 
 
@@ -176,6 +176,14 @@ def not_csp(peer: DrivePeer) -> None:
     peer.drive.faults.not_csp = True
 
 
+class HastyMaster(Master):
+    """A master that waits for the mode as long as for a real drive: this one never shows it, or shows it at once."""
+
+    def wait(self, condition: Callable[[], bool], timeout_s: float, otherwise: str) -> None:
+        never = "the mode" in otherwise and self.heard.objects.get((0x6061, 0)) != Mode.CYCLIC_SYNC_POSITION
+        super().wait(condition, timeout_s / self._patience if never else timeout_s, otherwise)
+
+
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
@@ -190,14 +198,17 @@ def test_a_drive_that_takes_offsets_otherwise_is_refused_and_disabled(
 ) -> None:
     drive, settings = peer
     spoil(drive)
-    with Master(settings, "X") as master, pytest.raises(DeviceError) as caught:
+    with HastyMaster(settings, "X") as master, pytest.raises(DeviceError) as caught:
         run_steps(master, sign_test)
     assert says in str(caught.value)
     assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
     assert drive.drive.dictionary.number(0x60B0) == 0
 
 
-def test_a_watchdog_that_does_nothing_is_refused(peer: tuple[DrivePeer, MachineConfig]) -> None:
+def test_a_watchdog_that_does_nothing_is_refused(
+    peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(commissioning_watchdog, "STARVE_TIMEOUT_S", 0.05)  # it never stops
     drive, settings = peer
     drive.drive.faults.no_heartbeat_consumer = True
     with Master(settings, "X") as master, pytest.raises(DriveFault, match="watchdog does not work"):
@@ -326,7 +337,8 @@ def test_a_silent_bus_gets_no_frame() -> None:
         assert other.recv(0) is None
 
 
-def test_a_drive_that_does_not_answer_is_named() -> None:
+def test_a_drive_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(canopen_sdo, "RESPONSE_TIMEOUT_S", 0.01)  # nothing ever comes
     settings = config(drive={"node_id": 9})
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as other:
         other.send(can.Message(arbitration_id=0x701, data=[5], is_extended_id=False))

@@ -27,9 +27,9 @@ class Peer(threading.Thread):
     """One client is the guard; ``sent`` lists (SYNC count, COB-ID, data) of everything it put on the bus.
 
     Each cycle: SYNC, the drives' TPDOs, then the NC's targets; while ``lockstep`` the next SYNC waits for the offset
-    frames of a guard that sent some in the cycle before: briefly after a zero, long while an offset is in force.
-    ``row`` runs over ``demand`` while ``playing``, slowly from ``slow_from``, so that a test on a busy host still meets
-    the path where it wants to.
+    frames of a guard that sent some in the cycle before: briefly after a zero, long while an offset is in force, and no
+    longer once a test says that they are not ``expected``. ``row`` runs over ``demand`` while ``playing``, slowly from
+    ``slow_from``, so that a test on a busy host still meets the path where it wants to.
     """
 
     def __init__(self, demand: list[list[int]], period_s: float = 0.001) -> None:
@@ -42,7 +42,7 @@ class Peer(threading.Thread):
         self.playing = False
         self.pause_s = 0.0
         self.slow_from = NEVER
-        self.lockstep = self.syncing = True
+        self.lockstep = self.syncing = self.expected = True
         self.ended = threading.Event()
         self._inbox = b""
         self._offset_frames = 0
@@ -116,9 +116,9 @@ class Peer(threading.Thread):
         answer_s = HOLDING_ANSWER_S if any(drive.offset for drive in self.drives) else ANSWER_S
         deadline_s = time.monotonic() + (answer_s if waits else self.period_s)
         while time.monotonic() < deadline_s and not self.ended.is_set() and self._client is not None:
-            if waits and self._offset_frames - before >= len(self.drives):
+            if waits and (not self.expected or self._offset_frames - before >= len(self.drives)):
                 break
-            self._listen(max(0.0, deadline_s - time.monotonic()))
+            self._listen(min(0.02, max(0.0, deadline_s - time.monotonic())))
         self._answered = self._offset_frames > before
 
     def _transmit(self, text: bytes) -> None:

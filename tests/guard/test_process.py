@@ -20,6 +20,7 @@ from fdhil import config as machine_config
 from fdhil.cli.guard import open_bus, settings_of
 from fdhil.guard.client import GuardClient, GuardLost
 from fdhil.guard.settings import to_json
+from tests.guard import impatient
 from tests.guard.machine import DIGEST, FACTS_GIVEN, LIMITS, commissioned, smooth_path
 from tests.guard.peer import NEVER, Peer, write_config
 
@@ -30,7 +31,7 @@ TOKEN = "the operator's"
 class Rig:
     """Peer, guard process and a daemon's client that says it is alive."""
 
-    def __init__(self, folder: Path, clock: str = "sync", program: Sequence[str] = ("-m", "fdhil.guard")) -> None:
+    def __init__(self, folder: Path, clock: str = "sync", program: Sequence[str] = ("-m", impatient.__name__)) -> None:
         self.peer = Peer(DEMAND)
         self.peer.start()
         self.config = machine_config.load(write_config(folder, self.peer.port, clock))
@@ -189,8 +190,8 @@ def test_lost_daemon_ramps_down(rig: Rig, how: str) -> None:
     rig.into_the_cut()
     assert rig.client is not None
     rig.alive.clear()
-    if how == "falls silent":  # five seconds of wall clock are longer than the path in lockstep
-        rig.peer.pause_s = 0.05
+    if how == "falls silent":
+        (rig.run_directory / impatient.DAEMON).touch()
     if how == "closes":
         rig.client.close()
     rig.peer.wait(lambda: any(e.get("code") == "MainLost" for e in rig.events()), "MainLost")
@@ -202,7 +203,8 @@ def test_lost_daemon_ramps_down(rig: Rig, how: str) -> None:
 def test_lost_sync_freezes_and_adopting_brings_it_to_zero(rig: Rig) -> None:
     rig.into_the_cut()
     assert rig.client is not None
-    rig.peer.playing = rig.peer.syncing = False
+    rig.peer.playing = rig.peer.syncing = rig.peer.expected = False
+    (rig.run_directory / impatient.BUS).touch()
     rig.peer.wait(lambda: rig.state() == "FROZEN", "frozen")
     count = len(rig.peer.sent)
     held = rig.peer.offsets_sent()[-1][1]
@@ -210,7 +212,10 @@ def test_lost_sync_freezes_and_adopting_brings_it_to_zero(rig: Rig) -> None:
     assert len(rig.peer.sent) == count
     assert rig.client.status()["cause"]["code"] == "SyncLost"
     assert rig.client.adopt(TOKEN)["code"] == "SyncLost"
-    rig.peer.syncing = True
+    (rig.run_directory / impatient.BUS).unlink()
+    tick, rig.peer.syncing = rig.peer.tick, True
+    rig.peer.wait(lambda: rig.peer.tick > tick + 1, "SYNC")
+    rig.peer.expected = True
     rig.peer.wait(lambda: rig.client is not None and rig.client.adopt(TOKEN)["ok"], "adoption")
     rig.peer.wait(lambda: rig.state() == "OFF", "off")
     assert rig.peer.offsets_sent()[-1][1] == 0
@@ -223,6 +228,7 @@ def test_stopped_process_sends_nothing(rig: Rig) -> None:
     rig.peer.lockstep, rig.peer.slow_from = False, NEVER
     rig.process.send_signal(signal.SIGSTOP)
     os.waitid(os.P_PID, rig.process.pid, os.WSTOPPED | os.WNOWAIT)
+    rig.peer.expected = False
     time.sleep(0.02)
     count, tick = len(rig.peer.sent), rig.peer.tick
     rig.peer.wait(lambda: rig.peer.tick > tick + 200, "SYNC")
@@ -266,12 +272,16 @@ def test_what_is_forged_foreign_or_silent_makes_no_step(rig: Rig) -> None:
     peer.inject((0x301, (-819).to_bytes(4, "little", signed=True)))
     drive.received_offset = -819
     peer.wait(lambda: rig.state() == "OFF", "off")
+    peer.expected = False  # the guard is silent, whatever the drives hold
     assert client.status()["cause"]["code"] == "OffsetHijack"
     held = [offsets[0] for _, _, offsets in peer.latched]
     steps = [abs(b - a) for a, b in itertools.pairwise(held)]
     # the foreign one, and one back where a frame of ours was on its way already
     assert sum(step > LIMITS.hard_rate for step in steps) <= 2 + client.status()["missed_cycles"]
     peer.playing, peer.row = False, 0
+    tick = peer.tick
+    peer.wait(lambda: peer.tick > tick + 1, "SYNC")
+    peer.expected, peer.slow_from = True, NEVER
     rig.into_the_cut()
     drive.shows_offset = False
     peer.wait(lambda: rig.state() == "FROZEN", "frozen: no zero is read back")
@@ -280,6 +290,7 @@ def test_what_is_forged_foreign_or_silent_makes_no_step(rig: Rig) -> None:
     rig.process.kill()
     rig.process.wait()
     client.close()
+    peer.slow_from = NEVER
     count = len(peer.sent)
     again = rig.start()
     try:

@@ -117,10 +117,10 @@ def test_each_row_of_the_table_is_applied_at_its_own_cycle(tmp_path: Path) -> No
         finally:
             ended.set()
             keeper.join()
+    guard.terminate()  # while there is SYNC: it answers at one
+    guard.communicate()
     twin.command(command="quit")
     assert twin.process.wait(300) == 0
-    guard.terminate()
-    guard.communicate()
     twin.process.communicate()
     assert status["cause"]["code"] == "Finished"
     assert finished["late_rpdo"] == {"X": 0, "Y": 0}

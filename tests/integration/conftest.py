@@ -15,6 +15,7 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.config import MachineConfig
+from fdhil.drivers import commissioning, commissioning_checks
 from fdhil.drivers.commissioning_checks import survey
 from fdhil.drivers.commissioning_master import Master
 from fdhil.drivers.commissioning_record import CommissioningRecord, axis_digest, save_record
@@ -112,6 +113,14 @@ TRANSPORTS: Mapping[str, Callable[[dict[str, Any]], None]] = {
 def transport(request: pytest.FixtureRequest) -> str:
     """The transport of this run of the suite."""
     return str(request.param)
+
+
+@pytest.fixture
+def settling_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorter waits of the commissioning than on a real machine; the simulated drive settles sooner."""
+    monkeypatch.setattr(commissioning_checks, "LISTEN_S", 0.3)
+    monkeypatch.setattr(commissioning, "SETTLE_CYCLES", 150)
+    monkeypatch.setattr(commissioning, "AVERAGE_CYCLES", 80)
 
 
 @pytest.fixture

@@ -48,7 +48,7 @@ def sections() -> dict[str, Any]:
 
 
 @pytest.fixture
-def client(bench: Bench, tmp_path: Path) -> Iterator[GuardClient]:
+def client(bench: Bench, settling_soon: None, tmp_path: Path) -> Iterator[GuardClient]:
     """A guard on the bench's bus, the drives commissioned before."""
     for axis in "XY":
         record = commission(bench.config, axis)

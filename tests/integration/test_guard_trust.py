@@ -20,6 +20,7 @@ from fdhil.daemon.token import read_token
 from fdhil.drivers.commissioning_void import is_void, void_record
 from fdhil.guard.client import GuardClient
 from fdhil.guard.interlocks import FACTS
+from tests.guard import impatient
 from tests.integration.conftest import PATIENCE_S, Bench, sign_off
 from tests.integration.test_guard import toml
 
@@ -52,16 +53,20 @@ class Shop:
 
     @contextmanager
     def guard(self) -> Iterator[GuardClient]:
-        with Process("guard", ["fdhil.cli.guard", str(self.config)], self.folder / "guard.log") as process:
+        with Process("guard", [impatient.__name__, str(self.config)], self.folder / "guard.log") as process:
             process.event("ready", PATIENCE_S)
             with GuardClient(self.run) as client:
                 yield client
 
     def nc(self, on: bool) -> None:
-        """Switch the NC; that it stops because a drive is gone is no error here."""
+        """Switch the NC; that it stops because a drive is gone is no error here. What it stops is SYNC."""
+        if on:
+            (self.run / impatient.BUS).unlink(missing_ok=True)
         self.bench.command(json.dumps({"command": "nc", "on": on}))
         while (event := self.bench.events.get(timeout=PATIENCE_S))["event"] != "nc" or event["on"] is not on:
             pass
+        if not on:
+            (self.run / impatient.BUS).touch()
 
     def fault(self, **fault: object) -> None:
         self.bench.command(json.dumps({"command": "fault", **fault}))

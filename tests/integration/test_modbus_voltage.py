@@ -18,6 +18,12 @@ from tests.integration.conftest import Bench, digested, take_voltage_from_sensor
 from tests.integration.test_loop import TRUE, recorded, shuttle
 
 
+@pytest.fixture(params=["hub", pytest.param("socketcan", marks=pytest.mark.socketcan)])
+def transport(request: pytest.FixtureRequest) -> str:
+    """The buses whose frames are stamped on their way; the slow sensor is tried on ``virtual``."""
+    return str(request.param)
+
+
 @pytest.fixture
 def sections() -> dict[str, Any]:
     """A sensor answers in wall time, so the machine runs in it too."""

@@ -30,7 +30,7 @@ from tests.integration.test_guard import DIGEST, client, sections
 from tests.paths import bench_demand, rms
 
 __all__ = ["client", "sections"]
-PASSES = 6
+PASSES = 5
 
 
 @pytest.fixture
@@ -83,7 +83,7 @@ def written(folder: Path, path: Float) -> Path:
 def test_a_program_longer_than_the_ring(bench: Bench, client: GuardClient, tmp_path: Path) -> None:
     """Armed with its first 10 s, never interrupted, 20 times better on the whole."""
     there = bench_demand(10)
-    path = np.concatenate([np.repeat(there[:1], 300, axis=0), *[there, there[::-1]] * (PASSES // 2)])
+    path = np.concatenate([np.repeat(there[:1], 300, axis=0), *([there, there[::-1]] * 3)[:PASSES]])
     demand = written(tmp_path, path)
     models = nominal_models(bench.config)
     digest = program_digest(demand)
@@ -92,11 +92,11 @@ def test_a_program_longer_than_the_ring(bench: Bench, client: GuardClient, tmp_p
     assert checked is not None
     stream = Stream(checked, DIGEST, 0.001)
     states, held = played(bench, client, demand, stream)
-    # one process hands on here and runs the twin: it may sleep longer than the twin waits, a few cycles of 30,000
+    # one process hands on here and runs the twin: it may sleep longer than the twin waits, a few cycles of 16,000
     assert max(bench.event("finished")["late_rpdo"].values()) < 10
     assert stream.done
     assert states <= {"RAMPING", "ACTIVE"}
-    assert held < 15_000  # the ring, not the program
+    assert held < 14_000 < len(path)  # the ring, not the program
     cause = client.status()["cause"]
     assert cause["code"] == "Finished"
     after = contour_um(demand.with_name("trace.csv"), len(path))[400:]
@@ -130,7 +130,7 @@ def played(bench: Bench, client: GuardClient, demand: Path, stream: Stream) -> t
                 answer = client.load("XY", piece.demand, piece.offset, DIGEST, piece.first, piece.final)
                 assert answer["ok"], answer
             else:
-                time.sleep(0.01)
+                time.sleep(0.03)
     return states, held
 
 

@@ -1,0 +1,51 @@
+"""The guard whose patience a test ends: a file in its run directory stands for ten seconds of silence.
+
+``python -m tests.guard.impatient CONFIG`` starts it as fdhil-guard does, with ``--settings`` it is the guard itself.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+from fdhil.guard.settings import Settings
+
+BUS, DAEMON = "bus_silent_for_long", "daemon_silent_for_long"
+
+
+def shorten(name: str, file: str) -> None:
+    """Make this time-out of the settings short while the file is there."""
+    usual = getattr(Settings, name).fget
+    setattr(
+        Settings,
+        name,
+        property(lambda self: 0.2 if (Path(self.run_directory) / file).exists() else usual(self)),
+    )
+
+
+_execv = os.execv
+
+
+def execute(program: str, arguments: list[str]) -> None:
+    """Become this module where fdhil-guard becomes the guard."""
+    _execv(program, [__spec__.name if word == "fdhil.guard" else word for word in arguments])
+
+
+def main() -> int:
+    """Start what the arguments are of."""
+    if "--settings" in sys.argv:
+        from fdhil.guard.__main__ import main as guard
+
+        shorten("silence_s", BUS)
+        shorten("daemon_lost_s", DAEMON)
+        return guard()
+    from fdhil.cli import guard as command
+
+    os.execv = execute  # type: ignore[assignment]
+    command.main()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
