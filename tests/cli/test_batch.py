@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import pty
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 
 from fdhil.cli import batch
+from fdhil.cli.main import cli, run_safely
 from fdhil.config import Identification
 from studies import bench
 from tests.identification.recorded import signals
@@ -53,15 +53,14 @@ def test_other_processes_give_the_same(recordings: list[Path], limit: str, monke
         np.testing.assert_allclose(one.pooled.values, other.pooled.values, rtol=1e-6)
 
 
-def test_a_terminal_sees_how_far_the_work_is(recordings: list[Path]) -> None:
+def test_a_terminal_sees_how_far_the_work_is(recordings: list[Path], capsys: pytest.CaptureFixture[str]) -> None:
     master, slave = pty.openpty()
-    command = [sys.executable, "-m", "fdhil.cli.main", "identify", "--json", *map(str, recordings)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=slave, text=True) as process:
-        os.close(slave)
-        answer, _ = process.communicate()
-    seen = os.read(master, 65536).decode()
+    with os.fdopen(slave, "w") as terminal, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["fdhil", "identify", "--json", *map(str, recordings)])
+        patch.setattr(sys, "stderr", terminal)
+        assert run_safely(cli) == 0
+        seen = os.read(master, 65536).decode()
     os.close(master)
-    assert process.returncode == 0
-    assert answer.startswith("{")
+    assert capsys.readouterr().out.startswith("{")
     assert "identifying" in seen
     assert "%" in seen

@@ -15,7 +15,18 @@ from fdhil.records import Skill
 from fdhil.store.history import History, Stamp
 from tests.cli.test_predict import _bench as _bench
 from tests.cli.test_predict import invoke, remember
-from tests.paths import bench_trajectory
+from tests.paths import bench_trajectory, smooth, trajectory
+
+
+def one_corner(folder: Path) -> Path:
+    """A demand of one corner and a rest, whose page is soon drawn."""
+    ramp = np.linspace(0.0, 30.0, 180)
+    corner = np.column_stack(
+        [np.append(ramp, np.full(480, 30.0)), np.concatenate([np.zeros(180), ramp, np.full(300, 30.0)])]
+    )
+    path = folder / "corner.csv"
+    write_demand_csv(trajectory(smooth(corner, (0.060, 0.030), 0.001)), path)
+    return path
 
 
 def test_writes_json_and_csv(bench: Path) -> None:
@@ -73,7 +84,7 @@ def test_with_a_history_a_gain_has_its_uncertainty_and_a_spread_below_the_digits
     assert document["after"]["uncertainty_um"] == pytest.approx(0.4 * 2**0.5, rel=1e-3)
     assert 1 < document["gain_at_least"] < document["gain"]
     page = bench / "correct.html"
-    assert invoke(*arguments, "--report", page).exit_code == 0
+    assert invoke("correct", one_corner(bench), *arguments[2:], "--report", page).exit_code == 0
     assert "predicted smaller by at least" in page.read_text("utf-8")
     text = invoke("predict", *arguments[1:]).stdout
     assert "± <0.1 um" in text
@@ -114,7 +125,7 @@ def test_a_report_shows_before_and_after(bench: Path) -> None:
     """``predict`` and ``correct`` write a page of their own."""
     for command, shown in (("predict", "predicted, RMS"), ("correct", "not known here")):
         page = bench / f"{command}.html"
-        arguments = [command, bench / "demand.csv", "--config", bench / "bench.toml", "--report", page]
+        arguments = [command, one_corner(bench), "--config", bench / "bench.toml", "--report", page]
         assert invoke(*arguments).exit_code == 0
         assert shown in page.read_text("utf-8")
         assert "with the nominal parameters of the configuration" in page.read_text("utf-8")

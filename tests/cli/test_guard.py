@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import pwd
 import signal
 import socket
@@ -183,7 +184,14 @@ def test_no_drive_is_commissioned_while_a_guard_owns_the_bus(
     assert "BusLocked" in capsys.readouterr().err
 
 
-def test_it_becomes_the_guard_owns_its_bus_and_stops_cleanly(tmp_path: Path, peer: Peer) -> None:
+def never(*_: object) -> None:
+    """Stand in for becoming the guard, where that must not be."""
+    raise AssertionError("a second guard")
+
+
+def test_it_becomes_the_guard_owns_its_bus_and_stops_cleanly(
+    tmp_path: Path, peer: Peer, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A second one, by another name of the same hub and from another directory, exits with 3 and sends nothing."""
     config = write_config(tmp_path, peer.port)
     (tmp_path / "other").mkdir()
@@ -193,16 +201,17 @@ def test_it_becomes_the_guard_owns_its_bus_and_stops_cleanly(tmp_path: Path, pee
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         ready = json.loads(process.stdout.readline())
-        seconds = [
-            subprocess.run([*command[:-1], str(again)], capture_output=True, text=True) for again in (config, other)
-        ]
+        monkeypatch.setattr(os, "execv", never)
+        for again in (config, other):
+            assert run(monkeypatch, str(again)) == 3
+            refused = capsys.readouterr().err
+            assert "BusLocked" in refused
+            assert len(refused.splitlines()) == 1
         process.send_signal(signal.SIGTERM)
         told = [json.loads(line) for line in process.stdout]
         assert process.wait(20) == 0
         assert told[-1]["event"] == "stopped"
     assert (ready["event"], ready["axes"]) == ("ready", ["X", "Y"])
-    assert [second.returncode for second in seconds] == [3, 3]
-    assert all("BusLocked" in second.stderr and len(second.stderr.splitlines()) == 1 for second in seconds)
     assert peer.sent == []
 
 
