@@ -34,6 +34,7 @@ Loader = Callable[[Path, MachineConfig], Trajectory]
 Emit = Callable[[dict[str, Any]], None]
 
 WALL_CLOCK_S = 0.004  # how often heartbeats and their time-outs are looked at
+IDLE_PERIODS = 4  # in lockstep, of a machine that stands: whoever listens is not kept busy for nothing
 LOCKSTEP_WAIT_S = 0.5
 LOCKSTEP_HOLDING_WAIT_S = 8.0  # a listener takes ten seconds without SYNC for a bus that is dead
 _MIN_SPACING = 0.75  # of a period, between two SYNCs after a late one
@@ -55,7 +56,9 @@ class Pace:
         """
         if self._lockstep and waits:
             return self._last_s + (LOCKSTEP_HOLDING_WAIT_S if holds else LOCKSTEP_WAIT_S)
-        return self._next_s if idle or not self._lockstep else 0.0
+        if not self._lockstep:
+            return self._next_s
+        return self._last_s + IDLE_PERIODS * self._period_s if idle else 0.0
 
     def sent(self, now_s: float) -> None:
         """A SYNC went out: the next one is a period later on the grid, unless the host is late.
@@ -64,8 +67,7 @@ class Pace:
         caught up.
         """
         self._last_s = now_s
-        on_grid = now_s if self._lockstep else self._next_s
-        self._next_s = max(on_grid + self._period_s, now_s + _MIN_SPACING * self._period_s)
+        self._next_s = max(self._next_s + self._period_s, now_s + _MIN_SPACING * self._period_s)
 
 
 class SimService:

@@ -364,14 +364,14 @@ def test_lockstep_runs_when_everything_is_there_and_waits_longer_for_who_holds_a
     assert pace.due_s(waits=True, idle=False) == 10.5
     assert pace.due_s(waits=True, idle=False, holds=True) == 18.0
     assert settings(clock="sync").silence_s > 8.0 + 1.0, "a guard must not take the wait for a dead bus"
-    assert pace.due_s(waits=False, idle=True) == pytest.approx(10.001, abs=3e-4)
+    assert pace.due_s(waits=False, idle=True) == pytest.approx(10.004)  # it stands: nobody is kept busy for nothing
 
 
 def test_a_lockstep_machine_that_ran_ahead_of_the_clock_does_not_stand_still_afterwards() -> None:
     pace = Pace(0.001, lockstep=True)
     for k in range(5000):  # five seconds of motion in one of wall time
         pace.sent(10.0 + k * 0.0002)
-    assert pace.due_s(waits=False, idle=True) == pytest.approx(11.001, abs=3e-4)
+    assert pace.due_s(waits=False, idle=True) == pytest.approx(11.0038)
 
 
 def test_a_played_file_leaves_axes_alone_that_it_does_not_name() -> None:
