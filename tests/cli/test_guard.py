@@ -202,16 +202,16 @@ def test_it_becomes_the_guard_owns_its_bus_and_stops_cleanly(
         assert process.stdout is not None
         ready = json.loads(process.stdout.readline())
         monkeypatch.setattr(os, "execv", never)
-        for again in (config, other):
-            assert run(monkeypatch, str(again)) == 3
-            refused = capsys.readouterr().err
-            assert "BusLocked" in refused
-            assert len(refused.splitlines()) == 1
-        process.send_signal(signal.SIGTERM)
+        try:
+            seconds = [(run(monkeypatch, str(again)), capsys.readouterr().err) for again in (config, other)]
+        finally:
+            process.send_signal(signal.SIGTERM)
         told = [json.loads(line) for line in process.stdout]
         assert process.wait(20) == 0
         assert told[-1]["event"] == "stopped"
     assert (ready["event"], ready["axes"]) == ("ready", ["X", "Y"])
+    assert [code for code, _ in seconds] == [3, 3]
+    assert all("BusLocked" in refused and len(refused.splitlines()) == 1 for _, refused in seconds)
     assert peer.sent == []
 
 
