@@ -52,6 +52,20 @@ def frames_of(can: SocketcandText, far: socket.socket, text: bytes) -> list[tupl
         return got
 
 
+class Narrow(socket.socket):
+    """A connection whose buffer has room for five bytes more."""
+
+    def send(self, data: object, flags: int = 0) -> int:
+        return super().send(bytes(data)[:5], flags)  # type: ignore[call-overload] # bytes are given
+
+
+def test_half_a_frame_is_a_bus_that_is_gone() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server, socket.create_connection(server.getsockname()):
+        near, _ = server.accept()
+        with Narrow(fileno=near.detach()) as narrow, pytest.raises(BusDown, match="part of a frame"):
+            SocketcandText(narrow, allowed={0x301}, wanted={0x080}).send(0x301, bytes(4))
+
+
 def test_only_our_own_frames_leave(wire: tuple[SocketcandText, socket.socket]) -> None:
     can, far = wire
     assert can.send(0x301, b"\x02\x0a\xff\x00")
@@ -204,6 +218,13 @@ def test_controller_states(can_id: int, detail: int, states: list[str]) -> None:
 def test_settings_survive_their_file() -> None:
     made = settings(token_sha256="ab" * 32, offset_synchronous=False, daemon_uid=7)
     assert from_json(to_json(made)) == made
+
+
+def test_a_settings_file_that_was_changed_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "guard.json"
+    file.write_text(to_json(settings()).replace('"heartbeat_s": 0.02', '"heartbeat_s": 0.03'))
+    with pytest.raises(ConfigError, match="damaged or was changed by hand"):
+        load(file)
 
 
 @pytest.mark.parametrize(
