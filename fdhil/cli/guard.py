@@ -45,7 +45,7 @@ def guard(config: Path, check: bool) -> None:
     anything is not as it must be: also when the daemon dies, and before it stops itself. Events are JSON lines on
     stdout. Exit codes: 0 stopped with nothing applied, 2 wrong config, 3 bus trouble, or an offset may be left.
     """
-    machine = machine_config.load(config)
+    machine = _with_given_key(machine_config.load(config))
     name = corrected_bus(machine, str(config))
     daemons = machine.store.run_directory or machine.store.directory / "run"
     token, run_directory = operator_token(daemons), machine.guard.run_directory or daemons
@@ -247,11 +247,27 @@ def operator_token(run_directory: Path) -> str:
     """
     from fdhil.daemon.token import TOKEN_NAME, ensure_token, read_token  # late, as above
 
-    given = os.environ.get("CREDENTIALS_DIRECTORY")
-    if given and (Path(given) / TOKEN_NAME).exists():
-        return read_token(Path(given))
+    given = _given(TOKEN_NAME)
+    if given is not None:
+        return read_token(given.parent)
     _make(run_directory)
     return ensure_token(run_directory)
+
+
+def _with_given_key(machine: MachineConfig) -> MachineConfig:
+    """Take the key of the commissioning records from systemd, where it gives one (LoadCredential)."""
+    from fdhil.drivers.commissioning_record import KEY_NAME  # late, as above
+
+    given = _given(KEY_NAME)
+    if given is None:
+        return machine
+    return machine.model_copy(update={"store": machine.store.model_copy(update={"commissioning_key": given})})
+
+
+def _given(name: str) -> Path | None:
+    """The credential of that name, None where systemd gives none."""
+    folder = os.environ.get("CREDENTIALS_DIRECTORY")
+    return Path(folder) / name if folder and (Path(folder) / name).exists() else None
 
 
 def _make(directory: Path) -> None:

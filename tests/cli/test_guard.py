@@ -234,13 +234,19 @@ def test_a_guard_under_a_user_of_its_own(
     (given / "token").write_text("the operator's")
     (given / "token").chmod(0o400)
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(given))
+    key = given / "commissioning.key"
+    key.write_text("5e" * 32)
+    key.chmod(0o400)
+    machine = machine_config.load(config)
+    save_record(replace(RECORD, config_digest=axis_digest(machine, "X")), machine.store.directory, key)
     assert run(monkeypatch, str(config), "--check") == 0
     settings = load(tmp_path / "own" / "guard.json")
     assert settings.token_sha256 == hashlib.sha256(b"the operator's").hexdigest()
     assert settings.daemon_uid == pwd.getpwnam("daemon").pw_uid
     assert settings.run_directory == str(tmp_path / "own")
     assert stat.S_IMODE((tmp_path / "own" / "guard.json").stat().st_mode) == 0o600
-    assert not (tmp_path / "fdhil-data").exists()
+    assert settings.axes[0].record, "its key came from systemd too"
+    assert not (tmp_path / "fdhil-data" / "run").exists()
     config.write_text(config.read_text().replace('"daemon"', '"nobody of that name"'))
     assert run(monkeypatch, str(config), "--check") == 2
     assert "there is no user 'nobody of that name'" in capsys.readouterr().err
