@@ -17,7 +17,9 @@ from pathlib import Path
 import pytest
 
 from fdhil import config as machine_config
+from fdhil.cli.failing import run_safely
 from fdhil.cli.guard import open_bus, settings_of
+from fdhil.cli.main import cli
 from fdhil.guard.client import GuardClient, GuardLost
 from fdhil.guard.settings import to_json
 from tests.guard import impatient
@@ -46,6 +48,17 @@ class Rig:
         self.alive = threading.Event()
         self._ended = threading.Event()
         self._keeper = threading.Thread(target=self._keep_alive, daemon=True)
+
+    def adopt(self) -> int:
+        """Run the operator's command in this process; return its exit code."""
+        token = self.run_directory / "token"
+        token.touch(0o600)
+        token.write_text(TOKEN)
+        config = self.run_directory / "machine.toml"
+        config.write_text(config.read_text().partition("[store]")[0] + '[store]\nrun_directory = "."\n')
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("sys.argv", ["fdhil", "adopt", str(config), "--yes"])
+            return run_safely(cli)
 
     def start(self) -> subprocess.Popen[bytes]:
         """Start a guard on a descriptor of its own, as fdhil-guard does by exec."""
@@ -200,7 +213,8 @@ def test_lost_daemon_ramps_down(rig: Rig, how: str) -> None:
     check_limits(rig)
 
 
-def test_lost_sync_freezes_and_adopting_brings_it_to_zero(rig: Rig) -> None:
+def test_lost_sync_freezes_and_adopting_brings_it_to_zero(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
+    """Out of FROZEN as the operator goes: ``fdhil adopt``, and 0 only when zero was read back."""
     rig.into_the_cut()
     assert rig.client is not None
     rig.peer.playing = rig.peer.syncing = rig.peer.expected = False
@@ -211,13 +225,15 @@ def test_lost_sync_freezes_and_adopting_brings_it_to_zero(rig: Rig) -> None:
     time.sleep(0.1)
     assert len(rig.peer.sent) == count
     assert rig.client.status()["cause"]["code"] == "SyncLost"
-    assert rig.client.adopt(TOKEN)["code"] == "SyncLost"
+    assert rig.adopt() == 1
+    assert "refused: SyncLost" in capsys.readouterr().err
     (rig.run_directory / impatient.BUS).unlink()
     tick, rig.peer.syncing = rig.peer.tick, True
     rig.peer.wait(lambda: rig.peer.tick > tick + 1, "SYNC")
     rig.peer.expected = True
-    rig.peer.wait(lambda: rig.client is not None and rig.client.adopt(TOKEN)["ok"], "adoption")
-    rig.peer.wait(lambda: rig.state() == "OFF", "off")
+    rig.peer.wait(lambda: rig.adopt() == 0, "adoption")
+    assert capsys.readouterr().out == "guard: OFF, offset 0\n"
+    assert rig.state() == "OFF"
     assert rig.peer.offsets_sent()[-1][1] == 0
     assert held != 0
     check_limits(rig)
