@@ -37,6 +37,15 @@ AXIS = axis_toml("X") + "[sim.axis.X]\nJt = 0.085\n"
 BENCH = HEAD + AXIS + AXIS.replace(".X", ".Y")
 
 
+@contextmanager
+def patient() -> Iterator[None]:
+    """Wait long for a drive's answer by SDO."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("RESPONSE_TIMEOUT_S", "DEADLINE_S"):
+            patch.setattr(canopen_sdo, name, 20.0)
+        yield
+
+
 @dataclass
 class Shop:
     """A twin that runs, and the configuration of the machine that it is."""
@@ -54,9 +63,7 @@ class Shop:
 
     def commission(self) -> None:
         """Commission both axes; a twin on a busy host may take seconds for an answer."""
-        with pytest.MonkeyPatch.context() as patch:
-            for name in ("RESPONSE_TIMEOUT_S", "DEADLINE_S"):
-                patch.setattr(canopen_sdo, name, 20.0)
+        with patient():
             for axis in self.config.axis:
                 save_record(commission(self.config, axis), self.config.store.directory)
 
@@ -105,9 +112,9 @@ class Shop:
         self.wait(lambda: log.read_text().count(words) >= times)
         self.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None)
 
-    def nc_on(self) -> None:
-        """Switch the NC on: SYNC, NMT, drives enabled."""
-        self.twin.command("nc", on=True)
+    def nc(self, on: bool) -> None:
+        """Switch the NC: with it come SYNC, NMT and enabled drives."""
+        self.twin.command("nc", on=on)
         self.twin.event("nc")
 
     def play(self, name: str, program: str, **options: Any) -> dict[str, Any]:

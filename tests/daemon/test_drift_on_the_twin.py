@@ -43,7 +43,7 @@ def shop(tmp_path: Path) -> Iterator[Shop]:
 
 def test_warming_and_load(shop: Shop, capsys: pytest.CaptureFixture[str]) -> None:
     with shop.daemon() as daemon:
-        shop.nc_on()
+        shop.nc(on=True)
         for celsius in CELSIUS:
             shop.twin.command("temperature", celsius=float(celsius))
             _shuttle(shop)

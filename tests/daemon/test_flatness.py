@@ -44,7 +44,7 @@ def test_an_identified_machine_follows_without_a_program(shop: Shop, capsys: Cap
     with shop.guard() as guard, shop.daemon() as daemon:
         code, _, err = fdhil("arm", shop.path, "--method", "flatness", capsys=capsys)
         assert (code, "refused: ModelNotValidated" in err) == (1, True), err
-        shop.nc_on()
+        shop.nc(on=True)
         shop.play("shuttle.ngc", f"G21 G90 G94\n{TO_AND_FRO}M2\n")
         shop.status_when(lambda s: all(s["axes"][a]["accepted"] >= 2 for a in "XY"))
         before = largest_errors_um(shop, "before")

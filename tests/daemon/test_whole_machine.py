@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 
+import can
 import numpy as np
 import pytest
 
@@ -15,7 +17,7 @@ from fdhil.errors import ConnectError
 from fdhil.prediction import contour_error_um
 from fdhil.store.history import History
 from fdhil.store.windows import list_windows
-from tests.daemon.shop import CORNER, REAL, SHUTTLE, Shop, fdhil, opened
+from tests.daemon.shop import CORNER, REAL, SHUTTLE, Shop, fdhil, opened, patient
 
 Capture = pytest.CaptureFixture[str]
 ROUND = "G1 X60 F8000\nG1 Y40\nG1 X0\nG1 Y0\n"
@@ -34,7 +36,7 @@ def shop(tmp_path: Path) -> Iterator[Shop]:
 def test_from_the_bus_to_the_history_to_a_corrected_cut_and_back(shop: Shop, capsys: Capture) -> None:
     with shop.guard() as guard, shop.daemon() as daemon:
         _refuses_what_is_not_known(shop, capsys)
-        shop.nc_on()
+        shop.nc(on=True)
         shop.play("shuttle.ngc", SHUTTLE)
         told = shop.status_when(lambda s: all(s["axes"][a]["accepted"] + s["axes"][a]["refused"] >= 4 for a in "XY"))
         _knows_the_drives(told)
@@ -43,6 +45,7 @@ def test_from_the_bus_to_the_history_to_a_corrected_cut_and_back(shop: Shop, cap
         _refuses_a_long_program_by_its_line(shop, capsys)
         _cuts_a_program_longer_than_the_ring(shop, capsys, plain)
         _disarms_what_is_refused_before_it_begins(shop, capsys)
+        _refuses_a_drive_that_was_written_to_until_it_is_compared(shop, capsys)
         assert fdhil("arm", shop.path, shop.folder / "corner.ngc", capsys=capsys)[0] == 0
         assert daemon.stop() == 0  # disarms first
         assert guard.stop() == 0
@@ -154,6 +157,23 @@ def _disarms_what_is_refused_before_it_begins(shop: Shop, capsys: Capture) -> No
     assert 0 <= int(line[1]) - (3 + 14 * len(body)) <= 1  # its first or its second move
     assert "it had not begun and is disarmed" in refused["text"]
     shop.status_when(lambda s: s["state"] == "OFF" and s["armed"] is None and s["checking"] is None)
+
+
+def _refuses_a_drive_that_was_written_to_until_it_is_compared(shop: Shop, capsys: Capture) -> None:
+    """Another master writes the following error window, to what it was: nobody knows that until it is compared."""
+    place = shop.config.bus["can0"]
+    with can.Bus(interface="socketcand", channel=place.channel, host=place.host, port=place.port) as bus:
+        written = struct.pack("<BHBI", 0x23, 0x6065, 0, 32768)
+        bus.send(can.Message(arbitration_id=0x601, data=written, is_extended_id=False))
+        shop.status_when(lambda s: any(notice["code"] == "RecordVoid" for notice in s["notices"]))
+    code, out, err = fdhil("arm", shop.path, shop.folder / "corner.ngc", capsys=capsys)
+    assert (code, out) == (1, "")
+    assert "refused: RecordVoid: axis X" in err
+    assert "run fdhil check" in err
+    shop.nc(on=False)
+    with patient():
+        assert fdhil("check", shop.path, capsys=capsys)[0] == 0
+    shop.nc(on=True)
 
 
 def _cut(shop: Shop, name: str, program: str = "corner.ngc", text: str = CORNER) -> float:
