@@ -46,7 +46,8 @@ def test_from_the_bus_to_the_history_to_a_corrected_cut_and_back(shop: Shop, cap
         _cuts_a_program_longer_than_the_ring(shop, capsys, plain)
         _disarms_what_is_refused_before_it_begins(shop, capsys)
         _refuses_a_drive_that_was_written_to_until_it_is_compared(shop, capsys)
-        assert fdhil("arm", shop.path, shop.folder / "corner.ngc", capsys=capsys)[0] == 0
+        code, out, err = fdhil("arm", shop.path, shop.folder / "corner.ngc", capsys=capsys)
+        assert code == 0, (out, err)
         assert daemon.stop() == 0  # disarms first
         assert guard.stop() == 0
     log = (shop.folder / "daemon.log").read_text()
@@ -174,6 +175,7 @@ def _refuses_a_drive_that_was_written_to_until_it_is_compared(shop: Shop, capsys
     with patient():
         assert fdhil("check", shop.path, capsys=capsys)[0] == 0
     shop.nc(on=True)
+    shop.play("dwell.ngc", "G4 P0.3\nM2\n")  # the interlocks want 100 good SYNC
 
 
 def _cut(shop: Shop, name: str, program: str = "corner.ngc", text: str = CORNER) -> float:
