@@ -6,7 +6,6 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,8 +23,6 @@ from fdhil.validation import analyse, pool
 MANY_FILES = 16  # from here on further processes pay for their start
 MANY_WINDOWS = 48
 CHUNK = 8
-# the matrices of a window are small: the libraries' own threads would only stand in the processes' way
-ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 Progress = Callable[[float], None]
 
 
@@ -103,17 +100,6 @@ def _cores() -> int:
     return os.cpu_count() or 1
 
 
-@contextmanager
-def _processes() -> Iterator[ProcessPoolExecutor]:
-    """Yield processes that are spawned, not forked (a progress display has threads), each on one thread."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
-    try:
-        with ProcessPoolExecutor(_cores(), mp_context=multiprocessing.get_context("spawn")) as executor:
-            yield executor
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+def _processes() -> ProcessPoolExecutor:
+    """Return processes that are spawned, not forked: a progress display has threads."""
+    return ProcessPoolExecutor(_cores(), mp_context=multiprocessing.get_context("spawn"))

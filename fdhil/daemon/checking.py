@@ -21,7 +21,6 @@ from fdhil.store.atomic import store_error
 
 FOLDER = "checked"
 MAX_LINE = 1 << 20
-ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 Enough = Callable[[Checked], bool]
 
@@ -162,7 +161,6 @@ class _Going:
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.PIPE,
                 limit=MAX_LINE,
-                env={**os.environ, **ONE_THREAD},
             )
             if self._abandoned:
                 self._kill()

@@ -123,8 +123,9 @@ def _cuts_a_program_longer_than_the_ring(shop: Shop, capsys: Capture, plain: flo
     told = [json.loads(line)["progress"] for line in err.splitlines()]
     assert {one["program"] for one in told} == {str(program)}
     corrected = _cut(shop, "long_corrected", "long.ngc", LONG)
-    shop.told("-> OFF: Finished", 2)
+    shop.told("-> OFF: Finished", 2)  # never interrupted
     assert corrected < 0.1 * plain, (corrected, plain)
+    assert answer["before"]["rms_um"] > 20 * corrected
 
 
 def _refuses_a_long_program_by_its_line(shop: Shop, capsys: Capture) -> None:
