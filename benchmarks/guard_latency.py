@@ -19,8 +19,8 @@ import threading
 import time
 from pathlib import Path
 
+from fdhil.arming.guard_client import GuardClient
 from fdhil.guard import core
-from fdhil.guard.client import GuardClient
 from fdhil.guard.frames import Listener
 from fdhil.guard.interlocks import FACTS
 from fdhil.guard.limits import Limits

@@ -13,7 +13,7 @@ from functools import partial
 
 from fdhil import tables
 from fdhil.config import Identification
-from fdhil.daemon.warm import nominal_rapid
+from fdhil.daemon.kernel_warmup import nominal_rapid
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import AxisPipeline
 from fdhil.records import Window

@@ -26,15 +26,15 @@ REGULATORS: Mapping[str, str] = {
     "pid": "fdhil.model.pid:prepare",
 }
 VOLTAGE_SOURCES: Mapping[str, str] = {
-    "drive": "fdhil.drivers.cia402_drive:VoltageObject",
-    "modbus": "fdhil.drivers.modbus_voltage:ModbusVoltage",
+    "drive": "fdhil.drivers.cia402.drive:VoltageObject",
+    "modbus": "fdhil.drivers.modbus.voltage:ModbusVoltage",
 }
 EVENT_SOURCES: Mapping[str, str] = {
-    "inferred": "fdhil.drivers.g0_inferred:InferredG0",
-    "digital_input": "fdhil.drivers.g0_digital_input:DigitalInputG0",
+    "inferred": "fdhil.drivers.moves.inferred:InferredG0",
+    "digital_input": "fdhil.drivers.moves.digital_input:DigitalInputG0",
 }
 DRIVE_PROFILES: Mapping[str, str] = {
-    "fdhil_twin": "fdhil.drivers.profiles.fdhil_twin:PROFILE",
+    "fdhil_twin": "fdhil.drivers.cia402.profiles.fdhil_twin:PROFILE",
 }
 
 

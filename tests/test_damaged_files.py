@@ -11,10 +11,10 @@ from typing import BinaryIO
 
 import pytest
 
+from fdhil.arming.checked_program import Checked
+from fdhil.arming.program_check import HEADER, SCHEMA, code_digest, keep
+from fdhil.arming.token import TOKEN_NAME, ensure_token, read_token
 from fdhil.config import Nc
-from fdhil.daemon.program_check import HEADER, SCHEMA, code_digest, keep
-from fdhil.daemon.streamed import Checked
-from fdhil.daemon.token import TOKEN_NAME, ensure_token, read_token
 from fdhil.errors import ConfigError, FdhilError, ProgramError
 from fdhil.guard.settings import load, to_json
 from fdhil.prediction.models import load_models

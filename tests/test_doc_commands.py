@@ -16,8 +16,8 @@ import pytest
 from fdhil import config
 from fdhil.cli.guard import guard
 from fdhil.cli.main import cli
-from fdhil.daemon.keeping import Keeper
-from fdhil.daemon.warm import nominal_rapid
+from fdhil.daemon.kernel_warmup import nominal_rapid
+from fdhil.daemon.outcome_store import Keeper
 from fdhil.store.windows import encode_window
 from studies import bench
 from tests.bench import bench_document

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdhil.config import MachineConfig
-from fdhil.daemon.warm import nominal_rapid
+from fdhil.daemon.kernel_warmup import nominal_rapid
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import AxisPipeline, Record
 from fdhil.pipeline.ring import Ring

@@ -134,7 +134,7 @@ def _corrected(reference: Trajectory, models: Mapping[str, Parameters], config: 
     import numpy as np
 
     from fdhil import correction
-    from fdhil.prediction import load
+    from fdhil.prediction import inverse_dynamics as load
 
     planned = correction.plan(reference, models, config)
     if not planned.refused:

@@ -18,9 +18,9 @@ from fdhil.errors import ConfigError, ConfigFault, DeviceError, DriveFault
 from fdhil.guard.control import SOCKET_NAME
 
 if TYPE_CHECKING:
+    from fdhil.commissioning.config_check import Place
+    from fdhil.commissioning.scan import BusScan, Description, Node
     from fdhil.config import MachineConfig
-    from fdhil.drivers.bus_scan import BusScan, Description, Node
-    from fdhil.drivers.config_check import Place
 
 CONFIG = click.argument("config", type=click.Path(path_type=Path))
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
@@ -63,7 +63,7 @@ def scan(config: Path, places: tuple[Path, ...], as_json: bool) -> None:
     found, 2 wrong option or configuration, 3 a bus cannot be reached or nothing is on it.
     """
     machine = machine_config.load(config)
-    from fdhil.drivers.bus_scan import scan_bus  # late: --help imports nothing heavy
+    from fdhil.commissioning.scan import scan_bus  # late: --help imports nothing heavy
 
     descriptions = _descriptions(places, config.parent)
     scans = []
@@ -78,7 +78,7 @@ def scan(config: Path, places: tuple[Path, ...], as_json: bool) -> None:
 
 def _descriptions(places: Sequence[Path], folder: Path) -> list[Description]:
     """Read the EDS files; one that was named must be readable, of those that only lie there it is told."""
-    from fdhil.drivers.bus_scan import read_descriptions
+    from fdhil.commissioning.scan import read_descriptions
 
     found, faults = read_descriptions(places or [folder])
     if faults and places:
@@ -140,7 +140,7 @@ def check(config: Path, as_json: bool) -> int:
     reached.
     """
     machine = machine_config.load(config)
-    from fdhil.drivers.config_check import check_machine
+    from fdhil.commissioning.config_check import check_machine
 
     found = check_machine(machine, _progress)
     _tell_compared(machine, found)
@@ -154,7 +154,8 @@ def check(config: Path, as_json: bool) -> int:
 
 def _tell_compared(machine: MachineConfig, found: Sequence[Place]) -> None:
     """Drives that are as they were commissioned have their records hold again, others void; a running guard is told."""
-    from fdhil.drivers import commissioning_compare, commissioning_void
+    from fdhil.commissioning import compare as commissioning_compare
+    from fdhil.commissioning import void as commissioning_void
 
     directory, seen = machine.store.directory, {}
     for place, finding in found:
@@ -171,9 +172,9 @@ def _tell_compared(machine: MachineConfig, found: Sequence[Place]) -> None:
 
 def _guard_told(machine: MachineConfig, seen: Mapping[str, str]) -> set[str]:
     """Tell the guard, where one runs, which drives were compared; return the axes whose records stay void there."""
+    from fdhil.arming.guard_client import GuardClient
     from fdhil.cli.guard import operator_token
     from fdhil.cli.service import guard_directory, run_directory
-    from fdhil.guard.client import GuardClient
 
     directory = guard_directory(machine)
     if not seen or not (directory / SOCKET_NAME).exists():
@@ -282,7 +283,7 @@ def _stopped_like_ctrl_c() -> Iterator[None]:
 def _commission_axis(machine: MachineConfig, axis: str, yes: bool, quiet: bool) -> dict[str, Any]:
     """Run all steps for one axis and save its record; DriveFault when it is refused."""
     from fdhil.cli.bus_lock import lock_bus
-    from fdhil.drivers import commissioning
+    from fdhil.commissioning import steps as commissioning
 
     with lock_bus(machine.bus[machine.axis[axis].drive.bus]):  # the guard reads the record when it starts
         record = commissioning.commission(machine, axis, _guide(machine, axis, yes, quiet))
@@ -313,7 +314,7 @@ def _guide(machine: MachineConfig, axis: str, yes: bool, quiet: bool) -> Callabl
 
 def _ask(machine: MachineConfig, axis: str) -> None:
     """Ask before anything moves; DriveFault when the answer is no, or nobody is there to give one."""
-    from fdhil.drivers.commissioning import largest_move_um
+    from fdhil.commissioning.steps import largest_move_um
 
     question = (
         f"The set-up of axis {axis} is as it must be. Now the drive is switched on and the axis moves by 10 um, "

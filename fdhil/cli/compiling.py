@@ -15,7 +15,11 @@ import click
 NEEDS: Mapping[str, Mapping[str, float]] = {
     "predict": {"fdhil.model.kernels": 4, "fdhil.prediction.kernels": 1},
     "correct": {"fdhil.correction.kernels": 10},
-    "identify": {"fdhil.identification.sweeps": 9, "fdhil.identification.innovations": 5, "fdhil.model.feed_drive": 2},
+    "identify": {
+        "fdhil.identification.batch_filter": 9,
+        "fdhil.identification.innovations": 5,
+        "fdhil.model.feed_drive": 2,
+    },
 }
 
 

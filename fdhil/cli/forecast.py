@@ -96,7 +96,7 @@ def remember(past: Past, now: Comparison, config: MachineConfig) -> None:
         return
     import time
 
-    from fdhil.daemon.keeping import boot_id
+    from fdhil.daemon.outcome_store import boot_id
     from fdhil.errors import StoreError
     from fdhil.store.history import History, Stamp
 

@@ -26,8 +26,8 @@ from fdhil.guard.limits import Limits
 from fdhil.guard.settings import AxisSettings, Feedforward, Layout, Pdo, Settings, from_json, to_json
 
 if TYPE_CHECKING:
-    from fdhil.drivers.commissioning_record import CommissioningRecord
-    from fdhil.drivers.profile import DriveProfile, PdoSpec
+    from fdhil.commissioning.record import CommissioningRecord
+    from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
 
 SETTINGS_NAME = "guard.json"
 CONNECT_S = 5.0
@@ -71,7 +71,7 @@ def guard(config: Path, check: bool) -> None:
 
 def _compare_again(machine: MachineConfig, bus: str) -> None:
     """Where no NC runs the bus, ask the commissioned drives whether they still are what was signed off."""
-    from fdhil.drivers.commissioning_compare import compare_again  # late, as below
+    from fdhil.commissioning.compare import compare_again  # late, as below
 
     def tell(text: str) -> None:
         click.echo(json.dumps({"event": "record_void", "text": text}))
@@ -128,7 +128,7 @@ def limits_of(axis: Axis, sync_period_s: float) -> Limits:
 
 
 def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
-    from fdhil.drivers.profile import load_profile  # late: the drivers' room is heavy, --help is not
+    from fdhil.drivers.cia402.profile import load_profile  # late: the drivers' room is heavy, --help is not
 
     profile = load_profile(axis.drive.profile)
     node_id, period_s = machine.node_id(name), machine.machine.sync_period_s
@@ -164,8 +164,8 @@ def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
 
 def _commissioned(machine: MachineConfig, name: str, record: CommissioningRecord | None) -> dict[str, Any]:
     """The fingerprint of the drive as it was signed off, and whether something against that was seen since."""
-    from fdhil.drivers.commissioning_record import holds  # late, as above
-    from fdhil.drivers.commissioning_void import is_void
+    from fdhil.commissioning.record import holds  # late, as above
+    from fdhil.commissioning.void import is_void
 
     if record is None or not holds(record, machine, name):
         return {}
@@ -216,7 +216,7 @@ def heartbeat_timeout_s(machine: MachineConfig, axis: str) -> float:
 
 def _record(machine: MachineConfig, axis: str) -> CommissioningRecord | None:
     """The axis' commissioning; None without one that can be read."""
-    from fdhil.drivers.commissioning_record import load_record  # late, as above
+    from fdhil.commissioning.record import load_record  # late, as above
 
     try:
         return load_record(machine.store.directory, axis, machine.store.commissioning_key)
@@ -245,7 +245,7 @@ def operator_token(run_directory: Path) -> str:
 
     Under a user of its own the guard is given it by systemd (LoadCredential=token:...).
     """
-    from fdhil.daemon.token import TOKEN_NAME, ensure_token, read_token  # late, as above
+    from fdhil.arming.token import TOKEN_NAME, ensure_token, read_token  # late, as above
 
     given = _given(TOKEN_NAME)
     if given is not None:
@@ -256,7 +256,7 @@ def operator_token(run_directory: Path) -> str:
 
 def _with_given_key(machine: MachineConfig) -> MachineConfig:
     """Take the key of the commissioning records from systemd, where it gives one (LoadCredential)."""
-    from fdhil.drivers.commissioning_record import KEY_NAME  # late, as above
+    from fdhil.commissioning.record import KEY_NAME  # late, as above
 
     given = _given(KEY_NAME)
     if given is None:

@@ -14,7 +14,7 @@ import numpy as np
 from fdhil import config as machine_config
 from fdhil import tables
 from fdhil.config import MachineConfig
-from fdhil.daemon.warm import nominal_rapid, warm
+from fdhil.daemon.kernel_warmup import nominal_rapid, warm
 from fdhil.records import SlowVoltage, Window, frozen
 from fdhil.sim.machine import Machine
 from fdhil.validation import analyse

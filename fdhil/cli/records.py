@@ -37,8 +37,8 @@ def replay(recordings: tuple[Path, ...], config: Path | None, method: str | None
     validated, or there is none.
     """
     machine = machine_config.load(config) if config else None
-    from fdhil.daemon.documents import as_document
     from fdhil.daemon.journal import line_of
+    from fdhil.daemon.outcome_json import as_document
 
     files = []
     validated = True
@@ -152,7 +152,7 @@ def _history(machine: machine_config.MachineConfig, axis: str | None) -> tuple[l
 
 
 def _row(revision: Revision) -> dict[str, Any]:
-    from fdhil.daemon.documents import parameters_status
+    from fdhil.daemon.outcome_json import parameters_status
 
     published = revision.set
     return {

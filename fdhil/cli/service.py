@@ -14,7 +14,7 @@ from fdhil import tables
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
 
 if TYPE_CHECKING:
-    from fdhil.guard.client import GuardClient
+    from fdhil.arming.guard_client import GuardClient
 
 CONFIG = click.argument("config", type=click.Path(path_type=Path))
 DISARM_S = 15.0  # the daemon waits for the guard's answer and for the ramp
@@ -102,7 +102,7 @@ def arm(config: Path, program: Path | None, method: str | None, whole: bool, as_
     if program is not None:
         with program.open("rb"):  # a file that is not there is trouble, not the daemon's no
             pass
-    from fdhil.daemon.token import read_token
+    from fdhil.arming.token import read_token
 
     request = {
         "request": "arm",
@@ -160,8 +160,8 @@ def disarm(config: Path, as_json: bool) -> None:
 def _disarm_at_the_guard(config: Path, silent: DeviceError) -> Mapping[str, Any]:
     """Ask the guard without the daemon; ``silent`` is why. ConnectError when neither answers."""
     machine = machine_config.load(config)
-    from fdhil.daemon.standing import landed, verdict
-    from fdhil.guard.client import GuardClient
+    from fdhil.arming.guard_client import GuardClient
+    from fdhil.arming.standing import landed, verdict
 
     try:
         with GuardClient(guard_directory(machine)) as guard:
@@ -186,8 +186,8 @@ def adopt(config: Path, yes: bool, as_json: bool) -> None:
     if as_json and not yes:
         raise click.UsageError("--json cannot ask: give --yes too")
     machine = machine_config.load(config)
-    from fdhil.daemon.token import read_token
-    from fdhil.guard.client import GuardClient
+    from fdhil.arming.guard_client import GuardClient
+    from fdhil.arming.token import read_token
 
     with GuardClient(guard_directory(machine)) as guard:
         answer = _adopted(guard, lambda: read_token(run_directory(machine)), yes, quiet=as_json)
@@ -196,7 +196,7 @@ def adopt(config: Path, yes: bool, as_json: bool) -> None:
 
 def _adopted(guard: GuardClient, token: Callable[[], str], yes: bool, quiet: bool) -> Mapping[str, Any]:
     """Have what stands ramped to zero, where anything does and the operator wants it; return the answer."""
-    from fdhil.daemon.standing import AT_REST, landed, standing, verdict
+    from fdhil.arming.standing import AT_REST, landed, standing, verdict
 
     status = guard.status()
     stands, state = standing(status), status["state"]

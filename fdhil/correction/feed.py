@@ -9,7 +9,7 @@ import numpy as np
 
 from fdhil.config import Axis, MachineConfig
 from fdhil.model import closed_loop
-from fdhil.prediction import load
+from fdhil.prediction import inverse_dynamics as load
 from fdhil.records import Float, Parameters, Trajectory
 
 _HALVINGS = 9

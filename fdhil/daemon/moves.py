@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.drivers import g0_inferred
+from fdhil.drivers.moves import inferred as g0_inferred
 from fdhil.identification.windows import PLATEAU_BAND, PLATEAU_S, RAPID_SHARE, RUN_SHARE
 from fdhil.records import AxisSamples, Float, Int
 

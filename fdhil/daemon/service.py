@@ -15,18 +15,18 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
+from fdhil.arming.desk import Armory
+from fdhil.arming.guard_link import TRIPPED, VOIDING
+from fdhil.arming.standing import ADOPT, START_AND_ADOPT, Standing
+from fdhil.commissioning.void import void_record
 from fdhil.config import MachineConfig, unlikely
 from fdhil.daemon import blackbox, journal
-from fdhil.daemon.armory import Armory
 from fdhil.daemon.control import SOCKET_NAME, Answer, ControlServer, refusal
-from fdhil.daemon.guard_link import TRIPPED, VOIDING
-from fdhil.daemon.keeping import Keeper
+from fdhil.daemon.kernel_warmup import warm
 from fdhil.daemon.lock import sole_owner
 from fdhil.daemon.notify import notify
-from fdhil.daemon.standing import ADOPT, START_AND_ADOPT, Standing
+from fdhil.daemon.outcome_store import Keeper
 from fdhil.daemon.status import Watch
-from fdhil.daemon.warm import warm
-from fdhil.drivers.commissioning_void import void_record
 from fdhil.errors import DeviceError, FdhilError, StoreError
 from fdhil.pipeline import AxisPipeline, Record
 from fdhil.records import AxisSamples, Notice, Outcome, Temperature, TickTimes

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from fdhil.config import MachineConfig
-from fdhil.daemon.documents import parameters_status
 from fdhil.daemon.hearing import Hearing, Trouble
+from fdhil.daemon.outcome_json import parameters_status
 from fdhil.records import Notice, Outcome, ParameterSet, Skill, WindowOutcome
 
 SCHEMA = "fdhil-status-1"

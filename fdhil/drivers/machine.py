@@ -14,14 +14,14 @@ from typing import Protocol
 
 from fdhil import tables
 from fdhil.config import MachineConfig
-from fdhil.drivers.bus_decoder import BusDecoder
-from fdhil.drivers.canopen_bus import CanBus
-from fdhil.drivers.cia402_drive import InputSamples
-from fdhil.drivers.frame_history import FrameHistory, candump
-from fdhil.drivers.modbus_link import BUSY, ModbusRefused
-from fdhil.drivers.modbus_voltage import ModbusVoltage
-from fdhil.drivers.temperature import ModbusTemperature
-from fdhil.drivers.tick_clock import TickClock
+from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.frame_history import FrameHistory, candump
+from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.cia402.bus_decoder import BusDecoder
+from fdhil.drivers.cia402.drive import InputSamples
+from fdhil.drivers.modbus.link import BUSY, ModbusRefused
+from fdhil.drivers.modbus.temperature import ModbusTemperature
+from fdhil.drivers.modbus.voltage import ModbusVoltage
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
 from fdhil.records import AxisSamples, MoveEvent, Notice, Temperature, TickTimes, VoltageSamples
 

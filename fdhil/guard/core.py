@@ -25,8 +25,8 @@ from fdhil.guard.feedforward import FeedMode
 from fdhil.guard.feeding import go_on
 from fdhil.guard.interlocks import FACTS, FEEDFORWARD_FACTS, Alarm, Reaction
 from fdhil.guard.limits import brake, follow, violation
-from fdhil.guard.observe import behind, observe
 from fdhil.guard.path import Path
+from fdhil.guard.plausibility import behind, observe
 from fdhil.guard.settings import AxisSettings, Settings
 from fdhil.guard.state import IN_CHARGE, LANDING, SENDING, AxisState, Inputs, Mode, Output, Request, State
 from fdhil.guard.tracking import await_start, rest, track

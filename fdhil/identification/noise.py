@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from fdhil.identification.batch_filter import whiten
 from fdhil.identification.motion import Motion, Noise
-from fdhil.identification.sweeps import whiten
 from fdhil.records import Float
 
 ITERATIONS = 12

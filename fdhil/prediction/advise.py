@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.prediction import load
+from fdhil.prediction import inverse_dynamics as load
+from fdhil.prediction.feed_refinement import raised_alone
 from fdhil.prediction.feeds import Feeds, Judge, Source, highest, stretches, worst_rows
 from fdhil.prediction.predict import contour_um, predict
-from fdhil.prediction.raising import raised_alone
 from fdhil.records import Float, Int, Parameters, Prediction, Zone
 
 ALONG_MM = 1e-9  # a row that moves less has no direction

@@ -9,8 +9,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
-from fdhil.sim.modbus_sensor import SensorFaults
-from fdhil.sim.sensors import SIGNALS, DriveFaults
+from fdhil.sim.drive.sensors import SIGNALS, DriveFaults
+from fdhil.sim.wire.modbus_sensor import SensorFaults
 
 if TYPE_CHECKING:
     from fdhil.sim.faults import FaultEntry

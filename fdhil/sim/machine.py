@@ -10,16 +10,16 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault, StoreError
-from fdhil.sim import description
-from fdhil.sim.drive import Drive
+from fdhil.sim.axis_unit import Stream, Unit
+from fdhil.sim.drive import description
+from fdhil.sim.drive.servo import Drive
 from fdhil.sim.faults import FaultEntry, FaultSchedule
-from fdhil.sim.hub import Frame
-from fdhil.sim.modbus_sensor import VoltageSensor
-from fdhil.sim.nc import Event, Nc, Row
-from fdhil.sim.nc_link import BusFrame
+from fdhil.sim.nc.controller import Event, Nc, Row
+from fdhil.sim.nc.drive_link import BusFrame
 from fdhil.sim.recorder import Recorder
 from fdhil.sim.thermal import SlideWay
-from fdhil.sim.unit import Stream, Unit
+from fdhil.sim.wire.hub import Frame
+from fdhil.sim.wire.modbus_sensor import VoltageSensor
 
 SYNC = 0x80
 OFFSET_RPDO = 2

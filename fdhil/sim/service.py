@@ -21,14 +21,14 @@ from typing import Any
 from fdhil.config import MachineConfig
 from fdhil.errors import FdhilError
 from fdhil.records import Trajectory
-from fdhil.sim import eds
-from fdhil.sim.attach import Attachment, Selectable, attach
+from fdhil.sim.drive import eds
 from fdhil.sim.faults import FaultEntry
-from fdhil.sim.hub import Frame, Handler
 from fdhil.sim.machine import Machine
-from fdhil.sim.modbus_sensor import SensorServers
-from fdhil.sim.nc_link import BusFrame
-from fdhil.sim.panel import MAX_LINE, Panel, PanelError
+from fdhil.sim.nc.drive_link import BusFrame
+from fdhil.sim.operator_commands import MAX_LINE, Panel, PanelError
+from fdhil.sim.wire.attach import Attachment, Selectable, attach
+from fdhil.sim.wire.hub import Frame, Handler
+from fdhil.sim.wire.modbus_sensor import SensorServers
 
 Loader = Callable[[Path, MachineConfig], Trajectory]
 Emit = Callable[[dict[str, Any]], None]

@@ -11,8 +11,8 @@ from fdhil.identification.motion import noise_levels, resolution
 from fdhil.identification.windows import carried, longest, moving_range, noise_of, smooth
 from fdhil.records import Bool, Float, Reason, Window
 from fdhil.validation.backlash import backlash
-from fdhil.validation.episode import interruptions
-from fdhil.validation.readings import alike
+from fdhil.validation.interruptions import interruptions
+from fdhil.validation.repeated_readings import alike
 
 CHANCE = 1e-4  # of a false alarm of one check on one good window
 TOLERATED_GAP = 3  # rows: a longer gap hides what the drive did

@@ -17,8 +17,8 @@ from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_start import sample_rows
 from fdhil.identification.slow_voltage import innovations_of
 from fdhil.records import Float, Reason, Window
-from fdhil.validation.bridging import log_beyond
 from fdhil.validation.plausibility import at_rest
+from fdhil.validation.sensor_reconstruction import log_beyond
 from fdhil.validation.slow_readings import CHANCE, LEAST_NOISE_SAMPLES, likely_same, runs
 from fdhil.validation.slow_stuck import slow_stuck_values
 

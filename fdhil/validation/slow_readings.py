@@ -14,7 +14,7 @@ import numpy as np
 from fdhil.identification.motion import resolution
 from fdhil.identification.windows import carried, noise_of, runs_of, smooth
 from fdhil.records import Float, Reason, Window
-from fdhil.validation.readings import alike
+from fdhil.validation.repeated_readings import alike
 
 LEAST_SAMPLES = 3
 MOVED_SAMPLES = 4  # equal while the speed changes: shorter runs may lie where current and speed balance

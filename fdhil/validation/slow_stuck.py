@@ -18,8 +18,8 @@ from fdhil.identification.motion import Motion, resolution
 from fdhil.identification.slow_voltage import innovations_of, spread_of
 from fdhil.identification.windows import moving_range
 from fdhil.records import Float, Reason, Window
-from fdhil.validation.bridging import log_beyond
 from fdhil.validation.plausibility import signals_of
+from fdhil.validation.sensor_reconstruction import log_beyond
 from fdhil.validation.stuck import CHANCE, LONGEST_RUNS, PARTS, TOLD_S, WITHIN_STEP
 
 ROWS = {"current": 0, "speed": 1}  # in which column of a row's variances

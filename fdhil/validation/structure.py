@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from fdhil.identification import sweeps
+from fdhil.identification import batch_filter as sweeps
 from fdhil.identification.covariance import aliasing
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.filtering import moving_mean

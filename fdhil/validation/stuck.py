@@ -19,9 +19,9 @@ from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.motion import resolution
 from fdhil.identification.windows import moving_range, runs_of
 from fdhil.records import Float, Reason, Window
-from fdhil.validation.bridging import Bridge
 from fdhil.validation.plausibility import RAIL_SAMPLES, beyond_chance, signals_of, wakes_with_a_jump
-from fdhil.validation.readings import alike, log_chance
+from fdhil.validation.repeated_readings import alike, log_chance
+from fdhil.validation.sensor_reconstruction import Bridge
 
 CHANCE = 2e-3  # of a false alarm of one signal in one good window, were its runs explained by what is drawn at random
 NOISES = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdhil.identification import sweeps
+from fdhil.identification import batch_filter as sweeps
 from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.filtering import moving_mean

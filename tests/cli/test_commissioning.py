@@ -19,8 +19,8 @@ import can
 import pytest
 
 from fdhil.cli.main import cli, run_safely
-from fdhil.drivers.commissioning_record import load_record
-from fdhil.sim.hub import Hub
+from fdhil.commissioning.record import load_record
+from fdhil.sim.wire.hub import Hub
 from tests.sim.hub_thread import HubThread
 from tests.sim.twin_process import TwinProcess, write_config
 

@@ -21,9 +21,9 @@ from fdhil import config as machine_config
 from fdhil.cli.bus_lock import lock_bus
 from fdhil.cli.guard import guard, heartbeat_timeout_s, limits_of, open_bus, settings_of
 from fdhil.cli.main import cli, run_safely
+from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
+from fdhil.commissioning.void import void_record
 from fdhil.config import CanBus, CorrectionLimits
-from fdhil.drivers.commissioning_record import CommissioningRecord, axis_digest, save_record
-from fdhil.drivers.commissioning_void import void_record
 from fdhil.errors import ConnectError, ProtocolError
 from fdhil.guard.limits import Limits
 from fdhil.guard.settings import from_json, load, to_json

@@ -13,8 +13,8 @@ from click.testing import CliRunner, Result
 
 from fdhil.cli.main import cli
 from fdhil.cli.records import read_windows
-from fdhil.daemon.keeping import Keeper
-from fdhil.daemon.warm import nominal_rapid
+from fdhil.daemon.kernel_warmup import nominal_rapid
+from fdhil.daemon.outcome_store import Keeper
 from fdhil.records import frozen
 from fdhil.store.recording_csv import read_recording
 from fdhil.store.windows import encode_window

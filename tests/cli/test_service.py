@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
+from fdhil.arming.token import ensure_token
 from fdhil.cli.parameter_view import cell, half_of
 from fdhil.cli.status_view import sparkline
 from fdhil.daemon import journal
 from fdhil.daemon.status import Watch
-from fdhil.daemon.token import ensure_token
 from fdhil.records import Notice
 from tests.daemon.machine import config_of
 from tests.daemon.shop import BENCH, fdhil

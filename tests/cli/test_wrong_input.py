@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from fdhil.sim.hub import Hub
+from fdhil.sim.wire.hub import Hub
 from tests.daemon.shop import fdhil
 from tests.sim.hub_thread import HubThread
 from tests.sim.twin_process import write_config

@@ -12,7 +12,7 @@ import numpy as np
 
 from fdhil import config as machine_config
 from fdhil.config import MachineConfig
-from fdhil.daemon.warm import nominal_rapid
+from fdhil.daemon.kernel_warmup import nominal_rapid
 from fdhil.errors import ConnectError
 from fdhil.pipeline import Record
 from fdhil.records import AxisSamples, MoveEvent, MoveKind, Notice, TickTimes, frozen, frozen_ints

@@ -14,10 +14,10 @@ import pytest
 from fdhil import config as machine_config
 from fdhil.cli.demo.processes import Process, Twin
 from fdhil.cli.main import cli, run_safely
+from fdhil.commissioning.steps import commission, save_record
 from fdhil.config import MachineConfig
 from fdhil.daemon.control import ask
-from fdhil.drivers import canopen_sdo
-from fdhil.drivers.commissioning import commission, save_record
+from fdhil.drivers.can import sdo as canopen_sdo
 from fdhil.errors import ConnectError
 from tests.bench import axis_toml
 

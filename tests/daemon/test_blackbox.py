@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
+from fdhil.arming.guard_link import TRIPPED, _changes
 from fdhil.daemon import blackbox
-from fdhil.daemon.guard_link import TRIPPED, _changes
-from fdhil.drivers.frame_history import FrameHistory, candump
-from fdhil.drivers.frames import ERROR_FLAG, frames_of
+from fdhil.drivers.can.frame_history import FrameHistory, candump
+from fdhil.drivers.can.frames import ERROR_FLAG, frames_of
 
 
 def status(state: str, code: str = "") -> dict[str, Any]:

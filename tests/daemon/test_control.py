@@ -13,12 +13,12 @@ from typing import Any
 
 import pytest
 
+from fdhil.arming.token import ensure_token, read_token
 from fdhil.daemon import journal
 from fdhil.daemon.control import MAX_CLIENTS, ControlServer, ask
 from fdhil.daemon.journal import BURST, FloodGate, line_of, printable
 from fdhil.daemon.lock import BusLocked, sole_owner
 from fdhil.daemon.notify import notify
-from fdhil.daemon.token import ensure_token, read_token
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
 from fdhil.records import Notice, Skill
 from tests.store.made import outcome, published

@@ -22,7 +22,7 @@ from fdhil.daemon.status import Watch
 from fdhil.drivers import open_machine
 from fdhil.pipeline import Record
 from fdhil.records import AxisSamples, Notice, TickTimes, frozen, frozen_ints
-from fdhil.sim.hub import encode
+from fdhil.sim.wire.hub import encode
 from tests.bench import bench_axis
 from tests.daemon.machine import Machine, config_of, rapids
 from tests.daemon.test_service import serving, status_when

@@ -15,12 +15,12 @@ from typing import Any
 
 import pytest
 
+from fdhil.commissioning.void import void_path
 from fdhil.config import MachineConfig
 from fdhil.daemon.control import ask
 from fdhil.daemon.hearing import Hearing
 from fdhil.daemon.lock import BusLocked
 from fdhil.daemon.service import InternalError, Service, run
-from fdhil.drivers.commissioning_void import void_path
 from fdhil.errors import ConnectError, DeviceError
 from fdhil.records import Notice
 from fdhil.store.history import History

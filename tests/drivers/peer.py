@@ -11,7 +11,7 @@ import can
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.sim.drive import Drive
+from fdhil.sim.drive.servo import Drive
 
 
 class DrivePeer:

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdhil.drivers.bus_decoder import BusDecoder
-from fdhil.drivers.frames import frames_of
-from fdhil.drivers.node_watch import NodeWatch, emcy_text
-from fdhil.drivers.sync_grid import SyncGrid
-from fdhil.drivers.tick_clock import TickClock
+from fdhil.drivers.can.frames import frames_of
+from fdhil.drivers.can.node_watch import NodeWatch, emcy_text
+from fdhil.drivers.can.sync_grid import SyncGrid
+from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.cia402.bus_decoder import BusDecoder
 from fdhil.records import Notice, TickTimes
 from tests.drivers.wire import Row, machine
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from fdhil.drivers import canopen_sdo
-from fdhil.drivers.canopen_sdo import SdoLink
+from fdhil.drivers.can import sdo as canopen_sdo
+from fdhil.drivers.can.sdo import SdoLink
 from fdhil.errors import DeviceTimeout
 
 
@@ -46,6 +46,6 @@ def test_the_roll_back_is_not_spoilt_by_a_late_answer(monkeypatch: pytest.Monkey
     monkeypatch.setattr(canopen_sdo, "QUIET_S", 0.0)
     with pytest.raises(DeviceTimeout):
         link.read_int(0x1016, 1)
-    monkeypatch.setattr("fdhil.drivers.canopen_sdo.time.sleep", node.arrive)
+    monkeypatch.setattr("fdhil.drivers.can.sdo.time.sleep", node.arrive)
     assert link.read_int(0x60B0) == 7
     assert link.read_int(0x6041) == 7

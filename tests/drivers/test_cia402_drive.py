@@ -10,8 +10,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.drivers.bus_decoder import BusDecoder
-from fdhil.drivers.frames import Frames, frames_of
+from fdhil.drivers.can.frames import Frames, frames_of
+from fdhil.drivers.cia402.bus_decoder import BusDecoder
 from fdhil.records import AxisSamples, Notice
 from tests.drivers.wire import Row, Wire, machine
 

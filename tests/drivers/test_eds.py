@@ -10,7 +10,7 @@ from canopen.objectdictionary import ObjectDictionary
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.drivers.eds import MAX_BYTES, MAX_OBJECTS, load_eds, objects_of, parse_eds
+from fdhil.drivers.cia402.eds import MAX_BYTES, MAX_OBJECTS, load_eds, objects_of, parse_eds
 from fdhil.errors import EdsError
 
 GOOD = """\

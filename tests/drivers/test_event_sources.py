@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdhil import tables
-from fdhil.drivers.cia402_drive import InputSamples
-from fdhil.drivers.g0_digital_input import DigitalInputG0
-from fdhil.drivers.g0_inferred import InferredG0
+from fdhil.drivers.cia402.drive import InputSamples
+from fdhil.drivers.moves.digital_input import DigitalInputG0
+from fdhil.drivers.moves.inferred import InferredG0
 from fdhil.records import AxisSamples, Float, MoveEvent, MoveKind, frozen, frozen_ints
 from tests.drivers.wire import machine
 

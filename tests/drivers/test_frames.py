@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdhil.drivers.frames import (
+from fdhil.drivers.can.frames import (
     ERROR_BUS_OFF,
     ERROR_CONTROLLER,
     ERROR_FLAG,

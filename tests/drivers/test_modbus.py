@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from fdhil import tables
 from fdhil.config import MachineConfig
 from fdhil.drivers import machine as machine_module
-from fdhil.drivers.counter_clock import CounterClock
+from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.cia402.profile import load_profile
 from fdhil.drivers.machine import MachineSource, Outlet, SensorSource
-from fdhil.drivers.modbus_link import ModbusLink
-from fdhil.drivers.modbus_voltage import ModbusVoltage, SensorBlock, parse_block
-from fdhil.drivers.profile import load_profile
-from fdhil.drivers.tick_clock import TickClock
+from fdhil.drivers.modbus.counter_clock import CounterClock
+from fdhil.drivers.modbus.link import ModbusLink
+from fdhil.drivers.modbus.voltage import ModbusVoltage, SensorBlock, parse_block
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
 from fdhil.records import Notice, Temperature, TickTimes, VoltageSamples
 from tests.drivers.modbus_peer import VOLTS_PER_COUNT, SensorPeer, sensor_peer

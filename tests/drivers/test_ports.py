@@ -14,9 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdhil.config import CanBus as BusSettings
-from fdhil.drivers.can_ports import HubClock, SocketcandPort
-from fdhil.drivers.canopen_bus import CanBus
-from fdhil.drivers.frames import ERROR_FLAG, EXTENDED_FLAG, Ring
+from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, Ring
+from fdhil.drivers.can.ports import HubClock, SocketcandPort
 from fdhil.errors import ConnectError, DeviceError
 
 

@@ -7,8 +7,8 @@ from itertools import pairwise
 import pytest
 
 from fdhil import tables
-from fdhil.drivers.cia402_drive import Cia402Decoder
-from fdhil.drivers.profile import DriveProfile, load_profile
+from fdhil.drivers.cia402.drive import Cia402Decoder
+from fdhil.drivers.cia402.profile import DriveProfile, load_profile
 from tests.drivers.wire import machine
 
 MAX_BITS = 64

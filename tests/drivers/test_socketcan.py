@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from fdhil.config import CanBus as BusSettings
-from fdhil.drivers.can_ports import SocketCanPort
-from fdhil.drivers.canopen_bus import CanBus
-from fdhil.drivers.frames import Ring
+from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.frames import Ring
+from fdhil.drivers.can.ports import SocketCanPort
 
 pytestmark = pytest.mark.socketcan
 SETTINGS = BusSettings(interface="socketcan", channel="vcan0")

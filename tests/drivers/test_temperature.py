@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from fdhil.config import Thermometer
-from fdhil.drivers.temperature import ModbusTemperature
-from fdhil.drivers.tick_clock import TickClock
+from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.modbus.temperature import ModbusTemperature
 from fdhil.errors import DeviceTimeout, ProtocolError
 from fdhil.records import Temperature
 from tests.drivers.modbus_peer import sensor_peer

@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fdhil.commissioning import steps as commissioning
+from fdhil.commissioning import survey as commissioning_checks
+from fdhil.commissioning.steps import commission
 from fdhil.config import MachineConfig
-from fdhil.drivers import MachineSource, Record, commissioning, commissioning_checks, open_machine
-from fdhil.drivers.commissioning import commission
+from fdhil.drivers import MachineSource, Record, open_machine
 from fdhil.errors import ConnectError, DriveFault, ProtocolError
 from fdhil.records import AxisSamples, MoveEvent, MoveKind, Notice, Temperature, VoltageSamples
 from tests.bench import bench_toml

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fdhil.config import MachineConfig, parse
-from fdhil.drivers.frames import Frames, frames_of
+from fdhil.drivers.can.frames import Frames, frames_of
 from tests.bench import bench_axis
 
 Row = tuple[int, int, bytes]

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from fdhil.arming.guard_client import ANSWER_S
 from fdhil.guard import core
-from fdhil.guard.client import ANSWER_S
 from fdhil.guard.conditions import View, failing, not_ready
 from fdhil.guard.interlocks import CATALOGUE, FACTS, Alarm, Reaction
 from fdhil.guard.state import AxisInput, AxisState, BusView, Inputs, Mode

@@ -6,8 +6,8 @@ import pytest
 
 from fdhil.guard import core
 from fdhil.guard.interlocks import Alarm
-from fdhil.guard.observe import observe
 from fdhil.guard.path import Path, rate_between
+from fdhil.guard.plausibility import observe
 from fdhil.guard.state import Inputs, Mode, Request
 from tests.guard.machine import Bench, bench
 

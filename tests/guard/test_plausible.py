@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdhil.cli.guard import settings_of
-from fdhil.guard.observe import observe
+from fdhil.guard.plausibility import observe
 from fdhil.guard.settings import Settings, from_json, to_json
 from fdhil.guard.state import AxisInput, BusView, Inputs, Mode, State, initial
 from tests.bench import bench_config

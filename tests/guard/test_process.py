@@ -17,10 +17,10 @@ from pathlib import Path
 import pytest
 
 from fdhil import config as machine_config
+from fdhil.arming.guard_client import GuardClient, GuardLost
 from fdhil.cli.failing import run_safely
 from fdhil.cli.guard import open_bus, settings_of
 from fdhil.cli.main import cli
-from fdhil.guard.client import GuardClient, GuardLost
 from fdhil.guard.settings import to_json
 from tests.guard import impatient
 from tests.guard.machine import DIGEST, FACTS_GIVEN, LIMITS, commissioned, smooth_path

@@ -14,11 +14,12 @@ import can
 import pytest
 
 from fdhil import config as machine_config
+from fdhil.commissioning import steps as commissioning
+from fdhil.commissioning import survey as commissioning_checks
+from fdhil.commissioning.master import Master
+from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
+from fdhil.commissioning.survey import survey
 from fdhil.config import MachineConfig
-from fdhil.drivers import commissioning, commissioning_checks
-from fdhil.drivers.commissioning_checks import survey
-from fdhil.drivers.commissioning_master import Master
-from fdhil.drivers.commissioning_record import CommissioningRecord, axis_digest, save_record
 from fdhil.pipeline import AxisPipeline
 from fdhil.program import load_trajectory
 from fdhil.records import Notice, Outcome

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fdhil.arming.guard_client import GuardClient
+from fdhil.arming.token import read_token
 from fdhil.cli.demo.processes import Process
+from fdhil.commissioning.steps import commission, save_record
 from fdhil.correction.online import law
-from fdhil.daemon.token import read_token
-from fdhil.drivers.commissioning import commission, save_record
-from fdhil.guard.client import GuardClient
 from fdhil.guard.interlocks import FEEDFORWARD_FACTS
 from fdhil.prediction.models import nominal_models
 from fdhil.records import Float

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fdhil.arming.guard_client import GuardClient
+from fdhil.arming.token import read_token
 from fdhil.cli.demo.processes import Process
-from fdhil.daemon.token import read_token
-from fdhil.guard.client import GuardClient
 from fdhil.guard.interlocks import FACTS
 from tests.integration.conftest import PATIENCE_S, Bench, sign_off
 

@@ -14,11 +14,11 @@ import can
 import pytest
 from click.testing import CliRunner
 
+from fdhil.arming.guard_client import GuardClient
+from fdhil.arming.token import read_token
 from fdhil.cli.demo.processes import Process
 from fdhil.cli.main import cli
-from fdhil.daemon.token import read_token
-from fdhil.drivers.commissioning_void import is_void, void_record
-from fdhil.guard.client import GuardClient
+from fdhil.commissioning.void import is_void, void_record
 from fdhil.guard.interlocks import FACTS
 from tests.guard import impatient
 from tests.integration.conftest import PATIENCE_S, Bench, sign_off

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fdhil.commissioning.steps import commission
 from fdhil.drivers import open_machine
-from fdhil.drivers.commissioning import commission
 from fdhil.pipeline import AxisPipeline
 from fdhil.records import AxisSamples, ParameterSet, WindowOutcome
 from tests.integration.conftest import PATIENCE_S, Bench, digested

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fdhil.arming.checked_program import FIRST_S, Block, Checked, Stream
+from fdhil.arming.guard_client import GuardClient
+from fdhil.arming.program_check import check
+from fdhil.arming.token import read_token
 from fdhil.config import MachineConfig
 from fdhil.correction import Limits
 from fdhil.correction import check as check_limits
-from fdhil.daemon.program_check import check
-from fdhil.daemon.streamed import FIRST_S, Block, Checked, Stream
-from fdhil.daemon.token import read_token
-from fdhil.guard.client import GuardClient
 from fdhil.guard.interlocks import FACTS
 from fdhil.prediction.models import nominal_models
 from fdhil.program import program_digest

@@ -11,8 +11,8 @@ from typing import Any
 import can
 import canopen
 
-from fdhil.sim.drive import Drive, Frame
-from fdhil.sim.eds import eds_text
+from fdhil.sim.drive.eds import eds_text
+from fdhil.sim.drive.servo import Drive, Frame
 
 
 class DirectBus(can.BusABC):

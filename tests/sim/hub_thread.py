@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import can
 
-from fdhil.sim.hub import Frame, Hub
+from fdhil.sim.wire.hub import Frame, Hub
 
 
 class HubThread(threading.Thread):

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdhil import config
-from fdhil.sim.drive import Drive
-from fdhil.sim.eds import write_eds
+from fdhil.sim.drive.eds import write_eds
+from fdhil.sim.drive.servo import Drive
 from tests.bench import bench_document
 from tests.sim.canopen_peer import dictionary, over_virtual_bus
 from tests.sim.rig import Abort, Rig, emergencies, machine

@@ -9,9 +9,9 @@ import pytest
 
 from fdhil import config
 from fdhil.records import Float
-from fdhil.sim.drive import Drive
-from fdhil.sim.physics import run_cycle
-from fdhil.sim.setpoints import CyclicSetpoints, Profile, Target
+from fdhil.sim.drive.physics import run_cycle
+from fdhil.sim.drive.servo import Drive
+from fdhil.sim.drive.setpoints import CyclicSetpoints, Profile, Target
 from tests.bench import bench_config, bench_document
 from tests.sim.rig import Rig, machine
 

@@ -18,8 +18,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fdhil.errors import ConnectError
-from fdhil.sim import hub as hub_module
-from fdhil.sim.hub import EXTENDED, Hub, decode_send, encode
+from fdhil.sim.wire import hub as hub_module
+from fdhil.sim.wire.hub import EXTENDED, Hub, decode_send, encode
 from tests.sim.hub_thread import frames_of, joined, serving
 
 _DATA = st.binary(max_size=8)

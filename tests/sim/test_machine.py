@@ -10,12 +10,12 @@ import pytest
 
 from fdhil.errors import ConfigError
 from fdhil.sim import faults
+from fdhil.sim.drive.sensors import DriveFaults
 from fdhil.sim.fault_kinds import FAULTS
 from fdhil.sim.machine import Machine
-from fdhil.sim.modbus_sensor import SensorFaults
-from fdhil.sim.panel import Panel, PanelError
-from fdhil.sim.sensors import DriveFaults
+from fdhil.sim.operator_commands import Panel, PanelError
 from fdhil.sim.service import Pace
+from fdhil.sim.wire.modbus_sensor import SensorFaults
 from tests.guard.machine import settings
 from tests.sim.bench_twin import PERIOD_S, TwinInHand, corner, trajectory, twin_config
 

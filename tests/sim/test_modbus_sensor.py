@@ -14,7 +14,7 @@ from pymodbus.client import ModbusTcpClient
 from pymodbus.exceptions import ModbusIOException
 
 from fdhil.errors import ConnectError
-from fdhil.sim.modbus_sensor import BLOCK, SensorServers, VoltageSensor
+from fdhil.sim.wire.modbus_sensor import BLOCK, SensorServers, VoltageSensor
 from tests.sim.bench_twin import TwinInHand, corner, twin_config
 
 

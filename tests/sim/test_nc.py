@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.sim.path import NEGLIGIBLE_MM, Player, Rate, rapid_rows
+from fdhil.sim.nc.path import NEGLIGIBLE_MM, Player, Rate, rapid_rows
 from tests.sim.bench_twin import PERIOD_S, TwinInHand, corner, smooth, targets, twin_config
 
 PER_MM = 65536 / 20

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.sim.description import bus_load, frame_bits, mapping
+from fdhil.sim.drive.description import bus_load, frame_bits, mapping
 from tests.sim.canopen_peer import direct
 from tests.sim.rig import Abort, Rig, machine
 

@@ -10,9 +10,9 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from fdhil.records import Float, Parameters
-from fdhil.sim import physics
-from fdhil.sim.physics import Physics, discretise
-from fdhil.sim.setpoints import Command
+from fdhil.sim.drive import physics
+from fdhil.sim.drive.physics import Physics, discretise
+from fdhil.sim.drive.setpoints import Command
 from tests.bench import bench_config
 
 AXIS = bench_config("X").axis["X"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.sim.power import PowerStage, Ramp, State
+from fdhil.sim.drive.power import PowerStage, Ramp, State
 
 S = State
 

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.sim.dictionary import U32, AbortCode, DataType, Dictionary, Entry, Object, record, var
-from fdhil.sim.sdo import SdoServer
+from fdhil.sim.drive.dictionary import U32, AbortCode, DataType, Dictionary, Entry, Object, record, var
+from fdhil.sim.drive.sdo import SdoServer
 from tests.sim.canopen_peer import direct, over_virtual_bus
 from tests.sim.rig import Abort, Rig
 

@@ -7,7 +7,7 @@ import pytest
 
 from fdhil import config
 from fdhil.errors import ConfigError
-from fdhil.sim.drive import Drive
+from fdhil.sim.drive.servo import Drive
 from tests.bench import bench_document
 
 

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from fdhil.daemon.keeping import Keeper
+from fdhil.daemon.outcome_store import Keeper
 from fdhil.errors import RecordingError, StoreError
 from fdhil.records import Notice, Parameters, Skill
 from fdhil.store import schema

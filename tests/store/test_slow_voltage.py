@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fdhil.config import Identification
-from fdhil.daemon.documents import as_document
+from fdhil.daemon.outcome_json import as_document
 from fdhil.errors import RecordingError
 from fdhil.store.export import csv_lines
 from fdhil.store.recording_csv import parse_recording

@@ -14,7 +14,7 @@ from studies import drives
 from studies.drives import Array
 from studies.scenes import demand_of, measured
 from tests.daemon.machine import config_of
-from tests.validation.test_episodes import DRIVE, MOVE, SCENE
+from tests.validation.test_interruptions import DRIVE, MOVE, SCENE
 
 BLOCK = 40
 

@@ -19,7 +19,7 @@ from studies import drives, faults
 from studies.drives import Drive, Move
 from studies.scenes import Scene, demand_of, measured, recorded
 from tests.identification.recorded import windows
-from tests.validation.test_episodes import DRIVE, SCENE
+from tests.validation.test_interruptions import DRIVE, SCENE
 
 SETTINGS = Identification()
 

@@ -13,7 +13,7 @@ from fdhil.validation import analyse, pool
 from studies import drives, faults
 from studies.scenes import demand_of, measured, recorded
 from tests.identification.recorded import windows
-from tests.validation.test_episodes import SCENE
+from tests.validation.test_interruptions import SCENE
 
 
 @pytest.mark.parametrize("seed", range(3))

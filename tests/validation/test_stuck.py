@@ -12,12 +12,12 @@ from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.records import Window, frozen
 from fdhil.validation import analyse
-from fdhil.validation.readings import log_chance
+from fdhil.validation.repeated_readings import log_chance
 from fdhil.validation.stuck import noise_steps, stuck_values
 from studies import drives, faults, signal_faults
 from studies.scenes import Sensor, demand_of, measured, recorded
 from tests.identification.recorded import windows
-from tests.validation.test_episodes import SCENE
+from tests.validation.test_interruptions import SCENE
 
 SETTINGS = Identification()
 FIELDS = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}

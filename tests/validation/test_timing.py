@@ -17,7 +17,7 @@ from fdhil.validation.structure import expected_correlation
 from fdhil.validation.timing import Shift, searched, shifts, timing_faults
 from studies import drives, faults
 from studies.scenes import demand_of, measured, recorded
-from tests.validation.test_episodes import SCENE
+from tests.validation.test_interruptions import SCENE
 
 FINE_S = 2.5e-4
 SETTINGS = Identification()

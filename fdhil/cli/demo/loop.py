@@ -17,10 +17,10 @@ from fdhil import config as machine_config
 from fdhil.cli.demo.processes import PATIENCE_S, Process, Twin
 from fdhil.cli.demo.report import Cut, Loop, Published
 from fdhil.cli.demo.toml import to_toml
+from fdhil.commissioning.record import save_record
+from fdhil.commissioning.steps import commission
 from fdhil.config import MachineConfig
 from fdhil.daemon.control import SOCKET_NAME, ask
-from fdhil.drivers.commissioning import commission
-from fdhil.drivers.commissioning_record import save_record
 from fdhil.errors import DeviceTimeout, FdhilError, RecordingError
 from fdhil.prediction import contour_error_um, predict
 from fdhil.program import load_trajectory

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdhil.config import Identification
+from fdhil.identification.batch_filter import whiten
 from fdhil.identification.covariance import TESTED_LAGS, aliasing, robust, suspicious
 from fdhil.identification.delay import coarse_delay
 from fdhil.identification.estimators import least_squares
@@ -27,7 +28,6 @@ from fdhil.identification.normal import inverse_of, solve
 from fdhil.identification.slow_descent import Likelihood, ascend, likelier_delay
 from fdhil.identification.slow_start import slow_least_squares, slow_start, with_course
 from fdhil.identification.slow_voltage import course_effect, in_order
-from fdhil.identification.sweeps import whiten
 from fdhil.records import PARAMETERS, Estimate, Float, Result, Window
 
 NAME = "maximum_likelihood"

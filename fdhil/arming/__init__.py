@@ -1,0 +1,1 @@
+"""Arming: from a program to rows that were checked, handed to the guard and fed to it while the machine runs."""

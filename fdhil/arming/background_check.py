@@ -1,0 +1,222 @@
+"""The check of a long program, seen from the daemon: started, followed ahead of the motion, abandoned, remembered."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hashlib
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from fdhil.arming.checked_program import Block, Checked
+from fdhil.arming.program_check import SCHEMA, part_file
+from fdhil.config import MachineConfig
+from fdhil.records import Parameters, Reason
+from fdhil.store.atomic import store_error
+
+FOLDER = "checked"
+MAX_LINE = 1 << 20
+
+Enough = Callable[[Checked], bool]
+
+
+class Check:
+    """At most one check at a time; it goes on by itself when enough has passed, until it ends or is abandoned."""
+
+    def __init__(self, config: MachineConfig) -> None:
+        self._config = config
+        self._folder = config.store.directory / FOLDER
+        self._going: _Going | None = None
+
+    @property
+    def progress(self) -> Mapping[str, Any] | None:
+        """What the check said last; None while none runs."""
+        return None if self._going is None or self._going.ended else self._going.progress
+
+    async def run(
+        self, program: Path, program_digest: str, models: Mapping[str, Parameters], enough: Enough
+    ) -> Checked | tuple[Reason, ...]:
+        """Return the program as soon as ``enough`` of it or all has passed, or why it is refused: every place.
+
+        What was checked before is not checked again; a check that still goes on is taken up, one of another program is
+        ended. StoreError when no rows can be written.
+        """
+        key = self._key(program_digest, models)
+        known = await asyncio.to_thread(Checked.find, self._folder, key, program.parent)
+        if known is not None:
+            return known
+        going = self._going
+        if going is None or going.ended or going.key != key:
+            await self.close()
+            going = self._going = _Going(program, key, await asyncio.to_thread(self._opened, key))
+            going.begin(self._request(program, program_digest, models, key))
+        with contextlib.ExitStack() as left:  # who waits for it was cancelled, or cannot judge it
+            left.callback(self.abandon)
+            found = await going.passed(enough)
+            left.pop_all()
+        return found
+
+    def _key(self, program_digest: str, models: Mapping[str, Parameters]) -> str:
+        of = [SCHEMA, program_digest, self._config.digest, {axis: m.as_dict() for axis, m in models.items()}]
+        return hashlib.sha256(json.dumps(of).encode()).hexdigest()[:32]
+
+    def _opened(self, key: str) -> Checked:
+        """Open the file before the process writes it: no rename or removal can come in between."""
+        part = part_file(self._folder, key)
+        try:
+            part.parent.mkdir(parents=True, exist_ok=True)
+            part.unlink(missing_ok=True)
+            part.touch()
+            return Checked(part, tuple(self._config.axis))
+        except OSError as error:
+            raise store_error(part, error) from None
+
+    def _request(self, program: Path, digest: str, models: Mapping[str, Parameters], key: str) -> Mapping[str, Any]:
+        return {
+            "program": str(program),
+            "program_digest": digest,
+            "config": self._config.model_dump(mode="json"),
+            "models": {axis: model.as_dict() for axis, model in models.items()},
+            "folder": str(self._folder),
+            "key": key,
+        }
+
+    def abandon(self) -> bool:
+        """End a check that runs; return whether one did."""
+        return self._going is not None and self._going.abandon()
+
+    async def attend(self) -> None:
+        """Raise what went wrong in following a check that goes on by itself."""
+        if self._going is not None and self._going.ended:
+            await self._going.over()
+
+    async def close(self) -> None:
+        """End a check that runs and wait for its end."""
+        self.abandon()
+        if self._going is not None:
+            await self._going.quiet()
+
+
+class _Going:
+    """One check on its way: its process, what it said last, and the rows that passed."""
+
+    def __init__(self, program: Path, key: str, checked: Checked) -> None:
+        self.key, self.checked = key, checked
+        self.ended = self._abandoned = False
+        self._program = str(program)
+        self.progress: Mapping[str, Any] = {}
+        self._hear({"progress": {"checked_s": 0.0, "line": 0, "times_real_time": 0.0, "refused": 0}})
+        self._news = asyncio.Event()
+        self._process: asyncio.subprocess.Process | None = None
+        self._task: asyncio.Task[None] | None = None
+
+    def begin(self, request: Mapping[str, Any]) -> None:
+        """Start the process and follow it."""
+        self._task = asyncio.create_task(self._follow(request), name=f"check of {self._program}")
+
+    async def passed(self, enough: Enough) -> Checked | tuple[Reason, ...]:
+        """Wait until enough or all has passed, or until all is known of why it is refused."""
+        while not self.ended:
+            if not self.checked.refused and enough(self.checked):
+                return self.checked
+            self._news.clear()
+            await self._news.wait()
+        await self.over()
+        return self.checked if self.checked.whole else self.checked.refused
+
+    async def over(self) -> None:
+        """Wait for the end; what went wrong in following the process is raised here."""
+        if self._task is not None:
+            await self._task
+
+    async def quiet(self) -> None:
+        """Wait for the end, whatever it is."""
+        if self._task is not None:
+            await asyncio.wait([self._task])
+
+    def abandon(self) -> bool:
+        """End the process; return whether it ran."""
+        running = not self.ended
+        self._abandoned = self._abandoned or running
+        self._kill()
+        return running
+
+    def _kill(self) -> None:
+        if self._process is not None and self._process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self._process.pid, signal.SIGKILL)  # its own kill() may take the exit code from who waits
+
+    async def _follow(self, request: Mapping[str, Any]) -> None:
+        """Take what the process says until it ends."""
+        try:
+            self._process = process = await asyncio.create_subprocess_exec(
+                sys.executable,
+                "-m",
+                "fdhil.arming.program_check",
+                stdin=asyncio.subprocess.PIPE,
+                stdout=asyncio.subprocess.PIPE,
+                limit=MAX_LINE,
+            )
+            if self._abandoned:
+                self._kill()
+            try:
+                await self._converse(process, request)
+            finally:
+                self._kill()
+                await process.wait()
+            self._conclude(process.returncode)
+        except OSError as error:
+            text = f"the check cannot be started ({error.strerror or error})"
+            self.checked.refused += (Reason("InternalError", text, "free memory and processes, then arm again"),)
+        finally:
+            self.ended = True
+            self._news.set()
+
+    async def _converse(self, process: asyncio.subprocess.Process, request: Mapping[str, Any]) -> None:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        with contextlib.suppress(ConnectionError):  # a process that ended already is told by its silence
+            process.stdin.write(json.dumps(request).encode() + b"\n")
+            await process.stdin.drain()
+        async for line in process.stdout:
+            with contextlib.suppress(ValueError):  # half a line is what an ended process leaves
+                told = json.loads(line)
+                if isinstance(told, dict):
+                    self._hear(told)
+            self._news.set()
+
+    def _hear(self, told: Mapping[str, Any]) -> None:
+        checked = self.checked
+        if "progress" in told:
+            self.progress = {"program": self._program, **told["progress"]}
+        elif "block" in told:
+            end, sha256 = told["block"]
+            checked.take(Block(end, sha256, told["last"]), told["errors"])
+        elif "refused" in told:
+            checked.refused += (_reason(told["refused"]),)
+        elif "error" in told:
+            checked.refused += (_reason(told["error"]),)
+        elif "header" in told:
+            checked.refused = tuple(map(_reason, told["header"]["refused"]))
+            if not checked.refused:
+                checked.conclude(told["header"])
+
+    def _conclude(self, code: int | None) -> None:
+        """A check that ended without a word on the whole has died."""
+        if self.checked.whole or (self.checked.refused and code == 0):
+            return
+        if self._abandoned:
+            died = Reason("Abandoned", "the check was abandoned", "arm again when it is wanted")
+        else:
+            text = f"the check ended with exit code {code} and no answer"
+            died = Reason("InternalError", text, "see the daemon's log, then report it")
+        self.checked.refused += (died,)
+
+
+def _reason(told: Mapping[str, Any]) -> Reason:
+    return Reason(told["code"], told["text"], told["advice"])

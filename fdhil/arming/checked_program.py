@@ -1,0 +1,210 @@
+"""A program longer than the guard's ring: armed with its first seconds, the rest is handed on as it runs.
+
+What is handed on are the very rows of the check, each block compared with the digest that the check told of it, so
+nothing is computed while it runs. The check may still be ahead of the motion: a block that it has not passed does not
+exist here. Where no more rows come the guard ramps to zero by itself (``TableStarved``), with a second of reserve left.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import weakref
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fdhil.arming.program_check import HEADER, ROWS, SCHEMA, code_digest, header_digest, reference_blocks
+from fdhil.config import MachineConfig
+from fdhil.correction import gate
+from fdhil.errors import ProgramError, StoreError
+from fdhil.program import program_digest
+from fdhil.records import Reason
+
+RING_S = 10.0  # of rows that the guard is given ahead of where the machine is; it ramps down below 1 s
+FIRST_S = 10.0
+
+NO_ERROR: Mapping[str, float] = {"rms_um": 0.0, "max_um": 0.0}
+
+Rows = dict[str, list[int]]
+
+
+class Piece(NamedTuple):
+    """Rows from ``first`` on: demand and offset per axis, in increments; ``final``: no more follow."""
+
+    first: int
+    demand: Rows
+    offset: Rows
+    final: bool
+
+
+class Block(NamedTuple):
+    """Rows that passed, up to ``end``; ``last``: the program ends with them."""
+
+    end: int
+    sha256: str
+    last: bool
+
+
+class Checked:
+    """The rows of one program that passed the gate: all of them, or while the check goes on those so far.
+
+    ``header`` is what the check found of the whole, None before its end; ``refused`` why the rows end where they end.
+    The file stays open: what is armed is read from it whatever becomes of its name.
+    """
+
+    def __init__(self, rows_file: Path, axes: Sequence[str]) -> None:
+        """Open the rows; OSError when they are not there."""
+        self.axes = tuple(axes)
+        self.blocks: list[Block] = []
+        self.errors: Mapping[str, Mapping[str, float]] = {"before": NO_ERROR, "after": NO_ERROR}
+        self.header: Mapping[str, Any] | None = None
+        self.refused: tuple[Reason, ...] = ()
+        self._descriptor = os.open(rows_file, os.O_RDONLY | os.O_CLOEXEC)
+        weakref.finalize(self, os.close, self._descriptor)
+
+    @staticmethod
+    def find(folder: Path, key: str, beside: Path) -> Checked | None:
+        """Return what was checked under ``key``; None when nothing was, by other code, or not all its rows are there.
+
+        ``beside`` is the program's folder: the subroutines there must be those of the check.
+        """
+        try:
+            header = json.loads((folder / (key + HEADER)).read_bytes())
+            if header.pop("digest") != header_digest(header):
+                return None
+            found = Checked(folder / (key + ROWS), header["axes"])
+            good = header["schema"] == SCHEMA and header["code"] == code_digest() and not header["refused"]
+            good = good and all(program_digest(beside / name) == sha for name, sha in header["files"].items())
+            blocks = [Block(end, sha256, end == header["rows"]) for end, sha256 in header["blocks"]]
+            for k, block in enumerate(blocks if good else []):
+                found.blocks.append(block)
+                found.content(k)
+            os.utime(folder / (key + HEADER))  # what is used is not the oldest
+            found.conclude(header)
+        except (OSError, StoreError, ValueError, LookupError, TypeError, AttributeError, RecursionError, ProgramError):
+            return None
+        return found if good and blocks and blocks[-1].last else None
+
+    def take(self, block: Block, errors: Mapping[str, Mapping[str, float]]) -> None:
+        """Add a block that passed; ``errors`` is the contour error so far, without and with the correction."""
+        self.blocks.append(block)
+        self.errors = errors
+
+    def conclude(self, header: Mapping[str, Any]) -> None:
+        """Take what the check found of the whole."""
+        self.errors = {which: header[which] for which in ("before", "after")}
+        self.header = header
+
+    @property
+    def rows(self) -> int:
+        """How many rows have passed."""
+        return self.blocks[-1].end if self.blocks else 0
+
+    @property
+    def whole(self) -> bool:
+        """Whether all of the program passed."""
+        return self.header is not None and not self.refused
+
+    @property
+    def gain_um(self) -> float:
+        """By how much the contour error's RMS is predicted to shrink in these rows; 0 where the gate lets none pass."""
+        then, now = self.errors["before"]["rms_um"], self.errors["after"]["rms_um"]
+        return 0.0 if gate.gains(then, now) else then - now
+
+    @property
+    def largest_um(self) -> float:
+        """The largest offset; of a program that is not known to its end, any."""
+        return float(self.header["largest_um"]) if self.header is not None else math.inf
+
+    def content(self, k: int) -> bytes:
+        """Return the rows of a block; StoreError when they are not those that the check told of."""
+        block, first = self.blocks[k], self.blocks[k - 1].end if k else 0
+        size = 8 * len(self.axes)
+        try:
+            content = os.pread(self._descriptor, size * (block.end - first), size * first)
+        except OSError as error:
+            raise StoreError(f"the checked rows cannot be read ({error.strerror}); arm again", "StoreFault") from None
+        if hashlib.sha256(content).hexdigest() != block.sha256:
+            raise StoreError("the checked rows are damaged; check the disk, then arm again", "CorruptFile")
+        return content
+
+
+class Stream:
+    """The rows of one checked program in the guard's increments; ``end`` is one past the last row handed out."""
+
+    def __init__(self, checked: Checked, program_digest: str, sync_period_s: float) -> None:
+        """Begin at the first row; nothing is read yet."""
+        self.checked, self.program_digest = checked, program_digest
+        self.axes = checked.axes
+        self.end = 0
+        self.period_s = sync_period_s
+        self._next = 0
+
+    @property
+    def ready(self) -> bool:
+        """Whether a block waits; the last one waits for what is found of the whole."""
+        blocks = self.checked.blocks
+        return self._next < len(blocks) and (self.checked.whole or not blocks[self._next].last)
+
+    @property
+    def reach_s(self) -> float:
+        """Where the rows end that passed and may be handed out, seconds of the program."""
+        blocks, whole = self.checked.blocks, self.checked.whole
+        return max((block.end for block in blocks[-2:] if whole or not block.last), default=0) * self.period_s
+
+    @property
+    def done(self) -> bool:
+        """Whether no more rows come, all of the program being handed out."""
+        return self.checked.whole and self._next == len(self.checked.blocks)
+
+    def take(self, seconds: float = 0.0) -> Piece:
+        """Return the next block, and more where ``seconds`` ask for it; StoreError when its rows are not there."""
+        first, content = self.end, [self._block()]
+        while self.ready and (self.end - first) * self.period_s < seconds:
+            content.append(self._block())
+        size = len(self.axes)
+        rows = np.frombuffer(b"".join(content), "<i4").reshape(-1, 2 * size).T.tolist()
+        demand, offset = (dict(zip(self.axes, part, strict=True)) for part in (rows[:size], rows[size:]))
+        return Piece(first, demand, offset, self.done)
+
+    def _block(self) -> bytes:
+        content = self.checked.content(self._next)
+        self.end = self.checked.blocks[self._next].end
+        self._next += 1
+        return content
+
+    def lacks(self, status: Mapping[str, Any]) -> bool:
+        """Whether the guard, by its status, holds less than the ring ahead of the machine."""
+        return not self.done and self.left_s(status) < RING_S
+
+    def left_s(self, status: Mapping[str, Any]) -> float:
+        """Return the seconds that the guard, by its status, holds ahead of the machine."""
+        rows = status.get("rows")
+        return (int(rows[1]) - int(status.get("row") or 0)) * self.period_s if rows else math.inf
+
+    def status(self) -> dict[str, Any]:
+        """Return how far the check is, whether all passed, and what was refused."""
+        checked = self.checked
+        return {
+            "checked_s": round(checked.rows * self.period_s, 3),
+            "whole": checked.whole,
+            "refused": [str(reason) for reason in checked.refused],
+        }
+
+
+def longer_than_ring(program: Path, config: MachineConfig) -> bool:
+    """Whether a program is longer than what the guard is given at first; no more of it is read than that takes.
+
+    ProgramError, RecordingError or ConfigError when what was read cannot be used.
+    """
+    rows = 0
+    for block in reference_blocks(program, config):
+        rows += block.time_s.size
+        if rows * config.machine.sync_period_s > FIRST_S:
+            return True
+    return False

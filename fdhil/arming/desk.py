@@ -1,0 +1,335 @@
+"""The operator's side of the daemon: what it knows of the models, arming and disarming, and vouching while armed."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import hmac
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from fdhil import tables
+from fdhil.arming.background_check import Check
+from fdhil.arming.checked_program import Checked
+from fdhil.arming.guard_link import GONE, REST, GuardLink
+from fdhil.arming.passes import Passes
+from fdhil.arming.preparing import (
+    Armament,
+    AxisKnowledge,
+    Feeding,
+    Long,
+    Refused,
+    Skills,
+    StreamedArmament,
+    feeding_facts,
+    may_begin,
+    prepare,
+    prepare_feeding,
+    prepare_stream,
+    standing_facts,
+)
+from fdhil.arming.standing import ADOPT, RAMPING_DOWN, START_AND_ADOPT, Standing, verdict
+from fdhil.arming.stream_feeder import Supply
+from fdhil.arming.token import ensure_token
+from fdhil.config import MachineConfig
+from fdhil.daemon.control import Answer, refusal
+from fdhil.daemon.outcome_store import Keeper, boot_id
+from fdhil.errors import DeviceError
+from fdhil.records import AxisSamples, Notice, Outcome, ParameterSet, Skill, Temperature
+from fdhil.store.history import Revision
+
+STREAM_S = 0.05
+ALIVE_S = 0.1  # the guard calls us lost after 0.5 s
+REFRESH_S = 0.5
+LANDING_S = 1.0  # without a SYNC; while there is SYNC, what ended a moment ago comes to rest by itself
+
+Tell = Callable[[Sequence[Notice]], None]
+Prepared = TypeVar("Prepared", bound=Armament | StreamedArmament | Feeding)
+
+
+class Armory:
+    """Knows when a correction may be armed, and withdraws what it no longer vouches for."""
+
+    def __init__(self, config: MachineConfig, keeper: Keeper, run_directory: Path) -> None:
+        self._config = config
+        self._keeper = keeper
+        self._run_directory = run_directory
+        self._token = ""
+        self._published: dict[str, tuple[ParameterSet, float]] = {}
+        self._temperature: dict[str, float] = {}
+        self._load_changed: set[str] = set()
+        self._skills = Skills(list(config.axis))
+        self._arming = asyncio.Lock()
+        self._armed: tuple[Armament | StreamedArmament | Feeding, Mapping[str, Any]] | None = None
+        self._check = Check(config)
+        self._passes = Passes(config)
+        self._supply: Supply | None = None
+        self._given_up = False
+        self._disarming: asyncio.Future[Answer] | None = None
+        self.guard = GuardLink(config.guard.run_directory or run_directory)
+
+    def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
+        """Start from what the history knows; the token is made where there is none. DeviceError when it cannot be."""
+        self._token = ensure_token(self._run_directory)
+        boot, now_s = boot_id(), time.monotonic()
+        for axis, revision in newest.items():
+            stamp = revision.stamp
+            same_boot = bool(boot) and stamp.boot == boot
+            age_s = now_s - stamp.monotonic_ns * 1e-9 if same_boot else time.time() - stamp.wall_s
+            # an age below 0 (a wall clock that was set back) stays one: it is not believed
+            self._published[axis] = (revision.set, now_s - age_s)
+        for skill in skills:
+            self._skills.add(skill)
+
+    def note(self, outcomes: Sequence[Outcome]) -> None:
+        """Take what the pipelines say."""
+        for outcome in outcomes:
+            if isinstance(outcome, ParameterSet):
+                self._published[outcome.axis] = (outcome, time.monotonic())
+                self._load_changed.discard(outcome.axis)
+            elif isinstance(outcome, Skill):
+                self._skills.add(outcome)
+            elif isinstance(outcome, Notice) and outcome.code == "LoadChanged" and outcome.severity == "MAJOR":
+                self._load_changed.add(outcome.axis)
+
+    def note_temperature(self, reading: Temperature) -> None:
+        """Take a temperature."""
+        self._temperature[reading.axis] = reading.celsius
+
+    def hear(self, samples: AxisSamples) -> None:
+        """Take samples: those of a pass of the armed program are compared with what was predicted."""
+        self._passes.take(samples)
+
+    @property
+    def passes(self) -> list[Mapping[str, Any]]:
+        """What the last passes under a correction measured, oldest first."""
+        return list(self._passes.told)
+
+    @property
+    def temperatures(self) -> Mapping[str, float]:
+        """The newest temperature of each axis that has one."""
+        return self._temperature
+
+    @property
+    def armed(self) -> Mapping[str, Any] | None:
+        """What was armed last and still is, None otherwise; of a long program also how far its check is."""
+        if self._armed is None:
+            return None
+        prepared, summary = self._armed
+        return {**summary, "check": prepared.stream.status()} if isinstance(prepared, StreamedArmament) else summary
+
+    def _known(self) -> dict[str, AxisKnowledge]:
+        now_s = time.monotonic()
+        known = {}
+        for axis in self._config.axis:
+            published, since_s = self._published.get(axis, (None, now_s))
+            known[axis] = AxisKnowledge(
+                published,
+                now_s - since_s,
+                self._temperature.get(axis),
+                self._skills.of(axis),
+                axis in self._load_changed,
+            )
+        return known
+
+    async def arm(self, request: Mapping[str, Any]) -> Answer:
+        """Plan, load and arm one program; every no has its class, cause and next action."""
+        token, program, method = (request.get(key) for key in ("token", "program", "method"))
+        if not isinstance(token, str) or not hmac.compare_digest(token.encode(), self._token.encode()):
+            return refusal("AuthRequired", "the operator's token is missing or wrong", "use the run directory's token")
+        feeding = program is None and method == "flatness"
+        if not (feeding or isinstance(program, str)) or not (method is None or method in tables.CORRECTIONS):
+            return refusal("BadRequest", "program or method is no name", f"methods: {', '.join(tables.CORRECTIONS)}")
+        if self._arming.locked():
+            return refusal("NotOff", "another program is being armed", "wait for its answer")
+        async with self._arming:
+            self._given_up = False
+            if not await self._landed():
+                text = f"what was armed before is still on, in state {self.guard.state}"
+                return refusal("NotOff", text, "run fdhil disarm or wait until it has ended, then arm again")
+            if self.guard.state in ("FROZEN", "lost"):
+                return refusal(
+                    "OffsetStands", f"the guard is {self.guard.state}: {self.guard.standing}", self._way_out()
+                )
+            if feeding:
+                return await self._feed_forward(token)
+            return await self._arm(Path(str(program)), method, token, request.get("whole") is True)
+
+    async def _landed(self) -> bool:
+        """Wait a moment for the end of what ramps down; return whether the guard is at rest, or absent."""
+        tick, moved_s = None, time.monotonic()
+        await asyncio.to_thread(self.guard.look)
+        while self.guard.state not in REST and time.monotonic() - moved_s < LANDING_S:
+            if self.guard.state in RAMPING_DOWN and self.guard.status.get("tick") != tick:
+                tick, moved_s = self.guard.status.get("tick"), time.monotonic()
+            await asyncio.sleep(STREAM_S)
+            await asyncio.to_thread(self.guard.look)
+        if self.guard.state in REST:
+            self._release()
+        return self.guard.state in REST
+
+    def _way_out(self) -> str:
+        """Return what to do about what may still be applied before anything is armed."""
+        return f"{ADOPT if self.guard.connected else START_AND_ADOPT}, then arm again"
+
+    def _release(self) -> None:
+        if self._armed is not None and not isinstance(self._armed[0], Feeding):
+            cause = "GuardLost" if self.guard.state in GONE else (self.guard.status.get("cause") or {}).get("code", "")
+            self._passes.end(cause, self._armed[0].summary())
+        self._armed = self._supply = None
+
+    async def _feed_forward(self, token: str) -> Answer:
+        """Switch the on-line feed-forward on: it needs no program."""
+        prepared = await asyncio.to_thread(prepare_feeding, self._config, self._known())
+        if isinstance(prepared, Refused):
+            return _refused(prepared)
+        summary = prepared.summary()
+        answer = await self._hand_over(self.guard.feed_forward, prepared, summary, token)
+        if not answer["ok"]:
+            return answer
+        text = f"speed and torque of {', '.join(prepared.laws)} are fed forward on line, whatever program runs"
+        return {"ok": True, "state": "FEEDFORWARD", "text": text, **summary}
+
+    async def _hand_over(
+        self, ask: Callable[[Prepared, str], Answer], prepared: Prepared, summary: Answer, token: str
+    ) -> Answer:
+        """Ask the guard in a thread; what it grants is armed, what it refuses is answered with what was planned."""
+        if self._given_up:
+            return refusal("Abandoned", "the arming was abandoned while it was prepared", "arm again when it is wanted")
+        prepared.facts["journal_writable"] = self._keeper.fault is None
+        if not isinstance(prepared, Feeding):
+            self._passes.begin(prepared.first().demand, prepared.rows)
+        try:
+            answer = await asyncio.to_thread(ask, prepared, token)
+        except DeviceError as error:
+            self._passes.forget()
+            return self._without_guard(error)
+        if not answer["ok"]:
+            self._passes.forget()
+            return dict(answer) | {"planned": summary}
+        self._armed = (prepared, summary)
+        self._supply = Supply(prepared, self.guard) if isinstance(prepared, StreamedArmament) else None
+        return dict(answer)
+
+    async def _arm(self, program: Path, method: str | None, token: str, whole: bool) -> Answer:
+        found = await asyncio.to_thread(prepare, program, method, self._config, self._known())
+        prepared = await self._checked(found, whole) if isinstance(found, Long) else found
+        if isinstance(prepared, Refused):
+            return _refused(prepared)
+        summary = prepared.summary()
+        answer = await self._hand_over(self.guard.arm, prepared, summary, token)
+        if not answer["ok"]:
+            return answer
+        text = f"armed {program.name} by {summary['method']}: {summary['promise']}"
+        if not summary.get("check", {"whole": True})["whole"]:
+            text += f" in its first {summary['check']['checked_s']:.0f} s; the check of the rest goes on ahead of it"
+        text += "; start the program, its error is measured as it runs"
+        return {"ok": True, "state": answer.get("state", "ARMED"), "text": text, **summary}
+
+    async def _checked(self, long: Long, whole: bool) -> StreamedArmament | Refused:
+        """Have a long program checked as far as arming asks, or as a ``whole``; it is armed with its first rows."""
+
+        def enough(checked: Checked) -> bool:
+            return not whole and may_begin(checked, self._config, self._known())
+
+        checked = await self._check.run(long.program, long.program_digest, long.models, enough)
+        if isinstance(checked, tuple):
+            return Refused(checked)
+        return await asyncio.to_thread(prepare_stream, long, checked, self._config, self._known())
+
+    @property
+    def checking(self) -> Mapping[str, Any] | None:
+        """How far the check of a long program is; None while none runs."""
+        return self._check.progress
+
+    def abandon(self) -> bool:
+        """Arm nothing of what is being prepared; return whether its check was ended. That of what is armed goes on."""
+        self._given_up = True
+        return self._supply is None and self._check.abandon()
+
+    async def disarm(self) -> Answer:
+        """Have the guard ramp to zero: ok only when it is reached. What is being planned or checked is not armed."""
+        self._supply = None  # no more rows, no more words about them
+        abandoned = self.abandon()
+        if self._disarming is None:  # who asks again meanwhile waits for the same ramp
+            self._disarming = asyncio.ensure_future(self._to_zero())
+            self._disarming.add_done_callback(self._disarmed)
+        answer = await asyncio.shield(self._disarming)
+        return {**answer, "text": f"{answer['text']}; the check was abandoned"} if abandoned else answer
+
+    def _disarmed(self, _: asyncio.Future[Answer]) -> None:
+        self._disarming = None
+
+    async def _to_zero(self) -> Answer:
+        try:
+            answer = await asyncio.to_thread(self.guard.disarm)
+        except DeviceError as error:
+            return self._without_guard(error)
+        if not answer["ok"]:
+            return answer
+        return verdict(self.guard.status)
+
+    def _without_guard(self, error: DeviceError) -> Answer:
+        """Return the refusal without a guard; what the last one may have left is told."""
+        stands = self.guard.standing
+        if stands.nothing:
+            text, _, advice = str(error).rpartition("; ")
+            return refusal("GuardAbsent", text, advice)
+        return refusal("OffsetStands", f"{error}; {stands}", START_AND_ADOPT)
+
+    async def attend(self, tell: Tell) -> None:
+        """Tell the guard that this loop turns and what is still vouched for, and the log what the guard does.
+
+        The guard's answer is not waited for: while a program is handed over it takes its time.
+        """
+        looking: asyncio.Future[list[Notice]] | None = None
+        turn = 0
+        while True:
+            self.guard.say_alive(self._facts())
+            if looking is None and turn % round(REFRESH_S / ALIVE_S) == 0:
+                looking = asyncio.ensure_future(asyncio.to_thread(self.guard.refresh))
+            await asyncio.sleep(ALIVE_S)
+            turn += 1
+            if looking is not None and looking.done():
+                tell(looking.result())
+                looking = None
+                if self.guard.state in REST:
+                    self._release()
+
+    async def stream(self, tell: Tell) -> None:
+        """Hand a long program's rows to the guard as they pass and as it runs, and tell what is refused of them."""
+        while True:
+            await asyncio.sleep(STREAM_S)
+            if self._supply is not None:
+                tell(await asyncio.to_thread(self._supply.go_on))
+            tell(await asyncio.to_thread(self._passes.digest))
+            await self._check.attend()
+
+    def _facts(self) -> Mapping[str, bool] | None:
+        """What is still vouched for while a correction runs; None while none does."""
+        if self._armed is None:
+            return None
+        armed = self._armed[0]
+        if isinstance(armed, Feeding):
+            facts = feeding_facts(tuple(armed.laws), self._config, self._known())
+        else:
+            facts = standing_facts(armed.axes, self._config, self._known(), armed.gain_um)
+        return facts | {"journal_writable": self._keeper.fault is None}
+
+    async def stand_down(self) -> Standing:
+        """Have a running correction ramped to zero and wait for it; return what may still be applied."""
+        self._supply = None
+        self.abandon()
+        if self.guard.connected:
+            with contextlib.suppress(DeviceError):
+                await asyncio.to_thread(self.guard.disarm if self.guard.state not in REST else self.guard.look)
+        await self._check.close()
+        await asyncio.to_thread(self.guard.close)
+        return self.guard.standing
+
+
+def _refused(refused: Refused) -> Answer:
+    first, *_ = refused.reasons
+    return dict(refusal(first.code, first.text, first.advice)) | {"refused": list(map(str, refused.reasons))}

@@ -1,0 +1,212 @@
+"""The daemon's link to the guard process: found again when it was gone, told that the daemon lives, asked to arm."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from fdhil.arming.checked_program import Piece
+from fdhil.arming.guard_client import GuardClient
+from fdhil.arming.preparing import Armament, Feeding, StreamedArmament
+from fdhil.arming.standing import ABSENT, AT_REST, START_AND_ADOPT, Standing, landed, lost, standing
+from fdhil.errors import DeviceError
+from fdhil.records import Notice
+
+SETTLING_TRIES = 25
+SETTLING_S = 0.2
+CHARGED = {"ARMED", "RAMPING", "ACTIVE", "HOLD", "FEEDFORWARD"}
+ORDERED = {"Disarmed", "Finished", "Stopped"}
+TRIPPED = "GuardTripped"
+GONE = {"absent", "lost"}
+RECORD_VOID = "RecordVoid"
+VOIDING = {RECORD_VOID, "NodeRebooted"}
+REST = {*AT_REST, *GONE}
+
+
+class GuardLink:
+    """At most one connection, safe from several threads.
+
+    ``state`` is the guard's; without one ``absent`` when nothing can be applied, ``lost`` when something may.
+    """
+
+    def __init__(self, run_directory: Path) -> None:
+        self._run_directory = run_directory
+        self._lock = threading.Lock()
+        self._client: GuardClient | None = None
+        self._status: Mapping[str, Any] = ABSENT
+        self._heard_s: float | None = None
+        self._untold: list[Notice] = []
+
+    @property
+    def connected(self) -> bool:
+        """Whether there is a connection."""
+        return self._client is not None
+
+    @property
+    def status(self) -> Mapping[str, Any]:
+        """What the guard said last, and how long ago; None: it never did."""
+        age_s = None if self._heard_s is None else round(time.monotonic() - self._heard_s, 3)
+        return {**self._status, "heard_s_ago": age_s}
+
+    @property
+    def standing(self) -> Standing:
+        """What may still be applied, by what the guard said last."""
+        return standing(self._status)
+
+    @property
+    def state(self) -> str:
+        """The guard's state when it was asked last."""
+        return str(self._status["state"])
+
+    @property
+    def row(self) -> int:
+        """The row of the path where the machine is, 0 before it has begun."""
+        return int(self._status.get("row") or 0)
+
+    def look(self) -> None:
+        """Connect where needed and ask for the status (blocking); what changed is told by the next ``refresh``."""
+        with contextlib.suppress(DeviceError), self._asked():
+            pass
+
+    def refresh(self) -> list[Notice]:
+        """Look at the status (blocking); return what changed since the last call."""
+        self.look()
+        with self._lock:
+            told, self._untold = self._untold, []
+        return told
+
+    @contextlib.contextmanager
+    def _asked(self, arming: bool = False) -> Iterator[GuardClient]:
+        """Give the connection, and look at the status afterwards; what changed is told by the next ``refresh``.
+
+        A guard that does not answer is let go: what it may have armed it ramps down, and so it ends as it is told.
+        """
+        with self._lock:
+            before = self._status
+            try:
+                if self._client is None:
+                    self._client = GuardClient(self._run_directory)
+                yield self._client
+                self._note(before, self._client.status())
+            except DeviceError as error:
+                reached = self._client is not None
+                self._drop()
+                self._status = lost(before, arming and reached)
+                self._untold += _gone(before, self._status, error)
+                raise
+
+    def _note(self, before: Mapping[str, Any], status: Mapping[str, Any]) -> None:
+        self._untold += _changes(before, status)
+        self._status, self._heard_s = status, time.monotonic()
+
+    def _drop(self) -> None:
+        if self._client is not None:
+            self._client.close()
+        self._client = None
+
+    def say_alive(self, facts: Mapping[str, bool] | None) -> None:
+        """Tell the guard that the daemon is well (never blocks); a guard that is gone is found out by ``refresh``."""
+        client = self._client
+        if client is not None:
+            try:
+                client.alive(facts)
+            except DeviceError:
+                self._status = {**self._status, "text": "the connection is lost"}
+
+    def arm(self, armament: Armament | StreamedArmament, token: str) -> Mapping[str, Any]:
+        """Load the table and arm (blocking); return the guard's answer. DeviceError when there is no guard."""
+        with self._asked(arming=True) as client:
+            answer = self._load(client, armament, armament.first())
+            if not answer["ok"]:
+                return answer
+            return self._ask(client, lambda: client.arm(token, armament.program_digest, armament.facts))
+
+    @staticmethod
+    def _load(client: GuardClient, armament: Armament | StreamedArmament, piece: Piece) -> Mapping[str, Any]:
+        return client.load(armament.axes, piece.demand, piece.offset, armament.program_digest, piece.first, piece.final)
+
+    def extend(self, armament: StreamedArmament, piece: Piece) -> Mapping[str, Any]:
+        """Hand on more rows of a running stream (blocking); DeviceError when there is no guard."""
+        with self._asked() as client:
+            return self._load(client, armament, piece)
+
+    def feed_forward(self, feeding: Feeding, token: str) -> Mapping[str, Any]:
+        """Switch the on-line feed-forward on (blocking); return the guard's answer. DeviceError without a guard."""
+        with self._asked(arming=True) as client:
+            return self._ask(client, lambda: client.feed_forward(token, feeding.laws, feeding.facts))
+
+    @staticmethod
+    def _ask(client: GuardClient, arm: Callable[[], Mapping[str, Any]]) -> Mapping[str, Any]:
+        """Ask until the interlocks have been good for long enough, for a few seconds; any other no is final."""
+        for _ in range(SETTLING_TRIES):
+            client.alive(None)  # planning took its time: the guard must know us as alive when it is asked
+            answer = arm()
+            if answer["ok"] or [told["code"] for told in answer.get("refused", [])] != ["NotSettled"]:
+                break
+            time.sleep(SETTLING_S)
+        return answer
+
+    def disarm(self) -> Mapping[str, Any]:
+        """Ask for the ramp to zero and wait for its end (blocking); DeviceError when there is no guard."""
+        with self._asked() as client:
+            answer = client.disarm()
+            if answer["ok"]:
+                landed(client)
+            return answer
+
+    def close(self) -> None:
+        """End the connection, and know what was heard last; what still runs is ramped down by the guard."""
+        with self._lock:
+            self._drop()
+
+
+def _gone(before: Mapping[str, Any], now: Mapping[str, Any], error: DeviceError) -> list[Notice]:
+    """Say once that the guard is gone, and what it may have left."""
+    if before["state"] in GONE and now["state"] == before["state"]:
+        return []
+    stands = standing(now)
+    text = f"{error}; it was in state {before['state']}; {stands}"
+    if stands.nothing:
+        return [Notice("GuardLost", "minor", text)]
+    return [Notice("GuardLost", "MAJOR", f"{text}; {START_AND_ADOPT}")]
+
+
+def _severity(state: str, stands: Standing) -> Literal["info", "minor", "MAJOR"]:
+    """A guard that is off and has not read its drives yet is no alarm, what it knows or has left is one."""
+    if state not in AT_REST or stands.nothing:
+        return "info"
+    return "MAJOR" if state == "FROZEN" or stands.known else "minor"
+
+
+def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
+    """Say when the guard came, changed its state, or saw a record void; what something ended is a trip."""
+    return [*_voided(before, now), *_moved(before, now)]
+
+
+def _voided(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
+    """Say which records hold no longer."""
+    known = {told["axis"] for told in before.get("not_good", []) if told["code"] == RECORD_VOID}
+    void = [told for told in now.get("not_good", []) if told["code"] == RECORD_VOID and told["axis"] not in known]
+    return [Notice(RECORD_VOID, "MAJOR", f"{told['text']}; {told['advice']}", told["axis"]) for told in void]
+
+
+def _moved(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[Notice]:
+    cause = now.get("cause") or {}
+    why = f": {cause.get('code', '')}: {cause['text']}" if cause.get("text") else ""
+    stands = standing(now)
+    severity = _severity(now["state"], stands)
+    left = f"; {stands}" if now["state"] in AT_REST else ""
+    if before["state"] in GONE:
+        return [Notice("GuardFound", severity, f"the guard runs, in state {now['state']}{why}{left}")]
+    if before["state"] == now["state"]:
+        known = not left or standing(before).nothing == stands.nothing
+        return [] if known else [Notice("GuardState", severity, f"{now['state']}{left}")]
+    notice = Notice("GuardState", severity, f"{before['state']} -> {now['state']}{why}{left}", cause.get("axis", ""))
+    tripped = before["state"] in CHARGED and now["state"] not in CHARGED and cause.get("code") not in ORDERED
+    if not tripped:
+        return [notice]
+    return [notice, Notice(TRIPPED, "MAJOR", f"{cause.get('code')}: {cause.get('text')}", cause.get("axis", ""))]

@@ -1,0 +1,362 @@
+"""From a program to what the guard is asked to send: plan, gate, table, and the facts that the daemon vouches for.
+
+Pure but for reading the program and the commissioning records; what says no is a value (:class:`Refused`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdhil import correction
+from fdhil.arming.checked_program import FIRST_S, Checked, Piece, Stream, longer_than_ring
+from fdhil.commissioning.feedforward import feedforward_object
+from fdhil.commissioning.record import CommissioningRecord, axis_digest, load_record
+from fdhil.config import MachineConfig
+from fdhil.correction import gate, online
+from fdhil.drivers.cia402.profile import load_profile
+from fdhil.prediction.gain import Gain, gain, skill_of
+from fdhil.program import load_trajectory, program_digest
+from fdhil.records import Correction, CorrectionTable, Float, Parameters, ParameterSet, Reason, Skill
+
+MODEL_AGE_S = 8 * 3600.0  # a shift: older parameters are of another state of the machine
+MODEL_KELVIN = 3.0
+SKILL_MOVES = 3  # FAULTS E19: the last three recorded moves ...
+SKILL_SHARE = 0.5  # ... must be predicted within half of the gain that is promised
+AHEAD_S = 60.0  # of a program that must have passed before it is armed ahead of its check
+UNGUARDED_UM = 20.0  # the largest offset that may stay in a drive whose watchdog on us is not proven
+
+
+@dataclass(frozen=True, slots=True)
+class AxisKnowledge:
+    """What the daemon knows of an axis when it arms: newest published set with its age, last moves' skills."""
+
+    published: ParameterSet | None
+    age_s: float
+    temperature_c: float | None
+    skills: tuple[Skill, ...]
+    load_changed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Armament:
+    """A correction ready for the guard: its table, what is promised, and the facts (see the guard's interlocks)."""
+
+    program: str
+    correction: Correction
+    table: CorrectionTable
+    facts: dict[str, bool]
+    predicted: Gain
+
+    @property
+    def rows(self) -> int:
+        """How many rows the table has."""
+        return int(self.correction.before.contour_um.size)
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """The axes that are corrected."""
+        return self.table.axes
+
+    @property
+    def program_digest(self) -> str:
+        """Which program it is for."""
+        return self.table.program_digest
+
+    @property
+    def gain_um(self) -> float:
+        """What is promised."""
+        return promised_um(self.correction)
+
+    def first(self) -> Piece:
+        """Return the rows to arm with: all of them."""
+        demand, offset = self.table.demand_increments, self.table.offset_increments
+        return Piece(0, {a: demand[a].tolist() for a in self.axes}, {a: offset[a].tolist() for a in self.axes}, True)
+
+    def summary(self) -> dict[str, Any]:
+        """Return what the operator is told."""
+        before, after, predicted = self.correction.before, self.correction.after, self.predicted
+        return {
+            "program": self.program,
+            "program_digest": self.table.program_digest,
+            "method": self.correction.method,
+            "rows": self.rows,
+            "before": {"rms_um": predicted.before_um, "max_um": float(before.contour_um.max())},
+            "after": {
+                "rms_um": predicted.after_um,
+                "max_um": float(after.contour_um.max()),
+                "uncertainty_um": predicted.half_um,
+            },
+            "promise": _promise(predicted),
+            "warnings": [str(reason) for reason in self.correction.warnings],
+            "facts": dict(self.facts),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class StreamedArmament:
+    """A long program: its first rows, ready for the guard, and the stream of all that passed and will pass the gate.
+
+    ``begun_um`` is what the rows promised that were checked when it was armed, ``skill_um`` how well the last moves
+    were predicted.
+    """
+
+    program: str
+    stream: Stream
+    begin: Piece
+    facts: dict[str, bool]
+    begun_um: float
+    skill_um: float | None = None
+
+    @property
+    def rows(self) -> int | None:
+        """How many rows the program has; None until that is known."""
+        return self.stream.checked.rows if self.stream.checked.whole else None
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """The axes that are corrected."""
+        return self.stream.axes
+
+    @property
+    def program_digest(self) -> str:
+        """Which program it is for."""
+        return self.stream.program_digest
+
+    @property
+    def gain_um(self) -> float:
+        """What is promised: of the whole, once that is known."""
+        return self.stream.checked.gain_um if self.stream.checked.whole else self.begun_um
+
+    def first(self) -> Piece:
+        """Return the rows to arm with."""
+        return self.begin
+
+    def summary(self) -> dict[str, Any]:
+        """Return what the operator is told; errors and rows are those that were checked by now."""
+        checked = self.stream.checked
+        return {
+            "program": self.program,
+            "program_digest": self.program_digest,
+            "method": "inverse",
+            "rows": checked.rows,
+            "streamed": True,
+            "before": dict(checked.errors["before"]),
+            "after": {**checked.errors["after"], "uncertainty_um": self.skill_um},
+            "promise": _promise(
+                Gain(checked.errors["before"]["rms_um"], checked.errors["after"]["rms_um"], self.skill_um)
+            ),
+            "check": self.stream.status(),
+            "warnings": [],
+            "facts": dict(self.facts),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Long:
+    """A program longer than the guard's ring: it is to be checked in a process of its own, ahead of the motion."""
+
+    program: Path
+    program_digest: str
+    models: Mapping[str, Parameters]
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """Why nothing is armed, the weightiest reason first."""
+
+    reasons: tuple[Reason, ...]
+
+
+def _promise(predicted: Gain) -> str:
+    return f"contour error {predicted.before_um:.1f} um RMS is predicted to become {predicted}"
+
+
+def rms(values: Float) -> float:
+    """Return the root mean square of (n,)."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def prepare(
+    program: Path, method: str | None, config: MachineConfig, known: Mapping[str, AxisKnowledge]
+) -> Armament | Long | Refused:
+    """Plan the correction of a program with the newest validated parameters; a long one is only recognised.
+
+    ProgramError, RecordingError or ConfigError when the program cannot be used; StoreError for a damaged record.
+    """
+    models = {}
+    for axis in config.axis:
+        published = known[axis].published if axis in known else None
+        if published is None:
+            text = f"axis {axis} has no validated parameters yet"
+            return Refused((Reason("ModelNotValidated", text, "let the machine make a few rapids of this axis"),))
+        models[axis] = published.parameters
+    digest = program_digest(program)
+    if method in (None, "inverse") and longer_than_ring(program, config):
+        off = gate.writing_off(list(config.axis), config)
+        return Refused(off) if off else Long(program, digest, models)
+    reference = load_trajectory(program, config)
+    planned = correction.plan(reference, models, config, method)
+    if planned.refused:
+        return Refused(planned.refused)
+    if not any(np.any(offset) for offset in planned.offset_um.values()):
+        text = f"the method {planned.method} plans no position offset"
+        return Refused((Reason("HarmPredicted", text, "use inverse or mirror; flatness is armed without a program"),))
+    table = correction.table(planned, config, digest)
+    facts = standing_facts(reference.axes, config, known, promised_um(planned))
+    largest_um = max(float(np.abs(offset).max()) for offset in planned.offset_um.values())
+    facts |= _commissioned(tuple(planned.offset_um), largest_um, config)
+    covariances = {axis: found.published.covariance for axis, found in known.items() if found.published is not None}
+    predicted = gain(planned, models, config, covariances, {axis: found.skills for axis, found in known.items()})
+    return Armament(str(program), planned, table, facts, predicted)
+
+
+def may_begin(checked: Checked, config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> bool:
+    """Whether a program may be armed while its check goes on: far ahead, and nothing left to learn that forbids it.
+
+    What the rest could still change, the largest offset and the gain, must be good enough already as it is.
+    StoreError for a damaged commissioning record.
+    """
+    if checked.rows * config.machine.sync_period_s < AHEAD_S:
+        return False
+    axes = checked.axes
+    certain = standing_facts(axes, config, known, checked.gain_um) | _commissioned(axes, checked.largest_um, config)
+    return certain == standing_facts(axes, config, known, math.inf) | _commissioned(axes, 0.0, config)
+
+
+def prepare_stream(
+    long: Long, checked: Checked, config: MachineConfig, known: Mapping[str, AxisKnowledge]
+) -> StreamedArmament:
+    """Make a checked program ready with the rows that it is armed with. StoreError when its rows cannot be read."""
+    stream, gain_um = Stream(checked, long.program_digest, config.machine.sync_period_s), checked.gain_um
+    facts = standing_facts(stream.axes, config, known, gain_um)
+    facts |= _commissioned(stream.axes, checked.largest_um, config)
+    skill_um = skill_of({axis: found.skills for axis, found in known.items()}, stream.axes)
+    return StreamedArmament(str(long.program), stream, stream.take(FIRST_S), facts, gain_um, skill_um)
+
+
+@dataclass(frozen=True, slots=True)
+class Feeding:
+    """The on-line feed-forward ready for the guard: the law of each axis, and the facts."""
+
+    laws: Mapping[str, Mapping[str, Any]]
+    facts: dict[str, bool]
+
+    def summary(self) -> dict[str, Any]:
+        """Return what the operator is told."""
+        return {"program": None, "method": "flatness", "axes": list(self.laws), "facts": dict(self.facts)}
+
+
+def prepare_feeding(config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> Feeding | Refused:
+    """Find the on-line law of every axis from its newest validated parameters. StoreError for a damaged record."""
+    axes = [name for name, axis in config.axis.items() if axis.correction is not None]
+    laws = {}
+    for name in axes:
+        published = known[name].published
+        if config.axis[name].feedforward is None:
+            text = f"axis {name} has no section [axis.{name}.feedforward]: its speed and torque offsets are off"
+            return Refused(
+                (Reason("FeedforwardOff", text, "add the section with its limits, then run fdhil commission"),)
+            )
+        if published is None:
+            text = f"axis {name} has no validated parameters yet"
+            return Refused((Reason("ModelNotValidated", text, "let the machine make a few rapids of this axis"),))
+        laws[name] = online.law(published.parameters, config.axis[name], config.machine.sync_period_s)
+    records = {name: _record(config, name) for name in axes}
+    facts = feeding_facts(axes, config, known) | {
+        "commissioned": all(_valid(record, config, name) for name, record in records.items()),
+        "feedforward_commissioned": all(_feeds(record, config, name) for name, record in records.items()),
+        "model_validated": True,
+        "watchdog_proven": all(r is not None and r.watchdog == "proven" for r in records.values()),
+    }
+    return Feeding(laws, facts)
+
+
+def feeding_facts(axes: Sequence[str], config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> dict[str, bool]:
+    """Return the facts about the models that may be withdrawn while the feed-forward runs."""
+    return {"model_fresh": all(_fresh(known[axis], config) for axis in axes)}
+
+
+def _feeds(record: CommissioningRecord | None, config: MachineConfig, axis: str) -> bool:
+    """Whether the record shows that the drive's RPDO of speed and torque offset was made valid."""
+    profile = load_profile(config.axis[axis].drive.profile)
+    found = profile.find_rpdo(profile.speed_offset)
+    if record is None or found is None:
+        return False
+    return record.options.get(feedforward_object(found[0].number)) == found[0].cob_base + config.node_id(axis)
+
+
+def promised_um(planned: Correction) -> float:
+    """Return by how much the contour error's RMS is predicted to shrink."""
+    return rms(planned.before.contour_um) - rms(planned.after.contour_um)
+
+
+def standing_facts(
+    axes: Sequence[str], config: MachineConfig, known: Mapping[str, AxisKnowledge], gain_um: float
+) -> dict[str, bool]:
+    """Return the facts about the models, which also may be withdrawn while a correction runs."""
+    return {
+        "model_validated": all(known[axis].published is not None for axis in axes),
+        "model_fresh": all(_fresh(known[axis], config) for axis in axes),
+        "skill_enough": all(_skilled(known[axis].skills, gain_um) for axis in axes),
+        "gain_positive": gain_um > 0.0,
+    }
+
+
+def _fresh(axis: AxisKnowledge, config: MachineConfig) -> bool:
+    """A model is of this machine as it is now: same configuration, same load, not old, not of another temperature."""
+    published = axis.published
+    if published is None or published.config_digest != config.digest or axis.load_changed:
+        return False
+    if not 0.0 <= axis.age_s <= MODEL_AGE_S:
+        return False
+    if published.temperature_c is None or axis.temperature_c is None:
+        return True
+    return abs(axis.temperature_c - published.temperature_c) <= MODEL_KELVIN
+
+
+def _skilled(skills: Sequence[Skill], gain_um: float) -> bool:
+    """The last recorded moves were predicted within half of what is promised; without any, nothing is known."""
+    last = list(skills)[-SKILL_MOVES:]
+    return bool(last) and all(skill.rms_um <= SKILL_SHARE * gain_um for skill in last)
+
+
+def _commissioned(axes: Sequence[str], largest_um: float, config: MachineConfig) -> dict[str, bool]:
+    records = {axis: _record(config, axis) for axis in axes}
+    return {
+        "commissioned": all(_valid(record, config, axis) for axis, record in records.items()),
+        # the plans assume an offset that the feed-forward sees; another drive would be made worse
+        "offset_in_feedforward_known": all(r is not None and r.offset_in_feedforward is True for r in records.values()),
+        "watchdog_proven": largest_um <= UNGUARDED_UM
+        or all(r is not None and r.watchdog == "proven" for r in records.values()),
+    }
+
+
+def _record(config: MachineConfig, axis: str) -> CommissioningRecord | None:
+    """Read an axis' record; a daemon that may not read the key leaves the seal to the guard."""
+    return load_record(config.store.directory, axis, config.store.commissioning_key, may_lack_key=True)
+
+
+def _valid(record: CommissioningRecord | None, config: MachineConfig, axis: str) -> bool:
+    return record is not None and record.readback_ok and record.config_digest == axis_digest(config, axis)
+
+
+class Skills:
+    """The last skills of each axis."""
+
+    def __init__(self, axes: Sequence[str]) -> None:
+        self._last = {axis: deque[Skill](maxlen=SKILL_MOVES) for axis in axes}
+
+    def add(self, skill: Skill) -> None:
+        """Take the newest."""
+        self._last[skill.axis].append(skill)
+
+    def of(self, axis: str) -> tuple[Skill, ...]:
+        """Return the last of an axis, oldest first."""
+        return tuple(self._last[axis])

@@ -1,0 +1,327 @@
+"""A whole program through the planner, the correction and the gate, block by block, ahead of the motion.
+
+A process of its own (``python -m fdhil.arming.program_check``, one JSON request on stdin): it may take minutes for an
+hour's program, at low priority, without holding up what the daemon listens to, and can be ended at any moment. Each
+block that passed is on disk, as the guard will get it, before it is told with its digest; what remains in the end is
+the file of all rows, and a header that vouches for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numba
+import numpy as np
+import scipy
+
+import fdhil
+from fdhil.config import MachineConfig
+from fdhil.correction import gate
+from fdhil.correction.streaming import StreamBlock, stream
+from fdhil.errors import FdhilError, ProgramError, StoreError
+from fdhil.program import Budget, program_digest
+from fdhil.program.demand_csv import read_demand_csv
+from fdhil.program.interpreter import Interpreter
+from fdhil.program.planner import stream as planned
+from fdhil.records import Float, Parameters, Reason, Trajectory
+from fdhil.store.atomic import store_error, sync_folder, write_file
+
+SCHEMA = "fdhil-check-4"
+ROWS = ".rows"
+HEADER = ".json"
+KEPT = 4  # checked programs; an hour of two axes takes 58 MB
+PIECE_ROWS = 2000
+MOST_REFUSED = 20  # places that are listed
+TELL_S = 0.5
+NICENESS = 10
+# what the rows depend on: their code and the libraries that compute them
+ROOMS = ("program", "correction", "prediction", "model", "records", "config", "tables.py", "cia402.py", "csv_text.py")
+OWN = "arming/program_check.py"
+LIBRARIES = (np, scipy, numba)
+
+Tell = Callable[[Mapping[str, Any]], None]
+
+
+def code_digest() -> str:
+    """Return the digest of the code that makes the rows, as it is on disk now, and of its libraries' versions.
+
+    What another planner made under the same version is not reused.
+    """
+    home = Path(fdhil.__file__).parent
+    digest = hashlib.sha256(json.dumps([sys.version, *(library.__version__ for library in LIBRARIES)]).encode())
+    for room in (*ROOMS, OWN):
+        place = home / room
+        for file in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
+            digest.update(str(file.relative_to(home)).encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()
+
+
+def reference_blocks(program: Path, config: MachineConfig) -> Iterator[Trajectory]:
+    """Return what the NC will order, in blocks; ProgramError, RecordingError or ConfigError where it cannot be used."""
+    return _opened(program, config)[0]
+
+
+def _opened(program: Path, config: MachineConfig) -> tuple[Iterator[Trajectory], Callable[[], list[Path]]]:
+    """Return the blocks, and what tells which files were opened for them so far."""
+    if program.suffix.lower() == ".csv":
+        return iter([read_demand_csv(program, config)]), lambda: [program]
+    interpreter = Interpreter(program, Budget.of(config.nc), block_delete=False)
+    return planned(interpreter.run(), config, PIECE_ROWS), lambda: interpreter.files
+
+
+class _Files:
+    """What the files of a program held when they were first used: its subroutines may lie beside it."""
+
+    def __init__(self, program: Path, digest: str) -> None:
+        self._digests = {program: digest}
+
+    def take(self, files: Sequence[Path]) -> None:
+        """Note the files that are new."""
+        self._digests |= {file: program_digest(file) for file in files if file not in self._digests}
+
+    def unchanged(self) -> dict[str, str]:
+        """Return the digest of each subroutine's file by its name; ProgramError when one, or the program, changed."""
+        for file, digest in self._digests.items():
+            if program_digest(file) != digest:
+                raise ProgramError(0, "", f"{file} was changed while it was checked; arm it again")
+        return {file.name: digest for file, digest in list(self._digests.items())[1:]}
+
+
+class _Path:
+    """The path as it comes, kept until its blocks are planned; after them only the lines that a refusal may name."""
+
+    def __init__(self, source: Iterator[Trajectory]) -> None:
+        self._source = source
+        self._parts: deque[tuple[int, Trajectory]] = deque()
+        self._end = 0
+
+    def pieces(self) -> Iterator[Mapping[str, Float]]:
+        """Yield the positions of each part, mm per axis."""
+        for part in self._source:
+            self._parts.append((self._end, part))
+            self._end += part.time_s.size
+            yield part.position_mm
+
+    def positions(self, first: int, stop: int) -> dict[str, Float]:
+        """Return the rows from ``first`` to ``stop``, and forget what lies before them."""
+        while self._parts and self._parts[0][0] + self._parts[0][1].time_s.size <= first:
+            self._parts.popleft()
+        found: dict[str, list[Float]] = {axis: [] for axis in self._parts[0][1].axes}
+        for start, part in self._parts:
+            for axis, values in part.position_mm.items():
+                found[axis].append(np.asarray(values[max(0, first - start) : max(0, stop - start)]))
+        return {axis: np.concatenate(parts) for axis, parts in found.items()}
+
+    def line(self, row: int) -> int:
+        """Return the source line of a row that is still kept, 0 where there is none."""
+        for start, part in self._parts:
+            if start <= row < start + part.time_s.size:
+                return int(part.line[row - start])
+        return 0
+
+
+@dataclass(slots=True)
+class _Findings:
+    """What is known of the blocks so far."""
+
+    rows: int = 0
+    before_square: float = 0.0
+    after_square: float = 0.0
+    before_max: float = 0.0
+    after_max: float = 0.0
+    largest_um: float = 0.0
+    refused: list[Reason] = field(default_factory=list)
+    named: set[tuple[str, ...]] = field(default_factory=set)
+
+    def take(self, block: StreamBlock) -> None:
+        """Add a block's errors and offsets."""
+        self.rows += block.before_um.size
+        self.before_square += float(block.before_um @ block.before_um)
+        self.after_square += float(block.after_um @ block.after_um)
+        self.before_max = max(self.before_max, float(block.before_um.max()))
+        self.after_max = max(self.after_max, float(block.after_um.max()))
+        self.largest_um = max(self.largest_um, *(float(np.abs(o).max()) for o in block.offset_um.values()))
+
+    def refuse(self, block: StreamBlock, path: _Path, dt_s: float) -> list[Reason]:
+        """Add a block's refusals with their line and time, return the new ones; the same in a line is told once."""
+        known = len(self.refused)
+        for row, reason in sorted(zip(block.at, block.refused, strict=True), key=lambda told: told[0]):
+            line = path.line(row)
+            name = (reason.code, *reason.text.split()[:2], str(line or row))
+            if name not in self.named:
+                self.named.add(name)
+                place = f"line {line}, at {row * dt_s:.2f} s" if line else f"at {row * dt_s:.2f} s"
+                self.refused.append(Reason(reason.code, f"{place}: {reason.text}", reason.advice))
+        return self.refused[known:]
+
+    def errors(self) -> dict[str, dict[str, float]]:
+        """Return the contour error so far, without and with the correction."""
+        then, now = (math.sqrt(square / max(1, self.rows)) for square in (self.before_square, self.after_square))
+        return {
+            "before": {"rms_um": then, "max_um": self.before_max},
+            "after": {"rms_um": now, "max_um": self.after_max},
+        }
+
+    def header(self) -> dict[str, Any]:
+        """Return the figures of the whole; what it gains is asked last."""
+        errors = self.errors()
+        refused = self.refused or list(gate.gains(errors["before"]["rms_um"], errors["after"]["rms_um"]))
+        told = [_told(reason) for reason in refused[:MOST_REFUSED]]
+        return {"rows": self.rows, **errors, "largest_um": self.largest_um, "refused": told}
+
+
+def _told(reason: Reason) -> dict[str, str]:
+    return {"code": reason.code, "text": reason.text, "advice": reason.advice}
+
+
+def check(
+    program: Path, sha256: str, models: Mapping[str, Parameters], config: MachineConfig, body: BinaryIO, tell: Tell
+) -> dict[str, Any]:
+    """Run the whole program through correction and gate; write its rows to ``body``, return the header.
+
+    ``sha256`` is the program's digest, under which its rows will be known. A row is the demand of each axis, then the
+    offset of each, int32 in the guard's increments. ``tell`` hears of each block that passed ({"block": ...}, once its
+    rows are written), of each place that is refused ({"refused": ...}), and now and then how far it is
+    ({"progress": ...}). ProgramError, RecordingError or ConfigError when the program cannot be used.
+    """
+    source, opened = _opened(program, config)
+    path, findings, files = _Path(source), _Findings(), _Files(program, sha256)
+    code, blocks, pace = code_digest(), list[list[Any]](), _Pace(config.machine.sync_period_s)
+    for block in stream(path.pieces(), models, config, goes_on=True):
+        demand = path.positions(block.first_row, block.first_row + block.before_um.size)
+        files.take(opened())
+        findings.take(block)
+        for reason in findings.refuse(block, path, config.machine.sync_period_s):
+            tell({"refused": _told(reason)})
+        if len(findings.refused) >= MOST_REFUSED:
+            break
+        if not findings.refused:
+            rows = encoded(demand, block.offset_um, config)
+            body.write(rows)
+            body.flush()
+            blocks.append([findings.rows, hashlib.sha256(rows).hexdigest()])
+            tell({"block": blocks[-1], "last": block.final, "errors": findings.errors()})
+        pace.tell(tell, findings, path)
+    of = {"schema": SCHEMA, "axes": list(config.axis), "code": code, "blocks": blocks, "files": files.unchanged()}
+    return of | findings.header()
+
+
+class _Pace:
+    """How far the check is and how fast; told now and then."""
+
+    def __init__(self, dt_s: float) -> None:
+        self._dt_s, self._begun_s, self._told_s = dt_s, time.monotonic(), -math.inf
+
+    def tell(self, tell: Tell, findings: _Findings, path: _Path) -> None:
+        now_s = time.monotonic()
+        if now_s - self._told_s < TELL_S:
+            return
+        self._told_s, checked_s = now_s, findings.rows * self._dt_s
+        progress = {
+            "checked_s": round(checked_s, 3),
+            "line": path.line(findings.rows - 1),
+            "times_real_time": round(checked_s / max(1e-3, now_s - self._begun_s), 1),
+            "refused": len(findings.refused),
+        }
+        tell({"progress": progress})
+
+
+def encoded(demand_mm: Mapping[str, Float], offset_um: Mapping[str, Float], config: MachineConfig) -> bytes:
+    """Return rows of demand and offset in increments, in the drives' own sign."""
+    columns = []
+    for values, per_mm in ((demand_mm, 1.0), (offset_um, 1e-3)):
+        for axis, settings in config.axis.items():
+            scale = settings.scaling.sign * settings.scaling.increments_per_mm * per_mm
+            columns.append(np.rint(values[axis] * scale))
+    return np.column_stack(columns).astype("<i4").tobytes()
+
+
+def header_digest(header: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a header's meaning."""
+    return hashlib.sha256(json.dumps(header, sort_keys=True).encode()).hexdigest()
+
+
+def part_file(folder: Path, key: str) -> Path:
+    """Return where rows are while they are written."""
+    return folder / f".{key}.part"
+
+
+def keep(folder: Path, key: str, request: Callable[[BinaryIO], dict[str, Any]]) -> dict[str, Any]:
+    """Have the rows written, then make them and their header durable under ``key``; the oldest programs go.
+
+    StoreError when that fails. A refused program leaves nothing.
+    """
+    part = part_file(folder, key)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for left in folder.glob(".*.part"):  # by a check that was ended
+            if left != part:
+                left.unlink()
+        with part.open("wb") as body:
+            header = request(body)
+            body.flush()
+            os.fsync(body.fileno())
+        if header["refused"]:
+            return header
+        part.rename(folder / (key + ROWS))
+        write_file(folder / (key + HEADER), json.dumps(header | {"digest": header_digest(header)}).encode())
+        newest = sorted(folder.glob("*" + HEADER), key=lambda file: file.stat().st_mtime, reverse=True)
+        for file in newest[KEPT:]:
+            file.unlink()
+            file.with_suffix(ROWS).unlink(missing_ok=True)
+        sync_folder(folder)
+    except OSError as error:
+        raise store_error(part, error) from None
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+    return header
+
+
+def _end_with_the_daemon() -> None:
+    # the daemon's end of the pipe is closed when it is gone; unbuffered: a lock that is held here would spoil the exit
+    while os.read(0, 1):
+        pass
+    os._exit(1)
+
+
+def main() -> None:
+    """Answer the one request; each line that is written is a JSON object, the last one is the answer."""
+    with contextlib.suppress(OSError):  # a sandbox may forbid even this; then the check competes
+        os.nice(NICENESS)
+    request = json.loads(sys.stdin.buffer.readline())
+    threading.Thread(target=_end_with_the_daemon, daemon=True).start()
+
+    def say(answer: Mapping[str, Any]) -> None:
+        sys.stdout.write(json.dumps(answer) + "\n")
+        sys.stdout.flush()
+
+    config = MachineConfig.model_validate(request["config"])
+    models = {axis: Parameters(**values) for axis, values in request["models"].items()}
+
+    def run(body: BinaryIO) -> dict[str, Any]:
+        return check(Path(request["program"]), request["program_digest"], models, config, body, say)
+
+    try:
+        header = keep(Path(request["folder"]), request["key"], run)
+        say({"header": {name: value for name, value in header.items() if name != "blocks"}})  # they were told
+    except StoreError as error:
+        say({"error": {"code": error.code, "text": str(error), "advice": "free the disk, then arm again"}})
+    except FdhilError as error:
+        say({"error": {"code": type(error).__name__, "text": str(error), "advice": "mend the program, then arm again"}})
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,130 @@
+"""What may still be applied in the drives, by what the guard said last: one rule, and its sentence for the operator."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from fdhil.arming.guard_client import GuardClient
+
+AT_REST = frozenset({"OFF", "FROZEN"})
+ABSENT: Mapping[str, Any] = {"state": "absent", "text": "no guard runs: nothing can be armed, nothing is sent"}
+RAMPING_DOWN = frozenset({"RAMP_DOWN", "ADOPT"})
+LANDING_S = 3.0  # without a SYNC; the ramp and the zeros after it are counted in SYNC by the guard
+LOOK_S = 0.02
+ADOPT = "hold the feed, then run fdhil adopt"
+START_AND_ADOPT = "hold the feed, start fdhil-guard, then run fdhil adopt"
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """``offset_um`` of each axis in its own direction (None: unknown), ``fed``: axes with speed or torque offsets.
+
+    ``heard`` is False when there never was a guard, so that nothing was sent.
+    """
+
+    offset_um: Mapping[str, float | None]
+    fed: tuple[str, ...] = ()
+    heard: bool = True
+
+    @property
+    def nothing(self) -> bool:
+        """Whether it is known that no offset is applied; what is unknown is not nothing."""
+        return not self.heard or (bool(self.offset_um) and not self.fed and not any(map(_stands, self._values())))
+
+    @property
+    def known(self) -> bool:
+        """Whether it is known that something is applied."""
+        return bool(self.fed) or any(self._values())
+
+    def _values(self) -> list[float | None]:
+        return list(self.offset_um.values())
+
+    def __str__(self) -> str:
+        if not self.heard:
+            return "no guard was heard, nothing was sent"
+        if self.nothing:
+            return "offset 0"
+        parts = [f"{um:+.3g} um on axis {axis}" for axis, um in self.offset_um.items() if um]
+        unknown = [axis for axis, um in self.offset_um.items() if um is None]
+        if unknown:
+            parts.append(f"an unknown offset on axis {', '.join(unknown)}")
+        if self.fed:
+            parts.append(f"speed and torque offsets on axis {', '.join(self.fed)}")
+        return (" and ".join(parts) or "an unknown offset") + " may still be applied"
+
+
+def _stands(offset_um: float | None) -> bool:
+    return offset_um is None or offset_um != 0.0
+
+
+def standing(status: Mapping[str, Any]) -> Standing:
+    """Return what may stand by a status document of the guard; what it does not say is unknown.
+
+    A zero of a guard that is not at rest is unknown too: the next SYNC may change it.
+    """
+    told = status.get("may_stand_um")
+    if status["state"] == "absent" and told is None:
+        return Standing({}, heard=False)
+    moving = status["state"] not in (*AT_REST, "absent")
+    known = {str(axis): _number(value) for axis, value in told.items()} if isinstance(told, Mapping) else {}
+    offset_um = {axis: None if moving and um == 0.0 else um for axis, um in known.items()}
+    return Standing(offset_um, _fed(status.get("feedforward")))
+
+
+def _number(value: Any) -> float | None:
+    numeric = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return float(value) if numeric else None
+
+
+def _fed(told: Any) -> tuple[str, ...]:
+    """Return the axes whose speed or torque offset is on, or was never read back as zero."""
+    if not isinstance(told, Mapping):
+        return ()
+    applied = told.get("applied") or {}
+    unconfirmed = (told.get("cause") or {}).get("code") == "EchoMismatch"
+    on = told.get("state", "OFF") != "OFF" or unconfirmed
+    return tuple(axis for axis, pair in applied.items() if on or any(pair))
+
+
+def lost(before: Mapping[str, Any], arming: bool) -> Mapping[str, Any]:
+    """Return what is known of a guard that is gone: what it told last, or nothing of what may have moved since.
+
+    ``arming``: it went while it was asked to arm, so that it may have armed.
+    """
+    if before["state"] in ("absent", "lost") and not arming:
+        return before
+    last = {**before, "state": "lost" if arming or before["state"] not in AT_REST else before["state"]}
+    stands = standing(last)
+    kept = {"may_stand_um": stands.offset_um, "feedforward": before.get("feedforward"), "last_state": before["state"]}
+    if stands.nothing:
+        text = "the guard is gone; it had nothing applied when it was heard last"
+        return {"state": "absent", "text": text, **kept}
+    return {"state": "lost", "text": f"the guard is gone; {stands}; {START_AND_ADOPT}", **kept}
+
+
+def landed(client: GuardClient) -> Mapping[str, Any]:
+    """Wait until the guard is at rest, as long as SYNC moves it on, and return its status (blocking). DeviceError."""
+    status, tick, moved_s = client.status(), None, time.monotonic()
+    while status["state"] not in AT_REST and time.monotonic() - moved_s < LANDING_S:
+        if status.get("tick") != tick:
+            tick, moved_s = status.get("tick"), time.monotonic()
+        time.sleep(LOOK_S)
+        status = client.status()
+    return status
+
+
+def verdict(status: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the answer to who asked for zero: ok only when the guard is off and knows that nothing is applied."""
+    stands, state = standing(status), status["state"]
+    told = {"state": state, "may_stand_um": dict(stands.offset_um)}
+    if state == "OFF" and stands.nothing:
+        return {"ok": True, "text": f"guard: OFF, {stands}", **told}
+    cause = (status.get("cause") or {}).get("text")
+    text = f"the guard is {state}" + (f" ({cause})" if cause else "") + f": {stands}"
+    advice = ADOPT if state in AT_REST else f"look at fdhil status; where it does not end, {ADOPT}"
+    return {"ok": False, "code": "OffsetStands", "text": text, "advice": advice, **told}

@@ -1,0 +1,80 @@
+"""What an armed long program still gets: its checked rows as it runs, and word of what the check found of the rest."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+from fdhil.arming.guard_link import REST, GuardLink
+from fdhil.arming.preparing import StreamedArmament
+from fdhil.errors import DeviceError, StoreError
+from fdhil.records import Notice
+
+RESERVE_S = 1.0  # with which left the guard ramps to zero
+SCARCE_S = 5.0  # half the ring: a check that lets it fall so far is told before the guard ends the correction
+
+
+class Supply:
+    """Feeds the guard with one program's rows; ``go_on`` blocks and is called every few cycles of the daemon."""
+
+    def __init__(self, armed: StreamedArmament, guard: GuardLink) -> None:
+        self._armed, self._guard = armed, guard
+        self._name = Path(armed.program).name
+        self._told = 0
+        self._scarce = self._broken = False
+
+    def go_on(self) -> list[Notice]:
+        """Hand on what the guard lacks, as far as it passed; return what is to be told."""
+        notices, stream = self._guard.refresh(), self._armed.stream
+        if self._guard.state in REST:
+            return notices
+        notices += self._found()
+        if self._broken:
+            return notices
+        if not stream.lacks(self._guard.status):
+            self._scarce = False
+            return notices
+        return notices + (self._extend() if stream.ready else self._missing())
+
+    def _found(self) -> list[Notice]:
+        """Tell what the check refuses; a program that has not begun is disarmed, one that runs goes on to there."""
+        refused, told = self._armed.stream.checked.refused, self._told
+        self._told = len(refused)
+        notices = [Notice(reason.code, "minor", f"{reason.text}; {reason.advice}") for reason in refused[told:]]
+        if told or not refused:
+            return notices
+        if self._guard.state == "ARMED":
+            self._broken = True
+            with contextlib.suppress(DeviceError):  # a guard that is gone holds nothing
+                self._guard.disarm()
+            then = "it had not begun and is disarmed"
+        else:
+            then = f"it is corrected for another {self.left_s():.1f} s, then ramped to zero before that place"
+        text = f"{notices[0].text}; {self._name} was armed ahead of its check: {then}"
+        return [Notice(notices[0].code, "MAJOR", text), *notices[1:]]
+
+    def _extend(self) -> list[Notice]:
+        try:
+            answer = self._guard.extend(self._armed, self._armed.stream.take())
+        except StoreError as error:
+            return self._ended(error.code, str(error))
+        except DeviceError as error:
+            return self._ended("GuardLost", str(error))
+        return [] if answer["ok"] else self._ended("StreamRefused", str(answer["text"]))
+
+    def _ended(self, code: str, text: str) -> list[Notice]:
+        self._broken = True
+        return [Notice(code, "MAJOR", f"{text}; the correction ends before these rows")]
+
+    def _missing(self) -> list[Notice]:
+        """Tell when rows become scarce because the check is not there yet; where it catches up they go on."""
+        if self._scarce or self._armed.stream.checked.refused or self.left_s() > SCARCE_S:
+            return []
+        self._scarce = True
+        text = f"the check of {self._name} is only {self.left_s() + RESERVE_S:.1f} s ahead of the motion"
+        advice = "ease the host or arm with --whole; where it does not catch up, the correction is ramped to zero"
+        return [Notice("CheckBehind", "MAJOR", f"{text}; {advice}")]
+
+    def left_s(self) -> float:
+        """Return for how long the machine is corrected yet by what has passed, seconds of the program."""
+        return max(0.0, self._armed.stream.reach_s - self._guard.row * self._armed.stream.period_s - RESERVE_S)

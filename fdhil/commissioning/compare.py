@@ -1,0 +1,115 @@
+"""Is the drive still the one that was signed off? Read again by SDO, with no NC on the bus, and compared.
+
+The answer is one finding per axis; it is ok only where the fingerprint is the record's and nothing differs from the
+configuration either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from fdhil.commissioning.master import Master
+from fdhil.commissioning.record import CommissioningRecord, fingerprint, load_record
+from fdhil.commissioning.scan import Ear
+from fdhil.commissioning.survey import Finding, Survey, survey
+from fdhil.commissioning.void import confirm_record, void_record
+from fdhil.config import MachineConfig
+from fdhil.errors import DeviceError, StoreError
+
+POINT = "commissioning record"
+LISTEN_S = 1.0
+TURN_S = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """One axis: the finding, and the fingerprint that was found; empty where anything differs or nothing answered."""
+
+    axis: str
+    finding: Finding
+    fingerprint: str = ""
+
+
+def found_fingerprint(found: Survey) -> str:
+    """Return the fingerprint of a drive as it was just read."""
+    identity = found.identity
+    who = (identity.vendor_id, identity.product_code, identity.revision, identity.serial)
+    return fingerprint(who, found.fingerprint, found.options)
+
+
+def compare_record(record: CommissioningRecord, found: Survey) -> Finding:
+    """Compare a drive as it was just read with its record."""
+    wrong = next((each for each in found.findings if each.ok is False), None)
+    cause = f"{wrong.cause}; {wrong.advice}" if wrong else ""
+    seen = found_fingerprint(found)
+    if not cause and seen != record.fingerprint:
+        cause = f"it is not as it was commissioned: {_difference(record, found)}"
+    advice = f"put it right with the drive's own tool, or run fdhil commission --axis {record.axis}"
+    return Finding(POINT, record.fingerprint, seen, not cause, cause, advice)
+
+
+def _difference(record: CommissioningRecord, found: Survey) -> str:
+    """Name the first thing that differs."""
+    if record.serial != found.identity.serial:
+        return f"its serial number is {found.identity.serial}, not {record.serial}"
+    if record.mapping_fingerprint != found.fingerprint:
+        return "its PDOs are set up otherwise"
+    for key in sorted({*record.options, *found.options}):
+        was, now = record.options.get(key), found.options.get(key)
+        if was != now and not key.startswith("14"):
+            return f"0x{key} is {'missing' if now is None else now}, and was {'missing' if was is None else was}"
+    return "vendor, product or revision are others"
+
+
+def compare_drive(config: MachineConfig, record: CommissioningRecord) -> Compared:
+    """Read the drive by SDO and compare it; one that does not answer differs."""
+    try:
+        with Master(config, record.axis) as master:
+            found = survey(master)
+    except DeviceError as error:
+        cause, _, advice = str(error).partition("; ")
+        finding = Finding(POINT, record.fingerprint, "no answer", False, cause, advice or "check its supply")
+        return Compared(record.axis, finding)
+    finding = compare_record(record, found)
+    return Compared(record.axis, finding, found_fingerprint(found) if finding.ok else "")
+
+
+def compare_again(config: MachineConfig, bus: str, say: Callable[[str], None]) -> None:
+    """Before a guard starts: with no NC on the bus compare every commissioned drive; what differs voids its record.
+
+    Beside an NC nothing is sent, and the records hold as long as nothing against them was seen. ``say`` gets one
+    sentence per record that is void now. ConnectError when the bus cannot be opened; StoreError.
+    """
+    records = _records(config, bus)
+    if not records or _an_nc_runs(config, bus):
+        return
+    for record in records:
+        compared = compare_drive(config, record)
+        if compared.finding.ok:
+            confirm_record(config.store.directory, record.axis)
+            continue
+        cause, advice = compared.finding.cause, compared.finding.advice
+        void_record(config.store.directory, record.axis, cause)
+        say(f"RecordVoid: axis {record.axis}: {cause}; nothing can be armed or adopted there; {advice}")
+
+
+def _records(config: MachineConfig, bus: str) -> list[CommissioningRecord]:
+    records = []
+    for name, axis in config.axis.items():
+        if axis.correction is not None and axis.drive.bus == bus:
+            try:
+                record = load_record(config.store.directory, name, config.store.commissioning_key)
+            except StoreError:
+                continue  # one that cannot be read is none, and is told when something is armed
+            records += [record] if record is not None else []
+    return records
+
+
+def _an_nc_runs(config: MachineConfig, bus: str) -> bool:
+    with Ear(bus, config) as ear:
+        for _ in range(round(LISTEN_S / TURN_S)):
+            ear.listen(TURN_S)
+            if ear.traffic.master is not None:
+                return True
+    return False

@@ -1,0 +1,231 @@
+"""Does the machine on the bus match its configuration: drives, mapping, scales, cycle, rapid signal and sensors.
+
+Where an NC runs the bus nothing is sent: what its own traffic shows is compared, the rest is told as not compared.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable, Iterator
+
+from fdhil.cia402 import PdoEntry
+from fdhil.commissioning.compare import POINT, compare_record
+from fdhil.commissioning.master import Master
+from fdhil.commissioning.record import load_record
+from fdhil.commissioning.scan import LISTEN_S, Ear, Traffic
+from fdhil.commissioning.survey import Finding, Survey, read_optional, survey
+from fdhil.config import MachineConfig
+from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec, load_profile
+from fdhil.drivers.modbus.link import ModbusLink, float32
+from fdhil.drivers.modbus.voltage import ALL_REGISTERS, parse_block
+from fdhil.errors import DeviceError, StoreError
+
+RATE_TOLERANCE = 0.1
+PERIOD_TOLERANCE = 0.02
+SDO_POINTS = ("identity", "cycle", "scale", "rated current", "communication lost", "stop by a ramp", "following error")
+NC_OFF = "switch the NC off and check again"
+
+Place = tuple[str, Finding]
+"""Where a finding belongs (``bus can0``, ``axis X``) and the finding."""
+
+
+def check_machine(config: MachineConfig, say: Callable[[str], None] = lambda _text: None) -> list[Place]:
+    """Compare everything; what cannot be reached is a finding. ConnectError only for a bus that cannot be opened."""
+    found: list[Place] = []
+    for bus in dict.fromkeys(axis.drive.bus for axis in config.axis.values()):
+        say(f"listening on bus {bus}")
+        with Ear(bus, config) as ear:
+            ear.listen(LISTEN_S)
+            traffic = ear.traffic
+        found += [(f"bus {bus}", finding) for finding in compare_bus(traffic, config)]
+        for axis in (name for name, settings in config.axis.items() if settings.drive.bus == bus):
+            say(f"comparing axis {axis}")
+            compared = compare_asked(config, axis) if traffic.master is None else compare_heard(traffic, config, axis)
+            found += [(f"axis {axis}", finding) for finding in compared]
+            found += [(f"axis {axis}", finding) for finding in asyncio.run(compare_sensors(config, axis))]
+    return found
+
+
+def compare_bus(traffic: Traffic, config: MachineConfig) -> Iterator[Finding]:
+    """Who runs the bus, and at which period."""
+    wanted = config.machine.sync_period_s
+    expected, period_s = f"{wanted * 1e3:g} ms", traffic.sync_period_s
+    if traffic.master is None:
+        yield Finding("NC", "off or on", "off: the drives are asked")
+        return
+    yield Finding("NC", "off or on", f"on ({traffic.master} heard): nothing is sent")
+    if period_s is None:
+        yield Finding("SYNC", expected, "none heard", None, "the NC sends no SYNC yet", "let it enable the drives")
+    elif config.guard.clock == "sync":
+        yield Finding("SYNC", "counted, not timed", f"{period_s * 1e3:.3f} ms")
+    else:
+        same = abs(period_s - wanted) <= PERIOD_TOLERANCE * wanted
+        found = f"{period_s * 1e3:.3f} ms"
+        cause = f"SYNC comes every {found} where the config has {expected}"
+        yield Finding("SYNC", expected, found, same, cause, "correct machine.sync_period_s or the NC's cycle")
+
+
+def compare_asked(config: MachineConfig, axis: str) -> list[Finding]:
+    """What the drive answers by SDO, with no NC on the bus."""
+    node = f"node-ID {config.node_id(axis)}"
+    with Master(config, axis) as master:
+        try:
+            found = survey(master)
+            seen = f"{node}, serial number {found.identity.serial}"
+            return [
+                Finding("drive", node, seen),
+                *found.findings,
+                _heartbeat(found.options.get("1017")),
+                *_rapid(config, master.profile, lambda: read_optional(master, *master.profile.digital_inputs)),
+                *_voltage_object(config, axis, master.profile, master),
+                *_record(config, axis, found),
+            ]
+        except DeviceError as error:
+            return [_unreachable("drive", node, error)]
+
+
+def _record(config: MachineConfig, axis: str, found: Survey) -> Iterator[Finding]:
+    """Whether the drive is the one that was signed off; nothing where none was."""
+    try:
+        record = load_record(config.store.directory, axis, config.store.commissioning_key, may_lack_key=True)
+    except StoreError as error:
+        cause, _, advice = str(error).partition("; ")
+        yield Finding(POINT, "as signed off", "cannot be read", False, cause, advice)
+        return
+    if record is not None:
+        yield compare_record(record, found)
+
+
+def _unreachable(point: str, expected: str, error: DeviceError) -> Finding:
+    cause, _, advice = str(error).removeprefix(f"{error.device}: ").partition("; ")
+    return Finding(point, expected, "no answer", False, cause, advice or "check its supply and its wiring")
+
+
+def _heartbeat(period_ms: int | None) -> Finding:
+    cause = "it sends no heartbeat (0x1017), and only its PDOs show that it lives"
+    shown = f"{period_ms} ms" if period_ms else "none"
+    return Finding("heartbeat", "any", shown, bool(period_ms), cause, "set 0x1017 to 100 with the drive's tool")
+
+
+def _rapid(config: MachineConfig, profile: DriveProfile, read: Callable[[], int | None]) -> Iterator[Finding]:
+    """The NC's signal of a rapid move, where the config counts on it."""
+    if config.g0.source != "digital_input":
+        yield Finding("rapid signal", "inferred", "inferred from the demand's speed")
+        return
+    bit = config.g0.input_bit
+    expected = f"bit {bit} of 0x60FD in a TPDO"
+    mapped = profile.find_tpdo(profile.digital_inputs)
+    advice = "map 0x60FD, or set g0.source = 'inferred'"
+    if mapped is None or mapped[1].bits <= bit:
+        cause = f"profile {profile.name} maps no bit {bit} of 0x60FD"
+        yield Finding("rapid signal", expected, "not mapped", False, cause, advice)
+        return
+    value = read()
+    if value is None:
+        yield Finding("rapid signal", expected, "no 0x60FD", False, "it has no digital inputs (0x60FD)", advice)
+        return
+    yield Finding("rapid signal", expected, f"{'on' if value >> bit & 1 else 'off'} now")
+
+
+def _voltage_object(config: MachineConfig, axis: str, profile: DriveProfile, master: Master) -> Iterator[Finding]:
+    if config.axis[axis].voltage.source != "drive":
+        return
+    if profile.voltage is None:
+        cause = f"profile {profile.name} has no object of the terminal voltage"
+        yield Finding("voltage", "from the drive", "none", False, cause, "set voltage.source = 'modbus'")
+        return
+    raw = read_optional(master, *profile.voltage, signed=True)
+    index, sub = profile.voltage
+    cause = f"it has no terminal voltage (0x{index:04X}:{sub:02X})"
+    shown = "none" if raw is None else f"{raw * profile.voltage_v_per_count:.2f} V"
+    yield Finding("voltage", "from the drive", shown, raw is not None, cause, "choose another profile or sensor")
+
+
+def compare_heard(traffic: Traffic, config: MachineConfig, axis: str) -> Iterator[Finding]:
+    """What the traffic of a running NC shows of one drive; nothing is sent."""
+    profile, node_id = load_profile(config.axis[axis].drive.profile), config.node_id(axis)
+    nmt = traffic.nmt(node_id)
+    cause = f"nothing was heard of node-ID {node_id}"
+    shown = f"{cause}" if node_id not in traffic.nodes else f"node-ID {node_id}, {nmt or 'no heartbeat'}"
+    advice = "check the drive's supply and drive.node_id"
+    yield Finding("drive", f"node-ID {node_id}", shown, node_id in traffic.nodes, cause, advice)
+    period_s = traffic.heartbeat_s(node_id)
+    yield _heartbeat(None if period_s is None else round(period_s * 1e3))
+    for spec in profile.tpdos:
+        yield _heard_pdo(traffic, spec, node_id)
+    target = profile.find_rpdo(profile.target)
+    if target is not None:
+        yield _heard_pdo(traffic, target[0], node_id)
+    yield from _rapid(config, profile, lambda: _heard_value(traffic, profile, node_id))
+    for point in SDO_POINTS:
+        yield Finding(point, "the config's", "not asked", None, "SDO belongs to the NC now", NC_OFF)
+
+
+def _heard_pdo(traffic: Traffic, spec: PdoSpec, node_id: int) -> Finding:
+    """Whether a PDO comes as often, and is as long, as the profile says; without SYNC none is due."""
+    cob_id, syncs = spec.cob_base + node_id, len(traffic.sync_ns)
+    count, length = traffic.count.get(cob_id, 0), traffic.length.get(cob_id, 0)
+    due = syncs / spec.every_sync if spec.valid else 0.0
+    expected = f"{cob_id:03X}: {spec.length} bytes, {f'every {spec.every_sync} SYNC' if spec.valid else 'never'}"
+    advice = "compare its mapping with the profile, or choose another profile"
+    if syncs == 0:
+        return Finding(spec.name, expected, "no SYNC", None, "the NC sends no SYNC yet", "let it enable the drives")
+    shown = f"{count} in {syncs} SYNC" + (f", {length} bytes" if count else "")
+    if count and length != spec.length:
+        cause = f"{spec.name} ({cob_id:03X}) has {length} bytes where the profile has {spec.length}"
+    else:
+        cause = f"{spec.name} ({cob_id:03X}) came {count} times in {syncs} SYNC where {due:.0f} are due"
+    ok = length in (0, spec.length) and abs(count - due) <= max(2.0, RATE_TOLERANCE * due)
+    return Finding(spec.name, expected, shown, ok, cause, advice)
+
+
+def _heard_value(traffic: Traffic, profile: DriveProfile, node_id: int) -> int | None:
+    mapped = profile.find_tpdo(profile.digital_inputs)
+    if mapped is None:
+        return None
+    spec, entry = mapped
+    data = traffic.data.get(spec.cob_base + node_id)
+    return None if data is None else _bits(data, entry)
+
+
+def _bits(data: int, entry: PdoEntry) -> int:
+    return data >> entry.bit_offset & (1 << entry.bits) - 1
+
+
+async def compare_sensors(config: MachineConfig, axis: str) -> list[Finding]:
+    """Reach and read the Modbus sensors of one axis; only reading, so that a running daemon misses nothing."""
+    settings, found = config.axis[axis], []
+    if settings.voltage.source == "modbus":
+        where = settings.voltage
+        link = ModbusLink(f"voltage sensor {axis}", where.host, where.port, where.unit, where.timeout_s)
+        found.append(await _sensor("voltage", f"Modbus {where.host}:{where.port}", link, _voltage))
+    if settings.temperature is not None:
+        place = settings.temperature
+        link = ModbusLink(f"thermometer {axis}", place.host, place.port, place.unit, place.timeout_s)
+
+        async def celsius(link: ModbusLink) -> str:
+            value = float32(await link.read_input(place.address, 2))
+            if not math.isfinite(value) or not -50.0 < value < 150.0:
+                text = f"register {place.address} gives {value:g} degC; compare the register map with the config"
+                raise DeviceError(link.name, text)
+            return f"{value:.2f} degC"
+
+        found.append(await _sensor("temperature", f"Modbus {place.host}:{place.port}", link, celsius))
+    return found
+
+
+async def _voltage(link: ModbusLink) -> str:
+    registers = await link.read_input(0, ALL_REGISTERS)
+    block = parse_block(link.name, registers)
+    return f"{float32(registers):.2f} V at {block.rate_hz:g} Hz"
+
+
+async def _sensor(point: str, expected: str, link: ModbusLink, read: Callable[[ModbusLink], Awaitable[str]]) -> Finding:
+    try:
+        await link.connect()
+        return Finding(point, expected, await read(link))
+    except DeviceError as error:
+        return _unreachable(point, expected, error)
+    finally:
+        link.close()

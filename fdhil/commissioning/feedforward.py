@@ -1,0 +1,108 @@
+"""Commissioning of the on-line feed-forward: its RPDO is exchanged only by a drive that takes it as it is meant.
+
+Every refusal is a DriveFault that begins with ``FeedforwardOff``, the class under which arming would be refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from fdhil.cia402 import Object
+from fdhil.commissioning.master import Master
+from fdhil.commissioning.survey import read_pdos
+from fdhil.drivers.cia402.profile import PdoSpec
+from fdhil.errors import DeviceError, DriveFault, ProtocolError, SdoAbort
+
+INVALID_COB_ID = 0x80000000
+PROBE = (0x0102, 3)  # increments/s and 0.1 %: too little to feel, and bytes that tell an entry at another place
+ARRIVED_CYCLES = 20
+
+
+def feedforward_object(number: int) -> str:
+    """Return the key under which a commissioning record keeps the RPDO's COB-ID: its parameter's index."""
+    return f"{Object.RPDO_PARAMETER + number - 1:04X}"
+
+
+@contextmanager
+def feedforward_open(master: Master) -> Iterator[dict[str, int]]:
+    """Set both offsets to 0 and make their RPDO valid, the axis disabled; back as it was when what follows fails.
+
+    Gives what goes into the record, the COB-ID that was read back; {} without [axis.X.feedforward]. DriveFault when
+    the drive maps them otherwise, or refuses.
+    """
+    if master.config.axis[master.axis].feedforward is None:
+        yield {}
+        return
+    spec = _spec(master)
+    parameter = Object.RPDO_PARAMETER + spec.number - 1
+    try:
+        before = master.sdo.read_int(parameter, 1)
+        cob_id = _make_valid(master, spec, before)
+    except SdoAbort as abort:
+        raise _refused(master, f"it refuses the RPDO of 60B1 and 60B2 ({abort})") from None
+    try:
+        yield {feedforward_object(spec.number): cob_id}
+    except BaseException as error:  # Ctrl-C, too: what is not signed off is not left exchanged
+        try:
+            master.sdo.write_int(parameter, 1, before, 4)
+            _write_zeros(master, spec)
+        except DeviceError as left:
+            cause = str(error).removeprefix(f"{master.device}: ") or "it was interrupted"
+            text = f"{cause}; 60B1, 60B2 or their RPDO stay as they are ({left}); power the drive off and on again"
+            raise ProtocolError(master.device, text) from error
+        raise
+
+
+def _spec(master: Master) -> PdoSpec:
+    """The profile's RPDO; the drive must map the same, before anything is written."""
+    found = master.profile.find_rpdo(master.profile.speed_offset)
+    if found is None or found[0].entry(master.profile.torque_offset) is None:
+        raise _refused(master, "its profile has no RPDO with 60B1 and 60B2")
+    spec = found[0]
+    mapped = next(pdo.mapped for one, pdo in read_pdos(master) if one is spec)
+    if mapped != tuple(entry.mapping for entry in spec.entries):
+        shown = ", ".join(f"{value:08X}" for value in mapped) or "nothing"
+        raise _refused(master, f"its {spec.name} maps {shown} where 60B1 and 60B2 belong")
+    return spec
+
+
+def _make_valid(master: Master, spec: PdoSpec, before: int) -> int:
+    _write_zeros(master, spec)
+    parameter, wanted = Object.RPDO_PARAMETER + spec.number - 1, before & ~INVALID_COB_ID
+    master.sdo.write_int(parameter, 1, wanted, 4)
+    cob_id = master.sdo.read_int(parameter, 1)
+    if cob_id != wanted:
+        raise _refused(master, f"the RPDO of 60B1 and 60B2 stays at {cob_id:08X}")
+    return cob_id
+
+
+def _write_zeros(master: Master, spec: PdoSpec) -> None:
+    for entry in spec.entries:
+        master.sdo.write_int(entry.index, entry.sub, 0, entry.bits // 8)
+
+
+def _refused(master: Master, cause: str) -> DriveFault:
+    advice = f"set the RPDO up with the drive's own tool, or leave [axis.{master.axis}.feedforward] out"
+    return DriveFault(master.device, f"FeedforwardOff: {cause}; {advice}")
+
+
+def prove_feedforward(master: Master) -> None:
+    """Send both offsets while the axis is disabled, and read by SDO that they arrived; then the same with zeros.
+
+    What they do is not tried: the drive's regulators are off. DriveFault when another value arrives.
+    """
+    if master.config.axis[master.axis].feedforward is None:
+        return
+    keys = (master.profile.speed_offset, master.profile.torque_offset)
+    try:
+        for pair in (PROBE, (0, 0)):
+            master.fed = pair
+            master.wait_cycles(ARRIVED_CYCLES)
+            speed, torque = (master.sdo.read_int(*key, signed=True) for key in keys)
+            if (speed, torque) != pair:
+                raise _refused(master, f"it was sent {pair} as speed and torque offset and holds ({speed}, {torque})")
+    finally:
+        master.fed = (0, 0)
+        master.wait_cycles(ARRIVED_CYCLES)
+        master.fed = None

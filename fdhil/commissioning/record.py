@@ -1,0 +1,213 @@
+"""The signed-off record of a commissioned drive, as JSON in the store; one that was changed is refused.
+
+It is sealed with a key that only its owner can read (mode 0600): who cannot read the key cannot make a record. See
+docs/decisions/0009-records-are-sealed.md for how far that goes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+import os
+import secrets
+import stat
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from fdhil.commissioning.void import confirm_record
+from fdhil.config import MachineConfig
+from fdhil.errors import StoreError
+
+SCHEMA = "fdhil-commissioning-2"
+UNSEALED = "fdhil-commissioning-1"
+MAX_RECORD_BYTES = 64 * 1024
+KEY_NAME = "commissioning.key"
+KEY_BYTES = 32
+SOFTWARE_LIMIT_KEYS = ("607D01", "607D02")
+
+
+@dataclass(frozen=True, slots=True)
+class CommissioningRecord:
+    """What was found and proven on one drive.
+
+    ``config_digest`` is :func:`axis_digest`. ``options`` holds 0x6007, 0x605A, 0x605E, 0x6065, 0x6085 and 0x1017 by
+    their hexadecimal index, as far as the drive has them, its software limits, and the COB-ID of the feed-forward's
+    RPDO where it was made valid. ``offset_in_feedforward`` None: could not be told.
+    ``watchdog`` is ``proven`` when the drive stopped after our heartbeat did.
+    """
+
+    axis: str
+    vendor_id: int
+    product_code: int
+    revision: int
+    serial: int
+    config_digest: str
+    mapping_fingerprint: str
+    options: Mapping[str, int]
+    following_error_window_um: float
+    offset_in_feedforward: bool | None
+    sign_test_um: float
+    readback_ok: bool
+    watchdog: str
+    created_utc: str
+
+    @property
+    def travel(self) -> tuple[int, int] | None:
+        """The drive's software limits in its own increments; None where it has none."""
+        low, high = (self.options.get(key) for key in SOFTWARE_LIMIT_KEYS)
+        return None if low is None or high is None else (low, high)
+
+    @property
+    def fingerprint(self) -> str:
+        """The drive as it was signed off, in 16 hexadecimal digits: what a comparison must find again."""
+        who = (self.vendor_id, self.product_code, self.revision, self.serial)
+        return fingerprint(who, self.mapping_fingerprint, self.options)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over all that the record says."""
+        return hashlib.sha256(self._text()).hexdigest()
+
+    def seal(self, key: bytes) -> str:
+        """HMAC-SHA-256 over all that the record says."""
+        return hmac.new(key, self._text(), hashlib.sha256).hexdigest()
+
+    def _text(self) -> bytes:
+        return json.dumps({"schema": SCHEMA, **asdict(self)}, sort_keys=True).encode()
+
+
+def fingerprint(identity: Sequence[int], mapping_fingerprint: str, options: Mapping[str, int]) -> str:
+    """SHA-256, 16 hexadecimal digits, of a drive's identity, PDOs and options; an RPDO's COB-ID is in the PDOs."""
+    own = {key: value for key, value in options.items() if not key.startswith("14")}
+    text = json.dumps([list(identity), mapping_fingerprint, own], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def holds(record: CommissioningRecord | None, config: MachineConfig, axis: str) -> bool:
+    """Whether there is a record and it was made with this configuration."""
+    return record is not None and record.readback_ok and record.config_digest == axis_digest(config, axis)
+
+
+def axis_digest(config: MachineConfig, axis: str) -> str:
+    """SHA-256, 16 hexadecimal digits, of all in the configuration that a commissioning depends on.
+
+    Where sensors are reached and what the motor's data sheet says may change without commissioning again.
+    """
+    settings = config.axis[axis].model_dump(mode="json", exclude={"voltage", "nominal", "regulators"})
+    if settings["feedforward"] is None:
+        del settings["feedforward"]
+    guard = config.guard.model_dump(mode="json", include={"node_id", "heartbeat_s"})
+    text = json.dumps([settings, guard, config.machine.sync_period_s, config.node_id(axis)], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def record_path(directory: Path, axis: str) -> Path:
+    """Return where an axis' record is kept."""
+    return directory / f"commissioning-{axis}.json"
+
+
+def save_record(record: CommissioningRecord, directory: Path, key: Path | None = None) -> Path:
+    """Seal and write the record (a temporary file, then renamed) and return its path; StoreError.
+
+    ``key`` is the file of the sealing key, left out: ``commissioning.key`` in the directory; it is made where there is
+    none.
+    """
+    path = record_path(directory, record.axis)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        seal = record.seal(_made_key(key or directory / KEY_NAME))
+        document = {"schema": SCHEMA, **asdict(record), "digest": record.digest, "seal": seal}
+        temporary = path.with_suffix(".tmp")
+        with temporary.open("w", encoding="utf-8") as file:
+            json.dump(document, file, indent=2)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        raise StoreError(f"{path} cannot be written ({error.strerror}); check the directory and free space") from None
+    confirm_record(directory, record.axis)
+    return path
+
+
+def load_record(
+    directory: Path, axis: str, key: Path | None = None, *, may_lack_key: bool = False
+) -> CommissioningRecord | None:
+    """Read an axis' record, None when there is none; StoreError when it is damaged, foreign, changed or not sealed.
+
+    ``may_lack_key``: a caller that is not allowed to read the key takes the record by its digest alone; what decides
+    about the machine must be able to read it.
+    """
+    path = record_path(directory, axis)
+    try:
+        with path.open("rb") as file:
+            raw = file.read(MAX_RECORD_BYTES + 1)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise StoreError(f"{path} cannot be read ({error.strerror}); commission the axis again") from None
+    try:
+        document = json.loads(raw[:MAX_RECORD_BYTES])
+        record = None if document.get("schema") == UNSEALED else _record(document)
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+        raise StoreError(f"{path} is no commissioning record; commission the axis again") from None
+    if record is None:
+        raise StoreError(f"{path} was written before records were sealed with a key; commission the axis again")
+    if document.get("schema") != SCHEMA or record.axis != axis or document.get("digest") != record.digest:
+        raise StoreError(f"{path} was changed after it was signed off; commission the axis again")
+    secret = _key(key or directory / KEY_NAME, may_lack_key)
+    if secret is not None and not _equal(str(document.get("seal")), record.seal(secret)):
+        raise StoreError(f"{path} is not sealed with this machine's key; commission the axis again")
+    return record
+
+
+def _equal(given: str, right: str) -> bool:
+    return hmac.compare_digest(given.encode("utf-8", "replace"), right.encode())
+
+
+def _made_key(path: Path) -> bytes:
+    """Return the sealing key; make one where there is none."""
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    except FileExistsError:
+        return _key(path, may_lack=False) or b""
+    try:
+        os.write(descriptor, secrets.token_hex(KEY_BYTES).encode())
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+    return _key(path, may_lack=False) or b""
+
+
+def _key(path: Path, may_lack: bool) -> bytes | None:
+    """Return the sealing key, None where it ``may_lack`` and may not be read; StoreError when it keeps no secret."""
+    advice = "delete it and commission every axis again"
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except PermissionError:
+        if may_lack:
+            return None
+        raise StoreError(f"{path}, the key of the records, may not be read by this user; run as its owner") from None
+    except OSError as error:
+        text = f"{path}, the key of the records, cannot be read ({error.strerror}); commission every axis again"
+        raise StoreError(text) from None
+    try:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode) or stat.S_IMODE(status.st_mode) & 0o077:
+            raise StoreError(f"{path}, the key of the records, can be read by others; {advice}")
+        raw = os.read(descriptor, 2 * KEY_BYTES + 2).strip()
+    except OSError as error:
+        raise StoreError(f"{path}, the key of the records, cannot be read ({error.strerror}); {advice}") from None
+    finally:
+        os.close(descriptor)
+    if len(raw) != 2 * KEY_BYTES:
+        raise StoreError(f"{path}, the key of the records, is damaged; {advice}")
+    return raw
+
+
+def _record(document: Any) -> CommissioningRecord:
+    values = {f.name: document[f.name] for f in fields(CommissioningRecord)}
+    values["options"] = {str(key): int(value) for key, value in values["options"].items()}
+    return CommissioningRecord(**values)

@@ -1,0 +1,324 @@
+"""Commissioning of one axis with no NC on the bus: read, compare, move by 10 um, prove the watchdog, sign off.
+
+``commission`` runs all steps; each step is a function of its own. Whatever fails, the offset goes back to 0, the drive
+is disabled and what was written is restored. See CiA 402-2 for the objects, CiA 301 7.2.8 for the heartbeat consumer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from datetime import UTC, datetime
+
+from fdhil import cia402
+from fdhil.cia402 import Mode, NmtCommand, Object, State
+from fdhil.commissioning import survey as checks
+from fdhil.commissioning.feedforward import feedforward_open, prove_feedforward
+from fdhil.commissioning.master import Master
+from fdhil.commissioning.record import (
+    CommissioningRecord,
+    axis_digest,
+    load_record,
+    record_path,
+    save_record,
+)
+from fdhil.commissioning.watchdog import watchdog_test
+from fdhil.config import CorrectionLimits, MachineConfig
+from fdhil.errors import DeviceError, DriveFault, ProtocolError
+
+__all__ = [
+    "CommissioningRecord",
+    "axis_digest",
+    "check_axis",
+    "commission",
+    "load_record",
+    "record_path",
+    "save_record",
+]
+
+SIGN_TEST_UM = 10.0
+ENABLE_TIMEOUT_S = 5.0
+SETTLE_CYCLES = 400
+AVERAGE_CYCLES = 200
+RAMPS = 8
+RAMP_CYCLES = 20
+EARLY_CYCLES = 8
+FEEDFORWARD_TRIES = 3
+
+
+def prepare(master: Master) -> None:
+    """Select CSP, start SYNC and the node, and take the actual position as target; the drive is not enabled yet."""
+    overflow = checks.read_optional(master, Object.SYNC_COUNTER_OVERFLOW) or 0
+    master.sdo.write_int(Object.MODE, 0, Mode.CYCLIC_SYNC_POSITION, 1)
+    master.produce_sync(overflow)
+    master.nmt(NmtCommand.START)
+    master.wait(
+        lambda: master.profile.position in master.heard.objects and master.profile.statusword in master.heard.objects,
+        2.0,
+        "it sends no PDOs after NMT start; check that its TPDOs are synchronous and valid",
+    )
+    master.hold_here()
+    master.wait_cycles(20)
+
+
+def enable(master: Master) -> None:
+    """Bring the drive to Operation enabled, holding its position; DriveFault when it does not get there."""
+    deadline = master.now() + ENABLE_TIMEOUT_S
+    reset_tried = False
+    while master.state() is not State.OPERATION_ENABLED:
+        if master.now() > deadline:
+            raise DriveFault(
+                master.device,
+                f"it stays in {master.state().value!r}; check supply, enable input and safe torque off",
+            )
+        if master.state() is State.FAULT:
+            if reset_tried:
+                raise checks.faulted(master, "it is in fault")
+            master.controlword, reset_tried = 0, True
+            master.wait_cycles(10)
+        word = cia402.controlword_toward_enabled(master.state())
+        if word is not None:
+            master.hold_here()
+            master.controlword = word
+        master.wait_cycles(10)
+    mode = (0x6061, 0)
+    if mode in master.heard.objects:
+        master.wait(
+            lambda: master.heard.objects[mode] == Mode.CYCLIC_SYNC_POSITION,
+            0.5,
+            "it does not take the mode cyclic synchronous position; check 0x6060 and 0x6502",
+        )
+    master.wait_cycles(SETTLE_CYCLES)
+    checks.require_enabled(master)
+
+
+def disable(master: Master) -> None:
+    """Take the power stage off, step by step, and leave the node pre-operational without SYNC."""
+    if not master.producing:
+        return
+    for word in (cia402.CONTROL_SWITCH_ON, cia402.CONTROL_SHUTDOWN, cia402.CONTROL_DISABLE_VOLTAGE):
+        master.controlword = word
+        master.wait_cycles(20)
+    if master.state() is State.FAULT:
+        master.controlword = cia402.CONTROL_FAULT_RESET
+        master.wait_cycles(20)
+        master.controlword = cia402.CONTROL_DISABLE_VOLTAGE
+        master.wait_cycles(20)
+    master.target = None
+    master.nmt(NmtCommand.ENTER_PRE_OPERATIONAL)
+    master.stop_sync()
+
+
+def zero_offset(master: Master) -> None:
+    """Ramp the offset to 0 and make sure that the drive holds 0."""
+    if master.target is None:
+        return
+    ramp(master, 0)
+    master.wait_cycles(20)
+    left = master.sdo.read_int(*master.profile.offset, signed=True)
+    if left != 0:
+        raise DriveFault(master.device, f"it still holds an offset of {left} increments; power it off and on again")
+
+
+def ramp(master: Master, goal: int, step: int | None = None) -> int:
+    """Move the offset to ``goal`` increments by ``step`` per cycle; returns the cycle of the first value."""
+    step = step or max(1, round(_limits(master).max_speed_mm_s * _per_mm(master) * master.period_s / 4))
+    start = master.offset
+    count = math.ceil(abs(goal - start) / step)
+    sign = 1 if goal > start else -1
+    first = master.play_offset([*(start + sign * step * k for k in range(1, count)), *([goal] if count else [])])
+    patience = 5.0 + 20 * count * master.period_s
+    master.wait(lambda: not master.playing, patience, "the offset was not sent; check the bus")
+    return first
+
+
+def _limits(master: Master) -> CorrectionLimits:
+    return master.config.axis[master.axis].correction or CorrectionLimits()
+
+
+def _per_mm(master: Master) -> float:
+    return master.config.axis[master.axis].scaling.increments_per_mm
+
+
+def sign_test(master: Master) -> float:
+    """Offset the axis by +10 um: read-back, demand and table must follow, in sign and size; returns the table's um.
+
+    The direction is the machine's: ``drive.sign`` is applied to what is sent and to what is read.
+    """
+    settings = master.config.axis[master.axis]
+    profile = master.profile
+    step = settings.scaling.to_increments(min(SIGN_TEST_UM, _limits(master).max_offset_um) / 1e3)
+    demand = master.average(profile.position_demand, AVERAGE_CYCLES)
+    table = master.average(profile.position, AVERAGE_CYCLES)
+    ramp(master, step, 1)
+    master.wait_cycles(SETTLE_CYCLES)
+    checks.require_enabled(master)
+    held = master.sdo.read_int(*profile.offset, signed=True)
+    if held != step:
+        raise DriveFault(
+            master.device, f"an offset of {step} increments was sent and 0x60B0 holds {held}; check the RPDO's mapping"
+        )
+    demanded = master.average(profile.position_demand, AVERAGE_CYCLES) - demand
+    moved = master.average(profile.position, AVERAGE_CYCLES) - table
+    if abs(demanded - step) > 1.5:
+        raise DriveFault(
+            master.device,
+            f"an offset of {step} increments moved its demand (0x6062) by {demanded:.0f}; "
+            "it does not add 0x60B0 to the target and cannot be corrected",
+        )
+    if not 0.5 <= moved / step <= 1.5:
+        raise DriveFault(
+            master.device,
+            f"an offset of {step} increments moved its position (0x6064) by {moved:.0f}; "
+            "check the direction of the encoder and lost motion",
+        )
+    ramp(master, 0, 1)
+    master.wait_cycles(SETTLE_CYCLES)
+    return settings.scaling.to_mm(moved) * 1e3
+
+
+def feedforward_test(master: Master) -> bool | None:
+    """Whether the offset's slope reaches the speed feed-forward; None when it cannot be told.
+
+    The offset is ramped at standstill and the speed demand (0x606B) read while the ramp is young. A demand without
+    feed-forward grows as v (1 - exp(-Kv t)) at most, with it the share Kff of v is there at once.
+    """
+    settings = master.config.axis[master.axis]
+    share, gain = settings.regulators.speed_feedforward, settings.regulators.position_gain_per_s
+    if share == 0.0:
+        return True  # there is no feed-forward that could miss it
+    step = _ramp_step(master.config, master.axis)
+    if step < 1 or checks.read_optional(master, Object.VELOCITY_DEMAND, signed=True) is None:
+        return None
+    excess: list[float] = []
+    for number in range(RAMPS):
+        goal = step * RAMP_CYCLES if number % 2 == 0 else 0
+        excess += _early_excess(master, goal, step, gain)
+        master.wait_cycles(SETTLE_CYCLES // 2)
+    ramp(master, 0, 1)
+    checks.require_enabled(master)
+    if len(excess) < RAMPS:
+        return None
+    mean = sum(excess) / len(excess)
+    return True if mean > 0.5 * share else False if mean < 0.25 * share else None
+
+
+def _ramp_step(config: MachineConfig, axis: str) -> int:
+    """Increments per cycle of the feed-forward test's ramp: up to 2 mm/s and 40 um, inside the limits."""
+    settings = config.axis[axis]
+    per_mm, limits = settings.scaling.increments_per_mm, settings.correction or CorrectionLimits()
+    fastest = int(min(2.0, limits.max_speed_mm_s) * per_mm * config.machine.sync_period_s)
+    return min(fastest, int(0.8 * min(50.0, limits.max_offset_um) / 1e3 * per_mm / RAMP_CYCLES))
+
+
+def largest_move_um(config: MachineConfig, axis: str) -> float:
+    """How far a commissioning moves the axis at most."""
+    settings = config.axis[axis]
+    ramped = _ramp_step(config, axis) * RAMP_CYCLES / settings.scaling.increments_per_mm * 1e3
+    return max(SIGN_TEST_UM, ramped)
+
+
+def tell_feedforward(master: Master) -> bool | None:
+    """Ask again while a busy computer saw too little of the ramp's begin; None when it never saw enough."""
+    for _ in range(FEEDFORWARD_TRIES):
+        answer = feedforward_test(master)
+        if answer is not None:
+            return answer
+    return None
+
+
+def _early_excess(master: Master, goal: int, step: int, gain_per_s: float) -> list[float]:
+    """Speed demand over ramp speed, less what the position loop alone explains, for the first cycles of a ramp."""
+    sign = 1 if goal > master.offset else -1
+    settings = master.config.axis[master.axis]
+    unit = master.profile.speed_rad_s_per_count(settings) * settings.drive.sign
+    ramp_rad_s = step / master.period_s / settings.drive.increments_per_rev * 2 * math.pi
+    values = [master.offset + sign * step * k for k in range(1, RAMP_CYCLES + 1)]
+    in_force = master.play_offset(values) + 1 + settings.drive.setpoint_delay_cycles
+    excess = []
+    while master.cycle <= in_force + EARLY_CYCLES:
+        asked = master.cycle
+        demand = master.sdo.read_int(Object.VELOCITY_DEMAND, signed=True) * unit * sign
+        age = (asked + master.cycle) / 2 - in_force
+        if 1 <= age <= EARLY_CYCLES:
+            excess.append(demand / ramp_rad_s - (1 - math.exp(-gain_per_s * age * master.period_s)))
+    return excess
+
+
+def check_axis(master: Master) -> checks.Survey:
+    """All that can be checked without moving; DriveFault for the first point that differs."""
+    found = checks.survey(master)
+    checks.require(master, found.findings)
+    return found
+
+
+def commission(
+    config: MachineConfig, axis: str, report: Callable[[str], None] = lambda _step: None
+) -> CommissioningRecord:
+    """Commission one axis and return the signed-off record (not saved yet); ``report`` gets each step's name.
+
+    Nothing moves before ``report`` returns from ``enable``, and nothing is written but the RPDO of the feed-forward,
+    which is given back: what ``report`` raises there ends it with no trace.
+
+    DriveFault, ProtocolError, DeviceTimeout or ConnectError, one sentence each, after everything was rolled back.
+    """
+    with Master(config, axis) as master:
+        report("listen")
+        checks.listen(master)
+        with feedforward_open(master) as feeding:
+            report("compare")
+            found = check_axis(master)
+            report("enable")
+            checks.require_alone(master)
+            with rolled_back(master):
+                prepare(master)
+                prove_feedforward(master)
+                enable(master)
+                report("sign test")
+                moved_um = sign_test(master)
+                report("feed-forward test")
+                in_feedforward = tell_feedforward(master)
+                report("watchdog test")
+                watchdog = watchdog_test(master, enable)
+                report("restore")
+    return CommissioningRecord(
+        axis=axis,
+        **asdict(found.identity),
+        config_digest=axis_digest(config, axis),
+        mapping_fingerprint=found.fingerprint,
+        options={**found.options, **feeding},
+        following_error_window_um=found.window_um,
+        offset_in_feedforward=in_feedforward,
+        sign_test_um=round(moved_um, 2),
+        readback_ok=True,
+        watchdog=watchdog,
+        created_utc=datetime.now(UTC).isoformat(timespec="seconds"),
+    )
+
+
+@contextlib.contextmanager
+def rolled_back(master: Master) -> Iterator[None]:
+    """Run steps; whatever happens, the offset goes to 0 and the drive is disabled afterwards.
+
+    What cannot be undone is told beside what went wrong.
+    """
+    failure: DeviceError | None = None
+    faults: list[str] = []
+    try:
+        yield
+    except DeviceError as error:
+        failure = error
+    finally:
+        for step in (zero_offset, disable):
+            try:
+                step(master)
+            except DeviceError as error:
+                faults.append(str(error))
+    if failure is not None and not faults:
+        raise failure
+    if faults:
+        first = f"{failure}; " if failure is not None else ""
+        text = f"{first}the drive could not be left as it was ({'; '.join(faults)}); power it off and on again"
+        raise ProtocolError(master.device, text) from failure

@@ -1,0 +1,343 @@
+"""Commissioning, first half: what is read from the drive and compared with the configuration. Nothing moves.
+
+``survey`` reads and compares everything and raises only for a drive that does not answer (SdoAbort, DeviceTimeout,
+ProtocolError); ``require`` turns the first point that differs into a DriveFault.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+from fdhil.cia402 import Mode, Object, State
+from fdhil.commissioning.master import Master
+from fdhil.commissioning.record import SOFTWARE_LIMIT_KEYS
+from fdhil.config import CorrectionLimits
+from fdhil.drivers.can.sdo import NO_OBJECT, NO_SUB_INDEX
+from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
+from fdhil.errors import ConnectError, DriveFault, ProtocolError, SdoAbort
+
+LISTEN_S = 2.0
+INVALID_COB_ID = 1 << 31
+NO_WINDOW = 0xFFFFFFFF
+SOFTWARE_LIMIT = 0x607D
+NO_SOFTWARE_LIMIT = (-(2**31), 2**31 - 1)
+OPTIONS = (
+    (Object.ABORT_CONNECTION_OPTION, True),
+    (Object.QUICK_STOP_OPTION, True),
+    (Object.FAULT_REACTION_OPTION, True),
+    (Object.FOLLOWING_ERROR_WINDOW, False),
+    (Object.QUICK_STOP_DECELERATION, False),
+    (Object.PRODUCER_HEARTBEAT, False),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Object 0x1018."""
+
+    vendor_id: int
+    product_code: int
+    revision: int
+    serial: int
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One point of the set-up, expected and found; ``ok`` None: it could not be compared.
+
+    ``cause`` and ``advice`` are the halves of the sentence that tells what is wrong and what to do next.
+    """
+
+    point: str
+    expected: str
+    found: str
+    ok: bool | None = True
+    cause: str = ""
+    advice: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """What was read of a drive: its identity, the mapping's fingerprint, its options, and every point compared."""
+
+    identity: Identity
+    fingerprint: str
+    options: Mapping[str, int]
+    window_um: float
+    findings: tuple[Finding, ...]
+
+
+def read_optional(master: Master, index: int, sub: int = 0, *, signed: bool = False) -> int | None:
+    """Read an integer object, None when the drive does not have it."""
+    try:
+        return master.sdo.read_int(index, sub, signed=signed)
+    except SdoAbort as abort:
+        if abort.code in (NO_OBJECT, NO_SUB_INDEX):
+            return None
+        raise
+
+
+def listen(master: Master) -> None:
+    """Listen without sending: on a silent bus nothing is sent, and beside an NC we are not the master."""
+    end = master.now() + LISTEN_S
+    while master.now() < end and master.heard.sync == 0:
+        master.check()
+        master.pause(0.01)
+    require_alone(master)
+    if master.heard.frames == 0:
+        text = "there is no drive on the bus; check the drives' supply, wiring and bit rate"
+        raise ConnectError(f"bus {master.bus.name}", text)
+
+
+def require_alone(master: Master) -> None:
+    """ProtocolError when another master was heard; to be asked before our own SYNC starts."""
+    if master.heard.sync or master.heard.foreign_rpdo:
+        text = "an NC is sending SYNC or set-points; switch it off while an axis is commissioned"
+        raise ProtocolError(f"bus {master.bus.name}", text)
+
+
+def survey(master: Master) -> Survey:
+    """Read everything that can be compared while the drive rests, and compare it."""
+    identity, pdos, options = read_identity(master), read_pdos(master), read_options(master)
+    window_um = options.get("6065", 0) / master.config.axis[master.axis].scaling.increments_per_mm * 1e3
+    findings = (
+        compare_identity(master.profile, identity),
+        *(compare_pdo(spec, found, master.node_id) for spec, found in pdos),
+        *compare_options(master, options),
+        *compare_mode(master),
+        *compare_scale(master),
+        *compare_rating(master),
+        *compare_window(master, options, window_um),
+    )
+    fingerprint = hashlib.sha256(repr([found.words for _, found in pdos]).encode()).hexdigest()[:16]
+    return Survey(identity, fingerprint, options, window_um, findings)
+
+
+def require(master: Master, findings: Iterable[Finding]) -> None:
+    """DriveFault with cause and advice of the first point that differs."""
+    for finding in findings:
+        if finding.ok is False:
+            raise DriveFault(master.device, f"{finding.cause}; {finding.advice}")
+
+
+def read_identity(master: Master) -> Identity:
+    """Read 0x1018; a number that the drive does not give is 0."""
+    return Identity(*(read_optional(master, Object.IDENTITY, sub) or 0 for sub in (1, 2, 3, 4)))
+
+
+def compare_identity(profile: DriveProfile, identity: Identity) -> Finding:
+    """Compare 0x1018 with the profile, where that names a vendor or product."""
+    wanted = ((profile.vendor_id, identity.vendor_id), (profile.product_code, identity.product_code))
+    shown = f"vendor {identity.vendor_id:08X}, product {identity.product_code:08X}"
+    return Finding(
+        "identity",
+        ", ".join(
+            f"{what} {'any' if number is None else f'{number:08X}'}"
+            for what, (number, _) in zip(("vendor", "product"), wanted, strict=True)
+        ),
+        shown,
+        all(number in (None, found) for number, found in wanted),
+        f"it is {shown}, which profile {profile.name} is not made for",
+        "choose another profile",
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class PdoFound:
+    """The communication and mapping parameters of one PDO as the drive has them."""
+
+    parameter: int
+    mapping: int
+    cob_id: int
+    kind: int
+    mapped: tuple[int, ...]
+
+    @property
+    def words(self) -> tuple[int, ...]:
+        """What goes into the mapping's fingerprint."""
+        return self.parameter, self.cob_id, self.kind, *self.mapped
+
+
+def read_pdos(master: Master) -> list[tuple[PdoSpec, PdoFound]]:
+    """Read the parameters of every PDO of the profile; one that the drive does not have maps nothing."""
+    places = (
+        (Object.RPDO_PARAMETER, Object.RPDO_MAPPING, master.profile.rpdos),
+        (Object.TPDO_PARAMETER, Object.TPDO_MAPPING, master.profile.tpdos),
+    )
+    return [
+        (spec, _read_pdo(master, parameter + spec.number - 1, mapping + spec.number - 1))
+        for parameter, mapping, specs in places
+        for spec in specs
+    ]
+
+
+def _read_pdo(master: Master, parameter: int, mapping: int) -> PdoFound:
+    cob_id = read_optional(master, parameter, 1)
+    if cob_id is None:
+        return PdoFound(parameter, mapping, INVALID_COB_ID, 0, ())
+    mapped = tuple(master.sdo.read_int(mapping, sub) for sub in range(1, master.sdo.read_int(mapping, 0) + 1))
+    return PdoFound(parameter, mapping, cob_id, master.sdo.read_int(parameter, 2), mapped)
+
+
+def compare_pdo(spec: PdoSpec, found: PdoFound, node_id: int) -> Finding:
+    """Compare one PDO with the profile: its mapping, COB-ID and, where it is valid, its transmission type."""
+    wanted = tuple(entry.mapping for entry in spec.entries)
+    cob_id = spec.cob_base + node_id
+    cause = ""
+    if found.mapped != wanted:
+        cause = f"{spec.name} maps {_mapping(found.mapped)} where the profile has {_mapping(wanted)}"
+    elif found.cob_id & 0x7FF != cob_id or bool(found.cob_id & INVALID_COB_ID) == spec.valid:
+        cause = f"{spec.name} has the COB-ID {found.cob_id:08X}, not {cob_id:03X}{'' if spec.valid else ', not valid'}"
+    elif spec.valid and found.kind != spec.every_sync:
+        cause = f"{spec.name} has transmission type {found.kind} where the profile has {spec.every_sync}"
+    return Finding(
+        spec.name,
+        _pdo_text(cob_id, spec.valid, spec.every_sync, wanted),
+        _pdo_text(found.cob_id & 0x7FF, not found.cob_id & INVALID_COB_ID, found.kind, found.mapped),
+        not cause,
+        cause,
+        f"write 0x{found.parameter:04X} and 0x{found.mapping:04X} with the drive's tool, or choose another profile",
+    )
+
+
+def _mapping(mapped: tuple[int, ...]) -> str:
+    return ", ".join(f"{value:08X}" for value in mapped) or "nothing"
+
+
+def _pdo_text(cob_id: int, valid: bool, kind: int, mapped: tuple[int, ...]) -> str:
+    return f"{cob_id:03X}, type {kind}: {_mapping(mapped)}" if valid else f"not valid: {_mapping(mapped)}"
+
+
+def compare_mode(master: Master) -> Iterator[Finding]:
+    """The drive must offer cyclic synchronous position and interpolate at the machine's SYNC period."""
+    modes = read_optional(master, Object.SUPPORTED_MODES)
+    if modes is not None:
+        offered = bool(modes >> (Mode.CYCLIC_SYNC_POSITION - 1) & 1)
+        cause = "it has no cyclic synchronous position mode (0x6502)"
+        shown = f"0x6502 = {modes:08X}"
+        yield Finding("mode", "cyclic synchronous position", shown, offered, cause, "it cannot be corrected")
+    value = read_optional(master, Object.INTERPOLATION_PERIOD, 1)
+    exponent = read_optional(master, Object.INTERPOLATION_PERIOD, 2, signed=True)
+    if value is None or exponent is None:
+        return
+    period_s = value * 10.0**exponent
+    found, wanted = f"{period_s * 1e3:g} ms", f"{master.period_s * 1e3:g} ms"
+    yield Finding(
+        "cycle",
+        wanted,
+        found,
+        abs(period_s - master.period_s) <= 1e-6,
+        f"it interpolates over {found} (0x60C2) while SYNC comes every {wanted}",
+        "set 0x60C2 or machine.sync_period_s",
+    )
+
+
+def compare_scale(master: Master) -> Iterator[Finding]:
+    """Position increments per motor revolution from 0x6091 and 0x6092 (else 0x608F) must be the configured ones."""
+    expected = master.config.axis[master.axis].drive.increments_per_rev
+    feed = _ratio(master, Object.FEED_CONSTANT)
+    gear = _ratio(master, Object.GEAR_RATIO)
+    encoder = _ratio(master, Object.POSITION_ENCODER_RESOLUTION)
+    if feed is not None:
+        per_rev, source = feed / (gear or 1.0), "0x6092 and 0x6091"
+    elif encoder is not None:
+        per_rev, source = encoder, "0x608F"
+    else:
+        return
+    yield Finding(
+        "scale",
+        f"{expected} per revolution",
+        f"{per_rev:g} per revolution",
+        abs(per_rev - expected) <= 1e-6 * expected,
+        f"its position counts {per_rev:g} per motor revolution ({source}) where the config has {expected}",
+        "correct the drive's factors or drive.increments_per_rev",
+    )
+
+
+def _ratio(master: Master, index: int) -> float | None:
+    upper, lower = read_optional(master, index, 1), read_optional(master, index, 2)
+    return None if upper is None or not lower else upper / lower
+
+
+def compare_rating(master: Master) -> Iterator[Finding]:
+    """0x6075 is what 0x6078 counts in: it must be the configured rated current."""
+    if master.profile.current_unit != "permille_of_rated":
+        return
+    milliamps = read_optional(master, Object.RATED_CURRENT)
+    expected = master.config.axis[master.axis].drive.rated_current_a
+    if milliamps is None:
+        return
+    yield Finding(
+        "rated current",
+        f"{expected:g} A",
+        f"{milliamps / 1e3:g} A",
+        abs(milliamps / 1e3 - expected) <= 0.01 * expected,
+        f"its rated current is {milliamps / 1e3:g} A (0x6075) where the config has {expected:g} A",
+        "correct drive.rated_current_a",
+    )
+
+
+def read_options(master: Master) -> dict[str, int]:
+    """Read option codes, window, heartbeat and software limits (607D01, 607D02); what is not there is left out."""
+    values = {f"{index:04X}": read_optional(master, index, signed=signed) for index, signed in OPTIONS}
+    low, high = (read_optional(master, SOFTWARE_LIMIT, sub, signed=True) for sub in (1, 2))
+    if low is not None and high is not None and low < high and (low, high) != NO_SOFTWARE_LIMIT:
+        values |= dict(zip(SOFTWARE_LIMIT_KEYS, (low, high), strict=True))
+    return {key: value for key, value in values.items() if value is not None}
+
+
+def compare_options(master: Master, options: Mapping[str, int]) -> Iterator[Finding]:
+    """The drive must stop, and by a ramp, when communication is lost."""
+    strict = " or ".join(map(str, master.profile.strict_abort_options))
+    abort = str(options.get("6007", "missing"))
+    yield Finding(
+        "communication lost",
+        f"0x6007 = {strict}",
+        f"0x6007 = {abort}",
+        options.get("6007") in master.profile.strict_abort_options,
+        f"0x6007 is {abort}: it goes on when communication is lost",
+        f"set it to {strict}",
+    )
+    yield Finding(
+        "stop by a ramp",
+        "0x605A and 0x605E not 0",
+        ", ".join(f"0x{key} = {options.get(key, 'missing')}" for key in ("605A", "605E")),
+        options.get("605E", 2) != 0 and options.get("605A", 2) != 0,
+        "0x605E or 0x605A is 0: it coasts instead of stopping by a ramp",
+        "set both to 2",
+    )
+
+
+def compare_window(master: Master, options: Mapping[str, int], window_um: float) -> Iterator[Finding]:
+    """The drive must notice that it leaves its path, no sooner than at four times the largest offset."""
+    settings = master.config.axis[master.axis]
+    largest = (settings.correction or CorrectionLimits()).max_offset_um
+    wanted = settings.drive.following_error_window_mm * 1e3
+    point, expected = "following error", f"{wanted:g} um"
+    if options.get("6065", NO_WINDOW) in (0, NO_WINDOW):
+        cause = "0x6065 is off: it never notices a following error"
+        yield Finding(point, expected, "off", False, cause, "set a window")
+        return
+    cause = f"its following-error window is {window_um:g} um (0x6065)"
+    if largest > window_um / 4:
+        small = f"{cause}, too small for offsets of {largest:g} um"
+        yield Finding(point, expected, f"{window_um:g} um", False, small, "set at least four times the largest offset")
+        return
+    same = abs(window_um - wanted) <= 0.01 * wanted
+    other = f"{cause} where the config has {wanted:g}"
+    yield Finding(point, expected, f"{window_um:g} um", same, other, "correct drive.following_error_window_mm")
+
+
+def faulted(master: Master, what: str) -> DriveFault:
+    """Return what to raise for a drive in fault, with its error code."""
+    code = read_optional(master, 0x603F)
+    shown = "no error code" if code is None else f"error code {code:04X}"
+    return DriveFault(master.device, f"{what} ({shown}); remove the cause and start again")
+
+
+def require_enabled(master: Master) -> None:
+    """Raise DriveFault when the drive is not in Operation enabled any more."""
+    if master.state() is not State.OPERATION_ENABLED:
+        raise faulted(master, f"it fell from Operation enabled to {master.state().value}")

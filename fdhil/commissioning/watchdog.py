@@ -1,0 +1,92 @@
+"""The commissioning's proof that a drive stops by itself when fdhil dies: CiA 301 7.2.8, the heartbeat consumer."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+
+from fdhil.cia402 import Object, State
+from fdhil.commissioning import survey as checks
+from fdhil.commissioning.master import Master
+from fdhil.drivers.can.sdo import NO_OBJECT, NO_SUB_INDEX
+from fdhil.errors import DeviceError, DriveFault, SdoAbort
+
+FEEDING_TRIES = 4
+FEEDING_S = 0.3
+STARVE_TIMEOUT_S = 1.0
+HEARTBEATS_MISSED = 3
+EMCY_HEARTBEAT = 0x8130
+
+
+def watchdog_test(master: Master, enable: Callable[[Master], None]) -> str:
+    """Feed the drive our heartbeat, then starve it: it must stop by itself. Returns ``proven``; else DriveFault.
+
+    ``enable`` brings the drive back to Operation enabled.
+    """
+    node_id, period_s = master.config.guard.node_id, master.config.guard.heartbeat_s
+    entry = node_id << 16 | round(HEARTBEATS_MISSED * period_s * 1e3)
+    with contextlib.ExitStack() as undo:
+        sub, before = _consumer_slot(master, node_id)
+        master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, 0, 4)
+        undo.callback(master.sdo.write_int, Object.CONSUMER_HEARTBEAT, sub, before, 4)
+        undo.callback(setattr, master, "heartbeat", False)
+        _feed(master, sub, entry, enable)
+        told = len(master.heard.emergencies)
+        master.heartbeat = False
+        with contextlib.suppress(DeviceError):
+            master.wait(lambda: master.state() is not State.OPERATION_ENABLED, STARVE_TIMEOUT_S, "")
+        master.check()
+        if master.state() is State.OPERATION_ENABLED:
+            raise DriveFault(
+                master.device,
+                "it went on although our heartbeat stopped: its watchdog does not work; check 0x1016 and 0x6007",
+            )
+        codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[told:]]
+        if EMCY_HEARTBEAT not in codes:
+            shown = ", ".join(f"{code:04X}" for code in codes) or "none"
+            raise DriveFault(
+                master.device, f"it stopped with the EMCY {shown} instead of 8130; find out what else stops it"
+            )
+    return "proven"
+
+
+def _feed(master: Master, sub: int, entry: int, enable: Callable[[Master], None]) -> None:
+    """Have the drive watch our heartbeat, and keep it content for a while; DriveFault when that cannot be done.
+
+    A busy computer sends a heartbeat late now and then, and the drive is right to stop then; that is tried again.
+    """
+    for _ in range(FEEDING_TRIES):
+        master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, entry, 4)
+        if master.sdo.read_int(Object.CONSUMER_HEARTBEAT, sub) != entry:
+            raise DriveFault(master.device, "it does not keep 0x1016; it cannot watch over fdhil and must not be armed")
+        told = len(master.heard.emergencies)
+        master.heartbeat = True
+        master.wait_cycles(round(FEEDING_S / master.period_s))
+        if master.state() is State.OPERATION_ENABLED:
+            return
+        codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[told:]]
+        if EMCY_HEARTBEAT not in codes:
+            checks.require_enabled(master)
+        master.heartbeat = False
+        master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, 0, 4)
+        enable(master)
+    raise DriveFault(
+        master.device,
+        f"it missed our heartbeat {FEEDING_TRIES} times; take load off this computer and try again",
+    )
+
+
+def _consumer_slot(master: Master, node_id: int) -> tuple[int, int]:
+    """Return a sub-index of 0x1016 that is free or ours, and its value."""
+    try:
+        count = master.sdo.read_int(Object.CONSUMER_HEARTBEAT, 0)
+        for sub in range(1, count + 1):
+            value = master.sdo.read_int(Object.CONSUMER_HEARTBEAT, sub)
+            if value & 0xFFFF == 0 or value >> 16 & 0x7F == node_id:
+                return sub, value
+    except SdoAbort as abort:
+        if abort.code not in (NO_OBJECT, NO_SUB_INDEX):
+            raise
+        text = "it has no heartbeat consumer (0x1016), so it cannot notice when fdhil dies; it must not be armed"
+        raise DriveFault(master.device, text) from None
+    raise DriveFault(master.device, "all entries of 0x1016 are taken; free one with the drive's tool")

@@ -1,0 +1,82 @@
+"""Compiling before the daemon says READY: a compile under way holds the interpreter for seconds."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fdhil import correction
+from fdhil.config import Axis, MachineConfig
+from fdhil.correction.kernels import project
+from fdhil.pipeline import AxisPipeline
+from fdhil.records import Float, Parameters, Stages, Trajectory, Window, frozen, frozen_ints
+from fdhil.validation.repeated_readings import log_chance
+from fdhil.validation.sensor_reconstruction import Crossing
+
+
+def warm(config: MachineConfig, method: str | None = None) -> None:
+    """Send made-up rapids of the nominal drives through the pipelines and plan a correction: every kernel compiles."""
+    dt_s = config.machine.sync_period_s
+    windows = {}
+    for name, axis in config.axis.items():
+        pipeline = AxisPipeline(name, config, method)
+        for direction in (1, -1):
+            windows[name] = nominal_rapid(name, axis, dt_s, direction)
+            pipeline.feed(windows[name])
+    rows = min(window.n for window in windows.values())
+    demand = {name: frozen(0.2 * window.demand_mm[:rows]) for name, window in windows.items()}
+    still = np.zeros(rows, dtype=np.int64)
+    reference = Trajectory(dt_s, frozen(np.arange(rows) * dt_s), demand, still.astype(np.bool_), frozen_ints(still))
+    models = {name: Parameters(**axis.nominal.model_dump()) for name, axis in config.axis.items()}
+    correction.plan(reference, models, config)
+    _warm_what_is_rare()
+
+
+def _warm_what_is_rare() -> None:
+    """Call the kernels that a sound drive seldom needs: offsets at their limits, readings that stand still."""
+    project(np.linspace(0.0, 2.0, 8), np.ones(3), np.zeros(2))
+    log_chance(np.arange(12.0), 4, 8, 3, 3, 2, 1.0)
+    theta, rows = np.array([0.5, 0.005, 0.8, 0.075, 0.05, 5.0, 0.0]), np.ones((4, 3))
+    assert Crossing(theta, 0.001, np.ones(4), rows, rows, rows, 0, 0, 0).free
+
+
+def nominal_rapid(name: str, axis: Axis, dt_s: float, direction: int = 1, seed: int = 1) -> Window:
+    """Return a rapid that the nominal drive would make (equations [1] and [2] solved for the voltage), with noise."""
+    nominal, top = axis.nominal, axis.rapid_speed_rad_s
+    ramp_s = axis.rapid_speed_mm_s / axis.max_acceleration_mm_s2
+    margin, ramp, cruise = (round(seconds / dt_s) for seconds in (0.1, ramp_s, 0.4))
+    speed = direction * top * _trapezoid(margin, ramp, cruise)
+    torque = nominal.Jt * np.gradient(speed, dt_s) + nominal.ft * speed + nominal.Cd * np.sign(speed)
+    current = torque / nominal.K
+    voltage = nominal.R * current + nominal.L * np.gradient(current, dt_s) + nominal.K * speed
+    if axis.voltage.sampling == "interval_mean":
+        voltage = (voltage + np.append(voltage[1:], voltage[-1])) / 2
+    turned = np.cumsum(speed) - 0.5 * (speed + speed[0])  # trapezoids
+    position = turned * dt_s * axis.screw_pitch_mm / (2 * math.pi)
+    rng = np.random.default_rng(seed)
+    noisy = [frozen(s + rng.normal(0, 1e-3 * np.abs(s).max(), s.size)) for s in (speed, current, voltage)]
+    begin, end = margin, speed.size - margin
+    return Window(
+        axis=name,
+        start_tick=0,
+        start_s=0.0,
+        dt_s=dt_s,
+        demand_mm=frozen(position),
+        position_mm=frozen(position),
+        speed_rad_s=noisy[0],
+        current_a=noisy[1],
+        voltage_v=noisy[2],
+        voltage_sampling=axis.voltage.sampling,
+        stages=Stages((begin, begin + ramp), (begin + ramp, end - ramp), (end - ramp, end)),
+        direction=direction,
+        rapid_speed_rad_s=top,
+        pitch_mm=axis.screw_pitch_mm,
+        source="warm-up",
+    )
+
+
+def _trapezoid(margin: int, ramp: int, cruise: int) -> Float:
+    """Return a speed profile 0..1 with smooth corners: rest, ramp, cruise, ramp, rest."""
+    up = 0.5 - 0.5 * np.cos(np.pi * (np.arange(ramp) + 0.5) / ramp)
+    return np.concatenate([np.zeros(margin), up, np.ones(cruise), up[::-1], np.zeros(margin)])

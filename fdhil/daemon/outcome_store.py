@@ -1,0 +1,200 @@
+"""What the daemon keeps of each outcome, and what happens when the disk refuses: a notice, and it goes on in shadow."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+from pathlib import Path
+
+from fdhil.config import MachineConfig
+from fdhil.drivers.cia402.profile import load_profile
+from fdhil.errors import StoreError
+from fdhil.identification.drift import Point
+from fdhil.pipeline import POOL_WINDOWS, Known
+from fdhil.records import PARAMETERS, Notice, Outcome, ParameterSet, Skill, WindowOutcome, frozen
+from fdhil.store.history import FILE_NAME, History, Revision, Stamp, StoredWindow
+from fdhil.store.windows import RawScale, Scales, WindowStore
+
+WINDOWS_FOLDER = "windows"
+SKILLS = 3
+
+
+def boot_id() -> str:
+    """Return the kernel's identifier of this boot; monotonic times compare only within one."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
+    except OSError:
+        return ""
+
+
+def raw_scales(config: MachineConfig, axis: str) -> Scales:
+    """Return how the drive's integers of each column become values: the drivers' own scales, in their own order."""
+    settings = config.axis[axis]
+    profile = load_profile(settings.drive.profile)
+    position = (RawScale(settings.scaling.sign / settings.scaling.increments_per_mm),)
+    voltage = profile.voltage_v_per_count
+    return {
+        "demand_mm": position,
+        "position_mm": position,
+        "speed_rad_s": (RawScale(profile.speed_rad_s_per_count(settings)),),
+        "current_a": (RawScale(profile.current_a_per_count(settings)),),
+        "voltage_v": (RawScale(voltage), RawScale(-voltage)) if voltage else (),
+    }
+
+
+def _point(window: StoredWindow) -> Point:
+    """Return a stored window's estimate as the drift tracker has it."""
+    told = window.parameters or {}
+    values, stds = (
+        frozen([math.nan if (number := told.get(name, {}).get(key)) is None else number for name in PARAMETERS])
+        for key in ("value", "std")
+    )
+    return Point(values, stds, window.start_tick, window.temperature_c)
+
+
+class Keeper:
+    """Writes outcomes to the windows' folder and to the history. Safe to call from several worker threads.
+
+    A store that refuses never stops the daemon: ``fault`` is the class of the refusal (None while all is well), the
+    outcome stays in memory only, and each next one is tried again (a window always as a new file).
+    """
+
+    def __init__(self, config: MachineConfig) -> None:
+        self._config = config
+        self._directory = config.store.directory
+        self._lock = threading.Lock()
+        self._scales = {axis: raw_scales(config, axis) for axis in config.axis}
+        self._boot = boot_id()
+        self._history: History | None = None
+        self._windows: WindowStore | None = None
+        self._pool_ids = {axis: deque[int](maxlen=POOL_WINDOWS) for axis in config.axis}
+        self.fault: str | None = None
+        self.strays: tuple[str, ...] = ()
+
+    def open(self) -> list[Notice]:
+        """Open or create the store; a damaged history is put aside, never deleted. Return what must be told."""
+        notices = []
+        try:
+            self._open()
+        except StoreError as error:
+            if error.code == "CorruptFile":
+                notices += self._put_aside(error)
+            else:
+                notices += self._refused(error)
+        notices += self._damaged_rows()
+        if self.strays:
+            names = ", ".join(self.strays[:5])
+            folder = self._directory / WINDOWS_FOLDER
+            text = f"{len(self.strays)} files in {folder} are no windows and are ignored: {names}."
+            notices.append(Notice("StrayFiles", "minor", text))
+        return notices
+
+    def _open(self) -> None:
+        if self._history is None:
+            self._history = History.open(self._directory)
+        folder = self._directory / WINDOWS_FOLDER
+        self._windows = WindowStore(folder, self._config.store.keep_windows, self._config.digest)
+        self.strays = self._windows.strays
+
+    def _damaged_rows(self) -> list[Notice]:
+        """Put damaged rows aside, so that they are told once."""
+        try:
+            places = self._history.put_damaged_aside() if self._history is not None else ""
+        except StoreError as error:
+            return self._refused(error)
+        if not places:
+            return []
+        text = f"Damaged rows of the history were put aside, older ones are used: {places}; check the disk."
+        return [Notice("CorruptFile", "MAJOR", text)]
+
+    def _put_aside(self, error: StoreError) -> list[Notice]:
+        path = self._directory / FILE_NAME
+        k = 1
+        while (aside := path.with_name(f"{FILE_NAME}.corrupt-{k}")).exists():
+            k += 1
+        try:
+            path.rename(aside)
+            for suffix in ("-wal", "-shm"):  # they belong to the damaged one
+                path.with_name(FILE_NAME + suffix).unlink(missing_ok=True)
+            self._open()
+        except (OSError, StoreError):
+            return self._refused(error)
+        text = f"The history was damaged, it is kept as {aside.name} and a new one was begun; check the disk."
+        return [Notice("CorruptFile", "MAJOR", text)]
+
+    def close(self) -> None:
+        """Close the history."""
+        with self._lock:
+            if self._history is not None:
+                self._history.close()
+                self._history = None
+
+    def newest(self) -> dict[str, Revision]:
+        """Return the newest revision of each axis that the history has."""
+        if self._history is None:
+            return {}
+        found = {axis: self._history.revisions(axis, limit=1) for axis in self._config.axis}
+        return {axis: revisions[0] for axis, revisions in found.items() if revisions}
+
+    def skills(self) -> list[Skill]:
+        """Return the newest skills of all axes, oldest first."""
+        if self._history is None:
+            return []
+        return [skill for axis in self._config.axis for skill in self._history.skills(axis, limit=SKILLS)]
+
+    def known(self, axis: str) -> Known:
+        """Return where an earlier run left off: first and newest set, and the newest accepted windows' estimates."""
+        if self._history is None:
+            return Known()
+        newest = self._history.revisions(axis, limit=1)
+        first = self._history.first_revision(axis)
+        windows = [window for window in self._history.windows(axis, limit=4 * POOL_WINDOWS) if window.accepted]
+        return Known(first.set if first else None, newest[0].set if newest else None, tuple(map(_point, windows)))
+
+    def counts(self, axis: str) -> tuple[int, int]:
+        """Return how many windows of an axis were ever accepted and refused."""
+        return (0, 0) if self._history is None else self._history.counts(axis)
+
+    def keep(self, outcomes: Sequence[Outcome]) -> list[Notice]:
+        """Store outcomes durably in their order; return a notice when that fails, and one when it works again."""
+        with self._lock:
+            try:
+                if self._history is None or self._windows is None:
+                    self._open()
+                for outcome in outcomes:
+                    self._keep(outcome)
+            except StoreError as error:
+                return self._refused(error)
+            if self.fault is not None and any(isinstance(outcome, WindowOutcome) for outcome in outcomes):
+                self.fault = None
+                text = "The store can be written again; what came in between was not kept, arm again when needed."
+                return [Notice("StoreRecovered", "info", text)]
+        return []
+
+    def _keep(self, outcome: Outcome) -> None:
+        assert self._history is not None
+        assert self._windows is not None
+        stamp = Stamp(time.time(), self._boot, time.monotonic_ns())
+        if isinstance(outcome, WindowOutcome):
+            axis = outcome.window.axis
+            last = self._history.last_window_number()
+            file = self._windows.append(outcome.window, self._scales[axis], last)
+            number = self._history.add_window(outcome, file.path.name, stamp)
+            if outcome.verdict.accepted:
+                self._pool_ids[axis].append(number)
+        elif isinstance(outcome, ParameterSet):
+            ids = list(self._pool_ids[outcome.axis])[-outcome.windows :]
+            self._history.add_revision(outcome, ids, stamp)
+        elif isinstance(outcome, Notice):
+            self._history.add_notice(outcome, stamp)
+        else:
+            self._history.add_skill(outcome, stamp)
+
+    def _refused(self, error: StoreError) -> list[Notice]:
+        again, self.fault = self.fault == error.code, error.code
+        if again:
+            return []
+        return [Notice(error.code, "MAJOR", f"{error}; the daemon goes on in shadow and cannot be armed.")]

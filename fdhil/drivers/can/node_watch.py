@@ -1,0 +1,146 @@
+"""What the nodes say about themselves: EMCY, boot-up, heartbeat, NMT state. Pure: ``now_ns`` comes from the caller.
+
+The frames are read here and not by the canopen library, which drops an EMCY shorter than 8 bytes, never notices a
+heartbeat that stops, and believes an NMT command as soon as it is sent.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+
+from fdhil.cia402 import COB_EMCY, COB_HEARTBEAT, Nmt
+from fdhil.drivers.can.frames import Frames
+from fdhil.records import Notice
+
+_MAX_EMCY_CODES = 32
+_HEARTBEATS_TO_LEARN = 3
+_BACK_NS = 2_000_000_000  # of regular heartbeats after which an outage is over: until then it is one and the same
+# what a node itself sends in CiA 301's predefined set: EMCY, TPDO1 to 4, SDO answers, heartbeat
+_OWN_COB_IDS = (0x080, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700)
+_NMT_STATES = frozenset(int(state) for state in Nmt)
+
+# error classes of CiA 301, 7.2.7.1
+_EMCY_CLASS = {
+    0x10: "generic error",
+    0x20: "current",
+    0x30: "voltage",
+    0x40: "temperature",
+    0x50: "device hardware",
+    0x60: "device software",
+    0x70: "additional modules",
+    0x80: "monitoring",
+    0x90: "external error",
+    0xF0: "additional functions",
+    0xFF: "device specific",
+}
+_EMCY_TEXT = {
+    0x8110: "CAN overrun",
+    0x8120: "CAN in error passive mode",
+    0x8130: "heartbeat or life guarding lost",
+    0x8140: "recovered from bus-off",
+    0x8150: "COB-ID collision",
+    0x8210: "PDO not processed, too short",
+    0x8220: "PDO too long",
+    0x8611: "following error",
+}
+
+
+def emcy_text(code: int) -> str:
+    """Return what an EMCY code means (CiA 301, table 26).
+
+    >>> emcy_text(0x8611)
+    'following error'
+    """
+    if code in _EMCY_TEXT:
+        return _EMCY_TEXT[code]
+    high = code >> 8
+    return _EMCY_CLASS.get(high, _EMCY_CLASS.get(high & 0xF0, "unknown"))
+
+
+class NodeWatch:
+    """Watches one node; ``feed`` returns edge-triggered notices."""
+
+    def __init__(self, axis: str, node_id: int) -> None:
+        self._axis = axis
+        self._node_id = node_id
+        self.nmt: Nmt | None = None
+        self.emcy_count = 0
+        self.boots = 0
+        self._codes: set[int] = set()
+        self._beats: list[int] = []
+        self._lost = False
+        self._period_ns = 0
+        self._back_since_ns: int | None = None
+        self._own_ids = np.array([cob_id + node_id for cob_id in _OWN_COB_IDS], dtype=np.uint32)
+        self.heard = 0
+
+    def feed(self, frames: Frames, now_ns: int) -> list[Notice]:
+        """Take a block of frames; ``now_ns`` is the host's monotonic time."""
+        notices = []
+        self.heard += int(np.count_nonzero(np.isin(frames["id"], self._own_ids)))
+        for frame in frames[frames["id"] == COB_EMCY + self._node_id]:
+            notices += self._emergency(int(frame["dlc"]), int(frame["data"]))
+        for frame in frames[frames["id"] == COB_HEARTBEAT + self._node_id]:
+            notices += self._heartbeat(int(frame["data"]) & 0x7F, int(frame["t_ns"]))
+        return notices + self._silence(now_ns)
+
+    def _notice(self, code: str, severity: Literal["info", "minor", "MAJOR"], text: str) -> Notice:
+        return Notice(code, severity, f"Drive {self._axis} {text}", self._axis)
+
+    def _emergency(self, length: int, data: int) -> list[Notice]:
+        """One notice per code; a flood is counted, not repeated."""
+        self.emcy_count += 1
+        code = data & 0xFFFF if length >= 2 else 0x1000
+        if code >> 8 == 0:
+            self._codes.clear()
+            return [self._notice("DriveEmergency", "info", "reports that its error is gone.")]
+        if code in self._codes or len(self._codes) >= _MAX_EMCY_CODES:
+            return []
+        self._codes.add(code)
+        detail = (data & (1 << 8 * length) - 1).to_bytes(8, "little")[:length].hex(" ")
+        text = f"reports error {code:04X} ({emcy_text(code)}; {detail}); look it up in the drive's manual."
+        return [self._notice("DriveEmergency", "MAJOR", text)]
+
+    def _heartbeat(self, state: int, t_ns: int) -> list[Notice]:
+        notices = []
+        if state == Nmt.BOOT_UP:
+            self.boots += 1
+            self._beats = []
+            text = "booted, its offset and set-up are unknown; check its supply and commission it again."
+            notices.append(self._notice("NodeRebooted", "MAJOR", text))
+        elif self.nmt is Nmt.OPERATIONAL and state != Nmt.OPERATIONAL:
+            text = "left the NMT state Operational, it takes no set-points; see what the NC did."
+            notices.append(self._notice("NmtStateWrong", "MAJOR", text))
+        if self._lost:
+            notices += self._after_an_outage(t_ns)
+        self._beats = [*self._beats, t_ns][-_HEARTBEATS_TO_LEARN - 1 :]
+        self.nmt = Nmt(state) if state in _NMT_STATES else self.nmt
+        return notices
+
+    def _after_an_outage(self, t_ns: int) -> list[Notice]:
+        """Say that the heartbeat is back once it has been regular for a while: an outage is two lines."""
+        if self._back_since_ns is None or t_ns - self._beats[-1] > self._longest_gap_ns():
+            self._back_since_ns, self._beats = t_ns, []
+            return []
+        if t_ns - self._back_since_ns < _BACK_NS:
+            return []
+        self._lost, self._back_since_ns = False, None
+        return [self._notice("HeartbeatLost", "info", "sends its heartbeat again.")]
+
+    def _longest_gap_ns(self) -> int:
+        """Three learned periods and 0.1 s; the period is the longest of those heard, some may have come in a burst."""
+        return 3 * self._period_ns + 100_000_000
+
+    def _silence(self, now_ns: int) -> list[Notice]:
+        """Tell a heartbeat that stops; a drive that sends none is not judged."""
+        if self._lost or len(self._beats) <= _HEARTBEATS_TO_LEARN:
+            return []
+        self._period_ns = max(b - a for a, b in pairwise(self._beats))
+        if now_ns - self._beats[-1] <= self._longest_gap_ns():
+            return []
+        self._lost = True
+        text = "sends no heartbeat any more and may be dead; check its supply and the bus."
+        return [self._notice("HeartbeatLost", "MAJOR", text)]

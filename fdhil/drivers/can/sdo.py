@@ -1,0 +1,155 @@
+"""SDO transfers with one node by the canopen library's client, within bounds of size and time.
+
+The library has no limit on size or duration, and takes a late answer to an earlier request of the same object for the
+answer to the present one. So after a time-out the line is left quiet until nothing more can come, and then the object
+is read twice: two equal answers, or an error.
+"""
+
+from __future__ import annotations
+
+import logging
+import operator
+import queue
+import time
+from typing import Any
+
+from canopen.objectdictionary import ObjectDictionary
+from canopen.sdo.client import SdoClient
+from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
+
+from fdhil.cia402 import COB_SDO_REQUEST, COB_SDO_RESPONSE
+from fdhil.drivers.can.bus import CanBus
+from fdhil.errors import DeviceTimeout, ProtocolError, SdoAbort
+
+RESPONSE_TIMEOUT_S = 0.5
+QUIET_S = 1.0
+DEADLINE_S = 2.0
+MAX_BYTES = 64 * 1024
+MAX_DOMAIN_BYTES = 4 * 1024 * 1024
+DOMAIN_DEADLINE_S = 30.0
+NO_OBJECT = 0x06020000
+NO_SUB_INDEX = 0x06090011
+_DEADLINE_ABORT = 0x05040000
+_MEMORY_ABORT = 0x05040005
+
+logging.getLogger("canopen").setLevel(logging.CRITICAL)
+
+
+def _name(index: int, sub: int) -> str:
+    return f"0x{index:04X}:{sub:02X}"
+
+
+class SdoLink:
+    """The SDO channel of one node. ``deliver`` is called by whoever reads the bus, all else by one other thread.
+
+    ``patience``: how many times as long as a real drive this one may take.
+    """
+
+    def __init__(self, device: str, node_id: int, bus: CanBus, patience: float = 1.0) -> None:
+        self._patience = patience
+        self.device = device
+        self.response_id = COB_SDO_RESPONSE + node_id
+        self._bus = bus
+        # the library's own functions are not annotated
+        client: Any = SdoClient
+        dictionary: Any = ObjectDictionary
+        self._client = client(COB_SDO_REQUEST + node_id, self.response_id, dictionary())
+        self._client.network = self
+        self._client.RESPONSE_TIMEOUT = RESPONSE_TIMEOUT_S * patience
+        self._late = False
+
+    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+        """What the library's client calls to send; remote frames are never sent."""
+        self._bus.send(can_id, bytes(data))
+
+    def deliver(self, data: bytes) -> None:
+        """Hand over a response frame of this node; one that is not 8 bytes long is no SDO."""
+        if len(data) == 8:
+            self._client.on_response(self.response_id, data, 0.0)
+
+    def read(self, index: int, sub: int = 0, *, block: bool = False) -> bytes:
+        """Read an object; SdoAbort, DeviceTimeout or ProtocolError. ``block`` uses a block upload (big DOMAINs)."""
+        try:
+            return self._upload(index, sub, block)
+        except DeviceTimeout:
+            first, second = self._upload(index, sub, block), self._upload(index, sub, block)
+            if first != second:
+                raise ProtocolError(
+                    self.device, f"{_name(index, sub)} gave two answers after a time-out; check that one master asks"
+                ) from None
+            return second
+
+    def read_int(self, index: int, sub: int = 0, *, signed: bool = False) -> int:
+        """Read an integer object, little-endian."""
+        return int.from_bytes(self.read(index, sub), "little", signed=signed)
+
+    def write_int(self, index: int, sub: int, value: int, length: int) -> None:
+        """Write an integer of ``length`` bytes; after a time-out the object tells whether it arrived.
+
+        TypeError when ``value`` is no integer, ValueError when it does not fit.
+        """
+        number = operator.index(value)  # the library would cut 1.7 to 1 without a word
+        if not -(1 << 8 * length - 1) <= number < 1 << 8 * length:
+            raise ValueError(f"{number} does not fit {length} bytes")
+        data = (number & (1 << 8 * length) - 1).to_bytes(length, "little")
+        try:
+            self._guarded(index, sub, lambda: self._client.download(index, sub, data))
+        except DeviceTimeout:
+            if self._upload(index, sub, False) == data == self._upload(index, sub, False):
+                return
+            self._guarded(index, sub, lambda: self._client.download(index, sub, data))
+
+    def _be_quiet(self) -> None:
+        """Wait until no late answer can come any more, and forget those that came."""
+        time.sleep(QUIET_S)
+        self._client.responses = queue.Queue()
+        self._late = False
+
+    def _upload(self, index: int, sub: int, block: bool) -> bytes:
+        data: bytes = self._guarded(index, sub, lambda: self._segments(index, sub, block))
+        return data
+
+    def _segments(self, index: int, sub: int, block: bool) -> bytes:
+        limit, patience = (MAX_DOMAIN_BYTES, DOMAIN_DEADLINE_S) if block else (MAX_BYTES, DEADLINE_S)
+        deadline = time.monotonic() + patience * self._patience
+        stream = self._client.open(index, sub, "rb", buffering=0, block_transfer=block)
+        parts, size = [], 0
+        with stream:
+            if stream.size is not None and stream.size > limit:
+                self._client.abort(_MEMORY_ABORT)
+                raise self._too_large(index, sub, limit)
+            while part := stream.read(7):
+                parts.append(part)
+                size += len(part)
+                if size > limit:
+                    self._client.abort(_MEMORY_ABORT)
+                    raise self._too_large(index, sub, limit)
+                if time.monotonic() > deadline:
+                    self._client.abort(_DEADLINE_ABORT)
+                    text = f"{_name(index, sub)} was not finished after {patience:g} s; check the bus load"
+                    raise ProtocolError(self.device, text)
+        return b"".join(parts)
+
+    def _too_large(self, index: int, sub: int, limit: int) -> ProtocolError:
+        text = f"{_name(index, sub)} is longer than {limit} bytes; this is no object of a healthy drive"
+        return ProtocolError(self.device, text)
+
+    def _guarded(self, index: int, sub: int, call: Any) -> Any:
+        """Run a call of the library and translate its errors into one sentence each; quiet first after a time-out."""
+        if self._late:
+            self._be_quiet()
+        try:
+            return call()
+        except SdoAbortedError as abort:
+            reason = SdoAbortedError.CODES.get(abort.code, "unknown reason").lower()
+            text = f"{_name(index, sub)} was refused ({reason}, {abort.code:08X}); compare the drive's manual"
+            raise SdoAbort(self.device, text, abort.code) from None
+        except SdoCommunicationError as error:
+            if "No SDO response" in str(error) or "could not be retransmitted" in str(error):
+                self._late = True
+                raise DeviceTimeout(
+                    self.device, f"{_name(index, sub)} was not answered; check the drive's supply and its node-ID"
+                ) from None
+            raise ProtocolError(
+                self.device, f"{_name(index, sub)} was answered wrongly ({error}); check that one master asks"
+            ) from None

@@ -1,0 +1,174 @@
+"""From frames to the SYNC grid: every frame gets the tick of the last SYNC before it. Pure: no clock, no I/O.
+
+With a counter byte (0x1019, 1..240) lost SYNCs are counted and the grid stays right; without one a lost SYNC cannot
+be seen, and each SYNC is one tick. Arrival times serve one purpose only: to tell 1 from 241 periods.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from fdhil.cia402 import COB_SYNC
+from fdhil.drivers.can.frames import Frames
+from fdhil.records import Int, Notice, TickTimes
+
+COUNTER_RANGE = 240
+_BACKWARD = COUNTER_RANGE // 2
+_HISTORY = 32
+
+
+@dataclass(frozen=True, slots=True)
+class Ticked:
+    """Frames as columns (n,): ``can_id``, ``length``, ``data`` and ``tick``, and the SYNCs among them: ``syncs``.
+
+    ``last_tick`` is the newest SYNC's, -1 before the first one.
+    """
+
+    can_id: npt.NDArray[np.uint32]
+    length: npt.NDArray[np.uint8]
+    data: npt.NDArray[np.uint64]
+    tick: Int
+    syncs: TickTimes
+    last_tick: int
+    notices: tuple[Notice, ...] = ()
+
+
+class SyncGrid:
+    """Counts SYNC cycles of one bus from 0 at the first SYNC seen."""
+
+    def __init__(self, sync_period_s: float, realtime: bool = True) -> None:
+        self._period_ns = sync_period_s * 1e9
+        self._realtime = realtime
+        self._last_tick = -1
+        self._last_counter: int | None = None
+        self._last_ns = 0
+        self._suspect: int | None = None  # the counter of a SYNC that went backwards
+        self._recent_odd: list[bool] = []
+        self._collision = False
+        self._intervals_ns: list[int] = []
+        self._stamped_ns: int | None = None
+        self.missed = 0
+        self.duplicates = 0
+        self.out_of_order = 0
+
+    def feed(self, frames: Frames) -> Ticked:
+        """Give every frame its tick; a SYNC itself has the tick it starts."""
+        # contiguous columns: they are compared and shifted once per PDO
+        can_id, length, data = (np.ascontiguousarray(frames[name]) for name in ("id", "dlc", "data"))
+        where = np.flatnonzero(can_id == COB_SYNC)
+        before = self._last_tick
+        if where.size == 0:
+            empty = TickTimes(np.empty(0, np.int64), np.empty(0, np.int64))
+            return Ticked(can_id, length, data, np.full(frames.size, before, np.int64), empty, before)
+        syncs = frames[where]
+        ticks = self._ticks(syncs)
+        kept = ticks >= 0
+        where, ticks, stamps = where[kept], ticks[kept], syncs["t_ns"][kept].astype(np.int64)
+        starts = np.concatenate([[before], ticks])
+        tick = starts[np.searchsorted(where, np.arange(frames.size), side="right")]
+        notices = self._collisions(stamps)
+        return Ticked(can_id, length, data, tick, TickTimes(ticks, stamps), self._last_tick, notices)
+
+    def _ticks(self, syncs: Frames) -> Int:
+        """Tick of every SYNC; -1 for one that is a duplicate or out of order."""
+        counters = (syncs["data"] & np.uint64(0xFF)).astype(np.int64)
+        counted = syncs["dlc"] > 0
+        regular = np.arange(1, syncs.size + 1) + self._last_tick
+        if self._last_tick < 0 and self._last_counter is None and counted[0]:
+            self._last_counter = (int(counters[0]) - 2) % COUNTER_RANGE + 1
+        if self._last_counter is None and not counted.any():
+            self._finish(regular, None, syncs, clean=True)
+            return regular
+        if self._last_counter is not None and counted.all():
+            expected = (self._last_counter + np.arange(syncs.size)) % COUNTER_RANGE + 1
+            if np.array_equal(expected, counters) and not self._long_pause(syncs):
+                self._finish(regular, int(counters[-1]), syncs, clean=True)
+                return regular
+        ticks = [
+            self._step(int(c) if has else None, int(t))
+            for c, has, t in zip(counters, counted, syncs["t_ns"], strict=True)
+        ]
+        return np.array(ticks, np.int64)
+
+    def _long_pause(self, syncs: Frames) -> bool:
+        """Whether a whole turn of the counter may have gone by between two of these SYNCs."""
+        stamps = np.concatenate([[self._last_ns or syncs["t_ns"][0]], syncs["t_ns"]])
+        return self._realtime and bool(np.diff(stamps).max() > _BACKWARD * self._period_ns)
+
+    def _finish(self, ticks: Int, counter: int | None, syncs: Frames, clean: bool) -> None:
+        self._last_tick = int(ticks[-1])
+        self._last_counter = counter
+        self._last_ns = int(syncs["t_ns"][-1])
+        self._suspect = None
+        self._recent_odd = (self._recent_odd + [not clean] * min(syncs.size, _HISTORY))[-_HISTORY:]
+
+    def _step(self, counter: int | None, t_ns: int) -> int:
+        """One SYNC of an irregular block; returns its tick or -1."""
+        if counter is None or self._last_counter is None:
+            return self._uncounted(counter, t_ns)
+        ahead = (counter - self._last_counter) % COUNTER_RANGE
+        whole_turns = self._whole_turns(ahead, t_ns)
+        self._recent_odd = [*self._recent_odd, ahead != 1][-_HISTORY:]
+        if ahead == 0 and whole_turns == 0:
+            self.duplicates += 1
+            return -1
+        if ahead > _BACKWARD and whole_turns == 0 and not self._continues(counter):
+            self.out_of_order += 1
+            self._suspect = counter
+            return -1
+        self._suspect = None
+        ahead += COUNTER_RANGE * whole_turns
+        self.missed += ahead - 1
+        return self._advance(ahead, counter, t_ns)
+
+    def _uncounted(self, counter: int | None, t_ns: int) -> int:
+        if counter is None and self._last_counter is not None:
+            # a second producer without a counter beside the one that counts
+            self.out_of_order += 1
+            self._recent_odd = [*self._recent_odd, True][-_HISTORY:]
+            return -1
+        return self._advance(1, counter, t_ns)
+
+    def _advance(self, ahead: int, counter: int | None, t_ns: int) -> int:
+        self._last_tick += ahead
+        self._last_counter = counter
+        self._last_ns = t_ns
+        return self._last_tick
+
+    def _continues(self, counter: int) -> bool:
+        """A counter that went backwards and counts on from there was restarted by its producer."""
+        return self._suspect is not None and (counter - self._suspect) % COUNTER_RANGE == 1
+
+    def _whole_turns(self, ahead: int, t_ns: int) -> int:
+        """Whole turns of the counter that went by unheard.
+
+        The elapsed time must fit a whole number of turns within 2 %: a simulated machine that was held up and then
+        goes on where it was fits none.
+        """
+        if not self._realtime:
+            return 0
+        elapsed = (t_ns - self._last_ns) / self._period_ns
+        turns = round((elapsed - ahead) / COUNTER_RANGE)
+        return turns if turns > 0 and abs(elapsed - ahead - turns * COUNTER_RANGE) <= max(2.0, 0.02 * elapsed) else 0
+
+    def _collisions(self, stamps: Int) -> tuple[Notice, ...]:
+        """Say once when two producers seem to send SYNC."""
+        if stamps.size:
+            before = [] if self._stamped_ns is None else [self._stamped_ns]
+            self._intervals_ns = (self._intervals_ns + np.diff([*before, *stamps]).tolist())[-_HISTORY:]
+            self._stamped_ns = int(stamps[-1])
+        twice = len(self._recent_odd) == _HISTORY and sum(self._recent_odd) > _HISTORY // 3
+        fast = (
+            self._realtime
+            and self._last_counter is None
+            and len(self._intervals_ns) == _HISTORY
+            and float(np.mean(self._intervals_ns)) < 0.75 * self._period_ns
+        )
+        was, self._collision = self._collision, twice or fast
+        if not self._collision or was:
+            return ()
+        text = "Two nodes seem to send SYNC, the sampling grid cannot be trusted; leave one SYNC producer on the bus."
+        return (Notice("SyncCollision", "MAJOR", text, tick=self._last_tick),)

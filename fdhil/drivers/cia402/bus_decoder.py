@@ -1,0 +1,61 @@
+"""One bus from frames to records: the SYNC grid, its drives' decoders and node watches. Pure: no clock, no I/O."""
+
+from __future__ import annotations
+
+from fdhil.config import MachineConfig
+from fdhil.drivers.can.frames import Frames, error_notices
+from fdhil.drivers.can.node_watch import NodeWatch
+from fdhil.drivers.can.sync_grid import SyncGrid
+from fdhil.drivers.cia402.drive import Cia402Decoder, InputSamples
+from fdhil.records import AxisSamples, Notice, TickTimes
+
+_SYNC_SILENCE_NS = 1_000_000_000
+
+
+class BusDecoder:
+    """Decodes all drives of the bus ``[bus.NAME]``."""
+
+    def __init__(self, bus: str, config: MachineConfig) -> None:
+        realtime = config.guard.clock == "monotonic" and config.sim.pace == "realtime"
+        self.grid = SyncGrid(config.machine.sync_period_s, realtime)
+        self.axes = [axis for axis, settings in config.axis.items() if settings.drive.bus == bus]
+        self.decoders = {axis: Cia402Decoder(axis, config) for axis in self.axes}
+        self.watches = {axis: NodeWatch(axis, config.node_id(axis)) for axis in self.axes}
+        self._last_sync_ns: int | None = None
+        self._sync_lost = False
+
+    def feed(self, frames: Frames, now_ns: int) -> list[TickTimes | AxisSamples | InputSamples | Notice]:
+        """Take a block of frames; return times of the ticks, samples, inputs and notices."""
+        ticked = self.grid.feed(frames)
+        out: list[TickTimes | AxisSamples | InputSamples | Notice] = [*error_notices(frames), *ticked.notices]
+        if ticked.syncs.tick.size:
+            out.append(ticked.syncs)
+            self._last_sync_ns = int(ticked.syncs.t_ns[-1])
+        out += self._sync_silence(now_ns)
+        for axis in self.axes:
+            out += self.decoders[axis].feed(ticked)
+            out += self.watches[axis].feed(frames, now_ns)
+        return out
+
+    def _sync_silence(self, now_ns: int) -> list[Notice]:
+        silent = self._last_sync_ns is not None and now_ns - self._last_sync_ns > _SYNC_SILENCE_NS
+        was, self._sync_lost = self._sync_lost, silent
+        if silent and not was:
+            text = "SYNC stopped, nothing is sampled; start the NC or see whether it still runs the bus."
+            return [Notice("SyncLost", "MAJOR", text)]
+        return [Notice("SyncLost", "info", "SYNC is back.")] if was and not silent else []
+
+    def counters(self) -> dict[str, int]:
+        """What was missed, duplicated or discarded on this bus, and how many frames each drive sent."""
+        counters = [decoder.counters for decoder in self.decoders.values()]
+        return {
+            "sync_missed": self.grid.missed,
+            "sync_duplicates": self.grid.duplicates,
+            "sync_out_of_order": self.grid.out_of_order,
+            "pdo_lost": sum(c.lost for c in counters),
+            "pdo_short": sum(c.short for c in counters),
+            "pdo_long": sum(c.long for c in counters),
+            "pdo_duplicates": sum(c.duplicates for c in counters),
+            "pdo_ambiguous": sum(c.ambiguous for c in counters),
+            **{f"{axis}.heard": watch.heard for axis, watch in self.watches.items()},
+        }

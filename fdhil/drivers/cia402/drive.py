@@ -1,0 +1,257 @@
+"""From frames on the SYNC grid to an axis' samples: the decoder of one CiA 402 drive. Pure: no clock, no I/O.
+
+A sample of tick k is made of the TPDOs received after SYNC k and before SYNC k+1. The demand r[k] is the target
+(0x607A) that was latched ``setpoint_delay_cycles`` before SYNC k, since the drive runs its set-point late; the offset
+in force o[k] comes from the sniffed 0x60B0 in the same way. A voltage that is the mean of the period before its SYNC
+belongs to row k-1. Rows leave two ticks late, when all they need is there; a row of which a frame is missing is left
+out: a hole in ``tick``, counted in ``lost``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from fdhil.cia402 import PdoEntry
+from fdhil.config import MachineConfig
+from fdhil.drivers.can.sync_grid import Ticked
+from fdhil.drivers.cia402.pdo_queue import DecoderCounters, Dense, PdoQueue, Setpoint, SetpointRows, decode, dense
+from fdhil.drivers.cia402.profile import DriveProfile, ObjectKey, load_profile
+from fdhil.records import AxisSamples, Bool, Float, Int, Notice, frozen, frozen_ints
+
+_FOREIGN_TICKS = 8
+_MISMATCHES = 3
+_READ_BACK_TOLERANCE = 2  # increments: two roundings
+
+
+@dataclass(frozen=True, slots=True)
+class InputSamples:
+    """Digital inputs (0x60FD) of an axis: ``tick`` (n,) and ``inputs`` (n,) int64 bit fields."""
+
+    axis: str
+    tick: Int
+    inputs: Int
+
+
+class VoltageObject:
+    """The voltage source ``drive``: a vendor object of the profile, decoded with the other TPDOs."""
+
+    def __init__(self, axis: str, config: MachineConfig, profile: DriveProfile) -> None:
+        settings = config.axis[axis]
+        self.key = profile.voltage if settings.voltage.source == "drive" else None
+        self.v_per_count = settings.drive.sign * profile.voltage_v_per_count
+        self.rows_back = 1 if settings.voltage.sampling == "interval_mean" else 0
+
+
+class Cia402Decoder:
+    """Decodes one axis; ``feed`` takes ticked frames of its bus, ``counters`` tells what was lost.
+
+    ValueError when the profile maps a needed object in no PDO.
+    """
+
+    def __init__(self, axis: str, config: MachineConfig, profile: DriveProfile | None = None) -> None:
+        self.axis = axis
+        self._settings = config.axis[axis]
+        self.profile = profile or load_profile(self._settings.drive.profile)
+        self.node_id = config.node_id(axis)
+        self.counters = DecoderCounters()
+        self._voltage = VoltageObject(axis, config, self.profile)
+        self._queues = {s.name: PdoQueue(s, s.cob_base + self.node_id) for s in self.profile.tpdos}
+        needed = [self.profile.position, self.profile.speed, self.profile.current, self.profile.statusword]
+        self._places = {key: self._place(key) for key in (*needed, *([self._voltage.key] if self._voltage.key else []))}
+        self._required = list(dict.fromkeys(name for name, _ in self._places.values()))
+        shown = (self.profile.position_demand, self.profile.offset, self.profile.digital_inputs)
+        self._shown_places = {key: self._place(key) for key in shown if self.profile.find_tpdo(key)}
+        self._mm_per_increment = self._settings.scaling.sign / self._settings.scaling.increments_per_mm
+        self._delay = self._settings.drive.setpoint_delay_cycles
+        self._target = self._sniffed(self.profile.target)
+        self._offset = self._sniffed(self.profile.offset)
+        self._syncs = np.empty(0, np.int64)
+        self._next_row: int | None = None
+        self._foreign_run = 0
+        self._mismatches = 0
+        self._told: set[str] = set()
+        self._notices: list[Notice] = []
+
+    def _place(self, key: ObjectKey) -> tuple[str, PdoEntry]:
+        found = self.profile.find_tpdo(key)
+        if found is None:
+            raise ValueError(f"profile {self.profile.name} maps {key[0]:04X}:{key[1]:02X} in no TPDO")
+        return found[0].name, found[1]
+
+    def _sniffed(self, key: ObjectKey) -> Setpoint:
+        found = self.profile.find_rpdo(key)
+        if found is None:
+            raise ValueError(f"profile {self.profile.name} maps {key[0]:04X}:{key[1]:02X} in no RPDO")
+        spec, entry = found
+        return Setpoint(PdoQueue(spec, spec.cob_base + self.node_id), entry, self._delay)
+
+    def feed(self, ticked: Ticked) -> list[AxisSamples | InputSamples | Notice]:
+        """Take a block of ticked frames; return the rows that became complete, and what must be told."""
+        for queue in (*self._queues.values(), self._target.queue, self._offset.queue):
+            queue.add(ticked, self.counters)
+        self._syncs = np.concatenate([self._syncs, ticked.syncs.tick])
+        first, stop = self._next_row or 0, ticked.last_tick - 1
+        if stop <= first:
+            return []
+        self._next_row = stop
+        self._length_notices()
+        offset = self._read_back_offset(first, stop)
+        demand = self._read_back_demand(first, stop, offset)
+        out: list[AxisSamples | InputSamples | Notice] = []
+        out += self._samples(first, stop, demand, offset)
+        out += self._inputs(first, stop)
+        self._forget(stop)
+        told, self._notices = self._notices, []
+        return [*out, *told]
+
+    def _forget(self, row: int) -> None:
+        for queue in self._queues.values():
+            queue.forget(row)
+        for setpoint in (self._target, self._offset):
+            setpoint.forget(row)
+        self._syncs = self._syncs[np.searchsorted(self._syncs, row) :]
+
+    def _heard(self, first: int, stop: int) -> Bool:
+        """Which SYNCs of ticks [first, stop) were received."""
+        mine = self._syncs[self._syncs.searchsorted(first) : self._syncs.searchsorted(stop)]
+        heard = np.zeros(stop - first, np.bool_)
+        heard[mine - first] = True
+        return heard
+
+    def _samples(
+        self, first: int, stop: int, demand: SetpointRows | None, offset: SetpointRows | None
+    ) -> list[AxisSamples]:
+        """Rows [first, stop); nothing while the demand is not known."""
+        heard = self._heard(first, stop)
+        grids = {name: dense(self._queues[name], first, stop + 1) for name in self._required}
+        lost = self._count(grids, heard)
+        if demand is None:
+            return []
+        lost += demand.lost + int(np.count_nonzero(~heard))
+        certain = demand.certain & heard
+        for key, (name, _) in self._places.items():
+            back = self._voltage.rows_back if key == self._voltage.key else 0
+            certain &= grids[name].present[back : back + stop - first]
+        if offset is not None:
+            certain &= offset.certain
+        self.counters.lost += demand.lost
+        return [self._record(np.flatnonzero(certain), first, grids, demand, offset, lost)]
+
+    def _count(self, grids: Mapping[str, Dense], heard: Bool) -> int:
+        """Count what is wrong with the frames of the rows' own ticks; returns the number lost."""
+        rows = heard.size
+        lost = sum(int(np.count_nonzero(grid.missing[:rows] & heard)) for grid in grids.values())
+        ambiguous = np.zeros(rows, np.bool_)
+        for grid in grids.values():
+            self.counters.duplicates += int(grid.duplicates[:rows].sum())
+            ambiguous |= grid.ambiguous[:rows]
+        self.counters.ambiguous += int(np.count_nonzero(ambiguous))
+        self.counters.lost += lost
+        self._foreign(ambiguous)
+        return lost
+
+    def _foreign(self, ambiguous: Bool) -> None:
+        clean = np.flatnonzero(~ambiguous)
+        self._foreign_run = ambiguous.size - 1 - int(clean[-1]) if clean.size else self._foreign_run + ambiguous.size
+        if self._foreign_run >= _FOREIGN_TICKS:
+            text = f"Two nodes send as drive {self.axis} (node-ID {self.node_id}); give each node its own node-ID."
+            self._tell("ForeignProducer", "MAJOR", text)
+
+    def _record(
+        self,
+        rows: Int,
+        first: int,
+        grids: Mapping[str, Dense],
+        demand: SetpointRows,
+        offset: SetpointRows | None,
+        lost: int,
+    ) -> AxisSamples:
+        profile = self.profile
+
+        def raw(key: ObjectKey, back: int = 0) -> Int:
+            name, entry = self._places[key]
+            return decode(entry, grids[name].words[rows + back])
+
+        mm = self._mm_per_increment
+        voltage: Float | None = None
+        if self._voltage.key is not None:
+            voltage = frozen(raw(self._voltage.key, self._voltage.rows_back) * self._voltage.v_per_count)
+        return AxisSamples(
+            axis=self.axis,
+            tick=frozen_ints(rows + first),
+            demand_mm=frozen(demand.value[rows] * mm),
+            position_mm=frozen(raw(profile.position) * mm),
+            speed_rad_s=frozen(raw(profile.speed) * profile.speed_rad_s_per_count(self._settings)),
+            current_a=frozen(raw(profile.current) * profile.current_a_per_count(self._settings)),
+            voltage_v=voltage,
+            offset_mm=frozen(offset.value[rows] * mm if offset is not None else np.zeros(rows.size)),
+            statusword=frozen_ints(raw(profile.statusword)),
+            lost=lost,
+        )
+
+    def _inputs(self, first: int, stop: int) -> list[InputSamples]:
+        tick, inputs = self._shown(self.profile.digital_inputs, first, stop)
+        return [InputSamples(self.axis, frozen_ints(tick), frozen_ints(inputs))] if tick.size else []
+
+    def _shown(self, key: ObjectKey, first: int, stop: int) -> tuple[Int, Int]:
+        """Ticks and values of a slower TPDO's object; empty when the profile maps it nowhere."""
+        if key not in self._shown_places:
+            return np.empty(0, np.int64), np.empty(0, np.int64)
+        name, entry = self._shown_places[key]
+        tick, words = self._queues[name].between(first, stop)
+        return tick, decode(entry, words)
+
+    def _read_back_offset(self, first: int, stop: int) -> SetpointRows | None:
+        """The offset in force on rows [first, stop): sniffed, else what the drive shows.
+
+        0x60B0 at SYNC k is what was latched there, so it is in force at k + delay.
+        """
+        _, shown = self._shown(self.profile.offset, first, stop)
+        if shown.size and self._offset.queue.tick.size == 0:
+            self._offset.held = int(shown[-1])
+        return self._offset.rows(first, stop)
+
+    def _read_back_demand(self, first: int, stop: int, offset: SetpointRows | None) -> SetpointRows | None:
+        """The demand on rows [first, stop): sniffed and checked against what the drive shows, else what it shows.
+
+        0x6062 at SYNC k is r[k] + o[k].
+        """
+        tick, shown = self._shown(self.profile.position_demand, first, stop)
+        base = shown - (offset.value[tick - first] if offset is not None else 0)
+        if self._target.queue.tick.size == 0 and shown.size:
+            self._target.held = int(base[-1])
+        demand = self._target.rows(first, stop)
+        if demand is not None and self._target.queue.tick.size and shown.size:
+            sure = demand.certain[tick - first]
+            self._compare((base - demand.value[tick - first])[sure])
+        return demand
+
+    def _compare(self, difference: Int) -> None:
+        for wrong in np.abs(difference) > _READ_BACK_TOLERANCE:
+            self._mismatches = self._mismatches + 1 if wrong else 0
+            if self._mismatches == _MISMATCHES:
+                text = (
+                    f"Drive {self.axis} follows another demand than the sniffed one, by {int(difference[-1])} "
+                    "increments, its samples cannot be trusted; check setpoint_delay_cycles and who sends set-points."
+                )
+                self._notices.append(Notice("DemandMismatch", "MAJOR", text, self.axis))
+
+    def _length_notices(self) -> None:
+        if self.counters.short >= 3:
+            text = (
+                f"Drive {self.axis} sends PDOs shorter than its mapping, they are not used; check the drive's mapping."
+            )
+            self._tell("PdoLength", "MAJOR", text)
+        if self.counters.long:
+            text = f"Drive {self.axis} sends PDOs longer than its mapping; commission it again."
+            self._tell("PdoMapping", "minor", text)
+
+    def _tell(self, code: str, severity: Literal["minor", "MAJOR"], text: str) -> None:
+        """Say a thing once."""
+        if code not in self._told:
+            self._told.add(code)
+            self._notices.append(Notice(code, severity, text, self.axis))

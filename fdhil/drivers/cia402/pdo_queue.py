@@ -1,0 +1,190 @@
+"""Frames of one PDO on their way to a dense grid of ticks, and sniffed set-points. Pure numpy, no loop per frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from fdhil.cia402 import PdoEntry
+from fdhil.drivers.can.sync_grid import Ticked
+from fdhil.drivers.cia402.profile import PdoSpec
+from fdhil.records import Bool, Int
+
+Words = npt.NDArray[np.uint64]
+
+
+def decode(entry: PdoEntry, data: Words) -> Int:
+    """Return the integers (n,) that ``entry`` maps in the frames' data words (n,): little-endian, sign-extended."""
+    top = data << np.uint64(64 - entry.bits - entry.bit_offset)
+    right = 64 - entry.bits
+    # the entry's sign bit is now bit 63, so an arithmetic shift extends it
+    return top.view(np.int64) >> np.int64(right) if entry.signed else (top >> np.uint64(right)).astype(np.int64)
+
+
+@dataclass(slots=True)
+class DecoderCounters:
+    """What a decoder counted: frames lost, too short, too long, duplicated, and ambiguous ones it put aside."""
+
+    lost: int = 0
+    short: int = 0
+    long: int = 0
+    duplicates: int = 0
+    ambiguous: int = 0
+
+
+@dataclass(slots=True)
+class PdoQueue:
+    """Frames of one PDO that wait until their ticks are complete; ``tick`` (m,) never falls."""
+
+    spec: PdoSpec
+    cob_id: int
+    tick: Int = field(default_factory=lambda: np.empty(0, np.int64))
+    data: Words = field(default_factory=lambda: np.empty(0, np.uint64))
+    length: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.length = self.spec.length
+
+    def add(self, ticked: Ticked, counters: DecoderCounters) -> None:
+        """Take this PDO's frames from a block; a short one is discarded, of a long one the mapped bytes are used."""
+        mine = (ticked.can_id == self.cob_id).nonzero()[0]
+        if mine.size == 0:
+            return
+        length = ticked.length[mine]
+        if (length != self.length).any():
+            whole = length >= self.length
+            counters.short += int(mine.size - np.count_nonzero(whole))
+            counters.long += int(np.count_nonzero(length > self.length))
+            mine = mine[whole]
+        self.tick = np.concatenate([self.tick, ticked.tick[mine]])
+        self.data = np.concatenate([self.data, ticked.data[mine]])
+
+    def forget(self, before_tick: int) -> None:
+        """Drop what is older than ``before_tick``."""
+        start = int(np.searchsorted(self.tick, before_tick))
+        if start:
+            self.tick, self.data = self.tick[start:], self.data[start:]
+
+    def between(self, first: int, stop: int) -> tuple[Int, Words]:
+        """Return tick and data of the frames of ticks [first, stop)."""
+        low, high = self.tick.searchsorted((first, stop))
+        return self.tick[low:high], self.data[low:high]
+
+    def gapless(self, first: int, stop: int) -> Words | None:
+        """Return the data of ticks [first, stop) when exactly one frame came in each of them, else None."""
+        tick, data = self.between(first, stop)
+        regular = tick.size == stop - first and bool((tick == np.arange(first, stop)).all())
+        return data if regular else None
+
+
+@dataclass(frozen=True, slots=True)
+class Dense:
+    """A PDO on every tick of [first, first + n): data ``words`` (n,), ``present`` (n,) and ``ambiguous`` (n,).
+
+    Of equal frames in one tick the first is used; different ones cannot be told apart (one may be late, one may be
+    another producer's), so none is. ``duplicates`` (n,) counts the equal ones to spare.
+    """
+
+    words: Words
+    present: Bool
+    ambiguous: Bool
+    duplicates: Int
+
+    @property
+    def missing(self) -> Bool:
+        """Ticks (n,) in which no frame came at all."""
+        return ~self.present & ~self.ambiguous
+
+
+def dense(queue: PdoQueue, first: int, stop: int) -> Dense:
+    """Lay the queue's frames of ticks [first, stop) out on the grid."""
+    n = stop - first
+    regular = queue.gapless(first, stop)
+    if regular is not None:
+        return Dense(regular, np.ones(n, np.bool_), np.zeros(n, np.bool_), np.zeros(n, np.int64))
+    tick, data = queue.between(first, stop)
+    place = tick - first
+    words = np.zeros(n, np.uint64)
+    words[place[::-1]] = data[::-1]
+    count = np.bincount(place, minlength=n)
+    ambiguous = np.zeros(n, np.bool_)
+    if tick.size > np.count_nonzero(count):
+        ambiguous[place[data != words[place]]] = True
+    duplicates = np.where(ambiguous, 0, np.maximum(count - 1, 0))
+    return Dense(words, (count > 0) & ~ambiguous, ambiguous, duplicates)
+
+
+@dataclass(frozen=True, slots=True)
+class SetpointRows:
+    """A set-point on rows [first, stop): ``value`` (n,), whether it is ``certain`` (n,), frames that must be lost."""
+
+    value: Int
+    certain: Bool
+    lost: int
+
+
+class Setpoint:
+    """A sniffed set-point: latched at each SYNC, held while none comes, uncertain where one may have been lost.
+
+    ``held`` is the value in force before the frames in the queue, None while it is not known.
+    """
+
+    def __init__(self, queue: PdoQueue, entry: PdoEntry, delay: int) -> None:
+        self.queue = queue
+        self.held: int | None = None
+        self._entry = entry
+        self._streaming = False
+        self._held_doubtful = False  # different frames came in its tick: the SYNC between them was lost
+        self.shift = delay + 1  # a frame after SYNC j is latched at SYNC j+1 and in force ``delay`` cycles later
+        self._reach = delay + 2  # a gap is looked across as far as is known when its row leaves
+
+    def rows(self, first: int, stop: int) -> SetpointRows | None:
+        """Return the set-point in force on rows [first, stop); None while nothing is known of it."""
+        regular = self.queue.gapless(first - self.shift, stop - self.shift)
+        if regular is not None:
+            return SetpointRows(decode(self._entry, regular), np.ones(stop - first, np.bool_), 0)
+        ticks, words, doubtful = self._latched()
+        values = decode(self._entry, words)
+        wanted = np.arange(first - self.shift, stop - self.shift)
+        at = np.searchsorted(ticks, wanted, side="right") - 1
+        if self.held is None and (ticks.size == 0 or at[-1] < 0):
+            return None
+        if ticks.size == 0:
+            return SetpointRows(np.full(wanted.size, self.held, np.int64), np.ones(wanted.size, np.bool_), 0)
+        now = np.maximum(at, 0)
+        value = np.where(at >= 0, values[now], self.held if self.held is not None else 0)
+        exact = (at >= 0) & (ticks[now] == wanted)
+        following = np.minimum(at + 1, ticks.size - 1)
+        gap = ~exact & (at + 1 < ticks.size) & (ticks[following] - wanted < self._reach)
+        gap &= ((at >= 0) & (wanted - ticks[now] < self._reach)) | ((at < 0) & self._streaming)
+        certain = ~(gap & (values[following] != value)) & ~(exact & doubtful[now])
+        if self.held is None:
+            certain &= at >= 0
+        before_gap = np.where(at >= 0, doubtful[now], self._held_doubtful)
+        lost = int(np.count_nonzero(gap & ~before_gap))
+        return SetpointRows(value, certain, lost)
+
+    def _latched(self) -> tuple[Int, Words, Bool]:
+        """Tick and word of the last frame of each tick, and whether different ones came in that tick."""
+        tick, data = self.queue.tick, self.queue.data
+        if tick.size == 0:
+            return tick, data, np.empty(0, np.bool_)
+        last = np.append(np.flatnonzero(np.diff(tick)), tick.size - 1)
+        doubtful = np.zeros(last.size, np.bool_)
+        if last.size < tick.size:
+            group = np.searchsorted(tick[last], tick)
+            doubtful[np.unique(group[data != data[last][group]])] = True
+        return tick[last], data[last], doubtful
+
+    def forget(self, row: int) -> None:
+        """Drop the frames that no row from ``row`` on needs, but hold the newest of them."""
+        keep = row - self.shift
+        count = int(np.searchsorted(self.queue.tick, keep))
+        if count:
+            self.held = int(decode(self._entry, self.queue.data[count - 1 : count])[0])
+            newest = self.queue.data[int(np.searchsorted(self.queue.tick, self.queue.tick[count - 1])) : count]
+            self._held_doubtful = bool((newest != newest[0]).any())
+            self._streaming = int(self.queue.tick[count - 1]) >= keep - self._reach
+            self.queue.forget(keep)

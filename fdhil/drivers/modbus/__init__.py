@@ -1,0 +1,1 @@
+"""Sensors on Modbus: one link, and what is read over it."""

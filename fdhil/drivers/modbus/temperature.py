@@ -1,0 +1,38 @@
+"""A slide-way thermometer behind Modbus TCP: one float32 in two input registers, asked now and then."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+from fdhil.config import Thermometer
+from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.modbus.link import ModbusLink, float32
+from fdhil.errors import ProtocolError
+from fdhil.records import Temperature
+
+PLAUSIBLE_C = (-50.0, 150.0)
+
+
+class ModbusTemperature:
+    """The thermometer of one axis; ``link`` is its connection, ``samples`` counts readings, none can be ``lost``."""
+
+    lost = 0
+
+    def __init__(self, axis: str, settings: Thermometer) -> None:
+        self.axis = axis
+        self.name = f"thermometer {axis}"
+        self.link = ModbusLink(self.name, settings.host, settings.port, settings.unit, settings.timeout_s)
+        self.samples = 0
+        self._address = settings.address
+        self._period_s = settings.period_s
+
+    async def poll(self, ticks: TickClock) -> list[Temperature]:
+        """Rest for the period and read once; errors of the link pass through, ProtocolError for no temperature."""
+        await asyncio.sleep(self._period_s)
+        celsius = float32(await self.link.read_input(self._address, 2))
+        if not PLAUSIBLE_C[0] < celsius < PLAUSIBLE_C[1] or not math.isfinite(celsius):
+            text = f"register {self._address} gives {celsius:g} degC; compare the register map with the config"
+            raise ProtocolError(self.name, text)
+        self.samples += 1
+        return [Temperature(self.axis, ticks.newest_tick, celsius, "slideway")]

@@ -1,0 +1,171 @@
+"""A voltage sensor on Modbus TCP that samples by itself and hands its samples over in blocks.
+
+Register map (16 bit words, big-endian, the same for input and holding registers): 0-1 newest voltage float32, 2-3
+its sample counter uint32, 4-5 sample rate Hz float32, 6-7 volts per count of the block float32, 8-9 slide-way
+temperature degC float32, 10 trigger, 11 status, 12-13 counter of the block's first sample uint32, 14 samples in the
+block, 16..115 the samples int16. Writing 1 to the trigger latches the newest samples that were not latched before.
+Everything is then read with one request, so that no value is torn.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdhil.config import MachineConfig
+from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.modbus.counter_clock import CounterClock, Line
+from fdhil.drivers.modbus.link import ModbusLink, float32, uint32
+from fdhil.errors import ProtocolError
+from fdhil.records import Float, Notice, Temperature, VoltageSamples, frozen, frozen_ints
+
+TRIGGER = 10
+FIRST_SAMPLE = 16
+BLOCK_SAMPLES = 100
+ALL_REGISTERS = FIRST_SAMPLE + BLOCK_SAMPLES
+STATUS_LOST = 2
+STUCK_POLLS = 20
+SYNC_LATENESS_NS = 200_000  # how late the stamp of a SYNC may be on a busy computer
+_SETTLE_STEPS = 8
+_SETTLE_STEP_S = 0.01
+_SETTLED_NS = 50_000_000  # a query is placed when so many later SYNCs have shown which stamps around it were late
+
+
+@dataclass(frozen=True, slots=True)
+class SensorBlock:
+    """One reading of the whole map: ``volts`` (n,) are the samples ``first`` .. ``first`` + n - 1."""
+
+    newest: int
+    rate_hz: float
+    celsius: float
+    lost: bool
+    first: int
+    volts: Float
+
+
+def parse_block(name: str, registers: Sequence[int]) -> SensorBlock:
+    """Decode and check the map; ProtocolError when a value cannot be."""
+    rate_hz, volts_per_count, celsius = (float32(registers, at) for at in (4, 6, 8))
+    count, first, newest = registers[14], uint32(registers, 12), uint32(registers, 2)
+    for what, ok in (
+        (f"a sample rate of {rate_hz} Hz", math.isfinite(rate_hz) and 0.1 <= rate_hz <= 1e6),
+        (f"{volts_per_count} volts per count", math.isfinite(volts_per_count) and volts_per_count != 0),
+        (f"{count} samples in a block of {BLOCK_SAMPLES}", count <= BLOCK_SAMPLES),
+        (f"a block that ends after the newest sample ({first} + {count} > {newest} + 1)", first + count <= newest + 1),
+    ):
+        if not ok:
+            raise ProtocolError(name, f"the sensor reports {what}; compare its register map with the driver's")
+    samples = np.array(registers[FIRST_SAMPLE : FIRST_SAMPLE + count], np.uint16).view(np.int16)
+    return SensorBlock(newest, rate_hz, celsius, registers[11] == STATUS_LOST, first, frozen(samples * volts_per_count))
+
+
+class ModbusVoltage:
+    """The voltage source ``modbus`` of one axis; ``poll`` asks once and returns what is new."""
+
+    def __init__(self, axis: str, config: MachineConfig) -> None:
+        settings = config.axis[axis].voltage
+        self.axis = axis
+        self.name = f"voltage sensor {axis}"
+        self._sign = config.axis[axis].drive.sign
+        self._period_s = config.machine.sync_period_s
+        self.link = ModbusLink(self.name, settings.host, settings.port, settings.unit, settings.timeout_s)
+        self._host_clock: CounterClock | None = None
+        self._tick_clock: CounterClock | None = None
+        self._rate_hz = 0.0
+        self._waiting: deque[tuple[int, int, int]] = deque(maxlen=BLOCK_SAMPLES)
+        self._next: int | None = None
+        self._still = 0
+        self.lost = 0
+        self.samples = 0
+
+    async def poll(self, ticks: TickClock) -> list[VoltageSamples | Temperature | Notice]:
+        """Latch and read once; errors of the link pass through."""
+        await self.link.write(TRIGGER, 1)
+        asked_ns = time.monotonic_ns()
+        registers = await self.link.read_input(0, ALL_REGISTERS)
+        answered_ns = time.monotonic_ns()
+        block = parse_block(self.name, registers)
+        for _ in range(_SETTLE_STEPS):  # the SYNCs around the query must have been drained before it can be placed
+            if not ticks.running or ticks.covers(answered_ns):
+                break
+            await asyncio.sleep(_SETTLE_STEP_S)
+        return self.accept(block, asked_ns, answered_ns, ticks)
+
+    def accept(
+        self, block: SensorBlock, asked_ns: int, answered_ns: int, ticks: TickClock
+    ) -> list[VoltageSamples | Temperature | Notice]:
+        """Place a block on the timelines. Pure but for this object's own memory."""
+        out: list[VoltageSamples | Temperature | Notice] = []
+        self._clocks(block, asked_ns, answered_ns, ticks)
+        out += self._continuity(block)
+        if math.isfinite(block.celsius) and -50.0 < block.celsius < 150.0:
+            out.append(Temperature(self.axis, ticks.newest_tick, block.celsius, "slideway"))
+        if block.volts.size:
+            out.append(self._samples(block, ticks))
+        return out
+
+    def _clocks(self, block: SensorBlock, asked_ns: int, answered_ns: int, ticks: TickClock) -> None:
+        if self._host_clock is None or self._tick_clock is None or block.rate_hz != self._rate_hz:
+            self._rate_hz = block.rate_hz
+            self._host_clock = CounterClock(1e9 / block.rate_hz)
+            self._tick_clock = CounterClock(1 / block.rate_hz / self._period_s)
+            self._waiting.clear()
+        self._host_clock.add(block.newest, asked_ns, answered_ns)
+        self._waiting.append((block.newest, asked_ns, answered_ns))
+        while self._waiting and (ticks.covers(self._waiting[0][2] + _SETTLED_NS) or self._tick_clock.line() is None):
+            newest, asked, answered = self._waiting.popleft()
+            between = ticks.bounds(asked, answered)
+            if between is not None:
+                self._tick_clock.add(newest, *between)
+
+    @property
+    def line(self) -> Line | None:
+        """Where the sensor's samples lie on the SYNC count, None before that is known."""
+        return self._tick_clock.line() if self._tick_clock else None
+
+    def _continuity(self, block: SensorBlock) -> list[Notice]:
+        """Count samples that are missing between blocks, and notice a counter that stands still."""
+        notices = []
+        if self._next is not None and block.volts.size and block.first > self._next:
+            missing = block.first - self._next
+            self.lost += missing
+            text = f"The {self.name} lost {missing} samples, the moves in them are not identified; poll it more often."
+            notices.append(Notice("SampleTiming", "minor", text, self.axis))
+        self._still = 0 if block.volts.size else self._still + 1
+        if self._still == STUCK_POLLS:
+            text = f"The {self.name} answers but samples no more; see whether it is in an error state."
+            notices.append(Notice("StuckValue", "MAJOR", text, self.axis))
+        if block.volts.size:
+            self._next = block.first + block.volts.size
+            self.samples += block.volts.size
+        return notices
+
+    def _samples(self, block: SensorBlock, ticks: TickClock) -> VoltageSamples:
+        counter = block.first + np.arange(block.volts.size)
+        t_ns, error_ns = self._times(counter, ticks)
+        return VoltageSamples(
+            sensor=self.name,
+            axis=self.axis,
+            counter=frozen_ints(counter),
+            t_ns=frozen_ints(np.round(t_ns)),
+            t_error_ns=frozen_ints(np.full(counter.size, max(1, round(error_ns)))),
+            voltage_v=frozen(self._sign * block.volts),
+            sample_rate_hz=block.rate_hz,
+        )
+
+    def _times(self, counter: np.ndarray, ticks: TickClock) -> tuple[np.ndarray, float]:
+        """Host time at which each sample begins: by way of the SYNC count where there is one, so that what was late
+        in both SYNC and sensor cancels."""
+        line = self.line
+        if line is not None and ticks.running:
+            fraction = line.start + line.step * (counter - line.origin)
+            return ticks.time_ns(fraction), line.error * ticks.period_ns + SYNC_LATENESS_NS
+        host = self._host_clock.line() if self._host_clock else None
+        assert host is not None  # accept() has just added a query
+        return host.start + host.step * (counter - host.origin), host.error

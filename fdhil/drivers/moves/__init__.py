@@ -1,0 +1,1 @@
+"""Sources of move events: which moves were ordered as rapids (G0). ``fdhil.tables`` lists them."""

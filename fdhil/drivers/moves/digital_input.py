@@ -1,0 +1,34 @@
+"""G0 events from the NC's own signal: a bit of the drive's digital inputs (0x60FD). Pure.
+
+The input comes with a slower TPDO than the samples, so an edge is known to that TPDO's period: the beginning is given
+as the tick of the sample before the edge, the end as the tick of the first sample after it.
+"""
+
+from __future__ import annotations
+
+from fdhil.config import MachineConfig
+from fdhil.drivers.cia402.drive import InputSamples
+from fdhil.records import AxisSamples, MoveEvent, MoveKind
+
+
+class DigitalInputG0:
+    """Says RAPID while the bit is set, REST when it falls."""
+
+    def __init__(self, axis: str, config: MachineConfig) -> None:
+        self._axis = axis
+        self._mask = 1 << config.g0.input_bit
+        self._high: bool | None = None
+        self._last_tick = 0
+
+    def feed(self, record: AxisSamples | InputSamples) -> list[MoveEvent]:
+        """Take a block of inputs; return the edges. The first sample ever only tells where the signal stands."""
+        if not isinstance(record, InputSamples) or record.axis != self._axis:
+            return []
+        events = []
+        for tick, inputs in zip(record.tick.tolist(), record.inputs.tolist(), strict=True):
+            high = bool(inputs & self._mask)
+            if self._high is not None and high != self._high:
+                kind = MoveKind.RAPID if high else MoveKind.REST
+                events.append(MoveEvent(self._axis, kind, self._last_tick if high else tick, "digital_input"))
+            self._high, self._last_tick = high, tick
+        return events

@@ -1,0 +1,134 @@
+"""One axis of the simulated machine: the drive with its slide-way and sensor, and what a fault can do to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from fdhil.sim.drive.sensors import DriveFaults
+from fdhil.sim.drive.servo import Drive
+from fdhil.sim.nc.drive_link import BusFrame
+from fdhil.sim.thermal import SlideWay
+from fdhil.sim.wire.modbus_sensor import SensorFaults, VoltageSensor
+
+_GAP_CYCLES = 50  # a longer silence is the end of a stream, not a late frame
+_PATIENCE_CYCLES = 3  # a listed RPDO that was missing this often is not waited for any more
+
+
+@dataclass(slots=True)
+class Stream:
+    """One RPDO, cycle by cycle; ``late`` counts the cycles in which it was missing in a stream that went on."""
+
+    active: bool = False
+    gap: int = 0
+    late: int = 0
+
+    def step(self, heard: bool) -> None:
+        """A cycle ended in which the RPDO was heard or not."""
+        if heard:
+            self.late += self.gap
+            self.active, self.gap = True, 0
+        elif self.active:
+            self.gap += 1
+            if self.gap > _GAP_CYCLES:
+                self.active, self.gap = False, 0
+
+    @property
+    def awaited(self) -> bool:
+        """Whether lockstep still waits for it."""
+        return self.active and self.gap <= _PATIENCE_CYCLES
+
+
+@dataclass(slots=True)
+class Unit:
+    """One axis of the machine: its drive and what is mounted around it. It is also what a fault acts on."""
+
+    axis: str
+    bus: str
+    drive: Drive
+    slide_way: SlideWay
+    sensor: VoltageSensor
+    outbox: list[BusFrame]
+    injected: dict[int, tuple[str, bytes]]
+    offsets: Stream = field(default_factory=Stream)
+    sync_on: bool = True
+    _before: dict[tuple[int, int], int] = field(default_factory=dict)
+
+    @property
+    def drive_faults(self) -> DriveFaults:
+        """The drive's fault state."""
+        return self.drive.faults
+
+    @property
+    def sensor_faults(self) -> SensorFaults:
+        """The sensor's fault state."""
+        return self.sensor.faults
+
+    def trip(self, code: int) -> None:
+        """Let the drive fall into fault."""
+        self.drive.trip(code)
+
+    def reboot(self) -> None:
+        """Restart the drive."""
+        self.drive.power_off()
+        self.power(True)
+
+    def power(self, on: bool) -> None:
+        """Cut or restore the drive's supply."""
+        if on:
+            self.outbox.extend((self.bus, frame) for frame in self.drive.power_on())
+        else:
+            self.drive.power_off()
+
+    def input(self, bit: int, on: bool) -> None:
+        """Set or clear a bit of 0x60FD."""
+        mask = 1 << (bit & 31)
+        self.drive.digital_inputs = self.drive.digital_inputs | mask if on else self.drive.digital_inputs & ~mask
+
+    def inject(self, can_id: int, data: bytes, on: bool) -> None:
+        """Send a foreign frame at every SYNC while it is on."""
+        if on:
+            self.injected[can_id] = (self.bus, data)
+        else:
+            self.injected.pop(can_id, None)
+
+    def sync(self, on: bool) -> None:
+        """Let the NC's SYNC fail on this axis' bus, or come again."""
+        self.sync_on = on
+
+    def object_fault(self, index: int, sub: int, value: int) -> str:
+        """Return why an object of the drive cannot hold a value, "" when it can."""
+        entry = self.drive.dictionary.entries.get(index << 8 | sub)
+        if entry is None or entry.size is None:
+            return f"the drive has no number {index:04X}:{sub:02X}"
+        low, high = (
+            (-(1 << 8 * entry.size - 1), (1 << 8 * entry.size - 1) - 1)
+            if entry.signed
+            else (0, (1 << 8 * entry.size) - 1)
+        )
+        return "" if low <= value <= high else f"{value} does not fit {index:04X}:{sub:02X}"
+
+    def put(self, index: int, sub: int, value: int, on: bool) -> None:
+        """Write an object past all access rules, and give it its value back."""
+        drive = self.drive
+        if on:
+            self._before.setdefault((index, sub), drive.dictionary.number(index, sub))
+            drive.set_object(index, sub, value)
+        elif (index, sub) in self._before:
+            drive.set_object(index, sub, self._before.pop((index, sub)))
+
+    def remap(self, number: int, on: bool) -> None:
+        """Let a TPDO carry its objects in the other order, as after another tool's visit, and put it right again.
+
+        The order is turned at the start and at the end alike.
+        """
+        del on
+        index = 0x1A00 + number - 1
+        count = self.drive.dictionary.number(index, 0)
+        words = [self.drive.dictionary.number(index, sub) for sub in range(count, 0, -1)]
+        self.drive.remap(index, [(word >> 16, word >> 8 & 0xFF, word & 0xFF) for word in words])
+
+    def warm(self, celsius: float) -> None:
+        """Set the slide-way's temperature everywhere it is felt."""
+        self.slide_way.celsius = celsius
+        self.drive.set_temperature(celsius)
+        self.sensor.celsius = celsius

@@ -1,0 +1,142 @@
+"""Error handling of a CANopen device: emergency messages, error history, heartbeats both ways."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from fdhil.sim.drive.dictionary import AbortCode, Dictionary, Entry, TransferAbort
+from fdhil.sim.drive.objects import ERROR_HISTORY, HEARTBEAT_CONSUMERS, INVALID
+
+Frame = tuple[int, bytes]
+
+# error codes (CiA 301 table 26, CiA 402-2)
+NO_ERROR = 0x0000
+HEARTBEAT_LOST = 0x8130
+PDO_TOO_SHORT = 0x8210
+SYNC_LENGTH = 0x8240
+RPDO_TIMEOUT = 0x8250
+FOLLOWING_ERROR = 0x8611
+
+_GENERIC, _COMMUNICATION, _PROFILE = 0x01, 0x10, 0x20
+_CLASS_BITS = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08}
+
+
+def _register_bits(code: int) -> int:
+    """Bits of the error register 0x1001 for an error code."""
+    if code & 0xFF00 in (0x8100, 0x8200):
+        return _GENERIC | _COMMUNICATION
+    if code & 0xFF00 == 0x8600:
+        return _GENERIC | _PROFILE
+    return _GENERIC | _CLASS_BITS.get(code >> 12, 0x80 if code >> 12 == 0xF else 0)
+
+
+class Emergencies:
+    """The error register, the history 0x1003, and the EMCY frames."""
+
+    def __init__(self, dictionary: Dictionary) -> None:
+        self._dictionary = dictionary
+        dictionary.read_hooks.update({0x1003 << 8 | n: self._field(n) for n in range(1, ERROR_HISTORY + 1)})
+
+    def report(self, code: int, detail: bytes = b"") -> list[Frame]:
+        """Note an error and return its frame, 8 bytes: code, error register, 5 bytes of ``detail``."""
+        values = self._dictionary.numbers
+        register = self._dictionary.number(0x1001) | _register_bits(code)
+        values[0x1001 << 8] = register
+        count = min(self._dictionary.number(0x1003) + 1, ERROR_HISTORY)
+        for n in range(count, 1, -1):
+            values[0x1003 << 8 | n] = values[0x1003 << 8 | n - 1]
+        values[0x1003 << 8 | 1] = code | int.from_bytes(detail[:2], "little") << 16
+        values[0x1003 << 8] = count
+        return self._frame(code, register, detail)
+
+    def clear(self, *, in_fault: bool = False) -> list[Frame]:
+        """Errors were reset, or with ``in_fault`` only the communication works again.
+
+        When the error register becomes 0, return the frame "error reset" (code 0).
+        """
+        before = self._dictionary.number(0x1001)
+        after = before & ~_COMMUNICATION if in_fault else 0
+        self._dictionary.numbers[0x1001 << 8] = after
+        return self._frame(NO_ERROR, 0, b"") if before and not after else []
+
+    def _frame(self, code: int, register: int, detail: bytes) -> list[Frame]:
+        cob_id = self._dictionary.number(0x1014)
+        if cob_id & INVALID:
+            return []
+        return [(cob_id & 0x7FF, code.to_bytes(2, "little") + bytes([register]) + detail[:5].ljust(5, b"\0"))]
+
+    def _field(self, n: int) -> Callable[[], int]:
+        def read() -> int:
+            if n > self._dictionary.number(0x1003):
+                raise TransferAbort(AbortCode.NO_DATA)
+            return self._dictionary.number(0x1003, n)
+
+        return read
+
+
+class HeartbeatConsumer:
+    """Watches the nodes of 0x1016; monitoring of a node starts with its first heartbeat."""
+
+    def __init__(self, dictionary: Dictionary) -> None:
+        self._dictionary = dictionary
+        self._heard: dict[int, float] = {}
+        self._periods: dict[int, float] = {}
+        for n in range(1, HEARTBEAT_CONSUMERS + 1):
+            dictionary.check[0x1016 << 8 | n] = self._check
+            dictionary.written[0x1016 << 8 | n] = lambda _: self.configure()
+        self.lost: set[int] = set()
+
+    def configure(self) -> None:
+        """Take over 0x1016; the monitoring starts anew."""
+        words = [self._dictionary.number(0x1016, n) for n in range(1, HEARTBEAT_CONSUMERS + 1)]
+        self._periods = {word >> 16 & 0x7F: (word & 0xFFFF) * 1e-3 for word in words if word & 0xFFFF and word >> 16}
+        self._heard.clear()
+        self.lost = set()
+
+    def _check(self, entry: Entry, value: int) -> None:
+        if value >> 16 > 127:
+            raise TransferAbort(AbortCode.RANGE)
+        for n in range(1, HEARTBEAT_CONSUMERS + 1):
+            other = self._dictionary.number(0x1016, n)
+            if n != entry.sub and value & 0xFFFF and other & 0xFFFF and other >> 16 == value >> 16:
+                raise TransferAbort(AbortCode.INCOMPATIBLE)
+
+    def receive(self, node_id: int, now_s: float) -> bool:
+        """Note a heartbeat; True when the last lost node is back."""
+        if node_id not in self._periods:
+            return False
+        self._heard[node_id] = now_s
+        was_lost = bool(self.lost)
+        self.lost.discard(node_id)
+        return was_lost and not self.lost
+
+    def expired(self, now_s: float) -> list[int]:
+        """Return the nodes whose heartbeat has just been missed."""
+        silent = [node for node, heard in self._heard.items() if now_s - heard > self._periods[node]]
+        for node in silent:
+            del self._heard[node]
+            self.lost.add(node)
+        return silent
+
+
+class HeartbeatProducer:
+    """Sends the NMT state every 0x1017 milliseconds of wall time."""
+
+    def __init__(self, dictionary: Dictionary, node_id: int) -> None:
+        self._dictionary = dictionary
+        self._cob_id = 0x700 + node_id
+        self._next_s: float | None = None
+        dictionary.written[0x1017 << 8] = lambda _: self.restart()
+
+    def restart(self) -> None:
+        """The period changed or the device started: the next heartbeat is due at once."""
+        self._next_s = None
+
+    def due(self, now_s: float, state: int) -> list[Frame]:
+        """Return the heartbeat when its time has come."""
+        period_s = self._dictionary.number(0x1017) * 1e-3
+        if period_s == 0 or (self._next_s is not None and now_s < self._next_s):
+            return []
+        late = self._next_s is None or now_s - self._next_s > period_s
+        self._next_s = now_s + period_s if late or self._next_s is None else self._next_s + period_s
+        return [(self._cob_id, bytes([state]))]

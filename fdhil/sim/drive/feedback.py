@@ -1,0 +1,110 @@
+"""The objects that a SYNC samples: positions, speeds, current, voltage, statusword (CiA 402-2)."""
+
+from __future__ import annotations
+
+import math
+
+from fdhil.config import Regulators
+from fdhil.sim.drive.dictionary import Dictionary
+from fdhil.sim.drive.motion import Motion, Source
+from fdhil.sim.drive.objects import VOLTAGE_V_PER_COUNT, Ratings
+from fdhil.sim.drive.physics import Physics
+from fdhil.sim.drive.power import PowerStage
+from fdhil.sim.drive.sensors import Sensors
+from fdhil.sim.drive.trace import TraceBuffer
+
+_VOLTAGE_ENABLED, _REMOTE, _LIMIT, _FOLLOWING_ERROR = 1 << 4, 1 << 9, 1 << 11, 1 << 13
+_LIMIT_SWITCHES = 0b11
+
+
+def clip16(value: float) -> int:
+    """Round to INTEGER16; beyond its range the end value."""
+    whole = round(value)
+    if -0x8000 <= whole <= 0x7FFF:
+        return whole
+    return 0x7FFF if whole > 0 else -0x8000
+
+
+def clip32(value: float) -> int:
+    """Round to INTEGER32; beyond its range the end value."""
+    whole = round(value)
+    if -0x80000000 <= whole <= 0x7FFFFFFF:
+        return whole
+    return 0x7FFFFFFF if whole > 0 else -0x80000000
+
+
+class Feedback:
+    """Samples a drive's objects. ``following_error`` is shown in bit 13, ``digital_inputs`` in 0x60FD."""
+
+    def __init__(
+        self,
+        dictionary: Dictionary,
+        ratings: Ratings,
+        regulators: Regulators,
+        physics: Physics,
+        power: PowerStage,
+        motion: Motion,
+        sensors: Sensors,
+        trace: TraceBuffer,
+    ) -> None:
+        self._numbers = dictionary.numbers
+        self._physics = physics
+        self._power = power
+        self._motion = motion
+        self._sensors = sensors
+        self._trace = trace
+        self._inc_per_rad = ratings.increments_per_rev / (2 * math.pi)
+        self._counts_per_a = 1e3 / ratings.rated_current_a
+        self._kv, self._kff = regulators.position_gain_per_s, regulators.speed_feedforward
+        self.following_error = False
+        self.digital_inputs = 0
+
+    @property
+    def true_position(self) -> int:
+        """The table's encoder, increments: what the position loop closes on."""
+        return round(self._physics.table_rad * self._inc_per_rad)
+
+    def sample(self, tick: int) -> int:
+        """Sample all objects now; the voltage is the mean of the cycle that ended. Returns the following error."""
+        physics, numbers = self._physics, self._numbers
+        true_position = self.true_position
+        position, speed, current, voltage = self._sensors.read(
+            true_position, physics.speed_rad_s, physics.current_a, physics.voltage_mean_v
+        )
+        demand = clip32(self._motion.demand)
+        shown = clip32(position)
+        speed_counts = clip32(speed * self._inc_per_rad)
+        current_counts = clip16(current * self._counts_per_a)
+        voltage_counts = clip16(voltage / VOLTAGE_V_PER_COUNT)
+        numbers[0x606200] = numbers[0x60FC00] = demand
+        numbers[0x606300] = clip32(physics.angle_rad * self._inc_per_rad)
+        numbers[0x606400] = shown
+        numbers[0x606B00] = self._speed_demand(true_position)
+        numbers[0x606C00] = speed_counts
+        numbers[0x607700] = numbers[0x607800] = current_counts
+        numbers[0x210100] = voltage_counts
+        numbers[0x60F400] = clip32(demand - true_position)
+        numbers[0x60FD00] = self.digital_inputs
+        self._trace.append(tick, demand, shown, speed_counts, current_counts, voltage_counts)
+        return demand - true_position
+
+    def _speed_demand(self, position: int) -> int:
+        """Output of the position loop at t_k, increments/s."""
+        if self._motion.source is Source.OFF:
+            return 0
+        p0, _, f0, _, v0, _, _, _ = self._motion.command
+        return clip32(self._kv * (p0 - position) + self._kff * f0 + v0 * self._inc_per_rad)
+
+    def show_state(self) -> None:
+        """Bring statusword and mode display up to date."""
+        word = self._power.state.value | _VOLTAGE_ENABLED | _REMOTE
+        if self._power.powered:
+            word |= self._motion.status_bits
+            if self._physics.current_limited or self._physics.voltage_limited or self._motion.limited:
+                word |= _LIMIT
+        if self.digital_inputs & _LIMIT_SWITCHES:
+            word |= _LIMIT
+        if self.following_error:
+            word |= _FOLLOWING_ERROR
+        self._numbers[0x604100] = word
+        self._numbers[0x606100] = self._motion.mode

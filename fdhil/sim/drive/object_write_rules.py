@@ -1,0 +1,116 @@
+"""What an SDO write to an object of the drive means beyond storing the value: rules and actions by object."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from fdhil.sim.drive.dictionary import AbortCode, Dictionary, Entry, TransferAbort
+from fdhil.sim.drive.objects import ERROR_HISTORY, INVALID, SUPPORTED_MODES
+from fdhil.sim.drive.power import known_quick_stop_code
+from fdhil.sim.drive.trace import TraceBuffer
+
+_SAVE, _LOAD = 0x65766173, 0x64616F6C  # "save" and "load", little-endian
+_STORABLE_ACCESS = ("rw", "rww", "rwr")
+_NOT_STORED = frozenset({0x1003, 0x1010, 0x1011, 0x6040, 0x6060, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x6071})
+
+
+class Stored:
+    """The non-volatile memory behind 0x1010 and 0x1011: values that a boot starts with instead of the defaults."""
+
+    def __init__(self, dictionary: Dictionary) -> None:
+        self._dictionary = dictionary
+        self._values: dict[int, int] = {}
+
+    def restore(self, which: Callable[[Entry], bool]) -> None:
+        """Give the chosen entries their defaults, or what was saved."""
+        self._dictionary.reset(which)
+        entries = self._dictionary.entries
+        self._dictionary.numbers.update({k: v for k, v in self._values.items() if which(entries[k])})
+
+    def save(self) -> None:
+        """Keep all parameters; set-points and the controlword are none."""
+        self._values = {
+            key: self._dictionary.numbers[key]
+            for key, entry in self._dictionary.entries.items()
+            if entry.access in _STORABLE_ACCESS and entry.index not in _NOT_STORED
+        }
+
+    def forget(self) -> None:
+        """Boot with the defaults next time."""
+        self._values = {}
+
+
+def register_rules(
+    dictionary: Dictionary,
+    *,
+    changeable: Callable[[], bool],
+    stored: Stored,
+    trace: TraceBuffer,
+    on_controlword: Callable[[], None],
+    on_communication: Callable[[], None],
+) -> None:
+    """Attach the rules. ``changeable`` says whether the drive is pre-operational; ``on_controlword`` and
+    ``on_communication`` are called after a write of 0x6040 or 0x6060 and of 0x1005."""
+
+    def at_rest(_entry: Entry, _value: int) -> None:
+        if not changeable():
+            raise TransferAbort(AbortCode.DEVICE_STATE)
+
+    def sync_id(entry: Entry, value: int) -> None:
+        at_rest(entry, value)
+        if value & ~0x7FF or value == 0:  # it consumes SYNC and does not produce it
+            raise TransferAbort(AbortCode.RANGE)
+
+    def counter_overflow(entry: Entry, value: int) -> None:
+        at_rest(entry, value)
+        if value == 1 or value > 240:
+            raise TransferAbort(AbortCode.RANGE)
+
+    def emergency_id(_entry: Entry, value: int) -> None:
+        if value & ~(INVALID | 0x7FF) or value & 0x7FF == 0:
+            raise TransferAbort(AbortCode.RANGE)
+
+    def mode(_entry: Entry, value: int) -> None:
+        if value and (value < 0 or not SUPPORTED_MODES >> (value - 1) & 1):
+            raise TransferAbort(AbortCode.RANGE)
+
+    def quick_stop(_entry: Entry, value: int) -> None:
+        if not known_quick_stop_code(value):
+            raise TransferAbort(AbortCode.RANGE)
+
+    dictionary.check.update(
+        {
+            0x100500: sync_id,
+            0x101001: _signature(_SAVE, stored.save),
+            0x101101: _signature(_LOAD, stored.forget),
+            0x101400: emergency_id,
+            0x101900: counter_overflow,
+            0x605A00: quick_stop,
+            0x606000: mode,
+        }
+    )
+    dictionary.written.update(
+        {
+            0x100300: lambda _: _clear_history(dictionary),
+            0x100500: lambda _: on_communication(),
+            0x212100: lambda _: trace.clear(),
+            0x604000: lambda _: on_controlword(),
+            0x606000: lambda _: on_controlword(),
+        }
+    )
+    # the capability, whatever was written: parameters are saved on command
+    dictionary.read_hooks.update({0x101001: lambda: 1, 0x101101: lambda: 1, 0x212000: trace.content})
+
+
+def _signature(wanted: int, action: Callable[[], None]) -> Callable[[Entry, int], None]:
+    def check(_entry: Entry, value: int) -> None:
+        if value != wanted:
+            raise TransferAbort(AbortCode.NOT_STORED)
+        action()
+
+    return check
+
+
+def _clear_history(dictionary: Dictionary) -> None:
+    for n in range(ERROR_HISTORY + 1):
+        dictionary.numbers[0x1003 << 8 | n] = 0

@@ -1,0 +1,248 @@
+"""The objects of the simulated drive: communication profile (CiA 301), drive profile (CiA 402-2), vendor objects.
+
+Position objects are in increments of the encoder, speeds in increments/s, currents in 0.1 % of 0x6075, torques in 0.1 %
+of 0x6076, the vendor's terminal voltage (0x2101) in 0.02 V: the mean over the SYNC period that ended.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fdhil.config import Axis, MachineConfig
+from fdhil.sim.drive.dictionary import ARRAY, I8, I16, I32, U8, U16, U32, DataType, Entry, Object, record, var
+
+VENDOR_ID = 0x46444849
+PRODUCT_CODE = 0x0402
+REVISION = 0x00010000
+DEVICE_NAME = b"fdhil twin drive"
+VOLTAGE_V_PER_COUNT = 0.02
+ERROR_HISTORY = 8
+HEARTBEAT_CONSUMERS = 4
+PDOS = 4
+PDO_ENTRIES = 8
+NO_WINDOW = 0xFFFFFFFF
+PROFILE_POSITION, CYCLIC_POSITION = 1, 8
+SUPPORTED_MODES = 1 << (PROFILE_POSITION - 1) | 1 << (CYCLIC_POSITION - 1)
+INVALID = 1 << 31
+NO_RTR = 1 << 30
+
+# default mapping: (COB-ID base, valid, transmission type, entries (index, sub, bits))
+RPDO_DEFAULTS: tuple[tuple[int, bool, int, tuple[tuple[int, int, int], ...]], ...] = (
+    (0x200, True, 1, ((0x6040, 0, 16), (0x607A, 0, 32))),
+    (0x300, True, 1, ((0x60B0, 0, 32),)),
+    (0x400, False, 1, ((0x60B1, 0, 32), (0x60B2, 0, 16))),
+    (0x500, False, 255, ()),
+)
+TPDO_DEFAULTS: tuple[tuple[int, bool, int, tuple[tuple[int, int, int], ...]], ...] = (
+    (0x180, True, 1, ((0x6064, 0, 32), (0x606C, 0, 32))),
+    (0x280, True, 1, ((0x6041, 0, 16), (0x6078, 0, 16), (0x2101, 0, 16))),
+    (0x380, True, 10, ((0x6062, 0, 32), (0x60B0, 0, 32))),
+    (0x480, True, 10, ((0x60FD, 0, 32), (0x6061, 0, 8), (0x6077, 0, 16))),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Ratings:
+    """What one axis' drive is set to, in its own units."""
+
+    node_id: int
+    sync_period_s: float
+    increments_per_rev: int
+    increments_per_mm: float
+    sign: int
+    rated_current_a: float
+    rated_torque_nm: float
+
+    @classmethod
+    def of(cls, config: MachineConfig, axis: str) -> Ratings:
+        """Read them from the machine's configuration."""
+        section = config.axis[axis]
+        return cls(
+            node_id=config.node_id(axis),
+            sync_period_s=config.machine.sync_period_s,
+            increments_per_rev=section.drive.increments_per_rev,
+            increments_per_mm=section.drive.increments_per_rev / section.screw_pitch_mm,
+            sign=section.drive.sign,
+            rated_current_a=section.drive.rated_current_a,
+            rated_torque_nm=section.nominal.K * section.drive.rated_current_a,
+        )
+
+
+def drive_objects(config: MachineConfig, axis: str) -> tuple[Object, ...]:
+    """Return all objects of one axis' drive with their power-on values."""
+    ratings = Ratings.of(config, axis)
+    objects = (
+        *_communication(config, axis, ratings),
+        *_pdos(ratings.node_id),
+        *_vendor(),
+        *_states(),
+        *_positions(config.axis[axis], ratings),
+        *_motor(config.axis[axis], ratings),
+    )
+    return tuple(sorted(objects, key=lambda item: item.index))
+
+
+def _communication(config: MachineConfig, axis: str, ratings: Ratings) -> list[Object]:
+    node = ratings.node_id
+    history = tuple(Entry(0x1003, n, f"Error field {n}", U32, "ro") for n in range(1, ERROR_HISTORY + 1))
+    consumers = tuple(
+        Entry(0x1016, n, f"Consumer heartbeat time {n}", U32, "rw") for n in range(1, HEARTBEAT_CONSUMERS + 1)
+    )
+    identity = (
+        Entry(0x1018, 1, "Vendor-ID", U32, "ro", VENDOR_ID),
+        Entry(0x1018, 2, "Product code", U32, "ro", PRODUCT_CODE),
+        Entry(0x1018, 3, "Revision number", U32, "ro", REVISION),
+        Entry(0x1018, 4, "Serial number", U32, "ro", 1000 + list(config.axis).index(axis) + 1),
+    )
+    sdo = (
+        Entry(0x1200, 1, "COB-ID client to server", U32, "ro", 0x600 + node, node_relative=True),
+        Entry(0x1200, 2, "COB-ID server to client", U32, "ro", 0x580 + node, node_relative=True),
+    )
+    return [
+        var(0x1000, "Device type", U32, "ro", 0x00020192),
+        var(0x1001, "Error register", U8, "ro", mappable=True),
+        record(
+            0x1003,
+            "Pre-defined error field",
+            history,
+            kind=ARRAY,
+            count=Entry(0x1003, 0, "Number of errors", U8, "rw", 0, low=0, high=0),
+        ),
+        var(0x1005, "COB-ID SYNC message", U32, "rw", 0x80),
+        var(0x1006, "Communication cycle period", U32, "rw", round(ratings.sync_period_s * 1e6)),
+        var(0x1008, "Manufacturer device name", DataType.VISIBLE_STRING, "const", DEVICE_NAME),
+        var(0x1009, "Manufacturer hardware version", DataType.VISIBLE_STRING, "const", b"simulated"),
+        var(0x100A, "Manufacturer software version", DataType.VISIBLE_STRING, "const", b"1.0"),
+        record(0x1010, "Store parameters", (Entry(0x1010, 1, "Save all parameters", U32, "rw", 1),), kind=ARRAY),
+        record(0x1011, "Restore default parameters", (Entry(0x1011, 1, "Restore all", U32, "rw", 1),), kind=ARRAY),
+        var(0x1014, "COB-ID emergency message", U32, "rw", 0x80 + node, node_relative=True),
+        record(0x1016, "Consumer heartbeat time", consumers, kind=ARRAY),
+        var(0x1017, "Producer heartbeat time", U16, "rw", 100),
+        record(0x1018, "Identity object", identity),
+        var(0x1019, "Synchronous counter overflow value", U8, "rw", 240 if config.sim.nc else 0),
+        record(0x1200, "SDO server parameter", sdo),
+    ]
+
+
+def _pdos(node_id: int) -> list[Object]:
+    objects = []
+    for number, (base, valid, kind, entries) in enumerate(RPDO_DEFAULTS):
+        cob_id = base + node_id + (0 if valid else INVALID)
+        objects.append(_pdo_communication(0x1400 + number, "RPDO", number, cob_id, kind))
+        objects.append(_pdo_mapping(0x1600 + number, "RPDO", number, entries))
+    for number, (base, valid, kind, entries) in enumerate(TPDO_DEFAULTS):
+        cob_id = base + node_id + NO_RTR + (0 if valid else INVALID)
+        objects.append(_pdo_communication(0x1800 + number, "TPDO", number, cob_id, kind))
+        objects.append(_pdo_mapping(0x1A00 + number, "TPDO", number, entries))
+    return objects
+
+
+def _pdo_communication(index: int, direction: str, number: int, cob_id: int, kind: int) -> Object:
+    entries = [
+        Entry(index, 1, "COB-ID", U32, "rw", cob_id, node_relative=True),
+        Entry(index, 2, "Transmission type", U8, "rw", kind),
+    ]
+    if direction == "TPDO":
+        entries.append(Entry(index, 3, "Inhibit time", U16, "rw"))
+    entries.append(Entry(index, 5, "Event timer", U16, "rw"))
+    if direction == "TPDO":
+        entries.append(Entry(index, 6, "SYNC start value", U8, "rw", 0, low=0, high=240))
+    return record(index, f"{direction} {number + 1} communication parameter", tuple(entries))
+
+
+def _pdo_mapping(index: int, direction: str, number: int, mapped: tuple[tuple[int, int, int], ...]) -> Object:
+    values = [i << 16 | s << 8 | bits for i, s, bits in mapped] + [0] * PDO_ENTRIES
+    entries = tuple(Entry(index, n + 1, f"Mapped object {n + 1}", U32, "rw", values[n]) for n in range(PDO_ENTRIES))
+    count = Entry(index, 0, "Number of mapped objects", U8, "rw", len(mapped))
+    return record(index, f"{direction} {number + 1} mapping parameter", entries, count=count)
+
+
+def _vendor() -> list[Object]:
+    return [
+        var(0x2101, "Terminal voltage, mean of the SYNC period", I16, "ro", mappable=True),
+        record(0x2110, "Temperatures", (Entry(0x2110, 1, "Slide-way temperature", I16, "ro", 2000, mappable=True),)),
+        var(0x2120, "Trace buffer", DataType.DOMAIN, "ro", b""),
+        var(0x2121, "Trace buffer clear", U8, "wo", low=1, high=1),
+    ]
+
+
+def _states() -> list[Object]:
+    return [
+        var(0x6007, "Abort connection option code", I16, "rw", 1, low=0, high=3),
+        var(0x603F, "Error code", U16, "ro", mappable=True),
+        var(0x6040, "Controlword", U16, "rww", mappable=True),
+        var(0x6041, "Statusword", U16, "ro", mappable=True),
+        var(0x605A, "Quick stop option code", I16, "rw", 2),
+        var(0x605B, "Shutdown option code", I16, "rw", 0, low=0, high=1),
+        var(0x605C, "Disable operation option code", I16, "rw", 1, low=0, high=1),
+        var(0x605E, "Fault reaction option code", I16, "rw", 2, low=0, high=2),
+        var(0x6060, "Modes of operation", I8, "rww", mappable=True),
+        var(0x6061, "Modes of operation display", I8, "ro", mappable=True),
+        var(0x60FD, "Digital inputs", U32, "ro", mappable=True),
+        var(0x6502, "Supported drive modes", U32, "ro", SUPPORTED_MODES),
+    ]
+
+
+def _positions(axis: Axis, ratings: Ratings) -> list[Object]:
+    per_mm = ratings.increments_per_mm
+    acceleration = round(axis.max_acceleration_mm_s2 * per_mm)
+    speed = round((axis.drive.speed_limit_mm_s or axis.rapid_speed_mm_s) * per_mm)
+    window = min(round(axis.drive.following_error_window_mm * per_mm), NO_WINDOW - 1)
+    low, high = -(2**31), 2**31 - 1
+    limits = (
+        Entry(0x607D, 1, "Min position limit", I32, "rw", low),
+        Entry(0x607D, 2, "Max position limit", I32, "rw", high),
+    )
+    return [
+        var(0x6062, "Position demand value", I32, "ro", mappable=True),
+        var(0x6063, "Position actual internal value", I32, "ro", mappable=True),
+        var(0x6064, "Position actual value", I32, "ro", mappable=True),
+        var(0x6065, "Following error window", U32, "rw", window),
+        var(0x6066, "Following error time out", U16, "rw", 10),
+        var(0x606B, "Velocity demand value", I32, "ro", mappable=True),
+        var(0x606C, "Velocity actual value", I32, "ro", mappable=True),
+        var(0x607A, "Target position", I32, "rww", mappable=True),
+        record(0x607D, "Software position limit", limits),
+        var(0x6081, "Profile velocity", U32, "rww", speed, mappable=True),
+        var(0x6083, "Profile acceleration", U32, "rww", acceleration, mappable=True, low=1),
+        var(0x6084, "Profile deceleration", U32, "rww", acceleration, mappable=True, low=1),
+        var(0x6085, "Quick stop deceleration", U32, "rww", 2 * acceleration, mappable=True, low=1),
+        _ratio(0x608F, "Position encoder resolution", "Increments", ratings.increments_per_rev, "Motor revolutions"),
+        _ratio(0x6091, "Gear ratio", "Motor revolutions", 1, "Shaft revolutions"),
+        _ratio(0x6092, "Feed constant", "Feed, increments", ratings.increments_per_rev, "Shaft revolutions"),
+        var(0x60B0, "Position offset", I32, "rw", mappable=True),
+        _interpolation(ratings.sync_period_s),
+        var(0x60F4, "Following error actual value", I32, "ro", mappable=True),
+        var(0x60FC, "Position demand internal value", I32, "ro", mappable=True),
+    ]
+
+
+def _ratio(index: int, name: str, upper: str, value: int, lower: str) -> Object:
+    entries = (Entry(index, 1, upper, U32, "rw", value, low=1), Entry(index, 2, lower, U32, "rw", 1, low=1))
+    return record(index, name, entries)
+
+
+def _interpolation(sync_period_s: float) -> Object:
+    """0x60C2: value x 10^exponent seconds; the drive interpolates at the machine's SYNC period and no other."""
+    exponent = -3
+    while exponent > -6 and abs(sync_period_s / 10**exponent - round(sync_period_s / 10**exponent)) > 1e-9:
+        exponent -= 1
+    value = round(sync_period_s / 10**exponent)
+    entries = (
+        Entry(0x60C2, 1, "Interpolation time period value", U8, "rw", value, low=value, high=value),
+        Entry(0x60C2, 2, "Interpolation time index", I8, "rw", exponent, low=exponent, high=exponent),
+    )
+    return record(0x60C2, "Interpolation time period", entries)
+
+
+def _motor(axis: Axis, ratings: Ratings) -> list[Object]:
+    return [
+        var(0x6071, "Target torque", I16, "rww", mappable=True),
+        var(0x6075, "Motor rated current", U32, "ro", round(ratings.rated_current_a * 1e3)),
+        var(0x6076, "Motor rated torque", U32, "ro", round(ratings.rated_torque_nm * 1e3)),
+        var(0x6077, "Torque actual value", I16, "ro", mappable=True),
+        var(0x6078, "Current actual value", I16, "ro", mappable=True),
+        var(0x6079, "DC link circuit voltage", U32, "ro", round(axis.regulators.voltage_limit_v * 1e3), mappable=True),
+        var(0x60B1, "Velocity offset", I32, "rw", mappable=True),
+        var(0x60B2, "Torque offset", I16, "rw", mappable=True),
+    ]

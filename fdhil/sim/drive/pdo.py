@@ -1,0 +1,279 @@
+"""The PDO engine (CiA 301, 7.2.2): RPDOs buffered until the SYNC, TPDOs sampled at the SYNC, mapping by the rules.
+
+Communication and mapping parameters may change in pre-operational only, a mapping only while its PDO is invalid and
+its sub-index 0 is 0.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from fdhil.sim.drive.dictionary import I8, I16, I32, U8, U16, U32, AbortCode, Dictionary, Entry, TransferAbort
+from fdhil.sim.drive.objects import INVALID, PDO_ENTRIES, PDOS
+
+Frame = tuple[int, bytes]
+
+_CODE = {I8: "b", I16: "h", I32: "i", U8: "B", U16: "H", U32: "I"}
+# dummy entries that an RPDO may map to skip bytes (CiA 301, 7.4.7.1)
+_DUMMIES = {int(kind): (code, 8 * struct.calcsize(code)) for kind, code in _CODE.items()}
+_ID_BITS = 0x1FFFFFFF
+_EXTENDED = 1 << 29
+_RESTRICTED = (
+    (0x000, 0x07F), (0x080, 0x080), (0x101, 0x180), (0x581, 0x5FF), (0x601, 0x67F), (0x6E0, 0x6FF), (0x701, 0x7FF),
+)  # fmt: skip
+
+
+@dataclass(slots=True)
+class Pdo:
+    """A valid PDO as it runs; ``keys`` holds None for a dummy entry."""
+
+    number: int
+    cob_id: int
+    kind: int
+    codec: struct.Struct
+    keys: tuple[int | None, ...]
+    inhibit_s: float = 0.0
+    event_s: float = 0.0
+    start_value: int = 0
+    pending: bytes | None = None  # RPDO: waits for the SYNC
+    sent: bytes | None = None  # TPDO: what the master knows
+    count: int = 0
+    last_s: float | None = None
+    checked: tuple[Entry, ...] = field(default=())
+
+    @property
+    def synchronous(self) -> bool:
+        """Transmission types 0 to 240."""
+        return self.kind <= 240
+
+
+class PdoEngine:
+    """All PDOs of one device. ``drop`` maps TPDO numbers to how many frames are still to be lost, -1 for all.
+
+    ``late`` counts, per RPDO, the cycles in which it was heard in the cycle before but not in time for this one.
+    """
+
+    def __init__(self, dictionary: Dictionary, changeable: Callable[[], bool], drop: dict[int, int]) -> None:
+        self._dictionary = dictionary
+        self._changeable = changeable
+        self._drop = drop
+        self._rpdos: dict[int, Pdo] = {}
+        self._tpdos: list[Pdo] = []
+        self.heard: set[int] = set()
+        self.heard_before: set[int] = set()
+        self.late: dict[int, int] = dict.fromkeys(range(1, PDOS + 1), 0)
+        self._register_checks()
+
+    def configure(self) -> None:
+        """Start all PDOs from the object dictionary's parameters: OPERATIONAL was entered or the mapping changed."""
+        self._rpdos = {pdo.cob_id: pdo for pdo in self.configured("rpdo")}
+        self._tpdos = list(self.configured("tpdo"))
+        self.heard, self.heard_before = set(), set()
+
+    def stop(self) -> None:
+        """Leave OPERATIONAL."""
+        self._rpdos, self._tpdos = {}, []
+        self.heard, self.heard_before = set(), set()
+
+    def configured(self, direction: str, *, with_invalid: bool = False) -> Iterator[Pdo]:
+        """Yield the PDOs of a direction (``rpdo`` or ``tpdo``) as the dictionary describes them."""
+        communication, mapping = (0x1400, 0x1600) if direction == "rpdo" else (0x1800, 0x1A00)
+        for n in range(PDOS):
+            number = self._dictionary.number
+            cob_id = number(communication + n, 1)
+            if cob_id & INVALID and not with_invalid:
+                continue
+            mapped = [number(mapping + n, sub + 1) for sub in range(number(mapping + n, 0))]
+            keys, codes, entries = self._resolve(mapped)
+            yield Pdo(
+                number=n + 1,
+                cob_id=cob_id & _ID_BITS,
+                kind=number(communication + n, 2),
+                codec=struct.Struct("<" + codes),
+                keys=keys,
+                inhibit_s=number(communication + n, 3) * 1e-4 if direction == "tpdo" else 0.0,
+                event_s=number(communication + n, 5) * 1e-3,
+                start_value=number(communication + n, 6) if direction == "tpdo" else 0,
+                checked=entries,
+            )
+
+    def _resolve(self, mapped: list[int]) -> tuple[tuple[int | None, ...], str, tuple[Entry, ...]]:
+        keys: list[int | None] = []
+        codes, checked = "", []
+        for value in mapped:
+            entry = self._dictionary.entries.get(value >> 8)
+            if entry is None:
+                keys.append(None)
+                codes += _DUMMIES[value >> 16][0]
+                continue
+            keys.append(entry.key)
+            codes += _CODE[entry.type]
+            if entry.low is not None or entry.high is not None or entry.key in self._dictionary.check:
+                checked.append(entry)
+        return tuple(keys), codes, tuple(checked)
+
+    # -- reception
+
+    def receive(self, can_id: int, data: bytes, now_s: float) -> Pdo | None:
+        """Take an RPDO; the PDO is returned when it is to be applied at once, else it waits for the SYNC.
+
+        LookupError when no RPDO has this identifier, ValueError when the frame is shorter than the mapping; a longer
+        one is used as far as the mapping goes (CiA 301, 7.2.2.5).
+        """
+        pdo = self._rpdos[can_id]
+        if len(data) < pdo.codec.size:
+            raise ValueError(f"RPDO {pdo.number} has {len(data)} bytes, its mapping needs {pdo.codec.size}")
+        pdo.pending = data[: pdo.codec.size]
+        pdo.last_s = now_s
+        self.heard.add(pdo.number)
+        return None if pdo.synchronous else pdo
+
+    def latch(self, *, count_late: bool) -> None:
+        """A SYNC: apply what was received since the last one."""
+        for pdo in self._rpdos.values():
+            if pdo.pending is not None and pdo.synchronous:
+                self.apply(pdo)
+        if count_late:
+            for number in self.heard_before - self.heard:
+                self.late[number] += 1
+        self.heard_before, self.heard = self.heard, set()
+
+    def apply(self, pdo: Pdo) -> None:
+        """Write the received values into the dictionary; a value out of its range is not taken."""
+        assert pdo.pending is not None
+        values: tuple[int, ...] = pdo.codec.unpack(pdo.pending)
+        received = {key: value for key, value in zip(pdo.keys, values, strict=True) if key is not None}
+        pdo.pending = None
+        for entry in pdo.checked:
+            try:
+                entry.check_range(received[entry.key])
+                if check := self._dictionary.check.get(entry.key):
+                    check(entry, received[entry.key])
+            except TransferAbort:
+                del received[entry.key]
+        self._dictionary.numbers.update(received)
+
+    def overdue(self, now_s: float) -> list[int]:
+        """Return the RPDOs whose event timer has just run out; monitoring starts with the first frame."""
+        late = [
+            pdo
+            for pdo in self._rpdos.values()
+            if pdo.event_s and pdo.last_s is not None and now_s - pdo.last_s > pdo.event_s
+        ]
+        for pdo in late:
+            pdo.last_s = None
+        return [pdo.number for pdo in late]
+
+    # -- transmission
+
+    def at_sync(self, counter: int | None, now_s: float) -> list[Frame]:
+        """Return the TPDOs that this SYNC asks for: types 1 to 240 every n-th, type 0 when changed, and events."""
+        frames: list[Frame] = []
+        for pdo in self._tpdos:
+            if not 1 <= pdo.kind <= 240:
+                self._on_event(pdo, now_s, frames)
+                continue
+            if pdo.start_value and counter is not None:
+                if counter != pdo.start_value:
+                    continue
+                pdo.start_value = 0
+            pdo.count += 1
+            if pdo.count >= pdo.kind:
+                pdo.count = 0
+                self._send(pdo, self._content(pdo), now_s, frames)
+        return frames
+
+    def on_events(self, now_s: float) -> list[Frame]:
+        """Return the event-driven TPDOs (types 254, 255) that changed or whose event timer ran out."""
+        frames: list[Frame] = []
+        for pdo in self._tpdos:
+            if pdo.kind > 240:
+                self._on_event(pdo, now_s, frames)
+        return frames
+
+    def _on_event(self, pdo: Pdo, now_s: float, frames: list[Frame]) -> None:
+        content = self._content(pdo)
+        since = None if pdo.last_s is None else now_s - pdo.last_s
+        elapsed = bool(pdo.event_s) and pdo.kind > 240 and (since is None or since >= pdo.event_s)
+        if (content != pdo.sent or elapsed) and (since is None or since >= pdo.inhibit_s):
+            self._send(pdo, content, now_s, frames)
+
+    def _content(self, pdo: Pdo) -> bytes:
+        values = self._dictionary.numbers
+        return pdo.codec.pack(*[values[key] for key in pdo.keys if key is not None])
+
+    def _send(self, pdo: Pdo, content: bytes, now_s: float, frames: list[Frame]) -> None:
+        pdo.sent, pdo.last_s = content, now_s
+        left = self._drop.get(pdo.number, 0)
+        if left == 0:
+            frames.append((pdo.cob_id, content))
+        elif left > 0:
+            self._drop[pdo.number] = left - 1
+
+    # -- configuration rules
+
+    def _register_checks(self) -> None:
+        rules = {1: self._check_cob_id, 2: self._check_kind, 3: self._check_invalid, 6: self._check_invalid}
+        for communication, mapping in ((0x1400, 0x1600), (0x1800, 0x1A00)):
+            for n in range(PDOS):
+                for sub in (1, 2, 3, 5, 6):
+                    if (key := communication + n << 8 | sub) in self._dictionary.entries:
+                        self._dictionary.check[key] = rules.get(sub, self._check_state)
+                self._dictionary.check[mapping + n << 8] = self._check_count
+                for sub in range(1, PDO_ENTRIES + 1):
+                    self._dictionary.check[mapping + n << 8 | sub] = self._check_mapping
+
+    def _check_state(self, entry: Entry, value: int) -> None:
+        if not self._changeable():
+            raise TransferAbort(AbortCode.DEVICE_STATE)
+
+    def _check_invalid(self, entry: Entry, value: int) -> None:
+        """The PDO must be invalid; ``entry`` is of its communication or of its mapping parameter."""
+        self._check_state(entry, value)
+        if not self._dictionary.number(entry.index & ~0x200, 1) & INVALID:
+            raise TransferAbort(AbortCode.DEVICE_STATE)
+
+    def _check_cob_id(self, entry: Entry, value: int) -> None:
+        self._check_state(entry, value)
+        old = self._dictionary.number(entry.index, 1)
+        if value & INVALID:
+            return
+        if not old & INVALID and (value ^ old) & _ID_BITS:
+            raise TransferAbort(AbortCode.DEVICE_STATE)
+        can_id = value & _ID_BITS
+        if value & _EXTENDED or can_id > 0x7FF or any(low <= can_id <= high for low, high in _RESTRICTED):
+            raise TransferAbort(AbortCode.RANGE)
+
+    def _check_kind(self, entry: Entry, value: int) -> None:
+        self._check_state(entry, value)
+        if 241 <= value <= 253:
+            raise TransferAbort(AbortCode.RANGE)
+
+    def _check_count(self, entry: Entry, value: int) -> None:
+        self._check_invalid(entry, value)
+        if value > PDO_ENTRIES:
+            raise TransferAbort(AbortCode.PDO_LENGTH)
+        mapped = [self._dictionary.number(entry.index, sub) for sub in range(1, value + 1)]
+        for word in mapped:
+            self._check_mappable(entry.index, word)
+        if sum(word & 0xFF for word in mapped) > 64:
+            raise TransferAbort(AbortCode.PDO_LENGTH)
+
+    def _check_mapping(self, entry: Entry, value: int) -> None:
+        self._check_invalid(entry, value)
+        if self._dictionary.number(entry.index, 0):
+            raise TransferAbort(AbortCode.DEVICE_STATE)
+        if value:
+            self._check_mappable(entry.index, value)
+
+    def _check_mappable(self, mapping_index: int, word: int) -> None:
+        receives = mapping_index < 0x1800
+        if receives and word >> 16 in _DUMMIES and word >> 8 & 0xFF == 0 and word & 0xFF == _DUMMIES[word >> 16][1]:
+            return
+        entry = self._dictionary.entries.get(word >> 8)
+        if entry is None or not entry.mappable or entry.size is None or word & 0xFF != 8 * entry.size:
+            raise TransferAbort(AbortCode.NOT_MAPPABLE)
+        if entry.access not in (("rw", "rww", "wo") if receives else ("ro", "rw", "rwr", "rww")):
+            raise TransferAbort(AbortCode.NOT_MAPPABLE)

@@ -1,0 +1,203 @@
+"""The SDO server (CiA 301, 7.2.4): expedited and segmented transfers both ways, block upload with CRC.
+
+Sans-I/O: a request of 8 bytes in, the answers out. One client, one transfer at a time; a new request to initiate
+drops the transfer that was going on, as the standard has it.
+"""
+
+from __future__ import annotations
+
+import binascii
+from dataclasses import dataclass, field
+
+from fdhil.sim.drive.dictionary import AbortCode, Dictionary, TransferAbort
+
+MAX_DOWNLOAD_BYTES = 1024  # no object that can be written is longer
+
+
+@dataclass(slots=True)
+class _Upload:
+    index: int
+    sub: int
+    data: bytes
+    toggle: int = 0
+    position: int = 0
+
+
+@dataclass(slots=True)
+class _Download:
+    index: int
+    sub: int
+    size: int | None
+    toggle: int = 0
+    data: bytearray = field(default_factory=bytearray)
+
+
+@dataclass(slots=True)
+class _BlockUpload:
+    index: int
+    sub: int
+    data: bytes
+    block_size: int
+    with_crc: bool
+    position: int = 0  # first byte that the client has not acknowledged
+    sent: int = 0  # segments of the block that is out
+    started: bool = False
+    ended: bool = False
+
+
+class SdoServer:
+    """Answers the SDO requests of one client from an object dictionary."""
+
+    def __init__(self, dictionary: Dictionary) -> None:
+        self._dictionary = dictionary
+        self._transfer: _Upload | _Download | _BlockUpload | None = None
+
+    def reset(self) -> None:
+        """Forget the transfer that is going on."""
+        self._transfer = None
+
+    def request(self, data: bytes) -> list[bytes]:
+        """Handle one request and return the responses, 8 bytes each; a frame that is not 8 bytes long is ignored."""
+        if len(data) != 8:
+            return []
+        index, sub = int.from_bytes(data[1:3], "little"), data[3]
+        goes_on = data[0] >> 5 in (0, 3, 5) and data[0] & 0xE3 != 0xA0
+        if goes_on and self._transfer is not None:  # such a request does not repeat what it is about
+            index, sub = self._transfer.index, self._transfer.sub
+        try:
+            return self._dispatch(data, index, sub)
+        except TransferAbort as abort:
+            self._transfer = None
+            return [_head(0x80, index, sub) + abort.code.to_bytes(4, "little")]
+
+    def _dispatch(self, data: bytes, index: int, sub: int) -> list[bytes]:
+        match data[0] >> 5:
+            case 0:
+                return self._download_segment(data)
+            case 1:
+                return self._initiate_download(data, index, sub)
+            case 2:
+                return self._initiate_upload(index, sub)
+            case 3:
+                return self._upload_segment(data)
+            case 4:
+                self._transfer = None
+                return []
+            case 5:
+                return self._block_upload(data, index, sub)
+            case _:
+                raise TransferAbort(AbortCode.COMMAND)
+
+    def _initiate_upload(self, index: int, sub: int) -> list[bytes]:
+        self._transfer = None
+        value = self._dictionary.read(index, sub)
+        if 1 <= len(value) <= 4:
+            return [_head(0x43 | (4 - len(value)) << 2, index, sub) + value.ljust(4, b"\0")]
+        self._transfer = _Upload(index, sub, value)
+        return [_head(0x41, index, sub) + len(value).to_bytes(4, "little")]
+
+    def _upload_segment(self, data: bytes) -> list[bytes]:
+        transfer = self._transfer
+        if not isinstance(transfer, _Upload):
+            raise TransferAbort(AbortCode.COMMAND)
+        toggle = data[0] >> 4 & 1
+        if toggle != transfer.toggle:
+            raise TransferAbort(AbortCode.TOGGLE)
+        part = transfer.data[transfer.position : transfer.position + 7]
+        transfer.position += len(part)
+        transfer.toggle ^= 1
+        last = transfer.position >= len(transfer.data)
+        if last:
+            self._transfer = None
+        return [bytes([toggle << 4 | (7 - len(part)) << 1 | last]) + part.ljust(7, b"\0")]
+
+    def _initiate_download(self, data: bytes, index: int, sub: int) -> list[bytes]:
+        self._transfer = None
+        expedited, sized = data[0] >> 1 & 1, data[0] & 1
+        entry = self._dictionary.writable(index, sub)
+        if expedited:
+            length = 4 - (data[0] >> 2 & 3) if sized else min(entry.size or 4, 4)
+            self._dictionary.write(index, sub, data[4 : 4 + length])
+        else:
+            size = int.from_bytes(data[4:8], "little") if sized else None
+            if size is not None and (size > MAX_DOWNLOAD_BYTES or (entry.size is not None and size != entry.size)):
+                raise TransferAbort(AbortCode.LENGTH)
+            self._transfer = _Download(index, sub, size)
+        return [_head(0x60, index, sub) + bytes(4)]
+
+    def _download_segment(self, data: bytes) -> list[bytes]:
+        transfer = self._transfer
+        if not isinstance(transfer, _Download):
+            raise TransferAbort(AbortCode.COMMAND)
+        toggle = data[0] >> 4 & 1
+        if toggle != transfer.toggle:
+            raise TransferAbort(AbortCode.TOGGLE)
+        transfer.data += data[1 : 8 - (data[0] >> 1 & 7)]
+        transfer.toggle ^= 1
+        last = data[0] & 1
+        size = transfer.size if transfer.size is not None else MAX_DOWNLOAD_BYTES
+        if len(transfer.data) > size or (last and transfer.size is not None and len(transfer.data) != size):
+            raise TransferAbort(AbortCode.LENGTH)
+        if last:
+            self._transfer = None
+            self._dictionary.write(transfer.index, transfer.sub, bytes(transfer.data))
+        return [bytes([0x20 | toggle << 4]) + bytes(7)]
+
+    def _block_upload(self, data: bytes, index: int, sub: int) -> list[bytes]:
+        command = data[0] & 3
+        if command == 0:
+            return self._initiate_block_upload(data, index, sub)
+        transfer = self._transfer
+        if not isinstance(transfer, _BlockUpload):
+            raise TransferAbort(AbortCode.COMMAND)
+        if command == 3 and not transfer.started:
+            transfer.started = True
+            return self._block(transfer)
+        if command == 2 and transfer.started and not transfer.ended:
+            return self._acknowledged(transfer, data[1], data[2])
+        if command == 1 and transfer.ended:
+            self._transfer = None
+            return []
+        raise TransferAbort(AbortCode.COMMAND)
+
+    def _initiate_block_upload(self, data: bytes, index: int, sub: int) -> list[bytes]:
+        self._transfer = None
+        value = self._dictionary.read(index, sub)
+        if not 1 <= data[4] <= 127:
+            raise TransferAbort(AbortCode.BLOCK_SIZE)
+        if 0 < len(value) <= data[5]:  # the protocol switch threshold: shorter objects go by the plain transfer
+            return self._initiate_upload(index, sub)
+        # a client that asks for no CRC may still check one that is offered: offer it on request alone
+        with_crc = bool(data[0] & 4)
+        self._transfer = _BlockUpload(index, sub, value, data[4], with_crc)
+        return [_head(0xC2 | with_crc << 2, index, sub) + len(value).to_bytes(4, "little")]
+
+    def _block(self, transfer: _BlockUpload) -> list[bytes]:
+        """Return the segments of the next block, each with its sequence number, the very last one marked."""
+        remaining = max(-(-(len(transfer.data) - transfer.position) // 7), 1)
+        transfer.sent = min(remaining, transfer.block_size)
+        frames = []
+        for number in range(1, transfer.sent + 1):
+            start = transfer.position + 7 * (number - 1)
+            last = number == remaining
+            frames.append(bytes([number | last << 7]) + transfer.data[start : start + 7].ljust(7, b"\0"))
+        return frames
+
+    def _acknowledged(self, transfer: _BlockUpload, received: int, block_size: int) -> list[bytes]:
+        if received > transfer.sent:
+            raise TransferAbort(AbortCode.COMMAND)
+        if not 1 <= block_size <= 127:
+            raise TransferAbort(AbortCode.BLOCK_SIZE)
+        transfer.block_size = block_size
+        all_sent = transfer.position + 7 * received >= len(transfer.data) and received == transfer.sent
+        transfer.position += 7 * received
+        if not all_sent:
+            return self._block(transfer)
+        transfer.ended = True
+        unused = -len(transfer.data) % 7 if transfer.data else 7
+        crc = binascii.crc_hqx(transfer.data, 0) if transfer.with_crc else 0
+        return [bytes([0xC1 | unused << 2]) + crc.to_bytes(2, "little") + bytes(5)]
+
+
+def _head(command: int, index: int, sub: int) -> bytes:
+    return bytes([command]) + index.to_bytes(2, "little") + bytes([sub])

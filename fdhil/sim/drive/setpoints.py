@@ -1,0 +1,131 @@
+"""What the loops follow: the cyclic set-points with their delay, and the drive's own ramps and profiles.
+
+Both give, for the cycle that begins, the demand at its start, at its end and one cycle later (increments), because the
+feed-forward runs linearly from the slope of this cycle to the slope of the next.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+Command = tuple[float, float, float, float, float, float, float, float]
+
+
+class Target(NamedTuple):
+    """One cycle's set-point: target and offset in increments, speed offset in rad/s, current offset in A."""
+
+    position: float
+    offset: float
+    speed: float
+    current: float
+
+
+class CyclicSetpoints:
+    """The cyclic synchronous position set-points, run ``delay`` SYNC cycles late."""
+
+    def __init__(self, delay: int, sync_period_s: float, offset_in_feedforward: bool) -> None:
+        self._delay = delay
+        self._period_s = sync_period_s
+        self._offset_in_feedforward = offset_in_feedforward
+        # the cycle before, the cycle in force, and those to come
+        self._queue: deque[Target] = deque(maxlen=delay + 2)
+        self.preset(Target(0.0, 0.0, 0.0, 0.0))
+
+    def preset(self, target: Target) -> None:
+        """Fill the whole delay with one target."""
+        self._queue.extend([target] * (self._delay + 2))
+
+    def push(self, target: Target) -> None:
+        """Take what was latched at a SYNC."""
+        self._queue.append(target)
+
+    @property
+    def now(self) -> Target:
+        """What is in force at the SYNC that was pushed last."""
+        return self._queue[1]
+
+    def command(self) -> Command:
+        """Return the command of the cycle that begins, see :func:`fdhil.sim.drive.physics.run_cycle`.
+
+        With a delay of one cycle the slope after this cycle is not known yet and is held; without a delay the set-point
+        is a stair, and its slope is that of the step that was just made.
+        """
+        queue, period = self._queue, self._period_s
+        first = queue[1]
+        second = queue[2] if self._delay >= 1 else first
+        p0, p1 = first.position + first.offset, second.position + second.offset
+        if self._delay >= 2:
+            f0, f1 = self._slope(first, second), self._slope(second, queue[3])
+        elif self._delay == 1:
+            f0 = f1 = self._slope(first, second)
+        else:
+            f0 = f1 = self._slope(queue[0], first)
+        return p0, p1, f0 / period, f1 / period, first.speed, second.speed, first.current, second.current
+
+    def _slope(self, first: Target, second: Target) -> float:
+        slope = second.position - first.position
+        return slope + second.offset - first.offset if self._offset_in_feedforward else slope
+
+
+class Profile:
+    """The drive's own motion: a trapezoid toward a target, or a ramp to standstill. Increments and seconds."""
+
+    def __init__(self, sync_period_s: float) -> None:
+        self._period_s = sync_period_s
+        self._points = (0.0, 0.0, 0.0)
+        self._speed = 0.0
+
+    def start(self, position: float, speed: float) -> None:
+        """Go on from a demand and its speed."""
+        position = float(position)  # the compiled cycle knows floats; an int would have it compiled once more
+        before = position - speed * self._period_s
+        self._points = (before, position, position + speed * self._period_s)
+        self._speed = speed
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the demand stands still, now and in the cycles already planned."""
+        return self._points[0] == self._points[1] == self._points[2]
+
+    @property
+    def now(self) -> float:
+        """The demand at the SYNC that was advanced to last."""
+        return self._points[0]
+
+    def advance(self, target: float | None, speed: float, acceleration: float, deceleration: float) -> None:
+        """Go one cycle on; without a target the demand slows down to rest."""
+        last = self._points[2]
+        if target is None:
+            drop = deceleration * self._period_s
+            following = math.copysign(max(abs(self._speed) - drop, 0.0), self._speed)
+            position = last + (self._speed + following) / 2 * self._period_s
+        else:
+            following, position = self._toward(target, last, speed, acceleration, deceleration)
+        self._speed = following
+        self._points = (self._points[1], last, position)
+
+    def _toward(
+        self, target: float, position: float, speed: float, acceleration: float, deceleration: float
+    ) -> tuple[float, float]:
+        period = self._period_s
+        distance = target - position
+        toward = math.copysign(1.0, distance)
+        # the fastest speed from which whole cycles of deceleration still stop at the target
+        step = deceleration * period / 2
+        reachable = math.sqrt(step * step + 2 * deceleration * abs(distance)) - step
+        wanted = toward * min(speed, reachable)
+        rate = acceleration if wanted * self._speed >= 0 and abs(wanted) > abs(self._speed) else deceleration
+        following = self._speed + min(max(wanted - self._speed, -rate * period), rate * period)
+        moved = following * period
+        if moved * toward >= abs(distance) and abs(following) <= 2 * deceleration * period:
+            return 0.0, target
+        return following, position + moved
+
+    def command(self) -> Command:
+        """Return the command of the cycle that begins."""
+        first, second, third = self._points
+        return (
+            first, second, (second - first) / self._period_s, (third - second) / self._period_s, 0.0, 0.0, 0.0, 0.0,
+        )  # fmt: skip

@@ -1,0 +1,387 @@
+"""The simulated NC, sans-I/O: SYNC producer, NMT master, and the one who enables the drives and streams set-points.
+
+After SYNC k-1 and before SYNC k it sends r[k+delay] by RPDO1 (controlword, target position), so that the drive, which
+runs its set-point ``delay`` cycles late, follows r[k] at SYNC k. All its times are counted in SYNC cycles.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from enum import Enum, auto
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fdhil.config import MachineConfig
+from fdhil.records import Trajectory
+from fdhil.sim.drive.power import State
+from fdhil.sim.nc.drive_link import ENABLED, SHUTDOWN, BusFrame, Link, Request
+from fdhil.sim.nc.path import Job, Pause, Player, Rate, Stage, rapid_rows
+from fdhil.sim.wire.hub import Frame
+
+Event = dict[str, Any]
+
+COUNTER_OVERFLOW = 240
+TAIL_S = 0.3  # rest after the last row that still belongs to the played file
+_SETTLE_S = 0.3  # rest between the rapid to the start and the first row
+_ANSWER_S = 1.0
+_ENABLE_S = 3.0
+_SILENCE_CYCLES = 5
+_RELEASE_CYCLES = 3
+_MAX_OVERRIDE = 1.5
+
+
+class Phase(Enum):
+    """What the NC is doing with the drives."""
+
+    OFF = auto()
+    CONFIGURE = auto()
+    ENABLE = auto()
+    READY = auto()
+    FAULTED = auto()
+    RELEASE = auto()
+
+
+class Row(NamedTuple):
+    """What is commanded for one SYNC: position (mm per axis), whether it is a rapid, whether a played file's row."""
+
+    position_mm: list[float]
+    rapid: bool
+    playing: bool
+
+
+class Nc:
+    """The NC of one machine. ``events`` collects what it has to say; who runs it takes them out.
+
+    Each period: send the frames of :meth:`begin`, give it what the drives answer by :meth:`hear`, then send the frames
+    of :meth:`end`. ``in_force`` is the row r[k] of the SYNC that :meth:`begin` gave last, None while it has none.
+    """
+
+    def __init__(self, config: MachineConfig) -> None:
+        period = config.machine.sync_period_s
+        self.axes = tuple(config.axis)
+        self.events: list[Event] = []
+        self.in_force: Row | None = None
+        self.phase = Phase.OFF
+        self._period_s = period
+        self._smoothing_s = config.nc.smoothing_s
+        self._speeds = [axis.rapid_speed_mm_s for axis in config.axis.values()]
+        self._accelerations = [axis.max_acceleration_mm_s2 for axis in config.axis.values()]
+        self._links = [
+            Link(
+                name,
+                axis.drive.bus,
+                config.node_id(name),
+                axis.drive.sign * axis.drive.increments_per_rev / axis.screw_pitch_mm,
+                axis.drive.setpoint_delay_cycles,
+            )
+            for name, axis in config.axis.items()
+        ]
+        self._by_node = {(link.bus, link.node_id): link for link in self._links}
+        self._buses = list(dict.fromkeys(link.bus for link in self._links))
+        self._delay = max(link.delay for link in self._links)
+        slope = min(a / v for a, v in zip(self._accelerations, self._speeds, strict=True))
+        self._rate = Rate(min(slope, 0.5 / period), period)
+        self._rows: deque[Row] = deque(maxlen=self._delay + 1)
+        self._stages: deque[Stage] = deque()
+        self._requests: deque[Request] = deque()
+        self._job: Job | None = None
+        self._position = [0.0] * len(self._links)
+        self._counter = 0
+        self._waited = 0
+        self._played = 0
+        self._hold = self._stopping = self._leaving = self._given_up = False
+        self.override = 1.0
+
+    # -- the panel
+
+    def switch(self, on: bool) -> None:
+        """Take over the bus and enable the drives, or come to rest, disable them and let go."""
+        if on and self.phase in (Phase.OFF, Phase.FAULTED):
+            self._take_over()
+        elif on and self.phase is Phase.READY:
+            self.events.append({"event": "nc", "on": True})
+        elif not on and self.phase is Phase.OFF:
+            self.events.append({"event": "nc", "on": False})
+        elif not on:
+            self._leaving = True
+            self.stop()
+
+    def play(self, file: str, trajectory: Trajectory) -> None:
+        """Go to the trajectory's start in a rapid, then play it; an event tells what forbids it."""
+        refusal = self._refusal(trajectory)
+        if refusal:
+            self._complain(f"{file} cannot be played: {refusal}")
+            return
+        self._job = Job(file, trajectory)
+        self._played, self._given_up = 0, False
+        if self.phase is Phase.READY:
+            self._start_job()
+
+    def stop(self) -> None:
+        """Slow down along the path and give the rest of it up."""
+        if self._stages:
+            self._stopping = True
+        elif self._job is not None and self.phase is not Phase.READY:
+            self._job = None
+
+    def feed_hold(self, on: bool) -> None:
+        """Slow down along the path and stay there; go on when it is released."""
+        self._hold = on
+
+    def set_override(self, percent: float) -> None:
+        """Set the rate along the path, 0 to 150 %; ValueError outside."""
+        if not 0 <= percent <= 100 * _MAX_OVERRIDE:
+            raise ValueError(f"an override is 0 to {100 * _MAX_OVERRIDE:g} %, not {percent:g}")
+        self.override = percent / 100
+
+    @property
+    def busy(self) -> bool:
+        """Whether it plays, is about to, or is taking over."""
+        return bool(self._stages) or self._job is not None or self.phase in (Phase.CONFIGURE, Phase.ENABLE)
+
+    @property
+    def on(self) -> bool:
+        """Whether it has the bus."""
+        return self.phase is not Phase.OFF
+
+    def _refusal(self, trajectory: Trajectory) -> str:
+        if self._leaving or self.phase in (Phase.OFF, Phase.FAULTED, Phase.RELEASE):
+            return "the NC does not have the drives; switch it on first"
+        if self._job is not None:
+            return f"{self._job.file} is being played; stop it first"
+        unknown = [axis for axis in trajectory.axes if axis not in self.axes]
+        if unknown:
+            return f"this machine has no axis {', '.join(unknown)}"
+        if abs(trajectory.dt_s - self._period_s) > 1e-9:
+            return f"its rows are {trajectory.dt_s:g} s apart, the SYNC period is {self._period_s:g} s"
+        return "" if trajectory.time_s.size else "it has no rows"
+
+    # -- the cycle
+
+    def begin(self) -> list[BusFrame]:
+        """Return the SYNC of this period, one frame per bus; none while the drives are being configured."""
+        if self.phase in (Phase.OFF, Phase.CONFIGURE):
+            return []
+        self._counter = self._counter % COUNTER_OVERFLOW + 1
+        for link in self._links:
+            link.silent += 1
+        before = self.in_force
+        self.in_force = self._rows[0] if len(self._rows) > self._delay else None
+        self._report(before, self.in_force)
+        return [(bus, (0x80, bytes([self._counter]))) for bus in self._buses]
+
+    def hear(self, bus: str, frame: Frame) -> None:
+        """Take what a drive sent: TPDO1 (position first), TPDO2 (statusword first), SDO answers."""
+        can_id, data = frame
+        link = self._by_node.get((bus, can_id & 0x7F))
+        if link is None:
+            return
+        kind = can_id & ~0x7F
+        if kind == 0x280 and len(data) >= 2:
+            link.status = data[0] | data[1] << 8
+            link.silent = 0
+        elif kind == 0x180 and len(data) >= 4:
+            link.position = int.from_bytes(data[:4], "little", signed=True)
+        elif kind == 0x580 and len(data) == 8:
+            self._answer(link, data)
+
+    def end(self) -> list[BusFrame]:
+        """Return what is sent after this period's SYNC: the set-points of the next one, or the steps of a takeover."""
+        match self.phase:
+            case Phase.OFF:
+                return []
+            case Phase.CONFIGURE:
+                return self._configure()
+            case Phase.ENABLE:
+                return self._enable()
+            case Phase.RELEASE:
+                return self._release()
+        return self._stream()
+
+    # -- takeover and release
+
+    def _take_over(self) -> None:
+        self.phase = Phase.CONFIGURE
+        self._leaving = self._stopping = False
+        self._counter = self._waited = 0
+        self._rows.clear()
+        self._requests.clear()
+        for link in self._links:
+            link.status = link.position = None
+            link.word = SHUTDOWN
+            self._requests.append(Request(link, 0x1019, COUNTER_OVERFLOW, required=False))
+            self._requests.append(Request(link, 0x6060, 8, required=True))
+
+    def _nmt(self, command: int) -> list[BusFrame]:
+        return [(link.bus, (0x000, bytes([command, link.node_id]))) for link in self._links]
+
+    def _configure(self) -> list[BusFrame]:
+        frames = self._nmt(0x80) if self._waited == 0 else []
+        self._waited += 1
+        if not self._requests:
+            self.phase, self._waited = Phase.ENABLE, 0
+            return self._nmt(0x01)
+        request = self._requests[0]
+        if not request.sent:
+            request.sent = True
+            frames.append(request.frame)
+        request.cycles += 1
+        if request.cycles * self._period_s > _ANSWER_S:
+            self._give_up(f"drive {request.link.axis} does not answer; check that it is powered")
+        return frames
+
+    def _answer(self, link: Link, data: bytes) -> None:
+        if not self._requests or not self._requests[0].sent or self._requests[0].link is not link:
+            return
+        request = self._requests[0]
+        if int.from_bytes(data[1:3], "little") != request.index:
+            return
+        self._requests.popleft()
+        if data[0] == 0x80 and request.required:
+            code = int.from_bytes(data[4:], "little")
+            self._give_up(f"drive {link.axis} refuses {request.index:04X} = {request.value} with SDO abort {code:08X}")
+
+    def _give_up(self, text: str) -> None:
+        self._complain(text)
+        self._end_job(stopped=True)
+        self._let_go()
+
+    def _enable(self) -> list[BusFrame]:
+        self._waited += 1
+        frames = [frame for link in self._links if (frame := link.walk()) is not None]
+        if all(link.state is State.OPERATION_ENABLED for link in self._links):
+            self._position = [(link.position or 0) / link.increments_per_mm for link in self._links]
+            self.phase = Phase.READY
+            self._rate.jump(0.0 if self._hold else self.override)
+            self._rows.extend([Row(self._position, False, False)] * (self._delay + 1))
+            self.events.append({"event": "nc", "on": True})
+            if self._job is not None:
+                self._start_job()
+        elif self._waited * self._period_s > _ENABLE_S:
+            stuck = ", ".join(f"{k.axis} ({k.state.name})" for k in self._links if k.word != ENABLED)
+            self._give_up(f"these drives do not reach Operation enabled: {stuck}; clear the cause and switch the NC on")
+        return frames
+
+    def _release(self) -> list[BusFrame]:
+        self._waited += 1
+        if self._waited > _RELEASE_CYCLES:
+            frames = self._nmt(0x80)
+            self._let_go()
+            return frames
+        for link in self._links:
+            link.word = SHUTDOWN
+        return [link.set_point(link.position) for link in self._links if link.position is not None]
+
+    def _let_go(self) -> None:
+        self.phase = Phase.OFF
+        self._leaving = False
+        self._rows.clear()
+        self._stages.clear()
+        self.in_force = None
+        self.events.append({"event": "nc", "on": False})
+
+    # -- motion
+
+    def _start_job(self) -> None:
+        assert self._job is not None
+        trajectory = self._job.trajectory
+        columns = [
+            trajectory.position_mm[axis] if axis in trajectory.axes else np.full(trajectory.time_s.size, here)
+            for axis, here in zip(self.axes, self._position, strict=True)
+        ]
+        rows = np.column_stack(columns)
+        self._rate.jump(0.0 if self._hold else self.override)
+        rapid = rapid_rows(
+            self._position, rows[0], self._speeds, self._accelerations, self._smoothing_s, self._period_s
+        )
+        if len(rapid):
+            self._stages.append(Stage(Player(rapid, np.ones(len(rapid), dtype=bool))))
+            self._stages.append(Stage(Pause(round(_SETTLE_S / self._period_s))))
+        self._stages.append(Stage(Player(rows, trajectory.rapid), playing=True))
+        self._stages.append(Stage(Pause(round(TAIL_S / self._period_s)), playing=True))
+
+    def _stream(self) -> list[BusFrame]:
+        self._supervise()
+        self._rows.append(self._advance())
+        frames = []
+        for place, link in enumerate(self._links):
+            if self.phase is Phase.FAULTED and link.state is not State.OPERATION_ENABLED:
+                link.word = SHUTDOWN
+                target = link.position or 0
+            else:
+                link.word = ENABLED
+                row = self._rows[link.delay - self._delay - 1]
+                target = round(row.position_mm[place] * link.increments_per_mm)
+            frames.append(link.set_point(target))
+        return frames
+
+    def _advance(self) -> Row:
+        """Go one cycle on along the path."""
+        held = self._hold or self._stopping or self.phase is Phase.FAULTED
+        rate = self._rate.step(0.0 if held else self.override)
+        if self._stopping and rate == 0.0:
+            self._stages.clear()
+            self._stopping, self._given_up = False, True
+        while self._stages and self._stages[0].motion.ended:
+            self._stages.popleft()
+        if not self._stages:
+            self._at_rest()
+            return Row(self._position, False, False)
+        stage = self._stages[0]
+        if isinstance(stage.motion, Pause):
+            stage.motion.cycles -= 1
+            return Row(self._position, False, stage.playing)
+        self._position, rapid = stage.motion.step(rate)
+        return Row(self._position, rapid, stage.playing)
+
+    def _at_rest(self) -> None:
+        if not self._hold and self.phase is Phase.READY:
+            self._rate.jump(self.override)
+        if self._leaving and not any(row.playing for row in self._rows):
+            self.phase, self._waited = Phase.RELEASE, 0
+
+    def _supervise(self) -> None:
+        """A drive that is not enabled any more, or silent, makes the path stop."""
+        if self.phase is Phase.FAULTED:
+            return
+        for link in self._links:
+            if link.silent > _SILENCE_CYCLES:
+                why = "sends no statusword any more"
+            elif link.status is None or link.status & 0x6F != State.OPERATION_ENABLED.value:
+                why = f"left Operation enabled for {link.state.name}"
+            else:
+                continue
+            self.phase = Phase.FAULTED
+            self.stop()
+            self._complain(f"drive {link.axis} {why}: the path is stopped; clear the cause and switch the NC on")
+            return
+
+    def _report(self, before: Row | None, now: Row | None) -> None:
+        """Tell when the first and the last row of a file come into force."""
+        was, is_ = before is not None and before.playing, now is not None and now.playing
+        if is_:
+            self._played += 1
+        if is_ and not was and self._job is not None:
+            rows = self._job.trajectory.time_s.size
+            self.events.append({"event": "playing", "file": self._job.file, "rows": rows})
+        elif was and not is_:
+            self._end_job(stopped=False)
+        elif self._job is not None and not self._stages and self.phase in (Phase.READY, Phase.FAULTED) and not is_:
+            self._end_if_given_up()
+
+    def _end_if_given_up(self) -> None:
+        if not any(row.playing for row in self._rows):
+            self._end_job(stopped=True)
+
+    def _end_job(self, *, stopped: bool) -> None:
+        if self._job is None:
+            return
+        rows = self._job.trajectory.time_s.size
+        stopped = stopped or self._given_up
+        played = min(self._played, rows) if stopped else rows
+        self.events.append({"event": "finished", "file": self._job.file, "rows": played, "stopped": stopped})
+        self._job = None
+
+    def _complain(self, text: str) -> None:
+        self.events.append({"event": "error", "text": text})

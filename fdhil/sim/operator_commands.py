@@ -1,0 +1,114 @@
+"""The operator's panel: one JSON command per line, checked before it acts."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from fdhil.errors import ConfigError, FdhilError
+from fdhil.sim import faults
+from fdhil.sim.axis_unit import Unit
+from fdhil.sim.machine import Machine
+
+MAX_LINE = 1 << 16
+_LOWEST_C, _HIGHEST_C = -40.0, 150.0
+
+
+class PanelError(FdhilError):
+    """A command of the panel cannot be obeyed."""
+
+    exit_code = 2
+
+
+class Panel:
+    """Obeys the commands of one machine. ``play`` and ``quit`` are the process' affair: it loads files, and it ends."""
+
+    def __init__(self, machine: Machine, play: Callable[[Path], None], quit: Callable[[], None]) -> None:
+        self._machine = machine
+        self._play = play
+        self._quit = quit
+        self._commands: Mapping[str, Callable[[dict[str, Any]], None]] = {
+            "nc": lambda command: machine.nc.switch(_flag(command, "on")),
+            "play": lambda command: self._play(_path(command)),
+            "feed_hold": lambda command: machine.nc.feed_hold(_flag(command, "on")),
+            "override": lambda command: machine.nc.set_override(_number(command, "percent")),
+            "stop": lambda _: machine.nc.stop(),
+            "set": self._set,
+            "temperature": self._temperature,
+            "fault": self._fault,
+            "trace": lambda command: machine.trace(_path(command)),
+            "quit": lambda _: self._quit(),
+        }
+
+    def obey(self, line: str) -> None:
+        """Obey one line; PanelError with what is wrong with it, an empty line is nothing."""
+        if not line.strip():
+            return
+        if len(line) > MAX_LINE:
+            raise PanelError("a command of the panel is longer than 64 KiB; give one JSON object per line")
+        try:
+            command = json.loads(line)
+        except ValueError as error:
+            raise PanelError(f"a command of the panel is no JSON ({error}); give one JSON object per line") from None
+        name = command.pop("command", None) if isinstance(command, dict) else None
+        if not isinstance(name, str) or name not in self._commands:
+            raise PanelError(f"the panel has no command {name!r}; it has {', '.join(self._commands)}")
+        try:
+            self._commands[name](command)
+        except (ValueError, TypeError) as error:
+            raise PanelError(f"command {name}: {error}") from None
+        except ConfigError as error:
+            raise PanelError(f"command {name}: {'; '.join(map(str, error.faults))}") from None
+
+    def _set(self, command: dict[str, Any]) -> None:
+        (unit,) = self._units(command, required=True)
+        parameters = command.get("parameters")
+        if not isinstance(parameters, dict) or not parameters:
+            raise ValueError('"parameters" must be an object such as {"Jt": 0.085}')
+        unknown = [name for name in parameters if name not in ("R", "L", "K", "Jt", "ft", "Cd")]
+        if unknown:
+            raise ValueError(f"{', '.join(unknown)} is no parameter of a drive; they are R, L, K, Jt, ft and Cd")
+        unit.drive.set_parameters(**{name: _number(parameters, name) for name in parameters})
+
+    def _temperature(self, command: dict[str, Any]) -> None:
+        celsius = _number(command, "celsius")
+        if not _LOWEST_C <= celsius <= _HIGHEST_C:
+            raise ValueError(f"{celsius:g} degC is no temperature of a slide-way")
+        for unit in self._units(command):
+            unit.warm(celsius)
+
+    def _fault(self, command: dict[str, Any]) -> None:
+        self._machine.fault(faults.parse(command, tuple(self._machine.units)))
+
+    def _units(self, command: dict[str, Any], *, required: bool = False) -> list[Unit]:
+        """The axis that a command names, or all."""
+        units, axis = self._machine.units, command.get("axis")
+        if axis is None and not required:
+            return list(units.values())
+        if axis not in units:
+            raise ValueError(f"there is no axis {axis!r}; the machine has {', '.join(units)}")
+        return [units[axis]]
+
+
+def _flag(command: Mapping[str, Any], key: str) -> bool:
+    value = command.get(key)
+    if not isinstance(value, bool):
+        raise TypeError(f'"{key}" must be true or false')
+    return value
+
+
+def _number(command: Mapping[str, Any], key: str) -> float:
+    value = command.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f'"{key}" must be a number')
+    return float(value)
+
+
+def _path(command: Mapping[str, Any]) -> Path:
+    value = command.get("file")
+    if not isinstance(value, str) or not value:
+        raise ValueError('"file" must be a path')
+    return Path(value)

@@ -1,0 +1,63 @@
+"""The process of the check: what it is asked, what it answers, what it imports, what can stand for it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from subprocess import PIPE
+
+import pytest
+
+from fdhil.arming.background_check import FOLDER
+from fdhil.arming.program_check import OWN, ROOMS
+from fdhil.config import MachineConfig
+from fdhil.prediction.models import nominal_models
+from fdhil.program import program_digest
+
+
+def asked(program: Path, config: MachineConfig, folder: Path) -> bytes:
+    """The request to check a program."""
+    request = {
+        "program": str(program),
+        "program_digest": program_digest(program),
+        "config": config.model_dump(mode="json"),
+        "models": {axis: model.as_dict() for axis, model in nominal_models(config).items()},
+        "folder": str(folder / FOLDER),
+        "key": "key",
+    }
+    return json.dumps(request).encode() + b"\n"
+
+
+def answered(request: bytes, errors: Path) -> bytes:
+    """What the process answers; it says nothing on stderr but what it imports."""
+    command = [sys.executable, "-X", "importtime", "-m", "fdhil.arming.program_check"]
+    with errors.open("wb") as stderr, subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=stderr) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdin.write(request)
+        process.stdin.flush()
+        answer = process.stdout.read()
+        assert process.wait() == 0
+    said = errors.read_text().splitlines()
+    assert [line for line in said if not line.startswith("import time:")] == []
+    _covered_by_the_digest({line.rsplit("|", 1)[1].strip() for line in said})
+    return answer
+
+
+def _covered_by_the_digest(imported: set[str]) -> None:
+    """A room that the check begins to use must be in it; errors and the writing of files make no row."""
+    rooms = {name.removesuffix(".py").replace("/", ".") for name in (*ROOMS, OWN)}
+    others = {"arming", "errors", "store", "store.atomic"}
+    modules = {name.removeprefix("fdhil.") for name in imported if name.startswith("fdhil.")}
+    assert {name for name in modules - others - rooms if name.split(".")[0] not in rooms} == set()
+    assert len(modules) > 50
+
+
+def says_instead(monkeypatch: pytest.MonkeyPatch, folder: Path, script: str) -> None:
+    """Let a shell script stand for the process of the check."""
+    python = folder / "python"
+    python.write_text(f"#!/bin/sh\n{script}")
+    python.chmod(0o700)
+    monkeypatch.setattr(sys, "executable", str(python))

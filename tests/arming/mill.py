@@ -1,0 +1,56 @@
+"""A guard that believes its table: it joins the rows that it is given, as the real one does, and is moved by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from fdhil.guard import table
+from tests.arming.guard_peer import ZERO, Guard
+
+RESERVE_ROWS = 1000
+Answer = Mapping[str, Any]
+
+
+class Mill:
+    """What listens at ``guard.sock``: loads tables, arms, starves; ``move`` is the machine's motion."""
+
+    def __init__(self, folder: Path) -> None:
+        self.state, self.row, self.cause = "OFF", 0, ""
+        self.rows: list[tuple[int, ...]] = []
+        self.final = False
+        self._peer = Guard(folder)
+        self._peer.says = self._answer
+
+    def _answer(self, kind: str) -> Answer:
+        if kind == "table":
+            return self._load()
+        if kind == "arm":
+            self.state = "ARMED"
+        elif kind == "disarm":
+            self.state, self.cause = "OFF", "Disarmed"
+        cause = {"code": self.cause, "text": "", "axis": ""} if self.cause else None
+        rows = [0, len(self.rows)] if self.rows else None
+        known = {"cause": cause, "may_stand_um": ZERO}
+        return {"ok": True, "state": self.state, "row": self.row or None, "rows": rows, **known}
+
+    def _load(self) -> Answer:
+        _, path = table.decode(table.read_sealed(self._peer.descriptor))
+        if path.first == 0:
+            self.rows = []
+        if path.first != len(self.rows):
+            return {"ok": False, "code": "ProgramMismatch", "text": "these rows do not continue the table"}
+        self.rows += list(zip(*path.demand, *path.offset, strict=True))
+        self.final = path.final
+        return {"ok": True, "rows": [0, len(self.rows)]}
+
+    def move(self, row: int) -> None:
+        """Let the machine come to a row; where too few are left behind it, the correction is ramped down."""
+        self.state, self.row = "ACTIVE", row
+        if not self.final and len(self.rows) - row < RESERVE_ROWS:
+            self.state, self.cause = "OFF", "TableStarved"
+
+    def close(self) -> None:
+        """End all connections."""
+        self._peer.close()

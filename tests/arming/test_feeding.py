@@ -1,0 +1,79 @@
+"""The on-line feed-forward is switched on only for drives that were commissioned for it, with validated parameters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil.arming.preparing import MODEL_AGE_S, Feeding, Refused, feeding_facts, prepare_feeding
+from fdhil.commissioning.record import axis_digest, save_record
+from fdhil.config import FeedforwardLimits, MachineConfig
+from fdhil.guard.interlocks import FEEDFORWARD_FACTS
+from fdhil.guard.requests import parse_law
+from tests.arming.test_preparing import known, record_of
+from tests.daemon.machine import config_of
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> MachineConfig:
+    """The bench, both axes with a feed-forward."""
+    made = config_of(tmp_path, ("X", "Y"))
+    axes = {name: axis.model_copy(update={"feedforward": FeedforwardLimits()}) for name, axis in made.axis.items()}
+    return made.model_copy(update={"axis": axes})
+
+
+def save_records(config: MachineConfig, **changes: Any) -> None:
+    """Save the records of both axes as a commissioning leaves them, with ``changes`` for X."""
+    for axis in "XY":
+        options = {"6007": 1, "1402": 0x400 + config.node_id(axis)}
+        values: dict[str, Any] = {"axis": axis, "config_digest": axis_digest(config, axis), "options": options}
+        save_record(record_of(config, **(values | (changes if axis == "X" else {}))), config.store.directory)
+
+
+def test_a_good_machine_is_vouched_for(config: MachineConfig) -> None:
+    """All facts but the journal's, which the armory adds; laws that the guard takes."""
+    save_records(config)
+    feeding = prepare_feeding(config, known(config))
+    assert isinstance(feeding, Feeding)
+    assert feeding.facts == dict.fromkeys(FEEDFORWARD_FACTS.keys() - {"journal_writable"}, True)
+    assert all(parse_law(dict(law)) is not None for law in feeding.laws.values())
+    assert feeding.summary()["axes"] == ["X", "Y"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "withheld"),
+    [
+        ({"options": {"6007": 1}}, "feedforward_commissioned"),
+        ({"options": {"1402": 0x80000401}}, "feedforward_commissioned"),
+        ({"watchdog": "not proven"}, "watchdog_proven"),
+        ({"config_digest": "another"}, "commissioned"),
+    ],
+)
+def test_what_the_record_does_not_show_is_withheld(
+    config: MachineConfig, changes: dict[str, Any], withheld: str
+) -> None:
+    """Each fact by itself."""
+    save_records(config, **changes)
+    feeding = prepare_feeding(config, known(config))
+    assert isinstance(feeding, Feeding)
+    assert [fact for fact, good in feeding.facts.items() if not good] == [withheld]
+
+
+def test_without_a_section_or_parameters_there_is_no_law(config: MachineConfig) -> None:
+    """The refusal names the section, or the rapids that are missing."""
+    refused = prepare_feeding(config, known(config, published=None))
+    assert isinstance(refused, Refused)
+    assert refused.reasons[0].code == "ModelNotValidated"
+    axes = {"X": config.axis["X"].model_copy(update={"feedforward": None}), "Y": config.axis["Y"]}
+    refused = prepare_feeding(config.model_copy(update={"axis": axes}), known(config))
+    assert isinstance(refused, Refused)
+    assert refused.reasons[0].code == "FeedforwardOff"
+    assert "[axis.X.feedforward]" in refused.reasons[0].text
+
+
+def test_an_old_model_is_withdrawn_while_it_runs(config: MachineConfig) -> None:
+    """The daemon says so with every sign of life, and the guard fades out."""
+    assert feeding_facts("XY", config, known(config)) == {"model_fresh": True}
+    assert feeding_facts("XY", config, known(config, age_s=MODEL_AGE_S + 1)) == {"model_fresh": False}

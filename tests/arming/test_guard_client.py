@@ -1,0 +1,191 @@
+"""The daemon's end of the guard's socket, and the start of the guard's process."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+import runpy
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from fdhil.arming.guard_client import GuardClient, GuardLost
+from fdhil.errors import ConnectError, DeviceTimeout
+from fdhil.guard import __main__ as entry
+from fdhil.guard import signals
+from fdhil.guard.requests import parse_line
+from fdhil.guard.settings import to_json
+from tests.guard.machine import settings
+
+
+@pytest.fixture
+def far(tmp_path: Path) -> Iterator[Callable[[bytes | None], GuardClient]]:
+    """A guard that answers every request with the same bytes; None: it hangs up."""
+    server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    server.bind(str(tmp_path / "guard.sock"))
+    server.listen()
+    threads: list[threading.Thread] = []
+    clients: list[GuardClient] = []
+
+    def serve(answer: bytes | None) -> None:
+        peer, _ = server.accept()
+        with peer, contextlib.suppress(ConnectionError):
+            while peer.recv(1 << 16) and answer is not None:
+                peer.sendall(answer)
+
+    def build(answer: bytes | None) -> GuardClient:
+        threads.append(threading.Thread(target=serve, args=(answer,)))
+        threads[-1].start()
+        clients.append(GuardClient(tmp_path, timeout_s=0.05 if answer == b"" else 20.0))
+        return clients[-1]
+
+    yield build
+    for client in clients:
+        client.close()
+    for thread in threads:
+        thread.join()
+    server.close()
+
+
+Far = Callable[[bytes | None], GuardClient]
+
+
+def test_no_guard_there_is_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(ConnectError, match="start fdhil-guard"):
+        GuardClient(tmp_path)
+
+
+def test_answers_of_others_are_passed_over(far: Far) -> None:
+    client = far(b'[]\n{"id": 99, "ok": false}\n{"id": 1, "ok": true, "state": "OFF"}\n')
+    assert client.status() == {"ok": True, "state": "OFF"}
+
+
+def test_a_guard_that_gives_no_answer_is_told(far: Far) -> None:
+    with pytest.raises(DeviceTimeout, match="gave no answer"), far(b"") as client:
+        client.disarm()
+
+
+def test_a_guard_that_went_is_lost(far: Far) -> None:
+    client = far(None)
+    with pytest.raises(GuardLost, match="is gone"):
+        client.adopt("token")
+    with pytest.raises(GuardLost, match="is gone"):
+        say_alive_for_ever(client)
+
+
+def say_alive_for_ever(client: GuardClient) -> None:
+    while True:
+        client.alive({"model_fresh": True})
+
+
+def test_a_connection_that_breaks_is_lost(far: Far, monkeypatch: pytest.MonkeyPatch) -> None:
+    client = far(b"")
+    client._timeout_s = 20.0
+    client._socket.shutdown(socket.SHUT_RD)
+    with pytest.raises(GuardLost):
+        client.arm("token", "digest", {})
+
+    class Broken:
+        def settimeout(self, seconds: float) -> None: ...
+        def sendall(self, line: bytes) -> None: ...
+        def close(self) -> None: ...
+        def recv(self, size: int) -> bytes:
+            raise OSError(104, "Connection reset by peer")
+
+    client._socket.close()
+    monkeypatch.setattr(client, "_socket", Broken())
+    with pytest.raises(GuardLost, match="reset"):
+        client.feed_forward("token", {"X": {}}, {})
+
+
+def test_a_table_goes_with_its_descriptor(far: Far) -> None:
+    client = far(b'{"id": 1, "ok": true}\n{"id": 2, "ok": true}\n')
+    assert client.compared("token", {"X": "fingerprint"})["ok"]
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    assert client.load("X", {"X": [1, 2]}, {"X": [0, 0]}, "digest") == {"ok": True}
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+    client.alive()
+
+
+@pytest.mark.parametrize(
+    "line", [b"", b"NaN", b'{"a": Infinity}', b"[" * 20_000, b"\xff", b"[]", b'{"a": ' + b"9" * 5000 + b"}"]
+)
+def test_what_is_no_request_is_none(line: bytes) -> None:
+    assert parse_line(line) is None
+
+
+@pytest.mark.parametrize(
+    "mark", ["NaN", "[]", "1.5", "1e999", "-9007199254740993", "true", "null", '"' + "x" * 201 + '"']
+)
+def test_a_mark_that_cannot_be_given_back_is_left_out(mark: str) -> None:
+    assert "id" not in (parse_line(f'{{"id": {mark}}}'.encode()) or {})
+
+
+@pytest.fixture
+def handlers() -> Iterator[None]:
+    before = {number: signal.getsignal(number) for number in signal.valid_signals()}
+    yield
+    descriptor = signal.set_wakeup_fd(-1)
+    if descriptor >= 0:
+        os.close(descriptor)
+    for number, handler in before.items():
+        if number not in signals.KEPT and handler is not None:
+            signal.signal(number, handler)
+    gc.unfreeze()
+    gc.enable()
+
+
+def start(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["fdhil.guard", *arguments])
+    return entry.main()
+
+
+def test_it_starts_on_its_descriptor_and_stops_at_a_signal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, handlers: None
+) -> None:
+    """With nothing heard it does not know that nothing stands, and says so."""
+    file = tmp_path / "guard.json"
+    file.write_text(to_json(settings(run_directory=str(tmp_path), clock="monotonic")))
+    caught = signals.catch
+
+    def catch_and_raise() -> socket.socket:
+        wake = caught()
+        for number in (signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP, signal.SIGRTMAX, 32, 33):
+            os.kill(os.getpid(), number)
+        return wake
+
+    monkeypatch.setattr(signals, "catch", catch_and_raise)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        near = socket.create_connection(server.getsockname())
+        assert start(monkeypatch, "--settings", str(file), "--descriptor", str(near.detach())) == 3
+
+
+def test_without_settings_or_descriptor_it_says_what_is_wrong(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], handlers: None
+) -> None:
+    file = tmp_path / "guard.json"
+    assert start(monkeypatch, "--settings", str(file), "--descriptor", "0") == 2
+    file.write_text(to_json(settings(run_directory=str(tmp_path))))
+    assert start(monkeypatch, "--settings", str(file), "--descriptor", str(1 << 20)) == 3
+    told = capsys.readouterr().err.splitlines()
+    assert "run fdhil-guard" in told[0]
+    assert "start the guard with fdhil-guard" in told[1]
+    monkeypatch.delitem(sys.modules, "fdhil.guard.__main__")
+    with pytest.raises(SystemExit, match="3"):
+        runpy.run_module("fdhil.guard", run_name="__main__")
+
+
+def test_a_machine_whose_numbers_are_unknown_leaves_two_signals_alone(
+    monkeypatch: pytest.MonkeyPatch, handlers: None
+) -> None:
+    monkeypatch.setattr(signals, "SIGACTION", {})
+    wake = signals.catch()
+    signal.raise_signal(signal.SIGQUIT)
+    assert wake.recv(10) == bytes([signal.SIGQUIT])
+    wake.close()

@@ -1,0 +1,126 @@
+"""The daemon's link to the guard: no trip is missed, whoever looked; a guard that does not answer holds nothing up."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from fdhil.arming.checked_program import Piece
+from fdhil.arming.desk import ALIVE_S, Armory
+from fdhil.arming.guard_link import TRIPPED, GuardLink
+from fdhil.arming.token import read_token
+from fdhil.config import MachineConfig
+from fdhil.daemon.outcome_store import Keeper
+from fdhil.errors import DeviceError
+from tests.arming.guard_peer import FINE, Guard
+from tests.daemon.machine import config_of
+
+STARVED = {"state": "RAMP_DOWN", "cause": {"code": "TableStarved", "text": "no rows", "axis": ""}, "ok": True}
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> MachineConfig:
+    """The bench, two axes, writing allowed."""
+    return config_of(tmp_path, ("X", "Y"))
+
+
+@pytest.fixture
+def folder(config: MachineConfig) -> Path:
+    """The run directory."""
+    assert config.store.run_directory is not None
+    config.store.run_directory.mkdir(parents=True)
+    return config.store.run_directory
+
+
+@pytest.fixture
+def guard(folder: Path) -> Iterator[Guard]:
+    """A guard that says what it is told to."""
+    made = Guard(folder)
+    yield made
+    made.close()
+
+
+class Long:
+    """A streamed program, as far as handing on its rows asks."""
+
+    axes = ("X",)
+    program_digest = "digest"
+
+
+def test_a_trip_that_another_request_saw_is_told_all_the_same(guard: Guard, folder: Path) -> None:
+    link, long = GuardLink(folder), Long()
+    assert [notice.code for notice in link.refresh()] == ["GuardFound"]
+    guard.says = lambda _kind: STARVED
+    piece = Piece(0, {"X": [0]}, {"X": [0]}, False)
+    assert link.extend(long, piece)["ok"]  # type: ignore[arg-type]
+    assert link.state == "RAMP_DOWN"
+    assert [notice.code for notice in link.refresh()] == ["GuardState", TRIPPED]
+    assert link.refresh() == []
+    link.close()
+
+
+def test_a_guard_that_does_not_answer_is_let_go(guard: Guard, folder: Path) -> None:
+    """What it may have armed by then ends with the connection: nobody was told that it is armed."""
+    link = GuardLink(folder)
+    link.refresh()
+    assert link._client is not None
+    link._client._timeout_s = 0.2
+    guard.says = lambda kind: None if kind == "disarm" else FINE
+    with pytest.raises(DeviceError):
+        link.disarm()
+    assert not link.connected
+    assert [notice.code for notice in link.refresh()] == ["GuardLost", "GuardFound"]
+    link.close()
+
+
+async def test_a_slow_guard_still_hears_that_the_daemon_lives(
+    config: MachineConfig, guard: Guard, folder: Path
+) -> None:
+    """Its answers are not waited for, not even while something is armed."""
+    guard.says = lambda _kind: None
+    armory = Armory(config, Keeper(config), folder)
+    attending = asyncio.create_task(armory.attend(lambda _told: None))
+    async with asyncio.timeout(60.0):
+        while guard.heard.count("alive") < 20:  # noqa: ASYNC110 - it is another thread that hears
+            await asyncio.sleep(ALIVE_S)
+    assert [kind for kind in guard.heard if kind != "alive"] == ["status"]
+    attending.cancel()
+    guard.close()
+    await asyncio.to_thread(armory.guard.close)
+
+
+@pytest.mark.parametrize("how", ["disarm", "abandon"])
+async def test_what_is_given_up_while_it_is_planned_is_not_armed(
+    how: str, config: MachineConfig, guard: Guard, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planning, planned = threading.Event(), threading.Event()
+
+    def slow(*_: object) -> Any:
+        planning.set()
+        assert planned.wait(60.0)
+
+        return SimpleNamespace(facts={}, summary=lambda: {"method": "inverse"})
+
+    monkeypatch.setattr("fdhil.arming.desk.prepare", slow)
+    guard.says = lambda _kind: {**FINE, "state": "OFF"}
+    armory = Armory(config, Keeper(config), folder)
+    armory.begin({}, [])
+    request = {"request": "arm", "program": "a.ngc", "token": read_token(folder)}
+    arming = asyncio.create_task(armory.arm(request))
+    assert await asyncio.to_thread(planning.wait, 60.0)
+    if how == "disarm":
+        await armory.disarm()
+    else:
+        armory.abandon()
+    planned.set()
+    answer = await arming
+    assert (answer["ok"], answer["code"]) == (False, "Abandoned")
+    assert set(guard.heard) <= {"disarm", "status"}
+    assert armory.armed is None
+    armory.guard.close()

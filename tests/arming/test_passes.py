@@ -1,0 +1,178 @@
+"""After each pass under a correction its measured error stands beside the predicted one and its uncertainty."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil.arming import passes
+from fdhil.arming.desk import Armory
+from fdhil.arming.passes import Pass
+from fdhil.arming.preparing import Armament, prepare
+from fdhil.config import MachineConfig
+from fdhil.prediction import contour_error_um
+from fdhil.prediction.gain import Gain, plus_minus
+from fdhil.records import AxisSamples, Float, Skill, frozen, frozen_ints
+from tests.arming.mill import Mill
+from tests.arming.test_ahead import opened
+from tests.arming.test_preparing import GENTLE, known, save_records
+from tests.daemon.machine import config_of
+
+REST_ROWS = 300
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> MachineConfig:
+    """The bench, two axes, commissioned."""
+    config = config_of(tmp_path, ("X", "Y"))
+    save_records(config)
+    return config
+
+
+@pytest.fixture
+def mill(config: MachineConfig) -> Iterator[Mill]:
+    """The guard."""
+    assert config.store.run_directory is not None
+    config.store.run_directory.mkdir(parents=True)
+    made = Mill(config.store.run_directory)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def program(tmp_path: Path) -> Path:
+    """A corner."""
+    path = tmp_path / "gentle.ngc"
+    path.write_text(GENTLE)
+    return path
+
+
+@pytest.fixture
+def armament(config: MachineConfig, program: Path) -> Armament:
+    """The corner, planned."""
+    found = prepare(program, None, config, known(config))
+    assert isinstance(found, Armament)
+    return found
+
+
+def heard(demand: Mapping[str, Float], position: Mapping[str, Float]) -> Iterator[AxisSamples]:
+    """What the bus shows of a pass: the way to its start, a rest, the pass, a rest; the axes in blocks of their own."""
+    for axis, size in (("X", 40), ("Y", 37)):
+        way = np.concatenate([np.linspace(30.0, 0.0, 200) + demand[axis][0], np.full(REST_ROWS, demand[axis][0])])
+        wanted = np.concatenate([way, demand[axis], np.full(REST_ROWS, demand[axis][-1])])
+        is_at = np.concatenate([way, position[axis], np.full(REST_ROWS, position[axis][-1])])
+        tick, zeros = np.arange(1000, 1000 + wanted.size), np.zeros(wanted.size)
+        for k in range(0, wanted.size, size):
+            part = slice(k, k + size)
+            ticks, still = frozen_ints(tick[part]), frozen(zeros[part])
+            yield AxisSamples(axis, ticks, frozen(wanted[part]), frozen(is_at[part]), still, still, None, still, ticks)
+
+
+def test_a_pass_is_measured_as_a_prediction_is_whatever_its_pieces(
+    config: MachineConfig, armament: Armament, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Chunks, margins and joined blocks change nothing: the figures are those of all rows at once."""
+    monkeypatch.setattr(passes, "CHUNK_S", 0.2)
+    reference, after = armament.correction.before.reference, armament.correction.after
+    demand = armament.first().demand
+    for rows in (armament.rows, None):
+        running = Pass(config, demand, rows)
+        samples = sorted(heard(reference.position_mm, after.predicted_mm), key=lambda block: int(block.tick[-1]))
+        for block in samples:
+            running.take(block)
+        told = running.measured()
+        assert told is not None
+        path, is_at = (np.column_stack([of[a] for a in "XY"]) for of in (reference.position_mm, after.predicted_mm))
+        error = contour_error_um(path, is_at, reference.dt_s)
+        assert told["measured"]["max_um"] == pytest.approx(float(error.max()), rel=1e-6)
+        if rows is not None:
+            assert told["rows"] == rows
+            assert told["measured"]["rms_um"] == pytest.approx(armament.predicted.after_um, rel=1e-6)
+            lag = (after.predicted_mm["X"] - reference.position_mm["X"]) * 1e3
+            assert told["following_rms_um"]["X"] == pytest.approx(float(np.sqrt(np.mean(lag**2))), rel=1e-6)
+        else:
+            assert told["rows"] >= armament.rows
+
+
+def test_a_pass_that_never_began_measures_nothing(config: MachineConfig, armament: Armament) -> None:
+    reference = armament.correction.before.reference
+    running = Pass(config, armament.first().demand, armament.rows)
+    away = {axis: values + 5.0 for axis, values in reference.position_mm.items()}
+    for block in heard(away, away):
+        running.take(block)
+    assert running.measured() is None
+
+
+def measured(armory: Armory, count: int) -> bool:
+    """Whether so many passes were measured."""
+    return len(armory.passes) == count
+
+
+async def test_each_pass_is_told_beside_what_was_predicted(
+    config: MachineConfig, mill: Mill, program: Path, armament: Armament, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(passes, "LATE_S", 0.0)
+    planned = armament.correction
+    reference = planned.before.reference.position_mm
+    worse = {axis: 3 * planned.before.predicted_mm[axis] - 2 * reference[axis] for axis in reference}
+    cases = [
+        (planned.after.predicted_mm, "Finished", "info"),
+        (planned.before.predicted_mm, "Finished", "minor"),
+        (worse, "StaleData", "MAJOR"),
+    ]
+    async with opened(config, mill) as shop:
+        for number, (is_at, cause, severity) in enumerate(cases, 1):
+            answer = await shop.arm(program)
+            assert answer["ok"], answer
+            assert "is predicted to become" in answer["text"]
+            assert " ± " in answer["text"]
+            assert answer["after"]["uncertainty_um"] > 0.5  # no better than the last moves were predicted
+            for block in heard(reference, is_at):
+                shop.armory.hear(block)
+            mill.state, mill.cause = "OFF", cause
+            await shop.until(partial(measured, shop.armory, number))
+            told = shop.armory.passes[-1]
+            notice = next(notice for notice in reversed(shop.told) if notice.code == "PassMeasured")
+            assert (notice.severity, notice.text.startswith(told["text"])) == (severity, True)
+            assert (told["pass"], told["ended_by"]) == (number, cause)
+    first, second, third = shop.armory.passes
+    assert first["measured"]["rms_um"] == pytest.approx(first["predicted"]["rms_um"], rel=1e-3)
+    assert second["measured"]["rms_um"] == pytest.approx(second["predicted_without"]["rms_um"], rel=1e-3)
+    assert "pass 1 of gentle.ngc: contour error measured" in first["text"]
+    assert "ended by StaleData" in third["text"]
+    assert any("more than predicted; identify again" in notice.text for notice in shop.told)
+    assert any("worse than without; leave it off" in notice.text for notice in shop.told)
+
+
+def test_a_gain_is_bounded_by_the_parameters_spread_and_by_the_skill(config: MachineConfig, program: Path) -> None:
+    def predicted(**changes: Any) -> Gain:
+        found = prepare(program, None, config, known(config, **changes))
+        assert isinstance(found, Armament)
+        return found.predicted
+
+    good = predicted()
+    assert good.half_um is not None
+    assert good.half_um > math.hypot(0.5, 0.5)  # the skill of both axes, and the parameters' spread
+    assert good.at_least is not None
+    assert good.at_least < good.before_um / good.after_um
+    poor = predicted(skills=(Skill("X", 1, 500.0, 900.0, 0.0, 900.0),))
+    assert poor.half_um is not None
+    assert poor.half_um > 500.0
+    assert poor.at_least is None
+    for unknown in ((), (Skill("X", 1, math.nan, 1.0, 0.0, 900.0),)):
+        assert predicted(skills=unknown).half_um is None
+    assert "how well it fits this machine is not known" in str(predicted(skills=()))
+
+
+def test_a_spread_below_the_digits_is_not_zero() -> None:
+    assert plus_minus(0.44) == "± 0.4"
+    assert plus_minus(0.05) == "± 0.1"
+    assert plus_minus(0.004) == "± <0.1"
+    assert plus_minus(0.0) == "± <0.1"
+    assert plus_minus(0.004, 2) == "± <0.01"

@@ -1,0 +1,172 @@
+"""Nothing is armed that the daemon cannot vouch for; every no has its class and what to do about it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil.arming.desk import Armory
+from fdhil.arming.preparing import MODEL_AGE_S, Armament, AxisKnowledge, Refused, prepare, standing_facts
+from fdhil.arming.token import read_token
+from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
+from fdhil.config import MachineConfig
+from fdhil.daemon.outcome_store import Keeper
+from fdhil.records import Notice, Skill
+from fdhil.store.history import Revision, Stamp
+from tests.daemon.machine import config_of
+from tests.store.made import published
+
+GENTLE = "G21 G90 G94\nG1 X20 F4000\nG1 Y20\nG4 P0.2\nM2\n"
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> MachineConfig:
+    """The bench, two axes, writing allowed."""
+    return config_of(tmp_path, ("X", "Y"))
+
+
+@pytest.fixture
+def program(tmp_path: Path) -> Path:
+    """A corner, whose error a correction can take away."""
+    path = tmp_path / "gentle.ngc"
+    path.write_text(GENTLE)
+    return path
+
+
+def known(config: MachineConfig, **changes: Any) -> dict[str, AxisKnowledge]:
+    """Return what a daemon knows of axes that are in good order, but for ``changes`` of X."""
+    newest = replace(published(), config_digest=config.digest)
+    skill = Skill("X", 1, 0.5, 1.0, 0.0, 30.0)
+    good = AxisKnowledge(newest, 60.0, 21.5, (skill, skill, skill))
+    return {"X": replace(good, **changes), "Y": good}
+
+
+def record_of(config: MachineConfig, **changes: Any) -> CommissioningRecord:
+    """Return the record of X as it should be, but for ``changes``."""
+    record = CommissioningRecord(
+        axis="X",
+        vendor_id=1,
+        product_code=2,
+        revision=3,
+        serial=4,
+        config_digest=axis_digest(config, "X"),
+        mapping_fingerprint="f",
+        options={"6007": 1},
+        following_error_window_um=10_000.0,
+        offset_in_feedforward=True,
+        sign_test_um=10.0,
+        readback_ok=True,
+        watchdog="proven",
+        created_utc="2026-01-01T00:00:00Z",
+    )
+    return replace(record, **changes)
+
+
+def save_records(config: MachineConfig, **changes: Any) -> None:
+    """Save the records of both axes, with ``changes`` for X."""
+    save_record(record_of(config, **changes), config.store.directory)
+    other = record_of(config, axis="Y", config_digest=axis_digest(config, "Y"))
+    save_record(other, config.store.directory)
+
+
+def test_a_good_machine_is_vouched_for(config: MachineConfig, program: Path) -> None:
+    save_records(config)
+    armament = prepare(program, None, config, known(config))
+    assert isinstance(armament, Armament)
+    assert all(armament.facts.values()), armament.facts
+    told = armament.summary()
+    assert told["after"]["rms_um"] < 0.2 * told["before"]["rms_um"]
+    assert told["program_digest"] == armament.table.program_digest
+    assert told["rows"] == armament.table.offset_increments["X"].size
+
+
+@pytest.mark.parametrize(
+    ("changes", "withheld"),
+    [
+        ({"age_s": MODEL_AGE_S + 1}, "model_fresh"),
+        ({"age_s": -1.0}, "model_fresh"),
+        ({"age_s": math.nan}, "model_fresh"),
+        ({"temperature_c": 25.0}, "model_fresh"),
+        ({"load_changed": True}, "model_fresh"),
+        ({"published": published()}, "model_fresh"),  # of another configuration
+        ({"skills": ()}, "skill_enough"),
+        ({"skills": (Skill("X", 1, 500.0, 900.0, 0.0, 900.0),)}, "skill_enough"),
+        ({"skills": (Skill("X", 1, math.nan, 1.0, 0.0, 900.0),)}, "skill_enough"),
+    ],
+)
+def test_a_fact_that_does_not_hold_is_withheld(changes: dict[str, Any], withheld: str, config: MachineConfig) -> None:
+    facts = standing_facts(["X", "Y"], config, known(config, **changes), gain_um=20.0)
+    assert [name for name, holds in facts.items() if not holds] == [withheld]
+
+
+def test_no_gain_is_no_gain(config: MachineConfig) -> None:
+    for gain_um in (0.0, -1.0, math.nan):
+        assert not standing_facts(["X", "Y"], config, known(config), gain_um)["gain_positive"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "withheld"),
+    [
+        ({"readback_ok": False}, ["commissioned"]),
+        ({"config_digest": "other"}, ["commissioned"]),
+        ({"offset_in_feedforward": None}, ["offset_in_feedforward_known"]),
+        ({"offset_in_feedforward": False}, ["offset_in_feedforward_known"]),
+        ({"watchdog": "none"}, ["watchdog_proven"]),
+        (None, ["commissioned", "offset_in_feedforward_known", "watchdog_proven"]),
+    ],
+)
+def test_a_drive_that_is_not_commissioned_is_not_vouched_for(
+    changes: dict[str, Any] | None, withheld: list[str], config: MachineConfig, tmp_path: Path
+) -> None:
+    program = tmp_path / "fast.ngc"
+    program.write_text(GENTLE.replace("F4000", "F9000"))  # an offset larger than what may stay in a drive
+    if changes is not None:
+        save_records(config, **changes)
+    armament = prepare(program, None, config, known(config))
+    assert isinstance(armament, Armament)
+    assert [name for name, holds in armament.facts.items() if not holds] == withheld
+
+
+def test_without_parameters_or_limits_nothing_is_planned(config: MachineConfig, program: Path, tmp_path: Path) -> None:
+    refused = prepare(program, None, config, known(config, published=None))
+    assert isinstance(refused, Refused)
+    assert refused.reasons[0].code == "ModelNotValidated"
+    listening = {axis: settings.model_copy(update={"correction": None}) for axis, settings in config.axis.items()}
+    shadow = config.model_copy(update={"axis": listening})
+    refused = prepare(program, None, shadow, known(shadow))
+    assert isinstance(refused, Refused)
+    assert refused.reasons[0].code == "WritingOff"
+
+
+async def test_the_operators_token_decides_and_a_missing_guard_is_told(config: MachineConfig, program: Path) -> None:
+    keeper = Keeper(config)
+    assert config.store.run_directory is not None
+    config.store.run_directory.mkdir(parents=True)
+    armory = Armory(config, keeper, config.store.run_directory)
+    stamp = Stamp(0.0, "another boot", 0)
+    newest = replace(published(), config_digest=config.digest)
+    skills = [Skill(axis, 1, 0.5, 1.0, 0.0, 30.0) for axis in ("X", "Y")]
+    armory.begin({axis: Revision(1, replace(newest, axis=axis), (), stamp) for axis in ("X", "Y")}, skills)
+    request = {"request": "arm", "program": str(program)}
+    for token in (None, "", 5, "wrong", "ä"):
+        answer = await armory.arm(request | {"token": token})
+        assert (answer["ok"], answer["code"]) == (False, "AuthRequired")
+    token = read_token(config.store.run_directory)
+    assert (await armory.arm(request | {"token": token}))["code"] == "GuardAbsent"
+    assert (await armory.arm(request | {"token": token, "method": "magic"}))["code"] == "BadRequest"
+    assert (await armory.arm({"request": "arm", "token": token}))["code"] == "BadRequest"
+    assert (await armory.disarm())["code"] == "GuardAbsent"
+    assert not (await armory.stand_down()).heard
+
+
+def test_a_changed_load_is_remembered_until_new_parameters_come(config: MachineConfig, tmp_path: Path) -> None:
+    armory = Armory(config, Keeper(config), tmp_path)
+    armory.note([replace(published(), config_digest=config.digest)])
+    armory.note([Notice("LoadChanged", "MAJOR", "Jt rose", "X")])
+    assert armory._known()["X"].load_changed
+    armory.note([replace(published(2), config_digest=config.digest)])
+    assert not armory._known()["X"].load_changed

@@ -1,0 +1,368 @@
+"""A long program is checked as a whole before it is armed: what is sent was checked, what is refused is named."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import io
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import fdhil
+from fdhil import correction
+from fdhil.arming.background_check import FOLDER, Check
+from fdhil.arming.checked_program import Checked, Piece, Stream
+from fdhil.arming.preparing import Long, StreamedArmament, prepare, prepare_stream
+from fdhil.arming.program_check import KEPT, SCHEMA, check, code_digest, keep
+from fdhil.config import MachineConfig
+from fdhil.errors import ProgramError, StoreError
+from fdhil.prediction.models import nominal_models
+from fdhil.program import load_trajectory, program_digest
+from fdhil.records import Reason
+from tests.arming.check_process import answered, asked, says_instead
+from tests.arming.test_preparing import known, save_records
+from tests.daemon.machine import config_of
+
+SQUARE = "G1 X40 F6000\nG1 Y30\nG1 X0\nG1 Y0\n"
+HEAD = "G21 G90 G94\nG4 P0.5\n"
+LONG = HEAD + SQUARE * 10 + "G4 P0.3\nM2\n"
+HARD_LINES = (15, 24)  # in the third square and in the fifth
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> MachineConfig:
+    """The bench, two axes, writing allowed."""
+    return config_of(tmp_path, ("X", "Y"))
+
+
+def written(folder: Path, text: str) -> Path:
+    """A program on disk."""
+    path = folder / "program.ngc"
+    path.write_text(text)
+    return path
+
+
+def checked(program: Path, config: MachineConfig) -> tuple[dict[str, Any], bytes, list[Any]]:
+    """Check a program in this process; return header, rows and what was told."""
+    body, told = io.BytesIO(), list[Any]()
+    header = check(program, program_digest(program), nominal_models(config), config, body, told.append)
+    return header, body.getvalue(), told
+
+
+def test_the_rows_are_those_of_the_whole_plan(config: MachineConfig, tmp_path: Path) -> None:
+    program = written(tmp_path, LONG)
+    header, body, told = checked(program, config)
+    planned = correction.plan(load_trajectory(program, config), nominal_models(config), config, "inverse")
+    table = correction.table(planned, config, "digest")
+    rows = np.frombuffer(body, "<i4").reshape(-1, 4)
+    for column, values in enumerate((*table.demand_increments.values(), *table.offset_increments.values())):
+        assert np.array_equal(rows[:, column], values)
+    assert header["refused"] == []
+    assert header["rows"] == len(rows)
+    assert header["before"]["rms_um"] == pytest.approx(np.sqrt(np.mean(planned.before.contour_um**2)))
+    assert header["after"]["max_um"] == pytest.approx(planned.after.contour_um.max(), abs=1e-6)
+    progress = next(one["progress"] for one in told if "progress" in one)
+    assert progress.keys() == {"checked_s", "line", "times_real_time", "refused"}
+    blocks = [one for one in told if "block" in one]
+    assert [one["block"] for one in blocks] == header["blocks"]
+    assert [one["last"] for one in blocks] == [False] * (len(blocks) - 1) + [True]
+    assert blocks[-1]["errors"] == {"before": header["before"], "after": header["after"]}
+    first = 0
+    for end, sha256 in header["blocks"]:
+        assert hashlib.sha256(rows[first:end].tobytes()).hexdigest() == sha256
+        first = end
+    assert first == header["rows"]
+
+
+def test_a_block_is_written_before_it_is_told(config: MachineConfig, tmp_path: Path) -> None:
+    """Who reads as far as was told finds the rows that were told."""
+    file, program, seen = tmp_path / "rows", written(tmp_path, LONG), 0
+
+    def look(told: Mapping[str, Any]) -> None:
+        nonlocal seen
+        if "block" in told:
+            end, sha256 = told["block"]
+            content = file.read_bytes()
+            assert len(content) == 16 * end
+            assert hashlib.sha256(content[16 * seen :]).hexdigest() == sha256
+            seen = end
+
+    with file.open("wb") as body:
+        check(program, program_digest(program), nominal_models(config), config, body, look)
+    assert seen > 15_000
+
+
+def hard_program() -> str:
+    """Two lines of a program ask more of the drives than they have."""
+    lines = LONG.splitlines()
+    for number in HARD_LINES:
+        lines[number - 1] = lines[number - 1].split(" F")[0] + " F30000"
+        lines[number] += " F6000"
+    return "\n".join(lines) + "\n"
+
+
+def test_every_place_is_named_with_line_axis_figure_and_advice(config: MachineConfig, tmp_path: Path) -> None:
+    sharp = config.model_copy(update={"nc": config.nc.model_copy(update={"smoothing_s": (0.02, 0.01)})})
+    header, body, at_once = checked(written(tmp_path, hard_program()), sharp)
+    assert [one["refused"] for one in at_once if "refused" in one] == header["refused"]
+    assert len(body) == 16 * header["blocks"][-1][0] < 16 * header["rows"]  # no row from the first place on
+    demand = [told for told in header["refused"] if told["code"] == "DemandTooHigh"]
+    told = " | ".join(reason["text"] for reason in demand)
+    for number in HARD_LINES:
+        assert f"line {number}," in told or f"line {number + 1}," in told, told
+    assert all("axis X has" in one["text"] or "axis Y has" in one["text"] for one in demand)
+    assert all(" ms: no offset can help" in one["text"] and one["advice"] for one in demand)
+
+
+def test_a_program_without_an_error_gains_nothing(config: MachineConfig, tmp_path: Path) -> None:
+    header, _, _ = checked(written(tmp_path, "G4 P12\nM2\n"), config)
+    assert [told["code"] for told in header["refused"]] == ["NoGain"]
+
+
+def test_a_checked_program_is_armed_with_its_first_rows_and_goes_on(config: MachineConfig, tmp_path: Path) -> None:
+    program = written(tmp_path, LONG)
+    save_records(config)
+    found = prepare(program, None, config, known(config))
+    assert isinstance(found, Long)
+    first, again = asyncio.run(_twice(config, found))
+    assert isinstance(first, Checked)
+    assert isinstance(again, Checked)
+    armament = prepare_stream(found, first, config, known(config))
+    assert isinstance(armament, StreamedArmament)
+    assert all(armament.facts.values()), armament.facts
+    assert armament.program_digest == program_digest(program)
+    stream, pieces = armament.stream, [armament.first()]
+    assert len(pieces[0].demand["X"]) == 10_000
+    assert first.whole
+    assert stream.lacks({"rows": [0, 10_000], "row": 1})
+    assert not stream.lacks({"rows": [0, 10_000], "row": 0})
+    while stream.ready:
+        pieces.append(stream.take())
+    assert [piece.final for piece in pieces] == [False] * (len(pieces) - 1) + [True]
+    assert [piece.first for piece in pieces[1:]] == [block.end for block in first.blocks[4:-1]]
+    (file,) = (config.store.directory / FOLDER).glob("*.rows")
+    body = np.frombuffer(file.read_bytes(), "<i4").reshape(-1, 4)
+    assert np.array_equal(np.concatenate([piece.offset["Y"] for piece in pieces]), body[:, 3])
+    assert not stream.lacks({"rows": [0, 10_000], "row": 9_999})
+
+
+def whole(_checked: Checked) -> bool:
+    """Nothing but the whole is enough."""
+    return False
+
+
+async def _twice(config: MachineConfig, found: Long) -> list[Checked | tuple[Reason, ...]]:
+    """Check in a process; the second time nothing is started."""
+    check, heard = Check(config), list[Mapping[str, Any]]()
+
+    async def listen() -> None:
+        while True:
+            if check.progress is not None:
+                heard.append(check.progress)
+            await asyncio.sleep(0.01)
+
+    listening = asyncio.create_task(listen())
+    first = await check.run(found.program, found.program_digest, found.models, whole)
+    before = len(heard)
+    again = await check.run(found.program, found.program_digest, found.models, whole)
+    listening.cancel()
+    assert heard[-1]["program"] == str(found.program)
+    assert len(heard) == before
+    return [first, again]
+
+
+async def test_an_abandoned_check_says_so_and_leaves_nothing(config: MachineConfig, tmp_path: Path) -> None:
+    program = written(tmp_path, HEAD + SQUARE * 2000 + "M2\n")
+    check = Check(config)
+    running = asyncio.create_task(check.run(program, program_digest(program), nominal_models(config), whole))
+    async with asyncio.timeout(500):
+        while not (check.progress or {}).get("checked_s"):  # noqa: ASYNC110 - what another process says has no event
+            await asyncio.sleep(0.05)
+    assert check.abandon()
+    refused = await running
+    assert isinstance(refused, tuple)
+    assert refused[0].code == "Abandoned"
+    assert check.progress is None
+    assert not check.abandon()
+    assert not list((config.store.directory / FOLDER).glob("*.json"))
+
+
+CALLS = HEAD + "O<square> CALL\n" * 3 + "G4 P0.3\nM2\n"
+BESIDE = "O<square> SUB\n" + SQUARE + "O<square> ENDSUB\n"
+
+
+async def test_a_subroutine_beside_the_program_belongs_to_it(config: MachineConfig, tmp_path: Path) -> None:
+    """The program is the same, its subroutine is not: what was checked is not what would be cut."""
+    beside = tmp_path / "square.ngc"
+    beside.write_text(BESIDE)
+    program = written(tmp_path, CALLS)
+    digest, models = program_digest(program), nominal_models(config)
+    folder, key = config.store.directory / FOLDER, Check(config)._key(digest, models)
+    header = keep(folder, key, lambda body: check(program, digest, models, config, body, lambda _told: None))
+    assert header["files"] == {"square.ngc": program_digest(beside)}
+    first = await Check(config).run(program, digest, models, whole)
+    assert isinstance(first, Checked)
+    assert [list(block[:2]) for block in first.blocks] == header["blocks"]  # it is known
+    (file,) = folder.glob("*.rows")
+    assert Checked.find(file.parent, file.stem, tmp_path) is not None
+    beside.write_text(BESIDE.replace("X40", "X41"))
+    assert Checked.find(file.parent, file.stem, tmp_path) is None
+    again = await Check(config).run(program, digest, models, whole)
+    assert isinstance(again, Checked)
+    assert again.blocks != first.blocks
+    assert again.header is not None
+    assert again.header["files"] == {"square.ngc": program_digest(beside)}
+    beside.unlink()
+    assert Checked.find(file.parent, file.stem, tmp_path) is None
+
+
+@pytest.mark.parametrize("which", ["program.ngc", "square.ngc"])
+def test_what_changes_while_it_is_checked_is_refused(which: str, config: MachineConfig, tmp_path: Path) -> None:
+    """Its rows would be known under the digest of what it was."""
+    (tmp_path / "square.ngc").write_text(BESIDE)
+    program = written(tmp_path, CALLS)
+
+    def change(_told: Mapping[str, Any]) -> None:
+        with (tmp_path / which).open("a") as file:
+            file.write("(another)\n")
+
+    with pytest.raises(ProgramError, match=f"{which} was changed while it was checked"):
+        check(program, program_digest(program), nominal_models(config), config, io.BytesIO(), change)
+
+
+async def test_a_process_that_dies_within_a_line_is_told(
+    config: MachineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = written(tmp_path, LONG)
+    says_instead(monkeypatch, tmp_path, 'read line\nprintf \'{"header": {"ref\'\nexit 9\n')
+    refused = await Check(config).run(program, program_digest(program), nominal_models(config), whole)
+    assert isinstance(refused, tuple)
+    assert (refused[0].code, "exit code 9" in refused[0].text) == ("InternalError", True)
+
+
+async def test_a_process_that_cannot_be_started_is_told(
+    config: MachineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program, check = written(tmp_path, LONG), Check(config)
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "absent"))
+    refused = await check.run(program, program_digest(program), nominal_models(config), whole)
+    assert isinstance(refused, tuple)
+    assert refused[0].text == "the check cannot be started (No such file or directory)"
+    await check.attend()  # it is no fault of the daemon
+
+
+async def test_a_broken_program_is_refused_with_its_line_by_a_process_that_ends(
+    config: MachineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It answers and ends while its stdin is open; its digest covers what it ran; the daemon makes a refusal of it."""
+    program = written(tmp_path, HEAD + SQUARE * 10 + "G1 X[1/0]\nM2\n")
+    answer = answered(asked(program, config, tmp_path), tmp_path / "stderr")
+    assert json.loads(answer.splitlines()[-1])["error"]["code"] == "ProgramError"
+    (tmp_path / "answer").write_bytes(answer)
+    says_instead(monkeypatch, tmp_path, f"read line\nexec cat '{tmp_path / 'answer'}'\n")
+    refused = await Check(config).run(program, program_digest(program), nominal_models(config), whole)
+    assert isinstance(refused, tuple)
+    assert refused[0].code == "ProgramError"
+    assert "43" in refused[0].text
+
+
+def test_the_process_ends_with_the_daemon(config: MachineConfig, tmp_path: Path) -> None:
+    program = written(tmp_path, HEAD + SQUARE * 5000 + "M2\n")
+    command = [sys.executable, "-m", "fdhil.arming.program_check"]
+    done = subprocess.run(command, input=asked(program, config, tmp_path), capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (1, b"")
+    assert b"header" not in done.stdout
+
+
+def made(folder: Path, key: str) -> Path:
+    """Keep eight rows in two blocks under a key; return their file."""
+    code = code_digest()
+
+    def rows(body: Any) -> dict[str, Any]:
+        content = np.arange(32, dtype="<i4").tobytes()
+        body.write(content)
+        blocks = [[end, hashlib.sha256(content[16 * (end - 4) : 16 * end]).hexdigest()] for end in (4, 8)]
+        errors = {which: {"rms_um": rms, "max_um": 3.0} for which, rms in (("before", 2.0), ("after", 0.5))}
+        of = {"schema": SCHEMA, "code": code, "files": {}, "axes": ["X", "Y"], "rows": 8, "blocks": blocks}
+        return {**of, **errors, "refused": [], "largest_um": 1.0}
+
+    keep(folder, key, rows)
+    return folder / f"{key}.rows"
+
+
+def test_what_was_checked_is_only_believed_whole(tmp_path: Path) -> None:
+    file = made(tmp_path, "a")
+    found = Checked.find(tmp_path, "a", tmp_path)
+    assert found is not None
+    assert (found.whole, found.rows, found.gain_um) == (True, 8, 1.5)
+    assert Checked.find(tmp_path, "b", tmp_path) is None
+    stream = Stream(found, "digest", 0.001)
+    content = bytearray(file.read_bytes())
+    content[70] ^= 1
+    file.write_bytes(content)
+    assert Checked.find(tmp_path, "a", tmp_path) is None
+    assert stream.take() == Piece(
+        0, {"X": [0, 4, 8, 12], "Y": [1, 5, 9, 13]}, {"X": [2, 6, 10, 14], "Y": [3, 7, 11, 15]}, False
+    )
+    with pytest.raises(StoreError, match="damaged"):
+        stream.take()
+    file.write_bytes(content[:40])
+    with pytest.raises(StoreError, match="damaged"):
+        Stream(found, "digest", 0.001).take()
+    assert Checked.find(tmp_path, "a", tmp_path) is None
+    file.unlink()
+    assert Checked.find(tmp_path, "a", tmp_path) is None
+
+
+def test_what_is_armed_outlives_its_file(tmp_path: Path) -> None:
+    """Another program may take its place in the store while it runs."""
+    file = made(tmp_path, "a")
+    found = Checked.find(tmp_path, "a", tmp_path)
+    assert found is not None
+    file.unlink()
+    assert Stream(found, "digest", 0.001).take(1.0).final
+
+
+def test_what_other_code_made_is_checked_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A changed planner under the same version makes other rows."""
+    made(tmp_path, "a")
+    home = tmp_path / "fdhil"
+    shutil.copytree(Path(fdhil.__file__).parent, home, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(fdhil, "__file__", str(home / "__init__.py"))
+    assert Checked.find(tmp_path, "a", tmp_path) is not None
+    (home / "guard" / "core.py").write_text("")  # makes no row
+    assert Checked.find(tmp_path, "a", tmp_path) is not None
+    with (home / "program" / "planner" / "smoothing.py").open("a") as file:
+        file.write("# otherwise\n")
+    assert Checked.find(tmp_path, "a", tmp_path) is None
+
+
+def test_a_refused_program_is_not_kept_and_old_ones_go(tmp_path: Path) -> None:
+    (tmp_path / ".left.part").write_bytes(b"half")
+    refused: dict[str, Any] = {"refused": [{"code": "NoGain", "text": "", "advice": ""}]}
+    assert keep(tmp_path, "no", lambda body: refused if body.write(b"rows") else {}) == refused
+    assert list(tmp_path.iterdir()) == []
+    for number in range(KEPT + 2):
+        file = made(tmp_path, f"k{number}")
+        for path in (file, file.with_suffix(".json")):
+            os.utime(path, (number, number))
+    made(tmp_path, "newest")
+    names = {path.stem for path in tmp_path.glob("*.json")}
+    assert names == {"newest", *(f"k{n}" for n in range(3, KEPT + 2))}
+    assert {path.stem for path in tmp_path.glob("*.rows")} == names
+    assert all(json.loads(path.read_bytes())["rows"] == 8 for path in tmp_path.glob("*.json"))
+
+
+def test_a_store_that_refuses_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(StoreError):
+        made(tmp_path / "file" / "folder", "a")

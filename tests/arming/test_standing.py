@@ -1,0 +1,330 @@
+"""What may still be applied is told, never hidden: by the link, the daemon and its commands, without a guard too."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil.arming import standing
+from fdhil.arming.desk import Armory
+from fdhil.arming.guard_link import GuardLink
+from fdhil.arming.token import ensure_token, read_token
+from fdhil.config import MachineConfig
+from fdhil.daemon.control import ask
+from fdhil.daemon.outcome_store import Keeper
+from fdhil.errors import ConnectError, DeviceError
+from tests.arming.guard_peer import Guard
+from tests.daemon.machine import Machine, config_of
+from tests.daemon.shop import BENCH, fdhil
+
+OFF: Mapping[str, Any] = {"ok": True, "state": "OFF", "cause": None, "may_stand_um": {"X": 0.0, "Y": 0.0}}
+ACTIVE = {**OFF, "state": "ACTIVE", "may_stand_um": {"X": -38.0, "Y": 0.0}}
+CAUSE = {"code": "BusOff", "text": "the CAN controller is bus-off", "axis": ""}
+FROZEN = {**OFF, "state": "FROZEN", "cause": CAUSE, "may_stand_um": {"X": -4.6, "Y": None}}
+STANDS = "-4.6 um on axis X and an unknown offset on axis Y may still be applied"
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Path:
+    """A machine's config and its run directory with a token."""
+    path = tmp_path / "machine.toml"
+    path.write_text(BENCH)
+    run = tmp_path / "fdhil-data" / "run"
+    run.mkdir(parents=True)
+    ensure_token(run)
+    return path
+
+
+@pytest.fixture
+def folder(machine: Path) -> Path:
+    """The run directory."""
+    return machine.parent / "fdhil-data" / "run"
+
+
+@pytest.fixture
+def guard(folder: Path) -> Iterator[Guard]:
+    """A guard that says what it is told to."""
+    made = Guard(folder)
+    made.says = lambda _kind: OFF
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> MachineConfig:
+    """The bench, two axes, with the same run directory."""
+    return config_of(tmp_path, ("X", "Y"))
+
+
+@pytest.mark.parametrize(
+    ("status", "nothing", "text"),
+    [
+        (standing.ABSENT, True, "no guard was heard, nothing was sent"),
+        (OFF, True, "offset 0"),
+        ({"state": "OFF"}, False, "an unknown offset may still be applied"),
+        ({"state": "OFF", "may_stand_um": {}}, False, "an unknown offset may still be applied"),
+        ({"state": "OFF", "may_stand_um": {"X": None}}, False, "an unknown offset on axis X may still be applied"),
+        ({"state": "OFF", "may_stand_um": {"X": float("nan")}}, False, "an unknown offset on axis X"),
+        ({"state": "OFF", "may_stand_um": {"X": False}}, False, "an unknown offset on axis X"),
+        ({"state": "FROZEN", "may_stand_um": {"X": 0.04}}, False, "+0.04 um on axis X may still be applied"),
+        (FROZEN, False, STANDS),
+        ({**OFF, "state": "ACTIVE"}, False, "an unknown offset on axis X, Y may still be applied"),
+        ({**OFF, "feedforward": {"state": "OFF", "applied": {"X": [0, 0]}, "cause": None}}, True, "offset 0"),
+        ({**OFF, "feedforward": {"state": "ZEROING", "applied": {"X": [0, 0]}}}, False, "speed and torque offsets on"),
+        (
+            {**OFF, "feedforward": {"state": "OFF", "applied": {"X": [0, 3]}}},
+            False,
+            "speed and torque offsets on axis X",
+        ),
+        (
+            {**OFF, "feedforward": {"state": "OFF", "applied": {"X": [0, 0]}, "cause": {"code": "EchoMismatch"}}},
+            False,
+            "speed and torque offsets on axis X may still be applied",
+        ),
+    ],
+)
+def test_only_a_zero_that_the_guard_told_is_nothing(status: Mapping[str, Any], nothing: bool, text: str) -> None:
+    stands = standing.standing(status)
+    assert stands.nothing is nothing
+    assert text in str(stands)
+
+
+def test_a_guard_that_dies_in_the_cut_leaves_its_last_word_until_one_that_knows_comes_back(
+    guard: Guard, folder: Path
+) -> None:
+    guard.says = lambda _kind: ACTIVE
+    link = GuardLink(folder)
+    link.refresh()
+    guard.close()
+    told = link.refresh()
+    expected = "-38 um on axis X and an unknown offset on axis Y may still be applied"
+    assert [(n.code, n.severity, expected in n.text) for n in told] == [("GuardLost", "MAJOR", True)]
+    assert "run fdhil adopt" in told[0].text
+    assert (link.state, str(link.standing), link.refresh()) == ("lost", expected, [])
+    assert "nothing is sent" not in json.dumps(link.status)
+    (folder / "guard.sock").unlink()
+    back = Guard(folder)
+    back.says = lambda _kind: {**OFF, "may_stand_um": {"X": None, "Y": None}}
+    assert [(n.code, n.severity) for n in link.refresh()] == [("GuardFound", "minor")]
+    assert str(link.standing) == "an unknown offset on axis X, Y may still be applied"
+    back.says = lambda _kind: OFF
+    assert [(n.code, n.severity, n.text) for n in link.refresh()] == [("GuardState", "info", "OFF; offset 0")]
+    assert link.standing.nothing
+    back.close()
+    assert [(n.code, n.severity) for n in link.refresh()] == [("GuardLost", "minor")]
+    assert (link.state, str(link.standing)) == ("absent", "offset 0")
+    link.close()
+
+
+def test_a_guard_that_is_lost_while_it_arms_may_have_armed(guard: Guard, folder: Path) -> None:
+    link = GuardLink(folder)
+    link.refresh()
+
+    def dies(kind: str) -> Mapping[str, Any]:
+        if kind != "status":
+            raise ConnectionError
+        return OFF
+
+    class Law:
+        laws: Mapping[str, Any] = {}
+        facts: Mapping[str, bool] = {}
+
+    guard.says = dies
+    with pytest.raises(DeviceError):
+        link.feed_forward(Law(), "token")  # type: ignore[arg-type]
+    assert str(link.standing) == "an unknown offset on axis X, Y may still be applied"
+    link.close()
+
+
+async def test_disarm_is_ok_at_zero_only(config: MachineConfig, guard: Guard, folder: Path) -> None:
+    """The ramp is waited for; FROZEN, and an offset that nobody knows, are no zero."""
+    ramp = iter([{**ACTIVE, "state": "RAMP_DOWN"}] * 3)
+    guard.says = lambda kind: OFF if kind == "disarm" else next(ramp, OFF)
+    armory = Armory(config, Keeper(config), folder)
+    assert await armory.disarm() == {
+        "ok": True,
+        "text": "guard: OFF, offset 0",
+        "state": "OFF",
+        "may_stand_um": {"X": 0.0, "Y": 0.0},
+    }
+    guard.says = lambda _kind: FROZEN
+    answer = await armory.disarm()
+    assert (answer["ok"], answer["code"], answer["state"]) == (False, "OffsetStands", "FROZEN")
+    assert answer["text"] == f"the guard is FROZEN (the CAN controller is bus-off): {STANDS}"
+    assert "run fdhil adopt" in answer["advice"]
+    armory.guard.close()
+
+
+async def test_disarm_that_never_reaches_zero_is_no(
+    config: MachineConfig, guard: Guard, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(standing, "LANDING_S", 0.05)
+    guard.says = lambda _kind: {**ACTIVE, "state": "RAMP_DOWN"}
+    armory = Armory(config, Keeper(config), folder)
+    answer = await armory.disarm()
+    assert (answer["ok"], answer["state"]) == (False, "RAMP_DOWN")
+    assert "-38 um on axis X" in answer["text"]
+    guard.close()
+    answer = await armory.disarm()
+    assert (answer["ok"], answer["code"]) == (False, "OffsetStands")
+    assert "-38 um on axis X" in answer["text"]
+    assert "start fdhil-guard" in answer["advice"]
+
+
+async def test_arming_a_frozen_guard_says_adopt_and_not_disarm(
+    config: MachineConfig, guard: Guard, folder: Path, tmp_path: Path
+) -> None:
+    guard.says = lambda _kind: FROZEN
+    armory = Armory(config, Keeper(config), folder)
+    armory.begin({}, [])
+    request = {"request": "arm", "program": str(tmp_path / "a.ngc"), "token": read_token(folder)}
+    answer = await armory.arm(request)
+    assert (answer["ok"], answer["code"]) == (False, "OffsetStands")
+    assert STANDS in answer["text"]
+    assert answer["advice"] == "hold the feed, then run fdhil adopt, then arm again"
+    armory.guard.close()
+
+
+def running(machine: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any, meanwhile: Any) -> tuple[int, str]:
+    """Run ``fdhil run`` in this process, call ``meanwhile`` beside it, stop it; return exit code and stderr."""
+    monkeypatch.setattr("fdhil.daemon.service.warm", lambda config, method: None)
+    monkeypatch.setattr("fdhil.drivers.open_machine", Machine().open)
+    path = machine.parent / "fdhil-data" / "run" / "daemon.sock"
+
+    def stop() -> None:
+        told: dict[str, Any] = {}
+        while not told:
+            try:
+                told = ask(path, {"request": "status"})
+            except ConnectError:
+                threading.Event().wait(0.02)
+        meanwhile(path)
+        ask(path, {"request": "stop"})
+
+    thread = threading.Thread(target=stop)
+    thread.start()
+    code, _, err = fdhil("run", machine, capsys=capsys)
+    thread.join()
+    return code, err
+
+
+def status_when(path: Path, ready: Any) -> dict[str, Any]:
+    """Ask for the status until it is ``ready``."""
+    while not ready(told := ask(path, {"request": "status"})):
+        threading.Event().wait(0.02)
+    return told
+
+
+def test_run_leaves_with_zero_only_when_the_guard_says_so(
+    machine: Path, guard: Guard, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    code, err = running(machine, monkeypatch, capsys, lambda p: status_when(p, lambda s: s["guard"]["state"] == "OFF"))
+    assert (code, err.splitlines()[-1].endswith("stopped, offset 0")) == (0, True)
+    guard.says = lambda _kind: FROZEN
+    code, err = running(
+        machine, monkeypatch, capsys, lambda p: status_when(p, lambda s: s["guard"]["state"] != "absent")
+    )
+    assert code == 3
+    assert err.splitlines()[-1].endswith(f"stopped, {STANDS}; hold the feed, then run fdhil adopt")
+
+
+def test_run_after_the_guards_death_tells_what_it_left_everywhere(
+    machine: Path, guard: Guard, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    guard.says = lambda _kind: ACTIVE
+    told: dict[str, Any] = {}
+
+    def dies(path: Path) -> None:
+        status_when(path, lambda s: s["state"] == "ACTIVE")
+        guard.close()
+        told.update(status_when(path, lambda s: s["state"] == "lost"))
+        told["disarm"] = fdhil("disarm", machine, capsys=capsys)
+
+    code, err = running(machine, monkeypatch, capsys, dies)
+    stands = "-38 um on axis X and an unknown offset on axis Y may still be applied"
+    assert code == 3
+    assert told["may_stand"] == {"nothing": False, "text": stands}
+    assert "nothing is sent" not in json.dumps(told["guard"])
+    assert told["disarm"][0] == 1
+    assert stands in told["disarm"][2]
+    assert stands in err.splitlines()[-1]
+
+
+def test_adopt_says_what_stands_asks_and_ends_at_zero(
+    machine: Path, guard: Guard, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    now = [FROZEN, {**FROZEN, "state": "ADOPT"}, {**FROZEN, "state": "ADOPT"}, OFF]
+    guard.says = lambda kind: {"ok": True} if kind == "adopt" else now.pop(0) if len(now) > 1 else now[0]
+    monkeypatch.setattr("click.termui.visible_prompt_func", lambda _text: "n")
+    code, _, err = fdhil("adopt", machine, capsys=capsys)
+    assert (code, guard.heard) == (130, ["status"])
+    assert f"the guard is FROZEN: {STANDS}" in err
+    now.insert(0, FROZEN)
+    monkeypatch.setattr("click.termui.visible_prompt_func", lambda _text: "y")
+    code, out, _ = fdhil("adopt", machine, capsys=capsys)
+    assert (code, out) == (0, "guard: OFF, offset 0\n")
+    assert guard.heard[2] == "adopt"
+    code, out, _ = fdhil("adopt", machine, "--yes", capsys=capsys)
+    assert (code, out) == (0, "guard: OFF, offset 0: there is nothing to adopt\n")
+    assert guard.heard.count("adopt") == 1
+
+
+def test_adopt_that_does_not_end_at_zero_is_1_with_the_cause(machine: Path, guard: Guard, capsys: Any) -> None:
+    reason = {"code": "StaleData", "axis": "X", "text": "axis X: its offset was not read yet", "advice": "wait"}
+    second = {**reason, "code": "RecordVoid", "text": "the record is void"}
+    no = {"ok": False, "state": "FROZEN", **reason, "refused": [reason, second]}
+    guard.says = lambda kind: no if kind == "adopt" else FROZEN
+    code, out, err = fdhil("adopt", machine, "--yes", capsys=capsys)
+    assert (code, out) == (1, "")
+    assert "refused: StaleData: axis X: its offset was not read yet; wait" in err
+    assert "also: RecordVoid: the record is void; wait" in err
+    guard.says = lambda _kind: FROZEN
+    code, out, _ = fdhil("adopt", machine, "--yes", "--json", capsys=capsys)
+    assert (code, json.loads(out)["may_stand_um"]) == (1, {"X": -4.6, "Y": None})
+    guard.says = lambda _kind: ACTIVE
+    code, _, err = fdhil("adopt", machine, "--yes", capsys=capsys)
+    assert (code, "run fdhil disarm" in err) == (1, True)
+    assert fdhil("adopt", machine, "--json", capsys=capsys)[0] == 2
+
+
+def test_adopt_without_a_guard_is_3(machine: Path, capsys: Any) -> None:
+    code, _, err = fdhil("adopt", machine, "--yes", capsys=capsys)
+    assert (code, "start fdhil-guard" in err) == (3, True)
+
+
+def test_a_guard_with_a_folder_of_its_own_is_found_there(machine: Path, capsys: Any) -> None:
+    machine.write_text(machine.read_text().replace("[guard]", '[guard]\nrun_directory = "guards"'))
+    (machine.parent / "guards").mkdir()
+    guard = Guard(machine.parent / "guards")
+    guard.says = lambda _kind: OFF
+    assert fdhil("disarm", machine, capsys=capsys)[0] == 0
+    assert fdhil("adopt", machine, "--yes", capsys=capsys)[0] == 0
+    guard.close()
+
+
+def test_disarm_beside_a_daemon_that_hangs_asks_the_guard(
+    machine: Path, folder: Path, guard: Guard, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.setattr("fdhil.cli.service.DISARM_S", 0.05)
+    with socket.socket(socket.AF_UNIX) as hung:
+        hung.bind(str(folder / "daemon.sock"))
+        hung.listen()
+        code, out, _ = fdhil("disarm", machine, "--json", capsys=capsys)
+    assert (code, json.loads(out)["asked"], guard.heard) == (0, "guard", ["disarm", "status"])
+
+
+def test_disarm_without_a_daemon_asks_the_guard(machine: Path, guard: Guard, capsys: Any) -> None:
+    code, out, _ = fdhil("disarm", machine, capsys=capsys)
+    assert (code, out, guard.heard) == (0, "guard: OFF, offset 0\n", ["disarm", "status"])
+    guard.says = lambda _kind: FROZEN
+    code, _, err = fdhil("disarm", machine, capsys=capsys)
+    assert (code, STANDS in err, "run fdhil adopt" in err) == (1, True, True)
+    guard.close()
+    code, _, err = fdhil("disarm", machine, capsys=capsys)
+    assert (code, "unknown what is applied" in err) == (3, True)

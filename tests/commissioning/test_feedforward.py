@@ -1,0 +1,157 @@
+"""Speed and torque offset: commissioned on a drive that maps and takes them as meant, refused by name on any other."""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from fdhil.commissioning.steps import commission
+from fdhil.config import MachineConfig
+from fdhil.errors import DeviceError, DriveFault
+from tests.drivers.peer import DrivePeer
+from tests.drivers.wire import machine
+
+Frames = list[tuple[int, bytes]]
+NOT_VALID = 0x80000401
+
+
+class Spoilt(DrivePeer):
+    """A drive in front of which ``spoil`` changes, answers (a list of frames) or swallows (None) what it is sent."""
+
+    spoil: Callable[[int, bytes], bytes | Frames | None] = staticmethod(lambda _id, data: data)
+
+    def take(self, can_id: int, data: bytes) -> Frames:
+        changed = self.spoil(can_id, data)
+        if isinstance(changed, bytes):
+            return super().take(can_id, changed)
+        return changed or []
+
+    def rpdo(self) -> int:
+        """The COB-ID of the RPDO with both offsets."""
+        return self.drive.dictionary.number(0x1402, 1)
+
+    def held(self) -> tuple[int, int]:
+        """Speed and torque offset in force."""
+        return self.drive.dictionary.number(0x60B1), self.drive.dictionary.number(0x60B2)
+
+
+pytestmark = pytest.mark.usefixtures("quick_commissioning")
+
+
+@pytest.fixture
+def peer() -> Iterator[tuple[Spoilt, MachineConfig]]:
+    bus: dict[str, object] = {"interface": "virtual", "channel": uuid.uuid4().hex}
+    settings = machine(bus=bus, feedforward={})
+    with Spoilt(settings) as running:
+        yield running, settings
+
+
+def test_a_drive_that_takes_both_is_signed_off_with_its_cob_id(peer: tuple[Spoilt, MachineConfig]) -> None:
+    drive, settings = peer
+    seen: list[tuple[int, int]] = []
+
+    def watch(can_id: int, data: bytes) -> bytes:
+        if can_id == 0x401:
+            seen.append((int.from_bytes(data[:4], "little", signed=True), int.from_bytes(data[4:], "little")))
+        return data
+
+    drive.spoil = watch
+    record = commission(settings, "X")
+    assert record.options["1402"] == drive.rpdo() == 0x401
+    assert set(seen) == {(0x0102, 3), (0, 0)}
+    assert seen[-1] == (0, 0)
+    assert drive.held() == (0, 0)
+
+
+def swapped(can_id: int, data: bytes) -> bytes:
+    return data[2:] + data[:2] if can_id == 0x401 else data
+
+
+def no_torque(can_id: int, data: bytes) -> bytes:
+    return data[:4] + bytes(2) if can_id == 0x401 else data
+
+
+def lost(can_id: int, data: bytes) -> bytes | None:
+    return None if can_id == 0x401 else data
+
+
+def keeps_it(can_id: int, data: bytes) -> bytes | None:
+    return None if can_id == 0x401 and not any(data) else data
+
+
+def aborts(can_id: int, data: bytes) -> bytes | Frames:
+    """Any download to 0x1402 is refused: unsupported access."""
+    if can_id == 0x601 and data[0] >> 5 == 1 and data[1:3] == b"\x02\x14":
+        return [(0x581, b"\x80" + data[1:4] + (0x06010000).to_bytes(4, "little"))]
+    return data
+
+
+def ignores(can_id: int, data: bytes) -> bytes | Frames:
+    """Any download to 0x1402 is confirmed and forgotten."""
+    if can_id == 0x601 and data[0] >> 5 == 1 and data[1:3] == b"\x02\x14":
+        return [(0x581, b"\x60" + data[1:4] + bytes(4))]
+    return data
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (swapped, "was sent (258, 3) as speed and torque offset and holds"),
+        (no_torque, "holds (258, 0)"),
+        (lost, "holds (0, 0)"),
+        (keeps_it, "was sent (0, 0) as speed and torque offset and holds (258, 3)"),
+        (aborts, "it refuses the RPDO of 60B1 and 60B2"),
+        (ignores, "the RPDO of 60B1 and 60B2 stays at 80000401"),
+    ],
+)
+def test_a_drive_that_takes_them_otherwise_is_refused_by_name_and_left_as_it_was(
+    spoil: Callable[[int, bytes], bytes | Frames | None], says: str, peer: tuple[Spoilt, MachineConfig]
+) -> None:
+    drive, settings = peer
+    drive.spoil = spoil
+    with pytest.raises(DriveFault, match="FeedforwardOff: ") as caught:
+        commission(settings, "X")
+    assert says in str(caught.value)
+    assert "leave [axis.X.feedforward] out" in str(caught.value)
+    assert drive.rpdo() == NOT_VALID
+    assert drive.held() == (0, 0)
+    assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
+
+
+@pytest.mark.parametrize("entries", [[(0x60B2, 0, 16), (0x60B1, 0, 32)], [(0x60B1, 0, 32)], []])
+def test_another_mapping_is_refused_before_anything_is_written(
+    entries: list[tuple[int, int, int]], peer: tuple[Spoilt, MachineConfig]
+) -> None:
+    drive, settings = peer
+    drive.drive.remap(0x1602, entries)
+    with pytest.raises(DriveFault, match=r"FeedforwardOff: its RPDO3 maps .* where 60B1 and 60B2 belong"):
+        commission(settings, "X")
+    assert drive.rpdo() == NOT_VALID
+    assert not {0x000, 0x080, 0x401} & set(drive.heard)
+
+
+def test_what_fails_later_makes_the_rpdo_invalid_again(peer: tuple[Spoilt, MachineConfig]) -> None:
+    drive, settings = peer
+    drive.drive.faults.ignore_offset = True
+    with pytest.raises(DeviceError, match="0x60B0 holds 0"):
+        commission(settings, "X")
+    deadline = time.monotonic() + 300
+    while drive.rpdo() != NOT_VALID and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert drive.rpdo() == NOT_VALID
+
+
+def test_ctrl_c_makes_the_rpdo_invalid_again(peer: tuple[Spoilt, MachineConfig]) -> None:
+    drive, settings = peer
+
+    def interrupted(step: str) -> None:
+        if step == "sign test":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        commission(settings, "X", interrupted)
+    assert drive.rpdo() == NOT_VALID
+    assert drive.held() == (0, 0)

@@ -1,0 +1,193 @@
+"""What a scan makes of traffic, of answers and of EDS files, and what a check makes of a drive that is not set up."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import can
+import pytest
+
+from fdhil.commissioning import config_check
+from fdhil.commissioning import scan as bus_scan
+from fdhil.commissioning.config_check import check_machine, compare_heard
+from fdhil.commissioning.scan import Description, Ear, EdsMatch, Traffic, printable, read_descriptions, scan_bus
+from fdhil.commissioning.survey import Finding, Identity
+from fdhil.config import MachineConfig
+from fdhil.drivers.can import sdo as canopen_sdo
+from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, frames_of
+from fdhil.errors import ConnectError, ProtocolError
+from tests.drivers.peer import DrivePeer
+from tests.drivers.wire import Row, Wire, machine
+
+WHO = Identity(1, 2, 3, 4)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorter waits than on a real machine."""
+    monkeypatch.setattr(bus_scan, "LISTEN_S", 0.25)
+    monkeypatch.setattr(config_check, "LISTEN_S", 0.25)
+    monkeypatch.setattr(canopen_sdo, "QUIET_S", 0.1)
+    monkeypatch.setattr(canopen_sdo, "RESPONSE_TIMEOUT_S", 0.2)
+
+
+@pytest.fixture
+def peer() -> Iterator[tuple[DrivePeer, MachineConfig]]:
+    settings = machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
+    with DrivePeer(settings) as running:
+        yield running, settings
+
+
+def traffic(*rows: Row) -> Traffic:
+    heard = Traffic()
+    heard.take(frames_of(rows))
+    return heard
+
+
+@pytest.mark.parametrize(
+    ("can_id", "data", "master"),
+    [
+        (0x080, b"", "SYNC"),
+        (0x000, b"\x01\x00", "NMT commands"),
+        (0x205, bytes(6), "set-points"),
+        (0x509, bytes(8), "set-points"),
+        (0x601, bytes(8), "SDO requests"),
+        (0x701, b"\x05", None),
+        (0x181, bytes(8), None),
+        (0x581, bytes(8), None),
+        (0x081, bytes(8), None),
+        (0x205 | EXTENDED_FLAG, bytes(6), None),
+        (0x200 | ERROR_FLAG, bytes(8), None),
+    ],
+)
+def test_a_master_is_recognised_by_what_it_sends(can_id: int, data: bytes, master: str | None) -> None:
+    assert traffic((0, can_id, data)).master == master
+
+
+def test_nodes_states_and_heartbeats_are_heard() -> None:
+    beats = [(int(k * 5e8), 0x703, bytes([0x7F])) for k in range(4)]
+    heard = traffic(*beats, (0, 0x182, bytes(8)), (0, 0x085, b"\x11\x86" + bytes(6)), (0, 0x707, b"\x33"))
+    assert heard.nodes == {2, 3, 5, 7}
+    assert (heard.nmt(3), heard.nmt(2), heard.nmt(7)) == ("pre-operational", None, "unknown (33)")
+    assert heard.heartbeat_s(3) == pytest.approx(0.5)
+    assert heard.heartbeat_s(7) is None
+    assert heard.emergencies == {5: {0x8611}}
+
+
+def test_a_sync_that_was_late_once_does_not_change_the_period() -> None:
+    stamps = [k * 1_000_000 + (9_000_000 if k == 20 else 0) for k in range(21)]
+    assert traffic(*((t, 0x80, b"") for t in stamps)).sync_period_s == pytest.approx(1e-3)
+    assert traffic((0, 0x80, b"")).sync_period_s is None
+
+
+@pytest.mark.parametrize(
+    ("found", "fit"),
+    [
+        ((1, 2, 3), "exact"),
+        ((1, 2, None), "exact"),
+        ((1, 2, 9), "other revision"),
+        ((1, 9, 3), None),
+        ((9, 2, 3), None),
+        ((None, None, None), None),
+    ],
+)
+def test_an_eds_fits_by_vendor_product_and_revision(found: tuple[int | None, ...], fit: str | None) -> None:
+    assert Description(Path("drive.eds"), *found).fits(WHO) == fit
+
+
+def test_eds_files_are_read_and_others_are_left(tmp_path: Path) -> None:
+    text = "[DeviceInfo]\nVendorNumber=0x1\nProductNumber=2\nRevisionNumber=3\n[1000]\nParameterName=Type\nDataType=7\n"
+    (tmp_path / "good.eds").write_text(text)
+    (tmp_path / "bad.dcf").write_text("nothing")
+    (tmp_path / "readme.txt").write_text("nothing")
+    found, faults = read_descriptions([tmp_path])
+    assert [(d.path.name, d.fits(WHO)) for d in found] == [("good.eds", "exact")]
+    assert [str(fault) for fault in faults] == ["bad.dcf: line 1: it has no object at all; this is no EDS file"]
+
+
+@pytest.mark.parametrize("text", [b"\x1b]0;owned\x07", b"a\rb\nc", b"\xff\xfe", b"x" * 500])
+def test_a_drives_text_cannot_steer_a_terminal(text: bytes) -> None:
+    assert printable(text).isprintable()
+    assert len(printable(text)) <= 80
+
+
+def test_a_node_that_lacks_objects_is_listed_all_the_same(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    _, settings = peer
+    exact = Description(Path("b.eds"), 0x46444849, 0x402, 0x10000)
+    other = Description(Path("a.eds"), 0x46444849, 0x402, 7)
+    found = scan_bus("can0", settings, [other, exact])
+    assert [(node.node_id, node.axis) for node in found.nodes] == [(1, "X")]
+    answers = found.nodes[0].answers
+    assert answers is not None
+    assert answers.eds == EdsMatch("b.eds", "exact")
+    assert answers.is_drive
+    with Ear("can0", settings) as ear:
+        assert ear.read(1, 0x5FFF) is None
+        assert ear.read(9, 0x1000) is None
+
+
+def test_nothing_is_asked_once_a_master_is_heard(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as nc, Ear("can0", settings) as ear:
+        nc.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+        ear.listen(0.1)
+        with pytest.raises(ProtocolError, match=r"an NC came on the bus \(SYNC\)"):
+            ear.answering()
+        with pytest.raises(ProtocolError, match="start again"):
+            ear.read(1, 0x1000)
+    assert drive.heard == [0x80]
+
+
+def test_a_silent_bus_is_told() -> None:
+    settings = machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
+    with pytest.raises(ConnectError, match="no node was heard and none answered"):
+        scan_bus("can0", settings, [])
+
+
+DIFFERENT: dict[str, tuple[Callable[[DrivePeer], None], str]] = {
+    "heartbeat": (lambda p: p.drive.set_object(0x1017, 0, 0), "none"),
+    "TPDO1": (lambda p: p.drive.set_object(0x1800, 2, 255), "181, type 255: 60640020, 606C0020"),
+    "communication lost": (lambda p: p.drive.set_object(0x6007, 0, 0), "0x6007 = 0"),
+    "following error": (lambda p: p.drive.set_object(0x6065, 0, 0), "off"),
+    "mode": (lambda p: p.drive.set_object(0x6502, 0, 1), "0x6502 = 00000001"),
+}
+
+
+@pytest.mark.parametrize("point", DIFFERENT)
+def test_a_drive_that_is_not_set_up_differs_in_that_point_alone(
+    point: str, peer: tuple[DrivePeer, MachineConfig]
+) -> None:
+    drive, settings = peer
+    spoil, shown = DIFFERENT[point]
+    spoil(drive)
+    wrong = [finding for _, finding in check_machine(settings) if not finding.ok]
+    assert [(finding.point, finding.found) for finding in wrong] == [(point, shown)]
+    assert wrong[0].cause
+    assert wrong[0].advice
+    assert not {0x000, 0x080, 0x201, 0x301} & set(drive.heard)
+
+
+def heard(config: MachineConfig, wire: Wire, *more: Row) -> dict[str, Finding]:
+    return {finding.point: finding for finding in compare_heard(traffic(*wire.rows(), *more), config, "X")}
+
+
+def test_what_an_ncs_traffic_shows_is_compared() -> None:
+    found = heard(machine(), Wire(400), *((int(k * 1e8), 0x701, b"\x05") for k in range(4)))
+    assert {point for point, finding in found.items() if finding.ok} == {
+        "drive", "heartbeat", "TPDO1", "TPDO2", "TPDO3", "TPDO4", "RPDO1", "rapid signal",
+    }  # fmt: skip
+    assert not [point for point, finding in found.items() if finding.ok is False]
+
+
+def test_a_drive_on_another_node_id_is_told() -> None:
+    found = heard(machine(), Wire(400, node_id=5))
+    assert found["drive"].ok is False
+    assert found["TPDO1"].cause == "TPDO1 (181) came 0 times in 400 SYNC where 400 are due"
+
+
+@pytest.mark.parametrize(("bit", "state"), [(16, "on now"), (3, "off now")])
+def test_the_rapid_signal_is_shown(bit: int, state: str) -> None:
+    config = machine(g0={"source": "digital_input", "input_bit": bit})
+    assert heard(config, Wire(400))["rapid signal"].found == state

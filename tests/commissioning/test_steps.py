@@ -1,0 +1,359 @@
+"""Commissioning against a simulated drive: a good one is signed off, every wrong set-up is refused with its reason."""
+
+from __future__ import annotations
+
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import can
+import pytest
+
+from fdhil.cia402 import Object, State
+from fdhil.commissioning import steps as commissioning
+from fdhil.commissioning import survey as commissioning_checks
+from fdhil.commissioning import watchdog as commissioning_watchdog
+from fdhil.commissioning.master import Master
+from fdhil.commissioning.steps import (
+    check_axis,
+    commission,
+    enable,
+    feedforward_test,
+    prepare,
+    rolled_back,
+    sign_test,
+)
+from fdhil.commissioning.watchdog import watchdog_test
+from fdhil.config import MachineConfig
+from fdhil.drivers.can import sdo as canopen_sdo
+from fdhil.errors import ConnectError, DeviceError, DriveFault, ProtocolError
+from tests.drivers.peer import DrivePeer
+from tests.drivers.wire import machine
+
+pytestmark = pytest.mark.usefixtures("quick_commissioning")
+
+
+def config(**sections: Any) -> MachineConfig:
+    """The drive shares a busy computer: it is waited for, as any simulated one."""
+    sections = {"guard": {"clock": "sync"}, **sections}
+    return machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex}, **sections)
+
+
+@pytest.fixture
+def peer() -> Iterator[tuple[DrivePeer, MachineConfig]]:
+    settings = config()
+    with DrivePeer(settings) as running:
+        yield running, settings
+
+
+def test_a_good_drive_is_signed_off_and_left_as_it_was(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    consumers = [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)]
+    steps: list[str] = []
+    record = commission(settings, "X", steps.append)
+    assert record.offset_in_feedforward is True
+    assert record.watchdog == "proven"
+    assert record.sign_test_um == pytest.approx(10.0, abs=3.0)
+    assert record.options == {"6007": 1, "605A": 2, "605E": 2, "6065": 32768, "6085": 26214400, "1017": 100}
+    assert record.serial == 1001
+    assert record.following_error_window_um == 10_000.0
+    assert steps[0] == "listen"
+    assert steps[-1] == "restore"
+    assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
+    deadline = time.monotonic() + 300
+    while drive.drive.nmt != 0x7F and time.monotonic() < deadline:
+        time.sleep(0.01)  # the peer's thread has yet to hear the last command
+    assert drive.drive.nmt == 0x7F
+    assert drive.drive.dictionary.number(0x60B0) == 0
+    assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == consumers
+
+
+class SleepyPeer(DrivePeer):
+    """A simulated drive whose process sleeps now and then, as on a busy computer, until its watchdog is tried."""
+
+    def take(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
+        """Sleep longer than any mean is taken over, at every 40th SYNC of the first 400."""
+        count = self.heard.count(0x080)
+        if can_id == 0x080 and count % 40 == 0 and count <= 400:
+            time.sleep(0.15)
+        return super().take(can_id, data)
+
+
+def test_a_simulated_drive_may_sleep() -> None:
+    settings = config()
+    with SleepyPeer(settings), Master(settings, "X") as master:
+        prepare(master)
+        enable(master)
+        assert sign_test(master) == pytest.approx(10.0, abs=3.0)
+
+
+def test_software_limits_are_kept_where_the_drive_has_them(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    with Master(settings, "X") as master:
+        assert not {"607D01", "607D02"} & commissioning_checks.read_options(master).keys()
+        drive.drive.set_object(0x607D, 1, -1000)
+        drive.drive.set_object(0x607D, 2, 820_000)
+        found = commissioning_checks.read_options(master)
+        assert (found["607D01"], found["607D02"]) == (-1000, 820_000)
+        drive.drive.set_object(0x607D, 2, -1000)  # both equal: switched off (CiA 402-2)
+        assert "607D01" not in commissioning_checks.read_options(master)
+
+
+def test_an_offset_kept_out_of_the_feedforward_is_noticed() -> None:
+    settings = config(sim={"axis": {"X": {"offset_in_feedforward": False}}})
+    with DrivePeer(settings), Master(settings, "X") as master, rolled_back(master):
+        prepare(master)
+        enable(master)
+        assert feedforward_test(master) is False
+
+
+def test_a_drive_that_counts_against_the_axis_passes() -> None:
+    settings = config(drive={"sign": -1})
+    with DrivePeer(settings), Master(settings, "X") as master, rolled_back(master):
+        check_axis(master)
+        prepare(master)
+        enable(master)
+        assert sign_test(master) == pytest.approx(10.0, abs=3.0)
+
+
+def watchdog(master: Master) -> str:
+    """The step as a commissioning runs it."""
+    return watchdog_test(master, enable)
+
+
+def run_steps(master: Master, last: Callable[[Master], object]) -> None:
+    with rolled_back(master):
+        prepare(master)
+        enable(master)
+        last(master)
+
+
+WRONG: dict[str, tuple[Callable[[DrivePeer], None], str]] = {
+    "goes on without communication": (lambda p: p.drive.set_object(0x6007, 0, 0), "0x6007 is 0"),
+    "disables voltage instead": (lambda p: p.drive.set_object(0x6007, 0, 2), "0x6007 is 2"),
+    "coasts": (lambda p: p.drive.set_object(0x605E, 0, 0), "coasts"),
+    "quick stop coasts": (lambda p: p.drive.set_object(0x605A, 0, 0), "coasts"),
+    "window off": (lambda p: p.drive.set_object(0x6065, 0, 0xFFFFFFFF), "0x6065 is off"),
+    "window zero": (lambda p: p.drive.set_object(0x6065, 0, 0), "0x6065 is off"),
+    "window too small": (lambda p: p.drive.set_object(0x6065, 0, 300), "too small"),
+    "gear x 10": (lambda p: p.drive.set_object(0x6091, 1, 10), "counts 6553.6 per motor revolution"),
+    "feed x 10": (lambda p: p.drive.set_object(0x6092, 1, 655360), "counts 655360 per motor revolution"),
+    "mapping": (
+        lambda p: p.drive.remap(0x1A01, [(0x6041, 0, 16), (0x2101, 0, 16), (0x6078, 0, 16)]),
+        "TPDO2 maps 60410010, 21010010, 60780010",
+    ),
+    "transmission type": (lambda p: p.drive.set_object(0x1800, 2, 255), "TPDO1 has transmission type 255"),
+    "COB-ID": (lambda p: p.drive.set_object(0x1401, 1, 0x305), "RPDO2 has the COB-ID 00000305"),
+    "PDO switched off": (lambda p: p.drive.set_object(0x1401, 1, 0x80000301), "RPDO2 has the COB-ID 80000301"),
+    "rated current": (lambda p: p.drive.set_object(0x6075, 0, 10_000), "rated current is 10 A"),
+    "no CSP": (lambda p: p.drive.set_object(0x6502, 0, 1), "no cyclic synchronous position"),
+    "other period": (lambda p: p.drive.set_object(0x60C2, 1, 2), "interpolates over 2 ms"),
+}
+
+
+@pytest.mark.parametrize("what", WRONG)
+def test_a_wrong_set_up_is_refused_before_anything_moves(what: str, peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    spoil, says = WRONG[what]
+    spoil(drive)
+    with Master(settings, "X") as master, pytest.raises(DeviceError) as caught:
+        check_axis(master)
+    assert says in str(caught.value)
+    assert not {0x000, 0x080, 0x201, 0x301} & set(drive.heard)
+
+
+def offset_doubled(peer: DrivePeer) -> None:
+    peer.drive.faults.offset_scale = 2.0
+
+
+def offset_negated(peer: DrivePeer) -> None:
+    peer.drive.faults.offset_scale = -1.0
+
+
+def offset_lost(peer: DrivePeer) -> None:
+    peer.drive.faults.ignore_offset = True
+
+
+def not_csp(peer: DrivePeer) -> None:
+    peer.drive.faults.not_csp = True
+
+
+class HastyMaster(Master):
+    """A master that waits for the mode as long as for a real drive: its drive never shows it."""
+
+    def wait(self, condition: Callable[[], bool], timeout_s: float, otherwise: str) -> None:
+        never = "the mode" in otherwise
+        super().wait(condition, timeout_s / self._patience if never else timeout_s, otherwise)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (offset_doubled, "does not add 0x60B0"),
+        (offset_negated, "does not add 0x60B0"),
+        (offset_lost, "0x60B0 holds 0"),
+        (not_csp, "does not take the mode"),
+    ],
+)
+def test_a_drive_that_takes_offsets_otherwise_is_refused_and_disabled(
+    spoil: Callable[[DrivePeer], None], says: str, peer: tuple[DrivePeer, MachineConfig]
+) -> None:
+    drive, settings = peer
+    spoil(drive)
+    kind = HastyMaster if spoil is not_csp else Master
+    with kind(settings, "X") as master, pytest.raises(DeviceError) as caught:
+        run_steps(master, sign_test)
+    assert says in str(caught.value)
+    assert drive.drive.power.state.name == "SWITCH_ON_DISABLED"
+    assert drive.drive.dictionary.number(0x60B0) == 0
+
+
+def test_a_watchdog_that_does_nothing_is_refused(
+    peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(commissioning_watchdog, "STARVE_TIMEOUT_S", 0.05)  # it never stops
+    drive, settings = peer
+    drive.drive.faults.no_heartbeat_consumer = True
+    with Master(settings, "X") as master, pytest.raises(DriveFault, match="watchdog does not work"):
+        run_steps(master, watchdog)
+    assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
+
+
+class LateMaster(Master):
+    """A master on a computer that is held up: in the first ``late`` feedings no heartbeat follows the first one."""
+
+    late = 0
+    trip: Callable[[], None] | None = None
+    feedings = 0
+    _beating = False
+
+    def _send_heartbeat(self) -> None:
+        if self.heartbeat and not self._beating:
+            self.feedings += 1
+            if self.trip is not None:
+                self.trip()
+            super()._send_heartbeat()
+        self._beating = self.heartbeat
+        if self.feedings > self.late:
+            super()._send_heartbeat()
+
+
+@pytest.fixture
+def fed(peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch) -> Iterator[LateMaster]:
+    """A master that feeds the drive for a short time; afterwards the drive watches nobody any more, and is off."""
+    monkeypatch.setattr(commissioning_watchdog, "FEEDING_S", 0.15)
+    drive, settings = peer
+    with LateMaster(settings, "X") as master:
+        yield master
+    assert drive.drive.power.state.name in ("SWITCH_ON_DISABLED", "FAULT")
+    assert [drive.drive.dictionary.number(0x1016, sub) for sub in (1, 2, 3, 4)] == [0, 0, 0, 0]
+
+
+def test_a_feeding_that_this_computer_missed_is_tried_again(fed: LateMaster) -> None:
+    fed.late = 2
+    run_steps(fed, lambda m: watchdog(m) == "proven" or pytest.fail("not proven"))
+    assert 2 < fed.feedings <= commissioning_watchdog.FEEDING_TRIES  # this computer may be late once by itself
+
+
+def test_a_computer_that_is_always_late_is_told(fed: LateMaster) -> None:
+    fed.late = 99
+    with pytest.raises(DriveFault, match="missed our heartbeat 4 times; take load off this computer"):
+        run_steps(fed, watchdog)
+    assert fed.feedings == commissioning_watchdog.FEEDING_TRIES
+
+
+def test_a_drive_that_trips_while_it_is_fed_is_not_tried_again(
+    fed: LateMaster, peer: tuple[DrivePeer, MachineConfig]
+) -> None:
+    fed.trip = lambda: peer[0].drive.trip(0x3210)
+    with pytest.raises(DriveFault, match="it fell from Operation enabled to Fault"):
+        run_steps(fed, watchdog)
+    assert fed.feedings == 1
+
+
+class SlowReader(Master):
+    """A master on a busy computer: the first ``slow`` readings of the speed demand come too late to tell anything."""
+
+    slow = 0
+    readings = 0
+
+    def __init__(self, config: MachineConfig, axis: str) -> None:
+        super().__init__(config, axis)
+        self._read_int = self.sdo.read_int
+        monkey: Any = self.sdo
+        monkey.read_int = self.read_int
+
+    def read_int(self, index: int, sub: int = 0, *, signed: bool = False) -> int:
+        value = self._read_int(index, sub, signed=signed)
+        if index == Object.VELOCITY_DEMAND:
+            self.readings += 1
+            if self.readings <= self.slow:
+                self.wait_cycles(2 * commissioning.EARLY_CYCLES + commissioning.RAMP_CYCLES)
+        return value
+
+
+READINGS = 1 + commissioning.RAMPS  # of a try in which each is late: whether the object is there, and one a ramp
+
+
+def test_a_ramp_whose_begin_was_missed_is_asked_again(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    _, settings = peer
+    with SlowReader(settings, "X") as master, rolled_back(master):
+        prepare(master)
+        enable(master)
+        master.slow = READINGS
+        assert commissioning.tell_feedforward(master) is True
+        assert master.readings > 2 * READINGS
+
+
+def test_a_feedforward_that_is_never_seen_stays_untold(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    _, settings = peer
+    with SlowReader(settings, "X") as master, rolled_back(master):
+        prepare(master)
+        enable(master)
+        master.slow = 1_000_000
+        assert commissioning.tell_feedforward(master) is None
+        assert master.readings == commissioning.FEEDFORWARD_TRIES * READINGS
+
+
+def test_full_heartbeat_consumers_are_refused(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    for sub in (1, 2, 3, 4):
+        drive.drive.set_object(0x1016, sub, (10 + sub) << 16 | 500)
+    with Master(settings, "X") as master, pytest.raises(DriveFault, match="all entries of 0x1016 are taken"):
+        watchdog(master)
+
+
+def test_an_nc_on_the_bus_is_left_alone(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as nc, Master(settings, "X") as master:
+        nc.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+        with pytest.raises(ProtocolError, match="an NC is sending"):
+            commissioning_checks.listen(master)
+    assert drive.heard == [0x80]  # the NC's own
+
+
+def test_a_silent_bus_gets_no_frame() -> None:
+    settings = config()
+    with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as other:
+        with pytest.raises(ConnectError, match="there is no drive on the bus"):
+            commission(settings, "X")
+        assert other.recv(0) is None
+
+
+def test_a_drive_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(canopen_sdo, "RESPONSE_TIMEOUT_S", 0.01)  # nothing ever comes
+    settings = config(drive={"node_id": 9})
+    with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as other:
+        other.send(can.Message(arbitration_id=0x701, data=[5], is_extended_id=False))
+        with Master(settings, "X") as master, pytest.raises(DeviceError, match=r"drive X: .* was not answered"):
+            master.sdo.read_int(Object.IDENTITY, 1)
+
+
+def test_states_are_shown(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    _, settings = peer
+    with Master(settings, "X") as master, rolled_back(master):
+        prepare(master)
+        assert master.state() is State.SWITCH_ON_DISABLED
+        enable(master)
+        assert master.state() is State.OPERATION_ENABLED
