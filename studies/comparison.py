@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import lru_cache, partial
 from itertools import product
 from pathlib import Path
@@ -26,7 +26,7 @@ from fdhil.identification.normal import solve
 from fdhil.records import PARAMETERS, Recording, Window, frozen
 from fdhil.store.recording_csv import parse_recording
 from studies import bench, pages
-from studies.comparison_page import figure, text
+from studies.comparison_page import Figures, figure, text
 from studies.estimators import TRUTH, Array, bound, noisy
 
 NOISES = (0.001, 0.005, 0.01)
@@ -36,24 +36,6 @@ FILTERS_HZ = {"none": 1e6, "40 Hz": Identification().lowpass_hz, "150 Hz": 150.0
 METHODS = (*OPERATORS, "partial_moments", "instrumental_variables", "maximum_likelihood")
 CHUNK = 10
 SURE_95 = 1.96
-
-
-@dataclass(frozen=True)
-class Figures:
-    """What came out for one noise and period: per cent of the truth, by method for each low-pass.
-
-    ``rms`` and ``bias`` (filters, methods, 6); ``rejected`` (filters, methods, 6) is the share of single rapids on
-    which the Durbin-Wu-Hausman test against maximum likelihood rejects at 5 %; ``one_sided`` (2, 6) are RMS error and
-    bias of zero forcing #1 with the voltage left raw; ``bound`` (6,).
-    """
-
-    noise: float
-    period_s: float
-    rms: Array
-    bias: Array
-    rejected: Array
-    one_sided: Array
-    bound: Array
 
 
 @lru_cache(maxsize=4)
