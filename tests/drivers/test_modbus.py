@@ -54,7 +54,6 @@ async def test_samples_that_were_not_fetched_in_time_are_counted() -> None:
     async with sensor_peer() as peer:
         sensor = ModbusVoltage("X", config(peer.port))
         await sensor.link.connect()
-        await asyncio.sleep(0.02)  # the sensor has begun to sample: what it does not hold any more can be told
         await sensor.poll(TickClock(0.001))
         await asyncio.sleep(0.25)
         notices = [r for r in await sensor.poll(TickClock(0.001)) if isinstance(r, Notice)]
