@@ -92,7 +92,7 @@ Said = Callable[..., tuple[int, str, str]]
 def fdhil(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Said:
     """Run a command in this process, with shorter waits than on a real machine: exit code, stdout and stderr."""
     for module, name, value in WAITS:
-        monkeypatch.setattr(importlib.import_module(f"fdhil.drivers.{module}"), name, value)
+        monkeypatch.setattr(importlib.import_module(f"fdhil.{module}"), name, value)
 
     def run(*arguments: object, said: str = "") -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["fdhil", *map(str, arguments)])
