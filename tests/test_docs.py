@@ -19,6 +19,13 @@ TEMPLATE = ROOT / "configs" / "machine-template.toml"
 PAGES = sorted(path for path in [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 
 
+def test_the_code_overview_names_what_exists() -> None:
+    page = (ROOT / "docs" / "explanation" / "code-overview.md").read_text("utf-8")
+    named = set(re.findall(r"`((?:fdhil|studies)/[\w/.]*)`", page))
+    assert len(named) > 40
+    assert [name for name in sorted(named) if not (ROOT / name).exists()] == []
+
+
 def test_the_generated_files_are_current() -> None:
     """In a process of its own: click remembers how a command was last asked for help."""
     command = [sys.executable, str(ROOT / "docs" / "generate.py"), "--check"]
