@@ -1,4 +1,4 @@
-"""The guard's invariants on random buses (``python -m studies.guard_invariants --sync 10000000 --seed 1``).
+"""The guard's invariants on random buses (``python -m studies.guard_invariants``).
 
 Faults, foreign and forged frames, restarts and requests in any order, at any time. Every frame that the guard sends is
 judged by the wire and by what the drive held, not by the guard's own state. The page goes to
@@ -8,24 +8,20 @@ judged by the wire and by what the drive held, not by the guard's own state. The
 from __future__ import annotations
 
 import argparse
-import json
-import os
-import platform
 import random
 import struct
-import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from typing import Any
 
 from fdhil.guard.state import SENDING, Mode, Request
+from studies import pages
 from tests.guard.machine import ENABLED, RECORD, Bench, arm_request, bench
 from tests.guard.wire import Wire
 
-PAGE = Path(__file__).parents[1] / "docs" / "studies" / "guard_invariants.md"
 EPISODE = 5000
 COMPARED = Request("compared", True, compared={"X": RECORD})
 ADOPT = Request("adopt", True)
@@ -258,66 +254,41 @@ def walks(sync: int, seed: int, processes: int) -> tuple[Counter[str], list[str]
     return seen, wrong
 
 
-def commit() -> str:
-    """The version of the source that was studied."""
-    told = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, cwd=PAGE.parent)
-    return told.stdout.strip() or "unknown"
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """Return what happened how often, and the frames that broke a limit."""
+    seen, wrong = walks(options.sync, options.seed, options.processes)
+    return {"counts": dict(sorted(seen.items())), "violations": wrong}
 
 
-def page(figures: dict[str, object], seen: Counter[str], wrong: list[str]) -> str:
+def page(run: pages.Run, figures: Mapping[str, Any]) -> str:
     """Return the study's page; its conclusion follows from the figures."""
+    seen, wrong = figures["counts"], figures["violations"]
     count = f"{len(wrong)} frames broke a limit" if wrong else "no frame broke a limit"
-    happened = [name for name, _ in dict(HAPPENINGS).items()]
-    moves = sorted(name for name in seen if " to " in name)
-    lines = [
-        "# The guard's invariants on random buses",
-        "",
-        f"Written by `{figures['command']}` at {figures['commit']}, Python {figures['python']}.",
-        "",
-        f"{seen['sync']:,} SYNC of one axis at random, {seen['frames']:,} offset frames sent: **{count}**.",
-        "",
-        "Each episode of some 5,000 SYNC begins with a guard that starts beside a drive that holds nothing, an offset",
-        "within 250 um, or anything, with a commissioning record that holds, is void or is missing. Every frame is",
-        "judged by the wire and by what the drive held, not by the guard's own state: it must be within 250 um, go on",
-        "from the last frame on the wire (anybody's) or from the value in the drive within rate and acceleration, and",
-        "travel no more in a second than allowed, two ramps apart. Nothing may be sent in OFF or FROZEN.",
-        "",
-        "| what happened | times |",
-        "|---|---|",
-        *[f"| {name} | {seen[name]:,} |" for name in happened],
-        "",
-        "| the guard's states | times |",
-        "|---|---|",
-        *[f"| {name} | {seen[name]:,} |" for name in moves],
-        "",
-        *[f"* {each}" for each in wrong[:20]],
-    ]
-    return "\n".join(lines).rstrip() + "\n"
+    lines = pages.head("The guard's invariants on random buses", "guard_invariants", run)
+    lines += pages.paragraph(
+        f"{seen['sync']:,} SYNC of one axis at random, {seen['frames']:,} offset frames sent: **{count}**."
+    )
+    lines += pages.paragraph(
+        f"""Each episode of some {EPISODE:,} SYNC begins with a guard that starts beside a drive that holds nothing, an
+        offset within 250 um, or anything, with a commissioning record that holds, is void or is missing. Every frame is
+        judged by the wire and by what the drive held, not by the guard's own state: it must be within 250 um, go on
+        from the last frame on the wire (anybody's) or from the value in the drive within rate and acceleration, and
+        travel no more in a second than allowed, two ramps apart. Nothing may be sent in OFF or FROZEN."""
+    )
+    happened = [[name, f"{seen.get(name, 0):,}"] for name in dict(HAPPENINGS)]
+    moves = [[name, f"{times:,}"] for name, times in seen.items() if " to " in name]
+    lines += [*pages.grid(("what happened", "times"), happened), ""]
+    lines += [*pages.grid(("the guard's states", "times"), moves), ""]
+    return "\n".join([*lines, *(f"* {each}" for each in wrong[:20])])
 
 
 def main() -> None:
-    """Run the walks and write the page and its JSON twin."""
-    options = argparse.ArgumentParser(description=__doc__)
-    options.add_argument("--sync", type=int, default=10_000_000)
-    options.add_argument("--seed", type=int, default=1)
-    options.add_argument("--processes", type=int, default=os.cpu_count() or 1)
-    options.add_argument("--out", type=Path, default=PAGE)
-    given = options.parse_args()
-    version = commit()
-    seen, wrong = walks(given.sync, given.seed, given.processes)
-    figures: dict[str, object] = {
-        "schema": "fdhil-study-1",
-        "study": "guard_invariants",
-        "command": f"python -m studies.guard_invariants --sync {given.sync} --seed {given.seed}",
-        "commit": version,
-        "python": platform.python_version(),
-        "violations": wrong,
-        "counts": dict(sorted(seen.items())),
-    }
-    given.out.write_text(page(figures, seen, wrong), "utf-8")
-    given.out.with_suffix(".json").write_text(json.dumps(figures, indent=1) + "\n", "utf-8")
-    print(f"{seen['sync']:,} SYNC, {seen['frames']:,} frames, {len(wrong)} wrong")
-    sys.exit(bool(wrong))
+    """Run the study."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--sync", type=int, default=10_000_000)
+    parser.add_argument("--seed", type=int, default=1)
+    figures = pages.conduct("guard_invariants", parser, lambda options: str(options.seed), measure)
+    sys.exit(bool(figures["violations"]))
 
 
 if __name__ == "__main__":
