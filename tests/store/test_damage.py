@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import random
+import shutil
 import sqlite3
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,8 @@ TABLES = ("windows", "revisions", "skills", "notices", "comparisons")
 FLIPS_PER_PAGE = 16
 
 
-def filled(folder: Path) -> bytes:
-    """A history of two axes, as its file's bytes after the daemon has ended."""
+def filled(folder: Path, wal: Path | None = None) -> bytes:
+    """A history of two axes, as its file's bytes after the daemon has ended; ``wal`` is given what a power cut left."""
     with History.open(folder) as history:
         for k in range(8):
             for axis in "XY":
@@ -43,6 +44,8 @@ def filled(folder: Path) -> bytes:
         used = {"X": UsedParameters(7, BENCH)}
         for k in range(8):
             history.add_comparison(Comparison("a" * 64, "p.ngc", "0123", used, 1.0 + k, (zone,) * 4), STAMP)
+        if wal is not None:
+            shutil.copytree(folder, wal)
     return (folder / FILE_NAME).read_bytes()
 
 
@@ -97,6 +100,31 @@ def test_no_flipped_bit_of_a_history_changes_what_is_read(tmp_path: Path) -> Non
     assert len(refused) > 50
     assert all("start the daemon" in str(e) or e.code in ("SchemaVersion", "StoreFault") for e in refused)
     assert left_out > 100
+
+
+def test_a_flipped_bit_of_the_log_after_a_power_cut_costs_the_newest_rows_at_most(tmp_path: Path) -> None:
+    filled(tmp_path / "whole", wal=tmp_path / "cut")
+    log = (tmp_path / "cut" / f"{FILE_NAME}-wal").read_bytes()
+    with History.read(tmp_path / "whole") as history:
+        true = contents(history)
+    lost = 0
+    rng = random.Random(3)
+    for byte in [*range(0, 32, 4), *rng.sample(range(32, len(log)), 24)]:
+        flipped = bytearray(log)
+        flipped[byte] ^= 1 << rng.randrange(8)
+        folder = tmp_path / f"at-{byte}"
+        shutil.copytree(tmp_path / "cut", folder)
+        (folder / f"{FILE_NAME}-wal").write_bytes(flipped)
+        (folder / f"{FILE_NAME}-shm").unlink(missing_ok=True)  # a power cut leaves none of it
+        try:
+            with History.read(folder) as history:
+                found = contents(history)
+        except StoreError:
+            continue
+        for table in TABLES:
+            assert [row for row in true[table] if row in found[table]] == found[table], (byte, table)
+            lost += len(true[table]) - len(found[table])
+    assert lost > 0
 
 
 def test_the_daemon_begins_anew_or_goes_on_whatever_bit_is_flipped(tmp_path: Path) -> None:
