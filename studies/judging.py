@@ -1,4 +1,4 @@
-"""What becomes of recordings: judged one by one, counted by kind, told as a table."""
+"""Judges recordings one by one, counts them by kind, and tells it as a table."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How often a good rapid is refused, and whether any bad one is accepted (``python -m studies.verdicts``).
+"""Counts how often a good rapid is refused, and whether any bad one is accepted (``python -m studies.verdicts``).
 
 Every recording is simulated anew with its own seed: drive, move, noise, resolution and sampling are drawn; each bad one
 gets one fault of random severity. The table goes to ``docs/studies/verdicts.md``.

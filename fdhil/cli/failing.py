@@ -1,4 +1,4 @@
-"""How an error becomes one sentence, or one JSON document, and an exit code."""
+"""Turns an error into one sentence, or one JSON document, and an exit code."""
 
 from __future__ import annotations
 

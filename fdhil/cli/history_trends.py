@@ -1,4 +1,4 @@
-"""What the stored windows tell of the drives' health: slopes, steps, and the dates of the maintenance limits."""
+"""Finds the drives' health in the stored windows: slopes, steps, and the dates of the maintenance limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How parameters are shown to people: one unit each, and one meaning of ±, in every table."""
+"""Shows parameters to people: one unit each, and one meaning of ±, in every table."""
 
 from __future__ import annotations
 
@@ -48,5 +48,5 @@ def cell(name: str, value: float | None, half: float | None, between: str = "\n"
 
 
 def _figures(value: float, width: float) -> int:
-    """How many figures of a value say something beside an interval of this width."""
+    """Return how many figures of a value say something beside an interval of this width."""
     return math.floor(math.log10(abs(value) / width)) + 2 if abs(value) > width else 1

@@ -76,7 +76,7 @@ class UsedParameters:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What was predicted of a program: ``program`` is its digest, ``zones`` as ``fdhil predict --json`` has them."""
+    """A prediction of a program: ``program`` is its digest, ``zones`` as ``fdhil predict --json`` has them."""
 
     program: str
     name: str

@@ -1,4 +1,4 @@
-"""What the pages of a Parquet file declare to take once they are read, so that it can be refused before they are.
+"""Adds up what the pages of a Parquet file declare to take once read, so that it can be refused before they are.
 
 The library allocates what a page's own header says, whatever the file's footer says: 64 kB can become 2 GB. The header
 is a struct of the Thrift compact protocol; its fields 2 and 3 are the page's size after and before decompression

@@ -53,7 +53,7 @@ Bits = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class RawScale:
-    """How a drive's integer q becomes a value: q * ``factor`` / ``divisor``, in this order of operations."""
+    """The scale of a drive's integer q: its value is q * ``factor`` / ``divisor``, in this order of operations."""
 
     factor: float = 1.0
     divisor: float = 1.0
@@ -257,7 +257,7 @@ class WindowFile:
 
 @dataclass(frozen=True, slots=True)
 class Listing:
-    """What is in the folder: ``windows`` oldest first, and the names of ``strays``, which are ignored."""
+    """The files of a folder: ``windows`` oldest first, and the names of ``strays``, which are ignored."""
 
     windows: tuple[WindowFile, ...]
     strays: tuple[str, ...]

@@ -42,7 +42,7 @@ WARM_C = (20.5, 21.0, 21.5, 22.0)
 
 @dataclass
 class Stage:
-    """What is needed to drive the demonstration: the twin with its panel, and the daemon's socket."""
+    """The demonstration's processes: the twin with its panel, and the daemon's socket."""
 
     out: Path
     config: MachineConfig
