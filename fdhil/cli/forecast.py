@@ -1,5 +1,5 @@
-"""Adds the past to ``fdhil predict --from-history``: what a step of a parameter costs, what became of each zone since the
-last time, and when it leaves a tolerance.
+"""Adds the past to ``fdhil predict --from-history``: what a step of a parameter costs, what became of each zone since
+the last time, and when it leaves a tolerance.
 """
 
 from __future__ import annotations
