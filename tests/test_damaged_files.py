@@ -19,7 +19,7 @@ from fdhil.errors import ConfigError, FdhilError, ProgramError
 from fdhil.guard.settings import load, to_json
 from fdhil.prediction.models import load_models
 from fdhil.program import Budget, interpret
-from fdhil.sim import faults
+from fdhil.sim import fault_script
 from tests.guard.machine import settings
 
 HOSTILE = {
@@ -139,4 +139,4 @@ def test_a_hostile_fault_script_is_a_config_error(text: str, tmp_path: Path) -> 
     path = tmp_path / "faults.toml"
     path.write_text(text)
     with pytest.raises(FdhilError):
-        faults.load(path, ("X",))
+        fault_script.load(path, ("X",))

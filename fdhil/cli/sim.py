@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,13 +53,13 @@ def _serve(path: Path, as_json: bool, script: Path | None, play: Path | None, tr
     import signal
 
     from fdhil import config
-    from fdhil.sim import faults
-    from fdhil.sim.service import SimService, json_emitter
+    from fdhil.sim import fault_script
+    from fdhil.sim.service import SimService
 
     machine = config.load(path)
-    entries = [] if script is None else faults.load(script, tuple(machine.axis))
-    emit = json_emitter() if as_json else _tell
-    service = SimService(machine, emit, _load, panel_fd=_panel_descriptor(), faults=entries)
+    entries = [] if script is None else fault_script.load(script, tuple(machine.axis))
+    tell = _tell_json if as_json else _tell
+    service = SimService(machine, tell, _load, panel_fd=_panel_descriptor(), faults=entries)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: service.stop())
     sys.setswitchinterval(0.0005)  # the SYNC must not wait 5 ms for the thread that serves the sensors
@@ -78,6 +79,11 @@ def _panel_descriptor() -> int | None:
         return sys.stdin.fileno()
     except (AttributeError, OSError, ValueError):
         return None
+
+
+def _tell_json(event: dict[str, Any]) -> None:
+    """Write an event as one line of JSON."""
+    click.echo(json.dumps(event))
 
 
 def _tell(event: dict[str, Any]) -> None:

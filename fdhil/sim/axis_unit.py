@@ -1,21 +1,20 @@
-"""One axis of the simulated machine: the drive with its slide-way and sensor, and what a fault can do to them."""
+"""Joins one axis' drive with its slide-way and sensor, and offers what a fault can do to them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from fdhil.sim.drive.sensors import DriveFaults
 from fdhil.sim.drive.servo import Drive
-from fdhil.sim.nc.drive_link import BusFrame
+from fdhil.sim.frame import BusFrame
 from fdhil.sim.thermal import SlideWay
-from fdhil.sim.wire.modbus_sensor import SensorFaults, VoltageSensor
+from fdhil.sim.wire.modbus_sensor import VoltageSensor
 
 _GAP_CYCLES = 50  # a longer silence is the end of a stream, not a late frame
 _PATIENCE_CYCLES = 3  # a listed RPDO that was missing this often is not waited for any more
 
 
 @dataclass(slots=True)
-class Stream:
+class RpdoStream:
     """One RPDO, cycle by cycle; ``late`` counts the cycles in which it was missing in a stream that went on."""
 
     active: bool = False
@@ -39,8 +38,12 @@ class Stream:
 
 
 @dataclass(slots=True)
-class Unit:
-    """One axis of the machine: its drive and what is mounted around it. It is also what a fault acts on."""
+class AxisUnit:
+    """One axis of the machine: its drive and what is mounted around it. It is also what a fault acts on.
+
+    ``injected`` holds the machine's foreign frames, sent at every SYNC; ``sync_on`` is False while the NC's SYNC fails
+    on the axis' bus.
+    """
 
     axis: str
     bus: str
@@ -49,28 +52,9 @@ class Unit:
     sensor: VoltageSensor
     outbox: list[BusFrame]
     injected: dict[int, tuple[str, bytes]]
-    offsets: Stream = field(default_factory=Stream)
+    offsets: RpdoStream = field(default_factory=RpdoStream)
     sync_on: bool = True
     _before: dict[tuple[int, int], int] = field(default_factory=dict)
-
-    @property
-    def drive_faults(self) -> DriveFaults:
-        """The drive's fault state."""
-        return self.drive.faults
-
-    @property
-    def sensor_faults(self) -> SensorFaults:
-        """The sensor's fault state."""
-        return self.sensor.faults
-
-    def trip(self, code: int) -> None:
-        """Let the drive fall into fault."""
-        self.drive.trip(code)
-
-    def reboot(self) -> None:
-        """Restart the drive."""
-        self.drive.power_off()
-        self.power(True)
 
     def power(self, on: bool) -> None:
         """Cut or restore the drive's supply."""
@@ -79,35 +63,23 @@ class Unit:
         else:
             self.drive.power_off()
 
-    def input(self, bit: int, on: bool) -> None:
+    def set_input(self, bit: int, on: bool) -> None:
         """Set or clear a bit of 0x60FD."""
-        mask = 1 << (bit & 31)
-        self.drive.digital_inputs = self.drive.digital_inputs | mask if on else self.drive.digital_inputs & ~mask
-
-    def inject(self, can_id: int, data: bytes, on: bool) -> None:
-        """Send a foreign frame at every SYNC while it is on."""
-        if on:
-            self.injected[can_id] = (self.bus, data)
-        else:
-            self.injected.pop(can_id, None)
-
-    def sync(self, on: bool) -> None:
-        """Let the NC's SYNC fail on this axis' bus, or come again."""
-        self.sync_on = on
+        feedback, mask = self.drive.feedback, 1 << bit
+        feedback.digital_inputs = feedback.digital_inputs | mask if on else feedback.digital_inputs & ~mask
 
     def object_fault(self, index: int, sub: int, value: int) -> str:
         """Return why an object of the drive cannot hold a value, "" when it can."""
         entry = self.drive.dictionary.entries.get(index << 8 | sub)
         if entry is None or entry.size is None:
             return f"the drive has no number {index:04X}:{sub:02X}"
-        low, high = (
-            (-(1 << 8 * entry.size - 1), (1 << 8 * entry.size - 1) - 1)
-            if entry.signed
-            else (0, (1 << 8 * entry.size) - 1)
-        )
-        return "" if low <= value <= high else f"{value} does not fit {index:04X}:{sub:02X}"
+        try:
+            entry.encode(value)
+        except OverflowError:
+            return f"{value} does not fit {index:04X}:{sub:02X}"
+        return ""
 
-    def put(self, index: int, sub: int, value: int, on: bool) -> None:
+    def overwrite(self, index: int, sub: int, value: int, on: bool) -> None:
         """Write an object past all access rules, and give it its value back."""
         drive = self.drive
         if on:
@@ -116,12 +88,8 @@ class Unit:
         elif (index, sub) in self._before:
             drive.set_object(index, sub, self._before.pop((index, sub)))
 
-    def remap(self, number: int, on: bool) -> None:
-        """Let a TPDO carry its objects in the other order, as after another tool's visit, and put it right again.
-
-        The order is turned at the start and at the end alike.
-        """
-        del on
+    def turn_tpdo(self, number: int) -> None:
+        """Let a TPDO carry its objects in the other order, as after another tool's visit; twice puts it right again."""
         index = 0x1A00 + number - 1
         count = self.drive.dictionary.number(index, 0)
         words = [self.drive.dictionary.number(index, sub) for sub in range(count, 0, -1)]

@@ -1,78 +1,83 @@
-"""The named faults of the simulated machine: what each acts on, and what its value means.
+"""Lists the named faults of the simulated machine: what each acts on, and what its value means.
 
 A newcomer adds a fault by one line of :data:`FAULTS`; being listed is being tested.
 """
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from functools import partial
+from typing import Annotated, Any
 
-from fdhil.sim.drive.sensors import SIGNALS, DriveFaults
-from fdhil.sim.wire.modbus_sensor import SensorFaults
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-if TYPE_CHECKING:
-    from fdhil.sim.faults import FaultEntry
+from fdhil.sim.axis_unit import AxisUnit
+from fdhil.sim.drive.sensors import SIGNALS
 
-
-class Target(Protocol):
-    """What a fault acts on: the drive and sensor of its axis, and the machine around them."""
-
-    @property
-    def drive_faults(self) -> DriveFaults:
-        """The drive's fault state."""
-        ...
-
-    @property
-    def sensor_faults(self) -> SensorFaults:
-        """The sensor's fault state."""
-        ...
-
-    def object_fault(self, index: int, sub: int, value: int) -> str:
-        """Return why an object cannot hold a value, "" when it can."""
-        ...
-
-    def trip(self, code: int) -> None:
-        """Let the drive fall into fault with an error code."""
-        ...
-
-    def reboot(self) -> None:
-        """Restart the drive: boot-up message, power-on values."""
-        ...
-
-    def power(self, on: bool) -> None:
-        """Cut or restore the drive's supply."""
-        ...
-
-    def input(self, bit: int, on: bool) -> None:
-        """Set a bit of 0x60FD."""
-        ...
-
-    def inject(self, can_id: int, data: bytes, on: bool) -> None:
-        """Send a foreign frame at every SYNC while it is on."""
-        ...
-
-    def put(self, index: int, sub: int, value: int, on: bool) -> None:
-        """Write an object past all access rules, or give it its value back."""
-        ...
-
-    def remap(self, number: int, on: bool) -> None:
-        """Turn the order of a TPDO's objects, or put it right again."""
-        ...
-
-    def sync(self, on: bool) -> None:
-        """Let the NC's SYNC fail, or come again."""
-        ...
-
-
-Action = Callable[[Target, "FaultEntry", bool], None]
 _MODBUS_CODES = frozenset({1, 2, 3, 4, 5, 6, 7, 8, 10, 11})
+
+
+class FaultEntry(BaseModel):
+    """One entry of a script or of the operator's panel; without an ``at_`` key it happens at once."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    at_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    at_sync: Annotated[int, Field(ge=0)] | None = None
+    at_row: Annotated[int, Field(ge=0)] | None = None
+    axis: str | None = None
+    fault: str
+    value: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    duration_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None = None
+    index: Annotated[int, Field(ge=0, le=0xFFFF)] | None = None
+    sub: Annotated[int, Field(ge=0, le=0xFF)] = 0
+    can_id: Annotated[int, Field(ge=0, le=0x7FF)] | None = None
+    data: str | None = None
+
+    @property
+    def number(self) -> float:
+        """The value, 0 where there is none."""
+        return 0.0 if self.value is None else self.value
+
+    @field_validator("fault")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        if name not in FAULTS:
+            near = difflib.get_close_matches(name, FAULTS, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise ValueError(f"{name!r} is none of {', '.join(FAULTS)}{hint}")
+        return name
+
+    @field_validator("data")
+    @classmethod
+    def _bytes(cls, text: str | None) -> str | None:
+        if text is not None and len(bytes.fromhex(text)) > 8:
+            raise ValueError("a CAN frame has at most 8 bytes")
+        return text
+
+    @model_validator(mode="after")
+    def _whole(self) -> FaultEntry:
+        kind = FAULTS[self.fault]
+        if sum(at is not None for at in (self.at_s, self.at_sync, self.at_row)) > 1:
+            raise ValueError("give one of at_s, at_sync and at_row")
+        if kind.needs_axis and self.axis is None:
+            raise ValueError(f"{self.fault} needs an axis")
+        if kind.value is not None and self.value is None:
+            raise ValueError(f"{self.fault} needs a value: {kind.value.meaning}")
+        if kind.value is not None and (wrong := kind.value.fault(self.number)):
+            raise ValueError(f"the value of {self.fault} is {kind.value.meaning}: {wrong}")
+        if self.fault == "object" and self.index is None:
+            raise ValueError("object needs the index (and sub) of what is to be overwritten")
+        if self.fault == "frame" and (self.can_id is None or self.data is None):
+            raise ValueError("frame needs can_id and data (hexadecimal)")
+        return self
 
 
 @dataclass(frozen=True, slots=True)
 class FaultValue:
-    """What the value of a fault means, and between which limits it lies."""
+    """The meaning of a fault's value, and its limits."""
 
     meaning: str
     low: float = -1e6
@@ -92,58 +97,60 @@ class FaultValue:
 
 @dataclass(frozen=True, slots=True)
 class FaultKind:
-    """A fault by name: ``apply(target, entry, on)`` starts it and ends it; a fault with a ``value`` needs one."""
+    """A fault by name: ``apply(unit, entry, on)`` starts it and ends it; a fault with a ``value`` needs one."""
 
-    apply: Action
+    apply: Callable[[AxisUnit, FaultEntry, bool], None]
     value: FaultValue | None = None
     needs_axis: bool = True
 
 
-def _attribute(owner: Callable[[Target], object], name: str, off: Any, value: FaultValue | None) -> FaultKind:
+def _attribute(owner: Callable[[AxisUnit], object], name: str, off: Any, value: FaultValue | None = None) -> FaultKind:
     """A fault that is an attribute of a fault state: set to its value (True without one), reset to ``off``."""
 
-    def apply(target: Target, entry: FaultEntry, on: bool) -> None:
+    def apply(unit: AxisUnit, entry: FaultEntry, on: bool) -> None:
         wanted = True if value is None else int(entry.number) if value.whole else entry.number
-        setattr(owner(target), name, wanted if on else off)
+        setattr(owner(unit), name, wanted if on else off)
 
     return FaultKind(apply, value)
 
 
-def _drive(name: str, off: Any, value: FaultValue | None = None) -> FaultKind:
-    return _attribute(lambda target: target.drive_faults, name, off, value)
-
-
-def _sensor(name: str, off: Any, value: FaultValue | None = None) -> FaultKind:
-    return _attribute(lambda target: target.sensor_faults, name, off, value)
+_drive = partial(_attribute, lambda unit: unit.drive.faults)
+_sensor = partial(_attribute, lambda unit: unit.sensor.faults)
+_sensor_signal = partial(_attribute, lambda unit: unit.sensor.faults.signal)
 
 
 def _signal(signal: str, name: str, off: Any, value: FaultValue | None) -> FaultKind:
-    return _attribute(lambda target: target.drive_faults.signal(signal), name, off, value)
+    return _attribute(lambda unit: unit.drive.faults.signal(signal), name, off, value)
 
 
-def _drop_tpdo(target: Target, entry: FaultEntry, on: bool) -> None:
+def _drop_tpdo(unit: AxisUnit, entry: FaultEntry, on: bool) -> None:
     if on:
-        target.drive_faults.drop_tpdo[int(entry.number)] = -1
+        unit.drive.faults.drop_tpdo[int(entry.number)] = -1
     else:
-        target.drive_faults.drop_tpdo.pop(int(entry.number), None)
+        unit.drive.faults.drop_tpdo.pop(int(entry.number), None)
 
 
-def _trip(target: Target, entry: FaultEntry, on: bool) -> None:
+def _trip(unit: AxisUnit, entry: FaultEntry, on: bool) -> None:
     if on:
-        target.trip(int(entry.number))
+        unit.drive.trip(int(entry.number))
 
 
-def _reboot(target: Target, _: FaultEntry, on: bool) -> None:
+def _reboot(unit: AxisUnit, _: FaultEntry, on: bool) -> None:
     if on:
-        target.reboot()
+        unit.power(False)
+        unit.power(True)
 
 
-def _object(target: Target, entry: FaultEntry, on: bool) -> None:
-    target.put(entry.index or 0, entry.sub, int(entry.number), on)
+def _sync_lost(unit: AxisUnit, _: FaultEntry, on: bool) -> None:
+    unit.sync_on = not on
 
 
-def _frame(target: Target, entry: FaultEntry, on: bool) -> None:
-    target.inject(entry.can_id or 0, bytes.fromhex(entry.data or ""), on)
+def _frame(unit: AxisUnit, entry: FaultEntry, on: bool) -> None:
+    can_id = entry.can_id or 0
+    if on:
+        unit.injected[can_id] = (unit.bus, bytes.fromhex(entry.data or ""))
+    else:
+        unit.injected.pop(can_id, None)
 
 
 _TPDO = FaultValue("number of the TPDO", 1, 4, whole=True)
@@ -167,11 +174,14 @@ FAULTS: Mapping[str, FaultKind] = {
     "drop_tpdo": FaultKind(_drop_tpdo, _TPDO),
     "trip": FaultKind(_trip, FaultValue("error code of the EMCY, such as 0x3210", 1, 0xFFFF, whole=True)),
     "reboot": FaultKind(_reboot),
-    "power_off": FaultKind(lambda target, _, on: target.power(not on)),
-    "remap": FaultKind(lambda target, entry, on: target.remap(int(entry.number), on), _TPDO),
-    "object": FaultKind(_object, FaultValue("number written to the object", -(2**31), 2**32 - 1, whole=True)),
+    "power_off": FaultKind(lambda unit, _, on: unit.power(not on)),
+    "remap": FaultKind(lambda unit, entry, _: unit.turn_tpdo(int(entry.number)), _TPDO),
+    "object": FaultKind(
+        lambda unit, entry, on: unit.overwrite(entry.index or 0, entry.sub, int(entry.number), on),
+        FaultValue("number written to the object", -(2**31), 2**32 - 1, whole=True),
+    ),
     "digital_input": FaultKind(
-        lambda target, entry, on: target.input(int(entry.number), on),
+        lambda unit, entry, on: unit.set_input(int(entry.number), on),
         FaultValue("bit of 0x60FD, 0 and 1 are the limit switches", 0, 31, whole=True),
     ),
     **{
@@ -184,10 +194,10 @@ FAULTS: Mapping[str, FaultKind] = {
     "sensor_exception": _sensor(
         "exception", 0, FaultValue("Modbus exception code", 1, 11, whole=True, among=_MODBUS_CODES)
     ),
-    "sensor_stuck": _sensor("stuck", False),
-    "sensor_delayed": _sensor("delay_samples", 0, FaultValue("samples", 0, 10000, whole=True)),
-    "sensor_gain": _sensor("gain", 1.0, _FACTOR),
-    "sensor_offset": _sensor("offset_v", 0.0, FaultValue("V")),
-    "sync_lost": FaultKind(lambda target, _, on: target.sync(not on), needs_axis=False),
+    "sensor_stuck": _sensor_signal("stuck", False),
+    "sensor_delayed": _sensor_signal("delay_cycles", 0, FaultValue("samples", 0, 10000, whole=True)),
+    "sensor_gain": _sensor_signal("gain", 1.0, _FACTOR),
+    "sensor_offset": _sensor_signal("offset", 0.0, FaultValue("V")),
+    "sync_lost": FaultKind(_sync_lost, needs_axis=False),
     "frame": FaultKind(_frame, needs_axis=False),
 }

@@ -1,4 +1,4 @@
-"""The simulated machine, sans-I/O: drives, slide-ways, sensors and NC, moved by SYNC and by nothing else."""
+"""Moves the simulated machine by SYNC and by nothing else, sans-I/O: drives, slide-ways, sensors and NC."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault, StoreError
-from fdhil.sim.axis_unit import Stream, Unit
+from fdhil.sim.axis_unit import AxisUnit, RpdoStream
 from fdhil.sim.drive import description
 from fdhil.sim.drive.servo import Drive
-from fdhil.sim.faults import FaultEntry, FaultSchedule
-from fdhil.sim.nc.controller import Event, Nc, Row
-from fdhil.sim.nc.drive_link import BusFrame
+from fdhil.sim.fault_script import FaultSchedule
+from fdhil.sim.frame import BusFrame, Frame
+from fdhil.sim.nc.controller import Event, NcController, Row
 from fdhil.sim.recorder import Recorder
 from fdhil.sim.thermal import SlideWay
-from fdhil.sim.wire.hub import Frame
 from fdhil.sim.wire.modbus_sensor import VoltageSensor
 
 SYNC = 0x80
@@ -33,7 +32,7 @@ class Machine:
     def __init__(self, config: MachineConfig) -> None:
         self.config = config
         self.period_s = config.machine.sync_period_s
-        self.nc = Nc(config)
+        self.nc = NcController(config)
         self.events: list[Event] = []
         self.tick = 0
         self._outbox: list[BusFrame] = []
@@ -42,20 +41,19 @@ class Machine:
         self.units = {
             axis: self._unit(axis, seeds[2 * place], seeds[2 * place + 1]) for place, axis in enumerate(config.axis)
         }
-        self._of_bus: dict[str, list[Unit]] = {}
+        self._of_bus: dict[str, list[AxisUnit]] = {}
         for unit in self.units.values():
             self._of_bus.setdefault(unit.bus, []).append(unit)
         self._first_bus = next(iter(self._of_bus))
-        self.schedule = FaultSchedule(self.units, self.period_s)
+        self.faults = FaultSchedule(self.units, self.period_s)
         self._listed = [_listed_rpdo(text, self.units) for text in config.sim.lockstep_rpdo]
-        self._streams = {key: Stream() for key in self._listed}
-        self._rapid_bit = 1 << config.g0.input_bit
+        self._streams = {key: RpdoStream() for key in self._listed}
         self._rapid = False
         self._row = 0
         self._next_trace: Path | None = None
         self._recorder: Recorder | None = None
 
-    def _unit(self, axis: str, drive_seed: np.random.SeedSequence, sensor_seed: np.random.SeedSequence) -> Unit:
+    def _unit(self, axis: str, drive_seed: np.random.SeedSequence, sensor_seed: np.random.SeedSequence) -> AxisUnit:
         section = self.config.axis[axis]
         sim = self.config.sim
         sensor = VoltageSensor(
@@ -66,7 +64,7 @@ class Machine:
             sim.modbus_cycles,
         )
         sensor.celsius = sim.thermal.ambient_c
-        return Unit(
+        return AxisUnit(
             axis,
             section.drive.bus,
             Drive(axis, self.config, np.random.default_rng(drive_seed)),
@@ -164,7 +162,7 @@ class Machine:
         row = self.nc.in_force
         playing = row is not None and row.playing
         leading = bus == self._first_bus
-        if leading and not self.schedule.idle:
+        if leading and not self.faults.idle:
             self._run_faults(self._row if playing else None)
         if leading and self._rapid != (row is not None and row.rapid):
             self._signal_rapid(not self._rapid)
@@ -182,7 +180,7 @@ class Machine:
             self._record(row if playing else None)
         return frames
 
-    def _advance(self, unit: Unit, data: bytes) -> list[Frame]:
+    def _advance(self, unit: AxisUnit, data: bytes) -> list[Frame]:
         """One SYNC for one axis; its sensor and slide-way go with it when the drive accepted the SYNC."""
         drive = unit.drive
         before = drive.tick
@@ -190,7 +188,7 @@ class Machine:
         frames = drive.receive(SYNC, data)
         if drive.tick == before:
             return frames
-        heard = drive.rpdos_heard_before
+        heard = drive.pdo.heard_before
         unit.offsets.step(OFFSET_RPDO in heard)
         for key in self._listed:
             if key[0] == unit.axis:
@@ -213,21 +211,20 @@ class Machine:
     def _signal_rapid(self, on: bool) -> None:
         self._rapid = on
         for unit in self.units.values():
-            inputs = unit.drive.digital_inputs
-            unit.drive.digital_inputs = inputs | self._rapid_bit if on else inputs & ~self._rapid_bit
+            unit.set_input(self.config.g0.input_bit, on)
 
     def _run_faults(self, row: int | None) -> None:
-        for entry in self.schedule.step(self.tick, row):
+        for entry in self.faults.step(self.tick, row):
             self.events.append({"event": "fault", "sync": self.tick, **entry.model_dump(exclude_none=True)})
 
     def waits(self) -> bool:
         """Whether an RPDO that belongs into this cycle has not arrived yet (lockstep)."""
         if self._listed:
             return any(
-                stream.awaited and number not in self.units[axis].drive.rpdos_heard
+                stream.awaited and number not in self.units[axis].drive.pdo.heard
                 for (axis, number), stream in self._streams.items()
             )
-        return any(unit.drive.rpdos_heard_before - unit.drive.rpdos_heard for unit in self.units.values())
+        return any(unit.drive.pdo.heard_before - unit.drive.pdo.heard for unit in self.units.values())
 
     def holds_offset(self) -> bool:
         """Whether a drive was given an offset of position, speed or torque that is not zero: its sender goes on."""
@@ -297,10 +294,6 @@ class Machine:
             return None
         return str(recorder.path)
 
-    def fault(self, entry: FaultEntry) -> None:
-        """Take a fault into the schedule."""
-        self.schedule.add(entry)
-
     def close(self) -> None:
         """Give up a trace that was not finished."""
         if self._recorder is not None:
@@ -308,7 +301,7 @@ class Machine:
             self._recorder = None
 
 
-def _listed_rpdo(text: str, units: Mapping[str, Unit]) -> tuple[str, int]:
+def _listed_rpdo(text: str, units: Mapping[str, AxisUnit]) -> tuple[str, int]:
     axis, _, number = text.partition(":")
     if axis not in units or number not in ("1", "2", "3", "4"):
         fault = ConfigFault("sim.lockstep_rpdo", f"{text!r} names no RPDO", "write axis and number, such as X:2")

@@ -1,4 +1,4 @@
-"""The operator's panel: one JSON command per line, checked before it acts."""
+"""Obeys the commands of the operator's panel: one JSON object per line, checked before it acts."""
 
 from __future__ import annotations
 
@@ -9,21 +9,22 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.errors import ConfigError, FdhilError
-from fdhil.sim import faults
-from fdhil.sim.axis_unit import Unit
+from fdhil.records import PARAMETERS
+from fdhil.sim import fault_script
+from fdhil.sim.axis_unit import AxisUnit
 from fdhil.sim.machine import Machine
 
 MAX_LINE = 1 << 16
 _LOWEST_C, _HIGHEST_C = -40.0, 150.0
 
 
-class PanelError(FdhilError):
+class CommandError(FdhilError):
     """A command of the panel cannot be obeyed."""
 
     exit_code = 2
 
 
-class Panel:
+class OperatorCommands:
     """Obeys the commands of one machine. ``play`` and ``quit`` are the process' affair: it loads files, and it ends."""
 
     def __init__(self, machine: Machine, play: Callable[[Path], None], quit: Callable[[], None]) -> None:
@@ -44,31 +45,31 @@ class Panel:
         }
 
     def obey(self, line: str) -> None:
-        """Obey one line; PanelError with what is wrong with it, an empty line is nothing."""
+        """Obey one line; CommandError with what is wrong with it, an empty line is nothing."""
         if not line.strip():
             return
         if len(line) > MAX_LINE:
-            raise PanelError("a command of the panel is longer than 64 KiB; give one JSON object per line")
+            raise CommandError("a command of the panel is longer than 64 KiB; give one JSON object per line")
         try:
             command = json.loads(line)
         except ValueError as error:
-            raise PanelError(f"a command of the panel is no JSON ({error}); give one JSON object per line") from None
+            raise CommandError(f"a command of the panel is no JSON ({error}); give one JSON object per line") from None
         name = command.pop("command", None) if isinstance(command, dict) else None
         if not isinstance(name, str) or name not in self._commands:
-            raise PanelError(f"the panel has no command {name!r}; it has {', '.join(self._commands)}")
+            raise CommandError(f"the panel has no command {name!r}; it has {', '.join(self._commands)}")
         try:
             self._commands[name](command)
         except (ValueError, TypeError) as error:
-            raise PanelError(f"command {name}: {error}") from None
+            raise CommandError(f"command {name}: {error}") from None
         except ConfigError as error:
-            raise PanelError(f"command {name}: {'; '.join(map(str, error.faults))}") from None
+            raise CommandError(f"command {name}: {'; '.join(map(str, error.faults))}") from None
 
     def _set(self, command: dict[str, Any]) -> None:
         (unit,) = self._units(command, required=True)
         parameters = command.get("parameters")
         if not isinstance(parameters, dict) or not parameters:
             raise ValueError('"parameters" must be an object such as {"Jt": 0.085}')
-        unknown = [name for name in parameters if name not in ("R", "L", "K", "Jt", "ft", "Cd")]
+        unknown = [name for name in parameters if name not in PARAMETERS]
         if unknown:
             raise ValueError(f"{', '.join(unknown)} is no parameter of a drive; they are R, L, K, Jt, ft and Cd")
         unit.drive.set_parameters(**{name: _number(parameters, name) for name in parameters})
@@ -81,9 +82,9 @@ class Panel:
             unit.warm(celsius)
 
     def _fault(self, command: dict[str, Any]) -> None:
-        self._machine.fault(faults.parse(command, tuple(self._machine.units)))
+        self._machine.faults.add(fault_script.parse(command, tuple(self._machine.units)))
 
-    def _units(self, command: dict[str, Any], *, required: bool = False) -> list[Unit]:
+    def _units(self, command: dict[str, Any], *, required: bool = False) -> list[AxisUnit]:
         """The axis that a command names, or all."""
         units, axis = self._machine.units, command.get("axis")
         if axis is None and not required:

@@ -1,4 +1,4 @@
-"""Writes what a played file really did: one CSV row per SYNC with the true table, as no sensor could give it."""
+"""Records the true motion of a played file: one CSV row per SYNC with the true table, as no sensor could give it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The process of the simulated machine: one loop that serves the buses, the panel and the clock.
+"""Serves the simulated machine in one loop: its buses, the operator's commands and the clock.
 
 In ``realtime`` the NC's SYNC follows the host's monotonic clock, and a late host makes it slip instead of hurrying
 after. In ``lockstep`` the next SYNC goes out as soon as every RPDO that belongs into the cycle has arrived, and an idle
@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import os
 import select
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,12 @@ from fdhil.config import MachineConfig
 from fdhil.errors import FdhilError
 from fdhil.records import Trajectory
 from fdhil.sim.drive import eds
-from fdhil.sim.faults import FaultEntry
+from fdhil.sim.fault_kinds import FaultEntry
+from fdhil.sim.frame import BusFrame, Frame
 from fdhil.sim.machine import Machine
-from fdhil.sim.nc.drive_link import BusFrame
-from fdhil.sim.operator_commands import MAX_LINE, Panel, PanelError
-from fdhil.sim.wire.attach import Attachment, Selectable, attach
-from fdhil.sim.wire.hub import Frame, Handler
+from fdhil.sim.operator_commands import MAX_LINE, CommandError, OperatorCommands
+from fdhil.sim.wire.attach import attach
+from fdhil.sim.wire.attachment import Attachment, Selectable, WakePipe
 from fdhil.sim.wire.modbus_sensor import SensorServers
 
 Loader = Callable[[Path, MachineConfig], Trajectory]
@@ -89,27 +89,23 @@ class SimService:
         self.config = config
         self.machine = Machine(config)
         self._emit, self._load = emit, load
-        self._panel = Panel(self.machine, self._play, self.stop)
+        self._panel = OperatorCommands(self.machine, self._play, self.stop)
         self._panel_fd = panel_fd
         self._line = b""
         self._ending = False
-        self._started_s = time.monotonic()
         self._drive_time_s = 0.0
         self._wall_s = 0.0
         self._loads: list[tuple[Path, Future[Trajectory]]] = []
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="ThreadPoolExecutor-sim")
-        self._wake_read, self._wake_write = os.pipe()
-        os.set_blocking(self._wake_read, False)
-        os.set_blocking(self._wake_write, False)
+        self._pipe = WakePipe()
         self._left = 0
         self._pace = Pace(config.machine.sync_period_s, lockstep=config.sim.pace == "lockstep")
         self._buses: dict[str, Attachment] = {}
-        self._handlers: dict[str, Handler] = {}
         self._servers: SensorServers | None = None
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         try:
             for entry in faults:
-                self.machine.fault(entry)
+                self.machine.faults.add(entry)
             self._open()
         except BaseException:
             self.close()
@@ -120,23 +116,17 @@ class SimService:
     def _open(self) -> None:
         for name in self.machine.buses:
             self._buses[name] = attach(name, self.config.bus[name])
-            self._handlers[name] = self._handler(name)
         if self.config.sim.modbus:
             sensors = {axis: unit.sensor for axis, unit in self.machine.units.items()}
-            voltages = {axis: self.config.axis[axis].voltage for axis in sensors}
-            servers = SensorServers(sensors, {axis: (v.host, v.port) for axis, v in voltages.items()})
+            addresses = {axis: (a.voltage.host, a.voltage.port) for axis, a in self.config.axis.items()}
+            servers = SensorServers(sensors, addresses)
             servers.start()
             self._servers = servers
 
-    def _handler(self, bus: str) -> Handler:
-        machine, attachment = self.machine, self._buses[bus]
-
-        def handle(frame: Frame) -> None:
-            answers = machine.receive(bus, frame)
-            if answers:
-                attachment.send(answers)
-
-        return handle
+    def _take(self, bus: str, frame: Frame) -> None:
+        answers = self.machine.receive(bus, frame)
+        if answers:
+            self._buses[bus].send(answers)
 
     def ready_event(self) -> dict[str, Any]:
         """Return the ready event; the EDS files it names are written now."""
@@ -179,15 +169,14 @@ class SimService:
         self.machine.close()
         if self._folder is not None:
             self._folder.cleanup()
-        for fd in (self._wake_read, self._wake_write):
-            os.close(fd)
+        self._pipe.close()
 
     # -- the loop
 
     def stop(self) -> None:
         """Ask the loop to end; may be called from a signal handler or another thread."""
         self._ending = True
-        self._wake()
+        self._pipe.wake()
 
     def run(self, play: Path | None = None, trace: Path | None = None) -> None:
         """Say that it is ready and serve until stopped. ``play`` is played at once, recorded to ``trace``."""
@@ -210,7 +199,7 @@ class SimService:
     def _turn(self) -> None:
         """One turn of the loop: wait, read, let time pass, send."""
         buses = self._buses.values()
-        readers: list[int | Selectable] = [self._wake_read]
+        readers: list[int | Selectable] = [self._pipe]
         if self._panel_fd is not None:
             readers.append(self._panel_fd)
         writers: list[Selectable] = []
@@ -236,13 +225,13 @@ class SimService:
             bus.flush(now_s)
 
     def _read(self, ready: Sequence[object]) -> None:
-        if self._wake_read in ready:
-            self._drain_wake()
+        if self._pipe in ready:
+            self._pipe.clear()
             self._take_loads()
         if self._panel_fd is not None and self._panel_fd in ready:
             self._serve_panel()
         for name, bus in self._buses.items():
-            bus.pump(ready, self._handlers[name])
+            bus.pump(ready, partial(self._take, name))
 
     def _timeout_s(self) -> float:
         now_s = time.monotonic()
@@ -302,14 +291,14 @@ class SimService:
         """Obey one command of the panel; what is wrong with it becomes an event."""
         try:
             self._panel.obey(line)
-        except PanelError as error:
+        except CommandError as error:
             self._emit({"event": "error", "text": str(error)})
 
     def _play(self, file: Path) -> None:
         """Load a file aside, so that the SYNC goes on meanwhile, then play it."""
         future = self._pool.submit(self._load, file, self.config)
         self._loads.append((file, future))
-        future.add_done_callback(lambda _: self._wake())
+        future.add_done_callback(lambda _: self._pipe.wake())
 
     def _take_loads(self) -> None:
         while self._loads and self._loads[0][1].done():
@@ -318,30 +307,3 @@ class SimService:
                 self.machine.nc.play(str(file), future.result())
             except FdhilError as error:
                 self._emit({"event": "error", "text": f"{file} cannot be played: {error}"})
-
-    def _wake(self) -> None:
-        try:
-            os.write(self._wake_write, b"\0")
-        except OSError:
-            return  # the pipe is full of calls already, or the service has just closed
-
-    def _drain_wake(self) -> None:
-        try:
-            os.read(self._wake_read, 4096)
-        except BlockingIOError:
-            return
-
-
-def json_emitter(write: Callable[[str], Any] | None = None) -> Emit:
-    """Return an ``emit`` that writes each event as one line of JSON to ``write``, standard output by default."""
-    import json
-
-    def emit(event: dict[str, Any]) -> None:
-        line = json.dumps(event)
-        if write is None:
-            sys.stdout.write(line + "\n")
-            sys.stdout.flush()
-        else:
-            write(line + "\n")
-
-    return emit

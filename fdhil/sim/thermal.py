@@ -1,4 +1,4 @@
-"""Slide-way temperature: one time constant, warmed in proportion to speed ([DES] 3.2: ft and Cd fall as it rises)."""
+"""Warms a slide-way: one time constant, warmed in proportion to speed ([DES] 3.2: ft and Cd fall as it rises)."""
 
 from __future__ import annotations
 

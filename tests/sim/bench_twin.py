@@ -10,8 +10,8 @@ import numpy as np
 from fdhil import config
 from fdhil.config import MachineConfig
 from fdhil.records import Float, Trajectory, frozen
+from fdhil.sim.frame import Frame
 from fdhil.sim.machine import Machine
-from fdhil.sim.wire.hub import Frame
 from tests.bench import bench_document
 
 PERIOD_S = 0.001

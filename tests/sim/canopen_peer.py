@@ -12,7 +12,8 @@ import can
 import canopen
 
 from fdhil.sim.drive.eds import eds_text
-from fdhil.sim.drive.servo import Drive, Frame
+from fdhil.sim.drive.servo import Drive
+from fdhil.sim.frame import Frame
 
 
 class DirectBus(can.BusABC):

@@ -10,7 +10,8 @@ from contextlib import contextmanager
 
 import can
 
-from fdhil.sim.wire.hub import Frame, Hub
+from fdhil.sim.frame import Frame
+from fdhil.sim.wire.hub import Hub
 
 
 class HubThread(threading.Thread):

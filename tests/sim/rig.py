@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from fdhil import config
-from fdhil.sim.drive.servo import Drive, Frame
+from fdhil.sim.drive.servo import Drive
+from fdhil.sim.frame import Frame
 from tests.bench import bench_document
 
 NO_NOISE = {"voltage_v": 0.0, "current_a": 0.0, "speed_rad_s": 0.0}

@@ -1,4 +1,4 @@
-"""What the drive does when something goes wrong: lost heartbeats and RPDOs, trips, following error, injected faults."""
+"""The drive reacts when something goes wrong: lost heartbeats and RPDOs, trips, following error, injected faults."""
 
 from __future__ import annotations
 
@@ -131,10 +131,10 @@ def test_following_error_window_and_time_out() -> None:
 
 def test_limit_switches_show_in_bit_11() -> None:
     rig = Rig()
-    rig.drive.digital_inputs = 1 << 16 | 2
+    rig.drive.feedback.digital_inputs = 1 << 16 | 2
     rig.sync()
     assert rig.status & 1 << 11
-    assert rig.read(0x60FD) == 0x10002 == rig.drive.digital_inputs
+    assert rig.read(0x60FD) == 0x10002 == rig.drive.feedback.digital_inputs
 
 
 def test_the_offset_can_be_ignored_or_scaled() -> None:

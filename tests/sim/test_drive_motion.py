@@ -1,4 +1,4 @@
-"""What the drive does with its set-points: the exact timing, the modes, the ramps, and the bench's path error."""
+"""The drive follows its set-points: the exact timing, the modes, the ramps, and the bench's path error."""
 
 from __future__ import annotations
 

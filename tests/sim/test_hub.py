@@ -18,8 +18,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fdhil.errors import ConnectError
+from fdhil.sim.frame import EXTENDED
 from fdhil.sim.wire import hub as hub_module
-from fdhil.sim.wire.hub import EXTENDED, Hub, decode_send, encode
+from fdhil.sim.wire.hub import Hub, decode_send, encode
 from tests.sim.hub_thread import frames_of, joined, serving
 
 _DATA = st.binary(max_size=8)

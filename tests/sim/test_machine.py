@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from fdhil.errors import ConfigError
-from fdhil.sim import faults
+from fdhil.sim import fault_script
 from fdhil.sim.drive.sensors import DriveFaults
 from fdhil.sim.fault_kinds import FAULTS
 from fdhil.sim.machine import Machine
-from fdhil.sim.operator_commands import Panel, PanelError
+from fdhil.sim.operator_commands import CommandError, OperatorCommands
 from fdhil.sim.service import Pace
 from fdhil.sim.wire.modbus_sensor import SensorFaults
 from tests.guard.machine import settings
@@ -192,8 +192,8 @@ def test_slide_ways_warm_with_speed_and_friction_falls() -> None:
 # -- the panel
 
 
-def a_panel(machine: Machine) -> Panel:
-    return Panel(machine, lambda path: None, lambda: None)
+def a_panel(machine: Machine) -> OperatorCommands:
+    return OperatorCommands(machine, lambda path: None, lambda: None)
 
 
 def test_the_panel_sets_parameters_and_temperature() -> None:
@@ -235,7 +235,7 @@ def test_the_panel_sets_parameters_and_temperature() -> None:
     ],
 )
 def test_the_panel_says_what_is_wrong(line: str, complaint: str) -> None:
-    with pytest.raises(PanelError, match=complaint.replace("?", r"\?")):
+    with pytest.raises(CommandError, match=complaint.replace("?", r"\?")):
         a_panel(Machine(twin_config())).obey(line)
 
 
@@ -250,18 +250,18 @@ def test_a_fault_script_acts_at_its_time_and_ends(tmp_path: Path) -> None:
         "[[fault]]\nat_s = 0.05\nfault = 'frame'\ncan_id = 0x123\ndata = '0a0b'\nduration_s = 0.01\n"
     )
     twin = TwinInHand(twin_config())
-    for entry in faults.load(script, ("X", "Y")):
-        twin.machine.fault(entry)
+    for entry in fault_script.load(script, ("X", "Y")):
+        twin.machine.faults.add(entry)
     twin.switch_on()
     twin.play(corner())
     signal = []
-    twin.each_cycle = lambda: signal.append("position" in twin.machine.units["X"].drive_faults.signals)
+    twin.each_cycle = lambda: signal.append("position" in twin.machine.units["X"].drive.faults.signals)
     twin.run_until("error")
     assert [event["fault"] for event in twin.events if event["event"] == "fault"] == ["frame", "position_stuck", "trip"]
     assert any(can_id == 0x82 and data[:2] == b"\x10\x32" for can_id, data in twin.wire)
     assert [data for can_id, data in twin.wire if can_id == 0x123] == [b"\x0a\x0b"] * 10
     twin.run(100)
-    assert not twin.machine.units["X"].drive_faults.signals["position"].stuck
+    assert not twin.machine.units["X"].drive.faults.signals["position"].stuck
 
 
 @pytest.mark.parametrize("name", FAULTS)
@@ -272,16 +272,16 @@ def test_every_fault_ends_without_a_trace(name: str) -> None:
     item = {"axis": "X", "fault": name, "value": 2.0, "duration_s": 0.003, "can_id": 0x555, "data": "01"}
     item |= {"index": 0x6065}
     objects = dict(twin.machine.units["X"].drive.dictionary.numbers)
-    twin.machine.fault(faults.parse(item, ("X",)))
+    twin.machine.faults.add(fault_script.parse(item, ("X",)))
     twin.run(20)
-    assert twin.machine.schedule.idle
+    assert twin.machine.faults.idle
     unit = twin.machine.units["X"]
-    ended = {signal: fault for signal, fault in unit.drive_faults.signals.items() if fault.stuck or fault.gain != 1.0}
+    ended = {signal: fault for signal, fault in unit.drive.faults.signals.items() if fault.stuck or fault.gain != 1.0}
     assert not ended
-    unit.drive_faults.signals.clear()
-    assert unit.drive_faults == DriveFaults()
-    assert unit.sensor_faults == SensorFaults()
-    assert unit.drive.digital_inputs == 0
+    unit.drive.faults.signals.clear()
+    assert unit.drive.faults == DriveFaults()
+    assert unit.sensor.faults == SensorFaults()
+    assert unit.drive.feedback.digital_inputs == 0
     assert unit.sync_on
     for key in (0x606500, 0x1A0101, 0x1A0102, 0x1A0103):
         assert unit.drive.dictionary.numbers[key] == objects[key]
@@ -315,7 +315,7 @@ def test_a_wrong_fault_script_is_refused(text: str, complaint: str, tmp_path: Pa
     script = tmp_path / "faults.toml"
     script.write_text(text)
     with pytest.raises(ConfigError, match=complaint):
-        faults.load(script, ("X", "Y"))
+        fault_script.load(script, ("X", "Y"))
 
 
 @pytest.mark.parametrize(
@@ -329,14 +329,14 @@ def test_a_wrong_fault_script_is_refused(text: str, complaint: str, tmp_path: Pa
 def test_an_object_that_cannot_hold_the_value_is_refused(item: dict[str, int], complaint: str) -> None:
     machine = Machine(twin_config("X"))
     with pytest.raises(ConfigError, match=complaint):
-        machine.fault(faults.parse({"fault": "object", "axis": "X", **item}, ("X",)))
+        machine.faults.add(fault_script.parse({"fault": "object", "axis": "X", **item}, ("X",)))
 
 
 def test_all_wrong_entries_are_named_at_once(tmp_path: Path) -> None:
     script = tmp_path / "faults.toml"
     script.write_text("[[fault]]\nfault='reboot'\n[[fault]]\nfault='meteor'\n")
     with pytest.raises(ConfigError) as caught:
-        faults.load(script, ("X",))
+        fault_script.load(script, ("X",))
     assert [fault.path for fault in caught.value.faults] == ["fault[0].entry", "fault[1].fault"]
 
 

@@ -140,26 +140,26 @@ def test_latched_blocks_join_without_overlap(batches: list[int]) -> None:
 
 
 def test_what_can_be_wrong_with_a_sensor(bench: Bench) -> None:
-    faults = bench.sensor.faults
+    signal = bench.sensor.faults.signal
     bench.sensor.feed(10.0)
-    faults.stuck = True
+    signal.stuck = True
     bench.sensor.feed(20.0)
     bench.sensor.feed(30.0)
     assert bench.floats(0, 1) == [20.0]
     assert bench.number(2) == 2, "a stuck sensor goes on counting"
-    faults.stuck = False
-    faults.gain, faults.offset_v = 2.0, 1.0
+    signal.stuck = False
+    signal.gain, signal.offset = 2.0, 1.0
     bench.sensor.feed(3.0)
     assert bench.floats(0, 1) == [7.0]
-    faults.gain, faults.offset_v, faults.delay_samples = 1.0, 0.0, 2
+    signal.gain, signal.offset, signal.delay_cycles = 1.0, 0.0, 2
     for volt in (1.0, 2.0, 3.0, 4.0):
         bench.sensor.feed(volt)
     assert bench.floats(0, 1) == [2.0]
-    faults.delay_samples = 0
+    signal.delay_cycles = 0
     bench.sensor.feed(5.0)
     bench.sensor.feed(6.0)
     assert bench.floats(0, 1) == [6.0]
-    faults.exception = 4
+    bench.sensor.faults.exception = 4
     assert bench.client.read_input_registers(0, count=2).exception_code == 4
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.sim.nc.path import NEGLIGIBLE_MM, Player, Rate, rapid_rows
+from fdhil.sim.nc.path import NEGLIGIBLE_MM, PathRate, RowPlayer, rapid_rows
 from tests.sim.bench_twin import PERIOD_S, TwinInHand, corner, smooth, targets, twin_config
 
 PER_MM = 65536 / 20
@@ -88,7 +88,7 @@ def test_a_rapid_brings_the_axes_to_the_start_within_their_limits() -> None:
     twin.switch_on()
     twin.play(corner() + np.array([300.0, 100.0]))
     inputs = []
-    twin.each_cycle = lambda: inputs.append(twin.machine.units["X"].drive.digital_inputs >> 16 & 1)
+    twin.each_cycle = lambda: inputs.append(twin.machine.units["X"].drive.feedback.digital_inputs >> 16 & 1)
     twin.run_until("playing")
     x = np.array([target for _, target in targets(twin.wire, 1)]) / PER_MM
     speed = np.diff(x) / PERIOD_S
@@ -107,9 +107,9 @@ def test_rows_that_are_rapid_raise_the_input() -> None:
     twin.switch_on()
     twin.play(corner(), rapid=True)
     twin.run_until("playing")
-    assert twin.machine.units["Y"].drive.digital_inputs >> 16 & 1 == 1
+    assert twin.machine.units["Y"].drive.feedback.digital_inputs >> 16 & 1 == 1
     twin.run_until("finished")
-    assert twin.machine.units["Y"].drive.digital_inputs == 0
+    assert twin.machine.units["Y"].drive.feedback.digital_inputs == 0
 
 
 def test_feed_hold_brakes_along_the_path_and_goes_on() -> None:
@@ -250,7 +250,7 @@ def test_rapids_keep_their_limits(start: list[float], end: list[float]) -> None:
 @settings(max_examples=50)
 @given(st.lists(st.tuples(st.sampled_from([0.0, 0.25, 0.5, 1.0, 1.2]), st.integers(1, 400)), min_size=1, max_size=6))
 def test_the_rate_is_slope_limited_and_arrives(orders: list[tuple[float, int]]) -> None:
-    rate = Rate(8.0, PERIOD_S)
+    rate = PathRate(8.0, PERIOD_S)
     before = rate.value
     for target, cycles in orders:
         for _ in range(cycles):
@@ -266,7 +266,7 @@ def test_the_rate_is_slope_limited_and_arrives(orders: list[tuple[float, int]]) 
 @given(st.floats(0.05, 1.5))
 def test_a_player_ends_exactly_on_the_last_row(rate: float) -> None:
     rows = smooth(np.linspace([0.0, 0.0], [1.0, 2.0], 20), (5,))
-    player = Player(rows, np.zeros(len(rows), dtype=bool))
+    player = RowPlayer(rows, np.zeros(len(rows), dtype=bool))
     places = []
     while not player.ended:
         places.append(player.step(rate)[0])

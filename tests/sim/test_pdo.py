@@ -62,8 +62,8 @@ def test_a_synchronous_rpdo_waits_for_the_sync_and_the_newest_counts() -> None:
     assert rig.read(0x60B0) == 0
     rig.sync()
     assert rig.read(0x60B0) == 6
-    assert rig.drive.rpdos_heard == set()
-    assert rig.drive.rpdos_heard_before == {2}
+    assert rig.drive.pdo.heard == set()
+    assert rig.drive.pdo.heard_before == {2}
 
 
 def test_an_event_driven_rpdo_acts_at_once() -> None:
@@ -144,7 +144,7 @@ def test_acyclic_and_event_driven_tpdos() -> None:
     rig.drive.wall_clock(1.0)
     assert ids(rig.sync()) == [0x181]  # first values; the two event-driven ones went out with the clock
     assert ids(rig.sync()) == []
-    rig.drive.digital_inputs = 1 << 16
+    rig.drive.feedback.digital_inputs = 1 << 16
     assert ids(rig.sync()) == [0x181, 0x281]
     assert ids(rig.drive.wall_clock(1.049)) == []
     assert 0x381 in ids(rig.drive.wall_clock(1.051))
@@ -185,21 +185,6 @@ def test_rpdo_values_out_of_range_are_not_taken() -> None:
     rig.send(0x501, bytes([8]))
     rig.send(0x501, bytes([9]))
     assert rig.read(0x6060) == 8 == rig.read(0x6061)
-
-
-def test_late_rpdos_are_counted() -> None:
-    rig = Rig()
-    rig.enable()
-    for _ in range(5):
-        rig.cycle(0, 0)
-    assert rig.drive.late_rpdos[2] == 0
-    rig.cycle(0)  # without its RPDO2
-    assert rig.drive.late_rpdos[2] == 1
-    rig.cycle(0)  # the sender has stopped: not late any more
-    assert rig.drive.late_rpdos[2] == 1
-    rig.cycle(0, 0)
-    rig.sync()
-    assert rig.drive.late_rpdos == {1: 1, 2: 2, 3: 0, 4: 0}
 
 
 def test_dropped_tpdos_and_a_mapping_changed_behind_our_back() -> None:

@@ -11,8 +11,7 @@ from scipy.linalg import expm
 
 from fdhil.records import Float, Parameters
 from fdhil.sim.drive import physics
-from fdhil.sim.drive.physics import Physics, discretise
-from fdhil.sim.drive.setpoints import Command
+from fdhil.sim.drive.physics import Command, Physics, discretise
 from tests.bench import bench_config
 
 AXIS = bench_config("X").axis["X"]
@@ -189,16 +188,6 @@ def test_offsets_of_speed_and_current_enter_the_loops() -> None:
     with_current.cycle(True, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 5.0, 5.0))
     assert with_current.current_a == pytest.approx(5.0, rel=0.15)  # 400 Hz of bandwidth, after 1 ms
     assert with_current.speed_rad_s == 0.0  # 4 N.m do not break the dry friction
-
-
-def test_friction_work_is_the_energy_that_is_lost() -> None:
-    twin = Physics(PLANT, AXIS.regulators, 1e-3, INC)
-    angle = work = 0.0
-    for points in points_of(np.linspace(0.0, 29.9, 300)):
-        twin.cycle(True, command(points))
-        work += (PLANT.Cd + PLANT.ft * twin.speed_rad_s) * (twin.angle_rad - angle)
-        angle = twin.angle_rad
-    assert twin.friction_work_j == pytest.approx(work, rel=2e-3)
 
 
 def test_the_kernel_runs_bit_by_bit_the_same_in_plain_python(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -82,7 +82,7 @@ RIG = Rig()
 @given(st.integers(0, 1400), st.integers(1, 127), st.booleans())
 def test_block_upload_by_the_library(cycles: int, block_size: int, crc: bool) -> None:
     rig = Rig()
-    trace = rig.drive._trace
+    trace = rig.drive.feedback.trace
     for n in range(cycles):
         trace.append(n, -n, n, 3 * n, n % 100, -n % 100)
     node, _ = direct(rig.drive)
@@ -192,14 +192,6 @@ def test_reads_that_are_refused() -> None:
     assert abort.value.code == 0x08000024
 
 
-def test_an_injected_refusal_is_answered() -> None:
-    rig = Rig()
-    rig.drive.dictionary.refused[0x607A00] = 0x06090030
-    with pytest.raises(Abort) as abort:
-        rig.write(0x607A, 0, 1, 4)
-    assert abort.value.code == 0x06090030
-
-
 def test_protocol_errors_end_the_transfer() -> None:
     content = b"a segmented string"
     sdo = domain(content)
@@ -243,7 +235,7 @@ def test_segmented_download_is_checked() -> None:
 
 
 def test_a_size_that_is_not_told_is_the_object_s() -> None:
-    sdo = server(record(0x2000, "Pair", (Entry(0x2000, 1, "A", DataType.INTEGER16, "rw"),)))
+    sdo = server(record(0x2000, "Pair", Entry(0x2000, 1, "A", DataType.INTEGER16, "rw")))
     sdo.request(head(0x22, 0x2000, 1) + b"\xfe\xff\x55\x55")
     assert sdo.request(head(0x40, 0x2000, 1) + bytes(4))[0] == head(0x4B, 0x2000, 1) + b"\xfe\xff\0\0"
 

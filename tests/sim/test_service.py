@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 
 from fdhil import config
-from fdhil.cli.sim import _lines
+from fdhil.cli.sim import _lines, _tell_json
 from fdhil.config import MachineConfig
 from fdhil.errors import ProgramError
 from fdhil.records import Trajectory
-from fdhil.sim.service import SimService, json_emitter
+from fdhil.sim.service import SimService
 from tests.bench import bench_document
 from tests.sim.bench_twin import corner, trajectory
 from tests.sim.hub_thread import frames_of
@@ -123,11 +123,9 @@ def test_without_such_a_place_it_lies_in_a_temporary_folder_that_goes(tmp_path: 
     assert not (tmp_path / "nowhere").exists()
 
 
-def test_events_are_one_line_of_json_each() -> None:
-    lines: list[str] = []
-    emit = json_emitter(lines.append)
-    emit({"event": "error", "text": "two\nlines"})
-    assert lines == ['{"event": "error", "text": "two\\nlines"}\n']
+def test_events_are_one_line_of_json_each(capsys: pytest.CaptureFixture[str]) -> None:
+    _tell_json({"event": "error", "text": "two\nlines"})
+    assert capsys.readouterr().out == '{"event": "error", "text": "two\\nlines"}\n'
 
 
 @pytest.mark.parametrize(

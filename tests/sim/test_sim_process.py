@@ -19,7 +19,7 @@ from pymodbus.client import ModbusTcpClient
 from fdhil import config
 from fdhil.cli.main import cli, run_safely
 from fdhil.program import load_trajectory
-from fdhil.sim import faults
+from fdhil.sim import fault_script
 from fdhil.sim.service import SimService
 from tests.sim.bench_twin import corner
 from tests.sim.hub_thread import frames_of
@@ -163,7 +163,7 @@ def _play_here(path: Path, demand: Path, trace: Path, script: Path) -> None:
         if event["event"] == "finished":
             service.stop()
 
-    service = SimService(config.load(path), emit, load_trajectory, faults=faults.load(script, ("X", "Y")))
+    service = SimService(config.load(path), emit, load_trajectory, faults=fault_script.load(script, ("X", "Y")))
     service.run(demand, trace)
 
 

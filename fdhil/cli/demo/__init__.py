@@ -46,6 +46,7 @@ def demo(out: Path, realtime: bool, as_json: bool) -> int:
 
 
 def _document(loop: Loop, report: Path) -> dict[str, Any]:
+    from fdhil.cli.demo.report import rms
     from fdhil.records import PARAMETERS, UNITS
 
     identified = {
@@ -65,7 +66,7 @@ def _document(loop: Loop, report: Path) -> dict[str, Any]:
     return {
         "schema": "fdhil-demo-1",
         "identified": identified,
-        "predicted": {"rms_um": float((contour**2).mean() ** 0.5), "max_um": float(contour.max())},
+        "predicted": {"rms_um": rms(contour), "max_um": float(contour.max())},
         "before": {"rms_um": before.rms_um, "max_um": before.max_um},
         "mirror": {"rms_um": mirror.rms_um, "max_um": mirror.max_um, "late_offsets": mirror.late_offsets},
         "after": {"rms_um": after.rms_um, "max_um": after.max_um, "late_offsets": after.late_offsets},

@@ -1,4 +1,4 @@
-"""The demonstration's loop: commission, shuttle, identify, predict, cut, arm, cut corrected, warm, cut again."""
+"""Runs the demonstration's loop: commission, shuttle, identify, predict, cut, arm, cut corrected, warm, cut again."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from fdhil import config as machine_config
 from fdhil.cli.demo.processes import PATIENCE_S, Process, Twin
-from fdhil.cli.demo.report import Cut, Loop, Published
+from fdhil.cli.demo.report import Cut, Loop, Published, rms
 from fdhil.cli.demo.toml import to_toml
 from fdhil.commissioning.record import save_record
 from fdhil.commissioning.steps import commission
@@ -24,7 +24,8 @@ from fdhil.daemon.control import SOCKET_NAME, ask
 from fdhil.errors import DeviceTimeout, FdhilError, RecordingError
 from fdhil.prediction import contour_error_um, predict
 from fdhil.program import load_trajectory
-from fdhil.records import PARAMETERS, Parameters, Trajectory, Window
+from fdhil.records import PARAMETERS, Window
+from fdhil.sim.drive.physics import true_parameters
 from fdhil.store.history import History
 from fdhil.store.windows import read_window
 
@@ -42,7 +43,7 @@ WARM_C = (20.5, 21.0, 21.5, 22.0)
 
 @dataclass
 class Stage:
-    """The demonstration's processes: the twin with its panel, and the daemon's socket."""
+    """The means to drive the demonstration: the twin with its panel, and the daemon's socket."""
 
     out: Path
     config: MachineConfig
@@ -52,11 +53,16 @@ class Stage:
     others: list[Process] = field(default_factory=list)
     cuts: list[Cut] = field(default_factory=list)
 
+    @property
+    def run(self) -> Path:
+        """The folder of the machine's run-time files."""
+        folder = self.config.store.run_directory
+        assert folder is not None
+        return folder
+
     def ask(self, request: str, **fields: Any) -> dict[str, Any]:
         """Ask the daemon; FdhilError with the daemon's own words when it refuses."""
-        run = self.config.store.run_directory
-        assert run is not None
-        answer = ask(run / SOCKET_NAME, {"request": request, **fields}, timeout_s=PATIENCE_S)
+        answer = ask(self.run / SOCKET_NAME, {"request": request, **fields}, timeout_s=PATIENCE_S)
         if not answer.get("ok"):
             raise FdhilError(f"the daemon refuses to {request}: {answer.get('code')}: {answer.get('text')}")
         return answer
@@ -73,7 +79,8 @@ def run_loop(out: Path, realtime: bool, say: Say) -> Loop:
         stage = _start_twin(out, realtime, say, stack)
         _commission(stage)
         for name, module in (("guard", ["fdhil.cli.guard"]), ("daemon", ["fdhil", "run"])):
-            stage.others.append(stack.enter_context(_daemon(name, [*module, str(out / "machine.toml")], out)))
+            process = Process(name, [*module, str(out / "machine.toml")], out / f"{name}.log")
+            stage.others.append(stack.enter_context(process))
         _await(lambda: _alive(stage), "the daemon did not get ready", stage)
         stage.twin.command("nc", on=True)
         stage.twin.event("nc")
@@ -87,20 +94,13 @@ def _start_twin(out: Path, realtime: bool, say: Say, stack: ExitStack) -> Stage:
     document["sim"]["pace"] = "realtime" if realtime else "lockstep"
     (out / "twin.toml").write_text(to_toml(document), "utf-8")
     twin = stack.enter_context(Twin(out / "twin.toml", out / "twin.log"))
-    bus = twin.ready["buses"]["can0"]
-    document["bus"] = {
-        "can0": {"interface": "socketcand", "channel": bus["channel"], "host": bus["host"], "port": bus["port"]}
-    }
+    document["bus"] = twin.ready["buses"]
     for axis, sensor in twin.ready["modbus"].items():  # the twin's voltage sensors tell the slide-way's temperature too
         document["axis"][axis]["temperature"] = {**sensor, "period_s": 0.2}
     (out / "machine.toml").write_text(to_toml(document), "utf-8")
     folder = source.parent
     programs = {label: folder / name for label, name in PROGRAMS.items()}
     return Stage(out, machine_config.load(out / "machine.toml"), twin, say, programs)
-
-
-def _daemon(name: str, arguments: list[str], out: Path) -> Process:
-    return Process(name, arguments, out / f"{name}.log")
 
 
 def _alive(stage: Stage) -> bool:
@@ -138,7 +138,7 @@ def _measure(stage: Stage) -> Loop:
     cold = _shuttle(stage, published)
     models = {axis: found[0].parameters for axis, found in published.items()}
     predicted = predict(programs["10 m/min"], models, config)
-    stage.say(f"predicted contour error of the path: {float((predicted.contour_um**2).mean() ** 0.5):.1f} um RMS")
+    stage.say(f"predicted contour error of the path: {rms(predicted.contour_um):.1f} um RMS")
     _cut(stage, "uncorrected", 20.0)
     _cut(stage, "mirror", 20.0, "mirror")
     _cut(stage, "inverse", 20.0, "inverse")
@@ -151,7 +151,7 @@ def _measure(stage: Stage) -> Loop:
     counters = stage.ask("status")["frames"]
     return Loop(
         config=config,
-        truth=_truth(config),
+        truth={a: true_parameters(settings.nominal, config.sim.axis[a]) for a, settings in config.axis.items()},
         published=published,
         cold=cold,
         warm={axis: window for axis, (window, _) in warm.items()},
@@ -160,15 +160,6 @@ def _measure(stage: Stage) -> Loop:
         cuts=stage.cuts,
         frames=(int(counters["received"]), int(counters["lost"])),
     )
-
-
-def _truth(config: MachineConfig) -> dict[str, Parameters]:
-    truth = {}
-    for axis, settings in config.axis.items():
-        real = config.sim.axis[axis].model_dump()
-        nominal = settings.nominal.model_dump()
-        truth[axis] = Parameters(**{name: real[name] or nominal[name] for name in PARAMETERS})
-    return truth
 
 
 def _shuttle(stage: Stage, published: dict[str, list[Published]]) -> dict[str, tuple[Window, float | None]]:
@@ -212,19 +203,13 @@ def _cut(stage: Stage, label: str, celsius: float, method: str | None = None) ->
 def _corrected(stage: Stage, program: Path, trace: Path, method: str) -> dict[str, Any]:
     """Arm and cut; FdhilError when the correction ended for anything but the end of the path."""
     stage.say(f"arming by {method}: predicted to help, inside the limits, drives commissioned")
-    stage.ask("arm", program=str(program), method=method, token=_token(stage))
+    stage.ask("arm", program=str(program), method=method, token=(stage.run / "token").read_text("utf-8").strip())
     finished = stage.twin.play(program, trace)
     _await(lambda: stage.ask("status")["state"] == "OFF", "the guard did not come to rest", stage)
     cause = stage.ask("status")["guard"]["cause"]
     if cause["code"] != "Finished":
         raise FdhilError(f"the guard ended the correction: {cause['code']}: {cause['text']}; {cause['advice']}")
     return finished
-
-
-def _token(stage: Stage) -> str:
-    run = stage.config.store.run_directory
-    assert run is not None
-    return (run / "token").read_text("utf-8").strip()
 
 
 def read_trace(path: Path, axes: Sequence[str]) -> tuple[Any, Any]:
@@ -234,6 +219,3 @@ def read_trace(path: Path, axes: Sequence[str]) -> tuple[Any, Any]:
         raise RecordingError(f"the trace {path} is empty")
     pick = [np.column_stack([rows[f"{axis}_{what}_mm"] for axis in axes]) for what in ("reference", "table")]
     return pick[0], pick[1]
-
-
-__all__ = ["Trajectory", "read_trace", "run_loop"]

@@ -1,4 +1,4 @@
-"""The demonstration's report: the paper's figures for the machine that was just identified."""
+"""Reports the demonstration: the paper's figures for the machine that was just identified."""
 
 from __future__ import annotations
 
@@ -39,6 +39,11 @@ DRIFTS: Sequence[tuple[str, Mapping[str, float]]] = (
 )
 
 
+def rms(values: Float) -> float:
+    """Return the root of the mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
 @dataclass(frozen=True, slots=True)
 class Cut:
     """One pass over the path as the twin measured it at its own table."""
@@ -53,7 +58,7 @@ class Cut:
     @property
     def rms_um(self) -> float:
         """RMS contour error."""
-        return float(np.sqrt(np.mean(self.contour_um**2)))
+        return rms(self.contour_um)
 
     @property
     def max_um(self) -> float:
@@ -93,23 +98,13 @@ def page(loop: Loop) -> Page:
         subtitle="A simulated two-axis machine, identified while it moved, predicted, and corrected over its own bus.",
         headline=[
             ("contour error measured before, RMS", f"{before.rms_um:.1f} um"),
-            ("predicted before it was cut", f"{_rms(loop.predicted.contour_um):.1f} um"),
+            ("predicted before it was cut", f"{rms(loop.predicted.contour_um):.1f} um"),
             ("measured with the paper's mirror", f"{mirror.rms_um:.2f} um"),
             ("measured with the inverse, RMS", f"{after.rms_um:.2f} um"),
             ("smaller by, as measured", f"{before.rms_um / after.rms_um:.0f} x"),
         ],
-        sections=[
-            _identified(loop),
-            _drifted(loop),
-            _path(loop),
-            _predicted(loop),
-            _corrected(loop),
-        ],
+        sections=[_identified(loop), _drifted(loop), _path(loop), _predicted(loop), _corrected(loop)],
     )
-
-
-def _rms(values: Float) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def parameter_rows(loop: Loop) -> list[list[str]]:
@@ -120,18 +115,14 @@ def parameter_rows(loop: Loop) -> list[list[str]]:
         for name in PARAMETERS:
             true, value, std = getattr(truth, name), getattr(found.parameters, name), found.std[name]
             unit, factor = DISPLAY[name]
-            found_text = cell(name, value, INTERVAL_95 * std, " ")
-            rows.append([axis, name, f"{true * factor:.5g} {unit}", found_text, _percent(value, true)])
+            found_text, deviation = cell(name, value, INTERVAL_95 * std, " "), f"{100 * (value / true - 1):+.2f} %"
+            rows.append([axis, name, f"{true * factor:.5g} {unit}", found_text, deviation])
     return rows
-
-
-def _percent(value: float, true: float) -> str:
-    return f"{100 * (value / true - 1):+.2f} %"
 
 
 def cut_rows(loop: Loop) -> list[list[str]]:
     """Return the table of contour errors: predicted, then each cut as measured at the table."""
-    rows = [["predicted", "", f"{_rms(loop.predicted.contour_um):.2f}", f"{loop.predicted.contour_um.max():.1f}", ""]]
+    rows = [["predicted", "", f"{rms(loop.predicted.contour_um):.2f}", f"{loop.predicted.contour_um.max():.1f}", ""]]
     rows += [
         [cut.label, f"{cut.temperature_c:.1f}", f"{cut.rms_um:.2f}", f"{cut.max_um:.1f}", str(cut.late_offsets)]
         for cut in loop.cuts

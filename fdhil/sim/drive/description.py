@@ -1,4 +1,4 @@
-"""What the simulated machine tells others about a drive: its live PDO mapping and the bus load it causes."""
+"""Describes a drive to others: its live PDO mapping and the bus load it causes."""
 
 from __future__ import annotations
 

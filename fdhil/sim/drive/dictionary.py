@@ -1,10 +1,11 @@
-"""The object dictionary of a CANopen device: typed entries, access rules, values (CiA 301, 7.4)."""
+"""Holds the object dictionary of a CANopen device: typed entries, access rules, values (CiA 301, 7.4)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 from fdhil.errors import FdhilError
 
@@ -15,7 +16,6 @@ class AbortCode(IntEnum):
     TOGGLE = 0x05030000
     COMMAND = 0x05040001
     BLOCK_SIZE = 0x05040002
-    CRC = 0x05040004
     READ_WRITE_ONLY = 0x06010001
     WRITE_READ_ONLY = 0x06010002
     NO_OBJECT = 0x06020000
@@ -62,7 +62,7 @@ Value = int | bytes
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One sub-index. ``access`` is ro, wo, rw, rww, rwr or const; ``node_relative``: $NODEID in the EDS."""
+    """One sub-index. ``access`` is ro, wo, rw, rww or const; ``node_relative``: $NODEID in the EDS."""
 
     index: int
     sub: int
@@ -127,28 +127,13 @@ class Object:
 VAR, DOMAIN_OBJECT, ARRAY, RECORD = 7, 2, 8, 9
 
 
-def var(
-    index: int,
-    name: str,
-    type: DataType,
-    access: str,
-    default: Value = 0,
-    *,
-    mappable: bool = False,
-    low: int | None = None,
-    high: int | None = None,
-    node_relative: bool = False,
-) -> Object:
-    """Return an object with one entry."""
+def var(index: int, name: str, type: DataType, access: str, default: Value = 0, **more: Any) -> Object:
+    """Return an object with one entry; ``more`` are further attributes of the entry."""
     kind = DOMAIN_OBJECT if type is DataType.DOMAIN else VAR
-    return Object(
-        index, name, kind, (Entry(index, 0, name, type, access, default, mappable, low, high, node_relative),)
-    )
+    return Object(index, name, kind, (Entry(index, 0, name, type, access, default, **more),))
 
 
-def record(
-    index: int, name: str, entries: tuple[Entry, ...], *, kind: int = RECORD, count: Entry | None = None
-) -> Object:
+def record(index: int, name: str, *entries: Entry, kind: int = RECORD, count: Entry | None = None) -> Object:
     """Return an object with sub-indices; its sub-index 0 is ``count`` or a constant, the highest sub-index."""
     if count is None:
         count = Entry(index, 0, "Highest sub-index supported", U8, "const", max(entry.sub for entry in entries))
@@ -159,8 +144,7 @@ class Dictionary:
     """Entries and their values, keyed ``index << 8 | sub``: ``numbers`` and ``texts`` (strings and domains).
 
     ``check`` and ``written`` are called before and after an SDO write of the keys they are registered for; ``check``
-    refuses by raising TransferAbort. ``read_hooks`` give what is computed when it is asked for. ``refused`` maps keys
-    to the abort code that a download gets, a fault to inject.
+    refuses by raising TransferAbort. ``read_hooks`` give what is computed when it is asked for.
     """
 
     def __init__(self, objects: tuple[Object, ...]) -> None:
@@ -172,7 +156,6 @@ class Dictionary:
         self.check: dict[int, Callable[[Entry, int], None]] = {}
         self.written: dict[int, Callable[[int], None]] = {}
         self.read_hooks: dict[int, Callable[[], Value]] = {}
-        self.refused: dict[int, int] = {}
         self.reset(lambda _: True)
 
     def reset(self, which: Callable[[Entry], bool]) -> None:
@@ -213,8 +196,6 @@ class Dictionary:
         entry = self.entry(index, sub)
         if entry.access in ("ro", "const"):
             raise TransferAbort(AbortCode.WRITE_READ_ONLY)
-        if entry.key in self.refused:
-            raise TransferAbort(self.refused[entry.key])
         return entry
 
     def write(self, index: int, sub: int, data: bytes) -> None:

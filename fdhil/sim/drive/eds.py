@@ -1,11 +1,11 @@
-"""The electronic data sheet of the drive as EDS 4.0 text (CiA 306)."""
+"""Writes the electronic data sheet of the drive as EDS 4.0 text (CiA 306)."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fdhil.sim.drive.dictionary import DOMAIN_OBJECT, VAR, Dictionary, Entry, Object
+from fdhil.sim.drive.dictionary import DOMAIN_OBJECT, VAR, Entry, Object
 from fdhil.sim.drive.objects import DEVICE_NAME, PDOS, PRODUCT_CODE, REVISION, VENDOR_ID
 
 if TYPE_CHECKING:
@@ -68,7 +68,20 @@ Line1=Position objects in increments, speeds in increments/s
 
 def eds_text(drive: Drive) -> str:
     """Return the drive's EDS; its defaults are the power-on values, COB-IDs relative to $NODEID."""
-    return _text(drive.dictionary, drive.node_id, f"fdhil_twin_{drive.axis}.eds")
+    groups: dict[str, list[Object]] = {"MandatoryObjects": [], "OptionalObjects": [], "ManufacturerObjects": []}
+    for item in drive.dictionary:
+        if item.index in _MANDATORY:
+            groups["MandatoryObjects"].append(item)
+        elif 0x2000 <= item.index < 0x6000:
+            groups["ManufacturerObjects"].append(item)
+        else:
+            groups["OptionalObjects"].append(item)
+    parts = [_HEAD.format(file=f"fdhil_twin_{drive.axis}.eds")]
+    for name, items in groups.items():
+        numbered = "".join(f"{n}=0x{item.index:04X}\n" for n, item in enumerate(items, 1))
+        parts.append(f"[{name}]\nSupportedObjects={len(items)}\n{numbered}")
+        parts += [_object(item, drive.node_id) for item in items]
+    return "\n".join(parts)
 
 
 def write_eds(drive: Drive, path: Path) -> Path:
@@ -76,23 +89,6 @@ def write_eds(drive: Drive, path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(eds_text(drive), encoding="ascii")
     return path
-
-
-def _text(dictionary: Dictionary, node_id: int, file: str) -> str:
-    groups = {"MandatoryObjects": [], "OptionalObjects": [], "ManufacturerObjects": []}  # type: dict[str, list[Object]]
-    for item in dictionary:
-        if item.index in _MANDATORY:
-            groups["MandatoryObjects"].append(item)
-        elif 0x2000 <= item.index < 0x6000:
-            groups["ManufacturerObjects"].append(item)
-        else:
-            groups["OptionalObjects"].append(item)
-    parts = [_HEAD.format(file=file)]
-    for name, items in groups.items():
-        numbered = "".join(f"{n}=0x{item.index:04X}\n" for n, item in enumerate(items, 1))
-        parts.append(f"[{name}]\nSupportedObjects={len(items)}\n{numbered}")
-        parts += [_object(item, node_id) for item in items]
-    return "\n".join(parts)
 
 
 def _object(item: Object, node_id: int) -> str:

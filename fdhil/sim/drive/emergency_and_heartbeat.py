@@ -1,4 +1,4 @@
-"""Error handling of a CANopen device: emergency messages, error history, heartbeats both ways."""
+"""Handles the errors of a CANopen device: emergency messages, error history, heartbeats both ways."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ from collections.abc import Callable
 
 from fdhil.sim.drive.dictionary import AbortCode, Dictionary, Entry, TransferAbort
 from fdhil.sim.drive.objects import ERROR_HISTORY, HEARTBEAT_CONSUMERS, INVALID
-
-Frame = tuple[int, bytes]
+from fdhil.sim.frame import Frame
 
 # error codes (CiA 301 table 26, CiA 402-2)
 NO_ERROR = 0x0000

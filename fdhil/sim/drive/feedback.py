@@ -1,4 +1,4 @@
-"""The objects that a SYNC samples: positions, speeds, current, voltage, statusword (CiA 402-2)."""
+"""Samples the objects of a drive at a SYNC: positions, speeds, current, voltage, statusword (CiA 402-2)."""
 
 from __future__ import annotations
 
@@ -15,26 +15,22 @@ from fdhil.sim.drive.trace import TraceBuffer
 
 _VOLTAGE_ENABLED, _REMOTE, _LIMIT, _FOLLOWING_ERROR = 1 << 4, 1 << 9, 1 << 11, 1 << 13
 _LIMIT_SWITCHES = 0b11
+INT16, INT32 = 0x7FFF, 0x7FFFFFFF
 
 
-def clip16(value: float) -> int:
-    """Round to INTEGER16; beyond its range the end value."""
+def clip(value: float, highest: int) -> int:
+    """Round to a signed integer with this highest value; beyond its range the end value."""
     whole = round(value)
-    if -0x8000 <= whole <= 0x7FFF:
+    if -highest - 1 <= whole <= highest:
         return whole
-    return 0x7FFF if whole > 0 else -0x8000
-
-
-def clip32(value: float) -> int:
-    """Round to INTEGER32; beyond its range the end value."""
-    whole = round(value)
-    if -0x80000000 <= whole <= 0x7FFFFFFF:
-        return whole
-    return 0x7FFFFFFF if whole > 0 else -0x80000000
+    return highest if whole > 0 else -highest - 1
 
 
 class Feedback:
-    """Samples a drive's objects. ``following_error`` is shown in bit 13, ``digital_inputs`` in 0x60FD."""
+    """Samples a drive's objects and keeps them in ``trace``. ``following_error`` is bit 13 of the statusword.
+
+    ``digital_inputs`` is 0x60FD: bits 0 and 1 limit switches, 2 home, 16 the NC's rapid signal.
+    """
 
     def __init__(
         self,
@@ -45,14 +41,13 @@ class Feedback:
         power: PowerStage,
         motion: Motion,
         sensors: Sensors,
-        trace: TraceBuffer,
     ) -> None:
         self._numbers = dictionary.numbers
         self._physics = physics
         self._power = power
         self._motion = motion
         self._sensors = sensors
-        self._trace = trace
+        self.trace = TraceBuffer()
         self._inc_per_rad = ratings.increments_per_rev / (2 * math.pi)
         self._counts_per_a = 1e3 / ratings.rated_current_a
         self._kv, self._kff = regulators.position_gain_per_s, regulators.speed_feedforward
@@ -71,21 +66,21 @@ class Feedback:
         position, speed, current, voltage = self._sensors.read(
             true_position, physics.speed_rad_s, physics.current_a, physics.voltage_mean_v
         )
-        demand = clip32(self._motion.demand)
-        shown = clip32(position)
-        speed_counts = clip32(speed * self._inc_per_rad)
-        current_counts = clip16(current * self._counts_per_a)
-        voltage_counts = clip16(voltage / VOLTAGE_V_PER_COUNT)
+        demand = clip(self._motion.demand, INT32)
+        shown = clip(position, INT32)
+        speed_counts = clip(speed * self._inc_per_rad, INT32)
+        current_counts = clip(current * self._counts_per_a, INT16)
+        voltage_counts = clip(voltage / VOLTAGE_V_PER_COUNT, INT16)
         numbers[0x606200] = numbers[0x60FC00] = demand
-        numbers[0x606300] = clip32(physics.angle_rad * self._inc_per_rad)
+        numbers[0x606300] = clip(physics.angle_rad * self._inc_per_rad, INT32)
         numbers[0x606400] = shown
         numbers[0x606B00] = self._speed_demand(true_position)
         numbers[0x606C00] = speed_counts
         numbers[0x607700] = numbers[0x607800] = current_counts
         numbers[0x210100] = voltage_counts
-        numbers[0x60F400] = clip32(demand - true_position)
+        numbers[0x60F400] = clip(demand - true_position, INT32)
         numbers[0x60FD00] = self.digital_inputs
-        self._trace.append(tick, demand, shown, speed_counts, current_counts, voltage_counts)
+        self.trace.append(tick, demand, shown, speed_counts, current_counts, voltage_counts)
         return demand - true_position
 
     def _speed_demand(self, position: int) -> int:
@@ -93,7 +88,7 @@ class Feedback:
         if self._motion.source is Source.OFF:
             return 0
         p0, _, f0, _, v0, _, _, _ = self._motion.command
-        return clip32(self._kv * (p0 - position) + self._kff * f0 + v0 * self._inc_per_rad)
+        return clip(self._kv * (p0 - position) + self._kff * f0 + v0 * self._inc_per_rad, INT32)
 
     def show_state(self) -> None:
         """Bring statusword and mode display up to date."""

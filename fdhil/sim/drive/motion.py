@@ -1,4 +1,4 @@
-"""Which set-point the loops follow: the modes of operation, the ramps of the power state machine, and the halt bit."""
+"""Chooses the set-point that the loops follow: modes of operation, ramps of the power state machine, the halt bit."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from operator import itemgetter
 
 from fdhil.sim.drive.dictionary import Dictionary
 from fdhil.sim.drive.objects import CYCLIC_POSITION, PROFILE_POSITION, Ratings
+from fdhil.sim.drive.physics import Command
 from fdhil.sim.drive.power import PowerStage, Ramp
 from fdhil.sim.drive.sensors import DriveFaults
-from fdhil.sim.drive.setpoints import Command, CyclicSetpoints, Profile, Target
+from fdhil.sim.drive.setpoints import CyclicSetpoints, Profile, Target
 
 _REST: Command = (0.0,) * 8
 _NEW_SETPOINT, _AT_ONCE, _RELATIVE, _HALT = 0x10, 0x20, 0x40, 0x100
@@ -70,18 +71,16 @@ class Motion:
     @property
     def status_bits(self) -> int:
         """Bits 10 and 12 of the statusword: in profile position target reached and acknowledge, in CSP following."""
+        halted = self.source is Source.STOP and self._profile.at_rest
         if self.mode == CYCLIC_POSITION:
-            halted = self.source is Source.STOP and self._profile.at_rest and self._power.follows
-            return _MODE_SPECIFIC if self.source is Source.CYCLIC else _TARGET_REACHED if halted else 0
+            if self.source is Source.CYCLIC:
+                return _MODE_SPECIFIC
+            return _TARGET_REACHED if halted and self._power.follows else 0
         if self.mode == PROFILE_POSITION:
             bits = _MODE_SPECIFIC if self._acknowledged else 0
             reached = self._pending is None and self._profile.at_rest and self._target in (None, self._profile.now)
-            return bits | (_TARGET_REACHED if reached or self._halted_at_rest else 0)
+            return bits | (_TARGET_REACHED if reached or halted else 0)
         return 0
-
-    @property
-    def _halted_at_rest(self) -> bool:
-        return self.source is Source.STOP and self._profile.at_rest
 
     def control(self, word: int) -> None:
         """Evaluate the mode bits of a controlword: the handshake of profile position (CiA 402-2, 10.3)."""
@@ -109,7 +108,7 @@ class Motion:
 
     @property
     def _base(self) -> float:
-        """What a relative target is relative to: the target before it, else where the axis stands."""
+        """The place from which a relative target counts: the target before it, else where the axis stands."""
         if self._target is not None:
             return self._target
         return self._profile.now if self.source in (Source.PROFILE, Source.STOP) else self._position
@@ -159,8 +158,7 @@ class Motion:
             self._profile.start(position, 0.0)
         elif self.source is Source.CYCLIC:
             # the demand that was in force, not where the new cycle's set-point would take it
-            start, speed = self.command[1], self.command[3]
-            self._profile.start(start, speed)
+            self._profile.start(self.command[1], self.command[3])
         number = self._dictionary.number
         ramp = self._power.ramp
         deceleration = number(Ramp.QUICK_STOP.value if ramp is Ramp.QUICK_STOP else Ramp.SLOW_DOWN.value)

@@ -1,4 +1,4 @@
-"""What an SDO write to an object of the drive means beyond storing the value: rules and actions by object."""
+"""Gives SDO writes to the drive their meaning beyond storing the value: rules and actions by object."""
 
 from __future__ import annotations
 
@@ -6,15 +6,14 @@ from collections.abc import Callable
 
 from fdhil.sim.drive.dictionary import AbortCode, Dictionary, Entry, TransferAbort
 from fdhil.sim.drive.objects import ERROR_HISTORY, INVALID, SUPPORTED_MODES
-from fdhil.sim.drive.power import known_quick_stop_code
+from fdhil.sim.drive.power import QUICK_STOP_CODES
 from fdhil.sim.drive.trace import TraceBuffer
 
 _SAVE, _LOAD = 0x65766173, 0x64616F6C  # "save" and "load", little-endian
-_STORABLE_ACCESS = ("rw", "rww", "rwr")
 _NOT_STORED = frozenset({0x1003, 0x1010, 0x1011, 0x6040, 0x6060, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x6071})
 
 
-class Stored:
+class StoredParameters:
     """The non-volatile memory behind 0x1010 and 0x1011: values that a boot starts with instead of the defaults."""
 
     def __init__(self, dictionary: Dictionary) -> None:
@@ -32,7 +31,7 @@ class Stored:
         self._values = {
             key: self._dictionary.numbers[key]
             for key, entry in self._dictionary.entries.items()
-            if entry.access in _STORABLE_ACCESS and entry.index not in _NOT_STORED
+            if entry.access in ("rw", "rww") and entry.index not in _NOT_STORED
         }
 
     def forget(self) -> None:
@@ -40,11 +39,11 @@ class Stored:
         self._values = {}
 
 
-def register_rules(
+def register_write_rules(
     dictionary: Dictionary,
     *,
     changeable: Callable[[], bool],
-    stored: Stored,
+    stored: StoredParameters,
     trace: TraceBuffer,
     on_controlword: Callable[[], None],
     on_communication: Callable[[], None],
@@ -75,7 +74,7 @@ def register_rules(
             raise TransferAbort(AbortCode.RANGE)
 
     def quick_stop(_entry: Entry, value: int) -> None:
-        if not known_quick_stop_code(value):
+        if value not in QUICK_STOP_CODES:
             raise TransferAbort(AbortCode.RANGE)
 
     dictionary.check.update(

@@ -1,4 +1,4 @@
-"""The objects of the simulated drive: communication profile (CiA 301), drive profile (CiA 402-2), vendor objects.
+"""Lists the objects of the simulated drive: communication profile (CiA 301), drive profile (CiA 402-2), vendor objects.
 
 Position objects are in increments of the encoder, speeds in increments/s, currents in 0.1 % of 0x6075, torques in 0.1 %
 of 0x6076, the vendor's terminal voltage (0x2101) in 0.02 V: the mean over the SYNC period that ended.
@@ -26,14 +26,16 @@ SUPPORTED_MODES = 1 << (PROFILE_POSITION - 1) | 1 << (CYCLIC_POSITION - 1)
 INVALID = 1 << 31
 NO_RTR = 1 << 30
 
-# default mapping: (COB-ID base, valid, transmission type, entries (index, sub, bits))
-RPDO_DEFAULTS: tuple[tuple[int, bool, int, tuple[tuple[int, int, int], ...]], ...] = (
+PdoMapping = tuple[tuple[int, int, int], ...]  # entries (index, sub, bits)
+
+# default PDOs: (COB-ID base, valid, transmission type, mapping)
+RPDO_DEFAULTS: tuple[tuple[int, bool, int, PdoMapping], ...] = (
     (0x200, True, 1, ((0x6040, 0, 16), (0x607A, 0, 32))),
     (0x300, True, 1, ((0x60B0, 0, 32),)),
     (0x400, False, 1, ((0x60B1, 0, 32), (0x60B2, 0, 16))),
     (0x500, False, 255, ()),
 )
-TPDO_DEFAULTS: tuple[tuple[int, bool, int, tuple[tuple[int, int, int], ...]], ...] = (
+TPDO_DEFAULTS: tuple[tuple[int, bool, int, PdoMapping], ...] = (
     (0x180, True, 1, ((0x6064, 0, 32), (0x606C, 0, 32))),
     (0x280, True, 1, ((0x6041, 0, 16), (0x6078, 0, 16), (0x2101, 0, 16))),
     (0x380, True, 10, ((0x6062, 0, 32), (0x60B0, 0, 32))),
@@ -43,7 +45,7 @@ TPDO_DEFAULTS: tuple[tuple[int, bool, int, tuple[tuple[int, int, int], ...]], ..
 
 @dataclass(frozen=True, slots=True)
 class Ratings:
-    """What one axis' drive is set to, in its own units."""
+    """The settings of one axis' drive, in its own units."""
 
     node_id: int
     sync_period_s: float
@@ -84,27 +86,13 @@ def drive_objects(config: MachineConfig, axis: str) -> tuple[Object, ...]:
 
 def _communication(config: MachineConfig, axis: str, ratings: Ratings) -> list[Object]:
     node = ratings.node_id
-    history = tuple(Entry(0x1003, n, f"Error field {n}", U32, "ro") for n in range(1, ERROR_HISTORY + 1))
-    consumers = tuple(
-        Entry(0x1016, n, f"Consumer heartbeat time {n}", U32, "rw") for n in range(1, HEARTBEAT_CONSUMERS + 1)
-    )
-    identity = (
-        Entry(0x1018, 1, "Vendor-ID", U32, "ro", VENDOR_ID),
-        Entry(0x1018, 2, "Product code", U32, "ro", PRODUCT_CODE),
-        Entry(0x1018, 3, "Revision number", U32, "ro", REVISION),
-        Entry(0x1018, 4, "Serial number", U32, "ro", 1000 + list(config.axis).index(axis) + 1),
-    )
-    sdo = (
-        Entry(0x1200, 1, "COB-ID client to server", U32, "ro", 0x600 + node, node_relative=True),
-        Entry(0x1200, 2, "COB-ID server to client", U32, "ro", 0x580 + node, node_relative=True),
-    )
     return [
         var(0x1000, "Device type", U32, "ro", 0x00020192),
         var(0x1001, "Error register", U8, "ro", mappable=True),
         record(
             0x1003,
             "Pre-defined error field",
-            history,
+            *(Entry(0x1003, n, f"Error field {n}", U32, "ro") for n in range(1, ERROR_HISTORY + 1)),
             kind=ARRAY,
             count=Entry(0x1003, 0, "Number of errors", U8, "rw", 0, low=0, high=0),
         ),
@@ -113,54 +101,71 @@ def _communication(config: MachineConfig, axis: str, ratings: Ratings) -> list[O
         var(0x1008, "Manufacturer device name", DataType.VISIBLE_STRING, "const", DEVICE_NAME),
         var(0x1009, "Manufacturer hardware version", DataType.VISIBLE_STRING, "const", b"simulated"),
         var(0x100A, "Manufacturer software version", DataType.VISIBLE_STRING, "const", b"1.0"),
-        record(0x1010, "Store parameters", (Entry(0x1010, 1, "Save all parameters", U32, "rw", 1),), kind=ARRAY),
-        record(0x1011, "Restore default parameters", (Entry(0x1011, 1, "Restore all", U32, "rw", 1),), kind=ARRAY),
+        record(0x1010, "Store parameters", Entry(0x1010, 1, "Save all parameters", U32, "rw", 1), kind=ARRAY),
+        record(0x1011, "Restore default parameters", Entry(0x1011, 1, "Restore all", U32, "rw", 1), kind=ARRAY),
         var(0x1014, "COB-ID emergency message", U32, "rw", 0x80 + node, node_relative=True),
-        record(0x1016, "Consumer heartbeat time", consumers, kind=ARRAY),
+        record(
+            0x1016,
+            "Consumer heartbeat time",
+            *(Entry(0x1016, n, f"Consumer heartbeat time {n}", U32, "rw") for n in range(1, HEARTBEAT_CONSUMERS + 1)),
+            kind=ARRAY,
+        ),
         var(0x1017, "Producer heartbeat time", U16, "rw", 100),
-        record(0x1018, "Identity object", identity),
+        record(
+            0x1018,
+            "Identity object",
+            Entry(0x1018, 1, "Vendor-ID", U32, "ro", VENDOR_ID),
+            Entry(0x1018, 2, "Product code", U32, "ro", PRODUCT_CODE),
+            Entry(0x1018, 3, "Revision number", U32, "ro", REVISION),
+            Entry(0x1018, 4, "Serial number", U32, "ro", 1000 + list(config.axis).index(axis) + 1),
+        ),
         var(0x1019, "Synchronous counter overflow value", U8, "rw", 240 if config.sim.nc else 0),
-        record(0x1200, "SDO server parameter", sdo),
+        record(
+            0x1200,
+            "SDO server parameter",
+            Entry(0x1200, 1, "COB-ID client to server", U32, "ro", 0x600 + node, node_relative=True),
+            Entry(0x1200, 2, "COB-ID server to client", U32, "ro", 0x580 + node, node_relative=True),
+        ),
     ]
 
 
 def _pdos(node_id: int) -> list[Object]:
     objects = []
-    for number, (base, valid, kind, entries) in enumerate(RPDO_DEFAULTS):
-        cob_id = base + node_id + (0 if valid else INVALID)
-        objects.append(_pdo_communication(0x1400 + number, "RPDO", number, cob_id, kind))
-        objects.append(_pdo_mapping(0x1600 + number, "RPDO", number, entries))
-    for number, (base, valid, kind, entries) in enumerate(TPDO_DEFAULTS):
-        cob_id = base + node_id + NO_RTR + (0 if valid else INVALID)
-        objects.append(_pdo_communication(0x1800 + number, "TPDO", number, cob_id, kind))
-        objects.append(_pdo_mapping(0x1A00 + number, "TPDO", number, entries))
+    for direction, first, flags, defaults in (
+        ("RPDO", 0x1400, 0, RPDO_DEFAULTS),
+        ("TPDO", 0x1800, NO_RTR, TPDO_DEFAULTS),
+    ):
+        for place, (base, valid, kind, mapped) in enumerate(defaults):
+            name, cob_id = f"{direction} {place + 1}", base + node_id + flags + (0 if valid else INVALID)
+            objects.append(_pdo_communication(first + place, name, cob_id, kind))
+            objects.append(_pdo_mapping(first + 0x200 + place, name, mapped))
     return objects
 
 
-def _pdo_communication(index: int, direction: str, number: int, cob_id: int, kind: int) -> Object:
+def _pdo_communication(index: int, name: str, cob_id: int, kind: int) -> Object:
     entries = [
         Entry(index, 1, "COB-ID", U32, "rw", cob_id, node_relative=True),
         Entry(index, 2, "Transmission type", U8, "rw", kind),
+        Entry(index, 3, "Inhibit time", U16, "rw"),
+        Entry(index, 5, "Event timer", U16, "rw"),
+        Entry(index, 6, "SYNC start value", U8, "rw", 0, low=0, high=240),
     ]
-    if direction == "TPDO":
-        entries.append(Entry(index, 3, "Inhibit time", U16, "rw"))
-    entries.append(Entry(index, 5, "Event timer", U16, "rw"))
-    if direction == "TPDO":
-        entries.append(Entry(index, 6, "SYNC start value", U8, "rw", 0, low=0, high=240))
-    return record(index, f"{direction} {number + 1} communication parameter", tuple(entries))
+    if index < 0x1800:  # what is received is neither held back nor started by a SYNC
+        entries = [entry for entry in entries if entry.sub not in (3, 6)]
+    return record(index, f"{name} communication parameter", *entries)
 
 
-def _pdo_mapping(index: int, direction: str, number: int, mapped: tuple[tuple[int, int, int], ...]) -> Object:
-    values = [i << 16 | s << 8 | bits for i, s, bits in mapped] + [0] * PDO_ENTRIES
-    entries = tuple(Entry(index, n + 1, f"Mapped object {n + 1}", U32, "rw", values[n]) for n in range(PDO_ENTRIES))
+def _pdo_mapping(index: int, name: str, mapped: PdoMapping) -> Object:
+    words = [i << 16 | s << 8 | bits for i, s, bits in mapped] + [0] * (PDO_ENTRIES - len(mapped))
+    entries = (Entry(index, n, f"Mapped object {n}", U32, "rw", word) for n, word in enumerate(words, 1))
     count = Entry(index, 0, "Number of mapped objects", U8, "rw", len(mapped))
-    return record(index, f"{direction} {number + 1} mapping parameter", entries, count=count)
+    return record(index, f"{name} mapping parameter", *entries, count=count)
 
 
 def _vendor() -> list[Object]:
     return [
         var(0x2101, "Terminal voltage, mean of the SYNC period", I16, "ro", mappable=True),
-        record(0x2110, "Temperatures", (Entry(0x2110, 1, "Slide-way temperature", I16, "ro", 2000, mappable=True),)),
+        record(0x2110, "Temperatures", Entry(0x2110, 1, "Slide-way temperature", I16, "ro", 2000, mappable=True)),
         var(0x2120, "Trace buffer", DataType.DOMAIN, "ro", b""),
         var(0x2121, "Trace buffer clear", U8, "wo", low=1, high=1),
     ]
@@ -188,11 +193,6 @@ def _positions(axis: Axis, ratings: Ratings) -> list[Object]:
     acceleration = round(axis.max_acceleration_mm_s2 * per_mm)
     speed = round((axis.drive.speed_limit_mm_s or axis.rapid_speed_mm_s) * per_mm)
     window = min(round(axis.drive.following_error_window_mm * per_mm), NO_WINDOW - 1)
-    low, high = -(2**31), 2**31 - 1
-    limits = (
-        Entry(0x607D, 1, "Min position limit", I32, "rw", low),
-        Entry(0x607D, 2, "Max position limit", I32, "rw", high),
-    )
     return [
         var(0x6062, "Position demand value", I32, "ro", mappable=True),
         var(0x6063, "Position actual internal value", I32, "ro", mappable=True),
@@ -202,7 +202,12 @@ def _positions(axis: Axis, ratings: Ratings) -> list[Object]:
         var(0x606B, "Velocity demand value", I32, "ro", mappable=True),
         var(0x606C, "Velocity actual value", I32, "ro", mappable=True),
         var(0x607A, "Target position", I32, "rww", mappable=True),
-        record(0x607D, "Software position limit", limits),
+        record(
+            0x607D,
+            "Software position limit",
+            Entry(0x607D, 1, "Min position limit", I32, "rw", -(2**31)),
+            Entry(0x607D, 2, "Max position limit", I32, "rw", 2**31 - 1),
+        ),
         var(0x6081, "Profile velocity", U32, "rww", speed, mappable=True),
         var(0x6083, "Profile acceleration", U32, "rww", acceleration, mappable=True, low=1),
         var(0x6084, "Profile deceleration", U32, "rww", acceleration, mappable=True, low=1),
@@ -218,8 +223,8 @@ def _positions(axis: Axis, ratings: Ratings) -> list[Object]:
 
 
 def _ratio(index: int, name: str, upper: str, value: int, lower: str) -> Object:
-    entries = (Entry(index, 1, upper, U32, "rw", value, low=1), Entry(index, 2, lower, U32, "rw", 1, low=1))
-    return record(index, name, entries)
+    first = Entry(index, 1, upper, U32, "rw", value, low=1)
+    return record(index, name, first, Entry(index, 2, lower, U32, "rw", 1, low=1))
 
 
 def _interpolation(sync_period_s: float) -> Object:
@@ -228,11 +233,12 @@ def _interpolation(sync_period_s: float) -> Object:
     while exponent > -6 and abs(sync_period_s / 10**exponent - round(sync_period_s / 10**exponent)) > 1e-9:
         exponent -= 1
     value = round(sync_period_s / 10**exponent)
-    entries = (
+    return record(
+        0x60C2,
+        "Interpolation time period",
         Entry(0x60C2, 1, "Interpolation time period value", U8, "rw", value, low=value, high=value),
         Entry(0x60C2, 2, "Interpolation time index", I8, "rw", exponent, low=exponent, high=exponent),
     )
-    return record(0x60C2, "Interpolation time period", entries)
 
 
 def _motor(axis: Axis, ratings: Ratings) -> list[Object]:

@@ -1,4 +1,4 @@
-"""The PDO engine (CiA 301, 7.2.2): RPDOs buffered until the SYNC, TPDOs sampled at the SYNC, mapping by the rules.
+"""Runs the PDOs of a device (CiA 301, 7.2.2): RPDOs buffered until the SYNC, TPDOs sampled at it, mapping by the rules.
 
 Communication and mapping parameters may change in pre-operational only, a mapping only while its PDO is invalid and
 its sub-index 0 is 0.
@@ -12,8 +12,7 @@ from dataclasses import dataclass, field
 
 from fdhil.sim.drive.dictionary import I8, I16, I32, U8, U16, U32, AbortCode, Dictionary, Entry, TransferAbort
 from fdhil.sim.drive.objects import INVALID, PDO_ENTRIES, PDOS
-
-Frame = tuple[int, bytes]
+from fdhil.sim.frame import Frame
 
 _CODE = {I8: "b", I16: "h", I32: "i", U8: "B", U16: "H", U32: "I"}
 # dummy entries that an RPDO may map to skip bytes (CiA 301, 7.4.7.1)
@@ -52,7 +51,7 @@ class Pdo:
 class PdoEngine:
     """All PDOs of one device. ``drop`` maps TPDO numbers to how many frames are still to be lost, -1 for all.
 
-    ``late`` counts, per RPDO, the cycles in which it was heard in the cycle before but not in time for this one.
+    ``heard`` has the numbers of the RPDOs received since the last SYNC, ``heard_before`` those of the cycle before.
     """
 
     def __init__(self, dictionary: Dictionary, changeable: Callable[[], bool], drop: dict[int, int]) -> None:
@@ -63,7 +62,6 @@ class PdoEngine:
         self._tpdos: list[Pdo] = []
         self.heard: set[int] = set()
         self.heard_before: set[int] = set()
-        self.late: dict[int, int] = dict.fromkeys(range(1, PDOS + 1), 0)
         self._register_checks()
 
     def configure(self) -> None:
@@ -77,13 +75,13 @@ class PdoEngine:
         self._rpdos, self._tpdos = {}, []
         self.heard, self.heard_before = set(), set()
 
-    def configured(self, direction: str, *, with_invalid: bool = False) -> Iterator[Pdo]:
+    def configured(self, direction: str) -> Iterator[Pdo]:
         """Yield the PDOs of a direction (``rpdo`` or ``tpdo``) as the dictionary describes them."""
         communication, mapping = (0x1400, 0x1600) if direction == "rpdo" else (0x1800, 0x1A00)
         for n in range(PDOS):
             number = self._dictionary.number
             cob_id = number(communication + n, 1)
-            if cob_id & INVALID and not with_invalid:
+            if cob_id & INVALID:
                 continue
             mapped = [number(mapping + n, sub + 1) for sub in range(number(mapping + n, 0))]
             keys, codes, entries = self._resolve(mapped)
@@ -130,14 +128,11 @@ class PdoEngine:
         self.heard.add(pdo.number)
         return None if pdo.synchronous else pdo
 
-    def latch(self, *, count_late: bool) -> None:
+    def latch(self) -> None:
         """A SYNC: apply what was received since the last one."""
         for pdo in self._rpdos.values():
             if pdo.pending is not None and pdo.synchronous:
                 self.apply(pdo)
-        if count_late:
-            for number in self.heard_before - self.heard:
-                self.late[number] += 1
         self.heard_before, self.heard = self.heard, set()
 
     def apply(self, pdo: Pdo) -> None:
@@ -275,5 +270,5 @@ class PdoEngine:
         entry = self._dictionary.entries.get(word >> 8)
         if entry is None or not entry.mappable or entry.size is None or word & 0xFF != 8 * entry.size:
             raise TransferAbort(AbortCode.NOT_MAPPABLE)
-        if entry.access not in (("rw", "rww", "wo") if receives else ("ro", "rw", "rwr", "rww")):
+        if entry.access not in (("rw", "rww", "wo") if receives else ("ro", "rw", "rww")):
             raise TransferAbort(AbortCode.NOT_MAPPABLE)

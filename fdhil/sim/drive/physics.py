@@ -1,4 +1,4 @@
-"""Motor, screw and table with the drive's three nested loops, one SYNC cycle at a time.
+"""Integrates motor, screw and table with the drive's three nested loops, one SYNC cycle at a time.
 
 Plant ([DES] eqs. 1 and 2), SI units:
 
@@ -19,63 +19,47 @@ import numpy as np
 
 from fdhil.config import Nominal, Regulators, SimAxis
 from fdhil.errors import ConfigError, ConfigFault
-from fdhil.records import Float, Parameters
+from fdhil.records import PARAMETERS, Float, Parameters
+
+Command = tuple[float, float, float, float, float, float, float, float]
 
 # what regulators other than these would need, this drive does not have
 _PLAIN = {"structure": "p_pi_pi", "torque_feedforward": 0.0, "setpoint_filter_s": 0.0, "current_delay_cycles": 0}
 # places in the state vector
-CURRENT, SPEED, ANGLE, TABLE, SPEED_INTEGRAL, CURRENT_INTEGRAL, FRICTION_WORK = range(7)
+CURRENT, SPEED, ANGLE, TABLE, SPEED_INTEGRAL, CURRENT_INTEGRAL = range(6)
 # places in the loops vector
 (KV, KFF, KPS, KIS, I_MAX, KPC, KIC, U_MAX, INC_PER_RAD, N_SPEED, N_CURRENT) = range(11)
 # flags that a cycle returns
 CURRENT_LIMIT, VOLTAGE_LIMIT = 1, 2
 
 
-@numba.njit(cache=True, nogil=True)
 def discretise(parameters: Float, step_s: float) -> Float:
     """Return the exact plant step as (5, 5): rows of the matrix exponential of [i, w, theta, u, torque].
 
     ``parameters`` is (6,) R, L, K, Jt, ft, Cd. The Taylor series converges at once: the step is far below the plant's
     time constants; it is halved and squared where it is not.
     """
-    R, L, K, Jt, ft = parameters[0], parameters[1], parameters[2], parameters[3], parameters[4]
+    R, L, K, Jt, ft, _ = parameters
     a = np.zeros((5, 5))
     a[0, 0], a[0, 1], a[0, 3] = -R / L, -K / L, 1.0 / L
     a[1, 0], a[1, 1], a[1, 4] = K / Jt, -ft / Jt, 1.0 / Jt
     a[2, 1] = 1.0
     # scaled to rad, A and V the entries differ by orders of magnitude; the largest one bounds the series
-    halvings = 0
-    while np.abs(a).max() * step_s > 0.5:
-        step_s *= 0.5
-        halvings += 1
-    result = np.eye(5)
-    term = np.eye(5)
+    halvings = max(0, math.ceil(math.log2(np.abs(a).max() * step_s / 0.5)))
+    a *= step_s / 2**halvings
+    phi = term = np.eye(5)
     for order in range(1, 21):
-        following = np.zeros((5, 5))
-        for i in range(5):
-            for j in range(5):
-                total = 0.0
-                for k in range(5):
-                    total += term[i, k] * a[k, j]
-                following[i, j] = total * step_s / order
-        term = following
-        result += term
+        term = term @ a / order
+        phi = phi + term
     for _ in range(halvings):
-        squared = np.zeros((5, 5))
-        for i in range(5):
-            for j in range(5):
-                total = 0.0
-                for k in range(5):
-                    total += result[i, k] * result[k, j]
-                squared[i, j] = total
-        result = squared
-    return result
+        phi = phi @ phi
+    return phi
 
 
 @numba.njit(cache=True, nogil=True)
 def _step(state: Float, u: float, load: float, parameters: Float, phi: Float, step_s: float) -> None:
     """Advance current, speed and angle by one step under voltage ``u`` and load torque ``load``."""
-    R, L, K, Cd, ft = parameters[0], parameters[1], parameters[2], parameters[5], parameters[4]
+    R, L, K, Cd = parameters[0], parameters[1], parameters[2], parameters[5]
     i, w = state[0], state[1]
     drive = K * i - load
     if w == 0.0 and abs(drive) <= Cd:
@@ -95,7 +79,6 @@ def _step(state: Float, u: float, load: float, parameters: Float, phi: Float, st
         turned = 0.5 * w * step_s
     state[1] = speed
     state[2] += turned
-    state[6] += (Cd * sign + ft * speed) * turned
 
 
 @numba.njit(cache=True, nogil=True)
@@ -113,10 +96,8 @@ def _coast(state: Float, load: float, parameters: Float, step_s: float) -> None:
     speed = w + step_s * (-ft * w - Cd * sign - load) / Jt
     if speed * sign < 0.0:
         speed = 0.0
-    turned = 0.5 * (w + speed) * step_s
     state[1] = speed
-    state[2] += turned
-    state[6] += (Cd * sign + ft * speed) * turned
+    state[2] += 0.5 * (w + speed) * step_s
 
 
 @numba.njit(cache=True, nogil=True)
@@ -127,14 +108,14 @@ def run_cycle(
     phi: Float,
     voltage: Float,
     enabled: bool,
-    command: tuple[float, float, float, float, float, float, float, float],
+    command: Command,
     load: float,
     half_backlash: float,
     step_s: float,
 ) -> tuple[float, int]:
     """Run one SYNC cycle; return the mean voltage and the limits that acted.
 
-    ``state`` (7,) and ``voltage`` (n,), one value per current step, are written. ``command`` is the set-point at the
+    ``state`` (6,) and ``voltage`` (n,), one value per current step, are written. ``command`` is the set-point at the
     start and end of the cycle (increments), the feed-forward speed at both (increments/s), the speed offset at both
     (rad/s) and the current offset at both (A); each is interpolated linearly and taken at the speed loop's instants.
     Each PI integrates first and keeps its old integral where its limit acts.
@@ -216,7 +197,7 @@ class Physics:
                 n_current,
             ]
         )
-        self._state = np.zeros(7)
+        self._state = np.zeros(6)
         self._half_backlash = backlash_rad / 2
         self._state[ANGLE] = self._state[TABLE] = angle_rad
         self.voltage_v = np.zeros(n_speed * n_current)
@@ -230,60 +211,34 @@ class Physics:
     def set_parameters(self, parameters: Parameters) -> None:
         """Change the plant from the next cycle on; the loops keep their gains."""
         self.parameters = parameters
-        self._plant = np.array([parameters.R, parameters.L, parameters.K, parameters.Jt, parameters.ft, parameters.Cd])
+        self._plant = np.array(list(parameters.as_dict().values()))
         self._phi = discretise(self._plant, self.step_s)
 
     def rehearse(self) -> None:
         """Run one cycle on a copy of the state: when this returns the kernels are compiled, which takes seconds."""
-        state, voltage = self._state.copy(), self.voltage_v.copy()
-        still = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        run_cycle(
-            state,
-            self._loops,
-            self._plant,
-            self._phi,
-            voltage,
-            False,
-            still,
-            self.load_torque_nm,
-            self._half_backlash,
-            self.step_s,
-        )
+        self._run(self._state.copy(), self.voltage_v.copy(), False, (0.0,) * 8)
 
-    def cycle(self, enabled: bool, command: tuple[float, float, float, float, float, float, float, float]) -> None:
+    def cycle(self, enabled: bool, command: Command) -> None:
         """Run one SYNC cycle of :func:`run_cycle`; ``enabled`` False means that no current flows."""
         if not enabled:
             self._state[SPEED_INTEGRAL] = self._state[CURRENT_INTEGRAL] = 0.0
-        self.voltage_mean_v, limits = run_cycle(
-            self._state,
-            self._loops,
-            self._plant,
-            self._phi,
-            self.voltage_v,
-            enabled,
-            command,
-            self.load_torque_nm,
-            self._half_backlash,
-            self.step_s,
-        )
+        self.voltage_mean_v, limits = self._run(self._state, self.voltage_v, enabled, command)
         self.current_limited = limits & CURRENT_LIMIT != 0
         self.voltage_limited = limits & VOLTAGE_LIMIT != 0
         self._unpack()
 
+    def _run(self, state: Float, voltage: Float, enabled: bool, command: Command) -> tuple[float, int]:
+        plant, load, backlash = self._plant, self.load_torque_nm, self._half_backlash
+        return run_cycle(state, self._loops, plant, self._phi, voltage, enabled, command, load, backlash, self.step_s)
+
     def _unpack(self) -> None:
-        self.current_a, self.speed_rad_s, self.angle_rad, self.table_rad, _, _, self.friction_work_j = (
-            self._state.tolist()
-        )
+        self.current_a, self.speed_rad_s, self.angle_rad, self.table_rad, _, _ = self._state.tolist()
 
 
 def true_parameters(nominal: Nominal, twin: SimAxis) -> Parameters:
     """Return the plant's parameters: the nominal values where the twin names none."""
-    return Parameters(
-        *(
-            float(getattr(nominal if getattr(twin, name) is None else twin, name))
-            for name in ("R", "L", "K", "Jt", "ft", "Cd")
-        )
-    )
+    named = twin.model_dump(exclude_none=True)
+    return Parameters(**{name: named.get(name, getattr(nominal, name)) for name in PARAMETERS})
 
 
 def check_structure(axis: str, regulators: Regulators) -> None:

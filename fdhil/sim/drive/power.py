@@ -1,4 +1,4 @@
-"""The power state machine of CiA 402-2: controlword in, state out, with the option codes for every kind of stop."""
+"""Steps the power states of CiA 402-2: controlword in, state out, with the option codes for every kind of stop."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _PLAIN = {
     (_S.QUICK_STOP_ACTIVE, _C.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,
 }
 _POWERED = frozenset({_S.OPERATION_ENABLED, _S.QUICK_STOP_ACTIVE, _S.FAULT_REACTION_ACTIVE})
-_QUICK_STOP_CODES = frozenset({0, 1, 2, 5, 6})
+QUICK_STOP_CODES = frozenset({0, 1, 2, 5, 6})  # disable, slow-down or quick-stop ramp, both also staying in the state
 
 
 def _decode(word: int) -> _Command | None:
@@ -183,8 +183,3 @@ class PowerStage:
         self.state = state
         self.ramp = None
         self.powered = state in _POWERED
-
-
-def known_quick_stop_code(code: int) -> bool:
-    """Whether 0x605A may hold ``code``: disable, slow-down or quick-stop ramp, and both with staying in the state."""
-    return code in _QUICK_STOP_CODES

@@ -1,4 +1,4 @@
-"""The SDO server (CiA 301, 7.2.4): expedited and segmented transfers both ways, block upload with CRC.
+"""Answers SDO requests (CiA 301, 7.2.4): expedited and segmented transfers both ways, block upload with CRC.
 
 Sans-I/O: a request of 8 bytes in, the answers out. One client, one transfer at a time; a new request to initiate
 drops the transfer that was going on, as the standard has it.
@@ -18,9 +18,8 @@ MAX_DOWNLOAD_BYTES = 1024  # no object that can be written is longer
 class _Upload:
     index: int
     sub: int
-    data: bytes
+    data: bytes  # what is still to be sent
     toggle: int = 0
-    position: int = 0
 
 
 @dataclass(slots=True)
@@ -100,13 +99,9 @@ class SdoServer:
         transfer = self._transfer
         if not isinstance(transfer, _Upload):
             raise TransferAbort(AbortCode.COMMAND)
-        toggle = data[0] >> 4 & 1
-        if toggle != transfer.toggle:
-            raise TransferAbort(AbortCode.TOGGLE)
-        part = transfer.data[transfer.position : transfer.position + 7]
-        transfer.position += len(part)
-        transfer.toggle ^= 1
-        last = transfer.position >= len(transfer.data)
+        toggle = _turned(transfer, data)
+        part, transfer.data = transfer.data[:7], transfer.data[7:]
+        last = not transfer.data
         if last:
             self._transfer = None
         return [bytes([toggle << 4 | (7 - len(part)) << 1 | last]) + part.ljust(7, b"\0")]
@@ -129,11 +124,8 @@ class SdoServer:
         transfer = self._transfer
         if not isinstance(transfer, _Download):
             raise TransferAbort(AbortCode.COMMAND)
-        toggle = data[0] >> 4 & 1
-        if toggle != transfer.toggle:
-            raise TransferAbort(AbortCode.TOGGLE)
+        toggle = _turned(transfer, data)
         transfer.data += data[1 : 8 - (data[0] >> 1 & 7)]
-        transfer.toggle ^= 1
         last = data[0] & 1
         size = transfer.size if transfer.size is not None else MAX_DOWNLOAD_BYTES
         if len(transfer.data) > size or (last and transfer.size is not None and len(transfer.data) != size):
@@ -197,6 +189,15 @@ class SdoServer:
         unused = -len(transfer.data) % 7 if transfer.data else 7
         crc = binascii.crc_hqx(transfer.data, 0) if transfer.with_crc else 0
         return [bytes([0xC1 | unused << 2]) + crc.to_bytes(2, "little") + bytes(5)]
+
+
+def _turned(transfer: _Upload | _Download, data: bytes) -> int:
+    """Return the toggle bit of a segment's request and expect the other one next."""
+    toggle = data[0] >> 4 & 1
+    if toggle != transfer.toggle:
+        raise TransferAbort(AbortCode.TOGGLE)
+    transfer.toggle ^= 1
+    return toggle
 
 
 def _head(command: int, index: int, sub: int) -> bytes:

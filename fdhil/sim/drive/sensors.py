@@ -1,55 +1,16 @@
-"""What the drive's sensors report: white noise, resolution, and the faults that a test or a fault script orders."""
+"""Reports what the drive's sensors see: with white noise, and with the faults that a test or a fault script orders."""
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from fdhil.config import Noise
+from fdhil.sim.signal_fault import SignalFault
 
 SIGNALS = ("position", "speed", "current", "voltage")
 _BLOCK = 1024
-
-
-@dataclass(slots=True)
-class SignalFault:
-    """What is wrong with one reported signal, in its own unit (increments, rad/s, A, V); applied in this order.
-
-    ``delay_cycles``: slow. ``gain``, ``offset``: wrong. ``clip``: saturates at +-clip. ``resolution``: coarse.
-    ``garbage``: random values of up to +-``garbage``. ``stuck``: the last value for ever.
-    """
-
-    delay_cycles: int = 0
-    gain: float = 1.0
-    offset: float = 0.0
-    clip: float | None = None
-    resolution: float = 0.0
-    garbage: float = 0.0
-    stuck: bool = False
-    _late: deque[float] = field(default_factory=deque, repr=False)
-    _held: float | None = field(default=None, repr=False)
-
-    def apply(self, value: float, rng: np.random.Generator) -> float:
-        """Return what is reported for ``value``."""
-        if self.delay_cycles:
-            self._late.append(value)
-            value = self._late[0]
-            while len(self._late) > self.delay_cycles:
-                self._late.popleft()
-        value = value * self.gain + self.offset
-        if self.clip is not None:
-            value = min(max(value, -self.clip), self.clip)
-        if self.resolution:
-            value = round(value / self.resolution) * self.resolution
-        if self.garbage:
-            value = float(rng.uniform(-self.garbage, self.garbage))
-        if not self.stuck:
-            self._held = None
-        elif self._held is None:
-            self._held = value
-        return value if self._held is None else self._held
 
 
 @dataclass(slots=True)

@@ -1,4 +1,4 @@
-"""A CiA 402 servo drive on a CANopen bus, sans-I/O: frames in, frames out, physics by SYNC.
+"""Simulates a CiA 402 servo drive on a CANopen bus, sans-I/O: frames in, frames out, physics by SYNC.
 
 At SYNC k the drive latches the RPDOs it received since SYNC k-1, samples all objects at t_k, sends the TPDOs that are
 due, and integrates [t_k, t_k+1). The 0x607A and 0x60B0 latched at SYNC k are what it follows at t_k+delay. Heartbeats
@@ -13,22 +13,28 @@ from dataclasses import replace
 import numpy as np
 
 from fdhil.config import MachineConfig, SimAxis
-from fdhil.sim.drive import emergency_and_heartbeat as monitor
 from fdhil.sim.drive.dictionary import Dictionary
-from fdhil.sim.drive.emergency_and_heartbeat import Emergencies, HeartbeatConsumer, HeartbeatProducer
-from fdhil.sim.drive.feedback import Feedback, clip16
-from fdhil.sim.drive.motion import Motion, Source
-from fdhil.sim.drive.object_write_rules import Stored, register_rules
+from fdhil.sim.drive.emergency_and_heartbeat import (
+    FOLLOWING_ERROR,
+    HEARTBEAT_LOST,
+    PDO_TOO_SHORT,
+    RPDO_TIMEOUT,
+    SYNC_LENGTH,
+    Emergencies,
+    HeartbeatConsumer,
+    HeartbeatProducer,
+)
+from fdhil.sim.drive.feedback import INT16, Feedback, clip
+from fdhil.sim.drive.motion import Motion
+from fdhil.sim.drive.object_write_rules import StoredParameters, register_write_rules
 from fdhil.sim.drive.objects import NO_WINDOW, Ratings, drive_objects
-from fdhil.sim.drive.pdo import Frame, PdoEngine
+from fdhil.sim.drive.pdo import PdoEngine
 from fdhil.sim.drive.physics import Physics, check_structure, true_parameters
 from fdhil.sim.drive.power import PowerStage, State
 from fdhil.sim.drive.sdo import SdoServer
-from fdhil.sim.drive.sensors import DriveFaults, Sensors, SignalFault
+from fdhil.sim.drive.sensors import DriveFaults, Sensors
 from fdhil.sim.drive.setpoints import CyclicSetpoints
-from fdhil.sim.drive.trace import TraceBuffer
-
-__all__ = ["Drive", "DriveFaults", "Frame", "SignalFault"]
+from fdhil.sim.frame import Frame
 
 OFF, STOPPED, OPERATIONAL, PRE_OPERATIONAL = -1, 0x04, 0x05, 0x7F
 
@@ -37,7 +43,7 @@ class Drive:
     """One axis' drive with its motor and table.
 
     ``faults`` may be changed at any time. ``table_mm`` is the true table position at the last SYNC, in the axis'
-    direction; ``physics`` holds the true current, speed, voltage and friction work after the cycle that was integrated.
+    direction; ``physics`` holds the true current, speed and voltage after the cycle that was integrated.
     ``nmt`` is the NMT state as a heartbeat shows it, -1 while the drive is without supply.
     """
 
@@ -72,8 +78,7 @@ class Drive:
                 section.drive.setpoint_delay_cycles, config.machine.sync_period_s, twin.offset_in_feedforward
             ),
         )
-        self._trace = TraceBuffer()
-        self._feedback = Feedback(
+        self.feedback = Feedback(
             self.dictionary,
             self.ratings,
             section.regulators,
@@ -81,7 +86,6 @@ class Drive:
             self.power,
             self.motion,
             Sensors(config.sim.noise, self.faults, rng),
-            self._trace,
         )
         self._attach()
 
@@ -101,12 +105,12 @@ class Drive:
         self._emergencies = Emergencies(self.dictionary)
         self._consumer = HeartbeatConsumer(self.dictionary)
         self._producer = HeartbeatProducer(self.dictionary, self.node_id)
-        self._stored = Stored(self.dictionary)
-        register_rules(
+        self._stored = StoredParameters(self.dictionary)
+        register_write_rules(
             self.dictionary,
             changeable=self._is_pre_operational,
             stored=self._stored,
-            trace=self._trace,
+            trace=self.feedback.trace,
             on_controlword=self._controlword_written,
             on_communication=self._communication_changed,
         )
@@ -120,14 +124,14 @@ class Drive:
         """Boot, or boot again: the power-on values, pre-operational; returns the boot-up message."""
         self._stored.restore(lambda _: True)
         self.power.start()
-        self.motion.reset(self._feedback.true_position)
-        self._feedback.following_error = False
+        self.motion.reset(self.feedback.true_position)
+        self.feedback.following_error = False
         self._over_window = self._last_offset = 0
         self._outgoing = []
         self.set_temperature(self._celsius)
-        self._feedback.sample(self.tick)
-        self._feedback.show_state()
-        self._trace.clear()
+        self.feedback.sample(self.tick)
+        self.feedback.show_state()
+        self.feedback.trace.clear()
         return self._boot_up()
 
     def power_off(self) -> None:
@@ -156,9 +160,9 @@ class Drive:
         frames = self._producer.due(now_s, self.nmt)
         if not self.faults.no_heartbeat_consumer:
             for node in self._consumer.expired(now_s):
-                self._connection_lost(monitor.HEARTBEAT_LOST, bytes([node]))
+                self._connection_lost(HEARTBEAT_LOST, bytes([node]))
         for number in self.pdo.overdue(now_s):
-            self._connection_lost(monitor.RPDO_TIMEOUT, bytes([number]))
+            self._connection_lost(RPDO_TIMEOUT, bytes([number]))
         return frames + self._take_outgoing() + self.pdo.on_events(now_s)
 
     # -- frames
@@ -212,7 +216,7 @@ class Drive:
         except LookupError:
             return []
         except ValueError:
-            return self._emergencies.report(monitor.PDO_TOO_SHORT)
+            return self._emergencies.report(PDO_TOO_SHORT)
         if at_once is not None:
             self.pdo.apply(at_once)
             self._controlword_written()
@@ -231,16 +235,16 @@ class Drive:
         counter = data[0] if data else None
         if counter is None and self.dictionary.numbers[0x101900]:
             told, self._sync_refused = self._sync_refused, True
-            return [] if told else self._emergencies.report(monitor.SYNC_LENGTH)
+            return [] if told else self._emergencies.report(SYNC_LENGTH)
         self._sync_refused = False
         operational = self.nmt == OPERATIONAL
         if operational:
-            self.pdo.latch(count_late=self.motion.source is Source.CYCLIC)
+            self.pdo.latch()
         self._keep_offset()
         self._control()
-        self.motion.at_sync(self._feedback.true_position)
-        self._supervise(self._feedback.sample(self.tick))
-        self._feedback.show_state()
+        self.motion.at_sync(self.feedback.true_position)
+        self._supervise(self.feedback.sample(self.tick))
+        self.feedback.show_state()
         self.table_mm = self.physics.table_rad * self._mm_per_rad
         frames = self.pdo.at_sync(counter, self._now_s) if operational else []
         self._integrate()
@@ -261,14 +265,14 @@ class Drive:
     def _control(self) -> None:
         word = self.dictionary.numbers[0x604000]
         if self.power.control(word):
-            self._feedback.following_error = False
+            self.feedback.following_error = False
             self.dictionary.numbers[0x603F00] = 0
             self._outgoing += self._emergencies.clear()
         self.motion.control(word)
 
     def _controlword_written(self) -> None:
         self._control()
-        self._feedback.show_state()
+        self.feedback.show_state()
 
     # -- faults and reactions
 
@@ -281,15 +285,15 @@ class Drive:
         self._over_window += 1
         over_ms = (self._over_window - 1) * self.ratings.sync_period_s * 1e3
         if over_ms >= self.dictionary.numbers[0x606600] and self.power.state is not State.FAULT_REACTION_ACTIVE:
-            self._feedback.following_error = True
-            self.trip(monitor.FOLLOWING_ERROR)
+            self.feedback.following_error = True
+            self.trip(FOLLOWING_ERROR)
 
     def trip(self, code: int, detail: bytes = b"") -> None:
         """Fall into fault with this error code: EMCY with the next frames, reaction by 0x605E."""
         self.dictionary.numbers[0x603F00] = code
         self._outgoing += self._emergencies.report(code, detail)
         self.power.fault()
-        self._feedback.show_state()
+        self.feedback.show_state()
 
     def _connection_lost(self, code: int, detail: bytes) -> None:
         self._outgoing += self._emergencies.report(code, detail)
@@ -303,18 +307,9 @@ class Drive:
         if self.power.powered:
             reactions = {1: self.power.fault, 2: self.power.disable_voltage, 3: self.power.quick_stop}
             reactions.get(self.dictionary.number(0x6007), lambda: None)()
-        self._feedback.show_state()
+        self.feedback.show_state()
 
     # -- what a test or the machine around the drive may turn
-
-    @property
-    def digital_inputs(self) -> int:
-        """0x60FD: bits 0 and 1 limit switches, 2 home, 16 the NC's rapid signal."""
-        return self._feedback.digital_inputs
-
-    @digital_inputs.setter
-    def digital_inputs(self, value: int) -> None:
-        self._feedback.digital_inputs = value & 0xFFFFFFFF
 
     def set_parameters(self, **values: float) -> None:
         """Change plant parameters (R, L, K, Jt, ft, Cd at the reference temperature) from the next cycle on.
@@ -331,7 +326,7 @@ class Drive:
     def set_temperature(self, celsius: float) -> None:
         """Set the slide-way's temperature: 0x2110 shows it, ft and Cd follow it."""
         self._celsius = celsius
-        self.dictionary.numbers[0x211001] = clip16(celsius * 100)
+        self.dictionary.numbers[0x211001] = clip(celsius * 100, INT16)
         self._apply_parameters()
 
     def _apply_parameters(self) -> None:
@@ -363,18 +358,3 @@ class Drive:
     def offset_mm(self) -> float:
         """The position offset o[k] in force at the last SYNC."""
         return self.ratings.sign * self.motion.cyclic.now.offset / self.ratings.increments_per_mm
-
-    @property
-    def rpdos_heard(self) -> set[int]:
-        """RPDO numbers received since the last SYNC."""
-        return self.pdo.heard
-
-    @property
-    def rpdos_heard_before(self) -> set[int]:
-        """RPDO numbers that were received between the last two SYNCs."""
-        return self.pdo.heard_before
-
-    @property
-    def late_rpdos(self) -> dict[int, int]:
-        """Per RPDO number, the cycles of enabled CSP in which it was missing after a cycle in which it was there."""
-        return self.pdo.late

@@ -1,4 +1,4 @@
-"""What the loops follow: the cyclic set-points with their delay, and the drive's own ramps and profiles.
+"""Computes what the loops follow: the cyclic set-points with their delay, and the drive's own ramps and profiles.
 
 Both give, for the cycle that begins, the demand at its start, at its end and one cycle later (increments), because the
 feed-forward runs linearly from the slope of this cycle to the slope of the next.
@@ -10,7 +10,7 @@ import math
 from collections import deque
 from typing import NamedTuple
 
-Command = tuple[float, float, float, float, float, float, float, float]
+from fdhil.sim.drive.physics import Command
 
 
 class Target(NamedTuple):
@@ -43,7 +43,7 @@ class CyclicSetpoints:
 
     @property
     def now(self) -> Target:
-        """What is in force at the SYNC that was pushed last."""
+        """The target in force at the SYNC that was pushed last."""
         return self._queue[1]
 
     def command(self) -> Command:

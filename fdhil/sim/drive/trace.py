@@ -1,4 +1,4 @@
-"""The drive's trace buffer: the last cycles as it saw them, read by SDO block upload (vendor object 0x2120)."""
+"""Keeps the last cycles as the drive saw them, to be read by SDO block upload (vendor object 0x2120)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The simulated NC, sans-I/O: SYNC producer, NMT master, and the one who enables the drives and streams set-points.
+"""Simulates the NC, sans-I/O: it produces SYNC, is the NMT master, enables the drives and streams set-points.
 
 After SYNC k-1 and before SYNC k it sends r[k+delay] by RPDO1 (controlword, target position), so that the drive, which
 runs its set-point ``delay`` cycles late, follows r[k] at SYNC k. All its times are counted in SYNC cycles.
@@ -15,9 +15,9 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.records import Trajectory
 from fdhil.sim.drive.power import State
-from fdhil.sim.nc.drive_link import ENABLED, SHUTDOWN, BusFrame, Link, Request
-from fdhil.sim.nc.path import Job, Pause, Player, Rate, Stage, rapid_rows
-from fdhil.sim.wire.hub import Frame
+from fdhil.sim.frame import BusFrame, Frame
+from fdhil.sim.nc.drive_link import ENABLED, SHUTDOWN, DriveLink, SdoWrite
+from fdhil.sim.nc.path import Job, PathRate, Pause, RowPlayer, Stage, rapid_rows
 
 Event = dict[str, Any]
 
@@ -32,7 +32,7 @@ _MAX_OVERRIDE = 1.5
 
 
 class Phase(Enum):
-    """What the NC is doing with the drives."""
+    """The NC's hold on the drives."""
 
     OFF = auto()
     CONFIGURE = auto()
@@ -43,14 +43,14 @@ class Phase(Enum):
 
 
 class Row(NamedTuple):
-    """What is commanded for one SYNC: position (mm per axis), whether it is a rapid, whether a played file's row."""
+    """The command for one SYNC: position (mm per axis), whether it is a rapid, whether a played file's row."""
 
     position_mm: list[float]
     rapid: bool
     playing: bool
 
 
-class Nc:
+class NcController:
     """The NC of one machine. ``events`` collects what it has to say; who runs it takes them out.
 
     Each period: send the frames of :meth:`begin`, give it what the drives answer by :meth:`hear`, then send the frames
@@ -68,7 +68,7 @@ class Nc:
         self._speeds = [axis.rapid_speed_mm_s for axis in config.axis.values()]
         self._accelerations = [axis.max_acceleration_mm_s2 for axis in config.axis.values()]
         self._links = [
-            Link(
+            DriveLink(
                 name,
                 axis.drive.bus,
                 config.node_id(name),
@@ -81,10 +81,10 @@ class Nc:
         self._buses = list(dict.fromkeys(link.bus for link in self._links))
         self._delay = max(link.delay for link in self._links)
         slope = min(a / v for a, v in zip(self._accelerations, self._speeds, strict=True))
-        self._rate = Rate(min(slope, 0.5 / period), period)
+        self._rate = PathRate(min(slope, 0.5 / period), period)
         self._rows: deque[Row] = deque(maxlen=self._delay + 1)
         self._stages: deque[Stage] = deque()
-        self._requests: deque[Request] = deque()
+        self._requests: deque[SdoWrite] = deque()
         self._job: Job | None = None
         self._position = [0.0] * len(self._links)
         self._counter = 0
@@ -210,8 +210,8 @@ class Nc:
         for link in self._links:
             link.status = link.position = None
             link.word = SHUTDOWN
-            self._requests.append(Request(link, 0x1019, COUNTER_OVERFLOW, required=False))
-            self._requests.append(Request(link, 0x6060, 8, required=True))
+            self._requests.append(SdoWrite(link, 0x1019, COUNTER_OVERFLOW, required=False))
+            self._requests.append(SdoWrite(link, 0x6060, 8, required=True))
 
     def _nmt(self, command: int) -> list[BusFrame]:
         return [(link.bus, (0x000, bytes([command, link.node_id]))) for link in self._links]
@@ -231,7 +231,7 @@ class Nc:
             self._give_up(f"drive {request.link.axis} does not answer; check that it is powered")
         return frames
 
-    def _answer(self, link: Link, data: bytes) -> None:
+    def _answer(self, link: DriveLink, data: bytes) -> None:
         if not self._requests or not self._requests[0].sent or self._requests[0].link is not link:
             return
         request = self._requests[0]
@@ -296,9 +296,9 @@ class Nc:
             self._position, rows[0], self._speeds, self._accelerations, self._smoothing_s, self._period_s
         )
         if len(rapid):
-            self._stages.append(Stage(Player(rapid, np.ones(len(rapid), dtype=bool))))
+            self._stages.append(Stage(RowPlayer(rapid, np.ones(len(rapid), dtype=bool))))
             self._stages.append(Stage(Pause(round(_SETTLE_S / self._period_s))))
-        self._stages.append(Stage(Player(rows, trajectory.rapid), playing=True))
+        self._stages.append(Stage(RowPlayer(rows, trajectory.rapid), playing=True))
         self._stages.append(Stage(Pause(round(TAIL_S / self._period_s)), playing=True))
 
     def _stream(self) -> list[BusFrame]:
@@ -367,11 +367,7 @@ class Nc:
             self.events.append({"event": "playing", "file": self._job.file, "rows": rows})
         elif was and not is_:
             self._end_job(stopped=False)
-        elif self._job is not None and not self._stages and self.phase in (Phase.READY, Phase.FAULTED) and not is_:
-            self._end_if_given_up()
-
-    def _end_if_given_up(self) -> None:
-        if not any(row.playing for row in self._rows):
+        elif self.phase in (Phase.READY, Phase.FAULTED) and not self._stages and not any(r.playing for r in self._rows):
             self._end_job(stopped=True)
 
     def _end_job(self, *, stopped: bool) -> None:

@@ -1,4 +1,4 @@
-"""What the NC knows of one drive and sends to it: set-points, the walk to Operation enabled, SDO writes."""
+"""Keeps the NC's view of one drive and makes what is sent to it: set-points, steps to Operation enabled, SDO writes."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ import struct
 from dataclasses import dataclass
 
 from fdhil.sim.drive.power import State
-from fdhil.sim.wire.hub import Frame
-
-BusFrame = tuple[str, Frame]
+from fdhil.sim.frame import BusFrame
 
 ENABLED = 0x0F
 SHUTDOWN = 0x06
@@ -32,7 +30,7 @@ def power_state(statusword: int) -> State:
 
 
 @dataclass(slots=True)
-class Link:
+class DriveLink:
     """One drive as the NC sees it: its default TPDO1 and TPDO2, and the controlword it was given last.
 
     ``increments_per_mm`` has the sign of the axis; ``silent`` counts the SYNCs since the last statusword.
@@ -69,10 +67,10 @@ class Link:
 
 
 @dataclass(slots=True)
-class Request:
+class SdoWrite:
     """An SDO write of one byte that awaits its answer; ``required`` tells whether an abort matters."""
 
-    link: Link
+    link: DriveLink
     index: int
     value: int
     required: bool

@@ -1,4 +1,4 @@
-"""The NC's motion along a path on the SYNC grid: the rapid to its start, and its rows at a variable rate."""
+"""Moves the NC along a path on the SYNC grid: in a rapid to its start, then through its rows at a variable rate."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def rapid_rows(
     return rows
 
 
-class Rate:
+class PathRate:
     """The path's rate, 1 for 100 %: follows a target with limited slope and rounded ends, for override and feed hold.
 
     ``slope_per_s`` bounds its change, so that a machine in rapid never brakes harder than its acceleration.
@@ -82,7 +82,7 @@ class Rate:
         return self.value
 
 
-class Player:
+class RowPlayer:
     """Plays rows (n, axes) at a rate: whole rows exactly, between them a cubic through the neighbours."""
 
     def __init__(self, rows: Float, rapid: Bool) -> None:
@@ -131,7 +131,7 @@ class Pause:
 class Stage:
     """Something to do along the path: a motion or a rest, and whether it is part of the played file."""
 
-    motion: Player | Pause
+    motion: RowPlayer | Pause
     playing: bool = False
 
 

@@ -1,4 +1,4 @@
-"""A CAN bus on TCP: the hub speaks the socketcand text protocol, so that any python-can program joins the bus.
+"""Serves a CAN bus on TCP in the text protocol of socketcand, so that any python-can program joins the bus.
 
     client -> hub   < open can0 >   < rawmode >   < echo >   < send 181 2 a ff >
     hub -> client   < hi >          < ok >        < ok >     < frame 181 1700000000.000000 0AFF >
@@ -14,16 +14,14 @@ from __future__ import annotations
 import errno
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
 from fdhil.errors import ConnectError
+from fdhil.sim.frame import EXTENDED, Frame
+from fdhil.sim.wire.attachment import Attachment, Handler
 
-Frame = tuple[int, bytes]
-Handler = Callable[[Frame], None]
-
-EXTENDED = 1 << 31  # marks a 29 bit identifier, as SocketCAN does
 QUEUE_BYTES = 8 << 20
 STALL_S = 5.0
 _MAX_COMMAND = 4096
@@ -73,7 +71,7 @@ class _Client:
     moved_s: float = 0.0
 
 
-class Hub:
+class Hub(Attachment):
     """The bus ``channel`` on a TCP port of ``host``, port 0 for any free one; ConnectError when it cannot be had.
 
     Not thread-safe: one loop selects on :meth:`readers` and :meth:`writers`, calls :meth:`pump`, then :meth:`flush`.
@@ -84,7 +82,6 @@ class Hub:
     def __init__(self, channel: str, host: str = "127.0.0.1", port: int = 0, queue_bytes: int = QUEUE_BYTES) -> None:
         self.channel = channel
         self.lost_clients = 0
-        self.senders_left = 0
         self.malformed = 0
         self._queue_bytes = queue_bytes
         self._clients: list[_Client] = []
@@ -102,11 +99,7 @@ class Hub:
             ) from None
         self._listener.setblocking(False)
         self.host, self.port = self._listener.getsockname()[:2]
-
-    @property
-    def settings(self) -> dict[str, str | int | None]:
-        """The arguments with which ``can.Bus`` joins."""
-        return {"interface": "socketcand", "channel": self.channel, "host": self.host, "port": self.port}
+        self.settings = {"interface": "socketcand", "channel": channel, "host": self.host, "port": self.port}
 
     @property
     def congested(self) -> bool:
@@ -119,16 +112,11 @@ class Hub:
         return sum(client.raw for client in self._clients)
 
     def readers(self) -> list[socket.socket]:
-        """Sockets to select for reading."""
         return [self._listener] if self.congested else [self._listener, *(c.socket for c in self._clients)]
 
     def writers(self) -> list[socket.socket]:
         """Sockets to select for writing: those whose queue could not be sent at once."""
         return [client.socket for client in self._clients if client.outbox]
-
-    def deadline_s(self) -> float | None:
-        """Monotonic time at which :meth:`flush` is due although no socket is ready: never."""
-        return None
 
     def pump(self, ready: Sequence[object], handler: Handler) -> None:
         """Read the sockets among ``ready``; each frame goes to the other clients, then to ``handler``, in turn."""
@@ -148,7 +136,6 @@ class Hub:
                 client.outbox += text
 
     def flush(self, now_s: float) -> None:
-        """Send what is queued as far as the sockets take it; ``now_s`` is monotonic."""
         for client in self._clients:
             if client.outbox:
                 self._write(client, now_s)
@@ -160,7 +147,6 @@ class Hub:
             self._clients = [client for client in self._clients if not client.gone]
 
     def close(self) -> None:
-        """Close every connection and the port."""
         for client in self._clients:
             client.socket.close()
         self._clients.clear()

@@ -1,4 +1,4 @@
-"""The separate voltage sensor of an axis: a Modbus TCP server with a small sample memory that can be latched.
+"""Serves the separate voltage sensor of an axis by Modbus TCP, with a small sample memory that can be latched.
 
 Registers, 16 bit, 32 bit values in two with the high word first, the same as input (fc 4) and holding registers (fc 3):
 
@@ -21,7 +21,7 @@ import struct
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from pymodbus.constants import ExcCodes
@@ -29,6 +29,7 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from fdhil.errors import ConnectError
+from fdhil.sim.signal_fault import SignalFault
 
 REGISTERS = 116
 BLOCK = 100
@@ -39,16 +40,13 @@ _NOISE_BLOCK = 1024
 
 @dataclass(slots=True)
 class SensorFaults:
-    """What is wrong with a sensor: ``silent`` answers nothing, ``slow_s`` answers late, ``exception`` answers every
-    request with this code, ``stuck`` repeats its value, ``delay_samples`` lags, ``gain`` and ``offset_v`` distort."""
+    """Errors of a sensor: ``silent`` answers nothing, ``slow_s`` answers late, ``exception`` answers every
+    request with this code, ``signal`` spoils the samples (V)."""
 
     silent: bool = False
     slow_s: float = 0.0
     exception: int = 0
-    stuck: bool = False
-    delay_samples: int = 0
-    gain: float = 1.0
-    offset_v: float = 0.0
+    signal: SignalFault = field(default_factory=SignalFault)
 
 
 class VoltageSensor:
@@ -67,10 +65,8 @@ class VoltageSensor:
         self._noise: list[float] = []
         self._lock = threading.Lock()
         self._recent: deque[float] = deque(maxlen=BLOCK)
-        self._late: deque[float] = deque()
         self._count = 0  # samples so far
         self._latched = 0  # samples that were latched or lost
-        self._held: float | None = None
         self._block = [0] * (REGISTERS - STATUS)
 
     def feed(self, mean_v: float) -> None:
@@ -81,22 +77,9 @@ class VoltageSensor:
         mean_v, self._sum_v, self._summed = self._sum_v / self._cycles, 0.0, 0
         if not self._noise:
             self._noise = (self._rng.standard_normal(_NOISE_BLOCK) * self._noise_v).tolist()
-        value = mean_v + self._noise.pop()
-        faults = self.faults
-        if faults.delay_samples or self._late:
-            self._late.append(value)
-            while len(self._late) > max(faults.delay_samples, 0) + 1:
-                self._late.popleft()
-            value = self._late[0]
-            if not faults.delay_samples:
-                self._late.clear()
-        value = value * faults.gain + faults.offset_v
-        if not faults.stuck:
-            self._held = None
-        elif self._held is None:
-            self._held = value
+        value = self.faults.signal.apply(mean_v + self._noise.pop(), self._rng)
         with self._lock:
-            self._recent.append(value if self._held is None else self._held)
+            self._recent.append(value)
             self._count += 1
 
     def latch(self) -> None:

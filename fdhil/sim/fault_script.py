@@ -1,0 +1,111 @@
+"""Reads the fault script and plays it: which fault happens when, to which axis, how badly and for how long.
+
+    [[fault]]
+    at_s = 2.5                 # or at_sync, counted from the first SYNC; or at_row, from a played file's first row
+    axis = "X"
+    fault = "load_torque"
+    value = 5.0                # what it means depends on the fault, see fault_kinds
+    duration_s = 0.3           # left out: for good
+
+A wrong entry is a ConfigError that names every fault of the script at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from fdhil.config import toml_document
+from fdhil.errors import ConfigError, ConfigFault
+from fdhil.sim.axis_unit import AxisUnit
+from fdhil.sim.fault_kinds import FAULTS, FaultEntry
+
+MAX_SCRIPT_BYTES = 256 * 1024
+
+
+def load(path: Path, axes: tuple[str, ...]) -> list[FaultEntry]:
+    """Read a fault script for a machine with these axes; ConfigError with everything that is wrong with it."""
+    try:
+        with path.open("rb") as file:
+            raw = file.read(MAX_SCRIPT_BYTES + 1)
+        if len(raw) > MAX_SCRIPT_BYTES:
+            raise ConfigError(str(path), [ConfigFault("file", "is larger than 256 KiB", "a fault script is a few kB")])
+    except OSError as error:
+        fault = ConfigFault("file", f"cannot be read: {error.strerror}", "check the path")
+        raise ConfigError(str(path), [fault]) from None
+    document = toml_document(raw, str(path))
+    faults = [ConfigFault(key, "is no key of a fault script", "[[fault]] is") for key in document if key != "fault"]
+    entries: list[FaultEntry] = []
+    listed = document.get("fault", [])
+    for place, item in enumerate(listed if isinstance(listed, list) else [listed]):
+        try:
+            entries.append(parse(item, axes))
+        except ConfigError as error:
+            faults += [ConfigFault(f"fault[{place}].{f.path}", f.what, f.suggestion) for f in error.faults]
+    if faults:
+        raise ConfigError(str(path), faults)
+    return entries
+
+
+def parse(item: object, axes: tuple[str, ...]) -> FaultEntry:
+    """Check one entry; ConfigError with everything that is wrong with it."""
+    try:
+        entry = FaultEntry.model_validate(item)
+    except ValidationError as error:
+        faults = [
+            ConfigFault(".".join(map(str, e["loc"])) or "entry", e["msg"].removeprefix("Value error, "))
+            for e in error.errors()
+        ]
+        raise ConfigError("fault", faults) from None
+    if entry.axis is not None and entry.axis not in axes:
+        raise ConfigError("fault", [ConfigFault("axis", f"there is no axis {entry.axis!r}", f"use {', '.join(axes)}")])
+    return entry
+
+
+class FaultSchedule:
+    """Starts and ends faults by SYNC."""
+
+    def __init__(self, units: Mapping[str, AxisUnit], period_s: float) -> None:
+        self._units, self._period_s = units, period_s
+        self._waiting: list[FaultEntry] = []
+        self._running: list[tuple[int, FaultEntry]] = []  # SYNC at which it ends
+
+    def add(self, entry: FaultEntry) -> None:
+        """Take an entry into the schedule; ConfigError when its object cannot hold its value."""
+        if entry.fault == "object":
+            wrong = self._unit(entry).object_fault(entry.index or 0, entry.sub, int(entry.number))
+            if wrong:
+                raise ConfigError("fault", [ConfigFault("object", wrong, "the drive's EDS lists its objects")])
+        self._waiting.append(entry)
+
+    @property
+    def idle(self) -> bool:
+        """Whether there is nothing to start or to end."""
+        return not self._waiting and not self._running
+
+    def step(self, tick: int, row: int | None) -> list[FaultEntry]:
+        """Start and end what is due at this SYNC; return what started. ``row`` counts a played file's rows."""
+        for end, entry in [item for item in self._running if item[0] <= tick]:
+            self._running.remove((end, entry))
+            self._apply(entry, on=False)
+        due = [entry for entry in self._waiting if self._is_due(entry, tick, row)]
+        for entry in due:
+            self._waiting.remove(entry)
+            self._apply(entry, on=True)
+            if entry.duration_s is not None:
+                self._running.append((tick + max(1, round(entry.duration_s / self._period_s)), entry))
+        return due
+
+    def _is_due(self, entry: FaultEntry, tick: int, row: int | None) -> bool:
+        if entry.at_row is not None:
+            return row is not None and row >= entry.at_row
+        at = entry.at_sync if entry.at_sync is not None else round((entry.at_s or 0.0) / self._period_s)
+        return tick >= at
+
+    def _apply(self, entry: FaultEntry, *, on: bool) -> None:
+        FAULTS[entry.fault].apply(self._unit(entry), entry, on)
+
+    def _unit(self, entry: FaultEntry) -> AxisUnit:
+        return self._units[entry.axis if entry.axis is not None else next(iter(self._units))]

@@ -1,0 +1,8 @@
+"""The types of a CAN frame inside the simulated machine."""
+
+from __future__ import annotations
+
+Frame = tuple[int, bytes]
+BusFrame = tuple[str, Frame]
+
+EXTENDED = 1 << 31  # marks a 29 bit identifier, as SocketCAN does

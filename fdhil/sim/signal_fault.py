@@ -1,0 +1,49 @@
+"""Spoils a reported signal as a fault script orders it."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+
+@dataclass(slots=True)
+class SignalFault:
+    """Errors of one reported signal, in its own unit; applied in this order.
+
+    ``delay_cycles``: slow. ``gain``, ``offset``: wrong. ``clip``: saturates at +-clip. ``resolution``: coarse.
+    ``garbage``: random values of up to +-``garbage``. ``stuck``: the last value for ever.
+    """
+
+    delay_cycles: int = 0
+    gain: float = 1.0
+    offset: float = 0.0
+    clip: float | None = None
+    resolution: float = 0.0
+    garbage: float = 0.0
+    stuck: bool = False
+    _late: deque[float] = field(default_factory=deque, repr=False, compare=False)
+    _held: float | None = field(default=None, repr=False, compare=False)
+
+    def apply(self, value: float, rng: np.random.Generator) -> float:
+        """Return what is reported for ``value``."""
+        if self.delay_cycles:
+            self._late.append(value)
+            value = self._late[0]
+            while len(self._late) > self.delay_cycles:
+                self._late.popleft()
+        else:
+            self._late.clear()
+        value = value * self.gain + self.offset
+        if self.clip is not None:
+            value = min(max(value, -self.clip), self.clip)
+        if self.resolution:
+            value = round(value / self.resolution) * self.resolution
+        if self.garbage:
+            value = float(rng.uniform(-self.garbage, self.garbage))
+        if not self.stuck:
+            self._held = None
+        elif self._held is None:
+            self._held = value
+        return value if self._held is None else self._held
