@@ -23,12 +23,12 @@ from fdhil.arming.guard_client import GuardClient
 from fdhil.guard import core
 from fdhil.guard.frames import Listener
 from fdhil.guard.interlocks import FACTS
-from fdhil.guard.limits import Limits
+from fdhil.guard.limits import OffsetLimits
 from fdhil.guard.path import Path as CorrectionPath
 from fdhil.guard.settings import AxisSettings, Pdo, Settings, to_json
 from fdhil.guard.state import Inputs, Request, State, initial
 
-LIMITS = Limits(offset=819, rate=65, acceleration=6, variation=9830, window=1000)
+LIMITS = OffsetLimits(offset=819, rate=65, acceleration=6, variation=9830, window=1000)
 ROWS = 20
 TOKEN = "benchmark"
 

@@ -26,7 +26,7 @@ Targets = tuple[int, ...]
 Pair = tuple[int, int]
 
 
-class Limits(NamedTuple):
+class FeedforwardLimits(NamedTuple):
     """Largest speed offset (increments/s) and torque offset (0.1 % of the rated torque), and each per SYNC cycle."""
 
     speed: int
@@ -144,7 +144,7 @@ def hear(feed: Feed, targets: Sequence[int | None]) -> Feed:
     return feed._replace(targets=tuple(heard))
 
 
-def move(feed: Feed, limits: Sequence[Limits], fade_cycles: int, confirmed: bool = True) -> Feed:
+def move(feed: Feed, limits: Sequence[FeedforwardLimits], fade_cycles: int, confirmed: bool = True) -> Feed:
     """Go one cycle on: the next offsets are ``applied``, inside their limits; OFF once zeros were sent.
 
     ``confirmed``: no drive shows anything but 0; zeros are sent for longer when one does.
@@ -172,7 +172,7 @@ def _landed(feed: Feed, confirmed: bool) -> Feed:
     return feed._replace(mode=FeedMode.OFF, cause=cause)
 
 
-def _inside(before: Pair, wanted: Pair, share: int, fade_cycles: int, limits: Limits) -> Pair:
+def _inside(before: Pair, wanted: Pair, share: int, fade_cycles: int, limits: FeedforwardLimits) -> Pair:
     """Fade, then keep amplitude and rate."""
     bounds = ((limits.speed, limits.speed_rate), (limits.torque, limits.torque_rate))
     values = []
@@ -182,7 +182,7 @@ def _inside(before: Pair, wanted: Pair, share: int, fade_cycles: int, limits: Li
     return values[0], values[1]
 
 
-def violates(limits: Limits, before: Pair, after: Pair) -> bool:
+def violates(limits: FeedforwardLimits, before: Pair, after: Pair) -> bool:
     """Check what is to be sent by the limits alone; zero may always be sent."""
     for last, value, largest, rate in zip(before, after, limits[::2], limits[1::2], strict=True):
         if type(value) is not int or not -largest <= value <= largest:

@@ -18,7 +18,7 @@ from typing import Any, Literal
 from fdhil.cia402 import PdoEntry, lay_out
 from fdhil.errors import ConfigError, ConfigFault
 from fdhil.guard import feedforward
-from fdhil.guard.limits import Limits, ceilings
+from fdhil.guard.limits import OffsetLimits, ceilings
 
 SCHEMA = "fdhil-guard-settings-2"
 MAX_BYTES = 1 << 20
@@ -48,7 +48,7 @@ class Feedforward:
     """What the on-line feed-forward may send: ``pdo`` maps 0x60B1 and 0x60B2, ``limits`` in the drive's counts."""
 
     pdo: Pdo
-    limits: feedforward.Limits
+    limits: feedforward.FeedforwardLimits
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ class AxisSettings:
     max_speed_mm_s: float
     max_acceleration_mm_s2: float
     sign: int
-    limits: Limits
+    limits: OffsetLimits
     window: int
     setpoint_delay_cycles: int
     heartbeat_timeout_s: float = 0.0
@@ -225,14 +225,14 @@ def _pdo(document: Mapping[str, Any]) -> Pdo:
 def _axis(document: dict[str, Any]) -> AxisSettings:
     tpdos = tuple(_pdo(pdo) for pdo in document.pop("tpdos"))
     target, offset = _pdo(document.pop("target")), _pdo(document.pop("offset"))
-    limits, feed = Limits(**document.pop("limits")), document.pop("feedforward")
+    limits, feed = OffsetLimits(**document.pop("limits")), document.pop("feedforward")
     travel = document.pop("travel")
     if travel is not None:
         low, high = (_whole(end, -(2**31), 2**31 - 1, "travel") for end in travel)
         document["travel"] = (low, high)
     if feed is not None:
         most = [_whole(limit, 1, 2**31 - 1, "a limit of the feed-forward") for limit in feed["limits"]]
-        feed = Feedforward(_pdo(feed["pdo"]), feedforward.Limits(*most))
+        feed = Feedforward(_pdo(feed["pdo"]), feedforward.FeedforwardLimits(*most))
     return AxisSettings(target=target, offset=offset, tpdos=tpdos, limits=limits, feedforward=feed, **document)
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from fdhil.errors import StoreError
-from fdhil.guard.limits import Limits, violation
+from fdhil.guard.limits import OffsetLimits, violation
 from fdhil.guard.path import Path
 
 MAX_TABLE_BYTES = 16 << 20
@@ -156,7 +156,7 @@ def read_sealed(descriptor: int | None, most_bytes: int = MAX_TABLE_BYTES) -> by
     return os.pread(descriptor, size, 0)
 
 
-def check_rows(limits: Limits, offsets: Sequence[int], start: int, stop: int) -> str | None:
+def check_rows(limits: OffsetLimits, offsets: Sequence[int], start: int, stop: int) -> str | None:
     """Check rows [start, stop) of a table's offsets, with what lies before ``start``; return the class or None.
 
     The row before the first is taken to be at rest at the first row's value: the fade-in brings the offset there.
@@ -171,7 +171,7 @@ def check_rows(limits: Limits, offsets: Sequence[int], start: int, stop: int) ->
     return "OffsetEnergy" if not _variation_fits(limits, offsets, start, stop) else None
 
 
-def _variation_fits(limits: Limits, offsets: Sequence[int], start: int, stop: int) -> bool:
+def _variation_fits(limits: OffsetLimits, offsets: Sequence[int], start: int, stop: int) -> bool:
     first = max(1, start - limits.window + 1)
     moves = [abs(offsets[row] - offsets[row - 1]) for row in range(first, stop)]
     travelled = 0
@@ -182,7 +182,7 @@ def _variation_fits(limits: Limits, offsets: Sequence[int], start: int, stop: in
     return True
 
 
-def near_no_end(travel: tuple[int, int], limits: Limits, demand: Sequence[int]) -> bool:
+def near_no_end(travel: tuple[int, int], limits: OffsetLimits, demand: Sequence[int]) -> bool:
     """Whether these rows keep twice the largest offset away from both software limits."""
     low, high = travel
     return not demand or (low + 2 * limits.offset <= min(demand) and max(demand) <= high - 2 * limits.offset)
@@ -196,7 +196,7 @@ class Loading:
     """
 
     joined: Path
-    limits: tuple[Limits, ...]
+    limits: tuple[OffsetLimits, ...]
     travel: tuple[Travel, ...] = ()
     next_row: int = field(default=0)
 
@@ -227,7 +227,7 @@ def begin(
     body: bytes,
     sequence: int,
     axes: Sequence[str],
-    limits: tuple[Limits, ...],
+    limits: tuple[OffsetLimits, ...],
     loaded: Path | None,
     keep_from: int,
     travel: tuple[Travel, ...] = (),

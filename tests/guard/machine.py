@@ -10,7 +10,7 @@ from fdhil.guard import core
 from fdhil.guard.feedforward import Pair
 from fdhil.guard.frames import Listener
 from fdhil.guard.interlocks import FACTS, Alarm
-from fdhil.guard.limits import Limits
+from fdhil.guard.limits import OffsetLimits
 from fdhil.guard.path import Path
 from fdhil.guard.settings import AxisSettings, Pdo, Settings
 from fdhil.guard.state import Inputs, Mode, Output, Request, State, initial
@@ -20,10 +20,10 @@ ENABLED = 0x1237
 FACTS_GIVEN: Mapping[str, bool] = dict.fromkeys(FACTS, True)
 DIGEST = "program-1"
 RECORD = "as commissioned"
-LIMITS = Limits(offset=819, rate=65, acceleration=6, variation=9830, window=1000)
+LIMITS = OffsetLimits(offset=819, rate=65, acceleration=6, variation=9830, window=1000)
 
 
-def axis_settings(name: str, node_id: int, limits: Limits = LIMITS) -> AxisSettings:
+def axis_settings(name: str, node_id: int, limits: OffsetLimits = LIMITS) -> AxisSettings:
     """The default mapping of the simulated drive."""
     return AxisSettings(
         name=name,
@@ -47,7 +47,7 @@ def axis_settings(name: str, node_id: int, limits: Limits = LIMITS) -> AxisSetti
     )
 
 
-def settings(axes: Sequence[str] = ("X", "Y"), limits: Limits = LIMITS, **changes: object) -> Settings:
+def settings(axes: Sequence[str] = ("X", "Y"), limits: OffsetLimits = LIMITS, **changes: object) -> Settings:
     """Settings of the bench in SYNC time."""
     made = Settings(
         bus="can0",

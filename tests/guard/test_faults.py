@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 
 from fdhil.guard.interlocks import Alarm
-from fdhil.guard.limits import Limits
+from fdhil.guard.limits import OffsetLimits
 from fdhil.guard.path import Path
 from fdhil.guard.state import ON_PATH, Mode, Request
 from tests.guard.machine import DIGEST, RECORD, Bench, Drive, bench
@@ -393,7 +393,7 @@ def test_vibrating_table_is_left_by_its_total_variation() -> None:
     assert machine.path is not None
     wave = [(k // 8 % 2 * 2 - 1) * (k % 8 if k % 8 < 4 else 8 - k % 8) * 6 for k in range(600)]
     machine.path = Path(0, machine.path.demand, (wave, machine.path.offset[1]), True, DIGEST, 1)
-    tight = Limits(819, 65, 12, 500, 1000)
+    tight = OffsetLimits(819, 65, 12, 500, 1000)
     machine.settings = replace(machine.settings, axes=tuple(replace(a, limits=tight) for a in machine.settings.axes))
     machine.settle()
     machine.arm()

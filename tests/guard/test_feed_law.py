@@ -12,9 +12,9 @@ from fdhil.guard.feedforward import (
     HOLD_CYCLES,
     ZEROS,
     Feed,
+    FeedforwardLimits,
     FeedMode,
     Law,
-    Limits,
     armed,
     end,
     hear,
@@ -82,7 +82,7 @@ def fed(**changes: Any) -> Feed:
 
 def test_it_fades_in_cycle_by_cycle_and_out_the_same_way() -> None:
     """Of 10 cycles each adds a tenth of what the law says, rounded down; ending takes it back."""
-    wide, feed = Limits(10**6, 10**6, 10**4, 10**4), fed()
+    wide, feed = FeedforwardLimits(10**6, 10**6, 10**4, 10**4), fed()
     assert LAW.offsets((30, 20, 10)) == (2000, 30)
     seen = []
     for _ in range(12):

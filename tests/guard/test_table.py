@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from fdhil.errors import StoreError
 from fdhil.guard import table
-from fdhil.guard.limits import Limits
+from fdhil.guard.limits import OffsetLimits
 from fdhil.guard.path import Path
 from fdhil.guard.table import TableRefused
 from tests.guard.machine import LIMITS
@@ -172,7 +172,7 @@ def load(loading: table.Loading, rows: int) -> table.Loading:
 
 
 def test_pieces_join_and_old_rows_are_let_go() -> None:
-    limits = (Limits(819, 65, 6, 9830, 10),) * 2
+    limits = (OffsetLimits(819, 65, 6, 9830, 10),) * 2
     path = load(table.begin(body(final=False), 1, "XY", limits, None, 0), 1).joined
     for sequence in range(2, 20):
         path = load(
@@ -216,7 +216,7 @@ def test_rows_beyond_a_limit_are_refused_wherever_they_are(row: int, value: int,
     assert f"rows {row // 7 * 7} to" in str(refusal.value)
 
 
-TINY = Limits(offset=10, rate=5, acceleration=2, variation=1000, window=100)
+TINY = OffsetLimits(offset=10, rate=5, acceleration=2, variation=1000, window=100)
 
 
 def loaded_within(travel: tuple[int, int] | None, demand: list[int]) -> Path:
