@@ -17,7 +17,7 @@ from typing import Any, Self
 
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
 from fdhil.guard import table
-from fdhil.guard.control import SOCKET_NAME
+from fdhil.guard.protocol import SOCKET_NAME
 
 ANSWER_S = 13.0  # the guard answers a request at a SYNC, or when it has missed it for up to 10 s
 

@@ -23,13 +23,14 @@ from fdhil.config import Axis, CanBus, MachineConfig, share_fault
 from fdhil.errors import ConfigError, ConfigFault, ConnectError, DeviceError, ProtocolError, StoreError
 from fdhil.guard.feedforward import FeedforwardLimits
 from fdhil.guard.limits import OffsetLimits
+from fdhil.guard.protocol import SETTINGS_NAME
 from fdhil.guard.settings import AxisSettings, Feedforward, Layout, Pdo, Settings, from_json, to_json
 
 if TYPE_CHECKING:
     from fdhil.commissioning.record import CommissioningRecord
     from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
 
-SETTINGS_NAME = "guard.json"
+
 CONNECT_S = 5.0
 SPEED_STEPS = 2.0  # times the motor's power: room for the load's own inertia and for the sensor's noise
 HEARTBEATS_AWAITED = 2.0  # periods of the drive's heartbeat until it counts as lost

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from fdhil.guard import feedforward
 from fdhil.guard.conditions import AGREEING, ARMING_INTERLOCKS, View, known
-from fdhil.guard.feedforward import FeedMode
 from fdhil.guard.feeding import is_fed
 from fdhil.guard.interlocks import Alarm, Reaction
 from fdhil.guard.limits import CEILING_OFFSET_UM
 from fdhil.guard.path import EPS
+from fdhil.guard.protocol import AT_REST, SENDING, FeedMode, Mode
 from fdhil.guard.settings import AxisSettings, Settings
-from fdhil.guard.state import SENDING, AxisState, Inputs, Mode, Request, State
+from fdhil.guard.state import AxisState, Inputs, Request, State
+from fdhil.guard.transitions import Event
 
 Views = tuple[View, ...]
 Alarms = tuple[Alarm, ...]
@@ -100,7 +101,7 @@ def adopt_refusals(state: State, request: Request, alarms: Alarms, views: Views)
     refused = [alarm for alarm in alarms if alarm.reaction is Reaction.FREEZE]
     if not _nothing_held(state):
         refused += doubts(views, alarms)
-    if state.mode not in (Mode.OFF, Mode.FROZEN) or state.feed.mode is not FeedMode.OFF:
+    if state.mode not in AT_REST or state.feed.mode is not FeedMode.OFF:
         refused.append(Alarm("NotOff", detail=state.mode.value))
     if request.token_valid is not True:
         refused.append(Alarm("AuthRequired"))
@@ -117,9 +118,9 @@ def adopting(state: State, settings: Settings) -> State:
     cause = Alarm("StaleOffset")
     if _nothing_held(state):
         axes = tuple([axis._replace(sent=(0,) * len(axis.sent), offset=0, rate=0) for axis in state.axes])
-        return state._replace(mode=Mode.OFF, axes=axes, adopt_checked=True, cause=None)
+        return state.after(Event.NOTHING_HELD, axes=axes, adopt_checked=True, cause=None)
     feed = feedforward.zeroing(len(state.axes), cause) if is_fed(state) and settings.feeds else state.feed
-    state = state._replace(mode=Mode.ADOPT, zeros_sent=0, adopt_checked=True, cause=cause, feed=feed)
+    state = state.after(Event.ADOPT, zeros_sent=0, adopt_checked=True, cause=cause, feed=feed)
     return _from_measured(state)
 
 
@@ -158,9 +159,9 @@ def unread(state: State) -> State:
 def frozen(state: State, cause: Alarm) -> State:
     """Stop sending: what the drive holds is unknown, unless only zeros were sent and shown."""
     if not state.measuring and all(map(is_zero, state.axes)):
-        return state._replace(mode=Mode.OFF, cause=cause, places=())
+        return state.after(Event.BLOCKED_AT_ZERO, cause=cause, places=())
     axes = tuple([axis._replace(read_back=None, readings=0) for axis in state.axes])
-    return state._replace(mode=Mode.FROZEN, cause=cause, places=(), axes=axes, measuring=0)
+    return state.after(Event.BLOCKED, cause=cause, places=(), axes=axes, measuring=0)
 
 
 def adopt_at_start(state: State, inputs: Inputs, alarms: Alarms, views: Views, settings: Settings) -> State:
@@ -179,7 +180,7 @@ def adopt_at_start(state: State, inputs: Inputs, alarms: Alarms, views: Views, s
         return adopting(state, settings)
     if state.unknown_for < patience(settings):
         return state._replace(unknown_for=state.unknown_for + 1)
-    return state._replace(mode=Mode.FROZEN, cause=in_doubt(views, doubtful), adopt_checked=True)
+    return state.after(Event.DOUBTFUL, cause=in_doubt(views, doubtful), adopt_checked=True)
 
 
 def measure(state: State, alarms: Alarms, views: Views, settings: Settings) -> State:

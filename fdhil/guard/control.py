@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.errors import DeviceError
+from fdhil.guard.protocol import SOCKET_NAME
 from fdhil.guard.requests import Document, parse_line
 
-SOCKET_NAME = "guard.sock"
 MAX_CLIENTS = 8
 MAX_LINE_BYTES = 1 << 15
 SO_PEERCRED = getattr(socket, "SO_PEERCRED", 17)

@@ -117,7 +117,6 @@ class Listener:
     bus_state: str = "active"
     lost_frames: int = 0
     foreign_ids: frozenset[int] = frozenset()
-    duplicates: int = 0
     emergencies: int = 0
     _pdos: dict[int, _PdoState] = field(default_factory=dict)
     _tpdos: list[list[_PdoState]] = field(default_factory=list)

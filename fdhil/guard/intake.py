@@ -9,9 +9,10 @@ from fdhil.guard.control import Client
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.journal import Journal
 from fdhil.guard.path import Path
+from fdhil.guard.protocol import Mode
 from fdhil.guard.requests import Document
 from fdhil.guard.settings import Settings
-from fdhil.guard.state import Mode, State
+from fdhil.guard.state import State
 
 ROWS_PER_TURN = 64
 ROWS_PER_IDLE_TURN = 1024

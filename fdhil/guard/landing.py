@@ -7,10 +7,10 @@ import time
 
 from fdhil.cia402 import COB_SYNC, pack
 from fdhil.guard.can_socket import BusDown, CanSocket
-from fdhil.guard.feedforward import FeedMode
 from fdhil.guard.limits import follow
+from fdhil.guard.protocol import SENDING, FeedMode
 from fdhil.guard.settings import Settings
-from fdhil.guard.state import SENDING, State
+from fdhil.guard.state import State
 
 ZEROS = 5
 

@@ -18,16 +18,16 @@ from fdhil.cia402 import COB_HEARTBEAT, COB_SYNC, Nmt, pack
 from fdhil.guard import core, status
 from fdhil.guard.can_socket import ERROR, BusDown, CanSocket
 from fdhil.guard.control import Client, Control
-from fdhil.guard.feedforward import FeedMode
 from fdhil.guard.frames import Listener
 from fdhil.guard.intake import Intake
 from fdhil.guard.interlocks import FACTS, WITHDRAWABLE, Alarm
 from fdhil.guard.journal import Journal, Notifier
 from fdhil.guard.landing import land
+from fdhil.guard.protocol import FeedMode, Mode
 from fdhil.guard.requests import Document, parse_request
 from fdhil.guard.settings import Settings
 from fdhil.guard.shadow import Shadow
-from fdhil.guard.state import Inputs, Mode, Output, Request, initial
+from fdhil.guard.state import Inputs, Output, Request, initial
 
 IDLE_S = 0.05
 REST_S = 0.001

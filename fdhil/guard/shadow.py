@@ -6,7 +6,8 @@ Nothing here leaves the process: it works on a copy of the core's state and is s
 from __future__ import annotations
 
 from fdhil.guard.path import Path
-from fdhil.guard.state import Mode, State
+from fdhil.guard.protocol import Mode
+from fdhil.guard.state import State
 from fdhil.guard.tracking import await_start, track
 
 
@@ -30,7 +31,7 @@ class Shadow:
         before = self._state
         if before is None:
             waiting = state._replace(rest=rested.rest, rested_for=rested.rested_for, start_row=self._start_row)
-            started, _ = await_start(waiting._replace(places=()), path)
+            started, _ = await_start(waiting._replace(mode=Mode.ARMED, places=()), path)
             self._state = started if started.places else None
             return
         found, lost = track(before._replace(targets=state.targets), path)

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fdhil.guard.adoption import may_stand
-from fdhil.guard.feedforward import FeedMode
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.path import Path
+from fdhil.guard.protocol import FEEDFORWARD, FeedMode
 from fdhil.guard.settings import Settings
 from fdhil.guard.state import State
 
@@ -46,7 +46,7 @@ def document(state: State, settings: Settings, path: Path | None, not_good: Sequ
     """Return what state and table say; the loop adds what it alone knows."""
     cause, feed = state.cause or state.feed.cause, state.feed
     return {
-        "state": state.mode.value if feed.mode is FeedMode.OFF else "FEEDFORWARD",
+        "state": state.mode.value if feed.mode is FeedMode.OFF else FEEDFORWARD,
         "cause": told(cause) if cause else None,
         "feedforward": {
             "state": feed.mode.value,

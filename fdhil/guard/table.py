@@ -18,6 +18,7 @@ from typing import Any, Protocol
 from fdhil.errors import StoreError
 from fdhil.guard.limits import OffsetLimits, violation
 from fdhil.guard.path import Path
+from fdhil.guard.protocol import TABLE_NAME
 
 MAX_TABLE_BYTES = 16 << 20
 MAX_HEAD_BYTES = 4096
@@ -121,7 +122,7 @@ def seal(body: bytes) -> int:
     if len(body) > MAX_TABLE_BYTES:
         raise StoreError(f"a correction table of {len(body)} bytes is too long for the guard; stream it in pieces")
     try:
-        descriptor = os.memfd_create("fdhil-table", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        descriptor = os.memfd_create(TABLE_NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         try:
             view = memoryview(body)
             while view:

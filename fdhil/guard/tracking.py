@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.path import EPS, Path, Place, advance, around, rate_between
-from fdhil.guard.state import Mode, State
+from fdhil.guard.state import State
+from fdhil.guard.transitions import Event
 
 STILL_CYCLES = 10
 """How long the targets must stand at the path's begin before a move can be its start."""
@@ -32,7 +33,7 @@ def await_start(state: State, path: Path) -> tuple[State, Alarm | None]:
     places = around(path, state.start_row + 1, now)
     if not places:
         return state, Alarm("Misaligned", detail="the first move leaves the path")
-    return state._replace(mode=Mode.RAMPING, places=places, anchor=places[0].row, cause=None), None
+    return state.after(Event.START, places=places, anchor=places[0].row, cause=None), None
 
 
 def track(state: State, path: Path) -> tuple[State, Alarm | None]:

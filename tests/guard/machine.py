@@ -12,8 +12,9 @@ from fdhil.guard.frames import Listener
 from fdhil.guard.interlocks import FACTS, Alarm
 from fdhil.guard.limits import OffsetLimits
 from fdhil.guard.path import Path
+from fdhil.guard.protocol import Mode
 from fdhil.guard.settings import AxisSettings, Pdo, Settings
-from fdhil.guard.state import Inputs, Mode, Output, Request, State, initial
+from fdhil.guard.state import Inputs, Output, Request, State, initial
 
 Frame = tuple[int, bytes]
 ENABLED = 0x1237

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from fdhil.guard.state import Mode, Request
+from fdhil.guard.protocol import Mode
+from fdhil.guard.state import Request
 from tests.guard.machine import Bench, bench
 
 

@@ -8,7 +8,8 @@ from fdhil.guard import core
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.path import Path, rate_between
 from fdhil.guard.plausibility import observe
-from fdhil.guard.state import Inputs, Mode, Request
+from fdhil.guard.protocol import Mode
+from fdhil.guard.state import Inputs, Request
 from tests.guard.machine import Bench, bench
 
 

@@ -12,7 +12,8 @@ import pytest
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.limits import OffsetLimits
 from fdhil.guard.path import Path
-from fdhil.guard.state import ON_PATH, Mode, Request
+from fdhil.guard.protocol import ON_PATH, Mode
+from fdhil.guard.state import Request
 from tests.guard.machine import DIGEST, RECORD, Bench, Drive, bench
 
 Fault = Callable[[Bench], None]

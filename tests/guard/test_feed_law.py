@@ -8,22 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.guard.feedforward import (
-    HOLD_CYCLES,
-    ZEROS,
-    Feed,
-    FeedforwardLimits,
-    FeedMode,
-    Law,
-    armed,
-    end,
-    hear,
-    move,
-    react,
-    violates,
-)
+from fdhil.guard.feedforward import Feed, FeedforwardLimits, Law, armed, end, hear, move, react, violates
 from fdhil.guard.interlocks import Alarm
+from fdhil.guard.protocol import HOLD_CYCLES, FeedMode
 from fdhil.guard.requests import parse_law
+from fdhil.guard.transitions import ZEROS
 from tests.guard.fed import LAW, LIMITS, ONE
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from fdhil.guard.path import EPS, SEARCH, Path, Place, advance, around, rate_between
-from fdhil.guard.state import Mode, State, initial
+from fdhil.guard.protocol import Mode
+from fdhil.guard.state import State, initial
 from fdhil.guard.tracking import STILL_CYCLES, await_start, rest, track
 from tests.guard import machine
 

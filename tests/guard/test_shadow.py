@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from fdhil.guard.path import Path
+from fdhil.guard.protocol import Mode
 from fdhil.guard.shadow import Shadow
-from fdhil.guard.state import Mode
 from tests.guard import machine
 from tests.guard.machine import DIGEST
 
