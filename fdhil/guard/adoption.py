@@ -1,4 +1,4 @@
-"""What a drive holds of our offset, and whether it may be believed. Pure, part of the core.
+"""Judges what a drive holds of our offset, and brings to zero what may be believed. Pure, part of the core.
 
 A value is known when three TPDOs in a row showed it, each at its own time. It is believed, and only then sent, when it
 is also within the compiled ceiling, agrees with the drive's own demand (0x6062), and the drive is as it was

@@ -1,4 +1,4 @@
-"""What must hold before and while an offset is sent, as predicates over what is known of the bus and of an axis.
+"""Judges the bus and each axis by the interlocks: predicates that must hold before and while an offset is sent.
 
 Every comparison says what is good: what is unknown (None, NaN) is never good.
 """

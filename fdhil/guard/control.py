@@ -1,4 +1,4 @@
-"""The guard's UNIX stream socket: JSON lines from a few clients, none of which can block the loop or fill its memory.
+"""Serves JSON lines of a few clients on a UNIX socket; none of them can block the loop or fill its memory.
 
 Each turn of the loop serves one client at most, by one request at most. A client whose answers wait is not read.
 """

@@ -1,4 +1,4 @@
-"""The guard's decisions: ``step(state, inputs, settings) -> (state, output)``, a pure function, once per SYNC.
+"""Decides what leaves the guard: ``step(state, inputs, settings) -> (state, output)``, pure, once per SYNC.
 
 No clock, no I/O: time is the SYNC count in the state. Every way out of a state leads toward OFF, but for the operator's
 arm and adopt. The order within a step: what the drives and the bus say, the interlocks, the request, the place on the

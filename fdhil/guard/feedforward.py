@@ -1,4 +1,4 @@
-"""The on-line feed-forward: speed and torque offsets (0x60B1, 0x60B2) from the targets that the NC sends. Pure.
+"""Computes speed and torque offsets (0x60B1, 0x60B2) on line from the targets that the NC sends. Pure.
 
 The law is a few whole weights per axis, found by the daemon from the identified drive; here it is integer arithmetic on
 the last targets, with limits of its own. It has a state beside the position offset's and is never on together with it.

@@ -1,4 +1,4 @@
-"""The on-line feed-forward's part of a step: what stops it, what it sends, and the check of that. Pure."""
+"""Steps the on-line feed-forward: what stops it, what it sends, and the check of that. Pure."""
 
 from __future__ import annotations
 

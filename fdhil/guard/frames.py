@@ -1,4 +1,4 @@
-"""From frames to what the core may know at a SYNC: pure bookkeeping, no socket and no clock of its own.
+"""Gathers frames into what the core may know at a SYNC: pure bookkeeping, no socket and no clock of its own.
 
 A TPDO is sampled at a SYNC and arrives after it, so that at the next SYNC it is one cycle old. The target that a SYNC
 latches is the last one that came before it.

@@ -1,4 +1,4 @@
-"""The table on its way in: taken from its descriptor, then checked a few rows a turn, so that no SYNC waits for it."""
+"""Takes a table from its descriptor and checks it a few rows a turn, so that no SYNC waits for it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The interlocks by name: each its own class, with reaction, cause and next action; what the daemon must vouch for."""
+"""Lists the interlocks: the reaction, cause and next action of each class, and what the daemon must vouch for."""
 
 from __future__ import annotations
 

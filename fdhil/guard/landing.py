@@ -1,4 +1,4 @@
-"""The last way to zero, when the loop itself has failed: from what was sent last, by the limits alone, at each SYNC."""
+"""Ramps to zero when the loop itself has failed: from what was sent last, by the limits alone, at each SYNC."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an offset may do, in whole drive increments per SYNC cycle, and how to move it inside these limits.
+"""Bounds an offset, in whole drive increments per SYNC cycle, and moves it inside these limits.
 
 Everything here is integer arithmetic: there is no NaN, no rounding, and every start can be enumerated by a test.
 The check of a frame (``violation``) shares no formula with the motion (``follow``), so that one guards the other.

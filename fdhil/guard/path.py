@@ -1,4 +1,4 @@
-"""The corrected path: rows of demand and offset per axis in drive increments, and where on it the machine is.
+"""Holds the corrected path, rows of demand and offset per axis in drive increments, and finds the machine on it.
 
 A row's demand is what the NC will send as 0x607A, so that the guard finds its place by looking, not by a clock.
 """

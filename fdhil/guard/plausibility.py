@@ -1,4 +1,4 @@
-"""What one SYNC tells about the axes: what was in force against what the drives showed. Pure, part of the core."""
+"""Compares at each SYNC what was in force with what the drives showed. Pure, part of the core."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The guard's shell: one loop over the bus, the daemon's socket and the signals; all decisions are the core's.
+"""Runs the guard's one loop over the bus, the daemon's socket and the signals; all decisions are the core's.
 
 At a SYNC the offset frames leave in the same turn and before anything else is done. Nothing here waits for a client:
 after each request that was served the clients rest, so that however many they send, every SYNC finds the loop waiting.

@@ -1,4 +1,4 @@
-"""From the bytes of a request to the record that the core decides on; what is none becomes one that is refused.
+"""Parses the bytes of a request into the record that the core decides on; what is none becomes one that is refused.
 
 Whatever the bytes are, nothing is raised here.
 """

@@ -1,4 +1,4 @@
-"""What the guard is told at start: a frozen record that goes through one JSON file in the run directory.
+"""Writes, reads and checks the guard's settings: a frozen record in one JSON file of the run directory.
 
 The file is written by ``fdhil-guard`` from the machine's config and profile; the guard reads nothing else.
 """

@@ -1,4 +1,4 @@
-"""What would be sent: off, but with a table loaded, the guard follows the path all the same and shows its offset.
+"""Follows a loaded table while the guard is off, to show what would be sent.
 
 Nothing here leaves the process: it works on a copy of the core's state and is shown in the status alone.
 """

@@ -1,4 +1,4 @@
-"""The records that go in and out of the guard's core."""
+"""Records what goes in and out of the guard's core, and what it remembers."""
 
 from __future__ import annotations
 

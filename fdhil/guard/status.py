@@ -1,4 +1,4 @@
-"""What the guard says about itself: its status document, and offsets in the units and the direction of the axis."""
+"""Makes the guard's status document, with offsets in the units and the direction of the axis."""
 
 from __future__ import annotations
 

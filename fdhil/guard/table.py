@@ -1,4 +1,4 @@
-"""A correction table on its way into the guard: handed over as an open descriptor of sealed memory, checked row by row.
+"""Hands a correction table to the guard as an open descriptor of sealed memory, and checks it row by row.
 
 Memory that is sealed cannot change, shrink or block while it is read, whoever still holds it.
 """

@@ -1,4 +1,4 @@
-"""Where on the path the machine is, told by the NC's targets alone. Pure, part of the core's step."""
+"""Finds the machine on the path by the NC's targets alone. Pure, part of the core's step."""
 
 from __future__ import annotations
 
