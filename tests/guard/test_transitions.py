@@ -19,7 +19,7 @@ ASKED = {Event.ARM, Event.NOTHING_HELD}
 def test_every_state_is_one_of_rest_charge_or_landing() -> None:
     assert set(SENT) == set(Mode)
     assert set(FEED_SENT) == set(FeedMode)
-    assert AT_REST | IN_CHARGE | LANDING == set(Mode)
+    assert set(Mode) == AT_REST | IN_CHARGE | LANDING
     assert not AT_REST & SENDING
     assert not IN_CHARGE & LANDING
     assert {*IN_CHARGE, "FEEDFORWARD"} == CHARGED
