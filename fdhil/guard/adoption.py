@@ -8,28 +8,20 @@ commissioned.
 from __future__ import annotations
 
 from fdhil.guard import feedforward
-from fdhil.guard.conditions import AGREEING, ARMING_INTERLOCKS, View, known
+from fdhil.guard.conditions import AGREEING, ARMING_INTERLOCKS, View, Views, known
 from fdhil.guard.feeding import is_fed
-from fdhil.guard.interlocks import Alarm, Reaction
-from fdhil.guard.limits import CEILING_OFFSET_UM
+from fdhil.guard.interlocks import Alarm, Alarms, Reaction
+from fdhil.guard.limits import CEILING_OFFSET_UM, ceiling
 from fdhil.guard.path import EPS
 from fdhil.guard.protocol import AT_REST, SENDING, FeedMode, Mode
 from fdhil.guard.settings import AxisSettings, Settings
 from fdhil.guard.state import AxisState, Inputs, Request, State
 from fdhil.guard.transitions import Event
 
-Views = tuple[View, ...]
-Alarms = tuple[Alarm, ...]
-
 PERIODS_AWAITED = 2 * AGREEING
 """TPDOs in which a value must have become known: three in a row, and as many that were in doubt."""
 IMPLAUSIBLE = frozenset({"StaleData", "TargetLost", "FollowingError", "Implausible", "PdoLength"})
 OF_THE_RECORD = frozenset({"NotCommissioned", "RecordVoid", "PdoMapping"})
-
-
-def ceiling(own: AxisSettings) -> int:
-    """Return the largest offset, in increments, that may ever be sent, whatever was read or configured."""
-    return int(CEILING_OFFSET_UM * 1e-3 * own.increments_per_mm + 1e-9)
 
 
 def patience(settings: Settings) -> int:
@@ -55,7 +47,7 @@ def _doubt(view: View) -> str:
     held = known(axis)
     if held is None:
         return "three TPDOs in a row do not agree on it"
-    if not abs(held) <= ceiling(own):
+    if not abs(held) <= ceiling(own.increments_per_mm):
         return f"{_um(own, held)}: beyond the ceiling of {CEILING_OFFSET_UM:.0f} um"
     if not axis.off_demand <= EPS:
         return f"{_um(own, held)}: its demand (0x6062) says otherwise"

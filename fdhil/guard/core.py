@@ -13,16 +13,15 @@ from fdhil.guard.adoption import (
     adopt_refusals,
     adopting,
     at_rest,
-    ceiling,
     compared,
     frozen,
     measure,
     unread,
 )
-from fdhil.guard.conditions import AGREEING, View, failing, not_ready, withheld
+from fdhil.guard.conditions import AGREEING, Views, failing, not_ready, withheld
 from fdhil.guard.feeding import go_on
-from fdhil.guard.interlocks import FACTS, FEEDFORWARD_FACTS, Alarm, Reaction
-from fdhil.guard.limits import brake, follow, violation
+from fdhil.guard.interlocks import FACTS, FEEDFORWARD_FACTS, Alarm, Alarms, Reaction
+from fdhil.guard.limits import brake, ceiling, follow, violation
 from fdhil.guard.path import Path
 from fdhil.guard.plausibility import behind, observe
 from fdhil.guard.protocol import HOLD_CYCLES, IN_CHARGE, LANDING, RESERVE_S, SENDING, FeedMode, Mode
@@ -35,9 +34,6 @@ SETTLED_CYCLES = 100
 FEED_HOLD_S = 10.0
 MISSED_CYCLES = 10
 FAILED_SENDS = 3
-
-Views = tuple[View, ...]
-Alarms = tuple[Alarm, ...]
 
 
 def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Output]:
@@ -194,7 +190,10 @@ def _follow_path(state: State, inputs: Inputs, alarms: Alarms, settings: Setting
         return _ramp_down(state, Alarm("ProgramMismatch"))
     hold = next((alarm for alarm in alarms if alarm.reaction is Reaction.HOLD), None)
     if state.mode is Mode.ARMED:
-        return _held(state, hold, settings) if hold else _started(state, path)
+        if hold:
+            return _held(state, hold, settings)
+        state, astray = await_start(state._replace(held_for=0), path)
+        return state if astray is None else _ramp_down(state, astray)
     state, lost = track(state, path)
     hold = hold or lost
     if path.final and state.places[0].row >= path.end - 1:
@@ -206,11 +205,6 @@ def _follow_path(state: State, inputs: Inputs, alarms: Alarms, settings: Setting
     if state.mode is Mode.HOLD:
         return state.after(Event.FOUND, held_for=0, cause=None)
     return state._replace(held_for=0)
-
-
-def _started(state: State, path: Path) -> State:
-    state, astray = await_start(state._replace(held_for=0), path)
-    return state if astray is None else _ramp_down(state, astray)
 
 
 def _held(state: State, alarm: Alarm, settings: Settings) -> State:
@@ -272,7 +266,7 @@ def _wrong_frame(state: State, offsets: tuple[int, ...], settings: Settings) -> 
     """Check the frames by the limits alone, whatever made them; they are wrong only if this program is."""
     for s, axis, offset in zip(settings.axes, state.axes, offsets, strict=True):
         broken = type(offset) is not int or violation(s.limits, axis.offset, axis.rate, offset) is not None
-        if broken or not abs(offset) <= ceiling(s):
+        if broken or not abs(offset) <= ceiling(s.increments_per_mm):
             return Alarm("InternalError", s.name, f"{axis.offset} + {axis.rate} -> {offset}")
     return None
 

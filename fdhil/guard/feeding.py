@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from fdhil.guard import feedforward
 from fdhil.guard.feedforward import FADE_S
-from fdhil.guard.interlocks import Alarm
+from fdhil.guard.interlocks import Alarm, Alarms
 from fdhil.guard.protocol import FeedMode
 from fdhil.guard.settings import Settings
 from fdhil.guard.state import Inputs, Output, State
-
-Alarms = tuple[Alarm, ...]
 
 
 def is_fed(state: State) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from statistics import median
 
 from fdhil.cia402 import (
@@ -47,7 +47,6 @@ class _PdoState:
     that came when it was due.
     """
 
-    axis: int
     entries: tuple[PdoEntry, ...]
     length: int
     every_sync: int
@@ -93,10 +92,10 @@ class _PdoState:
         return None if place is None or not self.values else self.values[place]
 
 
-def _pdo_state(axis: int, pdo: Pdo) -> _PdoState:
+def _pdo_state(pdo: Pdo) -> _PdoState:
     entries = pdo.entries
     where = {entry.index: k for k, entry in enumerate(entries) if entry.sub == 0}
-    return _PdoState(axis, entries, pdo_length(entries), max(1, pdo.every_sync), where, bool(_NEEDED & where.keys()))
+    return _PdoState(entries, pdo_length(entries), max(1, pdo.every_sync), where, bool(_NEEDED & where.keys()))
 
 
 @dataclass(slots=True)
@@ -106,45 +105,35 @@ class _Node:
     touched: int = 0
 
 
-@dataclass(slots=True)
 class Listener:
     """Gathers frames (``take``) and gives the axes' inputs and the bus' view at a SYNC (``at_sync``).
 
     The bus does not give back what we send ourselves: a frame with one of our COB-IDs is another node's.
     """
 
-    settings: Settings
-    bus_state: str = "active"
-    lost_frames: int = 0
-    foreign_ids: frozenset[int] = frozenset()
-    emergencies: int = 0
-    _pdos: dict[int, _PdoState] = field(default_factory=dict)
-    _tpdos: list[list[_PdoState]] = field(default_factory=list)
-    _carriers: list[Mapping[int, _PdoState]] = field(default_factory=list)
-    _targets: list[_PdoState] = field(default_factory=list)
-    _nodes: list[_Node] = field(default_factory=list)
-    _node_of: dict[int, int] = field(default_factory=dict)
-    _alarms: dict[tuple[str, str], Alarm] = field(default_factory=dict)
-    _counter: int | None = None
-    _last_sync_s: tuple[float, float] | None = None
-    _intervals: deque[float] = field(default_factory=lambda: deque(maxlen=INTERVALS))
-
-    def __post_init__(self) -> None:
-        for k, axis in enumerate(self.settings.axes):
-            target = _pdo_state(k, axis.target)
-            self._targets.append(target)
-            self._tpdos.append([_pdo_state(k, pdo) for pdo in axis.tpdos])
-            self._carriers.append(_carriers(self._tpdos[k]))
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.bus_state = "active"
+        self.lost_frames = self.emergencies = 0
+        self._sent_ids = settings.sent_ids
+        self._targets = [_pdo_state(axis.target) for axis in settings.axes]
+        self._tpdos = [[_pdo_state(pdo) for pdo in axis.tpdos] for axis in settings.axes]
+        self._carriers = list(map(_carriers, self._tpdos))
+        self._pdos: dict[int, _PdoState] = {}
+        for axis, target, tpdos in zip(settings.axes, self._targets, self._tpdos, strict=True):
             self._pdos[axis.target.cob_id] = target
-            self._pdos.update(zip([pdo.cob_id for pdo in axis.tpdos], self._tpdos[k], strict=True))
-            self._nodes.append(_Node())
-            self._node_of[axis.node_id] = k
-        self.foreign_ids = self.settings.sent_ids
+            self._pdos.update(zip([pdo.cob_id for pdo in axis.tpdos], tpdos, strict=True))
+        self._nodes = [_Node() for _ in settings.axes]
+        self._node_of = {axis.node_id: k for k, axis in enumerate(settings.axes)}
+        self._alarms: dict[tuple[str, str], Alarm] = {}
+        self._counter: int | None = None
+        self._last_sync_s: tuple[float, float] | None = None
+        self._intervals: deque[float] = deque(maxlen=INTERVALS)
 
     def wanted_ids(self) -> tuple[int, ...]:
         """All COB-IDs that the guard must hear, for a receive filter."""
         nodes = list(self._node_of)
-        ids = {COB_NMT, COB_SYNC, *self._pdos, *self.foreign_ids}
+        ids = {COB_NMT, COB_SYNC, *self._pdos, *self._sent_ids}
         return tuple(sorted(ids | {base + n for n in nodes for base in (COB_EMCY, COB_HEARTBEAT, COB_SDO_REQUEST)}))
 
     def take(self, cob_id: int, data: bytes, now_s: float) -> None:
@@ -152,7 +141,7 @@ class Listener:
         pdo = self._pdos.get(cob_id)
         if pdo is not None:
             pdo.take(data)
-        elif cob_id in self.foreign_ids:
+        elif cob_id in self._sent_ids:
             code = "BusLocked" if cob_id >= COB_HEARTBEAT else "OffsetHijack"
             self._alarm(Alarm(code, detail=f"{cob_id:03X} {data.hex()}"))
         elif cob_id == COB_NMT:

@@ -56,6 +56,7 @@ class Alarm:
         return f"{self.cause}; {effect}; {self.action}"
 
 
+Alarms = tuple[Alarm, ...]
 _R, _H, _F, _N = Reaction.RAMP_DOWN, Reaction.HOLD, Reaction.FREEZE, Reaction.REFUSE
 # class: (reaction while sending, cause, next action)
 CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {

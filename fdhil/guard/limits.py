@@ -50,6 +50,11 @@ class OffsetLimits:
         return 1 + -(-abs(offset) // self.rate) + 3 * -(-self.rate // self.acceleration)
 
 
+def ceiling(increments_per_mm: float) -> int:
+    """Return the largest offset, in increments, that may ever be sent, whatever was read or configured."""
+    return floor(CEILING_OFFSET_UM * 1e-3 * increments_per_mm + 1e-9)
+
+
 def ceilings(
     increments_per_mm: float, sync_period_s: float, max_speed_mm_s: float, max_acceleration_mm_s2: float
 ) -> OffsetLimits:
@@ -57,7 +62,7 @@ def ceilings(
     speed = min(CEILING_SPEED_MM_S, SPEED_SHARE * max_speed_mm_s)
     acceleration = min(CEILING_ACCELERATION_MM_S2, ACCELERATION_SHARE * max_acceleration_mm_s2)
     return OffsetLimits(
-        offset=floor(CEILING_OFFSET_UM * 1e-3 * increments_per_mm + 1e-9),
+        offset=ceiling(increments_per_mm),
         rate=_whole(speed * increments_per_mm * sync_period_s),
         acceleration=_whole(acceleration * increments_per_mm * sync_period_s**2),
         variation=floor(CEILING_VARIATION_MM * increments_per_mm + 1e-9),

@@ -159,7 +159,7 @@ def to_json(settings: Settings) -> str:
 def from_json(text: str, source: str = "settings") -> Settings:
     """Read settings back; ConfigError when the text is not what ``to_json`` writes, or asks for more than a ceiling."""
     try:
-        document = json.loads(text, parse_constant=_refuse)
+        document = json.loads(text, parse_constant=refuse_constant)
         if document.pop("schema") != SCHEMA:
             raise ValueError(f"schema is not {SCHEMA}")
         document.pop("digest", None)
@@ -192,7 +192,8 @@ def load(path: Path) -> Settings:
     return settings
 
 
-def _refuse(constant: str) -> None:
+def refuse_constant(constant: str) -> None:
+    """Raise ValueError: NaN and Infinity are no JSON."""
     raise ValueError(f"{constant} is no number")
 
 

@@ -11,9 +11,8 @@ import os
 import struct
 import sys
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
 
 from fdhil.errors import StoreError
 from fdhil.guard.limits import OffsetLimits, violation
@@ -26,17 +25,8 @@ SEALED = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_S
 _LENGTH = struct.Struct("<I")
 
 
-class Array(Protocol):
-    """An integer array of numpy, which this room does not import."""
-
-    def tolist(self) -> Any:
-        """Return the values as a list of int."""
-
-    def __len__(self) -> int:
-        """Number of rows."""
-
-
-Column = Sequence[int] | Array
+Column = Collection[int]
+"""A sequence of int, or an integer array of numpy."""
 Travel = tuple[int, int] | None
 """The software limits of an axis, in increments."""
 
@@ -60,7 +50,7 @@ def encode(
     """Return the body of a table: a JSON header, then demand and offset of each axis as little-endian int32.
 
     ``first`` is the number of the first row; a table that is streamed is sent in pieces with ``final`` False but in
-    the last. Numpy integer arrays are accepted. ValueError when a value is no integer of 32 bits.
+    the last. ValueError when a value is no integer of 32 bits.
     """
     rows = len(demand[axes[0]])
     head = {"axes": list(axes), "first": first, "rows": rows, "final": final, "program": program_digest}
@@ -75,9 +65,8 @@ def encode(
 
 
 def _to_int32(values: Column) -> bytes:
-    whole = values if isinstance(values, Sequence) else values.tolist()
     try:
-        column = array("i", whole)
+        column = array("i", values)
     except (TypeError, OverflowError) as error:
         raise ValueError(f"a table holds integers of 32 bits only: {error}") from None
     if sys.byteorder == "big":
@@ -263,9 +252,4 @@ def begin(
 
 
 def _join(old: Sequence[Sequence[int]], new: Sequence[Sequence[int]], cut: int) -> tuple[Sequence[int], ...]:
-    columns = []
-    for before, after in zip(old, new, strict=True):
-        column = array("i", before[cut:])
-        column.extend(after)
-        columns.append(column)
-    return tuple(columns)
+    return tuple([array("i", before[cut:]) + array("i", after) for before, after in zip(old, new, strict=True)])
