@@ -19,6 +19,7 @@ from fdhil.cia402 import (
     COB_SYNC,
     Nmt,
     NmtCommand,
+    Object,
     PdoEntry,
     pdo_length,
     unpack,
@@ -31,8 +32,6 @@ INF = float("inf")
 NEVER = 1 << 30
 INTERVALS = 32
 FOREIGN_CYCLES = 3
-TARGET, POSITION, READ_BACK, STATUSWORD, MODE, FOLLOWING = 0x607A, 0x6064, 0x60B0, 0x6041, 0x6061, 0x60F4
-SPEED_OFFSET, TORQUE_OFFSET, SPEED, DEMAND = 0x60B1, 0x60B2, 0x606C, 0x6062
 PDO_SET_UP = range(0x1400, 0x1C00)
 # what a commissioning record relies on besides: its options, the scale, the cycle, and "restore the defaults"
 SET_UP = frozenset((0x1005, 0x1011, 0x1016, 0x1017, 0x6007, 0x605A, 0x605E, 0x6065, 0x6066, 0x6075, 0x607D, 0x607E))
@@ -184,7 +183,7 @@ class Listener:
         if len(data) < 4 or not (data[0] >> 5 == 1 or data[0] & 0xE1 == 0xC0):
             return
         index, name = int.from_bytes(data[1:3], "little"), self.settings.axes[axis].name
-        if index == READ_BACK:
+        if index == Object.POSITION_OFFSET:
             self._alarm(Alarm("OffsetHijack", name, f"by SDO, {data.hex()}"))
         elif index in SET_UP or index in PDO_SET_UP:
             self._nodes[axis].touched += 1
@@ -254,7 +253,7 @@ class Listener:
             pdo.at_sync()
             if pdo.twice_run >= FOREIGN_CYCLES:
                 self._alarm(Alarm("ForeignProducer", axis.name))
-        target = target_pdo.get(TARGET) if target_pdo.fresh else None
+        target = target_pdo.get(Object.TARGET_POSITION) if target_pdo.fresh else None
         seen = self._axis_input(k, axis, now_s, target)
         for pdo in (target_pdo, *self._tpdos[k]):
             pdo.fresh = pdo.early = pdo.twice = False
@@ -262,23 +261,23 @@ class Listener:
 
     def _axis_input(self, k: int, axis: AxisSettings, now_s: float, target: int | None) -> AxisInput:
         tpdos, of, node = self._tpdos[k], self._carriers[k], self._nodes[k]
-        shown = of.get(READ_BACK)
+        shown = of.get(Object.POSITION_OFFSET)
         return AxisInput(
             target,
-            _fresh(of, POSITION),
-            _fresh(of, READ_BACK) if shown is not None and not shown.early else None,
-            _fresh(of, FOLLOWING),
-            _last(of, STATUSWORD),
-            _last(of, MODE),
+            _fresh(of, Object.POSITION_ACTUAL),
+            _fresh(of, Object.POSITION_OFFSET) if shown is not None and not shown.early else None,
+            _fresh(of, Object.FOLLOWING_ERROR),
+            _last(of, Object.STATUSWORD),
+            _last(of, Object.MODE_DISPLAY),
             node.nmt,
             _age(tpdos),
             now_s - node.heartbeat_at_s,
             max([pdo.short for pdo in tpdos], default=0),
             max([pdo.long for pdo in tpdos], default=0),
-            (_fresh(of, SPEED_OFFSET), _fresh(of, TORQUE_OFFSET)),
-            _fresh(of, SPEED),
+            (_fresh(of, Object.VELOCITY_OFFSET), _fresh(of, Object.TORQUE_OFFSET)),
+            _fresh(of, Object.VELOCITY_ACTUAL),
             NEVER if shown is None else -(-shown.sure_age // shown.every_sync),
-            _fresh(of, DEMAND),
+            _fresh(of, Object.POSITION_DEMAND),
             node.touched,
             shown is not None and shown.early,
         )
@@ -305,4 +304,4 @@ def _age(pdos: Sequence[_PdoState]) -> float:
     return max([-(-pdo.age // pdo.every_sync) for pdo in pdos if pdo.needed], default=NEVER)
 
 
-_NEEDED = frozenset({STATUSWORD, POSITION, MODE})
+_NEEDED = frozenset({Object.STATUSWORD, Object.POSITION_ACTUAL, Object.MODE_DISPLAY})

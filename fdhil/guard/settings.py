@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from fdhil.cia402 import PdoEntry, lay_out
+from fdhil.cia402 import Object, PdoEntry, lay_out
 from fdhil.errors import ConfigError, ConfigFault
 from fdhil.guard import feedforward
 from fdhil.guard.limits import OffsetLimits, ceilings
@@ -25,8 +25,8 @@ MAX_BYTES = 1 << 20
 MOST_INCREMENTS_PER_MM = 1e6
 Layout = tuple[tuple[int, int, int, bool], ...]
 """Entries (index, sub-index, bits, signed) of a PDO, one behind the other."""
-OFFSET_LAYOUT: Layout = ((0x60B0, 0, 32, True),)
-FEED_LAYOUT: Layout = ((0x60B1, 0, 32, True), (0x60B2, 0, 16, True))
+OFFSET_LAYOUT: Layout = ((Object.POSITION_OFFSET, 0, 32, True),)
+FEED_LAYOUT: Layout = ((Object.VELOCITY_OFFSET, 0, 32, True), (Object.TORQUE_OFFSET, 0, 16, True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +88,7 @@ class AxisSettings:
     @property
     def read_back_every(self) -> int:
         """With every how many SYNC a TPDO shows the offset in force; 0: none does."""
-        shown = [pdo.every_sync for pdo in self.tpdos if any(entry[:2] == (0x60B0, 0) for entry in pdo.layout)]
+        shown = [pdo.every_sync for pdo in self.tpdos if any(e[:2] == OFFSET_LAYOUT[0][:2] for e in pdo.layout)]
         return max(1, min(shown)) if shown else 0
 
 
