@@ -22,7 +22,7 @@ from fdhil.guard.conditions import AGREEING, Views, failing, not_ready, withheld
 from fdhil.guard.feeding import go_on
 from fdhil.guard.interlocks import FACTS, FEEDFORWARD_FACTS, Alarm, Alarms, Reaction
 from fdhil.guard.limits import brake, ceiling, follow, violation
-from fdhil.guard.path import Path
+from fdhil.guard.path import CorrectedPath
 from fdhil.guard.plausibility import behind, observe
 from fdhil.guard.protocol import HOLD_CYCLES, IN_CHARGE, LANDING, RESERVE_S, SENDING, FeedMode, Mode
 from fdhil.guard.settings import AxisSettings, Settings
@@ -239,7 +239,7 @@ def _move(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outp
     return state, Output(offsets, heartbeat)
 
 
-def _next_offsets(state: State, path: Path | None, settings: Settings) -> tuple[tuple[int, ...], Alarm | None]:
+def _next_offsets(state: State, path: CorrectedPath | None, settings: Settings) -> tuple[tuple[int, ...], Alarm | None]:
     """Return the next offset of each axis, and the alarm when the table itself asks for more than is allowed."""
     if state.mode is Mode.ARMED:
         return (0,) * len(state.axes), None
@@ -287,7 +287,7 @@ def _stands(axis: AxisState) -> AxisState:
     return axis._replace(rate=0, sent=(axis.sent[0], *axis.sent[:-1]))
 
 
-def _arrived(state: State, path: Path | None) -> State:
+def _arrived(state: State, path: CorrectedPath | None) -> State:
     """Leave RAMPING when on the table, and a landing when the drives show 0."""
     if state.mode is Mode.RAMPING and path is not None and len(state.places) == 1:
         on_table = tuple([axis.offset for axis in state.axes]) == path.offsets_at(state.places[0].row + 1)

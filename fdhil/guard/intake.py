@@ -8,7 +8,7 @@ from fdhil.guard import table
 from fdhil.guard.control import Client
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.journal import Journal
-from fdhil.guard.path import Path
+from fdhil.guard.path import CorrectedPath
 from fdhil.guard.protocol import Mode
 from fdhil.guard.requests import Document
 from fdhil.guard.settings import Settings
@@ -23,7 +23,7 @@ class Intake:
     """``path`` is the table in force; one more at a time is on its way in."""
 
     def __init__(self, settings: Settings, journal: Journal) -> None:
-        self.path: Path | None = None
+        self.path: CorrectedPath | None = None
         self._settings = settings
         self._journal = journal
         self._loading: tuple[table.Loading, Client, Document] | None = None

@@ -11,7 +11,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Mapping
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any
 
 from fdhil.cia402 import COB_HEARTBEAT, COB_SYNC, Nmt, pack
@@ -45,7 +45,7 @@ class Guard:
     ) -> None:
         self.settings = settings
         self.state = initial(settings)
-        self.control = Control(FilePath(settings.run_directory), settings.daemon_uid)
+        self.control = Control(Path(settings.run_directory), settings.daemon_uid)
         self.intake = Intake(settings, journal)
         self._can = can
         self._journal = journal

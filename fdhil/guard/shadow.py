@@ -5,7 +5,7 @@ Nothing here leaves the process: it works on a copy of the core's state and is s
 
 from __future__ import annotations
 
-from fdhil.guard.path import Path
+from fdhil.guard.path import CorrectedPath
 from fdhil.guard.protocol import Mode
 from fdhil.guard.state import State
 from fdhil.guard.tracking import await_start, track
@@ -15,12 +15,12 @@ class Shadow:
     """Follows one table as an armed guard would, without an interlock; begins anew where the path is lost or ends."""
 
     def __init__(self) -> None:
-        self._path: Path | None = None
+        self._path: CorrectedPath | None = None
         self._start_row = 0
         self._state: State | None = None
         self._before: State | None = None
 
-    def follow(self, state: State, path: Path | None) -> None:
+    def follow(self, state: State, path: CorrectedPath | None) -> None:
         """Take the SYNC that ``state`` has seen."""
         rested, self._before = self._before or state, state
         if state.mode is not Mode.OFF or path is None:

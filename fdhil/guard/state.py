@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 from fdhil.guard.feedforward import Feed, Law, Pair
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.limits import Travel
-from fdhil.guard.path import Path, Place
+from fdhil.guard.path import CorrectedPath, Place
 from fdhil.guard.protocol import SENDING, FeedMode, Mode
 from fdhil.guard.settings import Settings
 from fdhil.guard.transitions import Event, next_mode
@@ -87,7 +87,7 @@ class Inputs(NamedTuple):
     main_alive: bool = True
     alarms: tuple[Alarm, ...] = ()
     withdrawn: tuple[Alarm, ...] = ()
-    path: Path | None = None
+    path: CorrectedPath | None = None
     request: Request | None = None
 
 

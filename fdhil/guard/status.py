@@ -7,7 +7,7 @@ from typing import Any
 
 from fdhil.guard.adoption import may_stand
 from fdhil.guard.interlocks import Alarm
-from fdhil.guard.path import Path
+from fdhil.guard.path import CorrectedPath
 from fdhil.guard.protocol import FEEDFORWARD, FeedMode
 from fdhil.guard.settings import Settings
 from fdhil.guard.state import State
@@ -42,7 +42,7 @@ def sentence(standing_um: Mapping[str, float | None]) -> str:
     return f"{' and '.join(left)} may still be applied" if left else ""
 
 
-def document(state: State, settings: Settings, path: Path | None, not_good: Sequence[Alarm]) -> dict[str, Any]:
+def document(state: State, settings: Settings, path: CorrectedPath | None, not_good: Sequence[Alarm]) -> dict[str, Any]:
     """Return what state and table say; the loop adds what it alone knows."""
     cause, feed = state.cause or state.feed.cause, state.feed
     return {

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 from fdhil.errors import StoreError
 from fdhil.guard.limits import OffsetLimits, violation
-from fdhil.guard.path import Path
+from fdhil.guard.path import CorrectedPath
 from fdhil.guard.protocol import TABLE_NAME
 
 MAX_TABLE_BYTES = 16 << 20
@@ -74,7 +74,7 @@ def _to_int32(values: Column) -> bytes:
     return column.tobytes()
 
 
-def decode(body: bytes, sequence: int = 0) -> tuple[tuple[str, ...], Path]:
+def decode(body: bytes, sequence: int = 0) -> tuple[tuple[str, ...], CorrectedPath]:
     """Return the axes and the rows of a body; TableRefused (``CorruptFile``) when it is not what ``encode`` writes."""
     try:
         (length,) = _LENGTH.unpack_from(body)
@@ -90,7 +90,7 @@ def decode(body: bytes, sequence: int = 0) -> tuple[tuple[str, ...], Path]:
     except (struct.error, ValueError, KeyError, TypeError, RecursionError) as error:
         raise TableRefused("CorruptFile", f"the correction table cannot be read ({error}); plan it again") from None
     demand, offset = columns[: len(axes)], columns[len(axes) :]
-    return tuple(axes), Path(first, demand, offset, head.get("final") is True, program, sequence)
+    return tuple(axes), CorrectedPath(first, demand, offset, head.get("final") is True, program, sequence)
 
 
 def _columns(data: bytes, rows: int, count: int) -> tuple[Sequence[int], ...]:
@@ -185,7 +185,7 @@ class Loading:
     ``joined`` is the path with the new rows behind the old ones; ``done`` once every row has passed.
     """
 
-    joined: Path
+    joined: CorrectedPath
     limits: tuple[OffsetLimits, ...]
     travel: tuple[Travel, ...] = ()
     next_row: int = field(default=0)
@@ -218,7 +218,7 @@ def begin(
     sequence: int,
     axes: Sequence[str],
     limits: tuple[OffsetLimits, ...],
-    loaded: Path | None,
+    loaded: CorrectedPath | None,
     keep_from: int,
     travel: tuple[Travel, ...] = (),
 ) -> Loading:
@@ -240,7 +240,7 @@ def begin(
         raise TableRefused(
             "TableBusy", "the guard holds as many rows as it can; wait until the machine has passed some"
         )
-    joined = Path(
+    joined = CorrectedPath(
         loaded.first + cut,
         _join(loaded.demand, path.demand, cut),
         _join(loaded.offset, path.offset, cut),

@@ -11,7 +11,7 @@ from fdhil.guard.feedforward import Pair
 from fdhil.guard.frames import Listener
 from fdhil.guard.interlocks import FACTS, Alarm
 from fdhil.guard.limits import OffsetLimits
-from fdhil.guard.path import Path
+from fdhil.guard.path import CorrectedPath
 from fdhil.guard.protocol import Mode
 from fdhil.guard.settings import AxisSettings, Pdo, Settings
 from fdhil.guard.state import Inputs, Output, Request, State, initial
@@ -139,7 +139,7 @@ class Bench:
     """
 
     settings: Settings
-    path: Path | None = None
+    path: CorrectedPath | None = None
     demand: Sequence[Sequence[int]] = ()
     drives: list[Drive] = field(default_factory=list)
     state: State = field(init=False)
@@ -332,7 +332,7 @@ def bench(amplitude: int = 300, **changes: object) -> Bench:
     """A bench with a table loaded, its drives at rest at the begin of the path."""
     made = settings(**changes)  # type: ignore[arg-type] # fields of Settings
     demand, offset = smooth_path(amplitude=amplitude, axes=len(made.axes))
-    path = Path(0, tuple(demand), tuple(offset), True, DIGEST, 1)
+    path = CorrectedPath(0, tuple(demand), tuple(offset), True, DIGEST, 1)
     drives = [Drive(axis.node_id) for axis in made.axes]
     for drive, column in zip(drives, demand, strict=True):
         drive.queue = [(column[0], 0)] * 2

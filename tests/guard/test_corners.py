@@ -6,7 +6,7 @@ import pytest
 
 from fdhil.guard import core
 from fdhil.guard.interlocks import Alarm
-from fdhil.guard.path import Path, rate_between
+from fdhil.guard.path import CorrectedPath, rate_between
 from fdhil.guard.plausibility import observe
 from fdhil.guard.protocol import Mode
 from fdhil.guard.state import Inputs, Request
@@ -133,7 +133,7 @@ def test_heartbeat_alone_never_leaves() -> None:
 
 
 def test_rows_outside_the_table() -> None:
-    path = Path(5, ([0, 10, 20],), ([1, 2, 3],), True, "p")
+    path = CorrectedPath(5, ([0, 10, 20],), ([1, 2, 3],), True, "p")
     assert path.mismatch(4, (0,)) is None
     assert path.mismatch(8, (0,)) is None
     assert path.offsets_at(0) == (1,)
@@ -142,7 +142,7 @@ def test_rows_outside_the_table() -> None:
     assert rate_between(path, 6, (0,), (5,)) == 0.5
     assert rate_between(path, 6, (0,), (500,)) is None
     assert rate_between(path, 6, (-9,), (5,)) is None
-    resting = Path(0, ([7, 7, 7],), ([0, 0, 0],), True, "p")
+    resting = CorrectedPath(0, ([7, 7, 7],), ([0, 0, 0],), True, "p")
     assert resting.standing_rows() == 2
     assert rate_between(resting, 1, (7,), (7,)) is None
 
