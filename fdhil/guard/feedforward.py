@@ -13,7 +13,7 @@ from typing import NamedTuple
 from fdhil.guard.interlocks import Alarm, Reaction
 from fdhil.guard.limits import clamp
 from fdhil.guard.protocol import HOLD_CYCLES, FeedMode
-from fdhil.guard.transitions import ZEROS, ZEROS_UNCONFIRMED, Event, next_feed_mode
+from fdhil.guard.transitions import NEXT_FEED, ZEROS, ZEROS_UNCONFIRMED, Event
 
 SHIFT = 24
 FADE_S = 0.1
@@ -90,7 +90,7 @@ class Feed(NamedTuple):
 
     def after(self, event: Event, cause: Alarm | None) -> Feed:
         """Return the state that ``event`` leads to; KeyError where the table has no such way."""
-        return self._replace(mode=next_feed_mode(self.mode, event), cause=cause)
+        return self._replace(mode=NEXT_FEED[self.mode, event], cause=cause)
 
     def send(self, pairs: tuple[Pair, ...]) -> Feed:
         """Note what is sent now."""

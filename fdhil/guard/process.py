@@ -146,6 +146,7 @@ class Guard:
             frames = self._can.receive()
         except BusDown as error:
             self._bus_down(error)
+            self._in_silence(time.monotonic())
             return
         self._listener.lost_frames += self._can.lost_frames - self._lost_seen
         self._lost_seen = self._can.lost_frames
@@ -162,7 +163,6 @@ class Guard:
     def _bus_down(self, error: BusDown) -> None:
         self._listener.error("down")
         self._journal.write("bus_down", text=str(error))
-        self._in_silence(time.monotonic())
 
     def _sync(self, data: bytes, stamp_s: float, now_s: float, late: bool) -> None:
         self._last_sync_s, self._silent = now_s, False
@@ -241,8 +241,7 @@ class Guard:
             if output.heartbeat:
                 self._can.send(COB_HEARTBEAT + self.settings.node_id, bytes([Nmt.OPERATIONAL]))
         except BusDown as error:
-            self._listener.error("down")
-            self._journal.write("bus_down", text=str(error))
+            self._bus_down(error)
             return False
         return sent
 

@@ -12,7 +12,7 @@ from fdhil.guard.limits import Travel
 from fdhil.guard.path import CorrectedPath, Place
 from fdhil.guard.protocol import SENDING, FeedMode, Mode
 from fdhil.guard.settings import Settings
-from fdhil.guard.transitions import Event, next_mode
+from fdhil.guard.transitions import NEXT, Event
 
 Shown = tuple[int | None, int | None]
 """What a drive shows of its speed and its torque offset; None where no TPDO does."""
@@ -159,7 +159,7 @@ class State(NamedTuple):
 
     def after(self, event: Event, **changes: Any) -> State:
         """Return the state that ``event`` leads to, with ``changes``; KeyError where the table has no such way."""
-        return self._replace(mode=next_mode(self.mode, event), **changes)
+        return self._replace(mode=NEXT[self.mode, event], **changes)
 
 
 class Output(NamedTuple):

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from enum import Enum
 
 from fdhil.guard.protocol import AT_REST, IN_CHARGE, LANDING, ON_PATH, SENDING, FeedMode, Mode
@@ -54,17 +54,17 @@ FEED_SENT: Mapping[FeedMode, str] = {
     FeedMode.ZEROING: "0 at once",
 }
 # (what happens, in which states, the next state)
-TRANSITIONS: tuple[tuple[Event, frozenset[Mode], Mode], ...] = (
-    (Event.ARM, frozenset({Mode.OFF}), Mode.ARMED),
+TRANSITIONS: tuple[tuple[Event, Collection[Mode], Mode], ...] = (
+    (Event.ARM, {Mode.OFF}, Mode.ARMED),
     (Event.ADOPT, AT_REST, Mode.ADOPT),
     (Event.NOTHING_HELD, AT_REST, Mode.OFF),
-    (Event.DOUBTFUL, frozenset({Mode.OFF}), Mode.FROZEN),
-    (Event.START, frozenset({Mode.ARMED}), Mode.RAMPING),
-    (Event.ON_TABLE, frozenset({Mode.RAMPING}), Mode.ACTIVE),
-    (Event.LATE, frozenset({Mode.ACTIVE}), Mode.RAMPING),
-    (Event.GAP, frozenset({Mode.ARMED}), Mode.ARMED),
+    (Event.DOUBTFUL, {Mode.OFF}, Mode.FROZEN),
+    (Event.START, {Mode.ARMED}, Mode.RAMPING),
+    (Event.ON_TABLE, {Mode.RAMPING}, Mode.ACTIVE),
+    (Event.LATE, {Mode.ACTIVE}, Mode.RAMPING),
+    (Event.GAP, {Mode.ARMED}, Mode.ARMED),
     (Event.GAP, ON_PATH, Mode.HOLD),
-    (Event.FOUND, frozenset({Mode.HOLD}), Mode.RAMPING),
+    (Event.FOUND, {Mode.HOLD}, Mode.RAMPING),
     (Event.END, IN_CHARGE, Mode.RAMP_DOWN),
     (Event.HIJACK, SENDING, Mode.RAMP_DOWN),
     (Event.BLOCKED, SENDING, Mode.FROZEN),
@@ -72,23 +72,13 @@ TRANSITIONS: tuple[tuple[Event, frozenset[Mode], Mode], ...] = (
     (Event.ZERO_SHOWN, LANDING, Mode.OFF),
     (Event.ZERO_NOT_SHOWN, LANDING, Mode.FROZEN),
 )
-FEED_TRANSITIONS: tuple[tuple[Event, frozenset[FeedMode], FeedMode], ...] = (
-    (Event.ARM, frozenset({FeedMode.OFF}), FeedMode.ON),
-    (Event.ADOPT, frozenset({FeedMode.OFF}), FeedMode.ZEROING),
-    (Event.END, frozenset({FeedMode.ON}), FeedMode.ENDING),
-    (Event.BLOCKED, frozenset({FeedMode.ON, FeedMode.ENDING}), FeedMode.ZEROING),
-    (Event.ZERO_SHOWN, frozenset({FeedMode.ENDING, FeedMode.ZEROING}), FeedMode.OFF),
-    (Event.ZERO_NOT_SHOWN, frozenset({FeedMode.ENDING, FeedMode.ZEROING}), FeedMode.OFF),
+FEED_TRANSITIONS: tuple[tuple[Event, Collection[FeedMode], FeedMode], ...] = (
+    (Event.ARM, {FeedMode.OFF}, FeedMode.ON),
+    (Event.ADOPT, {FeedMode.OFF}, FeedMode.ZEROING),
+    (Event.END, {FeedMode.ON}, FeedMode.ENDING),
+    (Event.BLOCKED, {FeedMode.ON, FeedMode.ENDING}, FeedMode.ZEROING),
+    (Event.ZERO_SHOWN, {FeedMode.ENDING, FeedMode.ZEROING}, FeedMode.OFF),
+    (Event.ZERO_NOT_SHOWN, {FeedMode.ENDING, FeedMode.ZEROING}, FeedMode.OFF),
 )
-_NEXT = {(mode, event): after for event, modes, after in TRANSITIONS for mode in modes}
-_NEXT_FEED = {(mode, event): after for event, modes, after in FEED_TRANSITIONS for mode in modes}
-
-
-def next_mode(mode: Mode, event: Event) -> Mode:
-    """Return the state that follows; KeyError where ``event`` leads nowhere."""
-    return _NEXT[mode, event]
-
-
-def next_feed_mode(mode: FeedMode, event: Event) -> FeedMode:
-    """Return the same for the on-line feed-forward."""
-    return _NEXT_FEED[mode, event]
+NEXT = {(mode, event): after for event, modes, after in TRANSITIONS for mode in modes}
+NEXT_FEED = {(mode, event): after for event, modes, after in FEED_TRANSITIONS for mode in modes}

@@ -217,6 +217,24 @@ def test_a_hold_lasts_ten_cycles_each_time_anew() -> None:
     assert machine.alarms[-1].code == "TargetLost"
 
 
+def test_a_gap_before_the_start_holds_nothing_and_ends_after_ten_cycles() -> None:
+    machine = bench()
+    machine.settle()
+    assert machine.arm() == ()
+    for _ in range(2):
+        for _ in range(10):  # the first of them still latches what was streamed before
+            machine.sync(nc=False)
+        machine.sync()
+        machine.run(2)
+        assert machine.mode is Mode.ARMED
+    for _ in range(11):
+        machine.sync(nc=False)
+    assert machine.mode is Mode.ARMED
+    assert machine.until(Mode.RAMP_DOWN) == 1
+    assert machine.alarms[-1].code == "TargetLost"
+    assert {offsets for _, offsets in machine.frames} == {(0, 0)}
+
+
 def test_time_goes_on_without_sync_only_where_it_can_be_ramped() -> None:
     machine = active()
     tick = machine.state.tick
