@@ -20,7 +20,6 @@ from fdhil.cia402 import (
     Nmt,
     NmtCommand,
     Object,
-    PdoEntry,
     pdo_length,
     unpack,
 )
@@ -32,13 +31,13 @@ INF = float("inf")
 NEVER = 1 << 30
 INTERVALS = 32
 FOREIGN_CYCLES = 3
+_NEEDED = frozenset({Object.STATUSWORD, Object.POSITION_ACTUAL, Object.MODE_DISPLAY})
 PDO_SET_UP = range(0x1400, 0x1C00)
 # what a commissioning record relies on besides: its options, the scale, the cycle, and "restore the defaults"
 SET_UP = frozenset((0x1005, 0x1011, 0x1016, 0x1017, 0x6007, 0x605A, 0x605E, 0x6065, 0x6066, 0x6075, 0x607D, 0x607E))
 SET_UP |= {0x6085, 0x608F, 0x6091, 0x6092, 0x60C2}
 
 
-@dataclass(slots=True)
 class _PdoState:
     """One PDO that is listened to: its last content and age in SYNC cycles, and what is wrong with it.
 
@@ -46,21 +45,17 @@ class _PdoState:
     that came when it was due.
     """
 
-    entries: tuple[PdoEntry, ...]
-    length: int
-    every_sync: int
-    where: dict[int, int]
-    needed: bool = False
-    data: bytes = b""
-    age: int = NEVER
-    sure_age: int = NEVER
-    fresh: bool = False
-    early: bool = False
-    twice: bool = False
-    twice_run: int = 0
-    short: int = 0
-    long: int = 0
-    values: tuple[int, ...] = ()
+    def __init__(self, pdo: Pdo) -> None:
+        self.entries = pdo.entries
+        self.length = pdo_length(self.entries)
+        self.every_sync = max(1, pdo.every_sync)
+        self.where = {entry.index: k for k, entry in enumerate(self.entries) if entry.sub == 0}
+        self.needed = bool(_NEEDED & self.where.keys())
+        self.data = b""
+        self.values: tuple[int, ...] = ()
+        self.age = self.sure_age = NEVER
+        self.fresh = self.early = self.twice = False
+        self.twice_run = self.short = self.long = 0
 
     def take(self, data: bytes) -> None:
         """Take one frame: short ones are dropped and counted, of long ones the mapped bytes are used."""
@@ -91,12 +86,6 @@ class _PdoState:
         return None if place is None or not self.values else self.values[place]
 
 
-def _pdo_state(pdo: Pdo) -> _PdoState:
-    entries = pdo.entries
-    where = {entry.index: k for k, entry in enumerate(entries) if entry.sub == 0}
-    return _PdoState(entries, pdo_length(entries), max(1, pdo.every_sync), where, bool(_NEEDED & where.keys()))
-
-
 @dataclass(slots=True)
 class _Node:
     nmt: int | None = None
@@ -115,8 +104,8 @@ class Listener:
         self.bus_state = "active"
         self.lost_frames = self.emergencies = 0
         self._sent_ids = settings.sent_ids
-        self._targets = [_pdo_state(axis.target) for axis in settings.axes]
-        self._tpdos = [[_pdo_state(pdo) for pdo in axis.tpdos] for axis in settings.axes]
+        self._targets = [_PdoState(axis.target) for axis in settings.axes]
+        self._tpdos = [[_PdoState(pdo) for pdo in axis.tpdos] for axis in settings.axes]
         self._carriers = list(map(_carriers, self._tpdos))
         self._pdos: dict[int, _PdoState] = {}
         for axis, target, tpdos in zip(settings.axes, self._targets, self._tpdos, strict=True):
@@ -302,6 +291,3 @@ def _last(of: Mapping[int, _PdoState], index: int) -> int | None:
 def _age(pdos: Sequence[_PdoState]) -> float:
     """Age of the oldest TPDO that carries a signal of the guard, in units of its own rate, rounded up."""
     return max([-(-pdo.age // pdo.every_sync) for pdo in pdos if pdo.needed], default=NEVER)
-
-
-_NEEDED = frozenset({Object.STATUSWORD, Object.POSITION_ACTUAL, Object.MODE_DISPLAY})
