@@ -1,4 +1,4 @@
-"""What the guard takes over from a drive and what it refuses to believe; nothing read may become a step."""
+"""The guard takes over from a drive only what it may believe; nothing read may become a step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where on the path: the exact bounds of what is still this row, this place, this rate."""
+"""The place on the path has exact bounds: what is still this row, this place, this rate."""
 
 from __future__ import annotations
 
