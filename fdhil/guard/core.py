@@ -8,16 +8,7 @@ path, the motion of the offset, and a check of the frame by other formulas than 
 from __future__ import annotations
 
 from fdhil.guard import feedforward
-from fdhil.guard.adoption import (
-    adopt_at_start,
-    adopt_refusals,
-    adopting,
-    at_rest,
-    compared,
-    frozen,
-    measure,
-    unread,
-)
+from fdhil.guard.adoption import adopt_at_start, adopt_refusals, adopting, at_rest, compared, frozen, measure, unread
 from fdhil.guard.conditions import AGREEING, Views, failing, not_ready, withheld
 from fdhil.guard.feeding import go_on
 from fdhil.guard.interlocks import FACTS, FEEDFORWARD_FACTS, Alarm, Alarms, Reaction

@@ -45,10 +45,6 @@ class OffsetLimits:
         """Largest second difference of three frames."""
         return self.acceleration + ROUNDING_ACCELERATION
 
-    def ramp_cycles(self, offset: int) -> int:
-        """Return the bound on the cycles from ``offset`` at any rate to rest at 0: 1 + |o|/S + 3 S/A."""
-        return 1 + -(-abs(offset) // self.rate) + 3 * -(-self.rate // self.acceleration)
-
 
 def ceiling(increments_per_mm: float) -> int:
     """Return the largest offset, in increments, that may ever be sent, whatever was read or configured."""

@@ -130,7 +130,7 @@ class Settings:
     @property
     def heartbeat_cycles(self) -> int:
         """Our heartbeat comes with every so many SYNC."""
-        return max(1, round(self.heartbeat_s / self.sync_period_s))
+        return self.cycles(self.heartbeat_s)
 
     def cycles(self, seconds: float) -> int:
         """Return a duration in whole SYNC cycles, at least one."""

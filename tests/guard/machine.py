@@ -24,6 +24,11 @@ RECORD = "as commissioned"
 LIMITS = OffsetLimits(offset=819, rate=65, acceleration=6, variation=9830, window=1000)
 
 
+def ramp_cycles(limits: OffsetLimits, offset: int) -> int:
+    """The bound on the cycles from ``offset`` at any rate to rest at 0: 1 + |o|/S + 3 S/A."""
+    return 1 + -(-abs(offset) // limits.rate) + 3 * -(-limits.rate // limits.acceleration)
+
+
 def axis_settings(name: str, node_id: int, limits: OffsetLimits = LIMITS) -> AxisSettings:
     """The default mapping of the simulated drive."""
     return AxisSettings(

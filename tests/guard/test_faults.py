@@ -14,7 +14,7 @@ from fdhil.guard.limits import OffsetLimits
 from fdhil.guard.path import CorrectedPath
 from fdhil.guard.protocol import ON_PATH, Mode
 from fdhil.guard.state import Request
-from tests.guard.machine import DIGEST, RECORD, Bench, Drive, bench
+from tests.guard.machine import DIGEST, RECORD, Bench, Drive, bench, ramp_cycles
 
 Fault = Callable[[Bench], None]
 
@@ -136,7 +136,7 @@ def test_fault_ramps_down_in_time(cutting: Bench, row: str) -> None:
         cutting.sync()
         taken += 1
         assert taken <= rising or max(map(abs, cutting.offsets)) <= before
-    assert taken <= limits.ramp_cycles(peak)
+    assert taken <= ramp_cycles(limits, peak)
     cutting.drives = [Drive(d.node_id, queue=d.queue, offset=d.offset) for d in cutting.drives]
     cutting.until(Mode.OFF)
     assert cutting.state.cause is not None

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from fdhil.guard.limits import OffsetLimits, Travel, approach, brake, follow, stopping, violation
 from fdhil.guard.table import check_rows
+from tests.guard.machine import ramp_cycles
 
 SMALL = OffsetLimits(offset=40, rate=9, acceleration=2, variation=400, window=100)
 
@@ -55,7 +56,7 @@ def starts(limits: OffsetLimits) -> list[tuple[int, int]]:
 def test_ramp_to_zero_from_every_start_keeps_every_limit_and_its_time(limits: OffsetLimits) -> None:
     for start in starts(limits):
         offset, rate = start
-        for _ in range(limits.ramp_cycles(offset)):
+        for _ in range(ramp_cycles(limits, offset)):
             after = follow(limits, offset, rate, 0, 0)
             assert violation(limits, offset, rate, after) is None, (start, offset, rate, after)
             offset, rate = after, after - offset
@@ -67,7 +68,7 @@ def test_outward_ends_within_the_braking_time(limits: OffsetLimits) -> None:
     rising = -(-limits.hard_rate // limits.acceleration)
     for start in starts(limits):
         offset, rate = start
-        for cycle in range(limits.ramp_cycles(offset)):
+        for cycle in range(ramp_cycles(limits, offset)):
             after = follow(limits, offset, rate, 0, 0)
             crossed = start[0] * start[1] < 0  # one that runs through zero turns once behind it
             assert crossed or cycle < rising or abs(after) <= abs(offset), (start, cycle)
