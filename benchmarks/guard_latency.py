@@ -23,12 +23,12 @@ from fdhil.arming.guard_client import GuardClient
 from fdhil.guard import core
 from fdhil.guard.frames import Listener
 from fdhil.guard.interlocks import FACTS
-from fdhil.guard.limits import Limits
-from fdhil.guard.path import Path as CorrectionPath
+from fdhil.guard.limits import OffsetLimits
+from fdhil.guard.path import CorrectedPath
 from fdhil.guard.settings import AxisSettings, Pdo, Settings, to_json
 from fdhil.guard.state import Inputs, Request, State, initial
 
-LIMITS = Limits(offset=819, rate=65, acceleration=6, variation=9830, window=1000)
+LIMITS = OffsetLimits(offset=819, rate=65, acceleration=6, variation=9830, window=1000)
 ROWS = 20
 TOKEN = "benchmark"
 
@@ -146,7 +146,7 @@ def step_us(repeats: int = 2000) -> float:
     """Microseconds of processor time of one step while armed, two axes, the best of ten."""
     made = settings("")
     listener, state = Listener(made), initial(made)
-    path = CorrectionPath(0, ([0] * ROWS,) * 2, ([0] * ROWS,) * 2, True, "p", 1)
+    path = CorrectedPath(0, ([0] * ROWS,) * 2, ([0] * ROWS,) * 2, True, "p", 1)
     calls: list[tuple[State, Inputs]] = []
     for tick in range(1, 300):
         seen, bus = listener.at_sync(bytes([(tick - 1) % 240 + 1]), tick * 1e-3, tick * 1e-3)

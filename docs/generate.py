@@ -1,4 +1,5 @@
-"""Generate what can be generated: configs/machine-template.toml and docs/reference/ (config, commands, errors, faults).
+"""Generate what can be generated: configs/machine-template.toml and docs/reference/ (config, commands, errors,
+faults, guard).
 
 ``python docs/generate.py`` writes them; a test fails when they are not what the code says.
 """
@@ -10,7 +11,7 @@ import re
 import sys
 import types
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
@@ -22,6 +23,10 @@ from pydantic_core import PydanticUndefined
 
 from fdhil import config, errors
 from fdhil.cli.main import cli
+from fdhil.guard.core import FEED_HOLD_S, SETTLED_CYCLES
+from fdhil.guard.interlocks import CATALOGUE, EFFECT
+from fdhil.guard.protocol import HOLD_CYCLES
+from fdhil.guard.transitions import FEED_SENT, FEED_TRANSITIONS, SENT, TRANSITIONS, Event
 from fdhil.sim.fault_kinds import FAULTS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -147,12 +152,47 @@ def fault_reference() -> str:
     return "\n".join(lines) + "\n"
 
 
+def guard_reference() -> str:
+    """Return the guard's states, what leads from one to another, and its interlocks, as Markdown."""
+    lines = [
+        "# The guard's states and interlocks",
+        "",
+        "Generated from `fdhil/guard/transitions.py` and `fdhil/guard/interlocks.py`, the tables that the guard itself",
+        "goes by: no other way leads from one state to another. [Safety](../explanation/safety.md) says why.",
+        *_states("States", SENT, TRANSITIONS),
+        *_states("States of the on-line feed-forward", FEED_SENT, FEED_TRANSITIONS),
+        "",
+        "## Interlocks",
+        "",
+        f"All must be good for {SETTLED_CYCLES} SYNC before arming. A hold lasts {HOLD_CYCLES} SYNC at most, "
+        f"a feed hold {FEED_HOLD_S:g} s.",
+    ]
+    for reaction, effect in sorted(EFFECT.items(), reverse=True):
+        lines += ["", f"### {effect[:1].upper()}{effect[1:]}", "", "| class | cause | what to do |", "|---|---|---|"]
+        lines += [
+            f"| `{code}` | {cause} | {action} |" for code, (own, cause, action) in CATALOGUE.items() if own is reaction
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _states(
+    title: str, sent: Mapping[Any, str], transitions: Iterable[tuple[Event, Collection[Any], Any]]
+) -> Iterator[str]:
+    """Yield two tables: what is sent in each state, and every way from one to another."""
+    yield from ["", f"## {title}", "", "| state | what is sent |", "|---|---|"]
+    yield from [f"| {state} | {words} |" for state, words in sent.items()]
+    yield from ["", "| in | when | to |", "|---|---|---|"]
+    for event, states, after in transitions:
+        yield f"| {', '.join(state for state in sent if state in states)} | {event.value} | {after} |"
+
+
 GENERATED = {
     ROOT / "configs" / "machine-template.toml": template,
     ROOT / "docs" / "reference" / "config.md": config_reference,
     ROOT / "docs" / "reference" / "commands.md": command_reference,
     ROOT / "docs" / "reference" / "errors.md": error_reference,
     ROOT / "docs" / "reference" / "faults.md": fault_reference,
+    ROOT / "docs" / "reference" / "guard.md": guard_reference,
 }
 
 

@@ -17,7 +17,8 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from fdhil.guard.state import SENDING, Mode, Request
+from fdhil.guard.protocol import SENDING, Mode
+from fdhil.guard.state import Request
 from studies import pages
 from tests.guard.machine import ENABLED, RECORD, Bench, arm_request, bench
 from tests.guard.wire import Wire

@@ -30,13 +30,14 @@ from fdhil.arming.preparing import (
     prepare_stream,
     standing_facts,
 )
-from fdhil.arming.standing import ADOPT, RAMPING_DOWN, START_AND_ADOPT, Standing, verdict
+from fdhil.arming.standing import ADOPT, START_AND_ADOPT, Standing, verdict
 from fdhil.arming.stream_feeder import Supply
 from fdhil.arming.token import ensure_token
 from fdhil.config import MachineConfig
 from fdhil.daemon.control import Answer, refusal
 from fdhil.daemon.outcome_store import Keeper, boot_id
 from fdhil.errors import DeviceError
+from fdhil.guard.protocol import LANDING
 from fdhil.records import AxisSamples, Notice, Outcome, ParameterSet, Skill, Temperature
 from fdhil.store.history import Revision
 
@@ -162,7 +163,7 @@ class Armory:
         tick, moved_s = None, time.monotonic()
         await asyncio.to_thread(self.guard.look)
         while self.guard.state not in REST and time.monotonic() - moved_s < LANDING_S:
-            if self.guard.state in RAMPING_DOWN and self.guard.status.get("tick") != tick:
+            if self.guard.state in LANDING and self.guard.status.get("tick") != tick:
                 tick, moved_s = self.guard.status.get("tick"), time.monotonic()
             await asyncio.sleep(STREAM_S)
             await asyncio.to_thread(self.guard.look)

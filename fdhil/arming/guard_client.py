@@ -1,4 +1,4 @@
-"""The daemon's end of the guard's control socket. Blocking and small; ``alive`` never blocks.
+"""Talks to the guard over its control socket. Blocking and small; ``alive`` never blocks.
 
 Call ``alive`` at least every 0.2 s from the loop turn that checks the daemon's own health, not from a thread of its
 own: a daemon that hangs must look dead. The connection that armed is the one whose end ramps the offset down.
@@ -17,7 +17,7 @@ from typing import Any, Self
 
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout
 from fdhil.guard import table
-from fdhil.guard.control import SOCKET_NAME
+from fdhil.guard.protocol import SOCKET_NAME
 
 ANSWER_S = 13.0  # the guard answers a request at a SYNC, or when it has missed it for up to 10 s
 

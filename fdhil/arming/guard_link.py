@@ -12,13 +12,13 @@ from typing import Any, Literal
 from fdhil.arming.checked_program import Piece
 from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.preparing import Armament, Feeding, StreamedArmament
-from fdhil.arming.standing import ABSENT, AT_REST, START_AND_ADOPT, Standing, landed, lost, standing
+from fdhil.arming.standing import ABSENT, START_AND_ADOPT, Standing, landed, lost, standing
 from fdhil.errors import DeviceError
+from fdhil.guard.protocol import AT_REST, CHARGED
 from fdhil.records import Notice
 
 SETTLING_TRIES = 25
 SETTLING_S = 0.2
-CHARGED = {"ARMED", "RAMPING", "ACTIVE", "HOLD", "FEEDFORWARD"}
 ORDERED = {"Disarmed", "Finished", "Stopped"}
 TRIPPED = "GuardTripped"
 GONE = {"absent", "lost"}

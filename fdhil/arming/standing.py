@@ -8,12 +8,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from fdhil.guard.protocol import AT_REST
+
 if TYPE_CHECKING:
     from fdhil.arming.guard_client import GuardClient
 
-AT_REST = frozenset({"OFF", "FROZEN"})
 ABSENT: Mapping[str, Any] = {"state": "absent", "text": "no guard runs: nothing can be armed, nothing is sent"}
-RAMPING_DOWN = frozenset({"RAMP_DOWN", "ADOPT"})
 LANDING_S = 3.0  # without a SYNC; the ramp and the zeros after it are counted in SYNC by the guard
 LOOK_S = 0.02
 ADOPT = "hold the feed, then run fdhil adopt"

@@ -8,9 +8,9 @@ from pathlib import Path
 from fdhil.arming.guard_link import REST, GuardLink
 from fdhil.arming.preparing import StreamedArmament
 from fdhil.errors import DeviceError, StoreError
+from fdhil.guard.protocol import RESERVE_S
 from fdhil.records import Notice
 
-RESERVE_S = 1.0  # with which left the guard ramps to zero
 SCARCE_S = 5.0  # half the ring: a check that lets it fall so far is told before the guard ends the correction
 
 

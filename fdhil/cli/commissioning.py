@@ -15,7 +15,7 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.errors import ConfigError, ConfigFault, DeviceError, DriveFault
-from fdhil.guard.control import SOCKET_NAME
+from fdhil.guard.protocol import SOCKET_NAME
 
 if TYPE_CHECKING:
     from fdhil.commissioning.config_check import Place

@@ -19,17 +19,18 @@ from fdhil import config as machine_config
 from fdhil.cia402 import PdoEntry
 from fdhil.cli.bus_lock import lock_bus
 from fdhil.cli.main import run_safely
-from fdhil.config import Axis, CanBus, MachineConfig, OffsetLimits, share_fault
+from fdhil.config import Axis, CanBus, MachineConfig, share_fault
 from fdhil.errors import ConfigError, ConfigFault, ConnectError, DeviceError, ProtocolError, StoreError
-from fdhil.guard.feedforward import Limits as FeedforwardLimits
-from fdhil.guard.limits import Limits
+from fdhil.guard.feedforward import FeedforwardLimits
+from fdhil.guard.limits import OffsetLimits
+from fdhil.guard.protocol import SETTINGS_NAME
 from fdhil.guard.settings import AxisSettings, Feedforward, Layout, Pdo, Settings, from_json, to_json
 
 if TYPE_CHECKING:
     from fdhil.commissioning.record import CommissioningRecord
     from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
 
-SETTINGS_NAME = "guard.json"
+
 CONNECT_S = 5.0
 SPEED_STEPS = 2.0  # times the motor's power: room for the load's own inertia and for the sensor's noise
 HEARTBEATS_AWAITED = 2.0  # periods of the drive's heartbeat until it counts as lost
@@ -120,11 +121,11 @@ def _user_id(name: str | None) -> int | None:
         raise ConfigError("config", [fault]) from None
 
 
-def limits_of(axis: Axis, sync_period_s: float) -> Limits:
+def limits_of(axis: Axis, sync_period_s: float) -> OffsetLimits:
     """Return the limits in whole increments per SYNC cycle, as the planner has them, rounded down. ConfigError."""
     if fault := share_fault(axis, sync_period_s):
         raise ConfigError("config", [ConfigFault("axis.*.correction", fault, "leave this axis uncorrected")])
-    return Limits(*OffsetLimits.of(axis, sync_period_s).whole)
+    return OffsetLimits(*machine_config.OffsetLimits.of(axis, sync_period_s).whole)
 
 
 def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:

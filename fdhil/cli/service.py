@@ -196,7 +196,8 @@ def adopt(config: Path, yes: bool, as_json: bool) -> None:
 
 def _adopted(guard: GuardClient, token: Callable[[], str], yes: bool, quiet: bool) -> Mapping[str, Any]:
     """Have what stands ramped to zero, where anything does and the operator wants it; return the answer."""
-    from fdhil.arming.standing import AT_REST, landed, standing, verdict
+    from fdhil.arming.standing import landed, standing, verdict
+    from fdhil.guard.protocol import AT_REST
 
     status = guard.status()
     stands, state = standing(status), status["state"]

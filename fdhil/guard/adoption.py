@@ -1,4 +1,4 @@
-"""What a drive holds of our offset, and whether it may be believed. Pure, part of the core.
+"""Judges what a drive holds of our offset, and brings to zero what may be believed. Pure, part of the core.
 
 A value is known when three TPDOs in a row showed it, each at its own time. It is believed, and only then sent, when it
 is also within the compiled ceiling, agrees with the drive's own demand (0x6062), and the drive is as it was
@@ -8,27 +8,20 @@ commissioned.
 from __future__ import annotations
 
 from fdhil.guard import feedforward
-from fdhil.guard.conditions import AGREEING, ARMING_INTERLOCKS, View, known
-from fdhil.guard.feedforward import FeedMode
+from fdhil.guard.conditions import AGREEING, ARMING_INTERLOCKS, View, Views, known
 from fdhil.guard.feeding import is_fed
-from fdhil.guard.interlocks import Alarm, Reaction
-from fdhil.guard.limits import CEILING_OFFSET_UM
+from fdhil.guard.interlocks import Alarm, Alarms, Reaction
+from fdhil.guard.limits import CEILING_OFFSET_UM, ceiling
 from fdhil.guard.path import EPS
+from fdhil.guard.protocol import AT_REST, SENDING, FeedMode, Mode
 from fdhil.guard.settings import AxisSettings, Settings
-from fdhil.guard.state import SENDING, AxisState, Inputs, Mode, Request, State
-
-Views = tuple[View, ...]
-Alarms = tuple[Alarm, ...]
+from fdhil.guard.state import AxisState, Inputs, Request, State
+from fdhil.guard.transitions import Event
 
 PERIODS_AWAITED = 2 * AGREEING
 """TPDOs in which a value must have become known: three in a row, and as many that were in doubt."""
 IMPLAUSIBLE = frozenset({"StaleData", "TargetLost", "FollowingError", "Implausible", "PdoLength"})
 OF_THE_RECORD = frozenset({"NotCommissioned", "RecordVoid", "PdoMapping"})
-
-
-def ceiling(own: AxisSettings) -> int:
-    """Return the largest offset, in increments, that may ever be sent, whatever was read or configured."""
-    return int(CEILING_OFFSET_UM * 1e-3 * own.increments_per_mm + 1e-9)
 
 
 def patience(settings: Settings) -> int:
@@ -54,7 +47,7 @@ def _doubt(view: View) -> str:
     held = known(axis)
     if held is None:
         return "three TPDOs in a row do not agree on it"
-    if not abs(held) <= ceiling(own):
+    if not abs(held) <= ceiling(own.increments_per_mm):
         return f"{_um(own, held)}: beyond the ceiling of {CEILING_OFFSET_UM:.0f} um"
     if not axis.off_demand <= EPS:
         return f"{_um(own, held)}: its demand (0x6062) says otherwise"
@@ -100,7 +93,7 @@ def adopt_refusals(state: State, request: Request, alarms: Alarms, views: Views)
     refused = [alarm for alarm in alarms if alarm.reaction is Reaction.FREEZE]
     if not _nothing_held(state):
         refused += doubts(views, alarms)
-    if state.mode not in (Mode.OFF, Mode.FROZEN) or state.feed.mode is not FeedMode.OFF:
+    if state.mode not in AT_REST or state.feed.mode is not FeedMode.OFF:
         refused.append(Alarm("NotOff", detail=state.mode.value))
     if request.token_valid is not True:
         refused.append(Alarm("AuthRequired"))
@@ -117,9 +110,9 @@ def adopting(state: State, settings: Settings) -> State:
     cause = Alarm("StaleOffset")
     if _nothing_held(state):
         axes = tuple([axis._replace(sent=(0,) * len(axis.sent), offset=0, rate=0) for axis in state.axes])
-        return state._replace(mode=Mode.OFF, axes=axes, adopt_checked=True, cause=None)
+        return state.after(Event.NOTHING_HELD, axes=axes, adopt_checked=True, cause=None)
     feed = feedforward.zeroing(len(state.axes), cause) if is_fed(state) and settings.feeds else state.feed
-    state = state._replace(mode=Mode.ADOPT, zeros_sent=0, adopt_checked=True, cause=cause, feed=feed)
+    state = state.after(Event.ADOPT, zeros_sent=0, adopt_checked=True, cause=cause, feed=feed)
     return _from_measured(state)
 
 
@@ -158,9 +151,9 @@ def unread(state: State) -> State:
 def frozen(state: State, cause: Alarm) -> State:
     """Stop sending: what the drive holds is unknown, unless only zeros were sent and shown."""
     if not state.measuring and all(map(is_zero, state.axes)):
-        return state._replace(mode=Mode.OFF, cause=cause, places=())
+        return state.after(Event.BLOCKED_AT_ZERO, cause=cause, places=())
     axes = tuple([axis._replace(read_back=None, readings=0) for axis in state.axes])
-    return state._replace(mode=Mode.FROZEN, cause=cause, places=(), axes=axes, measuring=0)
+    return state.after(Event.BLOCKED, cause=cause, places=(), axes=axes, measuring=0)
 
 
 def adopt_at_start(state: State, inputs: Inputs, alarms: Alarms, views: Views, settings: Settings) -> State:
@@ -179,7 +172,7 @@ def adopt_at_start(state: State, inputs: Inputs, alarms: Alarms, views: Views, s
         return adopting(state, settings)
     if state.unknown_for < patience(settings):
         return state._replace(unknown_for=state.unknown_for + 1)
-    return state._replace(mode=Mode.FROZEN, cause=in_doubt(views, doubtful), adopt_checked=True)
+    return state.after(Event.DOUBTFUL, cause=in_doubt(views, doubtful), adopt_checked=True)
 
 
 def measure(state: State, alarms: Alarms, views: Views, settings: Settings) -> State:

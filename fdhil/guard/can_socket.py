@@ -1,4 +1,4 @@
-"""The two ways onto a CAN bus, on a descriptor that somebody else opened: CAN_RAW and the socketcand text protocol.
+"""Sends and receives on a descriptor that somebody else opened: CAN_RAW or the socketcand text protocol.
 
 What may leave is checked here, where the bytes leave: our heartbeat and the configured offset RPDOs, nothing else.
 """

@@ -1,11 +1,11 @@
-"""What must hold before and while an offset is sent, as predicates over what is known of the bus and of an axis.
+"""Judges the bus and each axis by the interlocks: predicates that must hold before and while an offset is sent.
 
 Every comparison says what is good: what is unknown (None, NaN) is never good.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 
 from fdhil.cia402 import (
     STATUS_FOLLOWING_ERROR,
@@ -16,12 +16,13 @@ from fdhil.cia402 import (
     State,
     state_of,
 )
-from fdhil.guard.interlocks import Alarm
+from fdhil.guard.interlocks import Alarm, Alarms
 from fdhil.guard.settings import AxisSettings
 from fdhil.guard.state import AxisInput, AxisState, BusView
 
 View = tuple[AxisSettings, AxisInput, AxisState]
 """One axis: what it is set to, what it showed, and what is remembered of it."""
+Views = tuple[View, ...]
 Good = Callable[[AxisSettings, AxisInput, AxisState], bool]
 AGREEING = 3
 """TPDOs in a row that must show the same offset before it is known."""
@@ -85,17 +86,17 @@ ARMING_INTERLOCKS: tuple[tuple[str, Good], ...] = (
 )
 
 
-def failing(bus: BusView, views: Iterable[View]) -> tuple[Alarm, ...]:
+def failing(bus: BusView, views: Views) -> Alarms:
     """Return an alarm for every interlock that is not good at this SYNC."""
     of_bus = [Alarm(code) for code, good in BUS_INTERLOCKS if not good(bus)]
     return (*of_bus, *[Alarm(code, v[0].name) for v in views for code, good in AXIS_INTERLOCKS if not good(*v)])
 
 
-def not_ready(views: Iterable[View]) -> tuple[Alarm, ...]:
+def not_ready(views: Views) -> Alarms:
     """Return an alarm for everything about the drives that forbids arming beyond ``failing``."""
     return tuple([Alarm(code, v[0].name) for v in views for code, good in ARMING_INTERLOCKS if not good(*v)])
 
 
-def withheld(facts: Mapping[str, object], needed: Mapping[str, str]) -> tuple[Alarm, ...]:
+def withheld(facts: Mapping[str, object], needed: Mapping[str, str]) -> Alarms:
     """Return an alarm for every needed fact that the daemon does not vouch for; only a true ``True`` counts."""
     return tuple(Alarm(code) for fact, code in needed.items() if facts.get(fact) is not True)

@@ -1,4 +1,4 @@
-"""The guard's UNIX stream socket: JSON lines from a few clients, none of which can block the loop or fill its memory.
+"""Serves JSON lines of a few clients on a UNIX socket; none of them can block the loop or fill its memory.
 
 Each turn of the loop serves one client at most, by one request at most. A client whose answers wait is not read.
 """
@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.errors import DeviceError
+from fdhil.guard.protocol import SOCKET_NAME
 from fdhil.guard.requests import Document, parse_line
 
-SOCKET_NAME = "guard.sock"
 MAX_CLIENTS = 8
 MAX_LINE_BYTES = 1 << 15
 SO_PEERCRED = getattr(socket, "SO_PEERCRED", 17)

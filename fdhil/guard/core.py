@@ -1,4 +1,4 @@
-"""The guard's decisions: ``step(state, inputs, settings) -> (state, output)``, a pure function, once per SYNC.
+"""Decides what leaves the guard: ``step(state, inputs, settings) -> (state, output)``, pure, once per SYNC.
 
 No clock, no I/O: time is the SYNC count in the state. Every way out of a state leads toward OFF, but for the operator's
 arm and adopt. The order within a step: what the drives and the bus say, the interlocks, the request, the place on the
@@ -8,40 +8,23 @@ path, the motion of the offset, and a check of the frame by other formulas than 
 from __future__ import annotations
 
 from fdhil.guard import feedforward
-from fdhil.guard.adoption import (
-    adopt_at_start,
-    adopt_refusals,
-    adopting,
-    at_rest,
-    ceiling,
-    compared,
-    frozen,
-    measure,
-    unread,
-)
-from fdhil.guard.adoption import may_stand as may_stand
-from fdhil.guard.conditions import AGREEING, View, failing, not_ready, withheld
-from fdhil.guard.feedforward import FeedMode
+from fdhil.guard.adoption import adopt_at_start, adopt_refusals, adopting, at_rest, compared, frozen, measure, unread
+from fdhil.guard.conditions import AGREEING, Views, failing, not_ready, withheld
 from fdhil.guard.feeding import go_on
-from fdhil.guard.interlocks import FACTS, FEEDFORWARD_FACTS, Alarm, Reaction
-from fdhil.guard.limits import brake, follow, violation
-from fdhil.guard.path import Path
+from fdhil.guard.interlocks import FACTS, FEEDFORWARD_FACTS, Alarm, Alarms, Reaction
+from fdhil.guard.limits import brake, ceiling, follow, violation
+from fdhil.guard.path import CorrectedPath
 from fdhil.guard.plausibility import behind, observe
+from fdhil.guard.protocol import HOLD_CYCLES, IN_CHARGE, LANDING, RESERVE_S, SENDING, FeedMode, Mode
 from fdhil.guard.settings import AxisSettings, Settings
-from fdhil.guard.state import IN_CHARGE, LANDING, SENDING, AxisState, Inputs, Mode, Output, Request, State
+from fdhil.guard.state import AxisState, Inputs, Output, Request, State
 from fdhil.guard.tracking import await_start, rest, track
+from fdhil.guard.transitions import ZEROS, ZEROS_UNCONFIRMED, Event
 
 SETTLED_CYCLES = 100
-HOLD_CYCLES = 10
 FEED_HOLD_S = 10.0
-RESERVE_S = 1.0
 MISSED_CYCLES = 10
 FAILED_SENDS = 3
-ZEROS = 3
-ZEROS_UNCONFIRMED = 50
-
-Views = tuple[View, ...]
-Alarms = tuple[Alarm, ...]
 
 
 def step(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Output]:
@@ -137,8 +120,8 @@ def _refusals(
 
 def _armed(state: State, inputs: Inputs) -> State:
     assert inputs.path is not None
-    return state._replace(
-        mode=Mode.ARMED,
+    return state.after(
+        Event.ARM,
         program_digest=inputs.path.program_digest,
         start_row=inputs.path.standing_rows(),
         axes=tuple([at_rest(axis, 0) for axis in state.axes]),
@@ -151,8 +134,8 @@ def _armed(state: State, inputs: Inputs) -> State:
 # --- reactions ---
 
 
-def _ramp_down(state: State, cause: Alarm) -> State:
-    return state._replace(mode=Mode.RAMP_DOWN, cause=cause, places=(), zeros_sent=0)
+def _ramp_down(state: State, cause: Alarm, event: Event = Event.END) -> State:
+    return state.after(event, cause=cause, places=(), zeros_sent=0)
 
 
 def _react(state: State, inputs: Inputs, alarms: Alarms, settings: Settings) -> State:
@@ -169,7 +152,7 @@ def _react(state: State, inputs: Inputs, alarms: Alarms, settings: Settings) -> 
     if state.failed_run >= 2 * FAILED_SENDS:
         return frozen(state, Alarm("TxQueueFull"))
     if hijack is not None:
-        return _ramp_down(state, hijack)._replace(measuring=max(1, state.measuring))
+        return _ramp_down(state, hijack, Event.HIJACK)._replace(measuring=max(1, state.measuring))
     if state.mode not in IN_CHARGE:
         return state
     if worst is not None and reaction is Reaction.RAMP_DOWN:
@@ -198,7 +181,10 @@ def _follow_path(state: State, inputs: Inputs, alarms: Alarms, settings: Setting
         return _ramp_down(state, Alarm("ProgramMismatch"))
     hold = next((alarm for alarm in alarms if alarm.reaction is Reaction.HOLD), None)
     if state.mode is Mode.ARMED:
-        return _held(state, hold, settings) if hold else _started(state, path)
+        if hold:
+            return _held(state, hold, settings)
+        state, astray = await_start(state._replace(held_for=0), path)
+        return state if astray is None else _ramp_down(state, astray)
     state, lost = track(state, path)
     hold = hold or lost
     if path.final and state.places[0].row >= path.end - 1:
@@ -208,13 +194,8 @@ def _follow_path(state: State, inputs: Inputs, alarms: Alarms, settings: Setting
     if hold is not None:
         return _held(state, hold, settings)
     if state.mode is Mode.HOLD:
-        return state._replace(mode=Mode.RAMPING, held_for=0, cause=None)
+        return state.after(Event.FOUND, held_for=0, cause=None)
     return state._replace(held_for=0)
-
-
-def _started(state: State, path: Path) -> State:
-    state, astray = await_start(state._replace(held_for=0), path)
-    return state if astray is None else _ramp_down(state, astray)
 
 
 def _held(state: State, alarm: Alarm, settings: Settings) -> State:
@@ -222,8 +203,7 @@ def _held(state: State, alarm: Alarm, settings: Settings) -> State:
     allowed = settings.cycles(FEED_HOLD_S) if alarm.code == "FeedHold" else HOLD_CYCLES
     if state.held_for >= allowed:
         return _ramp_down(state, alarm)
-    mode = Mode.ARMED if state.mode is Mode.ARMED else Mode.HOLD
-    return state._replace(mode=mode, held_for=state.held_for + 1, cause=alarm)
+    return state.after(Event.GAP, held_for=state.held_for + 1, cause=alarm)
 
 
 # --- the motion of the offset ---
@@ -250,7 +230,7 @@ def _move(state: State, inputs: Inputs, settings: Settings) -> tuple[State, Outp
     return state, Output(offsets, heartbeat)
 
 
-def _next_offsets(state: State, path: Path | None, settings: Settings) -> tuple[tuple[int, ...], Alarm | None]:
+def _next_offsets(state: State, path: CorrectedPath | None, settings: Settings) -> tuple[tuple[int, ...], Alarm | None]:
     """Return the next offset of each axis, and the alarm when the table itself asks for more than is allowed."""
     if state.mode is Mode.ARMED:
         return (0,) * len(state.axes), None
@@ -277,7 +257,7 @@ def _wrong_frame(state: State, offsets: tuple[int, ...], settings: Settings) -> 
     """Check the frames by the limits alone, whatever made them; they are wrong only if this program is."""
     for s, axis, offset in zip(settings.axes, state.axes, offsets, strict=True):
         broken = type(offset) is not int or violation(s.limits, axis.offset, axis.rate, offset) is not None
-        if broken or not abs(offset) <= ceiling(s):
+        if broken or not abs(offset) <= ceiling(s.increments_per_mm):
             return Alarm("InternalError", s.name, f"{axis.offset} + {axis.rate} -> {offset}")
     return None
 
@@ -298,11 +278,11 @@ def _stands(axis: AxisState) -> AxisState:
     return axis._replace(rate=0, sent=(axis.sent[0], *axis.sent[:-1]))
 
 
-def _arrived(state: State, path: Path | None) -> State:
+def _arrived(state: State, path: CorrectedPath | None) -> State:
     """Leave RAMPING when on the table, and a landing when the drives show 0."""
     if state.mode is Mode.RAMPING and path is not None and len(state.places) == 1:
         on_table = tuple([axis.offset for axis in state.axes]) == path.offsets_at(state.places[0].row + 1)
-        return state._replace(mode=Mode.ACTIVE) if on_table else state
+        return state.after(Event.ON_TABLE) if on_table else state
     if state.mode not in LANDING:
         return state
     if any(axis.offset or axis.rate for axis in state.axes):
@@ -310,7 +290,8 @@ def _arrived(state: State, path: Path | None) -> State:
     sent = state.zeros_sent + 1
     if sent > ZEROS and all(axis.zero_shown for axis in state.axes):
         axes = tuple([at_rest(axis, 0)._replace(readings=AGREEING, zero_shown=True) for axis in state.axes])
-        return state._replace(mode=Mode.OFF, axes=axes, zeros_sent=sent)
+        return state.after(Event.ZERO_SHOWN, axes=axes, zeros_sent=sent)
     if sent > ZEROS_UNCONFIRMED:
-        return unread(state)._replace(mode=Mode.FROZEN, cause=Alarm("EchoMismatch", detail="no zero was read back"))
+        cause = Alarm("EchoMismatch", detail="no zero was read back")
+        return unread(state).after(Event.ZERO_NOT_SHOWN, cause=cause)
     return state._replace(zeros_sent=sent)

@@ -1,4 +1,4 @@
-"""The on-line feed-forward: speed and torque offsets (0x60B1, 0x60B2) from the targets that the NC sends. Pure.
+"""Computes speed and torque offsets (0x60B1, 0x60B2) on line from the targets that the NC sends. Pure.
 
 The law is a few whole weights per axis, found by the daemon from the identified drive; here it is integer arithmetic on
 the last targets, with limits of its own. It has a state beside the position offset's and is never on together with it.
@@ -8,17 +8,15 @@ Zero is always the safer value: whatever freezes a position offset sets these of
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import Enum
 from typing import NamedTuple
 
 from fdhil.guard.interlocks import Alarm, Reaction
 from fdhil.guard.limits import clamp
+from fdhil.guard.protocol import HOLD_CYCLES, FeedMode
+from fdhil.guard.transitions import NEXT_FEED, ZEROS, ZEROS_UNCONFIRMED, Event
 
 SHIFT = 24
 FADE_S = 0.1
-HOLD_CYCLES = 10
-ZEROS = 3
-ZEROS_UNCONFIRMED = 50
 KEPT = 4
 """Cycles of what was sent, to compare with what the drives show: one late frame is no mismatch."""
 
@@ -26,7 +24,7 @@ Targets = tuple[int, ...]
 Pair = tuple[int, int]
 
 
-class Limits(NamedTuple):
+class FeedforwardLimits(NamedTuple):
     """Largest speed offset (increments/s) and torque offset (0.1 % of the rated torque), and each per SYNC cycle."""
 
     speed: int
@@ -68,15 +66,6 @@ def _whole(value: int) -> int:
     return (value + (1 << SHIFT - 1)) >> SHIFT
 
 
-class FeedMode(Enum):
-    """Whether the feed-forward acts: ENDING fades out, ZEROING sends zeros at once."""
-
-    OFF = "OFF"
-    ON = "ON"
-    ENDING = "ENDING"
-    ZEROING = "ZEROING"
-
-
 class Feed(NamedTuple):
     """The feed-forward's memory: ``share`` of ``FADE_S`` faded in (cycles), the last targets per axis, newest first.
 
@@ -99,6 +88,10 @@ class Feed(NamedTuple):
         """The offsets sent last, per axis."""
         return self.sent[0]
 
+    def after(self, event: Event, cause: Alarm | None) -> Feed:
+        """Return the state that ``event`` leads to; KeyError where the table has no such way."""
+        return self._replace(mode=NEXT_FEED[self.mode, event], cause=cause)
+
     def send(self, pairs: tuple[Pair, ...]) -> Feed:
         """Note what is sent now."""
         return self._replace(sent=(pairs, *self.sent)[:KEPT])
@@ -106,17 +99,18 @@ class Feed(NamedTuple):
 
 def armed(laws: tuple[Law, ...]) -> Feed:
     """Return the state behind an arming: nothing is sent but zeros until enough targets were heard."""
-    return Feed(FeedMode.ON, laws, targets=((),) * len(laws), sent=(((0, 0),) * len(laws),) * KEPT)
+    off = Feed(laws=laws, targets=((),) * len(laws), sent=(((0, 0),) * len(laws),) * KEPT)
+    return off.after(Event.ARM, None)
 
 
 def zeroing(axes: int, cause: Alarm) -> Feed:
     """Return the state that sends zeros to drives that hold something else."""
-    return Feed(FeedMode.ZEROING, sent=(((0, 0),) * axes,), cause=cause)
+    return Feed(sent=(((0, 0),) * axes,)).after(Event.ADOPT, cause)
 
 
 def end(feed: Feed, cause: Alarm) -> Feed:
     """Fade out."""
-    return feed._replace(mode=FeedMode.ENDING, cause=cause) if feed.mode is FeedMode.ON else feed
+    return feed.after(Event.END, cause) if feed.mode is FeedMode.ON else feed
 
 
 def react(feed: Feed, alarms: Sequence[Alarm]) -> Feed:
@@ -127,7 +121,7 @@ def react(feed: Feed, alarms: Sequence[Alarm]) -> Feed:
     if worst is None or worst.reaction is Reaction.REFUSE:
         return feed._replace(held=0)
     if worst.reaction is Reaction.FREEZE and feed.mode is not FeedMode.ZEROING:
-        return feed._replace(mode=FeedMode.ZEROING, share=0, zeros=0, cause=worst)
+        return feed.after(Event.BLOCKED, worst)._replace(share=0, zeros=0)
     if worst.reaction is Reaction.RAMP_DOWN or feed.held >= HOLD_CYCLES:
         return end(feed, worst)
     return feed._replace(held=feed.held + 1)
@@ -144,7 +138,7 @@ def hear(feed: Feed, targets: Sequence[int | None]) -> Feed:
     return feed._replace(targets=tuple(heard))
 
 
-def move(feed: Feed, limits: Sequence[Limits], fade_cycles: int, confirmed: bool = True) -> Feed:
+def move(feed: Feed, limits: Sequence[FeedforwardLimits], fade_cycles: int, confirmed: bool = True) -> Feed:
     """Go one cycle on: the next offsets are ``applied``, inside their limits; OFF once zeros were sent.
 
     ``confirmed``: no drive shows anything but 0; zeros are sent for longer when one does.
@@ -166,13 +160,14 @@ def move(feed: Feed, limits: Sequence[Limits], fade_cycles: int, confirmed: bool
 
 def _landed(feed: Feed, confirmed: bool) -> Feed:
     """OFF after enough zeros that the drives show, or far more of them that a drive does not show."""
-    if feed.zeros <= (ZEROS if confirmed else ZEROS_UNCONFIRMED):
+    if confirmed:
+        return feed.after(Event.ZERO_SHOWN, feed.cause) if feed.zeros > ZEROS else feed
+    if feed.zeros <= ZEROS_UNCONFIRMED:
         return feed
-    cause = feed.cause if confirmed else Alarm("EchoMismatch", detail="no zero was read back")
-    return feed._replace(mode=FeedMode.OFF, cause=cause)
+    return feed.after(Event.ZERO_NOT_SHOWN, Alarm("EchoMismatch", detail="no zero was read back"))
 
 
-def _inside(before: Pair, wanted: Pair, share: int, fade_cycles: int, limits: Limits) -> Pair:
+def _inside(before: Pair, wanted: Pair, share: int, fade_cycles: int, limits: FeedforwardLimits) -> Pair:
     """Fade, then keep amplitude and rate."""
     bounds = ((limits.speed, limits.speed_rate), (limits.torque, limits.torque_rate))
     values = []
@@ -182,7 +177,7 @@ def _inside(before: Pair, wanted: Pair, share: int, fade_cycles: int, limits: Li
     return values[0], values[1]
 
 
-def violates(limits: Limits, before: Pair, after: Pair) -> bool:
+def violates(limits: FeedforwardLimits, before: Pair, after: Pair) -> bool:
     """Check what is to be sent by the limits alone; zero may always be sent."""
     for last, value, largest, rate in zip(before, after, limits[::2], limits[1::2], strict=True):
         if type(value) is not int or not -largest <= value <= largest:

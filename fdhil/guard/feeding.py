@@ -1,14 +1,13 @@
-"""The on-line feed-forward's part of a step: what stops it, what it sends, and the check of that. Pure."""
+"""Steps the on-line feed-forward: what stops it, what it sends, and the check of that. Pure."""
 
 from __future__ import annotations
 
 from fdhil.guard import feedforward
-from fdhil.guard.feedforward import FADE_S, FeedMode
-from fdhil.guard.interlocks import Alarm
+from fdhil.guard.feedforward import FADE_S
+from fdhil.guard.interlocks import Alarm, Alarms
+from fdhil.guard.protocol import FeedMode
 from fdhil.guard.settings import Settings
 from fdhil.guard.state import Inputs, Output, State
-
-Alarms = tuple[Alarm, ...]
 
 
 def is_fed(state: State) -> bool:

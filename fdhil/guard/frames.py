@@ -1,4 +1,4 @@
-"""From frames to what the core may know at a SYNC: pure bookkeeping, no socket and no clock of its own.
+"""Gathers frames into what the core may know at a SYNC: pure bookkeeping, no socket and no clock of its own.
 
 A TPDO is sampled at a SYNC and arrives after it, so that at the next SYNC it is one cycle old. The target that a SYNC
 latches is the last one that came before it.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from statistics import median
 
 from fdhil.cia402 import (
@@ -19,7 +19,7 @@ from fdhil.cia402 import (
     COB_SYNC,
     Nmt,
     NmtCommand,
-    PdoEntry,
+    Object,
     pdo_length,
     unpack,
 )
@@ -31,15 +31,13 @@ INF = float("inf")
 NEVER = 1 << 30
 INTERVALS = 32
 FOREIGN_CYCLES = 3
-TARGET, POSITION, READ_BACK, STATUSWORD, MODE, FOLLOWING = 0x607A, 0x6064, 0x60B0, 0x6041, 0x6061, 0x60F4
-SPEED_OFFSET, TORQUE_OFFSET, SPEED, DEMAND = 0x60B1, 0x60B2, 0x606C, 0x6062
+_NEEDED = frozenset({Object.STATUSWORD, Object.POSITION_ACTUAL, Object.MODE_DISPLAY})
 PDO_SET_UP = range(0x1400, 0x1C00)
 # what a commissioning record relies on besides: its options, the scale, the cycle, and "restore the defaults"
 SET_UP = frozenset((0x1005, 0x1011, 0x1016, 0x1017, 0x6007, 0x605A, 0x605E, 0x6065, 0x6066, 0x6075, 0x607D, 0x607E))
 SET_UP |= {0x6085, 0x608F, 0x6091, 0x6092, 0x60C2}
 
 
-@dataclass(slots=True)
 class _PdoState:
     """One PDO that is listened to: its last content and age in SYNC cycles, and what is wrong with it.
 
@@ -47,22 +45,17 @@ class _PdoState:
     that came when it was due.
     """
 
-    axis: int
-    entries: tuple[PdoEntry, ...]
-    length: int
-    every_sync: int
-    where: dict[int, int]
-    needed: bool = False
-    data: bytes = b""
-    age: int = NEVER
-    sure_age: int = NEVER
-    fresh: bool = False
-    early: bool = False
-    twice: bool = False
-    twice_run: int = 0
-    short: int = 0
-    long: int = 0
-    values: tuple[int, ...] = ()
+    def __init__(self, pdo: Pdo) -> None:
+        self.entries = pdo.entries
+        self.length = pdo_length(self.entries)
+        self.every_sync = max(1, pdo.every_sync)
+        self.where = {entry.index: k for k, entry in enumerate(self.entries) if entry.sub == 0}
+        self.needed = bool(_NEEDED & self.where.keys())
+        self.data = b""
+        self.values: tuple[int, ...] = ()
+        self.age = self.sure_age = NEVER
+        self.fresh = self.early = self.twice = False
+        self.twice_run = self.short = self.long = 0
 
     def take(self, data: bytes) -> None:
         """Take one frame: short ones are dropped and counted, of long ones the mapped bytes are used."""
@@ -93,12 +86,6 @@ class _PdoState:
         return None if place is None or not self.values else self.values[place]
 
 
-def _pdo_state(axis: int, pdo: Pdo) -> _PdoState:
-    entries = pdo.entries
-    where = {entry.index: k for k, entry in enumerate(entries) if entry.sub == 0}
-    return _PdoState(axis, entries, pdo_length(entries), max(1, pdo.every_sync), where, bool(_NEEDED & where.keys()))
-
-
 @dataclass(slots=True)
 class _Node:
     nmt: int | None = None
@@ -106,46 +93,35 @@ class _Node:
     touched: int = 0
 
 
-@dataclass(slots=True)
 class Listener:
     """Gathers frames (``take``) and gives the axes' inputs and the bus' view at a SYNC (``at_sync``).
 
     The bus does not give back what we send ourselves: a frame with one of our COB-IDs is another node's.
     """
 
-    settings: Settings
-    bus_state: str = "active"
-    lost_frames: int = 0
-    foreign_ids: frozenset[int] = frozenset()
-    duplicates: int = 0
-    emergencies: int = 0
-    _pdos: dict[int, _PdoState] = field(default_factory=dict)
-    _tpdos: list[list[_PdoState]] = field(default_factory=list)
-    _carriers: list[Mapping[int, _PdoState]] = field(default_factory=list)
-    _targets: list[_PdoState] = field(default_factory=list)
-    _nodes: list[_Node] = field(default_factory=list)
-    _node_of: dict[int, int] = field(default_factory=dict)
-    _alarms: dict[tuple[str, str], Alarm] = field(default_factory=dict)
-    _counter: int | None = None
-    _last_sync_s: tuple[float, float] | None = None
-    _intervals: deque[float] = field(default_factory=lambda: deque(maxlen=INTERVALS))
-
-    def __post_init__(self) -> None:
-        for k, axis in enumerate(self.settings.axes):
-            target = _pdo_state(k, axis.target)
-            self._targets.append(target)
-            self._tpdos.append([_pdo_state(k, pdo) for pdo in axis.tpdos])
-            self._carriers.append(_carriers(self._tpdos[k]))
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        self.bus_state = "active"
+        self.lost_frames = self.emergencies = 0
+        self._sent_ids = settings.sent_ids
+        self._targets = [_PdoState(axis.target) for axis in settings.axes]
+        self._tpdos = [[_PdoState(pdo) for pdo in axis.tpdos] for axis in settings.axes]
+        self._carriers = list(map(_carriers, self._tpdos))
+        self._pdos: dict[int, _PdoState] = {}
+        for axis, target, tpdos in zip(settings.axes, self._targets, self._tpdos, strict=True):
             self._pdos[axis.target.cob_id] = target
-            self._pdos.update(zip([pdo.cob_id for pdo in axis.tpdos], self._tpdos[k], strict=True))
-            self._nodes.append(_Node())
-            self._node_of[axis.node_id] = k
-        self.foreign_ids = self.settings.sent_ids
+            self._pdos.update(zip([pdo.cob_id for pdo in axis.tpdos], tpdos, strict=True))
+        self._nodes = [_Node() for _ in settings.axes]
+        self._node_of = {axis.node_id: k for k, axis in enumerate(settings.axes)}
+        self._alarms: dict[tuple[str, str], Alarm] = {}
+        self._counter: int | None = None
+        self._last_sync_s: tuple[float, float] | None = None
+        self._intervals: deque[float] = deque(maxlen=INTERVALS)
 
     def wanted_ids(self) -> tuple[int, ...]:
         """All COB-IDs that the guard must hear, for a receive filter."""
         nodes = list(self._node_of)
-        ids = {COB_NMT, COB_SYNC, *self._pdos, *self.foreign_ids}
+        ids = {COB_NMT, COB_SYNC, *self._pdos, *self._sent_ids}
         return tuple(sorted(ids | {base + n for n in nodes for base in (COB_EMCY, COB_HEARTBEAT, COB_SDO_REQUEST)}))
 
     def take(self, cob_id: int, data: bytes, now_s: float) -> None:
@@ -153,7 +129,7 @@ class Listener:
         pdo = self._pdos.get(cob_id)
         if pdo is not None:
             pdo.take(data)
-        elif cob_id in self.foreign_ids:
+        elif cob_id in self._sent_ids:
             code = "BusLocked" if cob_id >= COB_HEARTBEAT else "OffsetHijack"
             self._alarm(Alarm(code, detail=f"{cob_id:03X} {data.hex()}"))
         elif cob_id == COB_NMT:
@@ -196,7 +172,7 @@ class Listener:
         if len(data) < 4 or not (data[0] >> 5 == 1 or data[0] & 0xE1 == 0xC0):
             return
         index, name = int.from_bytes(data[1:3], "little"), self.settings.axes[axis].name
-        if index == READ_BACK:
+        if index == Object.POSITION_OFFSET:
             self._alarm(Alarm("OffsetHijack", name, f"by SDO, {data.hex()}"))
         elif index in SET_UP or index in PDO_SET_UP:
             self._nodes[axis].touched += 1
@@ -266,7 +242,7 @@ class Listener:
             pdo.at_sync()
             if pdo.twice_run >= FOREIGN_CYCLES:
                 self._alarm(Alarm("ForeignProducer", axis.name))
-        target = target_pdo.get(TARGET) if target_pdo.fresh else None
+        target = target_pdo.get(Object.TARGET_POSITION) if target_pdo.fresh else None
         seen = self._axis_input(k, axis, now_s, target)
         for pdo in (target_pdo, *self._tpdos[k]):
             pdo.fresh = pdo.early = pdo.twice = False
@@ -274,23 +250,23 @@ class Listener:
 
     def _axis_input(self, k: int, axis: AxisSettings, now_s: float, target: int | None) -> AxisInput:
         tpdos, of, node = self._tpdos[k], self._carriers[k], self._nodes[k]
-        shown = of.get(READ_BACK)
+        shown = of.get(Object.POSITION_OFFSET)
         return AxisInput(
             target,
-            _fresh(of, POSITION),
-            _fresh(of, READ_BACK) if shown is not None and not shown.early else None,
-            _fresh(of, FOLLOWING),
-            _last(of, STATUSWORD),
-            _last(of, MODE),
+            _fresh(of, Object.POSITION_ACTUAL),
+            _fresh(of, Object.POSITION_OFFSET) if shown is not None and not shown.early else None,
+            _fresh(of, Object.FOLLOWING_ERROR),
+            _last(of, Object.STATUSWORD),
+            _last(of, Object.MODE_DISPLAY),
             node.nmt,
             _age(tpdos),
             now_s - node.heartbeat_at_s,
             max([pdo.short for pdo in tpdos], default=0),
             max([pdo.long for pdo in tpdos], default=0),
-            (_fresh(of, SPEED_OFFSET), _fresh(of, TORQUE_OFFSET)),
-            _fresh(of, SPEED),
+            (_fresh(of, Object.VELOCITY_OFFSET), _fresh(of, Object.TORQUE_OFFSET)),
+            _fresh(of, Object.VELOCITY_ACTUAL),
             NEVER if shown is None else -(-shown.sure_age // shown.every_sync),
-            _fresh(of, DEMAND),
+            _fresh(of, Object.POSITION_DEMAND),
             node.touched,
             shown is not None and shown.early,
         )
@@ -315,6 +291,3 @@ def _last(of: Mapping[int, _PdoState], index: int) -> int | None:
 def _age(pdos: Sequence[_PdoState]) -> float:
     """Age of the oldest TPDO that carries a signal of the guard, in units of its own rate, rounded up."""
     return max([-(-pdo.age // pdo.every_sync) for pdo in pdos if pdo.needed], default=NEVER)
-
-
-_NEEDED = frozenset({STATUSWORD, POSITION, MODE})

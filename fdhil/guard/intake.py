@@ -1,4 +1,4 @@
-"""The table on its way in: taken from its descriptor, then checked a few rows a turn, so that no SYNC waits for it."""
+"""Takes a table from its descriptor and checks it a few rows a turn, so that no SYNC waits for it."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from fdhil.guard import table
 from fdhil.guard.control import Client
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.journal import Journal
-from fdhil.guard.path import Path
+from fdhil.guard.path import CorrectedPath
+from fdhil.guard.protocol import Mode
 from fdhil.guard.requests import Document
 from fdhil.guard.settings import Settings
-from fdhil.guard.state import Mode, State
+from fdhil.guard.state import State
 
 ROWS_PER_TURN = 64
 ROWS_PER_IDLE_TURN = 1024
@@ -22,7 +23,7 @@ class Intake:
     """``path`` is the table in force; one more at a time is on its way in."""
 
     def __init__(self, settings: Settings, journal: Journal) -> None:
-        self.path: Path | None = None
+        self.path: CorrectedPath | None = None
         self._settings = settings
         self._journal = journal
         self._loading: tuple[table.Loading, Client, Document] | None = None

@@ -1,4 +1,4 @@
-"""The interlocks by name: each its own class, with reaction, cause and next action; what the daemon must vouch for."""
+"""Lists the interlocks: the reaction, cause and next action of each class, and what the daemon must vouch for."""
 
 from __future__ import annotations
 
@@ -56,6 +56,7 @@ class Alarm:
         return f"{self.cause}; {effect}; {self.action}"
 
 
+Alarms = tuple[Alarm, ...]
 _R, _H, _F, _N = Reaction.RAMP_DOWN, Reaction.HOLD, Reaction.FREEZE, Reaction.REFUSE
 # class: (reaction while sending, cause, next action)
 CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {

@@ -1,4 +1,4 @@
-"""What the guard tells: JSON lines on stdout (the journal pipe) and systemd's notifications. It writes no file."""
+"""Writes events as JSON lines on stdout (the journal pipe), and notifies systemd. It writes no file."""
 
 from __future__ import annotations
 

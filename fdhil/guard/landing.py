@@ -1,4 +1,4 @@
-"""The last way to zero, when the loop itself has failed: from what was sent last, by the limits alone, at each SYNC."""
+"""Ramps to zero when the loop itself has failed: from what was sent last, by the limits alone, at each SYNC."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import time
 
 from fdhil.cia402 import COB_SYNC, pack
 from fdhil.guard.can_socket import BusDown, CanSocket
-from fdhil.guard.feedforward import FeedMode
 from fdhil.guard.limits import follow
+from fdhil.guard.protocol import SENDING, FeedMode
 from fdhil.guard.settings import Settings
-from fdhil.guard.state import SENDING, State
+from fdhil.guard.state import State
 
 ZEROS = 5
 

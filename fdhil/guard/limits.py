@@ -1,4 +1,4 @@
-"""What an offset may do, in whole drive increments per SYNC cycle, and how to move it inside these limits.
+"""Bounds an offset, in whole drive increments per SYNC cycle, and moves it inside these limits.
 
 Everything here is integer arithmetic: there is no NaN, no rounding, and every start can be enumerated by a test.
 The check of a frame (``violation``) shares no formula with the motion (``follow``), so that one guards the other.
@@ -22,7 +22,7 @@ ROUNDING_ACCELERATION = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class OffsetLimits:
     """``offset`` increments, ``rate`` per cycle, ``acceleration`` per cycle^2, ``variation`` total per ``window``.
 
     ``window`` is one second in SYNC cycles: within it the offset may travel ``variation`` increments in all, which
@@ -45,19 +45,20 @@ class Limits:
         """Largest second difference of three frames."""
         return self.acceleration + ROUNDING_ACCELERATION
 
-    def ramp_cycles(self, offset: int) -> int:
-        """Return the bound on the cycles from ``offset`` at any rate to rest at 0: 1 + |o|/S + 3 S/A."""
-        return 1 + -(-abs(offset) // self.rate) + 3 * -(-self.rate // self.acceleration)
+
+def ceiling(increments_per_mm: float) -> int:
+    """Return the largest offset, in increments, that may ever be sent, whatever was read or configured."""
+    return floor(CEILING_OFFSET_UM * 1e-3 * increments_per_mm + 1e-9)
 
 
 def ceilings(
     increments_per_mm: float, sync_period_s: float, max_speed_mm_s: float, max_acceleration_mm_s2: float
-) -> Limits:
+) -> OffsetLimits:
     """Return the most that settings may allow an axis of that speed and acceleration, rounded down; 0: too coarse."""
     speed = min(CEILING_SPEED_MM_S, SPEED_SHARE * max_speed_mm_s)
     acceleration = min(CEILING_ACCELERATION_MM_S2, ACCELERATION_SHARE * max_acceleration_mm_s2)
-    return Limits(
-        offset=floor(CEILING_OFFSET_UM * 1e-3 * increments_per_mm + 1e-9),
+    return OffsetLimits(
+        offset=ceiling(increments_per_mm),
         rate=_whole(speed * increments_per_mm * sync_period_s),
         acceleration=_whole(acceleration * increments_per_mm * sync_period_s**2),
         variation=floor(CEILING_VARIATION_MM * increments_per_mm + 1e-9),
@@ -89,7 +90,7 @@ def clamp(value: int, low: int, high: int) -> int:
     return min(max(value, low), high)
 
 
-def follow(limits: Limits, offset: int, rate: int, wanted: int, wanted_rate: int) -> int:
+def follow(limits: OffsetLimits, offset: int, rate: int, wanted: int, wanted_rate: int) -> int:
     """Return the next offset on the way to a moving goal: ``wanted`` next cycle, moving at ``wanted_rate``.
 
     What is missing is made up without overshoot and inside the acceleration; on the goal the goal is met exactly. A
@@ -104,13 +105,13 @@ def follow(limits: Limits, offset: int, rate: int, wanted: int, wanted_rate: int
     return _inside(limits, offset, rate, speed)
 
 
-def brake(limits: Limits, offset: int, rate: int) -> int:
+def brake(limits: OffsetLimits, offset: int, rate: int) -> int:
     """Return the next offset when it is to come to rest wherever that is."""
     speed = rate - clamp(rate, -limits.acceleration, limits.acceleration)
     return _inside(limits, offset, rate, clamp(speed, -limits.hard_rate, limits.hard_rate))
 
 
-def _inside(limits: Limits, offset: int, rate: int, speed: int) -> int:
+def _inside(limits: OffsetLimits, offset: int, rate: int, speed: int) -> int:
     """Brake an outward speed in time for the largest offset, harder than usual where rounding leaves no other way."""
     outward = 1 if speed > 0 else -1
     room = max(0, limits.offset - outward * offset)
@@ -120,7 +121,7 @@ def _inside(limits: Limits, offset: int, rate: int, speed: int) -> int:
     return offset + speed
 
 
-def violation(limits: Limits, before: int, rate: int, offset: int) -> str | None:
+def violation(limits: OffsetLimits, before: int, rate: int, offset: int) -> str | None:
     """Check one frame against the one before it and that one's rate; return the class of what it breaks, or None.
 
     Braking-aware: an offset moving outward must still be able to stop at the limit.

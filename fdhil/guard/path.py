@@ -1,4 +1,4 @@
-"""The corrected path: rows of demand and offset per axis in drive increments, and where on it the machine is.
+"""Holds the corrected path, rows of demand and offset per axis in drive increments, and finds the machine on it.
 
 A row's demand is what the NC will send as 0x607A, so that the guard finds its place by looking, not by a clock.
 """
@@ -15,10 +15,10 @@ SEARCH = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Path:
+class CorrectedPath:
     """Rows [first, end) of a table; ``final``: no more rows follow. Per axis one sequence of integers.
 
-    A streamed table is a Path that grows at its end and is cut at its begin: rows keep their number.
+    A streamed table is a CorrectedPath that grows at its end and is cut at its begin: rows keep their number.
     """
 
     first: int
@@ -66,7 +66,7 @@ class Place:
     cost: int = 0
 
 
-def around(path: Path, row: int, targets: Sequence[int]) -> tuple[Place, ...]:
+def around(path: CorrectedPath, row: int, targets: Sequence[int]) -> tuple[Place, ...]:
     """Return the rows near ``row`` whose demand is the targets', the nearest first: a place is looked for."""
     places = []
     for candidate in sorted(range(row - SEARCH, row + SEARCH + 1), key=lambda r: (abs(r - row), r)):
@@ -76,7 +76,7 @@ def around(path: Path, row: int, targets: Sequence[int]) -> tuple[Place, ...]:
     return best_first(places)
 
 
-def advance(path: Path, places: Sequence[Place], targets: Sequence[int] | None) -> tuple[Place, ...]:
+def advance(path: CorrectedPath, places: Sequence[Place], targets: Sequence[int] | None) -> tuple[Place, ...]:
     """Move each place one row on and keep those that the targets agree with; without targets time alone moves them."""
     if targets is None:
         return tuple([Place(place.row + 1, place.cost) for place in places])
@@ -93,7 +93,7 @@ def best_first(places: Sequence[Place]) -> tuple[Place, ...]:
     return tuple(sorted(places, key=lambda place: place.cost))
 
 
-def rate_between(path: Path, row: int, last: Sequence[int], targets: Sequence[int]) -> float | None:
+def rate_between(path: CorrectedPath, row: int, last: Sequence[int], targets: Sequence[int]) -> float | None:
     """Return at what share of the planned rate the targets move along the path near ``row``; None: they leave it.
 
     Both targets must lie on the straights between neighbouring rows, which an override or a feed hold leads to.
@@ -102,7 +102,7 @@ def rate_between(path: Path, row: int, last: Sequence[int], targets: Sequence[in
     return None if here is None or there is None else there - here
 
 
-def _fraction(path: Path, row: int, targets: Sequence[int]) -> float | None:
+def _fraction(path: CorrectedPath, row: int, targets: Sequence[int]) -> float | None:
     """Where on the path the targets are, in rows, within ``2 SEARCH`` before and ``SEARCH`` behind ``row``."""
     for k in range(row + SEARCH, row - 2 * SEARCH, -1):
         if not path.has(k) or not path.has(k + 1):

@@ -1,4 +1,4 @@
-"""What one SYNC tells about the axes: what was in force against what the drives showed. Pure, part of the core."""
+"""Compares at each SYNC what was in force with what the drives showed. Pure, part of the core."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ from collections.abc import Sequence
 
 from fdhil.guard.conditions import AGREEING
 from fdhil.guard.feedforward import Pair
+from fdhil.guard.protocol import ON_PATH, SENDING, Mode
 from fdhil.guard.settings import AxisSettings, Settings
-from fdhil.guard.state import NOT_SHOWN, ON_PATH, SENDING, AxisInput, AxisState, Inputs, Mode, Shown, State
+from fdhil.guard.state import NOT_SHOWN, AxisInput, AxisState, Inputs, Shown, State
+from fdhil.guard.transitions import Event
 
 
 def observe(state: State, inputs: Inputs, settings: Settings) -> State:
@@ -124,4 +126,4 @@ def _fed(axis: AxisState, shown: Shown, sent: Sequence[Pair]) -> AxisState:
 
 def behind(state: State) -> State:
     """A frame did not leave in time: the offset is no longer on the table and has to catch up."""
-    return state._replace(mode=Mode.RAMPING) if state.mode is Mode.ACTIVE else state
+    return state.after(Event.LATE) if state.mode is Mode.ACTIVE else state

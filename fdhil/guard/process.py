@@ -1,4 +1,4 @@
-"""The guard's shell: one loop over the bus, the daemon's socket and the signals; all decisions are the core's.
+"""Runs the guard's one loop over the bus, the daemon's socket and the signals; all decisions are the core's.
 
 At a SYNC the offset frames leave in the same turn and before anything else is done. Nothing here waits for a client:
 after each request that was served the clients rest, so that however many they send, every SYNC finds the loop waiting.
@@ -11,23 +11,23 @@ import socket
 import time
 from collections import deque
 from collections.abc import Mapping
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any
 
 from fdhil.cia402 import COB_HEARTBEAT, COB_SYNC, Nmt, pack
 from fdhil.guard import core, status
 from fdhil.guard.can_socket import ERROR, BusDown, CanSocket
 from fdhil.guard.control import Client, Control
-from fdhil.guard.feedforward import FeedMode
 from fdhil.guard.frames import Listener
 from fdhil.guard.intake import Intake
 from fdhil.guard.interlocks import FACTS, WITHDRAWABLE, Alarm
 from fdhil.guard.journal import Journal, Notifier
 from fdhil.guard.landing import land
+from fdhil.guard.protocol import FeedMode, Mode
 from fdhil.guard.requests import Document, parse_request
 from fdhil.guard.settings import Settings
 from fdhil.guard.shadow import Shadow
-from fdhil.guard.state import Inputs, Mode, Output, Request, initial
+from fdhil.guard.state import Inputs, Output, Request, initial
 
 IDLE_S = 0.05
 REST_S = 0.001
@@ -45,7 +45,7 @@ class Guard:
     ) -> None:
         self.settings = settings
         self.state = initial(settings)
-        self.control = Control(FilePath(settings.run_directory), settings.daemon_uid)
+        self.control = Control(Path(settings.run_directory), settings.daemon_uid)
         self.intake = Intake(settings, journal)
         self._can = can
         self._journal = journal
@@ -146,6 +146,7 @@ class Guard:
             frames = self._can.receive()
         except BusDown as error:
             self._bus_down(error)
+            self._in_silence(time.monotonic())
             return
         self._listener.lost_frames += self._can.lost_frames - self._lost_seen
         self._lost_seen = self._can.lost_frames
@@ -162,7 +163,6 @@ class Guard:
     def _bus_down(self, error: BusDown) -> None:
         self._listener.error("down")
         self._journal.write("bus_down", text=str(error))
-        self._in_silence(time.monotonic())
 
     def _sync(self, data: bytes, stamp_s: float, now_s: float, late: bool) -> None:
         self._last_sync_s, self._silent = now_s, False
@@ -241,8 +241,7 @@ class Guard:
             if output.heartbeat:
                 self._can.send(COB_HEARTBEAT + self.settings.node_id, bytes([Nmt.OPERATIONAL]))
         except BusDown as error:
-            self._listener.error("down")
-            self._journal.write("bus_down", text=str(error))
+            self._bus_down(error)
             return False
         return sent
 

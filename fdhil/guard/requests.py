@@ -1,4 +1,4 @@
-"""From the bytes of a request to the record that the core decides on; what is none becomes one that is refused.
+"""Parses the bytes of a request into the record that the core decides on; what is none becomes one that is refused.
 
 Whatever the bytes are, nothing is raised here.
 """
@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fdhil.guard.feedforward import Law
-from fdhil.guard.settings import Settings
+from fdhil.guard.settings import Settings, refuse_constant
 from fdhil.guard.state import Request
 
 Document = dict[str, Any]
@@ -24,7 +24,7 @@ MOST_CHARACTERS = 200
 def parse_line(line: bytes) -> Document | None:
     """Return the JSON object of a line, None when it is none; its ``id`` stays only where it can be given back."""
     try:
-        document = json.loads(line, parse_constant=_refuse)
+        document = json.loads(line, parse_constant=refuse_constant)
     except (ValueError, RecursionError):
         return None
     if not isinstance(document, dict):
@@ -33,10 +33,6 @@ def parse_line(line: bytes) -> Document | None:
     if not (type(mark) is int and abs(mark) < 1 << 53) and not (isinstance(mark, str) and len(mark) <= MOST_CHARACTERS):
         document.pop("id", None)
     return document
-
-
-def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is no JSON")
 
 
 def parse_request(kind: Any, document: Mapping[str, Any], settings: Settings) -> Request:

@@ -1,4 +1,4 @@
-"""What the guard is told at start: a frozen record that goes through one JSON file in the run directory.
+"""Writes, reads and checks the guard's settings: a frozen record in one JSON file of the run directory.
 
 The file is written by ``fdhil-guard`` from the machine's config and profile; the guard reads nothing else.
 """
@@ -15,18 +15,18 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from fdhil.cia402 import PdoEntry, lay_out
+from fdhil.cia402 import Object, PdoEntry, lay_out
 from fdhil.errors import ConfigError, ConfigFault
 from fdhil.guard import feedforward
-from fdhil.guard.limits import Limits, ceilings
+from fdhil.guard.limits import OffsetLimits, ceilings
 
 SCHEMA = "fdhil-guard-settings-2"
 MAX_BYTES = 1 << 20
 MOST_INCREMENTS_PER_MM = 1e6
 Layout = tuple[tuple[int, int, int, bool], ...]
 """Entries (index, sub-index, bits, signed) of a PDO, one behind the other."""
-OFFSET_LAYOUT: Layout = ((0x60B0, 0, 32, True),)
-FEED_LAYOUT: Layout = ((0x60B1, 0, 32, True), (0x60B2, 0, 16, True))
+OFFSET_LAYOUT: Layout = ((Object.POSITION_OFFSET, 0, 32, True),)
+FEED_LAYOUT: Layout = ((Object.VELOCITY_OFFSET, 0, 32, True), (Object.TORQUE_OFFSET, 0, 16, True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class Feedforward:
     """What the on-line feed-forward may send: ``pdo`` maps 0x60B1 and 0x60B2, ``limits`` in the drive's counts."""
 
     pdo: Pdo
-    limits: feedforward.Limits
+    limits: feedforward.FeedforwardLimits
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +74,7 @@ class AxisSettings:
     max_speed_mm_s: float
     max_acceleration_mm_s2: float
     sign: int
-    limits: Limits
+    limits: OffsetLimits
     window: int
     setpoint_delay_cycles: int
     heartbeat_timeout_s: float = 0.0
@@ -88,7 +88,7 @@ class AxisSettings:
     @property
     def read_back_every(self) -> int:
         """With every how many SYNC a TPDO shows the offset in force; 0: none does."""
-        shown = [pdo.every_sync for pdo in self.tpdos if any(entry[:2] == (0x60B0, 0) for entry in pdo.layout)]
+        shown = [pdo.every_sync for pdo in self.tpdos if any(e[:2] == OFFSET_LAYOUT[0][:2] for e in pdo.layout)]
         return max(1, min(shown)) if shown else 0
 
 
@@ -130,7 +130,7 @@ class Settings:
     @property
     def heartbeat_cycles(self) -> int:
         """Our heartbeat comes with every so many SYNC."""
-        return max(1, round(self.heartbeat_s / self.sync_period_s))
+        return self.cycles(self.heartbeat_s)
 
     def cycles(self, seconds: float) -> int:
         """Return a duration in whole SYNC cycles, at least one."""
@@ -159,7 +159,7 @@ def to_json(settings: Settings) -> str:
 def from_json(text: str, source: str = "settings") -> Settings:
     """Read settings back; ConfigError when the text is not what ``to_json`` writes, or asks for more than a ceiling."""
     try:
-        document = json.loads(text, parse_constant=_refuse)
+        document = json.loads(text, parse_constant=refuse_constant)
         if document.pop("schema") != SCHEMA:
             raise ValueError(f"schema is not {SCHEMA}")
         document.pop("digest", None)
@@ -192,7 +192,8 @@ def load(path: Path) -> Settings:
     return settings
 
 
-def _refuse(constant: str) -> None:
+def refuse_constant(constant: str) -> None:
+    """Raise ValueError: NaN and Infinity are no JSON."""
     raise ValueError(f"{constant} is no number")
 
 
@@ -225,14 +226,14 @@ def _pdo(document: Mapping[str, Any]) -> Pdo:
 def _axis(document: dict[str, Any]) -> AxisSettings:
     tpdos = tuple(_pdo(pdo) for pdo in document.pop("tpdos"))
     target, offset = _pdo(document.pop("target")), _pdo(document.pop("offset"))
-    limits, feed = Limits(**document.pop("limits")), document.pop("feedforward")
+    limits, feed = OffsetLimits(**document.pop("limits")), document.pop("feedforward")
     travel = document.pop("travel")
     if travel is not None:
         low, high = (_whole(end, -(2**31), 2**31 - 1, "travel") for end in travel)
         document["travel"] = (low, high)
     if feed is not None:
         most = [_whole(limit, 1, 2**31 - 1, "a limit of the feed-forward") for limit in feed["limits"]]
-        feed = Feedforward(_pdo(feed["pdo"]), feedforward.Limits(*most))
+        feed = Feedforward(_pdo(feed["pdo"]), feedforward.FeedforwardLimits(*most))
     return AxisSettings(target=target, offset=offset, tpdos=tpdos, limits=limits, feedforward=feed, **document)
 
 

@@ -1,12 +1,13 @@
-"""What would be sent: off, but with a table loaded, the guard follows the path all the same and shows its offset.
+"""Follows a loaded table while the guard is off, to show what would be sent.
 
 Nothing here leaves the process: it works on a copy of the core's state and is shown in the status alone.
 """
 
 from __future__ import annotations
 
-from fdhil.guard.path import Path
-from fdhil.guard.state import Mode, State
+from fdhil.guard.path import CorrectedPath
+from fdhil.guard.protocol import Mode
+from fdhil.guard.state import State
 from fdhil.guard.tracking import await_start, track
 
 
@@ -14,12 +15,12 @@ class Shadow:
     """Follows one table as an armed guard would, without an interlock; begins anew where the path is lost or ends."""
 
     def __init__(self) -> None:
-        self._path: Path | None = None
+        self._path: CorrectedPath | None = None
         self._start_row = 0
         self._state: State | None = None
         self._before: State | None = None
 
-    def follow(self, state: State, path: Path | None) -> None:
+    def follow(self, state: State, path: CorrectedPath | None) -> None:
         """Take the SYNC that ``state`` has seen."""
         rested, self._before = self._before or state, state
         if state.mode is not Mode.OFF or path is None:
@@ -30,7 +31,7 @@ class Shadow:
         before = self._state
         if before is None:
             waiting = state._replace(rest=rested.rest, rested_for=rested.rested_for, start_row=self._start_row)
-            started, _ = await_start(waiting._replace(places=()), path)
+            started, _ = await_start(waiting._replace(mode=Mode.ARMED, places=()), path)
             self._state = started if started.places else None
             return
         found, lost = track(before._replace(targets=state.targets), path)

@@ -1,4 +1,4 @@
-"""No signal that can be caught ends the guard: those that ask it to stop have it ramp to zero, others do nothing."""
+"""Catches every signal that can be: those that ask the guard to stop have it ramp to zero, others do nothing."""
 
 from __future__ import annotations
 

@@ -1,41 +1,22 @@
-"""The records that go in and out of the guard's core."""
+"""Records what goes in and out of the guard's core, and what it remembers."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from enum import Enum
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-from fdhil.guard.feedforward import Feed, FeedMode, Law, Pair
+from fdhil.guard.feedforward import Feed, Law, Pair
 from fdhil.guard.interlocks import Alarm
 from fdhil.guard.limits import Travel
-from fdhil.guard.path import Path, Place
+from fdhil.guard.path import CorrectedPath, Place
+from fdhil.guard.protocol import SENDING, FeedMode, Mode
 from fdhil.guard.settings import Settings
+from fdhil.guard.transitions import NEXT, Event
 
-AT_REST = Travel()
 Shown = tuple[int | None, int | None]
 """What a drive shows of its speed and its torque offset; None where no TPDO does."""
 NOT_SHOWN: Shown = (None, None)
-
-
-class Mode(Enum):
-    """The guard's state; see the safety page."""
-
-    OFF = "OFF"
-    ADOPT = "ADOPT"
-    ARMED = "ARMED"
-    RAMPING = "RAMPING"
-    ACTIVE = "ACTIVE"
-    HOLD = "HOLD"
-    RAMP_DOWN = "RAMP_DOWN"
-    FROZEN = "FROZEN"
-
-
-ON_PATH = frozenset({Mode.RAMPING, Mode.ACTIVE, Mode.HOLD})
-IN_CHARGE = ON_PATH | {Mode.ARMED}
-LANDING = frozenset({Mode.ADOPT, Mode.RAMP_DOWN})
-SENDING = IN_CHARGE | LANDING
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +87,7 @@ class Inputs(NamedTuple):
     main_alive: bool = True
     alarms: tuple[Alarm, ...] = ()
     withdrawn: tuple[Alarm, ...] = ()
-    path: Path | None = None
+    path: CorrectedPath | None = None
     request: Request | None = None
 
 
@@ -122,7 +103,7 @@ class AxisState(NamedTuple):
     offset: int = 0
     rate: int = 0
     sent: tuple[int, ...] = (0,) * 4
-    travel: Travel = AT_REST
+    travel: Travel = Travel()
     read_back: int | None = None
     readings: int = 0
     off_demand: float = 0.0
@@ -175,6 +156,10 @@ class State(NamedTuple):
     def sending(self) -> bool:
         """Whether frames of ours leave."""
         return self.mode in SENDING or self.feed.mode is not FeedMode.OFF
+
+    def after(self, event: Event, **changes: Any) -> State:
+        """Return the state that ``event`` leads to, with ``changes``; KeyError where the table has no such way."""
+        return self._replace(mode=NEXT[self.mode, event], **changes)
 
 
 class Output(NamedTuple):

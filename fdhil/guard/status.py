@@ -1,4 +1,4 @@
-"""What the guard says about itself: its status document, and offsets in the units and the direction of the axis."""
+"""Makes the guard's status document, with offsets in the units and the direction of the axis."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fdhil.guard.adoption import may_stand
-from fdhil.guard.feedforward import FeedMode
 from fdhil.guard.interlocks import Alarm
-from fdhil.guard.path import Path
+from fdhil.guard.path import CorrectedPath
+from fdhil.guard.protocol import FEEDFORWARD, FeedMode
 from fdhil.guard.settings import Settings
 from fdhil.guard.state import State
 
@@ -42,11 +42,11 @@ def sentence(standing_um: Mapping[str, float | None]) -> str:
     return f"{' and '.join(left)} may still be applied" if left else ""
 
 
-def document(state: State, settings: Settings, path: Path | None, not_good: Sequence[Alarm]) -> dict[str, Any]:
+def document(state: State, settings: Settings, path: CorrectedPath | None, not_good: Sequence[Alarm]) -> dict[str, Any]:
     """Return what state and table say; the loop adds what it alone knows."""
     cause, feed = state.cause or state.feed.cause, state.feed
     return {
-        "state": state.mode.value if feed.mode is FeedMode.OFF else "FEEDFORWARD",
+        "state": state.mode.value if feed.mode is FeedMode.OFF else FEEDFORWARD,
         "cause": told(cause) if cause else None,
         "feedforward": {
             "state": feed.mode.value,

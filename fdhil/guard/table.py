@@ -1,4 +1,4 @@
-"""A correction table on its way into the guard: handed over as an open descriptor of sealed memory, checked row by row.
+"""Hands a correction table to the guard as an open descriptor of sealed memory, and checks it row by row.
 
 Memory that is sealed cannot change, shrink or block while it is read, whoever still holds it.
 """
@@ -11,13 +11,13 @@ import os
 import struct
 import sys
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
 
 from fdhil.errors import StoreError
-from fdhil.guard.limits import Limits, violation
-from fdhil.guard.path import Path
+from fdhil.guard.limits import OffsetLimits, violation
+from fdhil.guard.path import CorrectedPath
+from fdhil.guard.protocol import TABLE_NAME
 
 MAX_TABLE_BYTES = 16 << 20
 MAX_HEAD_BYTES = 4096
@@ -25,17 +25,8 @@ SEALED = fcntl.F_SEAL_SEAL | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_S
 _LENGTH = struct.Struct("<I")
 
 
-class Array(Protocol):
-    """An integer array of numpy, which this room does not import."""
-
-    def tolist(self) -> Any:
-        """Return the values as a list of int."""
-
-    def __len__(self) -> int:
-        """Number of rows."""
-
-
-Column = Sequence[int] | Array
+Column = Collection[int]
+"""A sequence of int, or an integer array of numpy."""
 Travel = tuple[int, int] | None
 """The software limits of an axis, in increments."""
 
@@ -59,7 +50,7 @@ def encode(
     """Return the body of a table: a JSON header, then demand and offset of each axis as little-endian int32.
 
     ``first`` is the number of the first row; a table that is streamed is sent in pieces with ``final`` False but in
-    the last. Numpy integer arrays are accepted. ValueError when a value is no integer of 32 bits.
+    the last. ValueError when a value is no integer of 32 bits.
     """
     rows = len(demand[axes[0]])
     head = {"axes": list(axes), "first": first, "rows": rows, "final": final, "program": program_digest}
@@ -74,9 +65,8 @@ def encode(
 
 
 def _to_int32(values: Column) -> bytes:
-    whole = values if isinstance(values, Sequence) else values.tolist()
     try:
-        column = array("i", whole)
+        column = array("i", values)
     except (TypeError, OverflowError) as error:
         raise ValueError(f"a table holds integers of 32 bits only: {error}") from None
     if sys.byteorder == "big":
@@ -84,7 +74,7 @@ def _to_int32(values: Column) -> bytes:
     return column.tobytes()
 
 
-def decode(body: bytes, sequence: int = 0) -> tuple[tuple[str, ...], Path]:
+def decode(body: bytes, sequence: int = 0) -> tuple[tuple[str, ...], CorrectedPath]:
     """Return the axes and the rows of a body; TableRefused (``CorruptFile``) when it is not what ``encode`` writes."""
     try:
         (length,) = _LENGTH.unpack_from(body)
@@ -100,7 +90,7 @@ def decode(body: bytes, sequence: int = 0) -> tuple[tuple[str, ...], Path]:
     except (struct.error, ValueError, KeyError, TypeError, RecursionError) as error:
         raise TableRefused("CorruptFile", f"the correction table cannot be read ({error}); plan it again") from None
     demand, offset = columns[: len(axes)], columns[len(axes) :]
-    return tuple(axes), Path(first, demand, offset, head.get("final") is True, program, sequence)
+    return tuple(axes), CorrectedPath(first, demand, offset, head.get("final") is True, program, sequence)
 
 
 def _columns(data: bytes, rows: int, count: int) -> tuple[Sequence[int], ...]:
@@ -121,7 +111,7 @@ def seal(body: bytes) -> int:
     if len(body) > MAX_TABLE_BYTES:
         raise StoreError(f"a correction table of {len(body)} bytes is too long for the guard; stream it in pieces")
     try:
-        descriptor = os.memfd_create("fdhil-table", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        descriptor = os.memfd_create(TABLE_NAME, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         try:
             view = memoryview(body)
             while view:
@@ -156,7 +146,7 @@ def read_sealed(descriptor: int | None, most_bytes: int = MAX_TABLE_BYTES) -> by
     return os.pread(descriptor, size, 0)
 
 
-def check_rows(limits: Limits, offsets: Sequence[int], start: int, stop: int) -> str | None:
+def check_rows(limits: OffsetLimits, offsets: Sequence[int], start: int, stop: int) -> str | None:
     """Check rows [start, stop) of a table's offsets, with what lies before ``start``; return the class or None.
 
     The row before the first is taken to be at rest at the first row's value: the fade-in brings the offset there.
@@ -171,7 +161,7 @@ def check_rows(limits: Limits, offsets: Sequence[int], start: int, stop: int) ->
     return "OffsetEnergy" if not _variation_fits(limits, offsets, start, stop) else None
 
 
-def _variation_fits(limits: Limits, offsets: Sequence[int], start: int, stop: int) -> bool:
+def _variation_fits(limits: OffsetLimits, offsets: Sequence[int], start: int, stop: int) -> bool:
     first = max(1, start - limits.window + 1)
     moves = [abs(offsets[row] - offsets[row - 1]) for row in range(first, stop)]
     travelled = 0
@@ -182,7 +172,7 @@ def _variation_fits(limits: Limits, offsets: Sequence[int], start: int, stop: in
     return True
 
 
-def near_no_end(travel: tuple[int, int], limits: Limits, demand: Sequence[int]) -> bool:
+def near_no_end(travel: tuple[int, int], limits: OffsetLimits, demand: Sequence[int]) -> bool:
     """Whether these rows keep twice the largest offset away from both software limits."""
     low, high = travel
     return not demand or (low + 2 * limits.offset <= min(demand) and max(demand) <= high - 2 * limits.offset)
@@ -195,8 +185,8 @@ class Loading:
     ``joined`` is the path with the new rows behind the old ones; ``done`` once every row has passed.
     """
 
-    joined: Path
-    limits: tuple[Limits, ...]
+    joined: CorrectedPath
+    limits: tuple[OffsetLimits, ...]
     travel: tuple[Travel, ...] = ()
     next_row: int = field(default=0)
 
@@ -227,8 +217,8 @@ def begin(
     body: bytes,
     sequence: int,
     axes: Sequence[str],
-    limits: tuple[Limits, ...],
-    loaded: Path | None,
+    limits: tuple[OffsetLimits, ...],
+    loaded: CorrectedPath | None,
     keep_from: int,
     travel: tuple[Travel, ...] = (),
 ) -> Loading:
@@ -250,7 +240,7 @@ def begin(
         raise TableRefused(
             "TableBusy", "the guard holds as many rows as it can; wait until the machine has passed some"
         )
-    joined = Path(
+    joined = CorrectedPath(
         loaded.first + cut,
         _join(loaded.demand, path.demand, cut),
         _join(loaded.offset, path.offset, cut),
@@ -262,9 +252,4 @@ def begin(
 
 
 def _join(old: Sequence[Sequence[int]], new: Sequence[Sequence[int]], cut: int) -> tuple[Sequence[int], ...]:
-    columns = []
-    for before, after in zip(old, new, strict=True):
-        column = array("i", before[cut:])
-        column.extend(after)
-        columns.append(column)
-    return tuple(columns)
+    return tuple([array("i", before[cut:]) + array("i", after) for before, after in zip(old, new, strict=True)])

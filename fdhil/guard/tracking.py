@@ -1,10 +1,11 @@
-"""Where on the path the machine is, told by the NC's targets alone. Pure, part of the core's step."""
+"""Finds the machine on the path by the NC's targets alone. Pure, part of the core's step."""
 
 from __future__ import annotations
 
 from fdhil.guard.interlocks import Alarm
-from fdhil.guard.path import EPS, Path, Place, advance, around, rate_between
-from fdhil.guard.state import Mode, State
+from fdhil.guard.path import EPS, CorrectedPath, Place, advance, around, rate_between
+from fdhil.guard.state import State
+from fdhil.guard.transitions import Event
 
 STILL_CYCLES = 10
 """How long the targets must stand at the path's begin before a move can be its start."""
@@ -21,7 +22,7 @@ def rest(state: State) -> State:
     return state._replace(rest=now, rested_for=state.rested_for + 1 if now == state.rest else 0)
 
 
-def await_start(state: State, path: Path) -> tuple[State, Alarm | None]:
+def await_start(state: State, path: CorrectedPath) -> tuple[State, Alarm | None]:
     """Armed: once the targets have stood at the path's begin, the first that leaves it says where the path is."""
     now, stood = state.targets[0], state.rest
     if now is None or stood is None or now == stood or state.rested_for < STILL_CYCLES:
@@ -32,10 +33,10 @@ def await_start(state: State, path: Path) -> tuple[State, Alarm | None]:
     places = around(path, state.start_row + 1, now)
     if not places:
         return state, Alarm("Misaligned", detail="the first move leaves the path")
-    return state._replace(mode=Mode.RAMPING, places=places, anchor=places[0].row, cause=None), None
+    return state.after(Event.START, places=places, anchor=places[0].row, cause=None), None
 
 
-def track(state: State, path: Path) -> tuple[State, Alarm | None]:
+def track(state: State, path: CorrectedPath) -> tuple[State, Alarm | None]:
     """Move along the path by what the targets say; an alarm when they say something else."""
     targets = state.targets[0]
     places = advance(path, state.places, targets)
@@ -51,7 +52,7 @@ def track(state: State, path: Path) -> tuple[State, Alarm | None]:
     return state._replace(places=advance(path, state.places, None), resuming=False), _lost(state, path, targets)
 
 
-def _lost(state: State, path: Path, targets: tuple[int, ...]) -> Alarm:
+def _lost(state: State, path: CorrectedPath, targets: tuple[int, ...]) -> Alarm:
     """The targets are at no row: either the path is run at another rate, or it is another path."""
     last = state.targets[1]
     rate = rate_between(path, state.places[0].row, last, targets) if last is not None else None

@@ -25,7 +25,7 @@ from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_re
 from fdhil.commissioning.void import void_record
 from fdhil.config import CanBus, CorrectionLimits
 from fdhil.errors import ConnectError, ProtocolError
-from fdhil.guard.limits import Limits
+from fdhil.guard.limits import OffsetLimits
 from fdhil.guard.settings import from_json, load, to_json
 from tests.guard.machine import DEMAND_AT_REST
 from tests.guard.peer import Peer, write_config
@@ -65,7 +65,7 @@ def test_check_writes_the_settings_and_a_token(
     assert token not in (directory / "guard.json").read_text()
     assert settings.sent_ids == {0x301, 0x302, 0x764}
     assert [axis.name for axis in settings.axes] == ["X", "Y"]
-    assert settings.axes[0].limits == Limits(819, 65, 6, 9830, 1000)
+    assert settings.axes[0].limits == OffsetLimits(819, 65, 6, 9830, 1000)
     assert settings.axes[1].target.cob_id == 0x202
     assert settings.axes[0].window == 32768
 
@@ -73,10 +73,10 @@ def test_check_writes_the_settings_and_a_token(
 def test_limits_are_whole_increments_rounded_down(tmp_path: Path) -> None:
     config = machine_config.load(write_config(tmp_path, 1))
     axis = config.axis["X"].model_copy(update={"correction": CorrectionLimits()})
-    assert limits_of(axis, 0.002) == Limits(163, 13, 3, 9830, 500)
+    assert limits_of(axis, 0.002) == OffsetLimits(163, 13, 3, 9830, 500)
     slow = config.axis["X"].model_copy(update={"rapid_speed_mm_s": 100.0, "max_acceleration_mm_s2": 1000.0})
     # 10 mm/s and 500 mm/s2 are the axis' shares; braked at one increment per SYNC^2, zero is near enough from less
-    assert limits_of(slow, 0.001) == Limits(819, 20, 1, 9830, 1000)
+    assert limits_of(slow, 0.001) == OffsetLimits(819, 20, 1, 9830, 1000)
 
 
 RECORD = CommissioningRecord(

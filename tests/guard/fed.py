@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from fdhil.guard.feedforward import SHIFT, Law, Limits
+from fdhil.guard.feedforward import SHIFT, FeedforwardLimits, Law
 from fdhil.guard.interlocks import FEEDFORWARD_FACTS
 from fdhil.guard.settings import Feedforward, Pdo, Settings
 from fdhil.guard.state import Request
@@ -14,7 +14,7 @@ from tests.guard.machine import Bench
 
 ONE = 1 << SHIFT
 LAW = Law(speed=(-200 * ONE,), torque=(2 * ONE, -ONE), pace=(-2 * ONE,), dry=30)
-LIMITS = Limits(speed=40_000, speed_rate=3_000, torque=900, torque_rate=120)
+LIMITS = FeedforwardLimits(speed=40_000, speed_rate=3_000, torque=900, torque_rate=120)
 FACTS = dict.fromkeys(FEEDFORWARD_FACTS, True)
 
 

@@ -10,20 +10,26 @@ from fdhil.guard import core
 from fdhil.guard.feedforward import Pair
 from fdhil.guard.frames import Listener
 from fdhil.guard.interlocks import FACTS, Alarm
-from fdhil.guard.limits import Limits
-from fdhil.guard.path import Path
+from fdhil.guard.limits import OffsetLimits
+from fdhil.guard.path import CorrectedPath
+from fdhil.guard.protocol import Mode
 from fdhil.guard.settings import AxisSettings, Pdo, Settings
-from fdhil.guard.state import Inputs, Mode, Output, Request, State, initial
+from fdhil.guard.state import Inputs, Output, Request, State, initial
 
 Frame = tuple[int, bytes]
 ENABLED = 0x1237
 FACTS_GIVEN: Mapping[str, bool] = dict.fromkeys(FACTS, True)
 DIGEST = "program-1"
 RECORD = "as commissioned"
-LIMITS = Limits(offset=819, rate=65, acceleration=6, variation=9830, window=1000)
+LIMITS = OffsetLimits(offset=819, rate=65, acceleration=6, variation=9830, window=1000)
 
 
-def axis_settings(name: str, node_id: int, limits: Limits = LIMITS) -> AxisSettings:
+def ramp_cycles(limits: OffsetLimits, offset: int) -> int:
+    """The bound on the cycles from ``offset`` at any rate to rest at 0: 1 + |o|/S + 3 S/A."""
+    return 1 + -(-abs(offset) // limits.rate) + 3 * -(-limits.rate // limits.acceleration)
+
+
+def axis_settings(name: str, node_id: int, limits: OffsetLimits = LIMITS) -> AxisSettings:
     """The default mapping of the simulated drive."""
     return AxisSettings(
         name=name,
@@ -47,7 +53,7 @@ def axis_settings(name: str, node_id: int, limits: Limits = LIMITS) -> AxisSetti
     )
 
 
-def settings(axes: Sequence[str] = ("X", "Y"), limits: Limits = LIMITS, **changes: object) -> Settings:
+def settings(axes: Sequence[str] = ("X", "Y"), limits: OffsetLimits = LIMITS, **changes: object) -> Settings:
     """Settings of the bench in SYNC time."""
     made = Settings(
         bus="can0",
@@ -138,7 +144,7 @@ class Bench:
     """
 
     settings: Settings
-    path: Path | None = None
+    path: CorrectedPath | None = None
     demand: Sequence[Sequence[int]] = ()
     drives: list[Drive] = field(default_factory=list)
     state: State = field(init=False)
@@ -331,7 +337,7 @@ def bench(amplitude: int = 300, **changes: object) -> Bench:
     """A bench with a table loaded, its drives at rest at the begin of the path."""
     made = settings(**changes)  # type: ignore[arg-type] # fields of Settings
     demand, offset = smooth_path(amplitude=amplitude, axes=len(made.axes))
-    path = Path(0, tuple(demand), tuple(offset), True, DIGEST, 1)
+    path = CorrectedPath(0, tuple(demand), tuple(offset), True, DIGEST, 1)
     drives = [Drive(axis.node_id) for axis in made.axes]
     for drive, column in zip(drives, demand, strict=True):
         drive.queue = [(column[0], 0)] * 2

@@ -1,4 +1,4 @@
-"""What the guard takes over from a drive and what it refuses to believe; nothing read may become a step."""
+"""The guard takes over from a drive only what it may believe; nothing read may become a step."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from dataclasses import replace
 import pytest
 
 from fdhil.guard import core
+from fdhil.guard.adoption import may_stand
 from fdhil.guard.interlocks import Alarm
-from fdhil.guard.state import Mode, Request
+from fdhil.guard.protocol import Mode
+from fdhil.guard.state import Request
 from tests.guard.machine import RECORD, Bench, arm_request, bench
 
 ADOPT = Request("adopt", token_valid=True)
@@ -56,11 +58,11 @@ def codes(refused: tuple[Alarm, ...] | None) -> set[str]:
 
 def test_a_believed_offset_is_ramped_from_its_value() -> None:
     machine = holding(-500, 819)
-    assert core.may_stand(machine.state, machine.settings) == (None, None)
+    assert may_stand(machine.state, machine.settings) == (None, None)
     machine.until(Mode.ADOPT)
     assert machine.tick > 20  # three TPDOs, not one
     machine.until(Mode.OFF)
-    assert core.may_stand(machine.state, machine.settings) == (0, 0)
+    assert may_stand(machine.state, machine.settings) == (0, 0)
     assert [drive.offset for drive in machine.drives] == [0, 0]
     assert largest_step(machine, 0) <= machine.settings.axes[0].limits.hard_rate
 
@@ -82,7 +84,7 @@ def test_what_may_not_be_believed_is_frozen_and_told(machine: Bench, told: str) 
     assert machine.state.cause is not None
     assert machine.state.cause.code == "OffsetDoubtful"
     assert told in machine.state.cause.sentence()
-    assert core.may_stand(machine.state, machine.settings) == tuple(drive.offset for drive in machine.drives)
+    assert may_stand(machine.state, machine.settings) == tuple(drive.offset for drive in machine.drives)
     assert codes(machine.sync(ADOPT).refused) & {"OffsetDoubtful", "NotCommissioned", "RecordVoid"}
     assert "NotOff" in codes(machine.sync(arm_request()).refused)
 
@@ -121,7 +123,7 @@ def test_another_node_in_step_with_the_drive_is_not_believed(phase: int) -> None
         if machine.tick % 10 == phase:
             machine.hear(0x381, struct.pack("<ii", 500, 500))
     assert machine.frames == []
-    assert core.may_stand(machine.state, machine.settings)[0] != 500
+    assert may_stand(machine.state, machine.settings)[0] != 500
 
 
 def test_an_offset_that_is_never_shown_alike_is_frozen() -> None:
@@ -139,7 +141,7 @@ def test_nothing_is_armed_while_the_read_back_is_silent() -> None:
     for _ in range(300):
         machine.sync(drop=(0x381,))
     assert machine.mode is Mode.OFF
-    assert core.may_stand(machine.state, machine.settings) == (None, 0)
+    assert may_stand(machine.state, machine.settings) == (None, 0)
     assert "ReadBackStale" in codes(machine.sync(arm_request(), drop=(0x381,)).refused)
     assert "OffsetDoubtful" in codes(machine.sync(ADOPT, drop=(0x381,)).refused)
     assert machine.frames == []
@@ -170,7 +172,7 @@ def test_a_read_back_that_stops_ends_the_correction() -> None:
     assert machine.frames[-1][1] == (0, 0)
     assert len(machine.frames) > frames + 50
     assert largest_step(machine, begin) <= machine.settings.axes[0].limits.hard_rate
-    assert core.may_stand(machine.state, machine.settings) == (None, 0)
+    assert may_stand(machine.state, machine.settings) == (None, 0)
 
 
 def test_one_lost_read_back_is_forgiven() -> None:
@@ -201,7 +203,7 @@ def test_after_a_foreign_offset_the_ramp_starts_from_what_is_measured(
     machine.sync()
     begin = len(machine.held)
     assert machine.mode is Mode.RAMP_DOWN
-    assert core.may_stand(machine.state, machine.settings) == (None, None)
+    assert may_stand(machine.state, machine.settings) == (None, None)
     machine.run(19)
     assert len(machine.frames) == frames  # nothing until it is known
     machine.until(Mode.OFF, 200)
@@ -217,7 +219,7 @@ def test_a_foreign_offset_beyond_the_ceiling_freezes() -> None:
     machine.run(100)
     assert machine.mode is Mode.FROZEN
     assert len(machine.frames) == frames
-    assert core.may_stand(machine.state, machine.settings)[0] == 2000
+    assert may_stand(machine.state, machine.settings)[0] == 2000
     assert machine.state.cause is not None
     assert machine.state.cause.detail.startswith("610.4 um may still be applied")
 
@@ -272,11 +274,11 @@ def test_no_frame_is_beyond_the_compiled_ceiling(monkeypatch: pytest.MonkeyPatch
 
 def test_what_may_stand_while_it_sends_is_what_was_sent_or_shown() -> None:
     machine = active()
-    assert core.may_stand(machine.state, machine.settings) == machine.frames[-1][1]
+    assert may_stand(machine.state, machine.settings) == machine.frames[-1][1]
     machine.drives[0].scale = 0.5
     while not machine.state.axes[0].echo_misses:
         machine.sync()
-    told = core.may_stand(machine.state, machine.settings)
+    told = may_stand(machine.state, machine.settings)
     assert told[0] == machine.state.axes[0].read_back != machine.frames[-1][1][0]
 
 
@@ -288,10 +290,10 @@ def test_a_zero_that_was_shown_at_the_end_stays_known() -> None:
     for drive in machine.drives:
         drive.answers = False
     machine.run(50)
-    assert core.may_stand(machine.state, machine.settings) == (0, 0)
+    assert may_stand(machine.state, machine.settings) == (0, 0)
     machine.inject(0x302, struct.pack("<i", 300))
     machine.sync()
-    assert core.may_stand(machine.state, machine.settings) == (None, None)
+    assert may_stand(machine.state, machine.settings) == (None, None)
 
 
 # --- out of FROZEN ---
@@ -302,14 +304,14 @@ def test_adopt_leads_out_of_frozen_once_the_drives_were_read() -> None:
     machine.listener.error("off")
     machine.sync()
     begin = len(machine.held)
-    assert core.may_stand(machine.state, machine.settings)[0] == machine.frames[-1][1][0]
+    assert may_stand(machine.state, machine.settings)[0] == machine.frames[-1][1][0]
     machine.listener.error("active")
     assert "OffsetDoubtful" in codes(machine.sync(ADOPT).refused)
     machine.run(35)
-    assert core.may_stand(machine.state, machine.settings) == machine.held[-1]
+    assert may_stand(machine.state, machine.settings) == machine.held[-1]
     assert machine.sync(ADOPT).refused == ()
     machine.until(Mode.OFF)
-    assert core.may_stand(machine.state, machine.settings) == (0, 0)
+    assert may_stand(machine.state, machine.settings) == (0, 0)
     assert largest_step(machine, begin) <= machine.settings.axes[0].limits.hard_rate
 
 
@@ -325,7 +327,7 @@ def test_adopt_of_nothing_is_off_without_a_frame() -> None:
     assert machine.sync(ADOPT).refused == ()
     assert machine.state.mode is Mode.OFF
     assert machine.frames == []
-    assert core.may_stand(machine.state, machine.settings) == (0, 0)
+    assert may_stand(machine.state, machine.settings) == (0, 0)
 
 
 # --- what voids a record ---

@@ -13,7 +13,8 @@ from fdhil.arming.guard_client import ANSWER_S
 from fdhil.guard import core
 from fdhil.guard.conditions import View, failing, not_ready
 from fdhil.guard.interlocks import CATALOGUE, FACTS, Alarm, Reaction
-from fdhil.guard.state import AxisInput, AxisState, BusView, Inputs, Mode
+from fdhil.guard.protocol import Mode
+from fdhil.guard.state import AxisInput, AxisState, BusView, Inputs
 from tests.guard.machine import DIGEST, FACTS_GIVEN, Bench, arm_request, axis_settings, bench
 from tests.guard.machine import settings as machine_settings
 

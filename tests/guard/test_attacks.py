@@ -1,4 +1,4 @@
-"""What must not end the guard, nor cost it a SYNC: garbage, floods and signals beside a running correction."""
+"""Garbage, floods and signals beside a running correction neither end the guard nor cost it a SYNC."""
 
 from __future__ import annotations
 

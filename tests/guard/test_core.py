@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from fdhil.guard.state import Mode, Request
-from tests.guard.machine import Bench, bench
+from fdhil.guard.protocol import Mode
+from fdhil.guard.state import Request
+from tests.guard.machine import Bench, bench, ramp_cycles
 
 
 @pytest.fixture
@@ -73,6 +74,6 @@ def test_disarm_in_the_cut_is_a_ramp(armed: Bench) -> None:
     while armed.offsets != (0, 0):
         armed.sync()
         taken += 1
-    assert taken <= armed.settings.axes[0].limits.ramp_cycles(start)
+    assert taken <= ramp_cycles(armed.settings.axes[0].limits, start)
     armed.until(Mode.OFF)
     assert armed.alarms[-1].code == "Disarmed"

@@ -6,9 +6,10 @@ import pytest
 
 from fdhil.guard import core
 from fdhil.guard.interlocks import Alarm
-from fdhil.guard.path import Path, rate_between
+from fdhil.guard.path import CorrectedPath, rate_between
 from fdhil.guard.plausibility import observe
-from fdhil.guard.state import Inputs, Mode, Request
+from fdhil.guard.protocol import Mode
+from fdhil.guard.state import Inputs, Request
 from tests.guard.machine import Bench, bench
 
 
@@ -132,7 +133,7 @@ def test_heartbeat_alone_never_leaves() -> None:
 
 
 def test_rows_outside_the_table() -> None:
-    path = Path(5, ([0, 10, 20],), ([1, 2, 3],), True, "p")
+    path = CorrectedPath(5, ([0, 10, 20],), ([1, 2, 3],), True, "p")
     assert path.mismatch(4, (0,)) is None
     assert path.mismatch(8, (0,)) is None
     assert path.offsets_at(0) == (1,)
@@ -141,7 +142,7 @@ def test_rows_outside_the_table() -> None:
     assert rate_between(path, 6, (0,), (5,)) == 0.5
     assert rate_between(path, 6, (0,), (500,)) is None
     assert rate_between(path, 6, (-9,), (5,)) is None
-    resting = Path(0, ([7, 7, 7],), ([0, 0, 0],), True, "p")
+    resting = CorrectedPath(0, ([7, 7, 7],), ([0, 0, 0],), True, "p")
     assert resting.standing_rows() == 2
     assert rate_between(resting, 1, (7,), (7,)) is None
 
@@ -214,6 +215,24 @@ def test_a_hold_lasts_ten_cycles_each_time_anew() -> None:
     assert machine.state.mode is Mode.HOLD
     assert machine.until(Mode.RAMP_DOWN) == 1
     assert machine.alarms[-1].code == "TargetLost"
+
+
+def test_a_gap_before_the_start_holds_nothing_and_ends_after_ten_cycles() -> None:
+    machine = bench()
+    machine.settle()
+    assert machine.arm() == ()
+    for _ in range(2):
+        for _ in range(10):  # the first of them still latches what was streamed before
+            machine.sync(nc=False)
+        machine.sync()
+        machine.run(2)
+        assert machine.mode is Mode.ARMED
+    for _ in range(11):
+        machine.sync(nc=False)
+    assert machine.mode is Mode.ARMED
+    assert machine.until(Mode.RAMP_DOWN) == 1
+    assert machine.alarms[-1].code == "TargetLost"
+    assert {offsets for _, offsets in machine.frames} == {(0, 0)}
 
 
 def test_time_goes_on_without_sync_only_where_it_can_be_ramped() -> None:

@@ -10,10 +10,11 @@ from dataclasses import replace
 import pytest
 
 from fdhil.guard.interlocks import Alarm
-from fdhil.guard.limits import Limits
-from fdhil.guard.path import Path
-from fdhil.guard.state import ON_PATH, Mode, Request
-from tests.guard.machine import DIGEST, RECORD, Bench, Drive, bench
+from fdhil.guard.limits import OffsetLimits
+from fdhil.guard.path import CorrectedPath
+from fdhil.guard.protocol import ON_PATH, Mode
+from fdhil.guard.state import Request
+from tests.guard.machine import DIGEST, RECORD, Bench, Drive, bench, ramp_cycles
 
 Fault = Callable[[Bench], None]
 
@@ -135,7 +136,7 @@ def test_fault_ramps_down_in_time(cutting: Bench, row: str) -> None:
         cutting.sync()
         taken += 1
         assert taken <= rising or max(map(abs, cutting.offsets)) <= before
-    assert taken <= limits.ramp_cycles(peak)
+    assert taken <= ramp_cycles(limits, peak)
     cutting.drives = [Drive(d.node_id, queue=d.queue, offset=d.offset) for d in cutting.drives]
     cutting.until(Mode.OFF)
     assert cutting.state.cause is not None
@@ -359,7 +360,7 @@ def test_table_that_breaks_a_limit_at_run_time_is_left(row: int, value: int, cod
     assert machine.path is not None
     columns = [list(column) for column in machine.path.offset]
     columns[0][row] = value
-    machine.path = Path(0, machine.path.demand, tuple(columns), True, DIGEST, 1)
+    machine.path = CorrectedPath(0, machine.path.demand, tuple(columns), True, DIGEST, 1)
     machine.settle()
     machine.arm()
     machine.run(30)
@@ -374,7 +375,7 @@ def test_table_that_breaks_a_limit_at_run_time_is_left(row: int, value: int, cod
 
 def test_table_that_is_swapped_for_another_program_is_left(cutting: Bench) -> None:
     assert cutting.path is not None
-    cutting.path = Path(0, cutting.path.demand, cutting.path.offset, True, "other", 2)
+    cutting.path = CorrectedPath(0, cutting.path.demand, cutting.path.offset, True, "other", 2)
     cutting.sync()
     assert cutting.mode is Mode.RAMP_DOWN
     assert cutting.alarms[-1].code == "ProgramMismatch"
@@ -383,7 +384,7 @@ def test_table_that_is_swapped_for_another_program_is_left(cutting: Bench) -> No
 def test_streamed_table_that_runs_dry_is_left_in_time(cutting: Bench) -> None:
     assert cutting.path is not None
     path = cutting.path
-    cutting.path = Path(0, path.demand, path.offset, False, DIGEST, 2)
+    cutting.path = CorrectedPath(0, path.demand, path.offset, False, DIGEST, 2)
     cutting.sync()
     assert cutting.alarms[-1].code == "TableStarved"
 
@@ -392,8 +393,8 @@ def test_vibrating_table_is_left_by_its_total_variation() -> None:
     machine = bench()
     assert machine.path is not None
     wave = [(k // 8 % 2 * 2 - 1) * (k % 8 if k % 8 < 4 else 8 - k % 8) * 6 for k in range(600)]
-    machine.path = Path(0, machine.path.demand, (wave, machine.path.offset[1]), True, DIGEST, 1)
-    tight = Limits(819, 65, 12, 500, 1000)
+    machine.path = CorrectedPath(0, machine.path.demand, (wave, machine.path.offset[1]), True, DIGEST, 1)
+    tight = OffsetLimits(819, 65, 12, 500, 1000)
     machine.settings = replace(machine.settings, axes=tuple(replace(a, limits=tight) for a in machine.settings.axes))
     machine.settle()
     machine.arm()

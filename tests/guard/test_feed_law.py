@@ -8,22 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.guard.feedforward import (
-    HOLD_CYCLES,
-    ZEROS,
-    Feed,
-    FeedMode,
-    Law,
-    Limits,
-    armed,
-    end,
-    hear,
-    move,
-    react,
-    violates,
-)
+from fdhil.guard.feedforward import Feed, FeedforwardLimits, Law, armed, end, hear, move, react, violates
 from fdhil.guard.interlocks import Alarm
+from fdhil.guard.protocol import HOLD_CYCLES, FeedMode
 from fdhil.guard.requests import parse_law
+from fdhil.guard.transitions import ZEROS
 from tests.guard.fed import LAW, LIMITS, ONE
 
 
@@ -82,7 +71,7 @@ def fed(**changes: Any) -> Feed:
 
 def test_it_fades_in_cycle_by_cycle_and_out_the_same_way() -> None:
     """Of 10 cycles each adds a tenth of what the law says, rounded down; ending takes it back."""
-    wide, feed = Limits(10**6, 10**6, 10**4, 10**4), fed()
+    wide, feed = FeedforwardLimits(10**6, 10**6, 10**4, 10**4), fed()
     assert LAW.offsets((30, 20, 10)) == (2000, 30)
     seen = []
     for _ in range(12):

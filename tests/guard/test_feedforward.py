@@ -14,12 +14,13 @@ import pytest
 
 from fdhil.guard import table
 from fdhil.guard.control import Client, Closer
-from fdhil.guard.feedforward import FeedMode, Pair, armed, violates
+from fdhil.guard.feedforward import Pair, armed, violates
 from fdhil.guard.intake import Intake
 from fdhil.guard.interlocks import FEEDFORWARD_FACTS, Alarm
 from fdhil.guard.journal import Journal
+from fdhil.guard.protocol import FeedMode, Mode
 from fdhil.guard.settings import Pdo, from_json, to_json
-from fdhil.guard.state import Mode, Request, initial
+from fdhil.guard.state import Request, initial
 from tests.guard import machine
 from tests.guard.fed import FACTS, LAW, LIMITS, fed_bench, fed_settings, request, switched_on
 from tests.guard.machine import Bench, arm_request

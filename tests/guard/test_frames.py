@@ -1,4 +1,4 @@
-"""What the guard hears: order, age, length and origin of frames, and the regularity of SYNC."""
+"""The guard hears order, age, length and origin of frames, and the regularity of SYNC."""
 
 from __future__ import annotations
 

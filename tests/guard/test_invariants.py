@@ -8,7 +8,8 @@ import hypothesis.strategies as st
 from hypothesis import settings as hypothesis_settings
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 
-from fdhil.guard.state import IN_CHARGE, ON_PATH, SENDING, Mode, Request
+from fdhil.guard.protocol import IN_CHARGE, ON_PATH, SENDING, Mode
+from fdhil.guard.state import Request
 from studies.guard_invariants import episode
 from tests.guard.machine import ENABLED, RECORD, Bench, arm_request, bench
 from tests.guard.wire import CEILING, Wire

@@ -6,10 +6,11 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from fdhil.guard.limits import Limits, Travel, approach, brake, follow, stopping, violation
+from fdhil.guard.limits import OffsetLimits, Travel, approach, brake, follow, stopping, violation
 from fdhil.guard.table import check_rows
+from tests.guard.machine import ramp_cycles
 
-SMALL = Limits(offset=40, rate=9, acceleration=2, variation=400, window=100)
+SMALL = OffsetLimits(offset=40, rate=9, acceleration=2, variation=400, window=100)
 
 
 def braking_way(rate: int, acceleration: int) -> int:
@@ -32,7 +33,7 @@ def test_approach_is_the_fastest_rate_that_still_stops(distance: int, accelerati
     assert rate + 1 + stopping(rate + 1, acceleration) > distance
 
 
-def starts(limits: Limits) -> list[tuple[int, int]]:
+def starts(limits: OffsetLimits) -> list[tuple[int, int]]:
     """All (offset, rate) that a frame within the limits may leave behind."""
     return [
         (offset, rate)
@@ -46,28 +47,28 @@ def starts(limits: Limits) -> list[tuple[int, int]]:
     "limits",
     [
         SMALL,
-        Limits(30, 1, 1, 400, 100),
-        Limits(25, 7, 1, 400, 100),
-        Limits(60, 20, 20, 400, 100),
-        Limits(164, 6, 1, 9830, 1000),
+        OffsetLimits(30, 1, 1, 400, 100),
+        OffsetLimits(25, 7, 1, 400, 100),
+        OffsetLimits(60, 20, 20, 400, 100),
+        OffsetLimits(164, 6, 1, 9830, 1000),
     ],
 )
-def test_ramp_to_zero_from_every_start_keeps_every_limit_and_its_time(limits: Limits) -> None:
+def test_ramp_to_zero_from_every_start_keeps_every_limit_and_its_time(limits: OffsetLimits) -> None:
     for start in starts(limits):
         offset, rate = start
-        for _ in range(limits.ramp_cycles(offset)):
+        for _ in range(ramp_cycles(limits, offset)):
             after = follow(limits, offset, rate, 0, 0)
             assert violation(limits, offset, rate, after) is None, (start, offset, rate, after)
             offset, rate = after, after - offset
         assert (offset, rate) == (0, 0), start
 
 
-@pytest.mark.parametrize("limits", [SMALL, Limits(25, 7, 1, 400, 100)])
-def test_outward_ends_within_the_braking_time(limits: Limits) -> None:
+@pytest.mark.parametrize("limits", [SMALL, OffsetLimits(25, 7, 1, 400, 100)])
+def test_outward_ends_within_the_braking_time(limits: OffsetLimits) -> None:
     rising = -(-limits.hard_rate // limits.acceleration)
     for start in starts(limits):
         offset, rate = start
-        for cycle in range(limits.ramp_cycles(offset)):
+        for cycle in range(ramp_cycles(limits, offset)):
             after = follow(limits, offset, rate, 0, 0)
             crossed = start[0] * start[1] < 0  # one that runs through zero turns once behind it
             assert crossed or cycle < rising or abs(after) <= abs(offset), (start, cycle)
@@ -147,10 +148,10 @@ def test_rows_are_checked_at_every_place() -> None:
 
 def test_total_variation_is_that_of_any_second() -> None:
     swing = [(k % 4 > 1) * 2 for k in range(400)]  # 1 increment per cycle on average
-    quiet = Limits(40, 9, 2, 100, 100)
+    quiet = OffsetLimits(40, 9, 2, 100, 100)
     assert check_rows(quiet, swing, 0, 400) is None
-    assert check_rows(Limits(40, 9, 2, 97, 100), swing, 0, 400) == "OffsetEnergy"
-    pieces = [check_rows(Limits(40, 9, 2, 97, 100), swing, k, k + 10) for k in range(0, 400, 10)]
+    assert check_rows(OffsetLimits(40, 9, 2, 97, 100), swing, 0, 400) == "OffsetEnergy"
+    pieces = [check_rows(OffsetLimits(40, 9, 2, 97, 100), swing, k, k + 10) for k in range(0, 400, 10)]
     assert pieces[5] is None
     assert set(pieces[11:]) == {"OffsetEnergy"}
 

@@ -1,18 +1,19 @@
-"""Where on the path: the exact bounds of what is still this row, this place, this rate."""
+"""The place on the path has exact bounds: what is still this row, this place, this rate."""
 
 from __future__ import annotations
 
 import pytest
 
-from fdhil.guard.path import EPS, SEARCH, Path, Place, advance, around, rate_between
-from fdhil.guard.state import Mode, State, initial
+from fdhil.guard.path import EPS, SEARCH, CorrectedPath, Place, advance, around, rate_between
+from fdhil.guard.protocol import Mode
+from fdhil.guard.state import State, initial
 from fdhil.guard.tracking import STILL_CYCLES, await_start, rest, track
 from tests.guard import machine
 
 FIRST = 100
 X = [0, 0, 0, *range(50, 50 * 61, 50)]
 Y = [0, 0, 0, *range(-30, -30 * 61, -30)]
-PATH = Path(FIRST, (X, Y), ([0] * len(X), [0] * len(X)), True, "p")
+PATH = CorrectedPath(FIRST, (X, Y), ([0] * len(X), [0] * len(X)), True, "p")
 END = FIRST + len(X)
 
 
@@ -49,7 +50,7 @@ def test_a_place_is_looked_for_eight_rows_to_either_side() -> None:
 
 
 def test_costs_add_up_and_the_cheapest_is_first() -> None:
-    flat = Path(0, ([0, 1, 2, 3, 4, 5, 6],), ([0] * 7,), True, "p")
+    flat = CorrectedPath(0, ([0, 1, 2, 3, 4, 5, 6],), ([0] * 7,), True, "p")
     places = around(flat, 3, (3,))
     assert [(place.row, place.cost) for place in places] == [(3, 0), (2, 1), (4, 1), (1, 2), (5, 2)]
     assert [(place.row, place.cost) for place in advance(flat, places, (4,))] == [

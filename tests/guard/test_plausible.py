@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from fdhil.cli.guard import settings_of
 from fdhil.guard.plausibility import observe
+from fdhil.guard.protocol import Mode
 from fdhil.guard.settings import Settings, from_json, to_json
-from fdhil.guard.state import AxisInput, BusView, Inputs, Mode, State, initial
+from fdhil.guard.state import AxisInput, BusView, Inputs, State, initial
 from tests.bench import bench_config
 from tests.guard import machine
 from tests.guard.machine import Bench

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from fdhil.guard.path import Path
+from fdhil.guard.path import CorrectedPath
+from fdhil.guard.protocol import Mode
 from fdhil.guard.shadow import Shadow
-from fdhil.guard.state import Mode
 from tests.guard import machine
 from tests.guard.machine import DIGEST
 
@@ -77,5 +77,5 @@ def test_armed_or_without_a_table_there_is_no_shadow() -> None:
     assert shadow.offsets() is None
     made.path = None
     assert followed(made, shadow, 3) == [None] * 3
-    shadow.follow(made.state, Path(0, ([0], [0]), ([0], [0]), True, DIGEST))
+    shadow.follow(made.state, CorrectedPath(0, ([0], [0]), ([0], [0]), True, DIGEST))
     assert shadow.offsets() is None

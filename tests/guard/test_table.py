@@ -7,7 +7,7 @@ import json
 import os
 import socket
 import struct
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from fdhil.errors import StoreError
 from fdhil.guard import table
-from fdhil.guard.limits import Limits
-from fdhil.guard.path import Path
+from fdhil.guard.limits import OffsetLimits
+from fdhil.guard.path import CorrectedPath
 from fdhil.guard.table import TableRefused
 from tests.guard.machine import LIMITS
 
@@ -73,7 +73,7 @@ def test_a_table_is_handed_over_in_sealed_memory() -> None:
         os.close(descriptor)
 
 
-def test_what_is_no_sealed_memory_is_not_read(tmp_path: FilePath) -> None:
+def test_what_is_no_sealed_memory_is_not_read(tmp_path: Path) -> None:
     """Neither opened, nor waited for, nor read: a FIFO, a socket, a file, memory that can still change, nothing."""
     os.mkfifo(tmp_path / "fifo")
     (tmp_path / "file").write_bytes(body())
@@ -104,7 +104,7 @@ def test_what_is_too_long_or_finds_no_memory_is_an_error(monkeypatch: pytest.Mon
 
 
 def open_descriptors() -> int:
-    return len(list(FilePath("/proc/self/fd").iterdir()))
+    return len(list(Path("/proc/self/fd").iterdir()))
 
 
 def refuse(*_: object) -> int:
@@ -172,7 +172,7 @@ def load(loading: table.Loading, rows: int) -> table.Loading:
 
 
 def test_pieces_join_and_old_rows_are_let_go() -> None:
-    limits = (Limits(819, 65, 6, 9830, 10),) * 2
+    limits = (OffsetLimits(819, 65, 6, 9830, 10),) * 2
     path = load(table.begin(body(final=False), 1, "XY", limits, None, 0), 1).joined
     for sequence in range(2, 20):
         path = load(
@@ -216,10 +216,10 @@ def test_rows_beyond_a_limit_are_refused_wherever_they_are(row: int, value: int,
     assert f"rows {row // 7 * 7} to" in str(refusal.value)
 
 
-TINY = Limits(offset=10, rate=5, acceleration=2, variation=1000, window=100)
+TINY = OffsetLimits(offset=10, rate=5, acceleration=2, variation=1000, window=100)
 
 
-def loaded_within(travel: tuple[int, int] | None, demand: list[int]) -> Path:
+def loaded_within(travel: tuple[int, int] | None, demand: list[int]) -> CorrectedPath:
     """Load a resting table of one axis with these software limits."""
     body = table.encode("X", {"X": demand}, {"X": [0] * len(demand)}, "p")
     loading = table.begin(body, 1, ["X"], (TINY,), None, 0, (travel,))

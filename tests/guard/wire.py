@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from fdhil.guard.limits import Limits
+from fdhil.guard.limits import OffsetLimits
 
 CEILING = 819
 """250 um of the bench's axis in increments."""
@@ -17,7 +17,7 @@ class Wire:
     step. A cycle without a frame of ours brings the offset to rest.
     """
 
-    def __init__(self, limits: Limits, held: int) -> None:
+    def __init__(self, limits: OffsetLimits, held: int) -> None:
         self._limits = limits
         self._last = self._before = held
         self._rate = 0

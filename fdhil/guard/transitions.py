@@ -1,0 +1,84 @@
+"""Tables the guard's states: what is sent in each, and which event leads from one to which. The core has no other way.
+
+``docs/reference/guard.md`` is generated from here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from enum import Enum
+
+from fdhil.guard.protocol import AT_REST, IN_CHARGE, LANDING, ON_PATH, SENDING, FeedMode, Mode
+
+ZEROS = 3
+ZEROS_UNCONFIRMED = 50
+"""Cycles of zeros before the end, where the drives show them and where one does not."""
+
+
+class Event(Enum):
+    """What leads to another state; the value says it."""
+
+    ARM = "the operator arms, and nothing forbids it"
+    ADOPT = "a drive holds what may be believed, at the start or when the operator adopts"
+    NOTHING_HELD = "the operator adopts, and all drives are known to hold 0"
+    DOUBTFUL = "at the start a drive holds an offset that may not be believed"
+    START = "the targets leave the path's begin"
+    ON_TABLE = "the offset is the table's"
+    LATE = "a frame did not leave in time"
+    GAP = "an interlock that holds fails"
+    FOUND = "the interlock is good again, and the place on the path is known"
+    END = (
+        "disarmed, told to stop, the path's end, a lost daemon, a hold that was too long, an interlock that ramps down"
+    )
+    HIJACK = "another node changed the offset"
+    BLOCKED = "an interlock that freezes fails, or frames do not leave, or what the drives hold may not be believed"
+    BLOCKED_AT_ZERO = "the same where nothing but zeros was sent, and they were shown"
+    ZERO_SHOWN = f"more than {ZEROS} cycles of zeros were sent, and the drives show them"
+    ZERO_NOT_SHOWN = f"more than {ZEROS_UNCONFIRMED} cycles of zeros were sent, and a drive does not show them"
+
+
+SENT: Mapping[Mode, str] = {
+    Mode.OFF: "nothing",
+    Mode.ADOPT: "the value that the drive holds, then toward 0",
+    Mode.ARMED: "0, and the heartbeat",
+    Mode.RAMPING: "toward the table's value, within the limits",
+    Mode.ACTIVE: "the table's value",
+    Mode.HOLD: "the last value, braked to rest",
+    Mode.RAMP_DOWN: "toward 0",
+    Mode.FROZEN: "nothing: the drive may still hold an offset",
+}
+FEED_SENT: Mapping[FeedMode, str] = {
+    FeedMode.OFF: "nothing",
+    FeedMode.ON: "what the law makes of the targets, faded in, within the limits",
+    FeedMode.ENDING: "the same, faded out",
+    FeedMode.ZEROING: "0 at once",
+}
+# (what happens, in which states, the next state)
+TRANSITIONS: tuple[tuple[Event, Collection[Mode], Mode], ...] = (
+    (Event.ARM, {Mode.OFF}, Mode.ARMED),
+    (Event.ADOPT, AT_REST, Mode.ADOPT),
+    (Event.NOTHING_HELD, AT_REST, Mode.OFF),
+    (Event.DOUBTFUL, {Mode.OFF}, Mode.FROZEN),
+    (Event.START, {Mode.ARMED}, Mode.RAMPING),
+    (Event.ON_TABLE, {Mode.RAMPING}, Mode.ACTIVE),
+    (Event.LATE, {Mode.ACTIVE}, Mode.RAMPING),
+    (Event.GAP, {Mode.ARMED}, Mode.ARMED),
+    (Event.GAP, ON_PATH, Mode.HOLD),
+    (Event.FOUND, {Mode.HOLD}, Mode.RAMPING),
+    (Event.END, IN_CHARGE, Mode.RAMP_DOWN),
+    (Event.HIJACK, SENDING, Mode.RAMP_DOWN),
+    (Event.BLOCKED, SENDING, Mode.FROZEN),
+    (Event.BLOCKED_AT_ZERO, SENDING, Mode.OFF),
+    (Event.ZERO_SHOWN, LANDING, Mode.OFF),
+    (Event.ZERO_NOT_SHOWN, LANDING, Mode.FROZEN),
+)
+FEED_TRANSITIONS: tuple[tuple[Event, Collection[FeedMode], FeedMode], ...] = (
+    (Event.ARM, {FeedMode.OFF}, FeedMode.ON),
+    (Event.ADOPT, {FeedMode.OFF}, FeedMode.ZEROING),
+    (Event.END, {FeedMode.ON}, FeedMode.ENDING),
+    (Event.BLOCKED, {FeedMode.ON, FeedMode.ENDING}, FeedMode.ZEROING),
+    (Event.ZERO_SHOWN, {FeedMode.ENDING, FeedMode.ZEROING}, FeedMode.OFF),
+    (Event.ZERO_NOT_SHOWN, {FeedMode.ENDING, FeedMode.ZEROING}, FeedMode.OFF),
+)
+NEXT = {(mode, event): after for event, modes, after in TRANSITIONS for mode in modes}
+NEXT_FEED = {(mode, event): after for event, modes, after in FEED_TRANSITIONS for mode in modes}
