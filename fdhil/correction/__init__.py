@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fdhil.correction.limits import Limits, check
+from fdhil.correction.limits import PlanLimits, check
 from fdhil.correction.planning import default_method, plan, table
 
-__all__ = ["Limits", "check", "default_method", "plan", "table"]
+__all__ = ["PlanLimits", "check", "default_method", "plan", "table"]

@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from fdhil.config import Axis
-from fdhil.correction.limits import Limits, check, fit
+from fdhil.correction.limits import PlanLimits, check, fit
 from fdhil.correction.linear import Inverse
 from fdhil.correction.resting import Resting
 from fdhil.model.closed_loop import Commands, Ready, Response, State
@@ -41,7 +41,7 @@ class AxisLoop:
     parameters: Parameters
     axis: Axis
     sync_period_s: float
-    limits: Limits
+    limits: PlanLimits
     drive: Ready
     inverse: Inverse
     resting: Resting

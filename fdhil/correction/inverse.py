@@ -16,7 +16,7 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.correction import linear
 from fdhil.correction.block import AxisLoop, Carry, Solution, solve
-from fdhil.correction.limits import Limits
+from fdhil.correction.limits import PlanLimits
 from fdhil.correction.method import Plan
 from fdhil.correction.mirror import lag_reason
 from fdhil.correction.resting import Resting
@@ -100,7 +100,7 @@ def axis_loop(parameters: Parameters, config: MachineConfig, axis: str) -> AxisL
     """Return what the blocks of one axis share; ValueError when writing is off for it."""
     period = config.machine.sync_period_s
     rows = round((BLOCK_S + LOOK_AHEAD_S) / period)
-    limits, drive = Limits.of(config.axis[axis], period), config.axis[axis]
+    limits, drive = PlanLimits.of(config.axis[axis], period), config.axis[axis]
     return AxisLoop(
         parameters,
         drive,

@@ -23,7 +23,7 @@ _SLACK = 0.05  # increments by which a seam may miss, far below the rounding
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class PlanLimits:
     """``offset`` increments, ``rate`` per cycle, ``acceleration`` per cycle^2, ``variation`` per ``window`` cycles."""
 
     offset: float
@@ -34,16 +34,16 @@ class Limits:
     um_per_increment: float
 
     @staticmethod
-    def of(axis: Axis, sync_period_s: float) -> Limits:
+    def of(axis: Axis, sync_period_s: float) -> PlanLimits:
         """Return the limits of an axis; ValueError when writing is off (no ``[axis.X.correction]``)."""
         derived = OffsetLimits.of(axis, sync_period_s)
         um_per_increment = 1e3 / axis.scaling.increments_per_mm
-        return Limits(
+        return PlanLimits(
             derived.offset, derived.rate, derived.acceleration, derived.variation, derived.window, um_per_increment
         )
 
     @property
-    def curve(self) -> Limits:
+    def curve(self) -> PlanLimits:
         """The limits of a curve that is rounded afterwards: less by the rounding, where that leaves enough."""
         return replace(
             self,
@@ -55,7 +55,7 @@ class Limits:
         )
 
 
-def check(offset_increments: Int, limits: Limits, before: tuple[float, float] = (0.0, 0.0)) -> list[Reason]:
+def check(offset_increments: Int, limits: PlanLimits, before: tuple[float, float] = (0.0, 0.0)) -> list[Reason]:
     """Return what a table (n,) breaks: empty, or ``OffsetLimit``, ``OffsetRate``, ``OffsetEnergy`` with its figure.
 
     ``before``: the two offsets ahead of the first row, the nearer one first. Rounding to increments is allowed for.
@@ -93,7 +93,7 @@ def variation(rate: Float, window: int) -> Float:
     return np.asarray(total[rows] - total[np.maximum(rows - window, 0)])
 
 
-def fit(wanted: Float, limits: Limits, before: tuple[float, float] = (0.0, 0.0)) -> Float:
+def fit(wanted: Float, limits: PlanLimits, before: tuple[float, float] = (0.0, 0.0)) -> Float:
     """Return the curve (n,) nearest to ``wanted`` (increments, n) that keeps the limits, ready to be rounded."""
     curve = limits.curve
     goal = np.ascontiguousarray(np.clip(wanted, -4 * curve.offset, 4 * curve.offset))
@@ -118,7 +118,7 @@ def fit(wanted: Float, limits: Limits, before: tuple[float, float] = (0.0, 0.0))
     return np.asarray(planned / max(too_far, too_high, 1.0))
 
 
-def _projected(goal: Float, limits: Limits, before: tuple[float, float]) -> Float:
+def _projected(goal: Float, limits: PlanLimits, before: tuple[float, float]) -> Float:
     """Project onto rate, acceleration and amplitude; far from what breaks them the goal stays as it is."""
     high, fast, hard, _, _ = kernels.extent(goal, np.array(before), limits.acceleration, limits.window)
     if high <= limits.offset and fast <= limits.rate and hard <= limits.acceleration:
@@ -138,7 +138,7 @@ def _projected(goal: Float, limits: Limits, before: tuple[float, float]) -> Floa
     return result
 
 
-def _breaks(offset: Float, limits: Limits, before: tuple[float, float], slack: float = 0.0) -> Bool:
+def _breaks(offset: Float, limits: PlanLimits, before: tuple[float, float], slack: float = 0.0) -> Bool:
     """Return (n,) the rows at which a limit is broken by more than ``slack`` increments."""
     rate = np.diff(offset, prepend=before[0])
     acceleration = np.diff(rate, prepend=before[0] - before[1])
@@ -177,7 +177,7 @@ def fit_all(wanted_um: Mapping[str, Float], axes: Mapping[str, Axis], sync_perio
     """Plan the wanted offsets of all axes inside their limits; return them in um, in whole increments."""
     planned: dict[str, Float] = {}
     for name, wanted in wanted_um.items():
-        limits = Limits.of(axes[name], sync_period_s)
+        limits = PlanLimits.of(axes[name], sync_period_s)
         whole = to_increments(fit(wanted / limits.um_per_increment, limits))
         planned[name] = whole.astype(np.float64) * limits.um_per_increment
     return planned
