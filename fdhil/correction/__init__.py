@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from fdhil.correction.limits import PlanLimits, check
-from fdhil.correction.planning import default_method, plan, table
+from fdhil.correction.planning import plan, table
 
-__all__ = ["PlanLimits", "check", "default_method", "plan", "table"]
+__all__ = ["PlanLimits", "check", "plan", "table"]

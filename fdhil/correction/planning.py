@@ -30,11 +30,6 @@ from fdhil.records import (
 MASK_PASSES = 3
 
 
-def default_method() -> str:
-    """The best method there is: the last of the table."""
-    return list(tables.CORRECTIONS)[-1]
-
-
 def plan(
     reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, method: str | None = None
 ) -> Correction:
@@ -42,7 +37,7 @@ def plan(
 
     ConfigError when an axis has no model; KeyError for an unknown method.
     """
-    name = method or default_method()
+    name = method or tables.DEFAULT_CORRECTION
     factory = tables.load(tables.CORRECTIONS, name)
     before = predict(reference, models, config)
     refused = gate.writing_off(reference.axes, config)
