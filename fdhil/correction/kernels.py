@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from numba import njit
 
+from fdhil.model.compiled import compiled
 from fdhil.records import Float
 
 ITERATIONS = 60
 
 
-def _differences_plain(o: Float, start: Float, which: int) -> Float:
+@compiled
+def _differences(o: Float, start: Float, which: int) -> Float:
     """Return o (0), its first (1) or its second (2) difference, each (n,); ``start`` = [o before, o before that]."""
     n = o.size
     out = np.empty(n)
@@ -28,10 +27,8 @@ def _differences_plain(o: Float, start: Float, which: int) -> Float:
     return out
 
 
-_differences: Callable[[Float, Float, int], Float] = njit(cache=True, nogil=True)(_differences_plain)
-
-
-def _scatter_plain(force: Float, which: int, into: Float) -> None:
+@compiled
+def _scatter(force: Float, which: int, into: Float) -> None:
     """Add the transposed difference of ``force`` (n,) to ``into`` (n,)."""
     n = force.size
     for k in range(n):
@@ -45,10 +42,8 @@ def _scatter_plain(force: Float, which: int, into: Float) -> None:
             into[k] += force[k] - 2.0 * one + two
 
 
-_scatter: Callable[[Float, int, Float], None] = njit(cache=True, nogil=True)(_scatter_plain)
-
-
-def _solve_plain(d0: Float, d1: Float, d2: Float, b: Float) -> Float:
+@compiled
+def _solve(d0: Float, d1: Float, d2: Float, b: Float) -> Float:
     """Solve a symmetric positive pentadiagonal system in place; d1[k], d2[k] couple row k to k + 1 and k + 2."""
     n = b.size
     for k in range(n):
@@ -74,10 +69,8 @@ def _solve_plain(d0: Float, d1: Float, d2: Float, b: Float) -> Float:
     return x
 
 
-_solve: Callable[[Float, Float, Float, Float], Float] = njit(cache=True, nogil=True)(_solve_plain)
-
-
-def _weigh_plain(weight: Float, which: int, d0: Float, d1: Float, d2: Float) -> None:
+@compiled
+def _weigh(weight: Float, which: int, d0: Float, d1: Float, d2: Float) -> None:
     """Add C' diag(weight) C of a difference to the three diagonals."""
     n = weight.size
     for k in range(n):
@@ -100,19 +93,15 @@ def _weigh_plain(weight: Float, which: int, d0: Float, d1: Float, d2: Float) -> 
                 d2[k - 2] += g
 
 
-_weigh: Callable[[Float, int, Float, Float, Float], None] = njit(cache=True, nogil=True)(_weigh_plain)
-
-
-def _all_differences_plain(o: Float, start: Float, into: Float) -> None:
+@compiled
+def _all_differences(o: Float, start: Float, into: Float) -> None:
     """Write o and its first two differences into the three rows of ``into`` (3, n)."""
     for c in range(3):
         into[c] = _differences(o, start, c)
 
 
-_all_differences: Callable[[Float, Float, Float], None] = njit(cache=True, nogil=True)(_all_differences_plain)
-
-
-def _begin_plain(value: Float, limits: Float, mu: float, slack: Float, force: Float) -> None:
+@compiled
+def _begin(value: Float, limits: Float, mu: float, slack: Float, force: Float) -> None:
     """Set slacks (6, n) well inside the limits and the forces that belong to them; row 2 c + side is one bound."""
     for bound in range(6):
         c, sign = bound // 2, 1.0 - 2.0 * (bound % 2)
@@ -121,10 +110,8 @@ def _begin_plain(value: Float, limits: Float, mu: float, slack: Float, force: Fl
             force[bound, k] = mu / slack[bound, k]
 
 
-_begin: Callable[[Float, Float, float, Float, Float], None] = njit(cache=True, nogil=True)(_begin_plain)
-
-
-def _newton_plain(
+@compiled
+def _newton(
     value: Float, slack: Float, force: Float, limits: Float, mu: float, b: Float, diagonals: Float
 ) -> tuple[float, float]:
     """Add the bounds to the system (``b`` (n,), ``diagonals`` (3, n)); return the mean gap and the worst miss."""
@@ -148,21 +135,15 @@ def _newton_plain(
     return gap / (6 * n), miss
 
 
-_newton: Callable[..., tuple[float, float]] = njit(cache=True, nogil=True)(_newton_plain)
-
-
-def _direction_plain(s: float, f: float, value: float, step: float, limit: float, mu: float) -> tuple[float, float]:
+@compiled
+def _direction(s: float, f: float, value: float, step: float, limit: float, mu: float) -> tuple[float, float]:
     """Return how slack and force of one bound move with the step; ``value`` and ``step`` carry the bound's sign."""
     ds = limit - value - s - step
     return ds, (mu - f * ds) / s - f
 
 
-_direction: Callable[..., tuple[float, float]] = njit(cache=True, nogil=True)(_direction_plain)
-
-
-def _lengths_plain(
-    value: Float, step: Float, slack: Float, force: Float, limits: Float, mu: float
-) -> tuple[float, float]:
+@compiled
+def _lengths(value: Float, step: Float, slack: Float, force: Float, limits: Float, mu: float) -> tuple[float, float]:
     """Return how much of the step may be taken, so that every slack and every force stays positive."""
     primal = 1.0
     dual = 1.0
@@ -178,10 +159,8 @@ def _lengths_plain(
     return primal, dual
 
 
-_lengths: Callable[..., tuple[float, float]] = njit(cache=True, nogil=True)(_lengths_plain)
-
-
-def _advance_plain(
+@compiled
+def _advance(
     value: Float, step: Float, slack: Float, force: Float, limits: Float, mu: float, primal: float, dual: float
 ) -> float:
     """Move slacks and forces by their shares of the step; return the mean gap that is left."""
@@ -197,10 +176,8 @@ def _advance_plain(
     return float(total / (6 * value.shape[1]))
 
 
-_advance: Callable[..., float] = njit(cache=True, nogil=True)(_advance_plain)
-
-
-def _project_plain(wanted: Float, limits: Float, start: Float) -> Float:
+@compiled
+def project(wanted: Float, limits: Float, start: Float) -> Float:
     """Return the nearest (n,) to ``wanted`` (least squares) whose value, first and second difference stay in +-limits.
 
     A primal-dual interior-point method; each of its steps is one pentadiagonal system. ``limits`` (3,) > 0.
@@ -231,10 +208,8 @@ def _project_plain(wanted: Float, limits: Float, start: Float) -> Float:
     return o
 
 
-project: Callable[[Float, Float, Float], Float] = njit(cache=True, nogil=True)(_project_plain)
-
-
-def _extent_plain(offset: Float, start: Float, acceleration: float, window: int) -> tuple[float, ...]:
+@compiled
+def extent(offset: Float, start: Float, acceleration: float, window: int) -> tuple[float, ...]:
     """Return the largest |value|, |first| and |second difference|, reach if it brakes, travel within ``window`` rows.
 
     ``start`` = [o before, o before that]; the travel before the first row counts as none.
@@ -256,10 +231,8 @@ def _extent_plain(offset: Float, start: Float, acceleration: float, window: int)
     return highest, fastest, hardest, farthest, longest
 
 
-extent: Callable[[Float, Float, float, int], tuple[float, ...]] = njit(cache=True, nogil=True)(_extent_plain)
-
-
-def _rounded_plain(exact: Float, settled: int, uneven: float) -> Float:
+@compiled
+def rounded(exact: Float, settled: int, uneven: float) -> Float:
     """Round (n,) with the error carried on; from row ``settled`` on change the increment as seldom as it can be.
 
     Rows 0 and 1 are rounded alone. ``uneven``: rounding error (increments times rows) that ends an increment's turn.
@@ -280,6 +253,3 @@ def _rounded_plain(exact: Float, settled: int, uneven: float) -> Float:
         if abs(carried) > uneven:
             high = 1.0 if carried > 0.0 else 0.0
     return out
-
-
-rounded: Callable[[Float, int, float], Float] = njit(cache=True, nogil=True)(_rounded_plain)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from numba import njit
 
+from fdhil.model.compiled import compiled
 from fdhil.records import Float
 
 
-def _segment_plain(path: Float, j: int, point: Float) -> float:
+@compiled
+def _segment(path: Float, j: int, point: Float) -> float:
     """Return the distance from ``point`` (d,) to the segment from row j of ``path`` to row j + 1."""
     length = 0.0
     along = 0.0
@@ -26,7 +25,8 @@ def _segment_plain(path: Float, j: int, point: Float) -> float:
     return float(np.sqrt(square))
 
 
-def _row_plain(path: Float, j: int, point: Float) -> float:
+@compiled
+def _row(path: Float, j: int, point: Float) -> float:
     """Return the distance from ``point`` (d,) to row j of ``path``."""
     square = 0.0
     for a in range(point.size):
@@ -34,11 +34,8 @@ def _row_plain(path: Float, j: int, point: Float) -> float:
     return float(np.sqrt(square))
 
 
-_row: Callable[[Float, int, Float], float] = njit(cache=True, nogil=True)(_row_plain)
-_segment: Callable[[Float, int, Float], float] = njit(cache=True, nogil=True)(_segment_plain)
-
-
-def _beyond_plain(arc: Float, reach: float, low: int, high: int) -> int:
+@compiled
+def _beyond(arc: Float, reach: float, low: int, high: int) -> int:
     """Return the first row above ``low`` at which ``arc`` (n,) exceeds ``reach``, high + 1 if none; it never falls."""
     if low >= high or arc[high] <= reach:
         return high + 1
@@ -57,7 +54,8 @@ def _beyond_plain(arc: Float, reach: float, low: int, high: int) -> int:
     return at
 
 
-def _before_plain(arc: Float, reach: float, low: int, high: int) -> int:
+@compiled
+def _before(arc: Float, reach: float, low: int, high: int) -> int:
     """Return the last row below ``high`` at which ``arc`` (n,) is less than ``reach``; low - 1 if none."""
     if high <= low or arc[low] >= reach:
         return low - 1
@@ -76,11 +74,8 @@ def _before_plain(arc: Float, reach: float, low: int, high: int) -> int:
     return at
 
 
-_beyond: Callable[[Float, float, int, int], int] = njit(cache=True, nogil=True)(_beyond_plain)
-_before: Callable[[Float, float, int, int], int] = njit(cache=True, nogil=True)(_before_plain)
-
-
-def _contour_plain(path: Float, actual: Float, half_window: int, first: int) -> Float:
+@compiled
+def contour(path: Float, actual: Float, half_window: int, first: int) -> Float:
     """Return (m,) the distance of each row of ``actual`` (m, d) to the polyline of ``path`` (n, d) within the window.
 
     Row k of ``actual`` belongs to row ``first`` + k. A stretch of the path is passed over only where its length proves
@@ -129,6 +124,3 @@ def _contour_plain(path: Float, actual: Float, half_window: int, first: int) -> 
                 nearest = j
         out[row] = best
     return out
-
-
-contour: Callable[[Float, Float, int, int], Float] = njit(cache=True, nogil=True)(_contour_plain)
