@@ -85,7 +85,7 @@ def comparison(
         name=program.name,
         config_digest=config.digest,
         used={axis: UsedParameters(newest.get(axis, 0), models[axis]) for axis in predicted.reference.axes},
-        rms_um=float((predicted.contour_um @ predicted.contour_um / predicted.contour_um.size) ** 0.5),
+        rms_um=predicted.rms_um,
         zones=tuple({key: zone[key] for key in KEPT} for zone in zones),
     )
 

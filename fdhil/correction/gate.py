@@ -47,7 +47,7 @@ def demand(
     for axis in reference.axes:
         load = feed.required(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s)
         share, what = max((load.current_share, "current"), (load.voltage_share, "voltage"))
-        place = " ".join(f"{a} {reference.position_mm[a][load.row]:.1f}" for a in reference.axes)
+        place = reference.place(load.row)
         if share > 1.0 or axis in limited:
             refused.append((axis, share, what, place))
         elif share > NEAR_SHARE or before.limited_s[axis] > 0.0 or _peak_share(before, axis, config) > NEAR_SHARE:
@@ -73,7 +73,7 @@ def _peak_share(before: Prediction, axis: str, config: MachineConfig) -> float:
 
 def _held(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> str:
     share = feed.held_share(reference, models, config)
-    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    path = reference.path_mm
     fastest = float(np.linalg.norm(np.diff(path, axis=0), axis=1).max()) / reference.dt_s * 0.06
     return f"a feed of {share * fastest:.1f} m/min ({share * 100:.0f} % of {fastest:.1f}) can be held, or smooth more"
 
@@ -99,17 +99,6 @@ def fade(worse: Bool, dt_s: float) -> Float:
     return np.asarray(ratio**3 * (10 - 15 * ratio + 6 * ratio**2))
 
 
-def gain(before: Prediction, after: Prediction) -> float:
-    """Return the RMS of the contour error without the correction over that with it."""
-    then, now = rms(before.contour_um), rms(after.contour_um)
-    return then / now if now > 0 else 1.0
-
-
-def rms(values: Float) -> float:
-    """Return the root mean square of (n,)."""
-    return float(np.sqrt(np.mean(values**2)))
-
-
 def gains(then_um: float, now_um: float) -> tuple[Reason, ...]:
     """Refuse a correction whose contour error's RMS is not predicted to shrink as a whole."""
     if then_um < NOTHING_UM:
@@ -122,7 +111,7 @@ def gains(then_um: float, now_um: float) -> tuple[Reason, ...]:
 
 def result(before: Prediction, after: Prediction, untouched: bool = False) -> tuple[Reason, ...]:
     """Refuse a correction that is not predicted to help as a whole, or (unless ``untouched``) makes a zone worse."""
-    none = gains(rms(before.contour_um), rms(after.contour_um))
+    none = gains(before.rms_um, after.rms_um)
     if none:
         return none
     worse = np.flatnonzero(worse_rows(before.contour_um, after.contour_um, before.reference.dt_s))

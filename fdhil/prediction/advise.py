@@ -89,7 +89,7 @@ def advise(
             start_s=float(reference.time_s[rows[0]]),
             end_s=float(reference.time_s[rows[-1]]) + reference.dt_s,
             error_um=error,
-            where=" ".join(f"{axis} {reference.position_mm[axis][row]:.1f}" for axis in reference.axes),
+            where=reference.place(row),
             cause=zone.cause if zone else "straight",
             axis=_off(prediction, row),
             load=_load(loads, rows),

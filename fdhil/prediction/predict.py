@@ -52,7 +52,7 @@ def contour_um(reference: Trajectory, models: Mapping[str, Parameters], config: 
 
 
 def _contour(reference: Trajectory, responses: Mapping[str, closed_loop.Response]) -> Float:
-    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    path = reference.path_mm
     actual = np.column_stack([responses[axis].position_mm for axis in reference.axes])
     return contour_error_um(path, actual, reference.dt_s)
 

@@ -40,7 +40,7 @@ def demand_sources(
     """
     contour = predict(reference, models, config).contour_um
     stretch = stretches_around(contour > tolerance_um, round(APART_S / reference.dt_s))
-    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    path = reference.path_mm
     averages = Averages(config.nc.smoothing_s, reference.dt_s)
     if config.nc.profile != "fir":
         return _source(reference, path, stretch, averages.capped), _source(reference, path, stretch, averages.stretched)
@@ -61,7 +61,7 @@ def stretches_around(over: Bool, apart: int) -> Int:
 
 
 def _source(reference: Trajectory, path: Float, stretch: Int, rule: Rule) -> Source:
-    positions = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    positions = reference.path_mm
     speeds = np.linalg.norm(np.diff(positions, axis=0, append=positions[-1:]), axis=1) * 60.0 / reference.dt_s
     fastest = np.zeros(int(stretch[-1]) + 1)
     np.maximum.at(fastest, stretch, speeds)

@@ -81,7 +81,7 @@ def contour_std_um(
 
 def _across(reference: Trajectory) -> list[Float]:
     """Return per axis (n,) the share of an axis' variance that is across the path: 1 - t^2 of its direction t."""
-    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    path = reference.path_mm
     if path.shape[1] == 1:
         return [np.ones(len(path))]
     velocity = np.gradient(path, axis=0)
@@ -103,15 +103,10 @@ def sensitivity_um(
     """
     reference = prediction.reference
     found = _all_positions(reference, models, config, offset_um)
-    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    path = reference.path_mm
     here = np.column_stack([found[axis][2] for axis in reference.axes])
-    start = float(reference.time_s[0])
-    ranges = [
-        tuple(round((seconds - start) / reference.dt_s) for seconds in (zone.start_s, zone.end_s))
-        for zone in prediction.zones
-    ]
     base = contour_error_um(path, here, reference.dt_s)
-    result: list[dict[str, dict[str, float]]] = [{axis: {} for axis in reference.axes} for _ in ranges]
+    result: list[dict[str, dict[str, float]]] = [{axis: {} for axis in reference.axes} for _ in prediction.zones]
     for a, axis in enumerate(reference.axes):
         moved, steps, _ = found[axis]
         for k, name in enumerate(PARAMETERS):
@@ -120,7 +115,7 @@ def sensitivity_um(
             contour = contour_error_um(path, other, reference.dt_s)
             value = abs(float(getattr(models[axis], name)))
             per_percent = 0.01 * value / steps[k]
-            for zone, (first, last) in zip(result, ranges, strict=True):
-                rise = float(contour[first:last].max() - base[first:last].max())
-                zone[axis][name] = rise * per_percent
+            for zone, per_axis in zip(prediction.zones, result, strict=True):
+                rows = prediction.rows(zone)
+                per_axis[axis][name] = float(contour[rows].max() - base[rows].max()) * per_percent
     return tuple(result)

@@ -47,7 +47,7 @@ class Geometry:
 def geometry(reference: Trajectory, loop_s: float) -> Geometry:
     """Find starts, stops, corners and reversals of a reference; ``loop_s`` is the time of the drives' loops."""
     dt = reference.dt_s
-    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    path = reference.path_mm
     velocity = np.zeros_like(path)
     velocity[:-1] = np.diff(path, axis=0) / dt
     speed = np.linalg.norm(velocity, axis=1)
@@ -285,11 +285,10 @@ def _zone(reference: Trajectory, shape: Geometry, contour_um: Float, run: _Run, 
         events = low + np.flatnonzero(shape.events["reversal"][low : run.last + 1])
         if events.size:
             place = int(events[np.argmin(np.abs(events - run.peak))])
-    where = " ".join(f"{axis} {reference.position_mm[axis][place]:.1f}" for axis in reference.axes)
     return Zone(
         start_s=round(float(reference.time_s[run.first]), 6),
         end_s=round(float(reference.time_s[run.last - 1]) + reference.dt_s, 6),
-        where=where,
+        where=reference.place(place),
         max_um=float(contour_um[run.peak]),
         cause=run.cause,
     )
