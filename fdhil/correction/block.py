@@ -16,8 +16,8 @@ import numpy as np
 from fdhil.config import Axis
 from fdhil.correction.limits import PlanLimits, check, fit
 from fdhil.correction.linear import Inverse
-from fdhil.correction.resting import Resting
-from fdhil.model.closed_loop import Commands, Ready, Response, State
+from fdhil.correction.resting import Resting, run_with
+from fdhil.model.closed_loop import Ready, Response, State
 from fdhil.records import Bool, Float, Parameters
 
 ITERATIONS = 8
@@ -50,6 +50,10 @@ class AxisLoop:
     def increment_mm(self) -> float:
         """Millimetres per drive increment."""
         return self.limits.um_per_increment * 1e-3
+
+    def run(self, reference_mm: Float, offset: Float, state: State, first: int, stop: int) -> Response:
+        """Run rows ``first`` .. ``stop`` of a block with an offset in increments."""
+        return run_with(self.drive, reference_mm[first:], offset[first:], self.increment_mm, state, stop - first)
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +175,7 @@ def _run(
             continue
         # dry friction takes hold early in a rest or not at all
         look = min(stop, max(first, done) + round(SEARCH_S / loop.sync_period_s))
-        response = _simulate(loop, reference_mm, offset, state, done, look)
+        response = loop.run(reference_mm, offset, state, done, look)
         position[done:look] = response.position_mm
         stuck = _stuck(loop, response, target_mm[done:look], max(first - done, 0))
         if stuck is None:
@@ -181,24 +185,17 @@ def _run(
         state = response.state_at(stuck)
         if lead:
             _hold(loop, reference_mm, offset, state, row, stop)
-        response = _simulate(loop, reference_mm, offset, state, row, stop)
+        response = loop.run(reference_mm, offset, state, row, stop)
         position[row:stop], state, done = response.position_mm, response.end, stop
         held[row:stop] = True
         gone = np.maximum(0.0, 1 - np.arange(stop - row) * loop.sync_period_s / FORGET_S)
         error_of_rest[row:stop] = (target_mm[row] - position[row]) * gone
     if done < guess.size:
-        position[done:] = _simulate(loop, reference_mm, offset, state, done, guess.size).position_mm
+        position[done:] = loop.run(reference_mm, offset, state, done, guess.size).position_mm
     if held.any() and check(offset[2:].astype(np.int64), loop.limits, before):
         offset[2:] = np.rint(fit(offset[2:], loop.limits, before))
-        position = _simulate(loop, reference_mm, offset, carry.state, 0, guess.size).position_mm
+        position = loop.run(reference_mm, offset, carry.state, 0, guess.size).position_mm
     return offset, position, np.where(held, error_of_rest, target_mm - position)
-
-
-def _simulate(loop: AxisLoop, reference_mm: Float, offset: Float, state: State, first: int, stop: int) -> Response:
-    # a cycle looks two rows ahead and no further
-    ahead = min(stop + 2, reference_mm.size)
-    commanded = reference_mm[first:ahead] + offset[first:ahead] * loop.increment_mm
-    return loop.drive.run(Commands(commanded), state, 0, stop - first)
 
 
 def _stuck(loop: AxisLoop, response: Response, target_mm: Float, first: int) -> int | None:

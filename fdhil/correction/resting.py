@@ -17,7 +17,7 @@ from scipy.linalg.lapack import dposv
 from fdhil.config import Axis
 from fdhil.correction import kernels
 from fdhil.model import closed_loop
-from fdhil.model.closed_loop import Commands, Response, State
+from fdhil.model.closed_loop import Commands, Ready, Response, State
 from fdhil.model.kernels import CURRENT_DEMAND, POSITION
 from fdhil.records import Float, Parameters
 
@@ -67,9 +67,15 @@ class Resting:
         return offset
 
     def _simulate(self, rest_mm: Float, offset: Float, state: State, rows: int) -> Response:
-        ahead = min(rows + 2, rest_mm.size)  # a cycle looks two rows ahead and no further
-        commanded = rest_mm[:ahead] + offset[:ahead] * self._increment_mm
-        return self._held.run(Commands(commanded), state, 0, rows)
+        return run_with(self._held, rest_mm, offset, self._increment_mm, state, rows)
+
+
+def run_with(
+    drive: Ready, reference_mm: Float, offset: Float, increment_mm: float, state: State, rows: int
+) -> Response:
+    """Run a drive's next ``rows`` cycles with an offset in increments; both paths begin with the first of them."""
+    ahead = min(rows + 2, reference_mm.size)  # a cycle looks two rows ahead and no further
+    return drive.run(Commands(reference_mm[:ahead] + offset[:ahead] * increment_mm), state, 0, rows)
 
 
 def _held(parameters: Parameters, axis: Axis) -> tuple[Parameters, Axis]:

@@ -16,8 +16,8 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.correction import gate, linear
-from fdhil.correction.block import AxisLoop, Carry, Solution, solve
-from fdhil.correction.inverse import BLOCK_S, LOOK_AHEAD_S, axis_loop, choose_delay_s, delayed, first_carry, following
+from fdhil.correction.block import AxisLoop, Solution
+from fdhil.correction.inverse import AxisInverse, block_rows, choose_delay_s, delayed
 from fdhil.correction.limits import check
 from fdhil.correction.mirror import lag_reason
 from fdhil.model import closed_loop
@@ -58,8 +58,7 @@ class _Axis:
     """One axis between two blocks; ``free`` is the state that it would have without any offset."""
 
     name: str
-    loop: AxisLoop
-    carry: Carry
+    inverse: AxisInverse
     free: State
 
 
@@ -86,7 +85,7 @@ def stream(
     result is that of the whole reference planned at once.
     """
     period = config.machine.sync_period_s
-    block, ahead = round(BLOCK_S / period), round(LOOK_AHEAD_S / period)
+    block, ahead = block_rows(period)
     window = round(WINDOW_S / period)
     path: dict[str, Float] = {}
     axes: dict[str, _Axis] = {}
@@ -122,7 +121,7 @@ def stream(
 
 
 def _axis(parameters: Parameters, config: MachineConfig, name: str, start_mm: float) -> _Axis:
-    return _Axis(name, axis_loop(parameters, config, name), first_carry(start_mm), closed_loop.start(start_mm))
+    return _Axis(name, AxisInverse.of(parameters, config, name, start_mm), closed_loop.start(start_mm))
 
 
 def _delay(models: Mapping[str, Parameters], config: MachineConfig, axes: Mapping[str, _Axis]) -> float:
@@ -136,13 +135,11 @@ def _solve(axis: _Axis, path: Float, kept: int, rows: int, delay_rows: float, en
     """Solve one block of one axis and move the axis to the next one."""
     reference = np.ascontiguousarray(path[kept:])
     target = np.ascontiguousarray(delayed(path, delay_rows)[kept:])
-    loop = axis.loop
+    loop = axis.inverse.loop
     free = loop.drive.run(Commands(reference), axis.free, 0, rows)
     axis.free = free.end
-    solution = solve(loop, reference, target, axis.carry, ends)
+    solution = axis.inverse.block(reference, target, rows, ends)
     refused = _refused(axis.name, loop, solution, free, rows)
-    if not ends:
-        axis.carry = following(loop, reference, solution, axis.carry, rows)
     offset = solution.offset[:rows] * loop.limits.um_per_increment
     return _Piece(offset, free.position_mm, solution.position_mm[:rows], refused)
 
