@@ -35,43 +35,26 @@ def _row(path: Float, j: int, point: Float) -> float:
 
 
 @compiled
-def _beyond(arc: Float, reach: float, low: int, high: int) -> int:
-    """Return the first row above ``low`` at which ``arc`` (n,) exceeds ``reach``, high + 1 if none; it never falls."""
-    if low >= high or arc[high] <= reach:
-        return high + 1
+def _beyond(arc: Float, reach: float, begin: int, end: int) -> int:
+    """Return the first row from ``begin`` to ``end`` (which may lie before it) that is farther along than ``reach``.
+
+    ``reach`` is a length from row ``begin``; where no row is that far, the one behind ``end``.
+    """
+    way = 1 if end >= begin else -1
+    far = abs(end - begin)
+    if abs(arc[end] - arc[begin]) <= reach:
+        return end + way
     step = 1
-    at = low + 1
-    while at < high and arc[at] <= reach:  # gallop, then halve
-        low = at
+    while step < far and abs(arc[begin + way * step] - arc[begin]) <= reach:  # gallop, then halve
         step *= 2
-        at = min(low + step, high)
-    while at - low > 1:
-        middle = (low + at) // 2
-        if arc[middle] <= reach:
+    low, high = step // 2, min(step, far)
+    while high - low > 1:
+        middle = (low + high) // 2
+        if abs(arc[begin + way * middle] - arc[begin]) <= reach:
             low = middle
         else:
-            at = middle
-    return at
-
-
-@compiled
-def _before(arc: Float, reach: float, low: int, high: int) -> int:
-    """Return the last row below ``high`` at which ``arc`` (n,) is less than ``reach``; low - 1 if none."""
-    if high <= low or arc[low] >= reach:
-        return low - 1
-    step = 1
-    at = high - 1
-    while at > low and arc[at] >= reach:
-        high = at
-        step *= 2
-        at = max(high - step, low)
-    while high - at > 1:
-        middle = (at + high) // 2
-        if arc[middle] >= reach:
             high = middle
-        else:
-            at = middle
-    return at
+    return begin + way * high
 
 
 @compiled
@@ -99,28 +82,19 @@ def contour(path: Float, actual: Float, half_window: int, first: int) -> Float:
         best = _row(path, k, point)
         begin = max(low, min(nearest, high))
         nearest = k
-        j = begin
-        while j < high:
-            # no point of the path within so far of row j is nearer than the best one
-            room = _row(path, j, point) - best
-            if arc[j + 1] - arc[j] <= room:
-                j = _beyond(arc, arc[j] + room, j + 1, high) - 1
-                continue
-            distance = _segment(path, j, point)
-            if distance < best:
-                best = distance
-                nearest = j
-            j += 1
-        j = begin
-        while j > low:
-            room = _row(path, j, point) - best
-            if arc[j] - arc[j - 1] <= room:
-                j = _before(arc, arc[j] - room, low, j - 1) + 1
-                continue
-            j -= 1
-            distance = _segment(path, j, point)
-            if distance < best:
-                best = distance
-                nearest = j
+        for end in (high, low):
+            way = 1 if end == high else -1
+            j = begin
+            while j != end:
+                # no point of the path within so far of row j is nearer than the best one
+                room = _row(path, j, point) - best
+                if abs(arc[j + way] - arc[j]) <= room:
+                    j = _beyond(arc, room, j, end) - way
+                    continue
+                distance = _segment(path, min(j, j + way), point)
+                if distance < best:
+                    best = distance
+                    nearest = min(j, j + way)
+                j += way
         out[row] = best
     return out
