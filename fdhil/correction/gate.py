@@ -8,9 +8,12 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from fdhil.config import MachineConfig, share_fault
-from fdhil.correction import feed
+from fdhil.model import closed_loop
+from fdhil.prediction.inverse_dynamics import required
 from fdhil.records import Bool, Float, Parameters, Prediction, Reason, Trajectory
 
+STEADY_S = 0.02  # a limit that acts shorter than this in all costs no more than a settling
+SHARE_STEP = 2e-3  # to which the feed that can be held is found
 NEAR_SHARE = 0.95  # of a current or voltage limit: worth a warning
 LEAST_GAIN = 1.05  # before / after RMS
 NOTHING_UM = 0.05  # an RMS below this is nothing to correct
@@ -43,12 +46,11 @@ def demand(
 ) -> tuple[tuple[Reason, ...], tuple[Reason, ...]]:
     """Return (refused, warnings): no offset helps a drive whose current or voltage is at its limit."""
     refused, warnings = [], []
-    limited = feed.steadily_limited(before.limited_s)
     for axis in reference.axes:
-        load = feed.required(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s)
-        share, what = max((load.current_share, "current"), (load.voltage_share, "voltage"))
-        place = reference.place(load.row)
-        if share > 1.0 or axis in limited:
+        asked = required(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s)
+        share, what = max(zip((float(one.max()) for one in asked), ("current", "voltage"), strict=True))
+        place = reference.place(int(np.argmax(np.maximum(*asked))))
+        if share > 1.0 or before.limited_s[axis] > STEADY_S:
             refused.append((axis, share, what, place))
         elif share > NEAR_SHARE or before.limited_s[axis] > 0.0 or _peak_share(before, axis, config) > NEAR_SHARE:
             text = f"axis {axis} comes near its {what} limit at {place}: little is left for a disturbance"
@@ -72,10 +74,31 @@ def _peak_share(before: Prediction, axis: str, config: MachineConfig) -> float:
 
 
 def _held(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> str:
-    share = feed.held_share(reference, models, config)
-    path = reference.path_mm
-    fastest = float(np.linalg.norm(np.diff(path, axis=0), axis=1).max()) / reference.dt_s * 0.06
-    return f"a feed of {share * fastest:.1f} m/min ({share * 100:.0f} % of {fastest:.1f}) can be held, or smooth more"
+    low, high = 0.0, 1.0
+    if _holds(1.0, reference, models, config):
+        low = 1.0
+    while high - low > SHARE_STEP:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if _holds(middle, reference, models, config) else (low, middle)
+    fastest = float(np.linalg.norm(np.diff(reference.path_mm, axis=0), axis=1).max()) / reference.dt_s * 0.06
+    return f"a feed of {low * fastest:.1f} m/min ({low * 100:.0f} % of {fastest:.1f}) can be held, or smooth more"
+
+
+def _holds(share: float, reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> bool:
+    """Whether no limit of any drive acts at a share of the feed.
+
+    An NC with fixed smoothing times then orders as large a share of speed and acceleration, so the path scaled by it
+    shows the demand on the drives, dry friction included.
+    """
+    for axis, path in reference.position_mm.items():
+        if np.ptp(path) == 0.0:
+            continue
+        scaled = path[0] + share * (path - path[0])
+        if max(one.max() for one in required(scaled, models[axis], config.axis[axis], reference.dt_s)) > 1.0:
+            return False
+        if closed_loop.simulate(models[axis], config.axis[axis], reference.dt_s, scaled).limited_s > 0.0:
+            return False
+    return True
 
 
 def worse_rows(before_um: Float, after_um: Float, dt_s: float) -> Bool:

@@ -7,9 +7,10 @@ braking-aware: |o| + v^2 / (2 A) <= L while the offset moves outward at v.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
+from scipy.ndimage import minimum_filter1d
 
 from fdhil.config import VARIATION_MM, Axis, OffsetLimits
 from fdhil.correction import kernels
@@ -23,24 +24,16 @@ _SLACK = 0.05  # increments by which a seam may miss, far below the rounding
 
 
 @dataclass(frozen=True, slots=True)
-class PlanLimits:
-    """``offset`` increments, ``rate`` per cycle, ``acceleration`` per cycle^2, ``variation`` per ``window`` cycles."""
+class PlanLimits(OffsetLimits):
+    """What an offset may do in increments, and how large these are."""
 
-    offset: float
-    rate: float
-    acceleration: float
-    variation: float
-    window: int
     um_per_increment: float
 
     @staticmethod
     def of(axis: Axis, sync_period_s: float) -> PlanLimits:
         """Return the limits of an axis; ValueError when writing is off (no ``[axis.X.correction]``)."""
-        derived = OffsetLimits.of(axis, sync_period_s)
-        um_per_increment = 1e3 / axis.scaling.increments_per_mm
-        return PlanLimits(
-            derived.offset, derived.rate, derived.acceleration, derived.variation, derived.window, um_per_increment
-        )
+        allowed = OffsetLimits.of(axis, sync_period_s)
+        return PlanLimits(**asdict(allowed), um_per_increment=1e3 / axis.scaling.increments_per_mm)
 
     @property
     def curve(self) -> PlanLimits:
@@ -80,12 +73,6 @@ def check(offset_increments: Int, limits: PlanLimits, before: tuple[float, float
     return reasons
 
 
-def braking_reach(offset: Float, rate: Float, acceleration: float) -> Float:
-    """Return (n,) how far each row's offset gets if it brakes from there: |o| + v^2 / (2 A) while moving outward."""
-    outward = np.maximum(rate * np.sign(offset), 0.0)
-    return np.asarray(np.abs(offset) + outward**2 / (2 * acceleration))
-
-
 def variation(rate: Float, window: int) -> Float:
     """Return (n,) the travel within the ``window`` cycles that end at each row."""
     total = np.concatenate([[0.0], np.cumsum(np.abs(rate))])
@@ -112,10 +99,8 @@ def fit(wanted: Float, limits: PlanLimits, before: tuple[float, float] = (0.0, 0
     if before != (0.0, 0.0):
         return _projected(np.zeros_like(goal), curve, before)
     # a curve that starts from rest and is scaled down keeps every limit that it kept before
-    rate = np.diff(planned, prepend=0.0)
-    too_far = float(variation(rate, curve.window).max(initial=0.0)) / (0.98 * curve.variation)
-    too_high = float(braking_reach(planned, rate, curve.acceleration).max(initial=0.0)) / curve.offset
-    return np.asarray(planned / max(too_far, too_high, 1.0))
+    _, _, _, reach, longest = kernels.extent(planned, np.zeros(2), curve.acceleration, curve.window)
+    return np.asarray(planned / max(longest / (0.98 * curve.variation), reach / curve.offset, 1.0))
 
 
 def _projected(goal: Float, limits: PlanLimits, before: tuple[float, float]) -> Float:
@@ -155,17 +140,11 @@ def _calm(travel: Float, allowed: float, window: int) -> Float:
         return np.ones(travel.size)
     factor = np.minimum(1.0, allowed / np.maximum(travel, 1e-12))
     # a row belongs to all windows that end within the next second; smoothed, so that the factor adds no jerk
-    lowest = np.minimum.accumulate(np.concatenate([factor, np.full(window, factor[-1])])[::-1])[::-1]
-    shrunk = lowest[: travel.size] if travel.size <= window else _sliding_minimum(factor, window)
+    lowest = minimum_filter1d(factor, window + 1, mode="nearest", origin=-((window + 1) // 2))
     smooth = max(1, window // 20)
-    padded = np.pad(shrunk, smooth, mode="edge")
+    padded = np.pad(lowest, smooth, mode="edge")
     kernel = np.hanning(2 * smooth + 1)
     return np.asarray(np.minimum(np.convolve(padded, kernel / kernel.sum(), mode="valid"), 1.0))
-
-
-def _sliding_minimum(values: Float, window: int) -> Float:
-    padded = np.concatenate([values, np.full(window, values[-1])])
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, window + 1).min(axis=1))
 
 
 def to_increments(offset: Float) -> Int:
