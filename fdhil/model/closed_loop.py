@@ -8,10 +8,9 @@ interpolation. Encoder and set-points are not quantised: against a drive with 65
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -37,34 +36,32 @@ class Commands(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """What the axis does, (n,) each, at the SYNC instants t_0 .. t_{n-1}.
+    """What the axis does at the SYNC instants t_0 .. t_{n-1}.
 
-    ``limited`` is the share of the cycle from that instant on in which the current or voltage limit acts. ``states``
-    (k, n) is the whole state at those instants, and ``end`` (STATES,) that after the last cycle: another run may
-    continue from any of them.
+    ``states`` (k, n) is the whole state at those instants, and ``end`` (STATES,) that after the last cycle: another run
+    may continue from any of them. ``limited`` (n,) is the share of the cycle from that instant on in which the current
+    or voltage limit acts.
     """
 
-    position_mm: Float
-    speed_rad_s: Float
-    current_a: Float
-    limited: Float
-    sync_period_s: float
     states: Float
+    limited: Float
     end: State
+    sync_period_s: float
 
-    @staticmethod
-    def from_columns(columns: Float, steps: int, sync_period_s: float, end: State) -> Response:
-        """Take apart what a kernel recorded, (1 + k, n); ``steps`` current-loop steps make a cycle."""
-        states = columns[kernels.ROW_STATE :]
-        return Response(
-            position_mm=states[kernels.POSITION],
-            speed_rad_s=states[kernels.SPEED],
-            current_a=states[kernels.CURRENT],
-            limited=columns[kernels.ROW_LIMITED] / steps,
-            sync_period_s=sync_period_s,
-            states=states,
-            end=end,
-        )
+    @property
+    def position_mm(self) -> Float:
+        """Where the table is, (n,)."""
+        return np.asarray(self.states[kernels.POSITION])
+
+    @property
+    def speed_rad_s(self) -> Float:
+        """The motor's speed, (n,)."""
+        return np.asarray(self.states[kernels.SPEED])
+
+    @property
+    def current_a(self) -> Float:
+        """The motor's current, (n,)."""
+        return np.asarray(self.states[kernels.CURRENT])
 
     @property
     def limited_s(self) -> float:
@@ -121,13 +118,8 @@ class Ready(Protocol):
 
 def prepare(parameters: Parameters, axis: Axis, sync_period_s: float) -> Ready:
     """Return the drive of an axis ready to be run, for those who run it often."""
-    return _structure(axis.regulators.structure)(parameters, axis, sync_period_s)
-
-
-@lru_cache(maxsize=16)
-def _structure(name: str) -> Callable[[Parameters, Axis, float], Ready]:
-    structure: Callable[[Parameters, Axis, float], Ready] = tables.load(tables.REGULATORS, name)
-    return structure
+    drive: Ready = tables.load(tables.REGULATORS, axis.regulators.structure)(parameters, axis, sync_period_s)
+    return drive
 
 
 def start(position_mm: float) -> State:

@@ -108,7 +108,8 @@ class Drive:
             end,
         )
         _, _, n_speed, n_current, _, _ = self.shape
-        return Response.from_columns(out, n_speed * n_current, self.sync_period_s, end)
+        limited = out[kernels.ROW_LIMITED] / (n_speed * n_current)
+        return Response(out[kernels.ROW_STATE :], limited, end, self.sync_period_s)
 
 
 def prepare(law: int, places: int, parameters: Parameters, axis: Axis, sync_period_s: float) -> Drive:
