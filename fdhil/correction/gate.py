@@ -8,12 +8,10 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from fdhil.config import MachineConfig, share_fault
-from fdhil.model import closed_loop
-from fdhil.prediction.inverse_dynamics import required
+from fdhil.prediction.inverse_dynamics import held_share, required
 from fdhil.records import Bool, Float, Parameters, Prediction, Reason, Trajectory
 
 STEADY_S = 0.02  # a limit that acts shorter than this in all costs no more than a settling
-SHARE_STEP = 2e-3  # to which the feed that can be held is found
 NEAR_SHARE = 0.95  # of a current or voltage limit: worth a warning
 LEAST_GAIN = 1.05  # before / after RMS
 NOTHING_UM = 0.05  # an RMS below this is nothing to correct
@@ -57,7 +55,9 @@ def demand(
             warnings.append(Reason("NearLimit", text, "lower the feed if the path error matters there"))
     if not refused:
         return (), tuple(warnings)
-    advice = _held(reference, models, config)
+    held = held_share(reference, models, config)
+    fastest = float(np.linalg.norm(np.diff(reference.path_mm, axis=0), axis=1).max()) / reference.dt_s * 0.06
+    advice = f"a feed of {held * fastest:.1f} m/min ({held * 100:.0f} % of {fastest:.1f}) can be held, or smooth more"
     return tuple(
         Reason(
             "DemandTooHigh",
@@ -71,34 +71,6 @@ def demand(
 
 def _peak_share(before: Prediction, axis: str, config: MachineConfig) -> float:
     return float(np.abs(before.current_a[axis]).max()) / config.axis[axis].regulators.current_limit_a
-
-
-def _held(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> str:
-    low, high = 0.0, 1.0
-    if _holds(1.0, reference, models, config):
-        low = 1.0
-    while high - low > SHARE_STEP:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if _holds(middle, reference, models, config) else (low, middle)
-    fastest = float(np.linalg.norm(np.diff(reference.path_mm, axis=0), axis=1).max()) / reference.dt_s * 0.06
-    return f"a feed of {low * fastest:.1f} m/min ({low * 100:.0f} % of {fastest:.1f}) can be held, or smooth more"
-
-
-def _holds(share: float, reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> bool:
-    """Whether no limit of any drive acts at a share of the feed.
-
-    An NC with fixed smoothing times then orders as large a share of speed and acceleration, so the path scaled by it
-    shows the demand on the drives, dry friction included.
-    """
-    for axis, path in reference.position_mm.items():
-        if np.ptp(path) == 0.0:
-            continue
-        scaled = path[0] + share * (path - path[0])
-        if max(one.max() for one in required(scaled, models[axis], config.axis[axis], reference.dt_s)) > 1.0:
-            return False
-        if closed_loop.simulate(models[axis], config.axis[axis], reference.dt_s, scaled).limited_s > 0.0:
-            return False
-    return True
 
 
 def worse_rows(before_um: Float, after_um: Float, dt_s: float) -> Bool:
