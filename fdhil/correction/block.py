@@ -9,7 +9,6 @@ current to the middle of the dry friction's band and keeps the position loop sil
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
@@ -223,13 +222,7 @@ def _hold(loop: AxisLoop, reference_mm: Float, offset: Float, state: State, row:
 
 def _fade(rows: int, sync_period_s: float) -> Float:
     """A smooth factor (rows,) from 1 down to 0 within ``FADE_S``."""
+    share = np.minimum(np.arange(1, min(rows, int(np.ceil(FADE_S / sync_period_s))) + 1) * sync_period_s / FADE_S, 1.0)
     factor = np.zeros(rows)
-    begin = _beginning(sync_period_s)[:rows]
-    factor[: begin.size] = begin
+    factor[: share.size] = 0.5 * (1 + np.cos(np.pi * share))
     return factor
-
-
-@lru_cache(maxsize=4)
-def _beginning(sync_period_s: float) -> Float:
-    share = np.minimum(np.arange(1, np.ceil(FADE_S / sync_period_s) + 1) * sync_period_s / FADE_S, 1.0)
-    return np.asarray(0.5 * (1 + np.cos(np.pi * share)))

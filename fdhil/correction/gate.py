@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
+from scipy.ndimage import distance_transform_edt, maximum_filter1d
 
 from fdhil.config import MachineConfig, share_fault
 from fdhil.prediction.inverse_dynamics import held_share, required
@@ -82,15 +82,9 @@ def worse_rows(before_um: Float, after_um: Float, dt_s: float) -> Bool:
 
 def fade(worse: Bool, dt_s: float) -> Float:
     """Return a factor (n,): 0 in and around the rows that get worse, 1 far from them, smooth in between."""
-    rows = np.flatnonzero(worse)
-    if rows.size == 0:
+    if not worse.any():
         return np.ones(worse.size)
-    here = np.arange(worse.size)
-    after = np.searchsorted(rows, here)
-    distance = np.minimum(
-        np.abs(here - rows[np.minimum(after, rows.size - 1)]), np.abs(here - rows[np.maximum(after - 1, 0)])
-    )
-    ratio = np.clip((distance * dt_s - MASK_S) / FADE_S, 0.0, 1.0)
+    ratio = np.clip((distance_transform_edt(~worse) * dt_s - MASK_S) / FADE_S, 0.0, 1.0)
     return np.asarray(ratio**3 * (10 - 15 * ratio + 6 * ratio**2))
 
 

@@ -28,12 +28,11 @@ Complex = npt.NDArray[np.complex128]
 
 @dataclass(frozen=True, slots=True)
 class Inverse:
-    """The inverse of one axis' loop for errors of up to ``rows`` rows, as a factor on their spectrum."""
+    """The inverse of one axis' loop as a factor on the spectrum of an error."""
 
     factor: Complex
     size: int
     pad: int
-    rows: int
 
     def apply(self, error: Float) -> Float:
         """Return the offset (n,) that would undo ``error`` (n,) in the linear loop; what lies outside counts as 0."""
@@ -75,4 +74,4 @@ def inverse(parameters: Parameters, axis: Axis, sync_period_s: float, rows: int)
     roll_off = 1 / (1 + (frequency / min(BANDWIDTH_HZ, 0.2 / sync_period_s)) ** 4)
     gain = roll_off / (np.abs(spectrum) ** 2 + REGULARISATION)
     factor = np.asarray(np.conj(spectrum) * gain, dtype=np.complex128)
-    return Inverse(factor, size, pad, rows)
+    return Inverse(factor, size, pad)
