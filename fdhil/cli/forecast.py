@@ -1,6 +1,4 @@
-"""What ``fdhil predict --from-history`` adds: what a step of a parameter costs, what became of each zone since the last
-time, and when it leaves a tolerance.
-"""
+"""Adds to ``fdhil predict --from-history`` what a step costs, the change of each zone, and when it leaves a tolerance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Offsets that make up for the predicted path error: methods, limits, the gate, and the guard's table."""
+"""Plans offsets that make up for the predicted path error: methods, limits, the gate, and the guard's table."""
 
 from __future__ import annotations
 

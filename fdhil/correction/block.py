@@ -1,4 +1,4 @@
-"""One axis, one block: offsets, in whole increments and inside their limits, that keep the table on its target.
+"""Solves one block of one axis: offsets, in whole increments and inside their limits, that keep it on its target.
 
 The offset is improved by iteration: simulate the closed loop with it, put the remaining error through the inverse of
 the linear loop, add. Two things are not left to the iteration. The limits hold at every step. And where the axis rests,
@@ -57,7 +57,7 @@ class AxisLoop:
 
 @dataclass(frozen=True, slots=True)
 class Carry:
-    """What a block hands to the next: the state at its first row, the increments fixed ahead of and in it, a guess.
+    """The hand-over to the next block: the state at its first row, the increments fixed ahead of and in it, a guess.
 
     ``fixed`` (2,): offsets of the next block's first two rows, which the last cycles have already used. ``guess`` (m,):
     unrounded offsets found for the rows that were looked at.

@@ -1,4 +1,4 @@
-"""The gate: what is not predicted to help is not sent, and every refusal says what to do about it."""
+"""The gate refuses what is not predicted to help, and says with every refusal what to do about it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Inverse correction: offsets that keep each table on r(t - tau), with one delay tau for all axes.
+"""Plans the inverse correction: offsets that keep each table on r(t - tau), with one delay tau for all axes.
 
 Aiming at the path, not at the clock, lets a drive that lags keep its lag: only where the axes lag by different times,
 or where the lag changes, are offsets needed. The path is worked through in blocks with a look-ahead, each from the

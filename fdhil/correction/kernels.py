@@ -1,4 +1,4 @@
-"""The compiled projection onto what an offset may do."""
+"""Compiled kernels project an offset onto what it may do, measure it and round it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an offset may do, and how a wanted offset is planned inside it, so that the guard never has to clip it.
+"""Plans a wanted offset inside its limits, so that the guard never has to clip it, and checks a table against them.
 
 In drive increments per SYNC cycle: amplitude L, rate S, acceleration A, total variation E within one second. L is
 braking-aware: |o| + v^2 / (2 A) <= L while the offset moves outward at v.
@@ -25,7 +25,7 @@ _SLACK = 0.05  # increments by which a seam may miss, far below the rounding
 
 @dataclass(frozen=True, slots=True)
 class PlanLimits(OffsetLimits):
-    """What an offset may do in increments, and how large these are."""
+    """The limits of an offset in increments, and the size of these."""
 
     um_per_increment: float
 

@@ -1,4 +1,4 @@
-"""The closed loop as a linear system: its delay, and a zero-phase inverse of it up to a bandwidth.
+"""Takes the closed loop as a linear system: its delay, and a zero-phase inverse of it up to a bandwidth.
 
 Away from the limits and from changes of the friction's sign the loop from offset to position is linear, whatever the
 regulators: one simulated impulse tells all. Its inverse is regularised, so that nothing is asked for where the drive

@@ -1,4 +1,4 @@
-"""The correction methods' common form: what each takes and returns."""
+"""States the correction methods' common form: what each takes and returns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Mirror correction ([DES] eq. 11 with H ~ 1, figure 16): the predicted error with its sign changed, unfiltered."""
+"""Plans the mirror correction ([DES] eq. 11, H ~ 1, figure 16): the predicted error, its sign changed, unfiltered."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a reference to a correction: method, limits, gate; and from a correction to the guard's table."""
+"""Plans a correction from a reference: method, limits, gate; and turns it into the guard's table."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an offset does while dry friction holds the table: nothing, but to the regulators.
+"""Keeps a resting axis at rest: while dry friction holds the table an offset moves the regulators alone.
 
 Left alone, their integrals wind up on the remaining error until the table slips by micrometres, now and then. While
 it is held the regulators alone are a linear system, whatever their structure: two simulated answers tell which offset
@@ -91,7 +91,7 @@ def _demand(response: Response) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class _Length:
-    """What depends on a rest's length alone: which of the splines count, how stiff they are, and both as one matrix."""
+    """A rest of some length: which of the splines count in it, how stiff they are, and both as one matrix."""
 
     effect: Float
     even: Float
@@ -102,7 +102,7 @@ class _Length:
 
 
 class _Lead:
-    """What an offset d from row 2 on does, as a cubic spline of knots ``step`` rows apart.
+    """The answer to an offset d from row 2 on, as a cubic spline of knots ``step`` rows apart.
 
     ``spline`` (free + step, m) holds d's basis, ``bends`` its second differences, ``effect`` (n, m) what each of them
     asks for, in A. A rest of less than n rows uses their first rows.

@@ -1,4 +1,4 @@
-"""The inverse correction while the path is still being made: blocks of 2 s with 0.5 s of look-ahead.
+"""Streams the inverse correction while the path is still being made: blocks of 2 s with 0.5 s of look-ahead.
 
 A block is there as soon as its look-ahead is, so nothing waits for the end of the program ([DES], conclusion: "an
 on-line technique is to be studied"). Each block passes limits and gate alone; what is kept between blocks is one state
@@ -64,7 +64,7 @@ class _Axis:
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
-    """What one axis makes of one block: offsets (um), positions without and with them, and what was in the way."""
+    """One block of one axis: offsets (um), positions without and with them, and what was in the way."""
 
     offset_um: Float
     before_mm: Float
@@ -145,7 +145,7 @@ def _solve(axis: _Axis, path: Float, kept: int, rows: int, delay_rows: float, en
 
 
 def _refused(name: str, loop: AxisLoop, solution: Solution, free: Response, rows: int) -> tuple[_Refusal, ...]:
-    """What one axis alone can say against a block: lag, a drive at its limit, an offset that breaks a limit."""
+    """Return the objections of one axis alone to a block: lag, a drive at its limit, an offset that breaks a limit."""
     um = loop.limits.um_per_increment
     refused = []
     if free.limited_s > LIMITED_S:

@@ -1,4 +1,4 @@
-"""The closed loop of one axis: the drive's regulators around the plant, driven by a reference on the SYNC grid.
+"""Simulates the closed loop of one axis: the drive's regulators around the plant, led by a reference on the SYNC grid.
 
 During cycle k the drive interpolates its set-point linearly from r[k] to r[k+1], and the speed that is fed forward from
 (r[k+1]-r[k])/T to (r[k+2]-r[k+1])/T. Beyond its end the reference is held. An offset is added to the reference before
@@ -27,7 +27,7 @@ _EMPTY: Float = np.empty(0)
 
 
 class Commands(NamedTuple):
-    """What an axis is told, (n,) each: reference in mm (its offset included), speed and torque offsets or empty."""
+    """The commands of an axis, (n,) each: reference in mm (its offset included), speed and torque offsets or empty."""
 
     reference_mm: Float
     speed_offset_rad_s: Float = _EMPTY
@@ -36,7 +36,7 @@ class Commands(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """What the axis does at the SYNC instants t_0 .. t_{n-1}.
+    """The answer of an axis at the SYNC instants t_0 .. t_{n-1}.
 
     ``states`` (k, n) is the whole state at those instants, and ``end`` (STATES,) that after the last cycle: another run
     may continue from any of them. ``limited`` (n,) is the share of the cycle from that instant on in which the current
@@ -50,7 +50,7 @@ class Response:
 
     @property
     def position_mm(self) -> Float:
-        """Where the table is, (n,)."""
+        """The place of the table, (n,)."""
         return np.asarray(self.states[kernels.POSITION])
 
     @property

@@ -1,4 +1,4 @@
-"""Equations [1] and [2] of [DES]: exact discretisation, and simulation from the measured voltage.
+"""Solves equations [1] and [2] of [DES]: exact discretisation, and simulation from the measured voltage.
 
     L di/dt  = u - R i - K w
     Jt dw/dt = K i - ft w - Cd sign(w)          w = 0 sticks while |K i| <= Cd

@@ -1,4 +1,4 @@
-"""The compiled loops of the closed-loop model. Plain numbers in, plain numbers out; no lock is held while they run.
+"""Compiled kernels run the closed-loop model. Plain numbers in, plain numbers out; no lock is held while they run.
 
 All compiled code of the drives is in this file, whatever their structure: numba's cache of a compiled function is
 renewed when its own file changes, not when that of a function it calls does.

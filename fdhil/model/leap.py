@@ -1,4 +1,4 @@
-"""One whole speed cycle of the current loop and the plant at once.
+"""Takes a whole speed cycle of the current loop and the plant at once.
 
 While the current demand is constant, no voltage is clipped and the table neither turns nor breaks loose, the steps of
 the current loop are one linear map. The kernel takes it where bounds on what happens in between prove that it may; all

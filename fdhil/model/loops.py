@@ -1,4 +1,4 @@
-"""What every regulator structure shares: the plant's exact step, the kernel's gains, a drive ready to run.
+"""Prepares what every regulator structure shares: the plant's exact step, the kernel's gains, a drive ready to run.
 
 Each PI integrates first: candidate = integral + ki h e, output = clip(kp e + candidate); where the clip acts, the old
 integral is kept. Three options go with every structure: acceleration fed forward as current, a filter on the

@@ -1,4 +1,4 @@
-"""Where a path leaves a tolerance, why, and the highest feed of each stretch at which it would not."""
+"""Advises feeds: where a path leaves a tolerance, why, and the highest feed of each stretch at which it would not."""
 
 from __future__ import annotations
 

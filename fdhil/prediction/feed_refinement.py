@@ -1,4 +1,4 @@
-"""A last look at the feeds that hold together: which of them may be higher while those beside them stay.
+"""Raises feeds that hold together a last time: each of them alone, while those beside it stay.
 
 An error that two stretches make between them hardly goes with one of them alone, so that a search which moves both by
 what it learns of each ends a little early.

@@ -1,4 +1,4 @@
-"""The highest feed of each stretch of a path at which it keeps a tolerance, found by running the whole path."""
+"""Searches the highest feed of each stretch of a path that keeps a tolerance, by running the whole path."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def highest(source: Source, over: Mapping[int, float], judge: Judge, tolerance_u
 
 @dataclass(slots=True)
 class _Stretch:
-    """What is known of one stretch: ``low`` holds, ``high`` does not; it is ``lost`` when no share is worth a trial.
+    """The bracket of one stretch: ``low`` holds, ``high`` does not; it is ``lost`` when no share is worth a trial.
 
     ``risen`` is how often in a row a higher share held.
     """

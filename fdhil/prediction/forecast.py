@@ -1,4 +1,4 @@
-"""What the history of the parameters says about a path: when a zone leaves a tolerance, and what a step has cost."""
+"""Forecasts a path's error from the parameters' history: when a zone leaves a tolerance, and what a step has cost."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class ZoneChange:
-    """What became of one zone since a program was last compared: its largest contour error ``before`` and ``now``, um.
+    """The change of one zone since a program was last compared: its largest contour error ``before`` and ``now``, um.
 
     ``by`` is what each parameter that changed did to it: (axis, symbol, um), the most first; putting one back alone
     would undo so much. ``settings_um`` is what a changed configuration did, None where it is the same.

@@ -1,4 +1,4 @@
-"""What a correction is predicted to gain, with the uncertainty that the prediction knows of itself.
+"""Tells what a correction is predicted to gain, with the uncertainty that the prediction knows of itself.
 
 What the model says of its own correction is the model against itself. What can be reached is bounded by how well the
 parameters are known, and by how well the last recorded moves were predicted.

@@ -1,4 +1,4 @@
-"""The compiled search of the contour error."""
+"""Compiled kernels search the contour error."""
 
 from __future__ import annotations
 

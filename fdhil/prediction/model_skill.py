@@ -1,4 +1,4 @@
-"""The skill of the closed-loop model: predicted against measured following error of one recorded move."""
+"""Judges the skill of the closed-loop model: predicted against measured following error of one recorded move."""
 
 from __future__ import annotations
 

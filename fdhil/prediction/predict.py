@@ -1,4 +1,4 @@
-"""Prediction of a reference trajectory from the identified closed loops ([DES] section 5, figure 9)."""
+"""Predicts a reference trajectory from the identified closed loops ([DES] section 5, figure 9)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recorded demand at other feeds: it has no lines, and what the NC would make of another feed is not in it.
+"""Runs a recorded demand at other feeds: it has no lines, and what the NC would make of another feed is not in it.
 
 Where the NC is an interpolator of the configured averages (``[nc] smoothing_s``), these can be taken off the demand,
 the path under them run at another speed, and the averages put on again: the demand is then what the NC would order. A

@@ -1,4 +1,4 @@
-"""What the parameters' uncertainty does to the predicted path, and which parameter matters where."""
+"""Propagates the parameters' uncertainty to the predicted path, and tells which parameter matters where."""
 
 from __future__ import annotations
 

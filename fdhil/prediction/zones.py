@@ -1,4 +1,4 @@
-"""Zones: stretches of the path whose contour error stands out, where they are and why they are there."""
+"""Finds zones: stretches of the path whose contour error stands out, where they are and why they are there."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CAUSES = ("saturation", "corner", "start", "stop", "reversal", "circular lag", "
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """What the reference does, (n,) each: path speed in mm/s, turn rate in rad/s, and the rows of its events.
+    """The course of a reference, (n,) each: path speed in mm/s, turn rate in rad/s, and the rows of its events.
 
     ``arc``: it turns, and not in a corner.
     """

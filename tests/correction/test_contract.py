@@ -1,4 +1,4 @@
-"""What every listed correction method keeps to, whoever wrote it."""
+"""The contract of every listed correction method, whoever wrote it."""
 
 from __future__ import annotations
 

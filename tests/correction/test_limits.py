@@ -1,4 +1,4 @@
-"""What an offset may do: the check against plain arithmetic, and plans that keep every limit."""
+"""The limits of an offset: the check against plain arithmetic, and plans that keep every limit."""
 
 from __future__ import annotations
 
