@@ -1,4 +1,4 @@
-"""Adds to ``fdhil predict --from-history`` what a step costs, the change of each zone, and when it leaves a tolerance."""
+"""Adds to ``fdhil predict --from-history`` what a step costs, each zone's change, and when it leaves a tolerance."""
 
 from __future__ import annotations
 
