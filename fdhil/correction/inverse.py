@@ -9,7 +9,6 @@ end.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +18,7 @@ from fdhil.correction import linear
 from fdhil.correction.block import AxisLoop, Carry, Solution, solve
 from fdhil.correction.limits import PlanLimits
 from fdhil.correction.method import Plan
-from fdhil.correction.mirror import too_large
+from fdhil.correction.mirror import allowed_um, too_large
 from fdhil.correction.resting import Resting
 from fdhil.model import closed_loop
 from fdhil.records import Float, Parameters, Prediction, Reason, Trajectory
@@ -31,32 +30,20 @@ SMALL_LAG_SHARE = 0.25
 
 
 def common_delay_s(
-    reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig
+    speeds_mm_s: Mapping[str, float], models: Mapping[str, Parameters], config: MachineConfig
 ) -> tuple[float, tuple[Reason, ...]]:
-    """Return tau, and ``LagTooLarge`` for axes whose own delay is so far from it that no offset may bridge it."""
-    delays, speeds = {}, {}
-    for axis in reference.axes:
-        path = reference.position_mm[axis]
-        if np.ptp(path) > 0.0:
-            delays[axis] = linear.delay_s(models[axis], config.axis[axis], reference.dt_s)
-            speeds[axis] = float(np.abs(np.diff(path)).max()) / reference.dt_s
-    tau = choose_delay_s(delays, speeds, config)
-    needed_um = {axis: abs(delay - tau) * speeds[axis] * 1e3 for axis, delay in delays.items()}
-    return tau, too_large(needed_um, config) if tau else ()
+    """Return tau, and ``LagTooLarge`` for axes whose own delay is so far from it that no offset may bridge it.
 
-
-def choose_delay_s(delays: Mapping[str, float], speeds_mm_s: Mapping[str, float], config: MachineConfig) -> float:
-    """Return tau: 0 where the offsets can make up for every axis' own delay at its speed, else amid their delays."""
-    small = (
-        abs(delay) * speeds_mm_s[axis] * 1e3 <= SMALL_LAG_SHARE * _allowed_um(config, axis)
-        for axis, delay in delays.items()
-    )
-    return 0.0 if all(small) else 0.5 * (min(delays.values()) + max(delays.values()))
-
-
-def _allowed_um(config: MachineConfig, axis: str) -> float:
-    limits = config.axis[axis].correction
-    return limits.max_offset_um if limits is not None else 0.0
+    It is 0 where the offsets can make up for every axis' own delay at its speed, else amid their delays.
+    """
+    period = config.machine.sync_period_s
+    delays = {axis: linear.delay_s(models[axis], config.axis[axis], period) for axis in speeds_mm_s}
+    small_um = {axis: SMALL_LAG_SHARE * allowed_um(config, axis) for axis in delays}
+    if all(abs(delay) * speeds_mm_s[axis] * 1e3 <= small_um[axis] for axis, delay in delays.items()):
+        return 0.0, ()
+    tau = 0.5 * (min(delays.values()) + max(delays.values()))
+    needed_um = {axis: abs(delay - tau) * speeds_mm_s[axis] * 1e3 for axis, delay in delays.items()}
+    return tau, too_large(needed_um, config)
 
 
 def delayed(path: Float, delay_rows: float) -> Float:
@@ -69,21 +56,22 @@ def delayed(path: Float, delay_rows: float) -> Float:
 
 def plan(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, _before: Prediction) -> Plan:
     """Return the offsets of the whole reference, block by block."""
-    tau, refused = common_delay_s(reference, models, config)
+    moving = [axis for axis, path in reference.position_mm.items() if np.ptp(path) > 0.0]
+    speeds = {axis: float(np.abs(np.diff(reference.position_mm[axis])).max()) / reference.dt_s for axis in moving}
+    tau, refused = common_delay_s(speeds, models, config)
     zero = np.zeros(reference.time_s.size)
     nothing = dict.fromkeys(reference.axes, zero)
     if refused:
         return Plan(nothing, tau, refused)
 
     def one(axis: str) -> tuple[Float, float]:
-        path = reference.position_mm[axis]
-        if np.ptp(path) == 0.0:
+        if axis not in moving:
             return zero, 0.0
+        path = reference.position_mm[axis]
         walk = AxisInverse.of(models[axis], config, axis, float(path[0]))
         return walk.whole(path, delayed(path, tau / reference.dt_s))
 
-    with ThreadPoolExecutor(max(1, len(reference.axes))) as pool:
-        found = dict(zip(reference.axes, pool.map(one, reference.axes), strict=True))
+    found = closed_loop.each_axis(one, reference.axes)
     refused = too_large({axis: needed for axis, (_, needed) in found.items()}, config)
     return Plan(nothing if refused else {axis: offset for axis, (offset, _) in found.items()}, tau, refused)
 

@@ -68,13 +68,10 @@ def _solve(d0: Float, d1: Float, d2: Float, b: Float) -> Float:
 
 
 @compiled
-def _newton(
-    value: Float, slack: Float, force: Float, limits: Float, mu: float, b: Float, diagonals: Float
-) -> tuple[float, float]:
-    """Add the bounds to the system (``b`` (n,), ``diagonals`` (3, n)); return the mean gap and the worst miss."""
+def _newton(value: Float, slack: Float, force: Float, limits: Float, mu: float, b: Float, diagonals: Float) -> float:
+    """Add the bounds to the system (``b`` (n,), ``diagonals`` (3, n)); return by how much the worst one misses."""
     n = b.size
     weight, push = np.empty(n), np.empty(n)
-    gap = 0.0
     miss = 0.0
     for c in range(3):
         for k in range(n):
@@ -82,13 +79,12 @@ def _newton(
             l1, l2 = force[2 * c, k], force[2 * c + 1, k]
             r1 = s1 + value[c, k] - limits[c]
             r2 = s2 - value[c, k] - limits[c]
-            gap += l1 * s1 + l2 * s2
             miss = max(miss, abs(r1) / limits[c], abs(r2) / limits[c])
             weight[k] = l1 / s1 + l2 / s2
             # with the forces of this iterate the two -l cancel those in the gradient
             push[k] = -(mu + l1 * r1) / s1 + (mu + l2 * r2) / s2
         _add_bound(push, weight, c, b, diagonals)
-    return gap / (6 * n), miss
+    return miss
 
 
 @compiled
@@ -131,11 +127,12 @@ def project(wanted: Float, limits: Float, start: Float) -> Float:
         slack[2 * c] = np.maximum(limits[c] - value[c], 0.1 * limits[c])
         slack[2 * c + 1] = np.maximum(limits[c] + value[c], 0.1 * limits[c])
     force = mu / slack
+    gap = mu  # the mean product of a slack and its force
     for _ in range(ITERATIONS):
         b = wanted - o
         diagonals[0] = 1.0
         diagonals[1:] = 0.0
-        gap, miss = _newton(value, slack, force, limits, mu, b, diagonals)
+        miss = _newton(value, slack, force, limits, mu, b, diagonals)
         if gap < 1e-7 * scale and miss < 1e-9:
             break
         move = _solve(diagonals[0], diagonals[1], diagonals[2], b)
@@ -143,7 +140,8 @@ def project(wanted: Float, limits: Float, start: Float) -> Float:
         primal, dual = _advance(value, step, slack, force, limits, mu)
         o += primal * move
         _differences(o, start, value)
-        mu = (0.1 if min(primal, dual) > 0.9 else 0.3) * ((slack * force).sum() / (6 * n))
+        gap = (slack * force).sum() / (6 * n)
+        mu = (0.1 if min(primal, dual) > 0.9 else 0.3) * gap
     return o
 
 

@@ -42,15 +42,15 @@ class Inverse:
         return np.asarray(back[self.pad : self.pad + error.size])
 
 
-def _without_dry_friction(parameters: Parameters, axis: Axis) -> tuple[Parameters, Axis]:
-    """The same loop without what is not linear: dry friction and limits."""
+def unlimited(parameters: Parameters, axis: Axis, dry_nm: float = 0.0) -> tuple[Parameters, Axis]:
+    """Return the same loop without limits, and with another dry friction: without any it is linear."""
     free = axis.regulators.model_copy(update={"current_limit_a": 1e9, "voltage_limit_v": 1e9})
-    return replace(parameters, Cd=0.0), axis.model_copy(update={"regulators": free})
+    return replace(parameters, Cd=dry_nm), axis.model_copy(update={"regulators": free})
 
 
 def delay_s(parameters: Parameters, axis: Axis, sync_period_s: float) -> float:
     """Return by how much the loop lags at constant speed: 0 with full feed-forward, (1 - Kff) / Kv with less."""
-    linear, free = _without_dry_friction(parameters, axis)
+    linear, free = unlimited(parameters, axis)
     ramp = np.arange(round(RAMP_S / sync_period_s), dtype=np.float64) * (sync_period_s * RAMP_MM_S)
     response = closed_loop.simulate(linear, free, sync_period_s, ramp)
     # the last rows look beyond the end, where the reference is held
@@ -59,7 +59,7 @@ def delay_s(parameters: Parameters, axis: Axis, sync_period_s: float) -> float:
 
 def inverse(parameters: Parameters, axis: Axis, sync_period_s: float, rows: int) -> Inverse:
     """Return the regularised zero-phase inverse of the axis' loop for blocks of up to ``rows`` rows."""
-    linear, free = _without_dry_friction(parameters, axis)
+    linear, free = unlimited(parameters, axis)
     ahead = round(AHEAD_S / sync_period_s)
     impulse = np.zeros(ahead + round(IMPULSE_S / sync_period_s))
     impulse[ahead] = 1.0

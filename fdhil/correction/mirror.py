@@ -29,13 +29,17 @@ def plan(
 
 def too_large(needed_um: Mapping[str, float], config: MachineConfig) -> tuple[Reason, ...]:
     """Return ``LagTooLarge`` for each axis whose largest offset is beyond its ceiling."""
-    reasons = []
-    for axis, needed in needed_um.items():
-        limits = config.axis[axis].correction
-        if limits is not None and not needed <= limits.max_offset_um:
-            feedforward = config.axis[axis].regulators.speed_feedforward
-            reasons.append(lag_reason(axis, needed, limits.max_offset_um, feedforward))
-    return tuple(reasons)
+    return tuple(
+        lag_reason(axis, needed, allowed_um(config, axis), config.axis[axis].regulators.speed_feedforward)
+        for axis, needed in needed_um.items()
+        if not needed <= allowed_um(config, axis)
+    )
+
+
+def allowed_um(config: MachineConfig, axis: str) -> float:
+    """Return the largest offset that an axis may have, 0 where writing is off."""
+    limits = config.axis[axis].correction
+    return limits.max_offset_um if limits is not None else 0.0
 
 
 def lag_reason(axis: str, needed_um: float, allowed_um: float, feedforward: float) -> Reason:

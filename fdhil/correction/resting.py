@@ -7,7 +7,7 @@ leads the current to the middle of the dry friction's band, and which one, by as
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -16,6 +16,7 @@ from scipy.linalg.lapack import dposv
 
 from fdhil.config import Axis
 from fdhil.correction import kernels
+from fdhil.correction.linear import unlimited
 from fdhil.model import closed_loop
 from fdhil.model.closed_loop import Commands, Ready, Response, State
 from fdhil.model.kernels import CURRENT_DEMAND, POSITION
@@ -38,7 +39,7 @@ class Resting:
     """The rests of one axis: what depends on its drive alone is found once."""
 
     def __init__(self, parameters: Parameters, axis: Axis, sync_period_s: float, increment_mm: float) -> None:
-        self._held = closed_loop.prepare(*_held(parameters, axis), sync_period_s)
+        self._held = closed_loop.prepare(*unlimited(parameters, axis, HELD_NM), sync_period_s)
         self._period_s, self._increment_mm = sync_period_s, increment_mm
         self._free, self._again = round(FREE_S / sync_period_s), round(AGAIN_S / sync_period_s)
         impulse = np.zeros(round((FREE_S + WATCHED_S) / sync_period_s))
@@ -76,12 +77,6 @@ def run_with(
     """Run a drive's next ``rows`` cycles with an offset in increments; both paths begin with the first of them."""
     ahead = min(rows + 2, reference_mm.size)  # a cycle looks two rows ahead and no further
     return drive.run(Commands(reference_mm[:ahead] + offset[:ahead] * increment_mm), state, 0, rows)
-
-
-def _held(parameters: Parameters, axis: Axis) -> tuple[Parameters, Axis]:
-    """The same drive with a table that nothing moves, and without limits."""
-    wide = axis.regulators.model_copy(update={"current_limit_a": 1e9, "voltage_limit_v": 1e9})
-    return replace(parameters, Cd=HELD_NM), axis.model_copy(update={"regulators": wide})
 
 
 def _demand(response: Response) -> Float:

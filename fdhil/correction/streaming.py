@@ -15,13 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.correction import gate, linear
+from fdhil.correction import gate
 from fdhil.correction.block import AxisLoop, Solution
-from fdhil.correction.inverse import AxisInverse, block_rows, choose_delay_s, delayed
+from fdhil.correction.inverse import AxisInverse, block_rows, common_delay_s, delayed
 from fdhil.correction.limits import check
 from fdhil.correction.mirror import lag_reason
-from fdhil.model import closed_loop
-from fdhil.model.closed_loop import Commands, Response, State
+from fdhil.model.closed_loop import Commands, Response, State, start
 from fdhil.prediction.contour import WINDOW_S, contour_error_um
 from fdhil.records import Float, Parameters, Reason
 
@@ -100,8 +99,12 @@ def stream(
         elif not path:
             return
         if not axes:
-            axes = {name: _axis(models[name], config, name, float(values[0])) for name, values in path.items()}
-            delay = _delay(models, config, axes)
+            axes = {
+                name: _Axis(name, AxisInverse.of(models[name], config, name, v[0]), start(v[0]))
+                for name, v in path.items()
+            }
+            # before any speed is known: as if every axis may run its rapid speed
+            delay, _ = common_delay_s({name: config.axis[name].rapid_speed_mm_s for name in path}, models, config)
         length = next(iter(path.values())).size - kept
         # one row more than the look-ahead tells that the path goes on
         while (length > block + ahead or piece is None) and not ended:
@@ -118,17 +121,6 @@ def stream(
             drop = max(0, kept + rows - window)
             path = {axis: values[drop:] for axis, values in path.items()}
             kept, row, length = kept + rows - drop, row + rows, length - rows
-
-
-def _axis(parameters: Parameters, config: MachineConfig, name: str, start_mm: float) -> _Axis:
-    return _Axis(name, AxisInverse.of(parameters, config, name, start_mm), closed_loop.start(start_mm))
-
-
-def _delay(models: Mapping[str, Parameters], config: MachineConfig, axes: Mapping[str, _Axis]) -> float:
-    """The common delay, chosen before any speed is known: as if every axis may run its rapid speed."""
-    delays = {name: linear.delay_s(models[name], config.axis[name], config.machine.sync_period_s) for name in axes}
-    speeds = {name: config.axis[name].rapid_speed_mm_s for name in axes}
-    return choose_delay_s(delays, speeds, config)
 
 
 def _solve(axis: _Axis, path: Float, kept: int, rows: int, delay_rows: float, ends: bool) -> _Piece:

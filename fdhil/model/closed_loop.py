@@ -8,10 +8,10 @@ interpolation. Encoder and set-points are not quantised: against a drive with 65
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +22,7 @@ from fdhil.model import kernels
 from fdhil.records import Float, Parameters
 
 State = npt.NDArray[np.float64]
+Work = TypeVar("Work")
 
 _EMPTY: Float = np.empty(0)
 
@@ -153,7 +154,12 @@ def simulate_axes(
             torque_offset_nm=(torque_offset_nm or {}).get(name),
         )
 
-    if len(reference_mm) == 1:
-        return {name: one(name) for name in reference_mm}
-    with ThreadPoolExecutor(len(reference_mm)) as pool:
-        return dict(zip(reference_mm, pool.map(one, reference_mm), strict=True))
+    return each_axis(one, reference_mm)
+
+
+def each_axis(work: Callable[[str], Work], axes: Collection[str]) -> dict[str, Work]:
+    """Return what ``work`` makes of each axis, one thread each."""
+    if len(axes) <= 1:
+        return {name: work(name) for name in axes}
+    with ThreadPoolExecutor(len(axes)) as pool:
+        return dict(zip(axes, pool.map(work, axes), strict=True))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -44,8 +43,7 @@ def _positions(
         )
         return np.array(moved), np.array(steps), here
 
-    with ThreadPoolExecutor(max(1, len(reference.axes))) as pool:
-        return dict(zip(reference.axes, pool.map(one, reference.axes), strict=True))
+    return closed_loop.each_axis(one, reference.axes)
 
 
 def contour_std_um(
