@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -307,7 +307,7 @@ def _zones(predicted: Prediction) -> list[dict[str, Any]]:
 
 
 def _reasons(reasons: Sequence[Reason]) -> list[dict[str, str]]:
-    return [{"code": r.code, "text": r.text, "advice": r.advice} for r in reasons]
+    return [asdict(reason) for reason in reasons]
 
 
 def _correction_document(program: str, planned: Correction, predicted: Gain) -> dict[str, Any]:
