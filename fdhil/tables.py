@@ -15,11 +15,13 @@ ESTIMATORS: Mapping[str, str] = {
     "instrumental_variables": "fdhil.identification.estimators.instrumental_variables:estimate",
     "maximum_likelihood": "fdhil.identification.estimators.maximum_likelihood:estimate",
 }
+DEFAULT_ESTIMATOR = "maximum_likelihood"
 CORRECTIONS: Mapping[str, str] = {
     "mirror": "fdhil.correction.mirror:plan",
     "flatness": "fdhil.correction.flatness:plan",
     "inverse": "fdhil.correction.inverse:plan",
 }
+DEFAULT_CORRECTION = "inverse"
 REGULATORS: Mapping[str, str] = {
     "p_pi_pi": "fdhil.model.p_pi_pi:prepare",
     "double_pi": "fdhil.model.double_pi:prepare",

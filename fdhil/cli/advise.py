@@ -134,7 +134,7 @@ def _corrected(reference: Trajectory, models: Mapping[str, Parameters], config: 
     import numpy as np
 
     from fdhil import correction
-    from fdhil.prediction import inverse_dynamics as load
+    from fdhil.prediction.inverse_dynamics import required
 
     planned = correction.plan(reference, models, config)
     if not planned.refused:
@@ -144,7 +144,7 @@ def _corrected(reference: Trajectory, models: Mapping[str, Parameters], config: 
         if zone.cause == "saturation":
             fault |= (reference.time_s >= zone.start_s) & (reference.time_s < zone.end_s)
     for axis in reference.axes:
-        asked = load.required(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s)
+        asked = required(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s)
         limits = config.axis[axis].correction
         room_um = limits.max_offset_um if limits else 0.0
         fault |= (np.maximum(*asked) > 1.0) | (np.abs(before.error_um[axis]) > room_um)

@@ -1,4 +1,4 @@
-"""Shows people the advice of ``fdhil advise``: lines that follow each other in one range, the worst of each by name."""
+"""Prints the advice of ``fdhil advise``: lines that follow each other in one range, the worst of each by name."""
 
 from __future__ import annotations
 

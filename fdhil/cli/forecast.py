@@ -1,6 +1,4 @@
-"""Adds the past to ``fdhil predict --from-history``: what a step of a parameter costs, what became of each zone since
-the last time, and when it leaves a tolerance.
-"""
+"""Adds to ``fdhil predict --from-history`` what a step costs, each zone's change, and when it leaves a tolerance."""
 
 from __future__ import annotations
 
@@ -85,7 +83,7 @@ def comparison(
         name=program.name,
         config_digest=config.digest,
         used={axis: UsedParameters(newest.get(axis, 0), models[axis]) for axis in predicted.reference.axes},
-        rms_um=float((predicted.contour_um @ predicted.contour_um / predicted.contour_um.size) ** 0.5),
+        rms_um=predicted.rms_um,
         zones=tuple({key: zone[key] for key in KEPT} for zone in zones),
     )
 

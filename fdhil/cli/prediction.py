@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +15,7 @@ from fdhil import tables
 from fdhil.cli.compiling import forewarn
 from fdhil.cli.options import OutputFile, Positive, Writing
 from fdhil.cli.parameter_view import MEANING
-from fdhil.records import INTERVAL_95
+from fdhil.records import INTERVAL_95, rms
 
 if TYPE_CHECKING:
     from fdhil.cli.forecast import Past
@@ -145,8 +145,8 @@ def _with_history(
     reference, zones = predicted.reference, document["zones"]
     std_um = prediction.contour_std_um(reference, models, _covariances(reference, past), config)
     document["contour"]["max_std_um"] = float(std_um.max())
-    for zone, row in zip(zones, _peak_rows(predicted), strict=True):
-        zone["std_um"] = float(std_um[row])
+    for entry, zone in zip(zones, predicted.zones, strict=True):
+        entry["std_um"] = float(std_um[predicted.worst_row(zone)])
     steps = forecast.steps(past, predicted, models, config, since)
     document["steps"] = forecast.step_entries(steps)
     now = forecast.comparison(program, digest, past, predicted, models, config, zones)
@@ -239,13 +239,6 @@ def _covariances(reference: Trajectory, past: Past) -> dict[str, Float]:
     return {axis: known.get(axis, np.zeros((6, 6))) for axis in reference.axes}
 
 
-def _peak_rows(predicted: Prediction) -> list[int]:
-    """Return the row of the largest contour error of each zone."""
-    start, dt_s = float(predicted.reference.time_s[0]), predicted.reference.dt_s
-    ranges = ((round((z.start_s - start) / dt_s), round((z.end_s - start) / dt_s)) for z in predicted.zones)
-    return [first + int(predicted.contour_um[first:last].argmax()) for first, last in ranges]
-
-
 def _prediction_columns(predicted: Prediction) -> dict[str, tuple[Float, int]]:
     """Return the columns of the CSV: header -> values (n,) and decimals."""
     reference = predicted.reference
@@ -284,18 +277,14 @@ def _write(path: Path, columns: Mapping[str, tuple[Float, int]]) -> None:
 
 
 def _contour(predicted: Prediction) -> dict[str, float]:
-    return {"rms_um": _rms(predicted.contour_um), "max_um": float(predicted.contour_um.max())}
-
-
-def _rms(values: Float) -> float:
-    return float((values @ values / values.size) ** 0.5)
+    return {"rms_um": predicted.rms_um, "max_um": float(predicted.contour_um.max())}
 
 
 def _prediction_document(predicted: Prediction) -> dict[str, Any]:
     return {
         "duration_s": round(float(predicted.reference.time_s[-1] - predicted.reference.time_s[0]), 6),
         "axes": {
-            axis: {"rms_error_um": _rms(error), "max_error_um": float(abs(error).max())}
+            axis: {"rms_error_um": rms(error), "max_error_um": float(abs(error).max())}
             for axis, error in predicted.error_um.items()
         },
         "contour": _contour(predicted),
@@ -309,16 +298,16 @@ def _zones(predicted: Prediction) -> list[dict[str, Any]]:
             "start_s": z.start_s,
             "end_s": z.end_s,
             "where": z.where,
-            "line": int(predicted.reference.line[row]),
+            "line": int(predicted.reference.line[predicted.worst_row(z)]),
             "max_um": z.max_um,
             "cause": z.cause,
         }
-        for z, row in zip(predicted.zones, _peak_rows(predicted), strict=True)
+        for z in predicted.zones
     ]
 
 
 def _reasons(reasons: Sequence[Reason]) -> list[dict[str, str]]:
-    return [{"code": r.code, "text": r.text, "advice": r.advice} for r in reasons]
+    return [asdict(reason) for reason in reasons]
 
 
 def _correction_document(program: str, planned: Correction, predicted: Gain) -> dict[str, Any]:

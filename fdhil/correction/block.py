@@ -1,4 +1,4 @@
-"""One axis, one block: offsets, in whole increments and inside their limits, that keep the table on its target.
+"""Solves one block of one axis: offsets, in whole increments and inside their limits, that keep it on its target.
 
 The offset is improved by iteration: simulate the closed loop with it, put the remaining error through the inverse of
 the linear loop, add. Two things are not left to the iteration. The limits hold at every step. And where the axis rests,
@@ -9,15 +9,14 @@ current to the middle of the dry friction's band and keeps the position loop sil
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
 from fdhil.config import Axis
-from fdhil.correction.limits import Limits, check, fit
+from fdhil.correction.limits import PlanLimits, check, fit
 from fdhil.correction.linear import Inverse
-from fdhil.correction.resting import Resting
-from fdhil.model.closed_loop import Commands, Ready, Response, State
+from fdhil.correction.resting import Resting, run_with
+from fdhil.model.closed_loop import Ready, Response, State
 from fdhil.records import Bool, Float, Parameters
 
 ITERATIONS = 8
@@ -41,7 +40,7 @@ class AxisLoop:
     parameters: Parameters
     axis: Axis
     sync_period_s: float
-    limits: Limits
+    limits: PlanLimits
     drive: Ready
     inverse: Inverse
     resting: Resting
@@ -51,10 +50,14 @@ class AxisLoop:
         """Millimetres per drive increment."""
         return self.limits.um_per_increment * 1e-3
 
+    def run(self, reference_mm: Float, offset: Float, state: State, first: int, stop: int) -> Response:
+        """Run rows ``first`` .. ``stop`` of a block with an offset in increments."""
+        return run_with(self.drive, reference_mm[first:], offset[first:], self.increment_mm, state, stop - first)
+
 
 @dataclass(frozen=True, slots=True)
 class Carry:
-    """What a block hands to the next: the state at its first row, the increments fixed ahead of and in it, a guess.
+    """The hand-over to the next block: the state at its first row, the increments fixed ahead of and in it, a guess.
 
     ``fixed`` (2,): offsets of the next block's first two rows, which the last cycles have already used. ``guess`` (m,):
     unrounded offsets found for the rows that were looked at.
@@ -171,7 +174,7 @@ def _run(
             continue
         # dry friction takes hold early in a rest or not at all
         look = min(stop, max(first, done) + round(SEARCH_S / loop.sync_period_s))
-        response = _simulate(loop, reference_mm, offset, state, done, look)
+        response = loop.run(reference_mm, offset, state, done, look)
         position[done:look] = response.position_mm
         stuck = _stuck(loop, response, target_mm[done:look], max(first - done, 0))
         if stuck is None:
@@ -181,24 +184,17 @@ def _run(
         state = response.state_at(stuck)
         if lead:
             _hold(loop, reference_mm, offset, state, row, stop)
-        response = _simulate(loop, reference_mm, offset, state, row, stop)
+        response = loop.run(reference_mm, offset, state, row, stop)
         position[row:stop], state, done = response.position_mm, response.end, stop
         held[row:stop] = True
         gone = np.maximum(0.0, 1 - np.arange(stop - row) * loop.sync_period_s / FORGET_S)
         error_of_rest[row:stop] = (target_mm[row] - position[row]) * gone
     if done < guess.size:
-        position[done:] = _simulate(loop, reference_mm, offset, state, done, guess.size).position_mm
+        position[done:] = loop.run(reference_mm, offset, state, done, guess.size).position_mm
     if held.any() and check(offset[2:].astype(np.int64), loop.limits, before):
         offset[2:] = np.rint(fit(offset[2:], loop.limits, before))
-        position = _simulate(loop, reference_mm, offset, carry.state, 0, guess.size).position_mm
+        position = loop.run(reference_mm, offset, carry.state, 0, guess.size).position_mm
     return offset, position, np.where(held, error_of_rest, target_mm - position)
-
-
-def _simulate(loop: AxisLoop, reference_mm: Float, offset: Float, state: State, first: int, stop: int) -> Response:
-    # a cycle looks two rows ahead and no further
-    ahead = min(stop + 2, reference_mm.size)
-    commanded = reference_mm[first:ahead] + offset[first:ahead] * loop.increment_mm
-    return loop.drive.run(Commands(commanded), state, 0, stop - first)
 
 
 def _stuck(loop: AxisLoop, response: Response, target_mm: Float, first: int) -> int | None:
@@ -226,13 +222,7 @@ def _hold(loop: AxisLoop, reference_mm: Float, offset: Float, state: State, row:
 
 def _fade(rows: int, sync_period_s: float) -> Float:
     """A smooth factor (rows,) from 1 down to 0 within ``FADE_S``."""
+    share = np.minimum(np.arange(1, min(rows, int(np.ceil(FADE_S / sync_period_s))) + 1) * sync_period_s / FADE_S, 1.0)
     factor = np.zeros(rows)
-    begin = _beginning(sync_period_s)[:rows]
-    factor[: begin.size] = begin
+    factor[: share.size] = 0.5 * (1 + np.cos(np.pi * share))
     return factor
-
-
-@lru_cache(maxsize=4)
-def _beginning(sync_period_s: float) -> Float:
-    share = np.minimum(np.arange(1, np.ceil(FADE_S / sync_period_s) + 1) * sync_period_s / FADE_S, 1.0)
-    return np.asarray(0.5 * (1 + np.cos(np.pi * share)))

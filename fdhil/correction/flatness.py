@@ -1,4 +1,4 @@
-"""On-line feed-forward: the drive is flat, its position tells speed and torque ([ROT 99] as [DES] proposes).
+"""Plans an on-line feed-forward: the drive is flat, its position tells speed and torque ([ROT 99] as [DES] proposes).
 
 With w = r' 2 pi / pitch, equation [2] gives the torque Jt w' + ft w + Cd sign(w) that follows the path; sent as torque
 offset (0x60B2), the speed loop has only the model's error left to do. What the drive's own feed-forward leaves out of

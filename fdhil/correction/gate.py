@@ -1,16 +1,17 @@
-"""The gate: what is not predicted to help is not sent, and every refusal says what to do about it."""
+"""The gate refuses what is not predicted to help, and says with every refusal what to do about it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
+from scipy.ndimage import distance_transform_edt, maximum_filter1d
 
 from fdhil.config import MachineConfig, share_fault
-from fdhil.correction import feed
+from fdhil.prediction.inverse_dynamics import held_share, required
 from fdhil.records import Bool, Float, Parameters, Prediction, Reason, Trajectory
 
+STEADY_S = 0.02  # a limit that acts shorter than this in all costs no more than a settling
 NEAR_SHARE = 0.95  # of a current or voltage limit: worth a warning
 LEAST_GAIN = 1.05  # before / after RMS
 NOTHING_UM = 0.05  # an RMS below this is nothing to correct
@@ -43,19 +44,20 @@ def demand(
 ) -> tuple[tuple[Reason, ...], tuple[Reason, ...]]:
     """Return (refused, warnings): no offset helps a drive whose current or voltage is at its limit."""
     refused, warnings = [], []
-    limited = feed.steadily_limited(before.limited_s)
     for axis in reference.axes:
-        load = feed.required(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s)
-        share, what = max((load.current_share, "current"), (load.voltage_share, "voltage"))
-        place = " ".join(f"{a} {reference.position_mm[a][load.row]:.1f}" for a in reference.axes)
-        if share > 1.0 or axis in limited:
+        asked = required(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s)
+        share, what = max(zip((float(one.max()) for one in asked), ("current", "voltage"), strict=True))
+        place = reference.place(int(np.argmax(np.maximum(*asked))))
+        if share > 1.0 or before.limited_s[axis] > STEADY_S:
             refused.append((axis, share, what, place))
         elif share > NEAR_SHARE or before.limited_s[axis] > 0.0 or _peak_share(before, axis, config) > NEAR_SHARE:
             text = f"axis {axis} comes near its {what} limit at {place}: little is left for a disturbance"
             warnings.append(Reason("NearLimit", text, "lower the feed if the path error matters there"))
     if not refused:
         return (), tuple(warnings)
-    advice = _held(reference, models, config)
+    held = held_share(reference, models, config)
+    fastest = float(np.linalg.norm(np.diff(reference.path_mm, axis=0), axis=1).max()) / reference.dt_s * 0.06
+    advice = f"a feed of {held * fastest:.1f} m/min ({held * 100:.0f} % of {fastest:.1f}) can be held, or smooth more"
     return tuple(
         Reason(
             "DemandTooHigh",
@@ -71,13 +73,6 @@ def _peak_share(before: Prediction, axis: str, config: MachineConfig) -> float:
     return float(np.abs(before.current_a[axis]).max()) / config.axis[axis].regulators.current_limit_a
 
 
-def _held(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> str:
-    share = feed.held_share(reference, models, config)
-    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
-    fastest = float(np.linalg.norm(np.diff(path, axis=0), axis=1).max()) / reference.dt_s * 0.06
-    return f"a feed of {share * fastest:.1f} m/min ({share * 100:.0f} % of {fastest:.1f}) can be held, or smooth more"
-
-
 def worse_rows(before_um: Float, after_um: Float, dt_s: float) -> Bool:
     """Return (n,) the rows of zones whose largest contour error the correction would raise by more than 1 um."""
     size = 2 * round(ZONE_S / dt_s) + 1
@@ -87,27 +82,10 @@ def worse_rows(before_um: Float, after_um: Float, dt_s: float) -> Bool:
 
 def fade(worse: Bool, dt_s: float) -> Float:
     """Return a factor (n,): 0 in and around the rows that get worse, 1 far from them, smooth in between."""
-    rows = np.flatnonzero(worse)
-    if rows.size == 0:
+    if not worse.any():
         return np.ones(worse.size)
-    here = np.arange(worse.size)
-    after = np.searchsorted(rows, here)
-    distance = np.minimum(
-        np.abs(here - rows[np.minimum(after, rows.size - 1)]), np.abs(here - rows[np.maximum(after - 1, 0)])
-    )
-    ratio = np.clip((distance * dt_s - MASK_S) / FADE_S, 0.0, 1.0)
+    ratio = np.clip((distance_transform_edt(~worse) * dt_s - MASK_S) / FADE_S, 0.0, 1.0)
     return np.asarray(ratio**3 * (10 - 15 * ratio + 6 * ratio**2))
-
-
-def gain(before: Prediction, after: Prediction) -> float:
-    """Return the RMS of the contour error without the correction over that with it."""
-    then, now = rms(before.contour_um), rms(after.contour_um)
-    return then / now if now > 0 else 1.0
-
-
-def rms(values: Float) -> float:
-    """Return the root mean square of (n,)."""
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def gains(then_um: float, now_um: float) -> tuple[Reason, ...]:
@@ -122,7 +100,7 @@ def gains(then_um: float, now_um: float) -> tuple[Reason, ...]:
 
 def result(before: Prediction, after: Prediction, untouched: bool = False) -> tuple[Reason, ...]:
     """Refuse a correction that is not predicted to help as a whole, or (unless ``untouched``) makes a zone worse."""
-    none = gains(rms(before.contour_um), rms(after.contour_um))
+    none = gains(before.rms_um, after.rms_um)
     if none:
         return none
     worse = np.flatnonzero(worse_rows(before.contour_um, after.contour_um, before.reference.dt_s))

@@ -1,4 +1,4 @@
-"""Inverse correction: offsets that keep each table on r(t - tau), with one delay tau for all axes.
+"""Plans the inverse correction: offsets that keep each table on r(t - tau), with one delay tau for all axes.
 
 Aiming at the path, not at the clock, lets a drive that lags keep its lag: only where the axes lag by different times,
 or where the lag changes, are offsets needed. The path is worked through in blocks with a look-ahead, each from the
@@ -9,19 +9,18 @@ end.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.correction import linear
 from fdhil.correction.block import AxisLoop, Carry, Solution, solve
-from fdhil.correction.limits import Limits
+from fdhil.correction.limits import PlanLimits
 from fdhil.correction.method import Plan
-from fdhil.correction.mirror import lag_reason
+from fdhil.correction.mirror import allowed_um, too_large
 from fdhil.correction.resting import Resting
 from fdhil.model import closed_loop
-from fdhil.model.closed_loop import Commands
 from fdhil.records import Float, Parameters, Prediction, Reason, Trajectory
 
 BLOCK_S = 2.0
@@ -31,36 +30,20 @@ SMALL_LAG_SHARE = 0.25
 
 
 def common_delay_s(
-    reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig
+    speeds_mm_s: Mapping[str, float], models: Mapping[str, Parameters], config: MachineConfig
 ) -> tuple[float, tuple[Reason, ...]]:
-    """Return tau, and ``LagTooLarge`` for axes whose own delay is so far from it that no offset may bridge it."""
-    delays, speeds = {}, {}
-    for axis in reference.axes:
-        path = reference.position_mm[axis]
-        if np.ptp(path) > 0.0:
-            delays[axis] = linear.delay_s(models[axis], config.axis[axis], reference.dt_s)
-            speeds[axis] = float(np.abs(np.diff(path)).max()) / reference.dt_s
-    tau = choose_delay_s(delays, speeds, config)
-    refused = []
-    for axis, delay in delays.items() if tau else ():
-        needed, room = abs(delay - tau) * speeds[axis] * 1e3, _allowed_um(config, axis)
-        if needed > room:
-            refused.append(lag_reason(axis, needed, room, config.axis[axis].regulators.speed_feedforward))
-    return tau, tuple(refused)
+    """Return tau, and ``LagTooLarge`` for axes whose own delay is so far from it that no offset may bridge it.
 
-
-def choose_delay_s(delays: Mapping[str, float], speeds_mm_s: Mapping[str, float], config: MachineConfig) -> float:
-    """Return tau: 0 where the offsets can make up for every axis' own delay at its speed, else amid their delays."""
-    small = (
-        abs(delay) * speeds_mm_s[axis] * 1e3 <= SMALL_LAG_SHARE * _allowed_um(config, axis)
-        for axis, delay in delays.items()
-    )
-    return 0.0 if all(small) else 0.5 * (min(delays.values()) + max(delays.values()))
-
-
-def _allowed_um(config: MachineConfig, axis: str) -> float:
-    limits = config.axis[axis].correction
-    return limits.max_offset_um if limits is not None else 0.0
+    It is 0 where the offsets can make up for every axis' own delay at its speed, else amid their delays.
+    """
+    period = config.machine.sync_period_s
+    delays = {axis: linear.delay_s(models[axis], config.axis[axis], period) for axis in speeds_mm_s}
+    small_um = {axis: SMALL_LAG_SHARE * allowed_um(config, axis) for axis in delays}
+    if all(abs(delay) * speeds_mm_s[axis] * 1e3 <= small_um[axis] for axis, delay in delays.items()):
+        return 0.0, ()
+    tau = 0.5 * (min(delays.values()) + max(delays.values()))
+    needed_um = {axis: abs(delay - tau) * speeds_mm_s[axis] * 1e3 for axis, delay in delays.items()}
+    return tau, too_large(needed_um, config)
 
 
 def delayed(path: Float, delay_rows: float) -> Float:
@@ -73,71 +56,76 @@ def delayed(path: Float, delay_rows: float) -> Float:
 
 def plan(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, _before: Prediction) -> Plan:
     """Return the offsets of the whole reference, block by block."""
-    tau, refused = common_delay_s(reference, models, config)
+    moving = [axis for axis, path in reference.position_mm.items() if np.ptp(path) > 0.0]
+    speeds = {axis: float(np.abs(np.diff(reference.position_mm[axis])).max()) / reference.dt_s for axis in moving}
+    tau, refused = common_delay_s(speeds, models, config)
     zero = np.zeros(reference.time_s.size)
+    nothing = dict.fromkeys(reference.axes, zero)
     if refused:
-        return Plan(dict.fromkeys(reference.axes, zero), tau, refused)
+        return Plan(nothing, tau, refused)
 
     def one(axis: str) -> tuple[Float, float]:
-        path = reference.position_mm[axis]
-        if np.ptp(path) == 0.0:
+        if axis not in moving:
             return zero, 0.0
-        return solve_axis(axis_loop(models[axis], config, axis), path, delayed(path, tau / reference.dt_s))
+        path = reference.position_mm[axis]
+        walk = AxisInverse.of(models[axis], config, axis, float(path[0]))
+        return walk.whole(path, delayed(path, tau / reference.dt_s))
 
-    with ThreadPoolExecutor(max(1, len(reference.axes))) as pool:
-        found = dict(zip(reference.axes, pool.map(one, reference.axes), strict=True))
-    refused = tuple(
-        lag_reason(axis, needed, _allowed_um(config, axis), config.axis[axis].regulators.speed_feedforward)
-        for axis, (_, needed) in found.items()
-        if needed > _allowed_um(config, axis)
-    )
-    if refused:
-        return Plan(dict.fromkeys(reference.axes, zero), tau, refused)
-    return Plan({axis: offset for axis, (offset, _) in found.items()}, tau)
+    found = closed_loop.each_axis(one, reference.axes)
+    refused = too_large({axis: needed for axis, (_, needed) in found.items()}, config)
+    return Plan(nothing if refused else {axis: offset for axis, (offset, _) in found.items()}, tau, refused)
 
 
-def axis_loop(parameters: Parameters, config: MachineConfig, axis: str) -> AxisLoop:
-    """Return what the blocks of one axis share; ValueError when writing is off for it."""
-    period = config.machine.sync_period_s
-    rows = round((BLOCK_S + LOOK_AHEAD_S) / period)
-    limits, drive = Limits.of(config.axis[axis], period), config.axis[axis]
-    return AxisLoop(
-        parameters,
-        drive,
-        period,
-        limits,
-        closed_loop.prepare(parameters, drive, period),
-        linear.inverse(parameters, drive, period, rows),
-        Resting(parameters, drive, period, limits.um_per_increment * 1e-3),
-    )
+@dataclass(slots=True)
+class AxisInverse:
+    """The inverse of one axis, worked through block by block: ``carry`` is what the last block left."""
+
+    loop: AxisLoop
+    carry: Carry
+
+    @staticmethod
+    def of(parameters: Parameters, config: MachineConfig, axis: str, start_mm: float) -> AxisInverse:
+        """Return it at rest at ``start_mm``, without an offset; ValueError when writing is off for the axis."""
+        period, drive = config.machine.sync_period_s, config.axis[axis]
+        limits = PlanLimits.of(drive, period)
+        loop = AxisLoop(
+            parameters,
+            drive,
+            period,
+            limits,
+            closed_loop.prepare(parameters, drive, period),
+            linear.inverse(parameters, drive, period, sum(block_rows(period))),
+            Resting(parameters, drive, period, limits.um_per_increment * 1e-3),
+        )
+        return AxisInverse(loop, Carry(closed_loop.start(start_mm), np.zeros(2), np.empty(0)))
+
+    def block(self, reference_mm: Float, target_mm: Float, rows: int, ends: bool) -> Solution:
+        """Solve the next ``rows``, with what is known of the rows behind them, and go on to those.
+
+        ``ends``: there are none.
+        """
+        loop, carry = self.loop, self.carry
+        solution = solve(loop, reference_mm, target_mm, carry, ends)
+        if not ends:
+            state = loop.run(reference_mm, solution.offset, carry.state, 0, rows).end
+            self.carry = Carry(state, solution.offset[rows : rows + 2], solution.guess[rows:])
+        return solution
+
+    def whole(self, reference_mm: Float, target_mm: Float) -> tuple[Float, float]:
+        """Return the offsets (n,) in um of a path that is known to its end, and the largest one that it needs."""
+        block, ahead = block_rows(self.loop.sync_period_s)
+        offsets, needed, first, ends = [], 0.0, 0, False
+        while not ends:
+            stop = min(first + block + ahead, reference_mm.size)
+            ends = stop == reference_mm.size
+            rows = stop - first if ends else block
+            solution = self.block(reference_mm[first:stop], target_mm[first:stop], rows, ends)
+            needed = max(needed, solution.needed_um)
+            offsets.append(solution.offset[:rows])
+            first += rows
+        return np.concatenate(offsets) * self.loop.limits.um_per_increment, needed
 
 
-def solve_axis(loop: AxisLoop, reference_mm: Float, target_mm: Float) -> tuple[Float, float]:
-    """Return the offsets (n,) in um of one axis along its whole reference, and the largest one it needs."""
-    block, ahead = round(BLOCK_S / loop.sync_period_s), round(LOOK_AHEAD_S / loop.sync_period_s)
-    carry = first_carry(float(reference_mm[0]))
-    pieces = []
-    needed = 0.0
-    for start in range(0, reference_mm.size, block):
-        stop = min(start + block + ahead, reference_mm.size)
-        ends = stop == reference_mm.size
-        solution = solve(loop, reference_mm[start:stop], target_mm[start:stop], carry, ends)
-        needed = max(needed, solution.needed_um)
-        pieces.append((solution.offset if ends else solution.offset[:block]) * loop.limits.um_per_increment)
-        if ends:
-            break
-        carry = following(loop, reference_mm[start:stop], solution, carry, block)
-    return np.concatenate(pieces), needed
-
-
-def first_carry(position_mm: float) -> Carry:
-    """Return what the first block starts from: an axis at rest on its reference, without an offset."""
-    return Carry(closed_loop.start(position_mm), np.zeros(2), np.empty(0))
-
-
-def following(loop: AxisLoop, reference_mm: Float, solution: Solution, carry: Carry, block: int) -> Carry:
-    """Return what the block after the first ``block`` rows of this one starts from."""
-    ahead = min(block + 2, reference_mm.size)
-    commanded = reference_mm[:ahead] + solution.offset[:ahead] * loop.increment_mm
-    head = loop.drive.run(Commands(commanded), carry.state, 0, block)
-    return Carry(head.end, solution.offset[block : block + 2], solution.guess[block:])
+def block_rows(sync_period_s: float) -> tuple[int, int]:
+    """Return how many rows a block has, and how many are looked at behind it."""
+    return round(BLOCK_S / sync_period_s), round(LOOK_AHEAD_S / sync_period_s)

@@ -1,54 +1,47 @@
-"""The compiled projection onto what an offset may do."""
+"""Compiled kernels project an offset onto what it may do, measure it and round it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from numba import njit
 
+from fdhil.model.compiled import compiled
 from fdhil.records import Float
 
 ITERATIONS = 60
 
 
-def _differences_plain(o: Float, start: Float, which: int) -> Float:
-    """Return o (0), its first (1) or its second (2) difference, each (n,); ``start`` = [o before, o before that]."""
-    n = o.size
-    out = np.empty(n)
-    for k in range(n):
+# an offset, its first and its second difference, as weights on a row and the rows before it
+DIFFERENCES = np.array([[1.0, 0.0, 0.0], [1.0, -1.0, 0.0], [1.0, -2.0, 1.0]])
+
+
+@compiled
+def _differences(o: Float, start: Float, into: Float) -> None:
+    """Write o and its differences into the rows of ``into`` (3, n); ``start`` = [o before, o before that]."""
+    for k in range(o.size):
         one = o[k - 1] if k >= 1 else start[0]
-        two = o[k - 2] if k >= 2 else (start[0] if k == 1 else start[1])
-        if which == 0:
-            out[k] = o[k]
-        elif which == 1:
-            out[k] = o[k] - one
-        else:
-            out[k] = o[k] - 2.0 * one + two
-    return out
+        two = o[k - 2] if k >= 2 else start[1 - k]
+        into[0, k] = o[k]
+        into[1, k] = o[k] - one
+        into[2, k] = o[k] - 2.0 * one + two
 
 
-_differences: Callable[[Float, Float, int], Float] = njit(cache=True, nogil=True)(_differences_plain)
-
-
-def _scatter_plain(force: Float, which: int, into: Float) -> None:
-    """Add the transposed difference of ``force`` (n,) to ``into`` (n,)."""
-    n = force.size
+@compiled
+def _add_bound(force: Float, weight: Float, which: int, b: Float, diagonals: Float) -> None:
+    """Add to the system C' ``force`` (n,) and C' diag(``weight``) C, with C the difference ``which``."""
+    own = DIFFERENCES[which]
+    n = b.size
     for k in range(n):
-        if which == 0:
-            into[k] += force[k]
-        elif which == 1:
-            into[k] += force[k] - (force[k + 1] if k + 1 < n else 0.0)
-        else:
-            one = force[k + 1] if k + 1 < n else 0.0
-            two = force[k + 2] if k + 2 < n else 0.0
-            into[k] += force[k] - 2.0 * one + two
+        total = force[k]
+        for j in range(1, min(which + 1, n - k)):
+            total += own[j] * force[k + j]
+        b[k] += total
+        for i in range(min(which, k) + 1):
+            for j in range(i, min(which, k) + 1):
+                diagonals[j - i, k - j] += own[i] * own[j] * weight[k]
 
 
-_scatter: Callable[[Float, int, Float], None] = njit(cache=True, nogil=True)(_scatter_plain)
-
-
-def _solve_plain(d0: Float, d1: Float, d2: Float, b: Float) -> Float:
+@compiled
+def _solve(d0: Float, d1: Float, d2: Float, b: Float) -> Float:
     """Solve a symmetric positive pentadiagonal system in place; d1[k], d2[k] couple row k to k + 1 and k + 2."""
     n = b.size
     for k in range(n):
@@ -74,63 +67,11 @@ def _solve_plain(d0: Float, d1: Float, d2: Float, b: Float) -> Float:
     return x
 
 
-_solve: Callable[[Float, Float, Float, Float], Float] = njit(cache=True, nogil=True)(_solve_plain)
-
-
-def _weigh_plain(weight: Float, which: int, d0: Float, d1: Float, d2: Float) -> None:
-    """Add C' diag(weight) C of a difference to the three diagonals."""
-    n = weight.size
-    for k in range(n):
-        g = weight[k]
-        if which == 0:
-            d0[k] += g
-        elif which == 1:
-            d0[k] += g
-            if k >= 1:
-                d0[k - 1] += g
-                d1[k - 1] -= g
-        else:
-            d0[k] += g
-            if k >= 1:
-                d0[k - 1] += 4.0 * g
-                d1[k - 1] -= 2.0 * g
-            if k >= 2:
-                d0[k - 2] += g
-                d1[k - 2] -= 2.0 * g
-                d2[k - 2] += g
-
-
-_weigh: Callable[[Float, int, Float, Float, Float], None] = njit(cache=True, nogil=True)(_weigh_plain)
-
-
-def _all_differences_plain(o: Float, start: Float, into: Float) -> None:
-    """Write o and its first two differences into the three rows of ``into`` (3, n)."""
-    for c in range(3):
-        into[c] = _differences(o, start, c)
-
-
-_all_differences: Callable[[Float, Float, Float], None] = njit(cache=True, nogil=True)(_all_differences_plain)
-
-
-def _begin_plain(value: Float, limits: Float, mu: float, slack: Float, force: Float) -> None:
-    """Set slacks (6, n) well inside the limits and the forces that belong to them; row 2 c + side is one bound."""
-    for bound in range(6):
-        c, sign = bound // 2, 1.0 - 2.0 * (bound % 2)
-        for k in range(value.shape[1]):
-            slack[bound, k] = max(limits[c] - sign * value[c, k], 0.1 * limits[c])
-            force[bound, k] = mu / slack[bound, k]
-
-
-_begin: Callable[[Float, Float, float, Float, Float], None] = njit(cache=True, nogil=True)(_begin_plain)
-
-
-def _newton_plain(
-    value: Float, slack: Float, force: Float, limits: Float, mu: float, b: Float, diagonals: Float
-) -> tuple[float, float]:
-    """Add the bounds to the system (``b`` (n,), ``diagonals`` (3, n)); return the mean gap and the worst miss."""
+@compiled
+def _newton(value: Float, slack: Float, force: Float, limits: Float, mu: float, b: Float, diagonals: Float) -> float:
+    """Add the bounds to the system (``b`` (n,), ``diagonals`` (3, n)); return by how much the worst one misses."""
     n = b.size
     weight, push = np.empty(n), np.empty(n)
-    gap = 0.0
     miss = 0.0
     for c in range(3):
         for k in range(n):
@@ -138,103 +79,74 @@ def _newton_plain(
             l1, l2 = force[2 * c, k], force[2 * c + 1, k]
             r1 = s1 + value[c, k] - limits[c]
             r2 = s2 - value[c, k] - limits[c]
-            gap += l1 * s1 + l2 * s2
             miss = max(miss, abs(r1) / limits[c], abs(r2) / limits[c])
             weight[k] = l1 / s1 + l2 / s2
             # with the forces of this iterate the two -l cancel those in the gradient
             push[k] = -(mu + l1 * r1) / s1 + (mu + l2 * r2) / s2
-        _scatter(push, c, b)
-        _weigh(weight, c, diagonals[0], diagonals[1], diagonals[2])
-    return gap / (6 * n), miss
+        _add_bound(push, weight, c, b, diagonals)
+    return miss
 
 
-_newton: Callable[..., tuple[float, float]] = njit(cache=True, nogil=True)(_newton_plain)
-
-
-def _direction_plain(s: float, f: float, value: float, step: float, limit: float, mu: float) -> tuple[float, float]:
-    """Return how slack and force of one bound move with the step; ``value`` and ``step`` carry the bound's sign."""
-    ds = limit - value - s - step
-    return ds, (mu - f * ds) / s - f
-
-
-_direction: Callable[..., tuple[float, float]] = njit(cache=True, nogil=True)(_direction_plain)
-
-
-def _lengths_plain(
-    value: Float, step: Float, slack: Float, force: Float, limits: Float, mu: float
-) -> tuple[float, float]:
-    """Return how much of the step may be taken, so that every slack and every force stays positive."""
-    primal = 1.0
-    dual = 1.0
+@compiled
+def _advance(value: Float, step: Float, slack: Float, force: Float, limits: Float, mu: float) -> tuple[float, float]:
+    """Move slacks and forces with the step, as far as each stays positive; return both shares of it."""
+    n = value.shape[1]
+    by = np.empty((2, 6, n))
+    share = np.ones(2)
     for bound in range(6):
         c, sign = bound // 2, 1.0 - 2.0 * (bound % 2)
-        for k in range(value.shape[1]):
+        for k in range(n):
             s, f = slack[bound, k], force[bound, k]
-            ds, df = _direction(s, f, sign * value[c, k], sign * step[c, k], limits[c], mu)
+            ds = limits[c] - sign * value[c, k] - s - sign * step[c, k]
+            df = (mu - f * ds) / s - f
+            by[0, bound, k], by[1, bound, k] = ds, df
             if ds < 0.0:
-                primal = min(primal, -0.99 * s / ds)
+                share[0] = min(share[0], -0.99 * s / ds)
             if df < 0.0:
-                dual = min(dual, -0.99 * f / df)
-    return primal, dual
+                share[1] = min(share[1], -0.99 * f / df)
+    slack += share[0] * by[0]
+    force += share[1] * by[1]
+    return share[0], share[1]
 
 
-_lengths: Callable[..., tuple[float, float]] = njit(cache=True, nogil=True)(_lengths_plain)
-
-
-def _advance_plain(
-    value: Float, step: Float, slack: Float, force: Float, limits: Float, mu: float, primal: float, dual: float
-) -> float:
-    """Move slacks and forces by their shares of the step; return the mean gap that is left."""
-    total = 0.0
-    for bound in range(6):
-        c, sign = bound // 2, 1.0 - 2.0 * (bound % 2)
-        for k in range(value.shape[1]):
-            s, f = slack[bound, k], force[bound, k]
-            ds, df = _direction(s, f, sign * value[c, k], sign * step[c, k], limits[c], mu)
-            slack[bound, k] = s + primal * ds
-            force[bound, k] = f + dual * df
-            total += slack[bound, k] * force[bound, k]
-    return float(total / (6 * value.shape[1]))
-
-
-_advance: Callable[..., float] = njit(cache=True, nogil=True)(_advance_plain)
-
-
-def _project_plain(wanted: Float, limits: Float, start: Float) -> Float:
+@compiled
+def project(wanted: Float, limits: Float, start: Float) -> Float:
     """Return the nearest (n,) to ``wanted`` (least squares) whose value, first and second difference stay in +-limits.
 
-    A primal-dual interior-point method; each of its steps is one pentadiagonal system. ``limits`` (3,) > 0.
+    A primal-dual interior-point method; each of its steps is one pentadiagonal system. ``limits`` (3,) > 0. Row 2 c of
+    slacks and forces is the upper bound of difference c, row 2 c + 1 the lower one.
     """
     n = wanted.size
     o = np.zeros(n)
-    zero = np.zeros(2)
     value, step, diagonals = np.empty((3, n)), np.empty((3, n)), np.empty((3, n))
-    slack, force = np.empty((6, n)), np.empty((6, n))
+    slack = np.empty((6, n))
     scale = max(1.0, np.abs(wanted).max())
     mu = 0.1 * scale
-    _all_differences(o, start, value)
-    _begin(value, limits, mu, slack, force)
+    _differences(o, start, value)
+    for c in range(3):
+        slack[2 * c] = np.maximum(limits[c] - value[c], 0.1 * limits[c])
+        slack[2 * c + 1] = np.maximum(limits[c] + value[c], 0.1 * limits[c])
+    force = mu / slack
+    gap = mu  # the mean product of a slack and its force
     for _ in range(ITERATIONS):
         b = wanted - o
         diagonals[0] = 1.0
         diagonals[1:] = 0.0
-        gap, miss = _newton(value, slack, force, limits, mu, b, diagonals)
+        miss = _newton(value, slack, force, limits, mu, b, diagonals)
         if gap < 1e-7 * scale and miss < 1e-9:
             break
         move = _solve(diagonals[0], diagonals[1], diagonals[2], b)
-        _all_differences(move, zero, step)
-        primal, dual = _lengths(value, step, slack, force, limits, mu)
-        left = _advance(value, step, slack, force, limits, mu, primal, dual)
+        _differences(move, np.zeros(2), step)
+        primal, dual = _advance(value, step, slack, force, limits, mu)
         o += primal * move
-        _all_differences(o, start, value)
-        mu = (0.1 if min(primal, dual) > 0.9 else 0.3) * left
+        _differences(o, start, value)
+        gap = (slack * force).sum() / (6 * n)
+        mu = (0.1 if min(primal, dual) > 0.9 else 0.3) * gap
     return o
 
 
-project: Callable[[Float, Float, Float], Float] = njit(cache=True, nogil=True)(_project_plain)
-
-
-def _extent_plain(offset: Float, start: Float, acceleration: float, window: int) -> tuple[float, ...]:
+@compiled
+def extent(offset: Float, start: Float, acceleration: float, window: int) -> tuple[float, ...]:
     """Return the largest |value|, |first| and |second difference|, reach if it brakes, travel within ``window`` rows.
 
     ``start`` = [o before, o before that]; the travel before the first row counts as none.
@@ -256,10 +168,8 @@ def _extent_plain(offset: Float, start: Float, acceleration: float, window: int)
     return highest, fastest, hardest, farthest, longest
 
 
-extent: Callable[[Float, Float, float, int], tuple[float, ...]] = njit(cache=True, nogil=True)(_extent_plain)
-
-
-def _rounded_plain(exact: Float, settled: int, uneven: float) -> Float:
+@compiled
+def rounded(exact: Float, settled: int, uneven: float) -> Float:
     """Round (n,) with the error carried on; from row ``settled`` on change the increment as seldom as it can be.
 
     Rows 0 and 1 are rounded alone. ``uneven``: rounding error (increments times rows) that ends an increment's turn.
@@ -280,6 +190,3 @@ def _rounded_plain(exact: Float, settled: int, uneven: float) -> Float:
         if abs(carried) > uneven:
             high = 1.0 if carried > 0.0 else 0.0
     return out
-
-
-rounded: Callable[[Float, int, float], Float] = njit(cache=True, nogil=True)(_rounded_plain)

@@ -1,4 +1,4 @@
-"""What an offset may do, and how a wanted offset is planned inside it, so that the guard never has to clip it.
+"""Plans a wanted offset inside its limits, so that the guard never has to clip it, and checks a table against them.
 
 In drive increments per SYNC cycle: amplitude L, rate S, acceleration A, total variation E within one second. L is
 braking-aware: |o| + v^2 / (2 A) <= L while the offset moves outward at v.
@@ -7,9 +7,10 @@ braking-aware: |o| + v^2 / (2 A) <= L while the offset moves outward at v.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
+from scipy.ndimage import minimum_filter1d
 
 from fdhil.config import VARIATION_MM, Axis, OffsetLimits
 from fdhil.correction import kernels
@@ -23,27 +24,19 @@ _SLACK = 0.05  # increments by which a seam may miss, far below the rounding
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
-    """``offset`` increments, ``rate`` per cycle, ``acceleration`` per cycle^2, ``variation`` per ``window`` cycles."""
+class PlanLimits(OffsetLimits):
+    """The limits of an offset in increments, and the size of these."""
 
-    offset: float
-    rate: float
-    acceleration: float
-    variation: float
-    window: int
     um_per_increment: float
 
     @staticmethod
-    def of(axis: Axis, sync_period_s: float) -> Limits:
+    def of(axis: Axis, sync_period_s: float) -> PlanLimits:
         """Return the limits of an axis; ValueError when writing is off (no ``[axis.X.correction]``)."""
-        derived = OffsetLimits.of(axis, sync_period_s)
-        um_per_increment = 1e3 / axis.scaling.increments_per_mm
-        return Limits(
-            derived.offset, derived.rate, derived.acceleration, derived.variation, derived.window, um_per_increment
-        )
+        allowed = OffsetLimits.of(axis, sync_period_s)
+        return PlanLimits(**asdict(allowed), um_per_increment=1e3 / axis.scaling.increments_per_mm)
 
     @property
-    def curve(self) -> Limits:
+    def curve(self) -> PlanLimits:
         """The limits of a curve that is rounded afterwards: less by the rounding, where that leaves enough."""
         return replace(
             self,
@@ -55,7 +48,7 @@ class Limits:
         )
 
 
-def check(offset_increments: Int, limits: Limits, before: tuple[float, float] = (0.0, 0.0)) -> list[Reason]:
+def check(offset_increments: Int, limits: PlanLimits, before: tuple[float, float] = (0.0, 0.0)) -> list[Reason]:
     """Return what a table (n,) breaks: empty, or ``OffsetLimit``, ``OffsetRate``, ``OffsetEnergy`` with its figure.
 
     ``before``: the two offsets ahead of the first row, the nearer one first. Rounding to increments is allowed for.
@@ -80,12 +73,6 @@ def check(offset_increments: Int, limits: Limits, before: tuple[float, float] = 
     return reasons
 
 
-def braking_reach(offset: Float, rate: Float, acceleration: float) -> Float:
-    """Return (n,) how far each row's offset gets if it brakes from there: |o| + v^2 / (2 A) while moving outward."""
-    outward = np.maximum(rate * np.sign(offset), 0.0)
-    return np.asarray(np.abs(offset) + outward**2 / (2 * acceleration))
-
-
 def variation(rate: Float, window: int) -> Float:
     """Return (n,) the travel within the ``window`` cycles that end at each row."""
     total = np.concatenate([[0.0], np.cumsum(np.abs(rate))])
@@ -93,7 +80,7 @@ def variation(rate: Float, window: int) -> Float:
     return np.asarray(total[rows] - total[np.maximum(rows - window, 0)])
 
 
-def fit(wanted: Float, limits: Limits, before: tuple[float, float] = (0.0, 0.0)) -> Float:
+def fit(wanted: Float, limits: PlanLimits, before: tuple[float, float] = (0.0, 0.0)) -> Float:
     """Return the curve (n,) nearest to ``wanted`` (increments, n) that keeps the limits, ready to be rounded."""
     curve = limits.curve
     goal = np.ascontiguousarray(np.clip(wanted, -4 * curve.offset, 4 * curve.offset))
@@ -112,13 +99,11 @@ def fit(wanted: Float, limits: Limits, before: tuple[float, float] = (0.0, 0.0))
     if before != (0.0, 0.0):
         return _projected(np.zeros_like(goal), curve, before)
     # a curve that starts from rest and is scaled down keeps every limit that it kept before
-    rate = np.diff(planned, prepend=0.0)
-    too_far = float(variation(rate, curve.window).max(initial=0.0)) / (0.98 * curve.variation)
-    too_high = float(braking_reach(planned, rate, curve.acceleration).max(initial=0.0)) / curve.offset
-    return np.asarray(planned / max(too_far, too_high, 1.0))
+    _, _, _, reach, longest = kernels.extent(planned, np.zeros(2), curve.acceleration, curve.window)
+    return np.asarray(planned / max(longest / (0.98 * curve.variation), reach / curve.offset, 1.0))
 
 
-def _projected(goal: Float, limits: Limits, before: tuple[float, float]) -> Float:
+def _projected(goal: Float, limits: PlanLimits, before: tuple[float, float]) -> Float:
     """Project onto rate, acceleration and amplitude; far from what breaks them the goal stays as it is."""
     high, fast, hard, _, _ = kernels.extent(goal, np.array(before), limits.acceleration, limits.window)
     if high <= limits.offset and fast <= limits.rate and hard <= limits.acceleration:
@@ -138,7 +123,7 @@ def _projected(goal: Float, limits: Limits, before: tuple[float, float]) -> Floa
     return result
 
 
-def _breaks(offset: Float, limits: Limits, before: tuple[float, float], slack: float = 0.0) -> Bool:
+def _breaks(offset: Float, limits: PlanLimits, before: tuple[float, float], slack: float = 0.0) -> Bool:
     """Return (n,) the rows at which a limit is broken by more than ``slack`` increments."""
     rate = np.diff(offset, prepend=before[0])
     acceleration = np.diff(rate, prepend=before[0] - before[1])
@@ -155,17 +140,11 @@ def _calm(travel: Float, allowed: float, window: int) -> Float:
         return np.ones(travel.size)
     factor = np.minimum(1.0, allowed / np.maximum(travel, 1e-12))
     # a row belongs to all windows that end within the next second; smoothed, so that the factor adds no jerk
-    lowest = np.minimum.accumulate(np.concatenate([factor, np.full(window, factor[-1])])[::-1])[::-1]
-    shrunk = lowest[: travel.size] if travel.size <= window else _sliding_minimum(factor, window)
+    lowest = minimum_filter1d(factor, window + 1, mode="nearest", origin=-((window + 1) // 2))
     smooth = max(1, window // 20)
-    padded = np.pad(shrunk, smooth, mode="edge")
+    padded = np.pad(lowest, smooth, mode="edge")
     kernel = np.hanning(2 * smooth + 1)
     return np.asarray(np.minimum(np.convolve(padded, kernel / kernel.sum(), mode="valid"), 1.0))
-
-
-def _sliding_minimum(values: Float, window: int) -> Float:
-    padded = np.concatenate([values, np.full(window, values[-1])])
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, window + 1).min(axis=1))
 
 
 def to_increments(offset: Float) -> Int:
@@ -177,7 +156,7 @@ def fit_all(wanted_um: Mapping[str, Float], axes: Mapping[str, Axis], sync_perio
     """Plan the wanted offsets of all axes inside their limits; return them in um, in whole increments."""
     planned: dict[str, Float] = {}
     for name, wanted in wanted_um.items():
-        limits = Limits.of(axes[name], sync_period_s)
+        limits = PlanLimits.of(axes[name], sync_period_s)
         whole = to_increments(fit(wanted / limits.um_per_increment, limits))
         planned[name] = whole.astype(np.float64) * limits.um_per_increment
     return planned

@@ -1,4 +1,4 @@
-"""The closed loop as a linear system: its delay, and a zero-phase inverse of it up to a bandwidth.
+"""Takes the closed loop as a linear system: its delay, and a zero-phase inverse of it up to a bandwidth.
 
 Away from the limits and from changes of the friction's sign the loop from offset to position is linear, whatever the
 regulators: one simulated impulse tells all. Its inverse is regularised, so that nothing is asked for where the drive
@@ -28,12 +28,11 @@ Complex = npt.NDArray[np.complex128]
 
 @dataclass(frozen=True, slots=True)
 class Inverse:
-    """The inverse of one axis' loop for errors of up to ``rows`` rows, as a factor on their spectrum."""
+    """The inverse of one axis' loop as a factor on the spectrum of an error."""
 
     factor: Complex
     size: int
     pad: int
-    rows: int
 
     def apply(self, error: Float) -> Float:
         """Return the offset (n,) that would undo ``error`` (n,) in the linear loop; what lies outside counts as 0."""
@@ -43,15 +42,15 @@ class Inverse:
         return np.asarray(back[self.pad : self.pad + error.size])
 
 
-def _without_dry_friction(parameters: Parameters, axis: Axis) -> tuple[Parameters, Axis]:
-    """The same loop without what is not linear: dry friction and limits."""
+def unlimited(parameters: Parameters, axis: Axis, dry_nm: float = 0.0) -> tuple[Parameters, Axis]:
+    """Return the same loop without limits, and with another dry friction: without any it is linear."""
     free = axis.regulators.model_copy(update={"current_limit_a": 1e9, "voltage_limit_v": 1e9})
-    return replace(parameters, Cd=0.0), axis.model_copy(update={"regulators": free})
+    return replace(parameters, Cd=dry_nm), axis.model_copy(update={"regulators": free})
 
 
 def delay_s(parameters: Parameters, axis: Axis, sync_period_s: float) -> float:
     """Return by how much the loop lags at constant speed: 0 with full feed-forward, (1 - Kff) / Kv with less."""
-    linear, free = _without_dry_friction(parameters, axis)
+    linear, free = unlimited(parameters, axis)
     ramp = np.arange(round(RAMP_S / sync_period_s), dtype=np.float64) * (sync_period_s * RAMP_MM_S)
     response = closed_loop.simulate(linear, free, sync_period_s, ramp)
     # the last rows look beyond the end, where the reference is held
@@ -60,7 +59,7 @@ def delay_s(parameters: Parameters, axis: Axis, sync_period_s: float) -> float:
 
 def inverse(parameters: Parameters, axis: Axis, sync_period_s: float, rows: int) -> Inverse:
     """Return the regularised zero-phase inverse of the axis' loop for blocks of up to ``rows`` rows."""
-    linear, free = _without_dry_friction(parameters, axis)
+    linear, free = unlimited(parameters, axis)
     ahead = round(AHEAD_S / sync_period_s)
     impulse = np.zeros(ahead + round(IMPULSE_S / sync_period_s))
     impulse[ahead] = 1.0
@@ -75,4 +74,4 @@ def inverse(parameters: Parameters, axis: Axis, sync_period_s: float, rows: int)
     roll_off = 1 / (1 + (frequency / min(BANDWIDTH_HZ, 0.2 / sync_period_s)) ** 4)
     gain = roll_off / (np.abs(spectrum) ** 2 + REGULARISATION)
     factor = np.asarray(np.conj(spectrum) * gain, dtype=np.complex128)
-    return Inverse(factor, size, pad, rows)
+    return Inverse(factor, size, pad)

@@ -1,11 +1,13 @@
-"""What every correction method returns."""
+"""States the correction methods' common form: what each takes and returns."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Protocol
 
-from fdhil.records import Float, Reason
+from fdhil.config import MachineConfig
+from fdhil.records import Float, Parameters, Prediction, Reason, Trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,3 +25,11 @@ class Plan:
     untouched: bool = False
     speed_offset_rad_s: Mapping[str, Float] = field(default_factory=dict)
     torque_offset_nm: Mapping[str, Float] = field(default_factory=dict)
+
+
+class Method(Protocol):
+    """A correction method; ``before`` is the prediction without it."""
+
+    def __call__(
+        self, reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, before: Prediction, /
+    ) -> Plan: ...

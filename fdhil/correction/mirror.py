@@ -1,4 +1,4 @@
-"""Mirror correction ([DES] eq. 11 with H ~ 1, figure 16): the predicted error with its sign changed, unfiltered."""
+"""Plans the mirror correction ([DES] eq. 11, H ~ 1, figure 16): the predicted error, its sign changed, unfiltered."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.correction.limits import fit_all
 from fdhil.correction.method import Plan
-from fdhil.records import Float, Parameters, Prediction, Reason, Trajectory
+from fdhil.records import Parameters, Prediction, Reason, Trajectory
 
 
 def plan(
@@ -23,20 +23,23 @@ def plan(
     Refused with ``LagTooLarge`` where the error exceeds what an offset may be: a clipped mirror is no mirror.
     """
     wanted = {axis: -error for axis, error in before.error_um.items()}
-    return Plan(fit_all(wanted, config.axis, reference.dt_s), refused=too_large(wanted, config), untouched=True)
+    largest = {axis: float(np.abs(offset).max(initial=0.0)) for axis, offset in wanted.items()}
+    return Plan(fit_all(wanted, config.axis, reference.dt_s), refused=too_large(largest, config), untouched=True)
 
 
-def too_large(wanted_um: Mapping[str, Float], config: MachineConfig) -> tuple[Reason, ...]:
-    """Return ``LagTooLarge`` for each axis whose wanted offset is beyond its ceiling."""
-    reasons = []
-    for axis, wanted in wanted_um.items():
-        limits = config.axis[axis].correction
-        largest = float(np.abs(wanted).max(initial=0.0))
-        if limits is not None and not largest <= limits.max_offset_um:
-            reasons.append(
-                lag_reason(axis, largest, limits.max_offset_um, config.axis[axis].regulators.speed_feedforward)
-            )
-    return tuple(reasons)
+def too_large(needed_um: Mapping[str, float], config: MachineConfig) -> tuple[Reason, ...]:
+    """Return ``LagTooLarge`` for each axis whose largest offset is beyond its ceiling."""
+    return tuple(
+        lag_reason(axis, needed, allowed_um(config, axis), config.axis[axis].regulators.speed_feedforward)
+        for axis, needed in needed_um.items()
+        if not needed <= allowed_um(config, axis)
+    )
+
+
+def allowed_um(config: MachineConfig, axis: str) -> float:
+    """Return the largest offset that an axis may have, 0 where writing is off."""
+    limits = config.axis[axis].correction
+    return limits.max_offset_um if limits is not None else 0.0
 
 
 def lag_reason(axis: str, needed_um: float, allowed_um: float, feedforward: float) -> Reason:

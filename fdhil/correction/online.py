@@ -1,4 +1,4 @@
-"""The on-line feed-forward's law: speed and torque offsets as weights on the last targets that an NC has sent.
+"""Finds the on-line feed-forward's law: speed and torque offsets as weights on the last targets that an NC has sent.
 
 The drive is flat ([DES], conclusion): its position tells speed and torque. On line only the past is known, so speed and
 acceleration are those of a polynomial through the last targets, by least squares, taken one cycle and the current

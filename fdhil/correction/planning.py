@@ -1,4 +1,4 @@
-"""From a reference to a correction: method, limits, gate; and from a correction to the guard's table."""
+"""Plans a correction from a reference: method, limits, gate; and turns it into the guard's table."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from fdhil import tables
 from fdhil.config import MachineConfig
 from fdhil.correction import gate
 from fdhil.correction.limits import fit_all
-from fdhil.correction.method import Plan
+from fdhil.correction.method import Method, Plan
 from fdhil.prediction.predict import predict, predict_corrected
 from fdhil.records import (
     Correction,
@@ -30,11 +30,6 @@ from fdhil.records import (
 MASK_PASSES = 3
 
 
-def default_method() -> str:
-    """The best method there is: the last of the table."""
-    return list(tables.CORRECTIONS)[-1]
-
-
 def plan(
     reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig, method: str | None = None
 ) -> Correction:
@@ -42,37 +37,37 @@ def plan(
 
     ConfigError when an axis has no model; KeyError for an unknown method.
     """
-    name = method or default_method()
-    factory = tables.load(tables.CORRECTIONS, name)
+    name = method or tables.DEFAULT_CORRECTION
+    factory: Method = tables.load(tables.CORRECTIONS, name)
     before = predict(reference, models, config)
+    warnings: tuple[Reason, ...] = ()
     refused = gate.writing_off(reference.axes, config)
-    if refused:
-        return _refuse(name, before, refused, ())
-    refused, warnings = gate.demand(reference, models, config, before)
-    if refused:
-        return _refuse(name, before, refused, warnings)
-    wanted: Plan = factory(reference, models, config, before)
-    if wanted.refused:
-        return _refuse(name, before, wanted.refused, warnings)
-    if wanted.torque_offset_nm:
-        speed, torque = wanted.speed_offset_rad_s, wanted.torque_offset_nm
-        after = predict_corrected(reference, models, config, None, speed, torque)
-        offset, masked = wanted.offset_um, tuple[Reason, ...]()
-    else:
+    if not refused:
+        refused, warnings = gate.demand(reference, models, config, before)
+    if not refused:
+        wanted = factory(reference, models, config, before)
+        refused = wanted.refused
+    if not refused:
         offset, after, masked = _mask_harm(reference, models, config, before, wanted)
-    refused = gate.result(before, after, wanted.untouched)
+        refused = gate.result(before, after, wanted.untouched)
     if refused:
-        return _refuse(name, before, refused, warnings)
+        zero = dict.fromkeys(reference.axes, frozen(np.zeros(before.contour_um.size)))
+        also = zero if name == "flatness" else {}
+        return Correction(name, before, before, zero, refused, warnings, 0.0, also, also)
     return Correction(
-        method=name,
-        before=before,
-        after=after,
-        offset_um={axis: frozen(values) for axis, values in offset.items()},
+        name,
+        before,
+        after,
+        _frozen(offset),
         warnings=warnings + masked,
         delay_s=wanted.delay_s,
-        speed_offset_rad_s={axis: frozen(values) for axis, values in wanted.speed_offset_rad_s.items()},
-        torque_offset_nm={axis: frozen(values) for axis, values in wanted.torque_offset_nm.items()},
+        speed_offset_rad_s=_frozen(wanted.speed_offset_rad_s),
+        torque_offset_nm=_frozen(wanted.torque_offset_nm),
     )
+
+
+def _frozen(offsets: Mapping[str, Float]) -> dict[str, Float]:
+    return {axis: frozen(values) for axis, values in offsets.items()}
 
 
 def _mask_harm(
@@ -84,18 +79,19 @@ def _mask_harm(
 ) -> tuple[Mapping[str, Float], Prediction, tuple[Reason, ...]]:
     """Leave alone the zones that would get worse; return the offsets, what they leave, and a warning.
 
-    What a method wants untouched stays as it is, and the warning says where it harms.
+    What a method wants untouched stays as it is, and the warning says where it harms. An on-line feed-forward has no
+    offsets that could be masked.
     """
-    offset = wanted.offset_um
-    after = predict_corrected(reference, models, config, offset)
+    offset, speed, torque = wanted.offset_um, wanted.speed_offset_rad_s, wanted.torque_offset_nm
+    after = predict_corrected(reference, models, config, offset, speed, torque)
+    if torque:
+        return offset, after, ()
     worse = np.zeros(before.contour_um.size, dtype=np.bool_)
-    if wanted.untouched:
-        worse = gate.worse_rows(before.contour_um, after.contour_um, reference.dt_s)
-    for _ in range(0 if wanted.untouched else MASK_PASSES):
+    for _ in range(MASK_PASSES):
         now = gate.worse_rows(before.contour_um, after.contour_um, reference.dt_s)
-        if not now.any():
-            break
         worse |= now
+        if wanted.untouched or not now.any():
+            break
         factor = gate.fade(worse, reference.dt_s)
         offset = fit_all(
             {axis: values * factor for axis, values in wanted.offset_um.items()}, config.axis, reference.dt_s
@@ -108,12 +104,6 @@ def _mask_harm(
     if not wanted.untouched:
         text += " and are left as they are"
     return offset, after, (Reason("HarmPredicted", text, "try the method inverse, or lower the feed there"),)
-
-
-def _refuse(method: str, before: Prediction, refused: tuple[Reason, ...], warnings: tuple[Reason, ...]) -> Correction:
-    zero = dict.fromkeys(before.reference.axes, frozen(np.zeros(before.contour_um.size)))
-    also = zero if method == "flatness" else {}
-    return Correction(method, before, before, zero, refused, warnings, speed_offset_rad_s=also, torque_offset_nm=also)
 
 
 def table(correction: Correction, config: MachineConfig, program_digest: str) -> CorrectionTable:

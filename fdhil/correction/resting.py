@@ -1,4 +1,4 @@
-"""What an offset does while dry friction holds the table: nothing, but to the regulators.
+"""Keeps a resting axis at rest: while dry friction holds the table an offset moves the regulators alone.
 
 Left alone, their integrals wind up on the remaining error until the table slips by micrometres, now and then. While
 it is held the regulators alone are a linear system, whatever their structure: two simulated answers tell which offset
@@ -7,7 +7,7 @@ leads the current to the middle of the dry friction's band, and which one, by as
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -16,8 +16,9 @@ from scipy.linalg.lapack import dposv
 
 from fdhil.config import Axis
 from fdhil.correction import kernels
+from fdhil.correction.linear import unlimited
 from fdhil.model import closed_loop
-from fdhil.model.closed_loop import Commands, Response, State
+from fdhil.model.closed_loop import Commands, Ready, Response, State
 from fdhil.model.kernels import CURRENT_DEMAND, POSITION
 from fdhil.records import Float, Parameters
 
@@ -38,7 +39,7 @@ class Resting:
     """The rests of one axis: what depends on its drive alone is found once."""
 
     def __init__(self, parameters: Parameters, axis: Axis, sync_period_s: float, increment_mm: float) -> None:
-        self._held = closed_loop.prepare(*_held(parameters, axis), sync_period_s)
+        self._held = closed_loop.prepare(*unlimited(parameters, axis, HELD_NM), sync_period_s)
         self._period_s, self._increment_mm = sync_period_s, increment_mm
         self._free, self._again = round(FREE_S / sync_period_s), round(AGAIN_S / sync_period_s)
         impulse = np.zeros(round((FREE_S + WATCHED_S) / sync_period_s))
@@ -67,15 +68,15 @@ class Resting:
         return offset
 
     def _simulate(self, rest_mm: Float, offset: Float, state: State, rows: int) -> Response:
-        ahead = min(rows + 2, rest_mm.size)  # a cycle looks two rows ahead and no further
-        commanded = rest_mm[:ahead] + offset[:ahead] * self._increment_mm
-        return self._held.run(Commands(commanded), state, 0, rows)
+        return run_with(self._held, rest_mm, offset, self._increment_mm, state, rows)
 
 
-def _held(parameters: Parameters, axis: Axis) -> tuple[Parameters, Axis]:
-    """The same drive with a table that nothing moves, and without limits."""
-    wide = axis.regulators.model_copy(update={"current_limit_a": 1e9, "voltage_limit_v": 1e9})
-    return replace(parameters, Cd=HELD_NM), axis.model_copy(update={"regulators": wide})
+def run_with(
+    drive: Ready, reference_mm: Float, offset: Float, increment_mm: float, state: State, rows: int
+) -> Response:
+    """Run a drive's next ``rows`` cycles with an offset in increments; both paths begin with the first of them."""
+    ahead = min(rows + 2, reference_mm.size)  # a cycle looks two rows ahead and no further
+    return drive.run(Commands(reference_mm[:ahead] + offset[:ahead] * increment_mm), state, 0, rows)
 
 
 def _demand(response: Response) -> Float:
@@ -85,7 +86,7 @@ def _demand(response: Response) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class _Length:
-    """What depends on a rest's length alone: which of the splines count, how stiff they are, and both as one matrix."""
+    """A rest of some length: which of the splines count in it, how stiff they are, and both as one matrix."""
 
     effect: Float
     even: Float
@@ -96,7 +97,7 @@ class _Length:
 
 
 class _Lead:
-    """What an offset d from row 2 on does, as a cubic spline of knots ``step`` rows apart.
+    """The answer to an offset d from row 2 on, as a cubic spline of knots ``step`` rows apart.
 
     ``spline`` (free + step, m) holds d's basis, ``bends`` its second differences, ``effect`` (n, m) what each of them
     asks for, in A. A rest of less than n rows uses their first rows.

@@ -1,4 +1,4 @@
-"""The inverse correction while the path is still being made: blocks of 2 s with 0.5 s of look-ahead.
+"""Streams the inverse correction while the path is still being made: blocks of 2 s with 0.5 s of look-ahead.
 
 A block is there as soon as its look-ahead is, so nothing waits for the end of the program ([DES], conclusion: "an
 on-line technique is to be studied"). Each block passes limits and gate alone; what is kept between blocks is one state
@@ -15,13 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.correction import gate, linear
-from fdhil.correction.block import AxisLoop, Carry, Solution, solve
-from fdhil.correction.inverse import BLOCK_S, LOOK_AHEAD_S, axis_loop, choose_delay_s, delayed, first_carry, following
+from fdhil.correction import gate
+from fdhil.correction.block import AxisLoop, Solution
+from fdhil.correction.inverse import AxisInverse, block_rows, common_delay_s, delayed
 from fdhil.correction.limits import check
 from fdhil.correction.mirror import lag_reason
-from fdhil.model import closed_loop
-from fdhil.model.closed_loop import Commands, Response, State
+from fdhil.model.closed_loop import Commands, Response, State, start
 from fdhil.prediction.contour import WINDOW_S, contour_error_um
 from fdhil.records import Float, Parameters, Reason
 
@@ -58,14 +57,13 @@ class _Axis:
     """One axis between two blocks; ``free`` is the state that it would have without any offset."""
 
     name: str
-    loop: AxisLoop
-    carry: Carry
+    inverse: AxisInverse
     free: State
 
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
-    """What one axis makes of one block: offsets (um), positions without and with them, and what was in the way."""
+    """One block of one axis: offsets (um), positions without and with them, and what was in the way."""
 
     offset_um: Float
     before_mm: Float
@@ -86,7 +84,7 @@ def stream(
     result is that of the whole reference planned at once.
     """
     period = config.machine.sync_period_s
-    block, ahead = round(BLOCK_S / period), round(LOOK_AHEAD_S / period)
+    block, ahead = block_rows(period)
     window = round(WINDOW_S / period)
     path: dict[str, Float] = {}
     axes: dict[str, _Axis] = {}
@@ -101,8 +99,12 @@ def stream(
         elif not path:
             return
         if not axes:
-            axes = {name: _axis(models[name], config, name, float(values[0])) for name, values in path.items()}
-            delay = _delay(models, config, axes)
+            axes = {
+                name: _Axis(name, AxisInverse.of(models[name], config, name, v[0]), start(v[0]))
+                for name, v in path.items()
+            }
+            # before any speed is known: as if every axis may run its rapid speed
+            delay, _ = common_delay_s({name: config.axis[name].rapid_speed_mm_s for name in path}, models, config)
         length = next(iter(path.values())).size - kept
         # one row more than the look-ahead tells that the path goes on
         while (length > block + ahead or piece is None) and not ended:
@@ -121,34 +123,21 @@ def stream(
             kept, row, length = kept + rows - drop, row + rows, length - rows
 
 
-def _axis(parameters: Parameters, config: MachineConfig, name: str, start_mm: float) -> _Axis:
-    return _Axis(name, axis_loop(parameters, config, name), first_carry(start_mm), closed_loop.start(start_mm))
-
-
-def _delay(models: Mapping[str, Parameters], config: MachineConfig, axes: Mapping[str, _Axis]) -> float:
-    """The common delay, chosen before any speed is known: as if every axis may run its rapid speed."""
-    delays = {name: linear.delay_s(models[name], config.axis[name], config.machine.sync_period_s) for name in axes}
-    speeds = {name: config.axis[name].rapid_speed_mm_s for name in axes}
-    return choose_delay_s(delays, speeds, config)
-
-
 def _solve(axis: _Axis, path: Float, kept: int, rows: int, delay_rows: float, ends: bool) -> _Piece:
     """Solve one block of one axis and move the axis to the next one."""
     reference = np.ascontiguousarray(path[kept:])
     target = np.ascontiguousarray(delayed(path, delay_rows)[kept:])
-    loop = axis.loop
+    loop = axis.inverse.loop
     free = loop.drive.run(Commands(reference), axis.free, 0, rows)
     axis.free = free.end
-    solution = solve(loop, reference, target, axis.carry, ends)
+    solution = axis.inverse.block(reference, target, rows, ends)
     refused = _refused(axis.name, loop, solution, free, rows)
-    if not ends:
-        axis.carry = following(loop, reference, solution, axis.carry, rows)
     offset = solution.offset[:rows] * loop.limits.um_per_increment
     return _Piece(offset, free.position_mm, solution.position_mm[:rows], refused)
 
 
 def _refused(name: str, loop: AxisLoop, solution: Solution, free: Response, rows: int) -> tuple[_Refusal, ...]:
-    """What one axis alone can say against a block: lag, a drive at its limit, an offset that breaks a limit."""
+    """Return the objections of one axis alone to a block: lag, a drive at its limit, an offset that breaks a limit."""
     um = loop.limits.um_per_increment
     refused = []
     if free.limited_s > LIMITED_S:

@@ -1,4 +1,4 @@
-"""The closed loop of one axis: the drive's regulators around the plant, driven by a reference on the SYNC grid.
+"""Simulates the closed loop of one axis: the drive's regulators around the plant, led by a reference on the SYNC grid.
 
 During cycle k the drive interpolates its set-point linearly from r[k] to r[k+1], and the speed that is fed forward from
 (r[k+1]-r[k])/T to (r[k+2]-r[k+1])/T. Beyond its end the reference is held. An offset is added to the reference before
@@ -8,11 +8,10 @@ interpolation. Encoder and set-points are not quantised: against a drive with 65
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -23,12 +22,13 @@ from fdhil.model import kernels
 from fdhil.records import Float, Parameters
 
 State = npt.NDArray[np.float64]
+Work = TypeVar("Work")
 
 _EMPTY: Float = np.empty(0)
 
 
 class Commands(NamedTuple):
-    """What an axis is told, (n,) each: reference in mm (its offset included), speed and torque offsets or empty."""
+    """The commands of an axis, (n,) each: reference in mm (its offset included), speed and torque offsets or empty."""
 
     reference_mm: Float
     speed_offset_rad_s: Float = _EMPTY
@@ -37,34 +37,32 @@ class Commands(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """What the axis does, (n,) each, at the SYNC instants t_0 .. t_{n-1}.
+    """The answer of an axis at the SYNC instants t_0 .. t_{n-1}.
 
-    ``limited`` is the share of the cycle from that instant on in which the current or voltage limit acts. ``states``
-    (k, n) is the whole state at those instants, and ``end`` (STATES,) that after the last cycle: another run may
-    continue from any of them.
+    ``states`` (k, n) is the whole state at those instants, and ``end`` (STATES,) that after the last cycle: another run
+    may continue from any of them. ``limited`` (n,) is the share of the cycle from that instant on in which the current
+    or voltage limit acts.
     """
 
-    position_mm: Float
-    speed_rad_s: Float
-    current_a: Float
-    limited: Float
-    sync_period_s: float
     states: Float
+    limited: Float
     end: State
+    sync_period_s: float
 
-    @staticmethod
-    def from_columns(columns: Float, steps: int, sync_period_s: float, end: State) -> Response:
-        """Take apart what a kernel recorded, (1 + k, n); ``steps`` current-loop steps make a cycle."""
-        states = columns[kernels.ROW_STATE :]
-        return Response(
-            position_mm=states[kernels.POSITION],
-            speed_rad_s=states[kernels.SPEED],
-            current_a=states[kernels.CURRENT],
-            limited=columns[kernels.ROW_LIMITED] / steps,
-            sync_period_s=sync_period_s,
-            states=states,
-            end=end,
-        )
+    @property
+    def position_mm(self) -> Float:
+        """The place of the table, (n,)."""
+        return np.asarray(self.states[kernels.POSITION])
+
+    @property
+    def speed_rad_s(self) -> Float:
+        """The motor's speed, (n,)."""
+        return np.asarray(self.states[kernels.SPEED])
+
+    @property
+    def current_a(self) -> Float:
+        """The motor's current, (n,)."""
+        return np.asarray(self.states[kernels.CURRENT])
 
     @property
     def limited_s(self) -> float:
@@ -121,13 +119,8 @@ class Ready(Protocol):
 
 def prepare(parameters: Parameters, axis: Axis, sync_period_s: float) -> Ready:
     """Return the drive of an axis ready to be run, for those who run it often."""
-    return _structure(axis.regulators.structure)(parameters, axis, sync_period_s)
-
-
-@lru_cache(maxsize=16)
-def _structure(name: str) -> Callable[[Parameters, Axis, float], Ready]:
-    structure: Callable[[Parameters, Axis, float], Ready] = tables.load(tables.REGULATORS, name)
-    return structure
+    drive: Ready = tables.load(tables.REGULATORS, axis.regulators.structure)(parameters, axis, sync_period_s)
+    return drive
 
 
 def start(position_mm: float) -> State:
@@ -161,7 +154,12 @@ def simulate_axes(
             torque_offset_nm=(torque_offset_nm or {}).get(name),
         )
 
-    if len(reference_mm) == 1:
-        return {name: one(name) for name in reference_mm}
-    with ThreadPoolExecutor(len(reference_mm)) as pool:
-        return dict(zip(reference_mm, pool.map(one, reference_mm), strict=True))
+    return each_axis(one, reference_mm)
+
+
+def each_axis(work: Callable[[str], Work], axes: Collection[str]) -> dict[str, Work]:
+    """Return what ``work`` makes of each axis, one thread each."""
+    if len(axes) <= 1:
+        return {name: work(name) for name in axes}
+    with ThreadPoolExecutor(len(axes)) as pool:
+        return dict(zip(axes, pool.map(work, axes), strict=True))

@@ -1,4 +1,4 @@
-"""Equations [1] and [2] of [DES]: exact discretisation, and simulation from the measured voltage.
+"""Solves equations [1] and [2] of [DES]: exact discretisation, and simulation from the measured voltage.
 
     L di/dt  = u - R i - K w
     Jt dw/dt = K i - ft w - Cd sign(w)          w = 0 sticks while |K i| <= Cd
@@ -8,12 +8,11 @@ Between two reversals the drive is linear, so its step over any interval is exac
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from fdhil.model.compiled import compiled, inlined
 from fdhil.records import Float, Parameters, VoltageSampling, read_only
 
 SUBSTEP_S = 6.25e-5  # stick and slip are decided this often; the linear part needs no substep
@@ -34,7 +33,8 @@ class Step:
     ramp: Float
 
 
-def _product_plain(a: Float, b: Float) -> Float:
+@inlined
+def _product(a: Float, b: Float) -> Float:
     """Return the product of two (2, 2) matrices: at this size a library call takes ten times longer."""
     out = np.empty((2, 2))
     out[0, 0] = a[0, 0] * b[0, 0] + a[0, 1] * b[1, 0]
@@ -44,10 +44,8 @@ def _product_plain(a: Float, b: Float) -> Float:
     return out
 
 
-_product: Callable[[Float, Float], Float] = njit(cache=True, nogil=True, inline="always")(_product_plain)
-
-
-def _transition_plain(a: Float, h: float) -> tuple[Float, Float, Float]:
+@compiled
+def transition(a: Float, h: float) -> tuple[Float, Float, Float]:
     """Return phi = exp(A h), its integral over h, and the answer to a ramp from -1/2 to 1/2 (all (2, 2))."""
     norm = np.abs(a).sum() * h
     halvings = 0
@@ -74,9 +72,6 @@ def _transition_plain(a: Float, h: float) -> tuple[Float, Float, Float]:
     return phi, mean, first / h - mean * 0.5
 
 
-transition: Callable[[Float, float], tuple[Float, Float, Float]] = njit(cache=True, nogil=True)(_transition_plain)
-
-
 def system_matrix(parameters: Parameters) -> Float:
     """Return A (2, 2) of dx/dt = A x + [u/L, -Cd sign(w)/Jt] for x = [i, w]."""
     p = parameters
@@ -88,7 +83,8 @@ def discretise(parameters: Parameters, dt_s: float) -> Step:
     return Step(*transition(system_matrix(parameters), dt_s))
 
 
-def _simulate_plain(
+@compiled
+def _simulate(
     a: Float, gains: Float, mean_v: Float, rise_v: Float, dt: float, substeps: int, start: Float
 ) -> tuple[Float, Float]:
     """Step through the intervals; ``gains`` = [1/L, Cd/Jt, K, Cd]; ``rise_v`` is the rise over each."""
@@ -119,9 +115,6 @@ def _simulate_plain(
             i = i_next
             w = 0.0 if w_next * side < 0.0 else w_next
     return current, speed
-
-
-_simulate: Callable[..., tuple[Float, Float]] = njit(cache=True, nogil=True)(_simulate_plain)
 
 
 def interval_shape(voltage_v: Float, sampling: VoltageSampling) -> tuple[Float, Float]:

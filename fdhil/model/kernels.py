@@ -1,4 +1,4 @@
-"""The compiled loops of the closed-loop model. Plain numbers in, plain numbers out; no lock is held while they run.
+"""Compiled kernels run the closed-loop model. Plain numbers in, plain numbers out; no lock is held while they run.
 
 All compiled code of the drives is in this file, whatever their structure: numba's cache of a compiled function is
 renewed when its own file changes, not when that of a function it calls does.
@@ -6,11 +6,9 @@ renewed when its own file changes, not when that of a function it calls does.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from numba import njit
 
+from fdhil.model.compiled import compiled, inlined
 from fdhil.records import Float
 
 # places in the state vector: what every drive has, then what structures and options add
@@ -32,7 +30,8 @@ HELD_CURRENT, HELD_INTEGRAL, HELD_BREAK, HELD_VOLTAGE, LEAP_RESISTANCE = range(6
 LEAP_ROWS, LEAP_COLUMNS = 11, 5
 
 
-def _cascade_plain(place: float, rate: float, state: Float, gains: Float) -> tuple[float, float, float]:
+@compiled
+def _cascade(place: float, rate: float, state: Float, gains: Float) -> tuple[float, float, float]:
     """P or PI on position, PI on speed: return the current demand and both integrals if no limit acts.
 
     ``place`` mm and ``rate`` rad/s are the set-point and the speed that is fed forward.
@@ -44,7 +43,8 @@ def _cascade_plain(place: float, rate: float, state: Float, gains: Float) -> tup
     return gains[SPEED_KP] * error + candidate, candidate, integral
 
 
-def _pid_plain(place: float, rate: float, state: Float, gains: Float) -> tuple[float, float, float]:
+@compiled
+def _pid(place: float, rate: float, state: Float, gains: Float) -> tuple[float, float, float]:
     """PID on position: return the current demand, the speed integral it does not have, and its own integral.
 
     The derivative is the difference of Kff times set-point less position over one cycle; ``rate`` rad/s adds to it.
@@ -60,7 +60,8 @@ def _pid_plain(place: float, rate: float, state: Float, gains: Float) -> tuple[f
     return gains[SPEED_KP] * speed, 0.0, integral
 
 
-def _filter_plain(place: float, rate: float, bend: float, order: int, decay: float, state: Float) -> None:
+@compiled
+def _filter(place: float, rate: float, bend: float, order: int, decay: float, state: Float) -> None:
     """Put set-point, speed and acceleration through ``order`` equal first-order filters, in place in the state."""
     for n in range(order):
         at = FILTERED + 3 * n
@@ -70,7 +71,8 @@ def _filter_plain(place: float, rate: float, bend: float, order: int, decay: flo
         state[at], state[at + 1], state[at + 2] = place, rate, bend
 
 
-def _current_cycles_plain(
+@compiled
+def _current_cycles(
     demand_a: float, limited: bool, plant: Float, gains: Float, n_current: int, delay: int, state: Float
 ) -> int:
     """Run the current loop and the plant for one speed cycle, step by step: return the steps with a limit acting.
@@ -118,23 +120,16 @@ def _current_cycles_plain(
     return steps
 
 
-_cascade: Callable[..., tuple[float, float, float]] = njit(cache=True, nogil=True)(_cascade_plain)
-_pid: Callable[..., tuple[float, float, float]] = njit(cache=True, nogil=True)(_pid_plain)
-_filter: Callable[..., None] = njit(cache=True, nogil=True)(_filter_plain)
-_current_cycles: Callable[..., int] = njit(cache=True, nogil=True)(_current_cycles_plain)
-
-
-def _between_plain(values: Float, k: int, part: float) -> float:
+@compiled
+def _between(values: Float, k: int, part: float) -> float:
     """Return the value ``part`` of the way from row k to k + 1, held beyond the end."""
     last = values.size - 1
     low = values[min(k, last)]
     return float(low + (values[min(k + 1, last)] - low) * part)
 
 
-_between: Callable[[Float, int, float], float] = njit(cache=True, nogil=True)(_between_plain)
-
-
-def _may_move_plain(i: float, w: float, integral: float, demand_a: float, plant: Float, leap: Float) -> float:
+@inlined
+def _may_move(i: float, w: float, integral: float, demand_a: float, plant: Float, leap: Float) -> float:
     """Return the largest voltage that a moving table may be asked for in a speed cycle; inf where it may turn."""
     net = abs(i - plant[15] / plant[14] if w > 0.0 else i + plant[15] / plant[14])
     e, q, ai, aw = abs(demand_a - i), abs(integral - leap[LEAP_RESISTANCE, 0] * i - plant[14] * w), abs(i), abs(w)
@@ -145,7 +140,8 @@ def _may_move_plain(i: float, w: float, integral: float, demand_a: float, plant:
     return float(peak + leap[LEAP_VOLTAGE, 3] * q + leap[LEAP_VOLTAGE, 4])
 
 
-def _may_hold_plain(i: float, integral: float, demand_a: float, plant: Float, leap: Float) -> float:
+@inlined
+def _may_hold(i: float, integral: float, demand_a: float, plant: Float, leap: Float) -> float:
     """Return the largest voltage that a table held by dry friction may be asked for; inf where it may break loose."""
     ai, e, q = abs(i), abs(demand_a - i), abs(integral - leap[LEAP_RESISTANCE, 0] * i)
     if not plant[14] * (ai + leap[HELD_BREAK, 2] * e + leap[HELD_BREAK, 3] * q) <= plant[15]:
@@ -153,27 +149,23 @@ def _may_hold_plain(i: float, integral: float, demand_a: float, plant: Float, le
     return float(leap[HELD_VOLTAGE, 0] * ai + leap[HELD_VOLTAGE, 2] * e + leap[HELD_VOLTAGE, 3] * q)
 
 
-def _mapped_plain(leap: Float, row: int, i: float, w: float, integral: float, demand_a: float, side: float) -> float:
+@inlined
+def _mapped(leap: Float, row: int, i: float, w: float, integral: float, demand_a: float, side: float) -> float:
     """Return what a row of the leap makes of a state."""
     moved = leap[row, 0] * i + leap[row, 1] * w + leap[row, 2] * integral
     return float(moved + leap[row, 3] * demand_a + leap[row, 4] * side)
 
 
-_may_move: Callable[..., float] = njit(cache=True, nogil=True, inline="always")(_may_move_plain)
-_may_hold: Callable[..., float] = njit(cache=True, nogil=True, inline="always")(_may_hold_plain)
-_mapped: Callable[..., float] = njit(cache=True, nogil=True, inline="always")(_mapped_plain)
-
-
-def _leapable_plain(
-    i: float, w: float, integral: float, demand_a: float, plant: Float, leap: Float
-) -> tuple[float, float]:
+@inlined
+def _leapable(i: float, w: float, integral: float, demand_a: float, plant: Float, leap: Float) -> tuple[float, float]:
     """Return the largest voltage of a speed cycle, inf where it is not linear, and the side: 0 for a held table."""
     if w == 0.0 and plant[15] > 0.0:
         return _may_hold(i, integral, demand_a, plant, leap), 0.0
     return _may_move(i, w, integral, demand_a, plant, leap), 1.0 if w > 0.0 else -1.0
 
 
-def _leapt_plain(
+@inlined
+def _leapt(
     i: float, w: float, integral: float, demand_a: float, side: float, leap: Float
 ) -> tuple[float, float, float]:
     """Return current, speed and integral of the current loop after a speed cycle."""
@@ -190,11 +182,8 @@ def _leapt_plain(
     )
 
 
-_leapable: Callable[..., tuple[float, float]] = njit(cache=True, nogil=True, inline="always")(_leapable_plain)
-_leapt: Callable[..., tuple[float, float, float]] = njit(cache=True, nogil=True, inline="always")(_leapt_plain)
-
-
-def _run_leaping_plain(
+@compiled
+def _run_leaping(
     reference: Float,
     first: int,
     plant: Float,
@@ -256,10 +245,8 @@ def _run_leaping_plain(
     state[SPEED_INTEGRAL], state[CURRENT_INTEGRAL], state[POSITION_INTEGRAL] = speeds, currents, places
 
 
-_run_leaping: Callable[..., None] = njit(cache=True, nogil=True)(_run_leaping_plain)
-
-
-def _run_plain(
+@compiled
+def run(
     reference: Float,
     speed_offset: Float,
     current_offset: Float,
@@ -316,6 +303,3 @@ def _run_plain(
             limited += _current_cycles(demand_a, demand_a != raw, plant, gains, n_current, delay, state)
         out[ROW_LIMITED, row] = limited
     return out
-
-
-run: Callable[..., Float] = njit(cache=True, nogil=True)(_run_plain)

@@ -1,4 +1,4 @@
-"""One whole speed cycle of the current loop and the plant at once.
+"""Takes a whole speed cycle of the current loop and the plant at once.
 
 While the current demand is constant, no voltage is clipped and the table neither turns nor breaks loose, the steps of
 the current loop are one linear map. The kernel takes it where bounds on what happens in between prove that it may; all
@@ -26,15 +26,15 @@ def _leap(plant: tuple[float, ...], kp: float, ki: float, steps: int) -> Float:
     held = _one_step(still, kp, ki, 0.0)
     held[_W] = held[_X] = 0.0  # nothing turns
     out = np.zeros((kernels.LEAP_ROWS, kernels.LEAP_COLUMNS))
-    through, whole = _courses(moving, steps)
-    out[kernels.LEAP_CURRENT : kernels.LEAP_WAY + 1] = whole[[_I, _W, _J, _X], :5]
+    through = _powers(moving, steps)
+    out[kernels.LEAP_CURRENT : kernels.LEAP_WAY + 1] = through[-1, [_I, _W, _J, _X], :5]
     turned = through[:, _W, :5] - np.eye(6)[_W, :5]
     turned[:, _S] += (turned[:, _I] + turned[:, _D] + resistance * turned[:, _J]) * (dry / torque_constant)
     out[kernels.LEAP_TURN] = _bound(turned[1:], resistance, torque_constant)
     voltages = _voltages(through[:-1], kp, ki)
     out[kernels.LEAP_VOLTAGE] = _bound(voltages, resistance, torque_constant)
-    through, whole = _courses(held, steps)
-    out[kernels.HELD_CURRENT : kernels.HELD_INTEGRAL + 1] = whole[[_I, _J], :5]
+    through = _powers(held, steps)
+    out[kernels.HELD_CURRENT : kernels.HELD_INTEGRAL + 1] = through[-1, [_I, _J], :5]
     changed = through[:-1, _I, :5] - np.eye(6)[_I, :5]
     out[kernels.HELD_BREAK] = _bound(changed, resistance, torque_constant)
     out[kernels.HELD_VOLTAGE] = _bound(_voltages(through[:-1], kp, ki), resistance, torque_constant)
@@ -68,12 +68,12 @@ def _one_step(plant: Float, kp: float, ki: float, dry: float) -> Float:
     return step
 
 
-def _courses(step: Float, steps: int) -> tuple[Float, Float]:
-    """Return the powers 0 .. ``steps`` of a step (steps + 1, 6, 6), and the last."""
+def _powers(step: Float, steps: int) -> Float:
+    """Return the powers 0 .. ``steps`` of a step, (steps + 1, 6, 6)."""
     powers = [np.eye(6)]
     for _ in range(steps):
         powers.append(step @ powers[-1])
-    return np.array(powers), powers[-1]
+    return np.array(powers)
 
 
 def _voltages(through: Float, kp: float, ki: float) -> Float:

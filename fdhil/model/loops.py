@@ -1,4 +1,4 @@
-"""What every regulator structure shares: the plant's exact step, the kernel's gains, a drive ready to run.
+"""Prepares what every regulator structure shares: the plant's exact step, the kernel's gains, a drive ready to run.
 
 Each PI integrates first: candidate = integral + ki h e, output = clip(kp e + candidate); where the clip acts, the old
 integral is kept. Three options go with every structure: acceleration fed forward as current, a filter on the
@@ -108,7 +108,8 @@ class Drive:
             end,
         )
         _, _, n_speed, n_current, _, _ = self.shape
-        return Response.from_columns(out, n_speed * n_current, self.sync_period_s, end)
+        limited = out[kernels.ROW_LIMITED] / (n_speed * n_current)
+        return Response(out[kernels.ROW_STATE :], limited, end, self.sync_period_s)
 
 
 def prepare(law: int, places: int, parameters: Parameters, axis: Axis, sync_period_s: float) -> Drive:

@@ -1,5 +1,4 @@
-"""What the closed loops will leave of a path: axis errors, contour error, the zones where it stands out, and the skill
-of such a prediction on recorded moves."""
+"""Predicts the path error that the closed loops leave: axis errors, contour error, zones; and judges how well."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a path leaves a tolerance, why, and the highest feed of each stretch at which it would not."""
+"""Advises feeds: where a path leaves a tolerance, why, and the highest feed of each stretch at which it would not."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.prediction import inverse_dynamics as load
 from fdhil.prediction.feed_refinement import raised_alone
 from fdhil.prediction.feeds import Feeds, Judge, Source, highest, stretches, worst_rows
+from fdhil.prediction.inverse_dynamics import required
 from fdhil.prediction.predict import contour_um, predict
 from fdhil.records import Float, Int, Parameters, Prediction, Zone
 
@@ -75,7 +75,7 @@ def advise(
     plain = _feeds(source, over, lambda r: contour_um(r, models, config), tolerance_um)
     better = _feeds(source, over, corrected, tolerance_um) if corrected is not None else None
     loads = {
-        axis: load.required(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s)
+        axis: required(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s)
         for axis in reference.axes
     }
     slowed = {k for feeds in (plain, better) if feeds for k, share in feeds.share.items() if share < 1.0}
@@ -89,7 +89,7 @@ def advise(
             start_s=float(reference.time_s[rows[0]]),
             end_s=float(reference.time_s[rows[-1]]) + reference.dt_s,
             error_um=error,
-            where=" ".join(f"{axis} {reference.position_mm[axis][row]:.1f}" for axis in reference.axes),
+            where=reference.place(row),
             cause=zone.cause if zone else "straight",
             axis=_off(prediction, row),
             load=_load(loads, rows),

@@ -1,4 +1,4 @@
-"""The contour error: how far the table is from the path, wherever along the path it should be."""
+"""Measures the contour error: how far the table is from the path, wherever along the path it should be."""
 
 from __future__ import annotations
 

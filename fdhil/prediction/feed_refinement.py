@@ -1,4 +1,4 @@
-"""A last look at the feeds that hold together: which of them may be higher while those beside them stay.
+"""Raises feeds that hold together a last time: each of them alone, while those beside it stay.
 
 An error that two stretches make between them hardly goes with one of them alone, so that a search which moves both by
 what it learns of each ends a little early.
@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdhil.prediction.feeds import AIM, STILL, WORTH, Feeds, Judge, Source, stretches, worst_rows
+from fdhil.prediction.feeds import AIM, STILL, WORTH, Feeds, Judge, Source, run, stretches
 from fdhil.records import Trajectory
 
 STEP = 1.05  # what is tried first
@@ -46,13 +46,8 @@ class _Raising:
         self._before, self._source, self._judge, self._tolerance_um = feeds, source, judge, tolerance_um
         self._share = dict(feeds.share)
         self._apart_s = 2 * source.after_s
-        self._reference, self._error_um = self._run(self._share)
+        self._reference, self._error_um = run(source, self._share, judge)
         self._most_um = {k: max(tolerance_um, um / STILL) for k, um in self._error_um.items() if um > tolerance_um}
-
-    def _run(self, share: Mapping[int, float]) -> tuple[Trajectory, dict[int, float]]:
-        reference = self._source.at(share)
-        found = worst_rows(stretches(reference), self._judge(reference), reference.dt_s, self._source.after_s)
-        return reference, {k: error for k, (error, _) in found.items()}
 
     def _spoilt(self, error_um: Mapping[int, float]) -> list[int]:
         return [k for k, um in error_um.items() if not 0.0 <= um <= self._most_um.get(k, self._tolerance_um)]
@@ -69,7 +64,7 @@ class _Raising:
     def step(self, factors: Mapping[int, float]) -> dict[int, float]:
         """Run with some shares times their factors and keep those that hold; return by what these may go on."""
         tried = {k: min(1.0, self._share[k] * factor) for k, factor in factors.items()}
-        reference, error_um = self._run(self._share | tried)
+        reference, error_um = run(self._source, self._share | tried, self._judge)
         spoilt = _spans(reference, self._spoilt(error_um)).values()
         good = {k for k, span in _spans(reference, tried).items() if not self._near(span, spoilt)}
         further = {k: self._further(tried[k] / self._share[k], self._error_um[k], error_um[k]) for k in good}
@@ -90,7 +85,7 @@ class _Raising:
         """Return the raised feeds where they hold together, those from before else."""
         if self._share == self._before.share:
             return self._before
-        _, error_um = self._run(self._share)
+        _, error_um = run(self._source, self._share, self._judge)
         if self._spoilt(error_um):
             return self._before
         return replace(self._before, share=self._share, left_um={k: error_um.get(k, 0.0) for k in self._share})

@@ -1,4 +1,4 @@
-"""The highest feed of each stretch of a path at which it keeps a tolerance, found by running the whole path."""
+"""Searches the highest feed of each stretch of a path that keeps a tolerance, by running the whole path."""
 
 from __future__ import annotations
 
@@ -90,6 +90,13 @@ def worst_rows(stretch: Int, contour_um: Float, dt_s: float, after_s: float) -> 
     return worst
 
 
+def run(source: Source, shares: Mapping[int, float], judge: Judge) -> tuple[Trajectory, dict[int, float]]:
+    """Run a path with its stretches at some shares; return it, and the largest error of each stretch, -1: unknown."""
+    reference = source.at(shares)
+    worst = worst_rows(stretches(reference), judge(reference), reference.dt_s, source.after_s)
+    return reference, {k: error for k, (error, _) in worst.items()}
+
+
 @dataclass(frozen=True, slots=True)
 class Feeds:
     """The share of the feed of each stretch as they were run together, its largest error, and which are held by it.
@@ -120,7 +127,7 @@ def highest(source: Source, over: Mapping[int, float], judge: Judge, tolerance_u
 
 @dataclass(slots=True)
 class _Stretch:
-    """What is known of one stretch: ``low`` holds, ``high`` does not; it is ``lost`` when no share is worth a trial.
+    """The bracket of one stretch: ``low`` holds, ``high`` does not; it is ``lost`` when no share is worth a trial.
 
     ``risen`` is how often in a row a higher share held.
     """
@@ -235,17 +242,16 @@ class _Search:
 
     def _run(self, shares: Mapping[int, float]) -> set[int]:
         """Run the path; return the stretches that leave the tolerance."""
-        reference = self._source.at(shares)
-        found = worst_rows(stretches(reference), self._judge(reference), reference.dt_s, self._source.after_s)
+        reference, error_um = run(self._source, shares, self._judge)
         seconds = float(reference.time_s[-1] - reference.time_s[0])
         if self._trials == 0:
             self._longest_s = max(LONGEST_S, LONGEST_SHARE * seconds)
         self._trials += 1
-        bad = {k for k, (error, _) in found.items() if error > self._tolerance_um}
+        bad = {k for k, error in error_um.items() if error > self._tolerance_um}
         for k in bad - self._open.keys():
             self._open[k] = _Stretch()
         for k, stretch in self._open.items():
-            error = found.get(k, (0.0, 0))[0]
+            error = error_um.get(k, 0.0)
             if error >= 0.0:
                 stretch.learn(shares.get(k, 1.0), error, k not in bad)
                 stretch.lost |= seconds > self._longest_s and k in bad and stretch.low is None

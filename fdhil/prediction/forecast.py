@@ -1,4 +1,4 @@
-"""What the history of the parameters says about a path: when a zone leaves a tolerance, and what a step has cost."""
+"""Forecasts a path's error from the parameters' history: when a zone leaves a tolerance, and what a step has cost."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fdhil.config import MachineConfig
 from fdhil.identification import trends
 from fdhil.identification.trends import LEAST_STEP, Slope, reach_days, slope
 from fdhil.prediction.predict import contour_um, predict
-from fdhil.records import PARAMETERS, Float, Parameters, ParameterSet, Prediction, Zone
+from fdhil.records import PARAMETERS, Float, Parameters, ParameterSet, Prediction, Zone, rms
 
 BEYOND_CHANCE = 3.0  # standard deviations
 GROUPS: Mapping[str, tuple[str, ...]] = {"inertia": ("Jt",), "friction": ("ft", "Cd")}
@@ -38,7 +38,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class ZoneChange:
-    """What became of one zone since a program was last compared: its largest contour error ``before`` and ``now``, um.
+    """The change of one zone since a program was last compared: its largest contour error ``before`` and ``now``, um.
 
     ``by`` is what each parameter that changed did to it: (axis, symbol, um), the most first; putting one back alone
     would undo so much. ``settings_um`` is what a changed configuration did, None where it is the same.
@@ -132,9 +132,9 @@ def step_costs(
                     changed={name: (old[name], float(getattr(models[axis], name))) for name in names},
                     since_revision=earlier[axis].revision,
                     cost_um=float(change[row]),
-                    rms_um=_rms(prediction.contour_um) - _rms(without),
+                    rms_um=prediction.rms_um - rms(without),
                     line=int(reference.line[row]),
-                    where=" ".join(f"{a} {reference.position_mm[a][row]:.1f}" for a in reference.axes),
+                    where=reference.place(row),
                 )
             )
     return tuple(sorted(steps, key=lambda step: -abs(step.cost_um)))
@@ -165,7 +165,7 @@ def zone_changes(
     gone = [zone for zone in then.zones if not any(_meet(zone, other) for other in prediction.zones)]
     changes = []
     for zone in sorted((*prediction.zones, *gone), key=lambda zone: zone.start_s):
-        rows = slice(*(round((s - float(reference.time_s[0])) / reference.dt_s) for s in (zone.start_s, zone.end_s)))
+        rows = prediction.rows(zone)
         peak = rows.start + int(np.argmax(np.maximum(prediction.contour_um, then.contour_um)[rows]))
         now_um, before_um = float(prediction.contour_um[rows].max()), float(then.contour_um[rows].max())
         by = ((axis, name, now_um - float(other[rows].max())) for (axis, name), other in without.items())
@@ -188,10 +188,6 @@ def zone_changes(
 
 def _meet(zone: Zone, other: Zone) -> bool:
     return zone.start_s < other.end_s and zone.end_s > other.start_s
-
-
-def _rms(values: Float) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def course(sets: Sequence[ParameterSet], days: Float) -> Course:

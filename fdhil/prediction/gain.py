@@ -1,4 +1,4 @@
-"""What a correction is predicted to gain, with the uncertainty that the prediction knows of itself.
+"""Tells what a correction is predicted to gain, with the uncertainty that the prediction knows of itself.
 
 What the model says of its own correction is the model against itself. What can be reached is bounded by how well the
 parameters are known, and by how well the last recorded moves were predicted.
@@ -14,7 +14,7 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.prediction.uncertainty import contour_std_um
-from fdhil.records import INTERVAL_95, Correction, Float, Parameters, Skill
+from fdhil.records import INTERVAL_95, Correction, Float, Parameters, Skill, rms
 
 
 class Gain(NamedTuple):
@@ -60,15 +60,15 @@ def gain(
     ``covariances`` (6, 6) and ``skills``, those of the last recorded moves, are per axis; where an axis that moves has
     none the uncertainty is not known.
     """
-    before, after, reference = planned.before.contour_um, planned.after.contour_um, planned.before.reference
+    reference = planned.before.reference
     moving = [axis for axis in reference.axes if np.ptp(reference.position_mm[axis]) > 0.0]
     half = None
     if all(axis in covariances for axis in moving):
         known = {axis: covariances.get(axis, np.zeros((6, 6))) for axis in reference.axes}
         std_um = contour_std_um(reference, models, known, config, planned.offset_um)
         skill_um = skill_of(skills, moving)
-        half = None if skill_um is None else math.hypot(INTERVAL_95 * _rms(std_um), skill_um)
-    return Gain(_rms(before), _rms(after), half)
+        half = None if skill_um is None else math.hypot(INTERVAL_95 * rms(std_um), skill_um)
+    return Gain(planned.before.rms_um, planned.after.rms_um, half)
 
 
 def skill_of(skills: Mapping[str, Sequence[Skill]], axes: Sequence[str]) -> float | None:
@@ -77,7 +77,3 @@ def skill_of(skills: Mapping[str, Sequence[Skill]], axes: Sequence[str]) -> floa
         return None
     um = math.hypot(*(float(np.max([skill.rms_um for skill in skills[axis]])) for axis in axes))
     return um if math.isfinite(um) else None
-
-
-def _rms(values: Float) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,11 +1,16 @@
-"""What a path demands of a drive, by inverse dynamics: [DES] eqs. 1 and 2 turned around."""
+"""Inverse dynamics tells what a path demands of a drive: [DES] eqs. 1 and 2 turned around."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
-from fdhil.config import Axis
-from fdhil.records import Float, Parameters
+from fdhil.config import Axis, MachineConfig
+from fdhil.model import closed_loop
+from fdhil.records import Float, Parameters, Trajectory
+
+SHARE_STEP = 2e-3  # to which the feed that can be held is found
 
 
 def required(reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: float) -> tuple[Float, Float]:
@@ -22,3 +27,28 @@ def required(reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: floa
         np.asarray(np.abs(current) / axis.regulators.current_limit_a),
         np.asarray(np.abs(voltage) / axis.regulators.voltage_limit_v),
     )
+
+
+def held_share(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> float:
+    """Return the largest share <= 1 of the feed at which no limit of any drive acts, to ``SHARE_STEP``.
+
+    At a share of the feed an NC with fixed smoothing times orders as large a share of speed and acceleration, so the
+    path scaled by it shows the demand on the drives, dry friction included.
+    """
+
+    def holds(share: float) -> bool:
+        for axis, path in reference.position_mm.items():
+            if np.ptp(path) == 0.0:
+                continue
+            scaled = path[0] + share * (path - path[0])
+            if max(one.max() for one in required(scaled, models[axis], config.axis[axis], reference.dt_s)) > 1.0:
+                return False
+            if closed_loop.simulate(models[axis], config.axis[axis], reference.dt_s, scaled).limited_s > 0.0:
+                return False
+        return True
+
+    low, high = float(holds(1.0)), 1.0
+    while high - low > SHARE_STEP:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return low

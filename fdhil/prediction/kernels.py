@@ -1,16 +1,15 @@
-"""The compiled search of the contour error."""
+"""Compiled kernels search the contour error."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from numba import njit
 
+from fdhil.model.compiled import compiled
 from fdhil.records import Float
 
 
-def _segment_plain(path: Float, j: int, point: Float) -> float:
+@compiled
+def _segment(path: Float, j: int, point: Float) -> float:
     """Return the distance from ``point`` (d,) to the segment from row j of ``path`` to row j + 1."""
     length = 0.0
     along = 0.0
@@ -26,7 +25,8 @@ def _segment_plain(path: Float, j: int, point: Float) -> float:
     return float(np.sqrt(square))
 
 
-def _row_plain(path: Float, j: int, point: Float) -> float:
+@compiled
+def _row(path: Float, j: int, point: Float) -> float:
     """Return the distance from ``point`` (d,) to row j of ``path``."""
     square = 0.0
     for a in range(point.size):
@@ -34,53 +34,31 @@ def _row_plain(path: Float, j: int, point: Float) -> float:
     return float(np.sqrt(square))
 
 
-_row: Callable[[Float, int, Float], float] = njit(cache=True, nogil=True)(_row_plain)
-_segment: Callable[[Float, int, Float], float] = njit(cache=True, nogil=True)(_segment_plain)
+@compiled
+def _beyond(arc: Float, reach: float, begin: int, end: int) -> int:
+    """Return the first row from ``begin`` to ``end`` (which may lie before it) that is farther along than ``reach``.
 
-
-def _beyond_plain(arc: Float, reach: float, low: int, high: int) -> int:
-    """Return the first row above ``low`` at which ``arc`` (n,) exceeds ``reach``, high + 1 if none; it never falls."""
-    if low >= high or arc[high] <= reach:
-        return high + 1
+    ``reach`` is a length from row ``begin``; where no row is that far, the one behind ``end``.
+    """
+    way = 1 if end >= begin else -1
+    far = abs(end - begin)
+    if abs(arc[end] - arc[begin]) <= reach:
+        return end + way
     step = 1
-    at = low + 1
-    while at < high and arc[at] <= reach:  # gallop, then halve
-        low = at
+    while step < far and abs(arc[begin + way * step] - arc[begin]) <= reach:  # gallop, then halve
         step *= 2
-        at = min(low + step, high)
-    while at - low > 1:
-        middle = (low + at) // 2
-        if arc[middle] <= reach:
+    low, high = step // 2, min(step, far)
+    while high - low > 1:
+        middle = (low + high) // 2
+        if abs(arc[begin + way * middle] - arc[begin]) <= reach:
             low = middle
         else:
-            at = middle
-    return at
-
-
-def _before_plain(arc: Float, reach: float, low: int, high: int) -> int:
-    """Return the last row below ``high`` at which ``arc`` (n,) is less than ``reach``; low - 1 if none."""
-    if high <= low or arc[low] >= reach:
-        return low - 1
-    step = 1
-    at = high - 1
-    while at > low and arc[at] >= reach:
-        high = at
-        step *= 2
-        at = max(high - step, low)
-    while high - at > 1:
-        middle = (at + high) // 2
-        if arc[middle] >= reach:
             high = middle
-        else:
-            at = middle
-    return at
+    return begin + way * high
 
 
-_beyond: Callable[[Float, float, int, int], int] = njit(cache=True, nogil=True)(_beyond_plain)
-_before: Callable[[Float, float, int, int], int] = njit(cache=True, nogil=True)(_before_plain)
-
-
-def _contour_plain(path: Float, actual: Float, half_window: int, first: int) -> Float:
+@compiled
+def contour(path: Float, actual: Float, half_window: int, first: int) -> Float:
     """Return (m,) the distance of each row of ``actual`` (m, d) to the polyline of ``path`` (n, d) within the window.
 
     Row k of ``actual`` belongs to row ``first`` + k. A stretch of the path is passed over only where its length proves
@@ -104,31 +82,19 @@ def _contour_plain(path: Float, actual: Float, half_window: int, first: int) -> 
         best = _row(path, k, point)
         begin = max(low, min(nearest, high))
         nearest = k
-        j = begin
-        while j < high:
-            # no point of the path within so far of row j is nearer than the best one
-            room = _row(path, j, point) - best
-            if arc[j + 1] - arc[j] <= room:
-                j = _beyond(arc, arc[j] + room, j + 1, high) - 1
-                continue
-            distance = _segment(path, j, point)
-            if distance < best:
-                best = distance
-                nearest = j
-            j += 1
-        j = begin
-        while j > low:
-            room = _row(path, j, point) - best
-            if arc[j] - arc[j - 1] <= room:
-                j = _before(arc, arc[j] - room, low, j - 1) + 1
-                continue
-            j -= 1
-            distance = _segment(path, j, point)
-            if distance < best:
-                best = distance
-                nearest = j
+        for end in (high, low):
+            way = 1 if end == high else -1
+            j = begin
+            while j != end:
+                # no point of the path within so far of row j is nearer than the best one
+                room = _row(path, j, point) - best
+                if abs(arc[j + way] - arc[j]) <= room:
+                    j = _beyond(arc, room, j, end) - way
+                    continue
+                distance = _segment(path, min(j, j + way), point)
+                if distance < best:
+                    best = distance
+                    nearest = min(j, j + way)
+                j += way
         out[row] = best
     return out
-
-
-contour: Callable[[Float, Float, int, int], Float] = njit(cache=True, nogil=True)(_contour_plain)

@@ -1,4 +1,4 @@
-"""The skill of the closed-loop model: predicted against measured following error of one recorded move."""
+"""Judges the skill of the closed-loop model: predicted against measured following error of one recorded move."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 
 from fdhil.config import Axis
 from fdhil.model import closed_loop
-from fdhil.records import Float, Parameters, Skill
+from fdhil.records import Float, Parameters, Skill, rms
 
 LONGEST_DELAY = 8.0  # in SYNC cycles
 _EDGE = 8  # rows at either end that a shifted comparison leaves out
@@ -28,9 +28,9 @@ def skill(
     shift of the prediction (positive: the drive is later) that explains the difference best. ValueError when fewer
     than 20 rows can be compared.
     """
-    demand = _filled(demand_mm)
+    demand = _filled(demand_mm, "demand")
     offset = None if offset_mm is None else np.nan_to_num(offset_mm)
-    start = closed_loop.start(_first(position_mm))
+    start = closed_loop.start(float(_filled(position_mm, "position")[0]))
     response = closed_loop.simulate(parameters, axis, sync_period_s, demand, offset, state=start)
     rows = np.flatnonzero(np.isfinite(demand_mm) & np.isfinite(position_mm))
     rows = rows[(rows >= _EDGE) & (rows < demand.size - _EDGE)]
@@ -42,27 +42,20 @@ def skill(
     return Skill(
         axis=axis_name,
         tick=tick,
-        rms_um=float(np.sqrt(np.mean(difference**2))),
+        rms_um=rms(difference),
         max_um=float(np.abs(difference).max()),
         delay_ms=delay * sync_period_s * 1e3,
-        measured_rms_um=float(np.sqrt(np.mean(measured**2))),
+        measured_rms_um=rms(measured),
     )
 
 
-def _first(position_mm: Float) -> float:
-    finite = position_mm[np.isfinite(position_mm)]
-    if finite.size == 0:
-        raise ValueError("the move has no position")
-    return float(finite[0])
-
-
-def _filled(demand_mm: Float) -> Float:
-    """The demand with its lost rows bridged: it is a smooth command, and what it drives there is not compared."""
-    good = np.isfinite(demand_mm)
+def _filled(values: Float, what: str) -> Float:
+    """Return the values with lost rows bridged: the demand is smooth, and what it drives there is not compared."""
+    good = np.isfinite(values)
     if not good.any():
-        raise ValueError("the move has no demand")
-    rows = np.arange(demand_mm.size)
-    return np.asarray(np.interp(rows, rows[good], demand_mm[good]))
+        raise ValueError(f"the move has no {what}")
+    rows = np.arange(values.size)
+    return np.asarray(np.interp(rows, rows[good], values[good]))
 
 
 def _delay(measured_mm: Float, predicted_mm: Float, rows: np.ndarray[tuple[int], np.dtype[np.int64]]) -> float:

@@ -1,4 +1,4 @@
-"""Model files: the six parameters of each axis as JSON, ``{"X": {"R", "L", "K", "Jt", "ft", "Cd"}, ...}``."""
+"""Reads model files: the six parameters of each axis as JSON, ``{"X": {"R", "L", "K", "Jt", "ft", "Cd"}, ...}``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Prediction of a reference trajectory from the identified closed loops ([DES] section 5, figure 9)."""
+"""Predicts a reference trajectory from the identified closed loops ([DES] section 5, figure 9)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault
-from fdhil.model import closed_loop
+from fdhil.model.closed_loop import Response, simulate_axes
 from fdhil.prediction.contour import contour_error_um
 from fdhil.prediction.zones import find_zones
 from fdhil.records import Float, Parameters, Prediction, Trajectory, frozen
@@ -38,23 +38,14 @@ def predict(
 
     Zones are what stands out, or with ``zones_above_um`` all that is above it.
     """
-    check_axes(reference, models, config)
-    responses = closed_loop.simulate_axes(models, config.axis, reference.dt_s, reference.position_mm)
     smooth = {axis: replace(model, Cd=0.0) for axis, model in models.items()}
+    responses = _responses(reference, models, config)
     return _assemble(reference, responses, config, zones_above_um, lambda: contour_um(reference, smooth, config))
 
 
 def contour_um(reference: Trajectory, models: Mapping[str, Parameters], config: MachineConfig) -> Float:
     """Return the contour error (n,) um alone, as :func:`predict` has it: for those who run many paths."""
-    check_axes(reference, models, config)
-    responses = closed_loop.simulate_axes(models, config.axis, reference.dt_s, reference.position_mm)
-    return _contour(reference, responses)
-
-
-def _contour(reference: Trajectory, responses: Mapping[str, closed_loop.Response]) -> Float:
-    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
-    actual = np.column_stack([responses[axis].position_mm for axis in reference.axes])
-    return contour_error_um(path, actual, reference.dt_s)
+    return _contour(reference, _responses(reference, models, config))
 
 
 def predict_corrected(
@@ -69,17 +60,29 @@ def predict_corrected(
 
     Speed and torque offsets (n,) per axis are those of an on-line feed-forward.
     """
+    offset_mm = {axis: values * 1e-3 for axis, values in (offset_um or {}).items()}
+    offsets = (offset_mm, speed_offset_rad_s, torque_offset_nm)
+    return _assemble(reference, _responses(reference, models, config, *offsets), config)
+
+
+def _responses(
+    reference: Trajectory,
+    models: Mapping[str, Parameters],
+    config: MachineConfig,
+    *offsets: Mapping[str, Float] | None,
+) -> Mapping[str, Response]:
     check_axes(reference, models, config)
-    offsets = None if offset_um is None else {axis: values * 1e-3 for axis, values in offset_um.items()}
-    responses = closed_loop.simulate_axes(
-        models, config.axis, reference.dt_s, reference.position_mm, offsets, speed_offset_rad_s, torque_offset_nm
-    )
-    return _assemble(reference, responses, config)
+    return simulate_axes(models, config.axis, reference.dt_s, reference.position_mm, *offsets)
+
+
+def _contour(reference: Trajectory, responses: Mapping[str, Response]) -> Float:
+    actual = np.column_stack([responses[axis].position_mm for axis in reference.axes])
+    return contour_error_um(reference.path_mm, actual, reference.dt_s)
 
 
 def _assemble(
     reference: Trajectory,
-    responses: Mapping[str, closed_loop.Response],
+    responses: Mapping[str, Response],
     config: MachineConfig,
     zones_above_um: float | None = None,
     without_friction: Callable[[], Float] | None = None,

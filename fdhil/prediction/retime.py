@@ -1,4 +1,4 @@
-"""A recorded demand at other feeds: it has no lines, and what the NC would make of another feed is not in it.
+"""Runs a recorded demand at other feeds: it has no lines, and what the NC would make of another feed is not in it.
 
 Where the NC is an interpolator of the configured averages (``[nc] smoothing_s``), these can be taken off the demand,
 the path under them run at another speed, and the averages put on again: the demand is then what the NC would order. A
@@ -40,7 +40,7 @@ def demand_sources(
     """
     contour = predict(reference, models, config).contour_um
     stretch = stretches_around(contour > tolerance_um, round(APART_S / reference.dt_s))
-    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    path = reference.path_mm
     averages = Averages(config.nc.smoothing_s, reference.dt_s)
     if config.nc.profile != "fir":
         return _source(reference, path, stretch, averages.capped), _source(reference, path, stretch, averages.stretched)
@@ -61,22 +61,18 @@ def stretches_around(over: Bool, apart: int) -> Int:
 
 
 def _source(reference: Trajectory, path: Float, stretch: Int, rule: Rule) -> Source:
-    positions = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
-    speeds = np.linalg.norm(np.diff(positions, axis=0, append=positions[-1:]), axis=1) * 60.0 / reference.dt_s
-    fastest = np.zeros(int(stretch[-1]) + 1)
-    np.maximum.at(fastest, stretch, speeds)
+    positions = reference.path_mm
+    fastest = _fastest(_steps(positions) * 60.0 / reference.dt_s, stretch)
 
     def at(shares: Mapping[int, float]) -> Trajectory:
         per_stretch = np.array([shares.get(k, 1.0) for k in range(fastest.size)])
         as_it_is = bool((per_stretch == 1.0).all())
         moved, lines = (positions, stretch) if as_it_is else rule(path, stretch, per_stretch[stretch])
-        rapid = np.zeros(lines.size, dtype=np.bool_)
-        rapid.setflags(write=False)
         return replace(
             reference,
             time_s=frozen(reference.time_s[0] + np.arange(lines.size) * reference.dt_s),
             position_mm={axis: frozen(moved[:, a]) for a, axis in enumerate(reference.axes)},
-            rapid=rapid,
+            rapid=np.broadcast_to(np.False_, lines.size),
             line=frozen_ints(lines),
         )
 
@@ -116,8 +112,10 @@ class Averages:
     def smoothed(self, path: Float, stretch: Int, share: Float) -> tuple[Float, Int]:
         """The path under the averages at other speeds, and the averages on again."""
         rows = _rows(1.0 / share)
-        moved = self._on(_between(path, rows))
-        return moved, _held(stretch, rows, len(moved))
+        grid = np.arange(len(path), dtype=np.float64)
+        moved = self._on(np.column_stack([np.interp(rows, grid, column) for column in path.T]))
+        found = stretch[rows.astype(np.int64)]
+        return moved, np.concatenate([found, np.full(len(moved) - found.size, found[-1])])
 
     def _faded(self, values: Float) -> Float:
         """Values (n,) that change from one to the next as an averaged demand does."""
@@ -135,12 +133,22 @@ class Averages:
 
     def capped(self, path: Float, stretch: Int, share: Float) -> tuple[Float, Int]:
         """The speed held below a share of the stretch's fastest: accelerations stay, as where they are the limit."""
-        speed = np.linalg.norm(np.diff(path, axis=0, append=path[-1:]), axis=1)
-        fastest = np.zeros(int(stretch[-1]) + 1)
-        np.maximum.at(fastest, stretch, speed)
-        most = self._faded(np.where(share < 1.0, share * fastest[stretch], speed.max()))
+        speed = _steps(path)
+        most = self._faded(np.where(share < 1.0, share * _fastest(speed, stretch)[stretch], speed.max()))
         rows = _rows(np.maximum(1.0, speed / np.maximum(most, 1e-12)))
         return _along(path, rows), stretch[rows.astype(np.int64)]
+
+
+def _steps(path: Float) -> Float:
+    """Return (n,) how far each row of a path (n, d) is from the next."""
+    return np.asarray(np.linalg.norm(np.diff(path, axis=0, append=path[-1:]), axis=1))
+
+
+def _fastest(speed: Float, stretch: Int) -> Float:
+    """Return the largest speed of each stretch, by its number."""
+    fastest = np.zeros(int(stretch[-1]) + 1)
+    np.maximum.at(fastest, stretch, speed)
+    return fastest
 
 
 def _rows(lasts: Float) -> Float:
@@ -150,16 +158,6 @@ def _rows(lasts: Float) -> Float:
     return np.asarray(np.interp(np.arange(math.ceil(begins[-1]) + 1), begins, rows))
 
 
-def _between(path: Float, rows: Float) -> Float:
-    grid = np.arange(len(path), dtype=np.float64)
-    return np.column_stack([np.interp(rows, grid, column) for column in path.T])
-
-
 def _along(path: Float, rows: Float) -> Float:
     """A demand between its rows: smooth, or the kinks at each row would ask for twice the acceleration."""
     return np.asarray(CubicSpline(np.arange(len(path)), path)(rows))
-
-
-def _held(stretch: Int, rows: Float, n: int) -> Int:
-    found = stretch[rows.astype(np.int64)]
-    return np.concatenate([found, np.full(n - found.size, found[-1])])

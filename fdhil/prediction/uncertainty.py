@@ -1,14 +1,13 @@
-"""What the parameters' uncertainty does to the predicted path, and which parameter matters where."""
+"""Propagates the parameters' uncertainty to the predicted path, and tells which parameter matters where."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 
-from fdhil.config import Axis, MachineConfig
+from fdhil.config import MachineConfig
 from fdhil.model import closed_loop
 from fdhil.prediction.contour import contour_error_um
 from fdhil.prediction.predict import check_axes
@@ -26,32 +25,25 @@ def _changed(parameters: Parameters, name: str) -> tuple[Parameters, float]:
 
 
 def _positions(
-    path_mm: Float, parameters: Parameters, axis: Axis, sync_period_s: float, offset_mm: Float | None
-) -> tuple[Float, Float, Float]:
-    """Return (6, n) positions with each parameter changed in turn, the steps (6,), and (n,) with none changed."""
-    here = closed_loop.simulate(parameters, axis, sync_period_s, path_mm, offset_mm).position_mm
-    moved = np.empty((len(PARAMETERS), path_mm.size))
-    steps = np.empty(len(PARAMETERS))
-    for k, name in enumerate(PARAMETERS):
-        other, steps[k] = _changed(parameters, name)
-        moved[k] = closed_loop.simulate(other, axis, sync_period_s, path_mm, offset_mm).position_mm
-    return moved, steps, here
-
-
-def _all_positions(
     reference: Trajectory,
     models: Mapping[str, Parameters],
     config: MachineConfig,
     offset_um: Mapping[str, Float] | None,
 ) -> dict[str, tuple[Float, Float, Float]]:
+    """Return of each axis (6, n) positions with each parameter changed in turn, the steps (6,), and (n,) with none."""
     check_axes(reference, models, config)
 
     def one(axis: str) -> tuple[Float, Float, Float]:
-        offset = None if offset_um is None else offset_um[axis] * 1e-3
-        return _positions(reference.position_mm[axis], models[axis], config.axis[axis], reference.dt_s, offset)
+        offset_mm = None if offset_um is None else offset_um[axis] * 1e-3
+        path = reference.position_mm[axis]
+        changed, steps = zip(*(_changed(models[axis], name) for name in PARAMETERS), strict=True)
+        here, *moved = (
+            closed_loop.simulate(model, config.axis[axis], reference.dt_s, path, offset_mm).position_mm
+            for model in (models[axis], *changed)
+        )
+        return np.array(moved), np.array(steps), here
 
-    with ThreadPoolExecutor(max(1, len(reference.axes))) as pool:
-        return dict(zip(reference.axes, pool.map(one, reference.axes), strict=True))
+    return closed_loop.each_axis(one, reference.axes)
 
 
 def contour_std_um(
@@ -66,7 +58,7 @@ def contour_std_um(
     ``covariances`` (6, 6) per axis, in the order of ``PARAMETERS``; NaN rows count as known exactly. First order: the
     position's derivative by each parameter, of which only what is across the path counts; at rest all of it does.
     """
-    found = _all_positions(reference, models, config, offset_um)
+    found = _positions(reference, models, config, offset_um)
     variances = []
     for axis in reference.axes:
         moved, steps, here = found[axis]
@@ -81,7 +73,7 @@ def contour_std_um(
 
 def _across(reference: Trajectory) -> list[Float]:
     """Return per axis (n,) the share of an axis' variance that is across the path: 1 - t^2 of its direction t."""
-    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    path = reference.path_mm
     if path.shape[1] == 1:
         return [np.ones(len(path))]
     velocity = np.gradient(path, axis=0)
@@ -102,16 +94,11 @@ def sensitivity_um(
     A mapping axis -> parameter -> um, in the order of the zones: it names the parameter that drives a zone's error.
     """
     reference = prediction.reference
-    found = _all_positions(reference, models, config, offset_um)
-    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    found = _positions(reference, models, config, offset_um)
+    path = reference.path_mm
     here = np.column_stack([found[axis][2] for axis in reference.axes])
-    start = float(reference.time_s[0])
-    ranges = [
-        tuple(round((seconds - start) / reference.dt_s) for seconds in (zone.start_s, zone.end_s))
-        for zone in prediction.zones
-    ]
     base = contour_error_um(path, here, reference.dt_s)
-    result: list[dict[str, dict[str, float]]] = [{axis: {} for axis in reference.axes} for _ in ranges]
+    result: list[dict[str, dict[str, float]]] = [{axis: {} for axis in reference.axes} for _ in prediction.zones]
     for a, axis in enumerate(reference.axes):
         moved, steps, _ = found[axis]
         for k, name in enumerate(PARAMETERS):
@@ -120,7 +107,7 @@ def sensitivity_um(
             contour = contour_error_um(path, other, reference.dt_s)
             value = abs(float(getattr(models[axis], name)))
             per_percent = 0.01 * value / steps[k]
-            for zone, (first, last) in zip(result, ranges, strict=True):
-                rise = float(contour[first:last].max() - base[first:last].max())
-                zone[axis][name] = rise * per_percent
+            for zone, per_axis in zip(prediction.zones, result, strict=True):
+                rows = prediction.rows(zone)
+                per_axis[axis][name] = float(contour[rows].max() - base[rows].max()) * per_percent
     return tuple(result)

@@ -1,4 +1,4 @@
-"""Zones: stretches of the path whose contour error stands out, where they are and why they are there."""
+"""Finds zones: stretches of the path whose contour error stands out, where they are and why they are there."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CAUSES = ("saturation", "corner", "start", "stop", "reversal", "circular lag", "
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """What the reference does, (n,) each: path speed in mm/s, turn rate in rad/s, and the rows of its events.
+    """The course of a reference, (n,) each: path speed in mm/s, turn rate in rad/s, and the rows of its events.
 
     ``arc``: it turns, and not in a corner.
     """
@@ -47,14 +47,13 @@ class Geometry:
 def geometry(reference: Trajectory, loop_s: float) -> Geometry:
     """Find starts, stops, corners and reversals of a reference; ``loop_s`` is the time of the drives' loops."""
     dt = reference.dt_s
-    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    path = reference.path_mm
     velocity = np.zeros_like(path)
     velocity[:-1] = np.diff(path, axis=0) / dt
     speed = np.linalg.norm(velocity, axis=1)
     moving = speed > 1e-3 * max(float(speed.max()), 1e-9)
     # where an axis turns around it stands still for an instant: that is no stop
-    going = moving | (_near(moving, PAUSE_S, 0.0, dt) & _near(moving, 0.0, PAUSE_S, dt))
-    step = np.diff(going.astype(np.int8), prepend=0, append=0)
+    step = np.diff(_joined(moving, PAUSE_S, dt).astype(np.int8), prepend=0, append=0)
     start, stop = step[:-1] == 1, np.zeros(len(path), dtype=np.bool_)
     stop[np.clip(np.flatnonzero(step == -1), 0, len(path) - 1)] = True
     change = np.diff(speed, append=0.0)
@@ -149,8 +148,8 @@ def find_zones(
         _Run(first, last, CAUSES[cause[first] % len(CAUSES)], _peak(contour_um, first, last))
         for first, last in _runs(above, cause, dt)
     ]
-    joined = _corners_joined(runs, shape, contour_um, loop_s, dt)
-    return tuple(_zone(reference, shape, contour_um, run, loop_s) for run in joined)
+    runs = _corners_joined(runs, shape, contour_um, loop_s, dt)
+    return tuple(_zone(reference, shape, contour_um, run, loop_s) for run in runs)
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,7 +222,7 @@ def _name_again(
     turned = _near(shape.arc, 0.0, RECENT * loop_s, dt)
     recent = _near(shape.events["corner"], BEFORE * loop_s, RECENT * loop_s, dt)
     reversing = _near(shape.events["reversal"], BEFORE * loop_s, AFTER * loop_s, dt)
-    across, along = _accelerations(shape, dt)
+    across, along = shape.speed * shape.turn_rate, np.abs(np.gradient(shape.speed, dt))  # accelerations, mm/s2
     for (first, last), name in zip(runs, names, strict=True):
         peak = _peak(contour_um, first, last)
         frictions = free[peak] < MOST_OF_IT * contour_um[peak]
@@ -239,11 +238,6 @@ def _name_again(
             new = "circular lag"
         if new != name:
             cause[first:last] = CAUSES.index(new) + (len(CAUSES) * first if new == "reversal" else 0)
-
-
-def _accelerations(shape: Geometry, dt: float) -> tuple[Float, Float]:
-    """Return (n,) how fast the velocity turns and how fast it grows or falls, mm/s2."""
-    return shape.speed * shape.turn_rate, np.abs(np.gradient(shape.speed, dt))
 
 
 def _ordinal(rows: Bool, before_s: float, dt: float) -> Int:
@@ -266,8 +260,7 @@ def _near(rows: Bool, before_s: float, after_s: float, dt: float) -> Bool:
 
 def _runs(above: Bool, cause: Int, dt: float) -> list[tuple[int, int]]:
     """Half-open runs of one cause above the threshold; gaps shorter than ``MERGE_S`` do not part them."""
-    closed = above | (_near(above, MERGE_S, 0.0, dt) & _near(above, 0.0, MERGE_S, dt))
-    edges = np.flatnonzero(np.diff(np.where(closed, cause, -1), prepend=-2, append=-2) != 0)
+    edges = np.flatnonzero(np.diff(np.where(_joined(above, MERGE_S, dt), cause, -1), prepend=-2, append=-2) != 0)
     runs = []
     for first, last in pairwise(edges.tolist()):
         inside = np.flatnonzero(above[first:last])
@@ -285,11 +278,10 @@ def _zone(reference: Trajectory, shape: Geometry, contour_um: Float, run: _Run, 
         events = low + np.flatnonzero(shape.events["reversal"][low : run.last + 1])
         if events.size:
             place = int(events[np.argmin(np.abs(events - run.peak))])
-    where = " ".join(f"{axis} {reference.position_mm[axis][place]:.1f}" for axis in reference.axes)
     return Zone(
         start_s=round(float(reference.time_s[run.first]), 6),
         end_s=round(float(reference.time_s[run.last - 1]) + reference.dt_s, 6),
-        where=where,
+        where=reference.place(place),
         max_um=float(contour_um[run.peak]),
         cause=run.cause,
     )

@@ -32,6 +32,7 @@ from fdhil.records.values import (
     frozen,
     frozen_ints,
     read_only,
+    rms,
 )
 from fdhil.records.verdicts import Estimate, Notice, ParameterSet, Reason, Result, Verdict, WindowOutcome
 
@@ -74,4 +75,5 @@ __all__ = [
     "frozen",
     "frozen_ints",
     "read_only",
+    "rms",
 ]

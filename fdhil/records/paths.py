@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from fdhil.records.values import Bool, Float, Int
+import numpy as np
+
+from fdhil.records.values import Bool, Float, Int, rms
 from fdhil.records.verdicts import Reason
 
 
@@ -26,6 +28,15 @@ class Trajectory:
     def axes(self) -> tuple[str, ...]:
         """The axes in the order of the machine."""
         return tuple(self.position_mm)
+
+    @property
+    def path_mm(self) -> Float:
+        """The path (n, d), a column per axis."""
+        return np.column_stack([self.position_mm[axis] for axis in self.axes])
+
+    def place(self, row: int) -> str:
+        """Say where a row is: ``X 1.0 Y 2.0``."""
+        return " ".join(f"{axis} {self.position_mm[axis][row]:.1f}" for axis in self.axes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +65,21 @@ class Prediction:
     current_a: Mapping[str, Float]
     limited_s: Mapping[str, float]
     zones: tuple[Zone, ...] = ()
+
+    @property
+    def rms_um(self) -> float:
+        """The RMS of the contour error."""
+        return rms(self.contour_um)
+
+    def rows(self, zone: Zone) -> slice:
+        """Return the rows of a zone."""
+        start_s = float(self.reference.time_s[0])
+        return slice(*(round((seconds - start_s) / self.reference.dt_s) for seconds in (zone.start_s, zone.end_s)))
+
+    def worst_row(self, zone: Zone) -> int:
+        """Return the row of a zone's largest contour error."""
+        rows = self.rows(zone)
+        return int(rows.start + self.contour_um[rows].argmax())
 
 
 @dataclass(frozen=True, slots=True)

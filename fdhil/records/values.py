@@ -50,6 +50,11 @@ def frozen_ints(values: npt.ArrayLike) -> Int:
     return array
 
 
+def rms(values: Float) -> float:
+    """Return the root mean square of (n,)."""
+    return float((values @ values / values.size) ** 0.5)
+
+
 @dataclass(frozen=True, slots=True)
 class Parameters:
     """The six physical parameters of equations [1] and [2]: ohm, H, N.m/A, kg.m2, N.m.s, N.m."""

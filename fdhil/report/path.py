@@ -76,10 +76,6 @@ def _with(parameters: str) -> str:
     return f", with {parameters}" if parameters else ""
 
 
-def _rms(predicted: Prediction) -> float:
-    return float(np.sqrt(np.mean(predicted.contour_um**2)))
-
-
 def _um(value: float) -> str:
     """Three digits, and no exponent."""
     if value < 0.001:
@@ -89,7 +85,7 @@ def _um(value: float) -> str:
 
 def _figures(label: str, predicted: Prediction) -> list[tuple[str, str]]:
     return [
-        (f"{label}, RMS", _um(_rms(predicted))),
+        (f"{label}, RMS", _um(predicted.rms_um)),
         (f"{label}, largest", _um(float(predicted.contour_um.max()))),
     ]
 
@@ -139,7 +135,7 @@ def worst_places(predicted: Prediction) -> list[tuple[Zone, int]]:
     They are apart from each other and in the path's order; of equal ones the first is taken.
     """
     reference = predicted.reference
-    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    path = reference.path_mm
     of_kinds: dict[tuple[str, str], Zone] = {}
     for zone in sorted(predicted.zones, key=lambda zone: (-float(f"{zone.max_um:.2g}"), zone.start_s)):
         of_kinds.setdefault((zone.cause, f"{zone.max_um:.2g}"), zone)
@@ -148,17 +144,11 @@ def worst_places(predicted: Prediction) -> list[tuple[Zone, int]]:
     found: list[tuple[Zone, int]] = []
     for most, zones in ((MOST_PLACES, [*causes.values(), *of_kinds.values()]), (FEW_PLACES, others)):
         for zone in zones:
-            first, last = _rows(reference, zone)
-            row = first + int(np.argmax(predicted.contour_um[first:last]))
+            row = predicted.worst_row(zone)
             apart = all(np.linalg.norm(path[row] - path[other]) > APART_MM for _, other in found)
             if apart and len(found) < most:
                 found.append((zone, row))
     return sorted(found, key=lambda place: place[1])
-
-
-def _rows(reference: Trajectory, zone: Zone) -> tuple[int, int]:
-    start = float(reference.time_s[0])
-    return round((zone.start_s - start) / reference.dt_s), round((zone.end_s - start) / reference.dt_s)
 
 
 def _places(cases: Sequence[tuple[str, Prediction]]) -> Section:
@@ -171,7 +161,8 @@ def _places(cases: Sequence[tuple[str, Prediction]]) -> Section:
 def _place(cases: Sequence[tuple[str, Prediction]], zone: Zone, row: int) -> tuple[str, str]:
     """Return caption and picture of one zone: in the plane of its motion, or over time where one axis moves alone."""
     reference = cases[0][1].reference
-    first, last = _rows(reference, zone)
+    inside = cases[0][1].rows(zone)
+    first, last = inside.start, inside.stop
     before, aside = round(BEFORE_S / reference.dt_s), round(ASIDE_S / reference.dt_s)
     rows = slice(max(0, first - aside), last + aside)
     line = f"line {reference.line[row]}, " if reference.line[row] else ""
@@ -210,7 +201,7 @@ def _place(cases: Sequence[tuple[str, Prediction]], zone: Zone, row: int) -> tup
 def nearest_mm(predicted: Prediction, rows: slice) -> Float:
     """Return for each predicted point of ``rows`` the point (m, d) of the path from which its contour error counts."""
     reference = predicted.reference
-    path = np.column_stack([reference.position_mm[axis] for axis in reference.axes])
+    path = reference.path_mm
     actual = np.column_stack([predicted.predicted_mm[axis] for axis in reference.axes])[rows]
     window = round(WINDOW_S / reference.dt_s)
     found = np.empty_like(actual)
@@ -229,11 +220,10 @@ def _zones(before: Prediction, after: Prediction | None) -> Section:
     largest = sorted(before.zones, key=lambda zone: -zone.max_um)[:MOST_ROWS]
     rows = []
     for zone in sorted(largest, key=lambda zone: zone.start_s):
-        first, last = _rows(reference, zone)
-        row = first + int(np.argmax(before.contour_um[first:last]))
+        row = before.worst_row(zone)
         cells = [f"{zone.start_s:.2f} - {zone.end_s:.2f}", str(reference.line[row] or ""), zone.where, zone.cause]
         cells.append(f"{zone.max_um:.1f}")
-        rows.append(cells if after is None else [*cells, f"{after.contour_um[first:last].max():.2f}"])
+        rows.append(cells if after is None else [*cells, f"{after.contour_um[before.rows(zone)].max():.2f}"])
     if not rows:
         return Section("Zones", "No zone stands out.")
     left_out = len(before.zones) - len(rows)

@@ -1,4 +1,4 @@
-"""What every listed correction method keeps to, whoever wrote it."""
+"""The contract of every listed correction method, whoever wrote it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from fdhil import config as configuration
 from fdhil import tables
-from fdhil.correction import Limits, check, plan
+from fdhil.correction import PlanLimits, check, plan
 from fdhil.correction.method import Plan
 from fdhil.prediction import predict
 from fdhil.prediction.models import nominal_models
@@ -39,7 +39,7 @@ def test_every_axis_gets_an_offset_per_row_that_the_guard_lets_pass(planned: tup
     _, correction = planned
     assert list(correction.offset_um) == list(REFERENCE.position_mm)
     for axis, offset in correction.offset_um.items():
-        limits = Limits.of(CONFIG.axis[axis], CONFIG.machine.sync_period_s)
+        limits = PlanLimits.of(CONFIG.axis[axis], CONFIG.machine.sync_period_s)
         increments = offset / limits.um_per_increment
         assert offset.shape == REFERENCE.position_mm[axis].shape
         assert np.allclose(increments, np.rint(increments), atol=1e-6)

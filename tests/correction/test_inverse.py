@@ -9,7 +9,7 @@ import pytest
 
 from fdhil import config as configuration
 from fdhil.cli.guard import limits_of
-from fdhil.correction import Limits, check, mirror, plan
+from fdhil.correction import PlanLimits, check, mirror, plan
 from fdhil.correction.inverse import BLOCK_S
 from fdhil.correction.linear import delay_s, inverse
 from fdhil.guard.table import check_rows
@@ -41,7 +41,7 @@ def scattered(seed: int) -> dict[str, Parameters]:
 def assert_within_limits(correction: Correction) -> None:
     """Amplitude with braking, rate, acceleration, variation; whole increments."""
     for axis, offset in correction.offset_um.items():
-        limits = Limits.of(CONFIG.axis[axis], 0.001)
+        limits = PlanLimits.of(CONFIG.axis[axis], 0.001)
         increments = offset / limits.um_per_increment
         assert np.allclose(increments, np.rint(increments), atol=1e-6)
         whole = np.rint(increments).astype(np.int64)
@@ -214,7 +214,7 @@ def test_narrow_limits_are_kept() -> None:
     correction = plan(trajectory(bench_demand(5)), MODELS, config, "inverse")
     assert correction.refused == ()
     for axis, offset in correction.offset_um.items():
-        limits = Limits.of(config.axis[axis], 0.001)
+        limits = PlanLimits.of(config.axis[axis], 0.001)
         assert check(np.rint(offset / limits.um_per_increment).astype(np.int64), limits) == []
     assert rms(correction.before.contour_um) > 4 * rms(correction.after.contour_um)
 

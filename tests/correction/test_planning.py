@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fdhil import config as configuration
-from fdhil.correction import Limits, check, plan, table
+from fdhil.correction import PlanLimits, check, plan, table
 from fdhil.model import closed_loop
 from fdhil.prediction import contour_error_um, predict
 from fdhil.prediction.models import nominal_models
@@ -37,7 +37,7 @@ def test_mirror_leaves_what_the_bench_says(feed: float, rms_um: float, max_um: f
     assert [reason.code for reason in correction.warnings if reason.code != "NearLimit"] == ["HarmPredicted"]
     assert correction.after.contour_um.max() == pytest.approx(max_um, rel=0.02)
     for axis, offset in correction.offset_um.items():
-        limits = Limits.of(CONFIG.axis[axis], 0.001)
+        limits = PlanLimits.of(CONFIG.axis[axis], 0.001)
         assert np.abs(offset + correction.before.error_um[axis]).max() <= 0.55 * limits.um_per_increment
         increments = offset / limits.um_per_increment
         assert np.allclose(increments, np.rint(increments), atol=1e-6)

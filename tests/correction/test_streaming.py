@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import pytest
 
-from fdhil.correction import Limits, check, plan
+from fdhil.correction import PlanLimits, check, plan
 from fdhil.correction.streaming import stream
 from fdhil.prediction.models import nominal_models
 from fdhil.records import Float
@@ -107,9 +107,10 @@ def test_seams_do_not_show() -> None:
     offsets = [block.offset_um for block in stream(pieces(there, 500), MODELS, CONFIG)]
     for axis in "XY":
         joined = (
-            np.concatenate([block[axis] for block in offsets]) / Limits.of(CONFIG.axis[axis], 0.001).um_per_increment
+            np.concatenate([block[axis] for block in offsets])
+            / PlanLimits.of(CONFIG.axis[axis], 0.001).um_per_increment
         )
-        assert check(np.rint(joined).astype(np.int64), Limits.of(CONFIG.axis[axis], 0.001)) == []
+        assert check(np.rint(joined).astype(np.int64), PlanLimits.of(CONFIG.axis[axis], 0.001)) == []
 
 
 def test_memory_is_flat() -> None:

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from fdhil import config as machine_config
 from fdhil.cli.guard import settings_of
 from fdhil.config import CEILING_ACCELERATION_MM_S2, CEILING_OFFSET_UM, CEILING_SPEED_MM_S, VARIATION_MM, OffsetLimits
-from fdhil.correction import Limits, check
+from fdhil.correction import PlanLimits, check
 from fdhil.correction.gate import writing_off
 from fdhil.correction.limits import fit, to_increments
 from fdhil.errors import ConfigError
@@ -81,7 +81,7 @@ def test_planner_and_guard_agree_on_every_axis_and_nothing_exceeds_a_ceiling(
         return
     assert OffsetLimits.of(axis, period).time_to_safe_s(period) <= 0.120 + 1e-9
     whole = settings_of(machine, "can0", Path(), "").axes[0].limits
-    planned = Limits.of(axis, period)
+    planned = PlanLimits.of(axis, period)
     assert (whole.offset, whole.rate, whole.acceleration, whole.variation, whole.window) == OffsetLimits.of(
         axis, period
     ).whole

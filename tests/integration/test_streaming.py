@@ -18,7 +18,7 @@ from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.program_check import check
 from fdhil.arming.token import read_token
 from fdhil.config import MachineConfig
-from fdhil.correction import Limits
+from fdhil.correction import PlanLimits
 from fdhil.correction import check as check_limits
 from fdhil.guard.interlocks import FACTS
 from fdhil.prediction.models import nominal_models
@@ -115,7 +115,7 @@ def test_rows_end_before_a_place_that_is_refused(bench: Bench, client: GuardClie
     assert stream.end == checked.rows
     assert client.status()["cause"]["code"] == "TableStarved"
     trace = np.genfromtxt(tmp_path / "trace.csv", delimiter=",", names=True)
-    limits = Limits.of(bench.config.axis["X"], 0.001)
+    limits = PlanLimits.of(bench.config.axis["X"], 0.001)
     for axis in "XY":
         sent = np.rint(trace[f"{axis}_offset_um"] / limits.um_per_increment)
         assert np.any(sent[: checked.rows - 1_000])

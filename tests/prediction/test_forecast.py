@@ -1,4 +1,4 @@
-"""What the parameters' history says about a path."""
+"""Forecasts of a path's error from the parameters' history."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ class Estimator(Protocol):
 
 
 def chosen(settings: Identification) -> tuple[str, Estimator]:
-    """Return the name and the function of the estimator that the settings ask for (the best when they do not say)."""
-    name = settings.method or list(tables.ESTIMATORS)[-1]
+    """Return the name and the function of the estimator that the settings ask for, else the default."""
+    name = settings.method or tables.DEFAULT_ESTIMATOR
     estimator: Estimator = tables.load(tables.ESTIMATORS, name)
     return name, estimator

@@ -1,0 +1,20 @@
+"""Compiles kernels: kept on disk from one start to the next, and run without the interpreter's lock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+from numba import njit
+
+Kernel = TypeVar("Kernel", bound=Callable[..., Any])
+
+
+def compiled(kernel: Kernel) -> Kernel:
+    """Compile a function of plain numbers and arrays; its own Python stays at ``py_func``."""
+    return cast(Kernel, njit(cache=True, nogil=True)(kernel))
+
+
+def inlined(kernel: Kernel) -> Kernel:
+    """Compile a function into each kernel that calls it."""
+    return cast(Kernel, njit(cache=True, nogil=True, inline="always")(kernel))

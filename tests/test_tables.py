@@ -1,0 +1,28 @@
+"""The registries: whatever they list can be loaded, and the defaults are listed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import pytest
+
+from fdhil import tables
+
+TABLES: dict[str, Mapping[str, str]] = {
+    name: table for name, table in vars(tables).items() if name.isupper() and isinstance(table, Mapping)
+}
+
+
+@pytest.mark.parametrize(("table", "name"), [(table, name) for table in TABLES for name in TABLES[table]])
+def test_what_is_listed_is_there(table: str, name: str) -> None:
+    assert tables.load(TABLES[table], name) is not None
+
+
+def test_the_defaults_are_listed() -> None:
+    assert tables.DEFAULT_ESTIMATOR in tables.ESTIMATORS
+    assert tables.DEFAULT_CORRECTION in tables.CORRECTIONS
+
+
+def test_what_is_not_listed_is_a_key_error() -> None:
+    with pytest.raises(KeyError):
+        tables.load(tables.CORRECTIONS, "none")
