@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from fdhil.errors import ProgramError
 from fdhil.program.machine import Machine
 from fdhil.program.modal import AXES, MM_PER_INCH, Modal
+from fdhil.program.motions import Swept, swept
 from fdhil.program.targets import axis_words, feed_mm_min, plane_axes, target
 from fdhil.program.words import Block
 
@@ -41,33 +41,31 @@ def arc(machine: Machine, block: Block) -> None:
     turns = _turns(block)
     turns = -turns if clockwise else turns
     axes = (first, second, normal)
-    angle, length = _extent(modal.position, end, centre, turns, axes)
-    feed = feed_mm_min(modal, block, length)
+    path = swept(modal.position, end, centre, turns, axes)
+    feed = feed_mm_min(modal, block, path.length_mm)
     if modal.rotation_deg and normal != 2:
-        _tilted(machine, block, end, centre, angle, axes, feed)
+        _tilted(machine, block, end, path, axes, feed)
     else:
-        machine.arc_to(block, end, centre, turns, feed, angle)
+        machine.arc_to(block, end, centre, turns, feed, path.angle_rad)
 
 
 def _tilted(
-    machine: Machine, block: Block, end: list[float], centre: tuple[float, float], angle: float,
-    axes: tuple[int, int, int], feed: float,
-) -> None:  # fmt: skip
+    machine: Machine, block: Block, end: list[float], path: Swept, axes: tuple[int, int, int], feed: float
+) -> None:
     """Order an arc whose plane is turned about Z with its system: chords, since it lies in none of the planes."""
     first, second, _ = axes
     if machine.compensation is not None:
         what = "an arc outside the XY plane of a turned system cannot be compensated; end compensation by G40 first"
-        raise ProgramError(block.line, f"G{machine.modal.motion / 10:g}", what)
+        raise block.fault(machine.modal.code, what)
     begin = list(machine.modal.position)
-    radii = [math.hypot(p[first] - centre[0], p[second] - centre[1]) for p in (begin, end)]
-    from_rad = math.atan2(begin[second] - centre[1], begin[first] - centre[0])
+    (x, y), radii = path.centre, path.radii
     step = 2.0 * math.acos(max(0.0, 1.0 - _CHORD_ERROR_MM / max(radii)))
-    chords = min(math.ceil(abs(angle) / step), machine.budget.max_motions_per_block)
+    chords = min(math.ceil(abs(path.angle_rad) / step), machine.budget.max_motions_per_block)
     for number in range(1, chords):
         share = number / chords
         place = [a + (b - a) * share for a, b in zip(begin, end, strict=True)]
-        radius, turned = radii[0] + (radii[1] - radii[0]) * share, from_rad + angle * share
-        place[first], place[second] = centre[0] + radius * math.cos(turned), centre[1] + radius * math.sin(turned)
+        radius, turned = radii[0] + (radii[1] - radii[0]) * share, path.begin_rad + path.angle_rad * share
+        place[first], place[second] = x + radius * math.cos(turned), y + radius * math.sin(turned)
         machine.feed_at(block, place, feed)
     machine.feed_at(block, end, feed)
 
@@ -87,7 +85,7 @@ def _centre_of_offsets(modal: Modal, block: Block, first: int, second: int) -> t
     if wrong:
         raise block.fault(wrong[0], f"gives no centre in the {modal.plane_name} plane; choose the plane or the letter")
     if not given:
-        raise ProgramError(block.line, f"G{modal.motion / 10:g}", "an arc wants its centre (I J K) or its radius (R)")
+        raise block.fault(modal.code, "an arc wants its centre (I J K) or its radius (R)")
     if modal.arc_absolute and len(given) < 2:
         raise block.fault(given[0], "an absolute centre (G90.1) wants both of its words")
     values = [block.words.get(letter, 0.0) * modal.scale for letter in letters]
@@ -132,29 +130,3 @@ def _centre_of_radius(
         (start[0] + end[0]) / 2.0 - side * height * dy / (2.0 * half),
         (start[1] + end[1]) / 2.0 + side * height * dx / (2.0 * half),
     )
-
-
-def _extent(
-    start: list[float], end: list[float], centre: tuple[float, float], turns: int, axes: tuple[int, int, int]
-) -> tuple[float, float]:
-    """Return the signed angle (rad) and the length (mm) of an arc or helix."""
-    first, second, normal = axes
-    begin = (start[first] - centre[0], start[second] - centre[1])
-    finish = (end[first] - centre[0], end[second] - centre[1])
-    angle = sweep(begin, finish, turns)
-    radius = (math.hypot(*begin) + math.hypot(*finish)) / 2.0
-    return angle, math.hypot(radius * angle, end[normal] - start[normal])
-
-
-def sweep(begin: tuple[float, float], finish: tuple[float, float], turns: int) -> float:
-    """Return the signed angle (rad) from one radius to the other: coincident ones are a whole circle."""
-    angle = math.atan2(finish[1], finish[0]) - math.atan2(begin[1], begin[0])
-    circle = 2.0 * math.pi
-    angle = math.remainder(angle, circle)
-    if abs(angle) < 1e-12:
-        angle = 0.0
-    if turns > 0 and angle <= 0.0:
-        angle += circle
-    elif turns < 0 and angle >= 0.0:
-        angle -= circle
-    return angle + (turns - (1 if turns > 0 else -1)) * circle

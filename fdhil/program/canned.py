@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from fdhil.errors import ProgramError
 from fdhil.program.machine import Machine
 from fdhil.program.modal import AXES, Modal
 from fdhil.program.motions import PLANE_AXES
@@ -57,7 +56,7 @@ def cycle(machine: Machine, block: Block, series: Series, fresh: bool) -> None:
     old = series.began * modal.scale
     depth, clearance = _levels(modal, words, old)
     if depth > clearance:
-        raise ProgramError(block.line, f"G{modal.motion / 10:g}", "its clearance level R lies below its depth")
+        raise block.fault(modal.code, "its clearance level R lies below its depth")
     if old < clearance:
         machine.rapid_to(block, _with(modal.position, {normal: clearance}))
     hole = Hole(machine, block, words, depth, clearance, clearance if modal.retract_to_r else max(old, clearance))
@@ -95,12 +94,12 @@ def _mm(modal: Modal, letter: str, value: float) -> float:
 
 def _check(modal: Modal, block: Block, given: Mapping[str, float], words: Mapping[str, float]) -> None:
     """Raise ProgramError for what the cycle cannot do; ``given`` are the words it may take its own from."""
-    code = f"G{modal.motion / 10:g}"
+    code = modal.code
     first, second, normal = (AXES[axis] for axis in PLANE_AXES[modal.plane_name])
     if modal.feed_mode == 930:
-        raise ProgramError(block.line, code, "cannot be used in inverse-time mode (G93); use G94 or G95")
+        raise block.fault(code, "cannot be used in inverse-time mode (G93); use G94 or G95")
     if not any(letter in block.words for letter in (first, second, normal, "@", "^")):
-        raise ProgramError(block.line, code, f"wants a word of {first.upper()}, {second.upper()} or {normal.upper()}")
+        raise block.fault(code, f"wants a word of {first.upper()}, {second.upper()} or {normal.upper()}")
     for letter in "abcuvw":
         if letter in block.words:
             raise block.fault(letter, "cannot be moved by a canned cycle")
@@ -113,15 +112,15 @@ def _check(modal: Modal, block: Block, given: Mapping[str, float], words: Mappin
     for letter in needs + (["i", "j", "k"] if modal.motion == _BACK_BORING else []):
         if letter not in given:
             shown = normal if letter == _DEPTH else letter
-            raise ProgramError(block.line, code, f"wants {shown.upper()}, {_MEANING.get(letter, 'its depth')}")
+            raise block.fault(code, f"wants {shown.upper()}, {_MEANING.get(letter, 'its depth')}")
     if modal.motion in _PECKING and not words["q"] > 0.0:
-        raise ProgramError(block.line, f"Q{words['q']:g}", "is no depth of a peck; Q must be positive")
+        raise block.fault(f"Q{words['q']:g}", "is no depth of a peck; Q must be positive")
     if words.get("p", 0.0) < 0.0:
-        raise ProgramError(block.line, f"P{words['p']:g}", "is no time to dwell; P must not be negative")
+        raise block.fault(f"P{words['p']:g}", "is no time to dwell; P must not be negative")
     if modal.motion in _SPINNING and modal.spindle_turns == 0:
-        raise ProgramError(block.line, code, "wants a turning spindle; give M3 or M4 first")
+        raise block.fault(code, "wants a turning spindle; give M3 or M4 first")
     if modal.motion in _TAPPING and modal.spindle_turns != _TAPPING[modal.motion]:
-        raise ProgramError(block.line, code, "wants the spindle to turn into the hole; G84 by M3, G74 by M4")
+        raise block.fault(code, "wants the spindle to turn into the hole; G84 by M3, G74 by M4")
 
 
 def _levels(modal: Modal, words: dict[str, float], began: float) -> tuple[float, float]:

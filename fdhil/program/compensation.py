@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
-from fdhil.errors import ProgramError
 from fdhil.program.motions import Dwell
 from fdhil.program.words import Block
 
@@ -78,7 +77,7 @@ class Compensation:
         """Take a programmed line that moves in the plane; return the pieces that are settled by it."""
         length = math.dist(start, corner)
         if not self.entered and length <= self.radius_mm:
-            raise ProgramError(block.line, f"G{41 if self.side > 0 else 42}",
+            raise block.fault(f"G{41 if self.side > 0 else 42}",
                                "the move that enters compensation must be longer than the tool's radius")  # fmt: skip
         way = ((corner[0] - start[0]) / length, (corner[1] - start[1]) / length)
         aside = self._aside(way)
@@ -97,7 +96,7 @@ class Compensation:
         near, far = math.dist(start, centre), math.dist(corner, centre)
         inward = self.side * sense * self.radius_mm
         if min(near, far) - inward <= 0.0 or (not self.entered and far < self.radius_mm):
-            raise ProgramError(block.line, "G2" if turns < 0 else "G3", "the arc's radius must exceed the tool's")
+            raise block.fault("G2" if turns < 0 else "G3", "the arc's radius must exceed the tool's")
         end = _toward(centre, corner, far - inward)
         heading, leaving = _tangent(centre, start, sense), _tangent(centre, corner, sense)
         if self.entered:
@@ -179,7 +178,7 @@ def _checked(piece: Piece, block: Block) -> Piece:
         turned = _sweep(piece)
         gouges = turned > piece.angle + _WRAPPED_RAD and turned * piece.radius > _BACKWARDS_MM
     if gouges:
-        raise ProgramError(block.line, "", "the tool would gouge beyond the inside corner; take a smaller one")
+        raise block.fault("", "the tool would gouge beyond the inside corner; take a smaller one")
     return piece
 
 
@@ -207,7 +206,7 @@ def _crossing(before: Piece, piece: Piece, radius: float, side: int) -> Vector:
     else:
         found = _circles(before, piece)
     if not found:
-        raise ProgramError(piece.block.line, "", "the tool does not fit into the inside corner; take a smaller one")
+        raise piece.block.fault("", "the tool does not fit into the inside corner; take a smaller one")
     return min(found, key=lambda point: (_turned_round(before, piece, point), math.dist(point, corner)))
 
 
@@ -254,7 +253,7 @@ def _entry_centre(block: Block, start: Vector, end: Vector, centre: Vector, corn
     chord = _minus(end, start)
     along = inward[0] * chord[0] + inward[1] * chord[1]
     if abs(along) < 1e-12:
-        raise ProgramError(block.line, "", "this arc cannot enter compensation; enter it by a straight move")
+        raise block.fault("", "this arc cannot enter compensation; enter it by a straight move")
     reach = -(chord[0] * chord[0] + chord[1] * chord[1]) / (2.0 * along)
     return (end[0] + reach * inward[0], end[1] + reach * inward[1])
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from fdhil.errors import ProgramError
 from fdhil.program.machine import Machine
 from fdhil.program.modal import NO_MOTION
 from fdhil.program.targets import axis_words, spline_feed_mm_min, target
@@ -27,22 +26,22 @@ class Spline:
 def spline(machine: Machine, block: Block, series: Spline) -> None:
     """Order the spline of a G5 or G5.1 block as feeds; ProgramError for words that give none."""
     modal = machine.modal
-    code = f"G{modal.motion / 10:g}"
+    code = modal.code
     if modal.plane != 0:
-        raise ProgramError(block.line, code, "works in the XY plane; give G17 first")
+        raise block.fault(code, "works in the XY plane; give G17 first")
     if machine.compensation is not None:
-        raise ProgramError(block.line, code, "cannot be used with cutter compensation on")
+        raise block.fault(code, "cannot be used with cutter compensation on")
     if not axis_words(block):
-        raise ProgramError(block.line, code, "wants X or Y, the end of the curve")
+        raise block.fault(code, "wants X or Y, the end of the curve")
     if any(axis > 1 for axis in axis_words(block)):
-        raise ProgramError(block.line, code, "moves X and Y alone; take the other axis words out")
+        raise block.fault(code, "moves X and Y alone; take the other axis words out")
     start, end = modal.position, target(modal, block)
     a, d = (start[0], start[1]), (end[0], end[1])
     feed = spline_feed_mm_min(modal, block)
     heading = _vector(block, "ij", modal.scale)
     if modal.motion == 51:
         if heading is None:
-            raise ProgramError(block.line, code, "wants I and J, the control point from the start")
+            raise block.fault(code, "wants I and J, the control point from the start")
         control = _plus(a, heading)
         series.leaving = None
         modal.motion = NO_MOTION  # G5.1 does not stay in force
@@ -51,7 +50,7 @@ def spline(machine: Machine, block: Block, series: Spline) -> None:
         leaving = _vector(block, "pq", modal.scale)
         words = block.words
         if leaving is None or ("p" in words) != ("q" in words) or ("i" in words) != ("j" in words):
-            raise ProgramError(block.line, code, "wants both P and Q, and I and J both or none")
+            raise block.fault(code, "wants both P and Q, and I and J both or none")
         if heading is None:  # the first of a series leaves without a direction of its own, as in the reference
             heading = (-series.leaving[0], -series.leaving[1]) if series.leaving is not None else (0.0, 0.0)
         series.leaving = leaving

@@ -268,13 +268,13 @@ class Flow:
         """M98 and M99: they begin their line (``text``), whose other words are not executed; False ends the program."""
         code = block.m["call"]
         if not text.startswith(f"m{code}") or (code == 99 and text != "m99"):
-            raise ProgramError(block.line, f"M{code}", "must begin its line; M99 stands alone, M98 with P and L")
+            raise block.fault(f"M{code}", "must begin its line; M99 stands alone, M98 with P and L")
         if code == 99:
             return self._end_fanuc()
         name, times = block.words.get("p", -1.0), block.words.get("l", 1.0)
         off = max(abs(name - round(name)), abs(times - round(times)))
         if name < 0.0 or off > 1e-4 or not 0 <= times < 1e9:
-            raise ProgramError(block.line, "M98", "wants the subroutine's number as P and may have its repeats as L")
+            raise block.fault("M98", "wants the subroutine's number as P and may have its repeats as L")
         if round(times) > 0:
             back = Place(self.source, self.source.after())
             self._enter(Frame(str(round(name)), back, fanuc=True, again=round(times) - 1), block.line)

@@ -26,7 +26,7 @@ from fdhil.program.motions import Feed, Motion, Rapid
 from fdhil.program.parameters import Variables
 from fdhil.program.source import Source
 from fdhil.program.state import KeptModes, names_of, numbers_of
-from fdhil.program.words import Block, Line, clean, read, without_number
+from fdhil.program.words import Block, Line, clean, g_word, read, without_number
 
 _VALUE = r"([+-]?(?:\d++\.?\d*+|\.\d++))[ \t]*+"
 _SIMPLE = re.compile(
@@ -278,7 +278,7 @@ class Interpreter:
         modes.set_switches(modal, block)
         self._change_tool(block)
         if "modal state" in block.m and not self._kept.do(block.m["modal state"], self._flow.depth):
-            raise ProgramError(block.line, "M72", "has no modes to restore; keep them by M70 first")
+            raise block.fault("M72", "has no modes to restore; keep them by M70 first")
         if block.g.get("one-shot") == 40:
             modes.dwell(machine, block)
         modes.set_units(modal, block)
@@ -326,7 +326,7 @@ class Interpreter:
         if "motion" in block.g:
             modal.motion = block.g["motion"]
         elif "machine co-ordinates" in block.g and modal.motion not in (0, 10):
-            raise ProgramError(block.line, "G53", "wants G0 or G1")
+            raise block.fault("G53", "wants G0 or G1")
         elif axes_used or _motion_of(modal, block) is None:
             return
         code = modal.motion
@@ -359,7 +359,7 @@ class Interpreter:
         elif code == nurbs.END:
             self._nurbs.order_motions(machine, block)
         elif code != NO_MOTION:
-            raise ProgramError(block.line, f"G{code / 10:g}", "is a G code that fdhil does not know")
+            raise block.fault(g_word(code), "is a G code that fdhil does not know")
         elif axis is not None and not axes_used:
             raise block.fault(axis, "has no motion to go with; give G0, G1, G2 or G3")
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from fdhil.errors import ProgramError
 from fdhil.program.budget import Budget
 from fdhil.program.compensation import Compensation, Piece, Waiting
 from fdhil.program.modal import Modal
@@ -60,7 +59,7 @@ class Machine:
     ) -> None:
         """Order an arc to ``target`` about ``centre`` (in the plane's order of axes), both in active co-ordinates."""
         if self.just_left:
-            raise ProgramError(block.line, f"G{self.modal.motion / 10:g}", "the move after G40 must be straight")
+            raise block.fault(self.modal.code, "the move after G40 must be straight")
         if self.compensation is None:
             self._arc(block, target, centre, turns, feed)
             return
@@ -152,7 +151,7 @@ class Machine:
     def _order(self, block: Block, motion: Motion) -> None:
         if len(self.out) >= self.budget.max_motions_per_block:
             most = self.budget.max_motions_per_block
-            raise ProgramError(block.line, "", f"orders more than {most} motions; split it")
+            raise block.fault("", f"orders more than {most} motions; split it")
         self.out.append(motion)
 
     def _checked(self, block: Block, position: list[float]) -> Point:

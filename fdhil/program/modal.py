@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, field
 
 from fdhil.program.motions import BLEND, PLANES, Corner, Point
+from fdhil.program.words import g_word
 
 AXES = "xyzabcuvw"
 INDEX = {letter: place for place, letter in enumerate(AXES)}
@@ -75,6 +76,11 @@ class Modal:
         if not (self.path_tolerance_mm > 0.0 or self.joining_mm > 0.0):
             return BLEND
         return Corner("blend", self.path_tolerance_mm or math.inf, self.joining_mm)
+
+    @property
+    def code(self) -> str:
+        """The motion in force as a program has it: G38.2."""
+        return g_word(self.motion)
 
     @property
     def plane_name(self) -> str:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from fdhil.errors import ProgramError
 from fdhil.program import arcs, nurbs, roughing
 from fdhil.program.compensation import Compensation
 from fdhil.program.machine import Machine
 from fdhil.program.modal import MM_PER_INCH, NO_MOTION, PLANE_CODES, Modal
-from fdhil.program.words import Block
+from fdhil.program.words import Block, g_word
 
 
 def set_feed(modal: Modal, block: Block) -> None:
@@ -33,7 +32,7 @@ def set_spindle(modal: Modal, block: Block) -> None:
     if "spindle mode" in block.g:
         modal.surface_speed = block.g["spindle mode"] == 960
     if block.g.get("spindle mode") == 960 and "s" not in block.words:
-        raise ProgramError(block.line, "G96", "constant surface speed wants the speed as S")
+        raise block.fault("G96", "constant surface speed wants the speed as S")
     if "spindle" in block.m:
         modal.spindle_turns = {3: 1, 4: -1}.get(block.m["spindle"], 0)
 
@@ -58,7 +57,7 @@ def dwell(machine: Machine, block: Block) -> None:
     """G4: LinuxCNC takes P-1 for a P that is missing, and lets any other negative dwell end at once."""
     seconds = block.words.get("p", _NO_DWELL)
     if seconds == _NO_DWELL:
-        raise ProgramError(block.line, "G4", "a dwell wants its seconds as P, not negative")
+        raise block.fault("G4", "a dwell wants its seconds as P, not negative")
     machine.dwell(block, max(0.0, seconds))
 
 
@@ -94,11 +93,11 @@ _ORIGINS = (280, 281, 300, 301, 520, 920, 923)
 def check_compensated(modal: Modal, block: Block) -> None:
     """Raise ProgramError for codes that cannot be used while cutter compensation is on."""
     g, m = block.g, block.m
-    refused = [f"G{g[group] / 10:g}" for group in _GROUPS_REFUSED if group in g]
+    refused = [g_word(g[group]) for group in _GROUPS_REFUSED if group in g]
     if g.get("plane", PLANE_CODES[modal.plane]) != PLANE_CODES[modal.plane]:
-        refused.append(f"G{g['plane'] / 10:g}")
+        refused.append(g_word(g["plane"]))
     if g.get("one-shot") in _ORIGINS:
-        refused.append(f"G{g['one-shot'] / 10:g}")
+        refused.append(g_word(g["one-shot"]))
     sets_system = g.get("one-shot") == 100 and block.words.get("l") in (2.0, 20.0)
     if sets_system and int(block.words.get("p", 0.0)) in (0, modal.system):
         refused.append("G10")
@@ -107,9 +106,9 @@ def check_compensated(modal: Modal, block: Block) -> None:
         refused.append("M6")
     motion = g.get("motion", modal.motion)
     if motion not in (0, 10, *arcs.CODES, nurbs.BEGIN, roughing.FINISH, NO_MOTION):
-        refused.append(f"G{motion / 10:g}")
+        refused.append(g_word(motion))
     if refused:
-        raise ProgramError(block.line, refused[0], "cannot be used with cutter compensation on; end it by G40 first")
+        raise block.fault(refused[0], "cannot be used with cutter compensation on; end it by G40 first")
 
 
 def compensate(machine: Machine, block: Block, tool: bool) -> None:
@@ -123,18 +122,18 @@ def compensate(machine: Machine, block: Block, tool: bool) -> None:
         machine.end_compensation()
         return
     if machine.compensation is not None:
-        raise ProgramError(block.line, f"G{code / 10:g}", "compensation is on already; end it by G40 first")
+        raise block.fault(g_word(code), "compensation is on already; end it by G40 first")
     diameter = block.words.get("d")
     if modal.plane >= 2:
         what = f"does not work in the {modal.plane_name} plane; use G17 or G18"
-        raise ProgramError(block.line, f"G{code / 10:g}", what)
+        raise block.fault(g_word(code), what)
     if code % 10 == 0:
         if diameter or tool:
             what = "fdhil has no tool table, so the radius is not known; give the diameter by G41.1 or G42.1 D"
-            raise ProgramError(block.line, f"G{code / 10:g}", what)
+            raise block.fault(g_word(code), what)
         diameter = 0.0
     if diameter is None:
-        raise ProgramError(block.line, f"G{code / 10:g}", "wants the tool's diameter as D")
+        raise block.fault(g_word(code), "wants the tool's diameter as D")
     radius = diameter / 2.0 * modal.scale
     side = (1 if code in (410, 411) else -1) * (1 if radius >= 0.0 else -1)
     machine.start_compensation(Compensation(abs(radius), side, _orientation(modal, block)))

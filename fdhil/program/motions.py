@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -75,6 +76,52 @@ class Dwell:
 
 
 Motion = Rapid | Feed | Arc | Dwell
+
+
+@dataclass(frozen=True, slots=True)
+class Swept:
+    """An arc as it is gone along, in mm and rad: ``centre`` in the plane, the ``radii`` and the angle at its ends."""
+
+    centre: tuple[float, float]
+    radii: tuple[float, float]
+    begin_rad: float
+    angle_rad: float
+    rise_mm: float
+    length_mm: float
+
+    @staticmethod
+    def of(motion: Arc, start: Point) -> Swept:
+        """Return what an arc sweeps from ``start`` on."""
+        axes = PLANE_AXES[motion.plane]
+        centre = (motion.centre[axes[0]] or 0.0, motion.centre[axes[1]] or 0.0)
+        return swept(start, motion.end, centre, motion.turns, axes)
+
+
+def swept(
+    start: Sequence[float], end: Sequence[float], centre: tuple[float, float], turns: int, axes: tuple[int, int, int]
+) -> Swept:
+    """Return what an arc sweeps from start to end about a centre in the plane of ``axes`` (first, second, normal)."""
+    first, second, normal = axes
+    begin = (start[first] - centre[0], start[second] - centre[1])
+    finish = (end[first] - centre[0], end[second] - centre[1])
+    radii = math.hypot(*begin), math.hypot(*finish)
+    angle = swept_rad(begin, finish, turns)
+    rise = end[normal] - start[normal]
+    length = math.hypot((radii[0] + radii[1]) / 2.0 * angle, rise)
+    return Swept(centre, radii, math.atan2(begin[1], begin[0]), angle, rise, length)
+
+
+def swept_rad(begin: tuple[float, float], finish: tuple[float, float], turns: int) -> float:
+    """Return the signed angle (rad) from one radius to the other: coincident ones are a whole circle."""
+    circle = 2.0 * math.pi
+    angle = math.remainder(math.atan2(finish[1], finish[0]) - math.atan2(begin[1], begin[0]), circle)
+    if abs(angle) < 1e-12:
+        angle = 0.0
+    if turns > 0 and angle <= 0.0:
+        angle += circle
+    elif turns < 0 and angle >= 0.0:
+        angle -= circle
+    return angle + (turns - (1 if turns > 0 else -1)) * circle
 
 
 def as_json(motion: Motion) -> dict[str, Any]:

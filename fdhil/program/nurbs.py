@@ -10,7 +10,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from fdhil.errors import ProgramError
 from fdhil.program.machine import Machine
 from fdhil.program.modal import NO_MOTION
 from fdhil.program.targets import axis_words, spline_feed_mm_min, target
@@ -35,21 +34,21 @@ class Nurbs:
         """Take the control point of a block of G5.2; ProgramError for words that give none."""
         modal, words = machine.modal, block.words
         if modal.plane != 0:
-            raise ProgramError(block.line, "G5.2", "works in the XY plane; give G17 first")
+            raise block.fault("G5.2", "works in the XY plane; give G17 first")
         axes = axis_words(block)
         spline_feed_mm_min(modal, block)
         weight = words.get("p", None if self.points else 1.0)
         if weight is None or weight < 0.0:
-            raise ProgramError(block.line, "G5.2", "wants the weight of each control point as P, not negative")
+            raise block.fault("G5.2", "wants the weight of each control point as P, not negative")
         if not self.points:
             self.order = _order(block)
             self.points.append((modal.position[0], modal.position[1], weight))
             if not axes:
                 return
         if 0 not in axes or 1 not in axes:
-            raise ProgramError(block.line, "G5.2", "wants both X and Y of a control point")
+            raise block.fault("G5.2", "wants both X and Y of a control point")
         if len(self.points) >= machine.budget.max_motions_per_block:
-            raise ProgramError(block.line, "G5.2", f"has more than {len(self.points)} control points; split the curve")
+            raise block.fault("G5.2", f"has more than {len(self.points)} control points; split the curve")
         place = target(modal, block)
         self.points.append((place[0], place[1], weight))
 
@@ -58,9 +57,9 @@ class Nurbs:
         points, self.points = self.points, []
         if len(points) < max(self.order, 2):
             what = f"a curve of order {self.order} wants as many control points; {len(points)} were given"
-            raise ProgramError(block.line, "G5.3", what)
+            raise block.fault("G5.3", what)
         if not any(weight for _, _, weight in points):
-            raise ProgramError(block.line, "G5.3", "all weights are zero; give one P that is not")
+            raise block.fault("G5.3", "all weights are zero; give one P that is not")
         places = list(_chords(points, self.order))
         feed = spline_feed_mm_min(machine.modal, block)
         machine.modal.motion = NO_MOTION

@@ -6,7 +6,6 @@ apart, with the rotation as the tenth; #5211 and on for G92, in force while #521
 
 from __future__ import annotations
 
-from fdhil.errors import ProgramError
 from fdhil.program.machine import Machine
 from fdhil.program.modal import AXES, Modal, rotate
 from fdhil.program.parameters import Variables
@@ -56,7 +55,7 @@ def set_data(modal: Modal, variables: Variables, block: Block) -> None:
         raise block.fault("l" if kind is not None else "G10", "sets nothing; fdhil knows G10 L1, L2, L10, L11 and L20")
     if round(kind) in _TABLE:
         if block.words.get("p", 0.0) < 1.0:
-            raise ProgramError(block.line, "G10", "wants the tool's number as P, from 1")
+            raise block.fault("G10", "wants the tool's number as P, from 1")
         return
     for letter in "ij":
         if letter in block.words:
@@ -99,7 +98,7 @@ def set_g92(modal: Modal, variables: Variables, block: Block) -> None:
     words = axis_words(block)
     local = block.g["one-shot"] == 520
     if not words:
-        raise ProgramError(block.line, "G52" if local else "G92", "wants axis words")
+        raise block.fault("G52" if local else "G92", "wants axis words")
     new = list(modal.g92)
     for axis, value in words.items():
         value = length_mm(modal, axis, value)
@@ -133,7 +132,7 @@ def set_tool_length(modal: Modal, block: Block) -> None:
     code = block.g["tool length"]
     if code == 432:
         if "h" not in block.words and not axis_words(block):
-            raise ProgramError(block.line, "G43.2", "wants the tool's number as H, or axis words")
+            raise block.fault("G43.2", "wants the tool's number as H, or axis words")
         return
     words = {axis: length_mm(modal, axis, value) for axis, value in axis_words(block).items()}
     tool = [words.get(axis, modal.tool[axis]) if code == 431 else 0.0 for axis in range(9)]

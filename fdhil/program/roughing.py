@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from fdhil.errors import ProgramError
-from fdhil.program.arcs import radii_agree, sweep
+from fdhil.program.arcs import radii_agree
 from fdhil.program.contour import Contour, ContourError, Part
 from fdhil.program.machine import Machine
 from fdhil.program.modal import Modal
+from fdhil.program.motions import swept_rad
 from fdhil.program.targets import feed_mm_min, length_mm
-from fdhil.program.words import Block
+from fdhil.program.words import Block, g_word
 
 CODES = (700, 710, 711, 712, 720, 721, 722)
 FINISH = 700
@@ -76,7 +76,7 @@ class Drawn:
         words = block.words
         given = [letter for letter in "ik" if letter in words]
         if ("r" in words) == bool(given):
-            raise ProgramError(block.line, f"G{self.motion / 10:g}", "an arc wants its centre (I K) or its radius (R)")
+            raise block.fault(g_word(self.motion), "an arc wants its centre (I K) or its radius (R)")
         if "r" in words:
             chord = new - old
             square = words["r"] ** 2 - abs(chord) ** 2 / 4.0
@@ -91,15 +91,15 @@ class Drawn:
 def start_of(machine: Machine, block: Block) -> complex:
     """Go to where a cycle begins, X and Z of its block, and return that; ProgramError when it cannot begin."""
     modal, words = machine.modal, block.words
-    code = f"G{modal.motion / 10:g}"
+    code = modal.code
     if "q" not in words:
-        raise ProgramError(block.line, code, "wants Q, the number of the subroutine with its contour")
+        raise block.fault(code, "wants Q, the number of the subroutine with its contour")
     if modal.plane != 1:
-        raise ProgramError(block.line, code, "works in the XZ plane; give G18")
+        raise block.fault(code, "works in the XZ plane; give G18")
     if words.get("i", 1.0) <= 0.0:
         raise block.fault("i", "is no depth of a cut; I must be positive")
     if machine.compensation is not None and modal.motion != FINISH:
-        raise ProgramError(block.line, code, "cannot be used with cutter compensation on")
+        raise block.fault(code, "cannot be used with cutter compensation on")
     start, first = list(modal.position), list(modal.position)
     for axis, letter in ((0, "x"), (2, "z")):
         if letter in words:
@@ -123,7 +123,7 @@ def work(machine: Machine, block: Block, drawn: Drawn, start: complex) -> None:
         else:
             _rough(tool, code, block.words)
     except ContourError as error:
-        raise ProgramError(block.line, f"G{code / 10:g}", str(error)) from None
+        raise block.fault(g_word(code), str(error)) from None
 
 
 @dataclass(slots=True)
@@ -157,7 +157,7 @@ class Tool:
         if not radii_agree(abs(begin), abs(finish), modal.scale):
             raise ContourError("an arc of its contour ends at another radius than it begins; correct its centre")
         turns = 1 if ccw else -1
-        angle = sweep((begin.real, begin.imag), (finish.real, finish.imag), turns)
+        angle = swept_rad((begin.real, begin.imag), (finish.real, finish.imag), turns)
         feed = feed_mm_min(modal, block, abs(angle) * (abs(begin) + abs(finish)) / 2.0)
         target = self.whole(end)
         self.machine.arc_to(block, target, (centre.real, centre.imag), turns, feed, angle)
@@ -172,7 +172,7 @@ class Tool:
 
 def _finish(tool: Tool, first: float, last: float, passes: float) -> None:
     if passes > tool.machine.budget.max_motions_per_block:
-        raise ProgramError(tool.block.line, f"P{passes:g}", "are too many passes; split them")
+        raise tool.block.fault(f"P{passes:g}", "are too many passes; split them")
     contour = tool.contour
     if _wants_turn(contour):
         contour.quarter()

@@ -61,6 +61,11 @@ M_GROUPS: Mapping[int, str] = _groups(
 )
 
 
+def g_word(code: int) -> str:
+    """Return a G code that is held times ten as a program has it: G38.2."""
+    return f"G{code / 10:g}"
+
+
 @dataclass(slots=True)
 class Block:
     """One line, read: ``words`` by letter (lower case, program units), G codes times ten and M codes by modal group,
@@ -224,9 +229,9 @@ def _add(block: Block, letter: str, value: float) -> None:
     elif letter == "m":
         _add_m(block, value)
     elif letter in block.words:
-        raise ProgramError(block.line, f"{letter.upper()}{value:g}", "this letter stands twice in the block; keep one")
+        raise block.fault(f"{letter.upper()}{value:g}", "this letter stands twice in the block; keep one")
     elif letter not in _LETTERS:
-        raise ProgramError(block.line, f"{letter.upper()}{value:g}", "stands where it may not; N and O begin a line")
+        raise block.fault(f"{letter.upper()}{value:g}", "stands where it may not; N and O begin a line")
     else:
         block.words[letter] = value
 
@@ -235,10 +240,10 @@ def _add_g(block: Block, value: float) -> None:
     code = round(value * 10.0)
     group = G_GROUPS.get(code) if abs(value * 10.0 - code) < 1e-3 else None
     if group is None:
-        raise ProgramError(block.line, f"G{value:g}", "is a G code that fdhil does not know; see the list of codes")
+        raise block.fault(f"G{value:g}", "is a G code that fdhil does not know; see the list of codes")
     if group in block.g and group != "cycle end":
-        other = f"G{block.g[group] / 10:g}"
-        raise ProgramError(block.line, f"G{value:g}", f"contradicts {other} in the same block; keep one of them")
+        other = g_word(block.g[group])
+        raise block.fault(f"G{value:g}", f"contradicts {other} in the same block; keep one of them")
     block.g[group] = code
 
 
@@ -246,7 +251,7 @@ def _add_m(block: Block, value: float) -> None:
     code = round(value)
     group = M_GROUPS.get(code) if abs(value - code) < 1e-4 else None
     if group is None:
-        raise ProgramError(block.line, f"M{value:g}", "is an M code that fdhil does not know; see the list of codes")
+        raise block.fault(f"M{value:g}", "is an M code that fdhil does not know; see the list of codes")
     if group in block.m:
-        raise ProgramError(block.line, f"M{value:g}", f"contradicts M{block.m[group]} in the same block; keep one")
+        raise block.fault(f"M{value:g}", f"contradicts M{block.m[group]} in the same block; keep one")
     block.m[group] = code
