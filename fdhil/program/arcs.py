@@ -23,24 +23,23 @@ _CHORD_RELATIVE = 0.001  # by how much half the chord may exceed the radius of a
 
 def arc(machine: Machine, block: Block) -> None:
     """Order the arc of a G2 or G3 block; ProgramError when its words give none."""
-    modal = machine.modal
-    first, second, normal = plane_axes(modal, block)
-    if "r" in block.words and any(letter in block.words for letter in _OFFSETS):
+    modal, words = machine.modal, block.words
+    axes = first, second, normal = plane_axes(modal, block)
+    by_radius = "r" in words
+    if by_radius and any(letter in words for letter in _OFFSETS):
         raise block.fault("r", "contradicts I, J or K in the same block; give the radius or the centre")
-    words = axis_words(block)
+    named = axis_words(block)
     end = target(modal, block)
+    here, there = (complex(place[first], place[second]) for place in (modal.position, end))
     clockwise = modal.motion == 20
-    if "r" in block.words:
-        if first not in words and second not in words and "@" not in block.words and "^" not in block.words:
+    if by_radius:
+        if first not in named and second not in named and "@" not in words and "^" not in words:
             raise block.fault("r", "an arc by radius wants an end in its plane; a circle wants its centre")
-        centre = _centre_of_radius(modal, block, (modal.position[first], modal.position[second]),
-                                   (end[first], end[second]), clockwise)  # fmt: skip
+        centre = _centre_of_radius_word(block, here, there, words["r"] * modal.scale, clockwise)
     else:
         centre = _centre_of_offsets(modal, block, first, second)
-        _check_radii(block, modal, centre, end, first, second)
-    turns = _turns(block)
-    turns = -turns if clockwise else turns
-    axes = (first, second, normal)
+        _check_radii(block, modal, abs(here - centre), abs(there - centre), f"{AXES[first]}, {AXES[second]}".upper())
+    turns = -_turns(block) if clockwise else _turns(block)
     path = swept(modal.position, end, centre, turns, axes)
     feed = feed_mm_min(modal, block, path.length_mm)
     if modal.rotation_deg and normal != 2:
@@ -58,7 +57,7 @@ def _tilted(
         what = "an arc outside the XY plane of a turned system cannot be compensated; end compensation by G40 first"
         raise block.fault(machine.modal.code, what)
     begin = list(machine.modal.position)
-    (x, y), radii = path.centre, path.radii
+    x, y, radii = path.centre.real, path.centre.imag, path.radii
     step = 2.0 * math.acos(max(0.0, 1.0 - _CHORD_ERROR_MM / max(radii)))
     chords = min(math.ceil(abs(path.angle_rad) / step), machine.budget.max_motions_per_block)
     for number in range(1, chords):
@@ -78,7 +77,7 @@ def _turns(block: Block) -> int:
     return turns
 
 
-def _centre_of_offsets(modal: Modal, block: Block, first: int, second: int) -> tuple[float, float]:
+def _centre_of_offsets(modal: Modal, block: Block, first: int, second: int) -> complex:
     letters = _OFFSETS[first], _OFFSETS[second]
     given = [letter for letter in letters if letter in block.words]
     wrong = [letter for letter in _OFFSETS if letter in block.words and letter not in letters]
@@ -89,22 +88,17 @@ def _centre_of_offsets(modal: Modal, block: Block, first: int, second: int) -> t
     if modal.arc_absolute and len(given) < 2:
         raise block.fault(given[0], "an absolute centre (G90.1) wants both of its words")
     values = [block.words.get(letter, 0.0) * modal.scale for letter in letters]
-    if modal.arc_absolute:
-        return values[0], values[1]
-    return modal.position[first] + values[0], modal.position[second] + values[1]
+    centre = complex(values[0], values[1])
+    return centre if modal.arc_absolute else complex(modal.position[first], modal.position[second]) + centre
 
 
-def _check_radii(
-    block: Block, modal: Modal, centre: tuple[float, float], end: list[float], first: int, second: int
-) -> None:
-    begin = math.hypot(modal.position[first] - centre[0], modal.position[second] - centre[1])
-    finish = math.hypot(end[first] - centre[0], end[second] - centre[1])
+def _check_radii(block: Block, modal: Modal, begin_mm: float, finish_mm: float, axes: str) -> None:
     word = next(letter for letter in _OFFSETS if letter in block.words)
-    if begin < _MIN_RADIUS_MM or finish < _MIN_RADIUS_MM:
+    if begin_mm < _MIN_RADIUS_MM or finish_mm < _MIN_RADIUS_MM:
         raise block.fault(word, "the arc has no radius; move the centre away from start and end")
-    if not radii_agree(begin, finish, modal.scale):
-        raise block.fault(word, f"the radius is {begin:.4f} mm at the start and {finish:.4f} mm at the end of the arc; "
-                                f"correct centre or end ({AXES[first].upper()}, {AXES[second].upper()})")  # fmt: skip
+    if not radii_agree(begin_mm, finish_mm, modal.scale):
+        raise block.fault(word, f"the radius is {begin_mm:.4f} mm at the start and {finish_mm:.4f} mm at the end of "
+                                f"the arc; correct centre or end ({axes})")  # fmt: skip
 
 
 def radii_agree(begin_mm: float, finish_mm: float, scale: float) -> bool:
@@ -113,20 +107,18 @@ def radii_agree(begin_mm: float, finish_mm: float, scale: float) -> bool:
     return off <= small or off <= min(_SPIRAL_LARGE * small, _SPIRAL_RELATIVE * max(begin_mm, finish_mm))
 
 
-def _centre_of_radius(
-    modal: Modal, block: Block, start: tuple[float, float], end: tuple[float, float], clockwise: bool
-) -> tuple[float, float]:
-    """Centre of the arc of radius R between two points; a negative R takes the longer way round."""
-    radius = block.words["r"] * modal.scale
-    dx, dy = end[0] - start[0], end[1] - start[1]
-    half = math.hypot(dx, dy) / 2.0
+def _centre_of_radius_word(block: Block, start: complex, end: complex, radius_mm: float, clockwise: bool) -> complex:
+    half = abs(end - start) / 2.0
     if half < _MIN_RADIUS_MM:
         raise block.fault("r", "an arc by radius ends where it starts; give the centre of a full circle")
-    if abs(radius) < half * (1.0 - _CHORD_RELATIVE):
+    if abs(radius_mm) < half * (1.0 - _CHORD_RELATIVE):
         raise block.fault("r", f"is too small a radius to reach the end, {2 * half:.4f} mm away")
+    return centre_of_radius(start, end, radius_mm, clockwise)
+
+
+def centre_of_radius(start: complex, end: complex, radius: float, clockwise: bool) -> complex:
+    """Return the centre of the arc of a radius between two points; a negative one takes the longer way round."""
+    half = abs(end - start) / 2.0
     height = math.sqrt(max(0.0, radius * radius - half * half))
     side = -1.0 if clockwise == (radius > 0) else 1.0
-    return (
-        (start[0] + end[0]) / 2.0 - side * height * dy / (2.0 * half),
-        (start[1] + end[1]) / 2.0 + side * height * dx / (2.0 * half),
-    )
+    return (start + end) / 2.0 + side * height * 1j * (end - start) / (2.0 * half)

@@ -136,7 +136,7 @@ def compensate(machine: Machine, block: Block, tool: bool) -> None:
         raise block.fault(g_word(code), "wants the tool's diameter as D")
     radius = diameter / 2.0 * modal.scale
     side = (1 if code in (410, 411) else -1) * (1 if radius >= 0.0 else -1)
-    machine.start_compensation(Compensation(abs(radius), side, _orientation(modal, block)))
+    machine.compensation = Compensation(abs(radius), side, _orientation(modal, block))
 
 
 def _orientation(modal: Modal, block: Block) -> int:

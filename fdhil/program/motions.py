@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -80,9 +81,12 @@ Motion = Rapid | Feed | Arc | Dwell
 
 @dataclass(frozen=True, slots=True)
 class Swept:
-    """An arc as it is gone along, in mm and rad: ``centre`` in the plane, the ``radii`` and the angle at its ends."""
+    """An arc as it is gone along, in mm and rad: its ``centre`` and the ``radii`` and the angle at its ends.
 
-    centre: tuple[float, float]
+    Places in a plane are complex: first + j second axis.
+    """
+
+    centre: complex
     radii: tuple[float, float]
     begin_rad: float
     angle_rad: float
@@ -93,28 +97,28 @@ class Swept:
     def of(motion: Arc, start: Point) -> Swept:
         """Return what an arc sweeps from ``start`` on."""
         axes = PLANE_AXES[motion.plane]
-        centre = (motion.centre[axes[0]] or 0.0, motion.centre[axes[1]] or 0.0)
+        centre = complex(motion.centre[axes[0]] or 0.0, motion.centre[axes[1]] or 0.0)
         return swept(start, motion.end, centre, motion.turns, axes)
 
 
 def swept(
-    start: Sequence[float], end: Sequence[float], centre: tuple[float, float], turns: int, axes: tuple[int, int, int]
+    start: Sequence[float], end: Sequence[float], centre: complex, turns: int, axes: tuple[int, int, int]
 ) -> Swept:
     """Return what an arc sweeps from start to end about a centre in the plane of ``axes`` (first, second, normal)."""
     first, second, normal = axes
-    begin = (start[first] - centre[0], start[second] - centre[1])
-    finish = (end[first] - centre[0], end[second] - centre[1])
-    radii = math.hypot(*begin), math.hypot(*finish)
+    begin = complex(start[first], start[second]) - centre
+    finish = complex(end[first], end[second]) - centre
+    radii = abs(begin), abs(finish)
     angle = swept_rad(begin, finish, turns)
     rise = end[normal] - start[normal]
     length = math.hypot((radii[0] + radii[1]) / 2.0 * angle, rise)
-    return Swept(centre, radii, math.atan2(begin[1], begin[0]), angle, rise, length)
+    return Swept(centre, radii, cmath.phase(begin), angle, rise, length)
 
 
-def swept_rad(begin: tuple[float, float], finish: tuple[float, float], turns: int) -> float:
+def swept_rad(begin: complex, finish: complex, turns: int) -> float:
     """Return the signed angle (rad) from one radius to the other: coincident ones are a whole circle."""
     circle = 2.0 * math.pi
-    angle = math.remainder(math.atan2(finish[1], finish[0]) - math.atan2(begin[1], begin[0]), circle)
+    angle = math.remainder(cmath.phase(finish) - cmath.phase(begin), circle)
     if abs(angle) < 1e-12:
         angle = 0.0
     if turns > 0 and angle <= 0.0:

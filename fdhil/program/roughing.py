@@ -6,10 +6,9 @@ depth of a cut, R the retract; G70 follows the contour P times from the distance
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
-from fdhil.program.arcs import radii_agree
+from fdhil.program.arcs import centre_of_radius, radii_agree
 from fdhil.program.contour import Contour, ContourError, Part
 from fdhil.program.machine import Machine
 from fdhil.program.modal import Modal
@@ -78,12 +77,9 @@ class Drawn:
         if ("r" in words) == bool(given):
             raise block.fault(g_word(self.motion), "an arc wants its centre (I K) or its radius (R)")
         if "r" in words:
-            chord = new - old
-            square = words["r"] ** 2 - abs(chord) ** 2 / 4.0
-            if square < 0.0:
+            if words["r"] ** 2 < abs(new - old) ** 2 / 4.0:
                 raise block.fault("r", "is too small a radius to reach the end")
-            aside = 1j * (math.sqrt(square) / abs(chord)) * chord
-            return (old + new) / 2.0 + (aside if self.motion == 30 else -aside)
+            return centre_of_radius(old, new, abs(words["r"]), self.motion == 20)
         centre = complex(words.get("k", 0.0), words.get("i", 0.0))
         return centre if self.modal.arc_absolute else old + centre
 
@@ -157,10 +153,10 @@ class Tool:
         if not radii_agree(abs(begin), abs(finish), modal.scale):
             raise ContourError("an arc of its contour ends at another radius than it begins; correct its centre")
         turns = 1 if ccw else -1
-        angle = swept_rad((begin.real, begin.imag), (finish.real, finish.imag), turns)
+        angle = swept_rad(begin, finish, turns)
         feed = feed_mm_min(modal, block, abs(angle) * (abs(begin) + abs(finish)) / 2.0)
         target = self.whole(end)
-        self.machine.arc_to(block, target, (centre.real, centre.imag), turns, feed, angle)
+        self.machine.arc_to(block, target, centre, turns, feed, angle)
 
     def whole(self, place: complex) -> list[float]:
         """Return a place in active co-ordinates of all axes."""

@@ -30,7 +30,7 @@ def piece(motion: Rapid | Feed | Arc, start: Point, limits: AxisLimits) -> Row |
         kind, length = float(PLANES.index(motion.plane)), path.length_mm
         share = [1.0, 1.0, 1.0]
         share[PLANE_AXES[motion.plane][2]] = abs(path.rise_mm) / length if length else 0.0
-        extra = (*path.centre, *path.radii, path.begin_rad, path.angle_rad)
+        extra = (path.centre.real, path.centre.imag, *path.radii, path.begin_rad, path.angle_rad)
     else:
         length = math.dist(start, motion.end)
         share = [abs(b - a) / length if length else 0.0 for a, b in zip(start, motion.end, strict=True)]

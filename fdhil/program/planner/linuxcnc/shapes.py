@@ -141,7 +141,8 @@ def turn(motion: Arc, start: Point) -> Turn:
     first, second, normal = PLANE_AXES[motion.plane]
     path = Swept.of(motion, start)
     radius, last = path.radii
-    c, s = (start[first] - path.centre[0]) / radius, (start[second] - path.centre[1]) / radius
+    x, y = path.centre.real, path.centre.imag
+    c, s = (start[first] - x) / radius, (start[second] - y) / radius
     sense = math.copysign(1.0, path.angle_rad)
 
     def whole(a: float, b: float, n: float) -> Point:
@@ -150,7 +151,7 @@ def turn(motion: Arc, start: Point) -> Turn:
         return (place[0], place[1], place[2])
 
     return Turn(
-        centre=whole(*path.centre, start[normal]), u=whole(c, s, 0.0), v=whole(-s * sense, c * sense, 0.0),
+        centre=whole(x, y, start[normal]), u=whole(c, s, 0.0), v=whole(-s * sense, c * sense, 0.0),
         radius=radius, growth=last - radius, angle=abs(path.angle_rad), rise=whole(0.0, 0.0, path.rise_mm),
         length=path.length_mm,
     )  # fmt: skip
