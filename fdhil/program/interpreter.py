@@ -14,7 +14,7 @@ from copy import deepcopy
 from pathlib import Path
 
 from fdhil.errors import ProgramError
-from fdhil.program import arcs, canned, curves, lathe, modes, nurbs, offsets, probing, roughing, targets
+from fdhil.program import arcs, canned, lathe, modes, offsets, probing, roughing, splines, targets
 from fdhil.program.budget import Budget
 from fdhil.program.checks import CYCLES, check_machine_words, check_readers, one_reader_of_axes
 from fdhil.program.commands import Command
@@ -68,8 +68,8 @@ class Interpreter:
         self._kept = KeptModes(modal, self._variables)
         self._flow = Flow(first, self._variables, budget, self._kept.returned, self._state)
         self._series = canned.Series()
-        self._spline = curves.Spline()
-        self._nurbs = nurbs.Nurbs()
+        self._spline = splines.Series()
+        self._nurbs = splines.Nurbs()
         self._known: dict[str, Command | Line] = {}
         self._blocks = self._again = 0
         self._empty_so_far = True
@@ -332,9 +332,9 @@ class Interpreter:
         code = modal.motion
         if code not in CYCLES:
             self._series.began = None
-        if code not in curves.CODES:
+        if code not in splines.BEZIER_CODES:
             self._spline.leaving = None
-        if code not in (nurbs.BEGIN, nurbs.END):
+        if code not in (splines.NURBS_BEGIN, splines.NURBS_END):
             self._nurbs.points.clear()
         if code == 0:
             machine.rapid_to(block, targets.target(modal, block))
@@ -350,13 +350,13 @@ class Interpreter:
             lathe.synchronised(machine, block)
         elif code == 760:
             lathe.threading(machine, block)
-        elif code in curves.CODES:
-            curves.spline(machine, block, self._spline)
+        elif code in splines.BEZIER_CODES:
+            splines.spline(machine, block, self._spline)
         elif code in roughing.CODES:
             self._work_contour(block, before)
-        elif code == nurbs.BEGIN:
+        elif code == splines.NURBS_BEGIN:
             self._nurbs.gather(machine, block)
-        elif code == nurbs.END:
+        elif code == splines.NURBS_END:
             self._nurbs.order_motions(machine, block)
         elif code != NO_MOTION:
             raise block.fault(g_word(code), "is a G code that fdhil does not know")

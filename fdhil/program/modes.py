@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fdhil.program import arcs, nurbs, roughing
+from fdhil.program import arcs, roughing, splines
 from fdhil.program.compensation import Compensation
 from fdhil.program.machine import Machine
 from fdhil.program.modal import MM_PER_INCH, NO_MOTION, PLANE_CODES, Modal
@@ -105,7 +105,7 @@ def check_compensated(modal: Modal, block: Block) -> None:
     if m.get("tool") == 6:
         refused.append("M6")
     motion = g.get("motion", modal.motion)
-    if motion not in (0, 10, *arcs.CODES, nurbs.BEGIN, roughing.FINISH, NO_MOTION):
+    if motion not in (0, 10, *arcs.CODES, splines.NURBS_BEGIN, roughing.FINISH, NO_MOTION):
         refused.append(g_word(motion))
     if refused:
         raise block.fault(refused[0], "cannot be used with cutter compensation on; end it by G40 first")

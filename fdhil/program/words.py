@@ -178,7 +178,7 @@ def read(text: str, context: Context, max_nesting: int) -> Line:
     words: list[tuple[str, Value]] = []
     settings: list[tuple[Value | str, Value]] = []
     while not reader.done():
-        _next(reader, words, settings)
+        read_word(reader, words, settings)
     if settings:
         return Line(None, tuple(words), tuple(settings))
     return Line(None, tuple(words), (), *_straight(words))
@@ -204,7 +204,8 @@ def _straight(words: list[tuple[str, Value]]) -> tuple[int | None, tuple[Value |
     return number, tuple(by_letter.get(letter) for letter in "xyzf")
 
 
-def _next(reader: Reader, words: list[tuple[str, Value]], settings: list[tuple[Value | str, Value]]) -> None:
+def read_word(reader: Reader, words: list[tuple[str, Value]], settings: list[tuple[Value | str, Value]]) -> None:
+    """Read the next word or the next setting of a parameter; ProgramError for what is neither."""
     reader.word_at = reader.at
     letter = reader.text[reader.at]
     if letter == "#":
