@@ -87,6 +87,10 @@ class Modal:
         """XY, XZ, YZ, UV, UW or VW."""
         return (*PLANES, "UV", "UW", "VW")[self.plane]
 
+    def unit(self, index: int) -> float:
+        """Return what one program unit of an axis is, in mm or degrees."""
+        return self.scale if AXES[index] in LINEAR else 1.0
+
     def machine(self, position: list[float] | None = None) -> Point:
         """Return X, Y, Z of a position (default: the present one) in machine millimetres."""
         p = self.position if position is None else position

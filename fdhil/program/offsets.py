@@ -16,6 +16,7 @@ G92_IN_FORCE, G92_FIRST = 5210, 5211
 HOME_FIRST = {280: 5161, 300: 5181}
 _TABLE = (1, 10, 11)
 SYSTEMS = {540: 1, 550: 2, 560: 3, 570: 4, 580: 5, 590: 6, 591: 7, 592: 8, 593: 9}
+CODE_OF_SYSTEM = {system: code for code, system in SYSTEMS.items()}
 
 
 def first_of(system: int) -> int:

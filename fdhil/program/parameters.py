@@ -57,7 +57,7 @@ class Variables:
     def named(self, name: str) -> float:
         """Return #<name>."""
         if name in self._state_names:
-            return self._state_names[name]()
+            return float(self._state_names[name]())
         return (self._globals if name.startswith("_") else self._locals)[name]
 
     def set(self, key: int | str, value: float, line: int) -> None:

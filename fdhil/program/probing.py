@@ -25,5 +25,5 @@ def probe(machine: Machine, variables: Variables, block: Block) -> None:
         raise block.fault(code, "starts too near to its target to probe")
     machine.stand_at(block, end)
     for axis, value in enumerate(end):
-        variables.store(_PROBED_FIRST + axis, value / (modal.scale if axis not in (3, 4, 5) else 1.0))
+        variables.store(_PROBED_FIRST + axis, value / modal.unit(axis))
     variables.store(_HIT, 0.0)

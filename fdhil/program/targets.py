@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from fdhil.program.modal import AXES, INDEX, LINEAR, Modal
+from fdhil.program.modal import AXES, INDEX, Modal
 from fdhil.program.motions import PLANE_AXES
 from fdhil.program.words import Block
 
@@ -70,11 +70,9 @@ def axis_words(block: Block) -> dict[int, float]:
 
 def length_mm(modal: Modal, index: int, value: float) -> float:
     """Return an axis word in mm or degrees; X is a diameter under G7."""
-    if AXES[index] not in LINEAR:
-        return value
     if index == 0 and modal.diameter:
         value /= 2.0
-    return value * modal.scale
+    return value * modal.unit(index)
 
 
 def target(modal: Modal, block: Block) -> list[float]:
