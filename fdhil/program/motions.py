@@ -6,7 +6,7 @@ import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 Point = tuple[float, float, float]
 PLANES = ("XY", "XZ", "YZ")
@@ -79,8 +79,7 @@ class Dwell:
 Motion = Rapid | Feed | Arc | Dwell
 
 
-@dataclass(frozen=True, slots=True)
-class Swept:
+class Swept(NamedTuple):
     """An arc as it is gone along, in mm and rad: its ``centre`` and the ``radii`` and the angle at its ends.
 
     Places in a plane are complex: first + j second axis.

@@ -32,7 +32,7 @@ class Series:
     leaving: complex | None = None
 
 
-def spline(machine: Machine, block: Block, series: Series) -> None:
+def spline(machine: Machine, series: Series, block: Block) -> None:
     """Order the spline of a G5 or G5.1 block as feeds; ProgramError for words that give none."""
     modal, words, code = machine.modal, block.words, machine.modal.code
     if modal.plane != 0:
