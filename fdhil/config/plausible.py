@@ -1,4 +1,4 @@
-"""Whether the numbers of an axis can be those of one machine, and which unit was likely mistaken where they cannot.
+"""Relations tell whether an axis' numbers can be of one machine, and slips which unit was mistaken where they cannot.
 
 Each relation between keys has a range in which ordinary feed drives lie, with room to spare, and one beyond which no
 drive lies. Outside the second the configuration is refused; between both it is used and the doubt is told.

@@ -1,4 +1,4 @@
-"""From TOML to a checked configuration: all faults at once, each with its path and a suggestion."""
+"""TOML becomes a checked configuration: all faults at once, each with its path and a suggestion."""
 
 from __future__ import annotations
 

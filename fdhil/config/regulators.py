@@ -42,7 +42,7 @@ class Regulators(Section):
 
     @model_validator(mode="after")
     def _integrals(self) -> Regulators:
-        """What a structure does not have would be ignored silently, what it lacks would make it another one."""
+        """Refuse a gain that the structure would ignore silently, and one whose lack makes it another structure."""
         if self.structure == "p_pi_pi" and self.position_ki_per_s2:
             raise ValueError("structure p_pi_pi has no position_ki_per_s2; set structure = 'double_pi'")
         if self.structure == "double_pi" and not self.position_ki_per_s2:

@@ -1,4 +1,4 @@
-"""What all tables of the file share: the base class, and the kinds of number."""
+"""All tables of the file share their base class and the kinds of number and name."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ _MEANING = {"r": "its clearance level", "q": "its peck", "p": "its dwell", "i": 
 
 @dataclass(slots=True)
 class Series:
-    """What a series of cycle blocks shares: its words and the level at which it began, both in program units.
+    """A series of cycle blocks shares its words and the level at which it began, both in program units.
 
     The numbers stay what they are when the units or the plane change, as in the reference.
     """

@@ -1,4 +1,4 @@
-"""What a program's flow keeps: places, labels, calls, and the turns of a loop, which show when it never ends."""
+"""The flow of a program keeps places, labels, calls, and the turns of a loop, which show when it never ends."""
 
 from __future__ import annotations
 

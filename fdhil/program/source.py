@@ -1,4 +1,4 @@
-"""Where the lines of a program come from: a file or any iterable of lines, read once, with marks to return to.
+"""A source reads the lines of a program, a file or any iterable of lines, once, with marks to return to.
 
 Only what a loop or a call may come back to is kept: a place in the file. Memory stays flat however long the program.
 """

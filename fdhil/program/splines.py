@@ -27,7 +27,7 @@ Weighted = tuple[complex, float]  # a control point in mm of the active co-ordin
 
 @dataclass(slots=True)
 class Series:
-    """What a series of G5 blocks shares: the last control vector, mirrored where a block gives no I and J."""
+    """A series of G5 blocks shares the last control vector, mirrored where a block gives no I and J."""
 
     leaving: complex | None = None
 

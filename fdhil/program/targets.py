@@ -1,4 +1,4 @@
-"""What the words of a block say: where it leads, how long that is, at which feed."""
+"""The words of a block give its target, its length and its feed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a line of text to a block: its words, codes by modal group, and parameter settings.
+"""Lines of text become blocks: words, codes by modal group, and parameter settings.
 
 Blanks, comments and case mean nothing outside names. A block has each letter once, except G, M and parameter settings.
 G codes are held times ten (G38.2 is 382).

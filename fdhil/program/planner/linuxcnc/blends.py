@@ -1,4 +1,4 @@
-"""How two segments meet: straight through, with a stop, by a parabola, or by an arc that touches both.
+"""Blends decide how two segments meet: straight through, with a stop, by a parabola, or by an arc that touches both.
 
 What LinuxCNC's planner does, as its demand shows: a kink so slight that its step takes less than a tenth of the axes'
 acceleration is passed; under G64 the better of an arc and a parabola is taken, a parabola counting half, since both of
