@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from string import ascii_lowercase, ascii_uppercase
 
 from fdhil.errors import ProgramError
 from fdhil.program.expressions import Context, Reader, Value, now, whole
 
-_PLAIN = re.compile(r"(?:[a-z@^][+-]?(?:\d++\.?\d*+|\.\d++))*+")
-_WORD = re.compile(r"([a-z@^])([+-]?(?:\d++\.?\d*+|\.\d++))")
 _NUMBER = re.compile(r"n(\d++)(?:\.\d++)?+")
 _CLEANED = str.maketrans(ascii_uppercase, ascii_lowercase, " \t\r\v\f")
 _COMMENT = "("
@@ -166,14 +164,6 @@ def _ended(block: Block) -> Block:
 
 def read(text: str, context: Context, max_nesting: int) -> Line:
     """Read a cleaned line; ProgramError with line and word for what the language does not allow."""
-    if _PLAIN.fullmatch(text) is not None:
-        block = Block(context.line)
-        for letter, digits in _WORD.findall(text):
-            value = float(digits)
-            if value - value != 0.0:
-                raise ProgramError(context.line, letter.upper() + digits[:12], "is too large a number")
-            _add(block, letter, value)
-        return _fixed(_ended(block))
     reader = Reader(text, context, max_nesting)
     words: list[tuple[str, Value]] = []
     settings: list[tuple[Value | str, Value]] = []
@@ -181,15 +171,10 @@ def read(text: str, context: Context, max_nesting: int) -> Line:
         read_word(reader, words, settings)
     if settings:
         return Line(None, tuple(words), tuple(settings))
-    return Line(None, tuple(words), (), *_straight(words))
-
-
-def _fixed(block: Block) -> Line:
-    code = block.g.get("motion")
-    straight = not block.m and len(block.g) == (code is not None) and code in (None, 0, 10)
-    if not straight or not block.words.keys() <= _STRAIGHT:
-        return Line(block)
-    return Line(block, code=code, straight=tuple(block.words.get(letter) for letter in "xyzf"))
+    line = Line(None, tuple(words), (), *_straight(words))
+    if not words or any(callable(value) for _, value in words):
+        return line
+    return replace(line, fixed=line.block(context))
 
 
 def _straight(words: list[tuple[str, Value]]) -> tuple[int | None, tuple[Value | None, ...] | None]:
@@ -218,10 +203,14 @@ def read_word(reader: Reader, words: list[tuple[str, Value]], settings: list[tup
     if letter == _COMMENT:
         reader.at += 1
         return
-    if letter not in _LETTERS:
+    if letter not in _LETTERS and letter not in "no":
         raise reader.fault("is no word of the language; check the characters")
     reader.at += 1
-    words.append((letter, reader.value()))
+    value = reader.value()
+    if letter in "no":
+        word = f"{letter}{value:g}" if isinstance(value, float) else None
+        raise reader.fault("stands where it may not; N and O begin a line", word)
+    words.append((letter, value))
 
 
 def _add(block: Block, letter: str, value: float) -> None:
@@ -231,8 +220,6 @@ def _add(block: Block, letter: str, value: float) -> None:
         _add_m(block, value)
     elif letter in block.words:
         raise block.fault(f"{letter.upper()}{value:g}", "this letter stands twice in the block; keep one")
-    elif letter not in _LETTERS:
-        raise block.fault(f"{letter.upper()}{value:g}", "stands where it may not; N and O begin a line")
     else:
         block.words[letter] = value
 
