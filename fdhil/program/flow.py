@@ -104,7 +104,7 @@ class Flow:
         if self._entering:
             self._begin_sub(label, command.keyword)
         elif skip.execute:
-            self._do(label, command, line)
+            self.execute(command, line)
 
     def read(self, text: str) -> Command:
         """Read a cleaned line that begins with O (after its line number)."""
@@ -112,9 +112,7 @@ class Flow:
 
     def execute(self, command: Command, line: int) -> None:
         """Execute an O-word."""
-        self._do(command.label(), command, line)
-
-    def _do(self, label: str, command: Command, line: int) -> None:
+        label = command.label()
         self.repeats = True
         match command.keyword:
             case "sub":
@@ -278,7 +276,7 @@ class Flow:
         if round(times) > 0:
             back = Place(self.source, self.source.after())
             self._enter(Frame(str(round(name)), back, fanuc=True, again=round(times) - 1), block.line)
-            self._variables.enter_names()
+            self._variables.enter(None)
         return True
 
     def call_contour(self, block: Block, name: str) -> None:
@@ -332,7 +330,7 @@ class Flow:
             raise command.fault(f"names another subroutine than O<{frame.name}>, which is under way")
         values = command.values()
         self._variables.leave()
-        self._variables.set_returned(values[0] if values else None)
+        self._variables.returned = values[0] if values else None
         self._go_back()
 
     def _end_fanuc(self) -> bool:
@@ -349,7 +347,7 @@ class Flow:
             frame.repeated = self.repeating = True
             self.source.go(frame.entry.mark)
             return True
-        self._variables.leave_names()
+        self._variables.leave()
         self._go_back()
         return True
 

@@ -170,11 +170,7 @@ def _finish(tool: Tool, first: float, last: float, passes: float) -> None:
     if passes > tool.machine.budget.max_motions_per_block:
         raise tool.block.fault(f"P{passes:g}", "are too many passes; split them")
     contour = tool.contour
-    if _wants_turn(contour):
-        contour.quarter()
-    contour.lead_down()
-    contour.finish_corners()
-    contour.check_falling()
+    contour.lay_out(along_x=_wants_turn(contour))
     for number in range(int(passes), 0, -1):
         path = contour.copy()
         path.widen((number - 1) * (first - last) / passes + last)
@@ -198,11 +194,7 @@ def _wants_turn(contour: Contour) -> bool:
 
 def _rough(tool: Tool, code: int, words: dict[str, float]) -> None:
     contour = tool.contour
-    if code in _ALONG_X:
-        contour.quarter()
-    contour.lead_down()
-    contour.finish_corners()
-    contour.check_falling()
+    contour.lay_out(along_x=code in _ALONG_X)
     contour.widen(words.get("d", 0.0))
     first, last = contour.parts[0], contour.parts[-1]
     tool.rapid(first.start)
@@ -355,15 +347,10 @@ class Roughing:
             self.tool.feed(part.end)
             self.at = part.end
             return False
-        if part.ccw:
-            if self.at.real < part.centre.real:
-                return True
+        behind = self.at.real < part.centre.real if part.ccw else self.at.real > part.centre.real
+        if not behind:
             self._follow_up(part)
-            return True
-        if self.at.real > part.centre.real:
-            return True
-        self._follow_up(part)
-        return False
+        return behind or part.ccw
 
     def _climb_only(self, part: Part) -> None:
         if part.centre is None and part.end.imag < part.start.imag:
