@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from fdhil.program.expressions import is_whole
 from fdhil.program.machine import Machine
 from fdhil.program.modal import AXES, MM_PER_INCH, Modal
 from fdhil.program.motions import Swept, swept
@@ -72,7 +73,7 @@ def _tilted(
 def _turns(block: Block) -> int:
     value = block.words.get("p", 1.0)
     turns = round(value)
-    if abs(value - turns) > 1e-4 or not 1 <= turns <= 1_000_000:
+    if not is_whole(value) or not 1 <= turns <= 1_000_000:
         raise block.fault("p", "is no number of turns; P must be a whole number from 1 to 1000000")
     return turns
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
+from fdhil.program.expressions import is_whole
 from fdhil.program.machine import Machine
 from fdhil.program.modal import AXES, Modal
 from fdhil.program.motions import PLANE_AXES
@@ -49,7 +50,7 @@ def cycle(machine: Machine, block: Block, series: Series, fresh: bool) -> None:
     words = {letter: _mm(modal, letter, value) for letter, value in _words(modal, block, series.words).items()}
     _check(modal, block, given, words)
     repeats = round(block.words.get("l", 1.0))
-    if "l" in block.words and (repeats < 1 or abs(block.words["l"] - repeats) > 1e-4):
+    if "l" in block.words and (repeats < 1 or not is_whole(block.words["l"])):
         raise block.fault("l", "is no number of repeats; L must be a whole number from 1")
     if series.began is None:
         series.began = modal.position[normal] / modal.scale

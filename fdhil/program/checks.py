@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from fdhil.program.expressions import is_whole
 from fdhil.program.words import Block, g_word
 
 CYCLES = frozenset({730, 740, *range(810, 900, 10)})
@@ -41,7 +42,7 @@ def check_machine_words(block: Block) -> None:
     """Raise ProgramError for values that a tool, a spindle, an input or an output cannot have."""
     words, m = block.words, block.m
     tool = words.get("t", 0.0)
-    if tool < 0.0 or not _is_whole(tool):
+    if tool < 0.0 or not is_whole(tool):
         raise block.fault("t", "is no number of a tool; T must be a whole number from 0")
     if words.get("$", 0.0) not in (0.0, -1.0):
         raise block.fault("$", "is no spindle; the machine has spindle 0 alone")
@@ -73,10 +74,6 @@ def _check_signal(block: Block, code: int) -> None:
         raise block.fault("M66", "wants L from 0 to 4, and 0 for an analogue input")
     if wait != 0.0 and words.get("q", 0.0) <= 0.0:
         raise block.fault("M66", "wants the longest time to wait as Q")
-
-
-def _is_whole(value: float) -> bool:
-    return abs(value - round(value)) <= 1e-4
 
 
 def one_reader_of_axes(block: Block) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from fdhil.errors import ProgramError
 from fdhil.program.budget import Budget
 from fdhil.program.commands import FANUC, Command
+from fdhil.program.expressions import is_whole
 from fdhil.program.frames import Frame, Label, Place, Skip
 from fdhil.program.parameters import LOCAL_NUMBERS, Variables
 from fdhil.program.source import Source
@@ -270,8 +271,7 @@ class Flow:
         if code == 99:
             return self._end_fanuc()
         name, times = block.words.get("p", -1.0), block.words.get("l", 1.0)
-        off = max(abs(name - round(name)), abs(times - round(times)))
-        if name < 0.0 or off > 1e-4 or not 0 <= times < 1e9:
+        if name < 0.0 or not 0 <= times < 1e9 or not (is_whole(name) and is_whole(times)):
             raise block.fault("M98", "wants the subroutine's number as P and may have its repeats as L")
         if round(times) > 0:
             back = Place(self.source, self.source.after())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fdhil.program import arcs, roughing, splines
 from fdhil.program.compensation import Compensation
+from fdhil.program.expressions import is_whole
 from fdhil.program.machine import Machine
 from fdhil.program.modal import MM_PER_INCH, NO_MOTION, PLANE_CODES, Modal
 from fdhil.program.words import Block, g_word
@@ -142,6 +143,6 @@ def compensate(machine: Machine, block: Block, tool: bool) -> None:
 def _orientation(modal: Modal, block: Block) -> int:
     """Return L of G41.1 and G42.1: where the tip of a turning tool lies about the centre of its nose."""
     value = block.words.get("l", 0.0)
-    if value < 0.0 or abs(value - round(value)) > 1e-4 or (value and modal.plane != 1):
+    if value < 0.0 or not is_whole(value) or (value and modal.plane != 1):
         raise block.fault("l", "is no orientation of a turning tool; L must be 0 to 9, in the XZ plane (G18)")
     return round(value)

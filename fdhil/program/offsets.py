@@ -6,6 +6,7 @@ apart, with the rotation as the tenth; #5211 and on for G92, in force while #521
 
 from __future__ import annotations
 
+from fdhil.program.expressions import is_whole
 from fdhil.program.machine import Machine
 from fdhil.program.modal import AXES, Modal, rotate
 from fdhil.program.parameters import Variables
@@ -52,7 +53,7 @@ def set_data(modal: Modal, variables: Variables, block: Block) -> None:
     L1, L10 and L11 change the tool table, which moves nothing: fdhil reads them and keeps no table.
     """
     kind = block.words.get("l")
-    if kind is None or round(kind) not in (*_TABLE, 2, 20) or abs(kind - round(kind)) > 1e-4:
+    if kind is None or round(kind) not in (*_TABLE, 2, 20) or not is_whole(kind):
         raise block.fault("l" if kind is not None else "G10", "sets nothing; fdhil knows G10 L1, L2, L10, L11 and L20")
     if round(kind) in _TABLE:
         if block.words.get("p", 0.0) < 1.0:

@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
+from fdhil.program.expressions import is_whole
 from fdhil.program.machine import Machine
 from fdhil.program.modal import NO_MOTION
 from fdhil.program.targets import axis_words, spline_feed_mm_min, target
@@ -130,7 +131,7 @@ class Nurbs:
 
 def _order(block: Block) -> int:
     value = block.words.get("l", float(_USUAL_ORDER))
-    if abs(value - round(value)) > 1e-4 or not 1 <= value <= 20:
+    if not is_whole(value) or not 1 <= value <= 20:
         raise block.fault("l", "is no order of a curve; L must be a whole number from 2 to 20")
     order = round(value)
     return order if order > 1 else _USUAL_ORDER  # as LinuxCNC does

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from string import ascii_lowercase, ascii_uppercase
 
 from fdhil.errors import ProgramError
-from fdhil.program.expressions import Context, Reader, Value, now, whole
+from fdhil.program.expressions import Context, Reader, Value, is_whole, now, whole
 
 _NUMBER = re.compile(r"n(\d++)(?:\.\d++)?+")
 _CLEANED = str.maketrans(ascii_uppercase, ascii_lowercase, " \t\r\v\f")
@@ -237,7 +237,7 @@ def _add_g(block: Block, value: float) -> None:
 
 def _add_m(block: Block, value: float) -> None:
     code = round(value)
-    group = M_GROUPS.get(code) if abs(value - code) < 1e-4 else None
+    group = M_GROUPS.get(code) if is_whole(value) else None
     if group is None:
         raise block.fault(f"M{value:g}", "is an M code that fdhil does not know; see the list of codes")
     if group in block.m:
