@@ -104,12 +104,9 @@ def _check(modal: Modal, block: Block, given: Mapping[str, float], words: Mappin
     for letter in "abcuvw":
         if letter in block.words:
             raise block.fault(letter, "cannot be moved by a canned cycle")
-    needs = [
-        _DEPTH,
-        "r",
-        *("q" for m in _PECKING if m == modal.motion),
-        *("p" for m in _WITH_DWELL if m == modal.motion),
-    ]
+    needs = [_DEPTH, "r"]
+    needs += ["q"] if modal.motion in _PECKING else []
+    needs += ["p"] if modal.motion in _WITH_DWELL else []
     for letter in needs + (["i", "j", "k"] if modal.motion == _BACK_BORING else []):
         if letter not in given:
             shown = normal if letter == _DEPTH else letter
