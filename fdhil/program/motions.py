@@ -108,13 +108,13 @@ def swept(
     begin = complex(start[first], start[second]) - centre
     finish = complex(end[first], end[second]) - centre
     radii = abs(begin), abs(finish)
-    angle = swept_rad(begin, finish, turns)
+    angle = _swept_rad(begin, finish, turns)
     rise = end[normal] - start[normal]
     length = math.hypot((radii[0] + radii[1]) / 2.0 * angle, rise)
     return Swept(centre, radii, cmath.phase(begin), angle, rise, length)
 
 
-def swept_rad(begin: complex, finish: complex, turns: int) -> float:
+def _swept_rad(begin: complex, finish: complex, turns: int) -> float:
     """Return the signed angle (rad) from one radius to the other: coincident ones are a whole circle."""
     circle = 2.0 * math.pi
     angle = math.remainder(cmath.phase(finish) - cmath.phase(begin), circle)

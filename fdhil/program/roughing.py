@@ -12,7 +12,7 @@ from fdhil.program.arcs import centre_of_radius, radii_agree
 from fdhil.program.contour import Contour, ContourError, Part
 from fdhil.program.machine import Machine
 from fdhil.program.modal import Modal
-from fdhil.program.motions import swept_rad
+from fdhil.program.motions import PLANE_AXES, swept
 from fdhil.program.targets import feed_mm_min, length_mm
 from fdhil.program.words import Block, g_word
 
@@ -149,14 +149,12 @@ class Tool:
         centre, there = (self.contour.programmed(place) * modal.scale for place in (part.centre, end))
         if max(abs((there - here).real), abs((there - here).imag)) < _SAME_PLACE * modal.scale:
             return
-        begin, finish = here - centre, there - centre
-        if not radii_agree(abs(begin), abs(finish), modal.scale):
+        target, turns = self.whole(end), 1 if ccw else -1
+        path = swept(modal.position, target, centre, turns, PLANE_AXES["XZ"])
+        if not radii_agree(*path.radii, modal.scale):
             raise ContourError("an arc of its contour ends at another radius than it begins; correct its centre")
-        turns = 1 if ccw else -1
-        angle = swept_rad(begin, finish, turns)
-        feed = feed_mm_min(modal, block, abs(angle) * (abs(begin) + abs(finish)) / 2.0)
-        target = self.whole(end)
-        self.machine.arc_to(block, target, centre, turns, feed, angle)
+        feed = feed_mm_min(modal, block, path.length_mm)
+        self.machine.arc_to(block, target, centre, turns, feed, path.angle_rad)
 
     def whole(self, place: complex) -> list[float]:
         """Return a place in active co-ordinates of all axes."""

@@ -45,6 +45,17 @@ def test_a_feed_is_the_programmed_speed_through_two_moving_averages() -> None:
     assert not reference.rapid.any()
 
 
+@pytest.mark.parametrize("profile", PROFILES)
+def test_an_arc_is_slowed_only_by_the_axes_that_it_moves(profile: str) -> None:
+    document = bench_document("XYZ")
+    document["nc"] = {"profile": profile}
+    document["axis"]["Z"]["rapid_speed_mm_s"] = 50.0
+    arc = [Arc(1, (200.0, 0.0, 0.0), (100.0, 0.0, None), 1, "XY", 6000.0)]
+    reference = plan(arc, parse(document))
+    speed = np.hypot(np.diff(reference.position_mm["X"]), np.diff(reference.position_mm["Y"])) / 1e-3
+    assert speed.max() == pytest.approx(100.0, rel=0.01)
+
+
 def test_the_path_is_run_at_the_programmed_feed_without_a_stop_between_feeds() -> None:
     document = bench_document()
     document["nc"] = {"smoothing_s": [], "end_rest_s": 0.0}
