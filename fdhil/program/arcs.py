@@ -66,8 +66,8 @@ def _tilted(
         place = [a + (b - a) * share for a, b in zip(begin, end, strict=True)]
         radius, turned = radii[0] + (radii[1] - radii[0]) * share, path.begin_rad + path.angle_rad * share
         place[first], place[second] = x + radius * math.cos(turned), y + radius * math.sin(turned)
-        machine.feed_at(block, place, feed)
-    machine.feed_at(block, end, feed)
+        machine.line_to(block, place, feed)
+    machine.line_to(block, end, feed)
 
 
 def _turns(block: Block) -> int:

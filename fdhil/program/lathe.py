@@ -24,9 +24,9 @@ def synchronised(machine: Machine, block: Block) -> None:
         raise block.fault(code, "wants K, the distance per revolution")
     start = list(modal.position)
     feed = _synchronous_feed(modal, block, abs(block.words["k"]) * modal.scale)
-    machine.feed_at(block, target(modal, block), feed)
+    machine.line_to(block, target(modal, block), feed)
     if modal.motion == 331:
-        machine.feed_at(block, start, feed * abs(block.words.get("i", 1.0)))
+        machine.line_to(block, start, feed * abs(block.words.get("i", 1.0)))
 
 
 def _synchronous_feed(modal: Modal, block: Block, pitch_mm: float) -> float:
@@ -92,15 +92,15 @@ def _cut(machine: Machine, block: Block, thread: Thread, start: list[float], end
 
     machine.rapid_to(block, at(clear, first_z))
     if thread.at_entry:
-        machine.feed_at(block, at(crest, first_z), thread.taper_feed)
-        machine.feed_at(block, at(root, first_z + along * thread.taper), thread.taper_feed)
+        machine.line_to(block, at(crest, first_z), thread.taper_feed)
+        machine.line_to(block, at(root, first_z + along * thread.taper), thread.taper_feed)
     else:
         machine.rapid_to(block, at(root, first_z))
     if thread.at_exit:
-        machine.feed_at(block, at(root, last_z - along * thread.taper), thread.feed)
-        machine.feed_at(block, at(crest, last_z), thread.taper_feed)
+        machine.line_to(block, at(root, last_z - along * thread.taper), thread.feed)
+        machine.line_to(block, at(crest, last_z), thread.taper_feed)
     else:
-        machine.feed_at(block, at(root, last_z), thread.feed)
+        machine.line_to(block, at(root, last_z), thread.feed)
     machine.rapid_to(block, at(clear, last_z))
 
 

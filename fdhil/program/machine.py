@@ -29,7 +29,7 @@ class Machine:
 
     def rapid_to(self, block: Block, target: list[float]) -> None:
         """Order a rapid to a position in active co-ordinates."""
-        self._straight(block, target, None)
+        self.line_to(block, target, None)
 
     def rapid_beside(self, block: Block, target: list[float]) -> None:
         """Order a rapid without cutter compensation, which the next move enters again."""
@@ -42,11 +42,22 @@ class Machine:
 
     def feed_to(self, block: Block, target: list[float]) -> None:
         """Order a straight feed to a position in active co-ordinates, at the feed in force."""
-        self._straight(block, target, feed_mm_min(self.modal, block, straight_length(self.modal.position, target)))
+        self.line_to(block, target, feed_mm_min(self.modal, block, straight_length(self.modal.position, target)))
 
-    def feed_at(self, block: Block, target: list[float], feed: float) -> None:
-        """Order a straight feed at ``feed`` mm/min."""
-        self._straight(block, target, feed)
+    def line_to(self, block: Block, target: list[float], feed: float | None) -> None:
+        """Order a straight line to a position in active co-ordinates at ``feed`` mm/min, a rapid where that is None."""
+        start = self.modal.position
+        self.modal.position = target
+        self.just_left = False
+        if self.compensation is None:
+            self._line(block, target, feed)
+            return
+        self._checked(block, target)
+        a, b = self._flat(start), self._flat(target)
+        if abs(b - a) < _TINY_MM and self.compensation.entered:
+            self.compensation.wait(Waiting(block, None, target, feed))
+            return
+        self._give(self.compensation.line(block, a, b, target, feed))
 
     def dwell(self, block: Block, seconds: float) -> None:
         """Order a dwell."""
@@ -77,20 +88,6 @@ class Machine:
             self._give(self.compensation.flush())
             self.just_left = self.compensation.entered
             self.compensation = None
-
-    def _straight(self, block: Block, target: list[float], feed: float | None) -> None:
-        start = self.modal.position
-        self.modal.position = target
-        self.just_left = False
-        if self.compensation is None:
-            self._line(block, target, feed)
-            return
-        self._checked(block, target)
-        a, b = self._flat(start), self._flat(target)
-        if abs(b - a) < _TINY_MM and self.compensation.entered:
-            self.compensation.wait(Waiting(block, None, target, feed))
-            return
-        self._give(self.compensation.line(block, a, b, target, feed))
 
     def _flat(self, position: list[float]) -> complex:
         first, second, _ = PLANE_AXES[self.modal.plane_name]

@@ -64,8 +64,8 @@ def spline(machine: Machine, series: Series, block: Block) -> None:
         series.leaving = leaving
         points = (start, start + heading, end + leaving, end)
     for place in _bezier_chords(points):
-        machine.feed_at(block, [place.real, place.imag, *whole[2:]], feed)
-    machine.feed_at(block, whole, feed)
+        machine.line_to(block, [place.real, place.imag, *whole[2:]], feed)
+    machine.line_to(block, whole, feed)
 
 
 def _bezier_chords(points: Bezier) -> Iterator[complex]:
@@ -126,7 +126,7 @@ class Nurbs:
         machine.modal.motion = NO_MOTION
         rest = machine.modal.position[2:]
         for place in places:
-            machine.feed_at(block, [place.real, place.imag, *rest], feed)
+            machine.line_to(block, [place.real, place.imag, *rest], feed)
 
 
 def _order(block: Block) -> int:
