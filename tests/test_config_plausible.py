@@ -83,6 +83,7 @@ def machines(draw: st.DrawFn) -> dict[str, Any]:
 
     pitch_mm, rpm, voltage_v = between(1.0, 300.0), between(60.0, 8000.0), between(24.0, 800.0)
     current_a, start_s = between(2.0, 300.0), between(0.01, 3.0)
+    start_s = max(start_s, rpm / 60 * pitch_mm / 1e6)  # no axis accelerates at more than 100 g
     speed = rpm * 2 * math.pi / 60
     K = between(0.05, 0.95) * voltage_v / speed
     R = between(0.01, 0.6) * voltage_v / current_a

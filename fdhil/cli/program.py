@@ -26,10 +26,10 @@ def interpret(program: Path, as_document: bool, max_blocks: int, max_repeated: i
     Nothing is printed unless the whole program can be interpreted.
     """
     from fdhil.program.budget import Budget
-    from fdhil.program.interpreter import interpret as motions_of
+    from fdhil.program.interpreter import Interpreter
     from fdhil.program.motions import as_json
 
-    motions = motions_of(program, Budget(max_blocks, max_repeated))
+    motions = Interpreter(program, Budget(max_blocks, max_repeated), block_delete=False).run()
     with tempfile.SpooledTemporaryFile(_SPOOL_CHARACTERS, mode="w+", encoding="utf-8") as spool:
         if as_document:
             spool.write('{"schema": "fdhil-interpret-1", "motions": [')

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from fdhil import tables
 from fdhil.cia402 import Scaling
 from fdhil.config.regulators import Regulators
-from fdhil.config.section import NotNegative, Positive, Section, listed
+from fdhil.config.section import NotNegative, Positive, Section, one_of
 
 # the built-in ceilings of what may ever be added to a set-point; a config can only lower them
 CEILING_OFFSET_UM = 250.0
@@ -55,7 +55,9 @@ class Drive(Section):
     node_id: int | None = Field(
         None, ge=1, le=127, description="CANopen node-ID; left out: 1 for the first axis, 2 for the next"
     )
-    profile: str = Field("fdhil_twin", description=f"the vendor profile: {', '.join(tables.DRIVE_PROFILES)}")
+    profile: Annotated[str, one_of(tables.DRIVE_PROFILES)] = Field(
+        "fdhil_twin", description=f"the vendor profile: {', '.join(tables.DRIVE_PROFILES)}"
+    )
     increments_per_rev: int = Field(
         65536, ge=4, le=2**31 - 1, description="encoder and set-point increments per revolution"
     )
@@ -69,16 +71,13 @@ class Drive(Section):
         None, ge=1e-3, le=1e5, description="the axis maximum; left out: the rapid speed"
     )
 
-    @field_validator("profile")
-    @classmethod
-    def _known(cls, name: str) -> str:
-        return listed(name, tables.DRIVE_PROFILES)
-
 
 class Voltage(Section):
     """[axis.X.voltage]: where the motor's terminal voltage comes from."""
 
-    source: str = Field("drive", description="drive (a vendor object in a TPDO) or modbus (a separate sensor)")
+    source: Annotated[str, one_of(tables.VOLTAGE_SOURCES)] = Field(
+        "drive", description="drive (a vendor object in a TPDO) or modbus (a separate sensor)"
+    )
     sampling: Literal["interval_mean", "instant"] = Field(
         "interval_mean", description="the drive's value is the mean since the last sample, or an instant"
     )
@@ -86,11 +85,6 @@ class Voltage(Section):
     port: int = Field(0, ge=0, le=65535, description="modbus: TCP port; 0 lets the simulator choose one")
     unit: int = Field(1, ge=0, le=247, description="modbus: unit identifier")
     timeout_s: Positive = Field(0.5, ge=1e-3, le=60, description="modbus: how long an answer may take")
-
-    @field_validator("source")
-    @classmethod
-    def _known(cls, name: str) -> str:
-        return listed(name, tables.VOLTAGE_SOURCES)
 
 
 class Thermometer(Section):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from fdhil import tables
-from fdhil.config.section import NotNegative, Positive, Section, listed
+from fdhil.config.section import NotNegative, Positive, Section, one_of
 
 
 class Nc(Section):
@@ -39,24 +39,18 @@ class Nc(Section):
 class G0(Section):
     """[g0]: how a rapid move is recognised."""
 
-    source: str = Field("inferred", description="inferred (from the demand's speed) or digital_input (the NC's signal)")
+    source: Annotated[str, one_of(tables.EVENT_SOURCES)] = Field(
+        "inferred", description="inferred (from the demand's speed) or digital_input (the NC's signal)"
+    )
     input_bit: int = Field(16, ge=0, le=31, description="digital_input: bit of 0x60FD that the NC raises")
-
-    @field_validator("source")
-    @classmethod
-    def _known(cls, name: str) -> str:
-        return listed(name, tables.EVENT_SOURCES)
 
 
 class Identification(Section):
     """[identification]"""
 
-    method: str | None = Field(None, description=f"{', '.join(tables.ESTIMATORS)}; left out: the best there is")
+    method: Annotated[str, one_of(tables.ESTIMATORS)] | None = Field(
+        None, description=f"{', '.join(tables.ESTIMATORS)}; left out: the best there is"
+    )
     lowpass_hz: Positive = Field(
         40.0, ge=0.01, le=1e5, description="least_squares: corner of the zero-phase low-pass on every signal"
     )
-
-    @field_validator("method")
-    @classmethod
-    def _known(cls, name: str | None) -> str | None:
-        return None if name is None else listed(name, tables.ESTIMATORS)

@@ -1,4 +1,4 @@
-"""From [axis.X.correction] to what an offset may do per SYNC: the one derivation, for the planner and for the guard."""
+"""Offset limits per SYNC follow from [axis.X.correction]: the one derivation, for the planner and for the guard."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether the numbers of an axis can be those of one machine, and which unit was likely mistaken where they cannot.
+"""Relations tell whether an axis' numbers can be of one machine, and slips which unit was mistaken where they cannot.
 
 Each relation between keys has a range in which ordinary feed drives lie, with room to spare, and one beyond which no
 drive lies. Outside the second the configuration is refused; between both it is used and the doubt is told.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from operator import attrgetter
 
 from fdhil.config.axis import Axis
 
@@ -136,11 +137,7 @@ def _within(figure: float, bounds: tuple[float, float]) -> bool:
 
 def _numbers(axis: Axis) -> dict[str, float]:
     """Return the numbers of an axis by their key within it."""
-    own = ("screw_pitch_mm", "rapid_speed_mm_s", "max_acceleration_mm_s2")
-    numbers: dict[str, float] = {name: getattr(axis, name) for name in own}
-    numbers |= {f"nominal.{name}": value for name, value in axis.nominal.model_dump().items()}
-    limits = ("current_limit_a", "voltage_limit_v")
-    return numbers | {f"regulators.{name}": getattr(axis.regulators, name) for name in limits}
+    return {key: attrgetter(key)(axis) for relation in RELATIONS for key in relation.keys}
 
 
 def _speed_rad_s(numbers: Numbers) -> float:

@@ -1,4 +1,4 @@
-"""From TOML to a checked configuration: all faults at once, each with its path and a suggestion."""
+"""TOML becomes a checked configuration: all faults at once, each with its path and a suggestion."""
 
 from __future__ import annotations
 
@@ -90,22 +90,26 @@ def _faults(error: ValidationError) -> list[ConfigFault]:
     faults = []
     items = error.errors(include_url=False)
     for item in items[:MOST_FAULTS]:
-        path = ".".join(_short(str(part)) for part in item["loc"]) or "config"
+        loc = item["loc"]
+        path = ".".join(_short(str(part)) for part in loc) or "config"
+        section, key = _section(loc[:-1]), str(loc[-1]) if loc else ""
+        field = section.model_fields.get(key)
+        meaning = field.description or "" if field else ""
         if item["type"] == "extra_forbidden":
-            faults.append(ConfigFault(path, "is no key of this section", _near_key(item["loc"])))
+            faults.append(ConfigFault(path, "is no key of this section", _near_key(section, key)))
         elif item["type"] == "missing":
-            faults.append(ConfigFault(path, "is missing", _describe(item["loc"])))
-        elif item["type"] == "value_error" and not item["loc"]:
+            faults.append(ConfigFault(path, "is missing", meaning))
+        elif item["type"] == "value_error" and not loc:
             for line in str(item["ctx"]["error"]).splitlines():
                 where, _, what = line.partition(": ")
                 faults.append(ConfigFault(where, what))
-        elif item["type"] in OUT_OF_RANGE and (bounds := _bounds(item["loc"])):
+        elif item["type"] in OUT_OF_RANGE and (bounds := _bounds(section, loc)):
             kind = "a finite number " if item["type"] == "finite_number" else ""
             what = f"must be {kind}{bounds}, not {_shown(item['input'])}"
-            faults.append(ConfigFault(path, what, _describe(item["loc"])))
+            faults.append(ConfigFault(path, what, meaning))
         else:
             shown = f", not {_shown(item['input'])}" if isinstance(item["input"], str | int | float | bool) else ""
-            faults.append(ConfigFault(path, item["msg"].removeprefix("Value error, ") + shown, _describe(item["loc"])))
+            faults.append(ConfigFault(path, item["msg"].removeprefix("Value error, ") + shown, meaning))
     if len(items) > MOST_FAULTS:
         faults.append(ConfigFault("file", f"has {len(items) - MOST_FAULTS} more faults", "mend these first"))
     return faults
@@ -123,14 +127,13 @@ def _shown(value: Any) -> str:
         return "a number of thousands of digits"
 
 
-def _bounds(loc: tuple[int | str, ...]) -> str:
+def _bounds(section: type[Section], loc: tuple[int | str, ...]) -> str:
     """Return the range that a key's number must have, as the models state it; empty when they state none."""
-    section = _section(loc[:-1])
-    names = [str(key) for key in loc if section and str(key) in section.model_fields]
-    if section is None or not names:
+    names = [str(key) for key in loc if str(key) in section.model_fields]
+    if not names:
         return ""
     field = section.model_fields[names[-1]]
-    told = list(_constraints(field)) + list(_constraints(field.annotation))
+    told = [*_constraints(field), *_constraints(field.annotation)]
     low = max((bound for item in told if (bound := getattr(item, "ge", None)) is not None), default=None)
     high = min((bound for item in told if (bound := getattr(item, "le", None)) is not None), default=LARGEST)
     return f"above 0 and at most {high:g}" if low is None else f"from {low:g} to {high:g}"
@@ -144,8 +147,8 @@ def _constraints(of: Any) -> Iterator[Any]:
         yield from _constraints(inner)
 
 
-def _section(loc: tuple[int | str, ...]) -> type[Section] | None:
-    """Follow a path of keys through the models; None where it leaves them."""
+def _section(loc: tuple[int | str, ...]) -> type[Section]:
+    """Follow a path of keys through the models as far as it leads."""
     section: type[Section] = MachineConfig
     for key in loc:
         field = section.model_fields.get(str(key))
@@ -163,13 +166,6 @@ def _arguments(annotation: Any) -> list[Any]:
     return [annotation] if not arguments else [x for a in arguments for x in _arguments(a)]
 
 
-def _near_key(loc: tuple[int | str, ...]) -> str:
-    section = _section(loc[:-1])
-    near = difflib.get_close_matches(str(loc[-1]), section.model_fields if section else [], n=1)
+def _near_key(section: type[Section], key: str) -> str:
+    near = difflib.get_close_matches(key, section.model_fields, n=1)
     return f"did you mean {near[0]!r}?" if near else "see configs/machine-template.toml"
-
-
-def _describe(loc: tuple[int | str, ...]) -> str:
-    section = _section(loc[:-1])
-    field = section.model_fields.get(str(loc[-1])) if section else None
-    return field.description or "" if field else ""

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from fdhil import tables
-from fdhil.config.section import NotNegative, Positive, Section, listed
+from fdhil.config.section import NotNegative, Positive, Section, one_of
 
 
 class Regulators(Section):
     """[axis.X.regulators]: the drive's nested loops."""
 
-    structure: str = Field("p_pi_pi", description=f"the regulators' structure: {', '.join(tables.REGULATORS)}")
+    structure: Annotated[str, one_of(tables.REGULATORS)] = Field(
+        "p_pi_pi", description=f"the regulators' structure: {', '.join(tables.REGULATORS)}"
+    )
     position_gain_per_s: Positive = Field(ge=1e-2, le=1e5, description="Kv of the position loop, 1/s")
     speed_feedforward: Annotated[float, Field(ge=0, le=1.5)] = Field(
         1.0, description="share of the demand's speed fed forward"
@@ -38,14 +40,9 @@ class Regulators(Section):
     setpoint_filter_order: Literal[1, 2] = Field(1, description="first-order, or two equal ones behind each other")
     current_delay_cycles: int = Field(0, ge=0, le=4, description="current cycles until a computed voltage acts")
 
-    @field_validator("structure")
-    @classmethod
-    def _known(cls, name: str) -> str:
-        return listed(name, tables.REGULATORS)
-
     @model_validator(mode="after")
     def _integrals(self) -> Regulators:
-        """What a structure does not have would be ignored silently, what it lacks would make it another one."""
+        """Refuse a gain that the structure would ignore silently, and one whose lack makes it another structure."""
         if self.structure == "p_pi_pi" and self.position_ki_per_s2:
             raise ValueError("structure p_pi_pi has no position_ki_per_s2; set structure = 'double_pi'")
         if self.structure == "double_pi" and not self.position_ki_per_s2:

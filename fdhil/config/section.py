@@ -1,4 +1,4 @@
-"""What all tables of the file share: the base class, and the kinds of number."""
+"""All tables of the file share their base class and the kinds of number and name."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ def _of_a_machine(value: float) -> float:
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False), AfterValidator(_of_a_machine)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False), AfterValidator(_of_a_machine)]
-Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False), AfterValidator(_of_a_machine)]
 AxisName = Annotated[str, Field(pattern="^[A-Z]$")]
 
@@ -32,8 +31,13 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
 
 
-def listed(name: str, table: Mapping[str, str]) -> str:
-    if name not in table:
-        near = difflib.get_close_matches(name, table, n=1)
-        raise ValueError(f"must be one of {', '.join(table)}" + (f"; did you mean {near[0]!r}?" if near else ""))
-    return name
+def one_of(table: Mapping[str, str]) -> AfterValidator:
+    """Return the check that a name is of a table."""
+
+    def check(name: str) -> str:
+        if name not in table:
+            near = difflib.get_close_matches(name, table, n=1)
+            raise ValueError(f"must be one of {', '.join(table)}" + (f"; did you mean {near[0]!r}?" if near else ""))
+        return name
+
+    return AfterValidator(check)

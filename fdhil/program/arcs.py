@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
-from fdhil.errors import ProgramError
+from fdhil.program.expressions import is_whole
 from fdhil.program.machine import Machine
 from fdhil.program.modal import AXES, MM_PER_INCH, Modal
+from fdhil.program.motions import Swept, swept
 from fdhil.program.targets import axis_words, feed_mm_min, plane_axes, target
 from fdhil.program.words import Block
 
@@ -23,90 +24,82 @@ _CHORD_RELATIVE = 0.001  # by how much half the chord may exceed the radius of a
 
 def arc(machine: Machine, block: Block) -> None:
     """Order the arc of a G2 or G3 block; ProgramError when its words give none."""
-    modal = machine.modal
-    first, second, normal = plane_axes(modal, block)
-    if "r" in block.words and any(letter in block.words for letter in _OFFSETS):
+    modal, words = machine.modal, block.words
+    axes = first, second, normal = plane_axes(modal, block)
+    by_radius = "r" in words
+    if by_radius and any(letter in words for letter in _OFFSETS):
         raise block.fault("r", "contradicts I, J or K in the same block; give the radius or the centre")
-    words = axis_words(block)
+    named = axis_words(block)
     end = target(modal, block)
+    here, there = (complex(place[first], place[second]) for place in (modal.position, end))
     clockwise = modal.motion == 20
-    if "r" in block.words:
-        if first not in words and second not in words and "@" not in block.words and "^" not in block.words:
+    if by_radius:
+        if first not in named and second not in named and "@" not in words and "^" not in words:
             raise block.fault("r", "an arc by radius wants an end in its plane; a circle wants its centre")
-        centre = _centre_of_radius(modal, block, (modal.position[first], modal.position[second]),
-                                   (end[first], end[second]), clockwise)  # fmt: skip
+        centre = _centre_of_radius_word(block, here, there, words["r"] * modal.scale, clockwise)
     else:
         centre = _centre_of_offsets(modal, block, first, second)
-        _check_radii(block, modal, centre, end, first, second)
-    turns = _turns(block)
-    turns = -turns if clockwise else turns
-    axes = (first, second, normal)
-    angle, length = _extent(modal.position, end, centre, turns, axes)
-    feed = feed_mm_min(modal, block, length)
+        _check_radii(block, modal, abs(here - centre), abs(there - centre), f"{AXES[first]}, {AXES[second]}".upper())
+    turns = -_turns(block) if clockwise else _turns(block)
+    path = swept(modal.position, end, centre, turns, axes)
+    feed = feed_mm_min(modal, block, path.length_mm)
     if modal.rotation_deg and normal != 2:
-        _tilted(machine, block, end, centre, angle, axes, feed)
+        _tilted(machine, block, end, path, axes, feed)
     else:
-        machine.arc_to(block, end, centre, turns, feed, angle)
+        machine.arc_to(block, end, centre, turns, feed, path.angle_rad)
 
 
 def _tilted(
-    machine: Machine, block: Block, end: list[float], centre: tuple[float, float], angle: float,
-    axes: tuple[int, int, int], feed: float,
-) -> None:  # fmt: skip
+    machine: Machine, block: Block, end: list[float], path: Swept, axes: tuple[int, int, int], feed: float
+) -> None:
     """Order an arc whose plane is turned about Z with its system: chords, since it lies in none of the planes."""
     first, second, _ = axes
     if machine.compensation is not None:
         what = "an arc outside the XY plane of a turned system cannot be compensated; end compensation by G40 first"
-        raise ProgramError(block.line, f"G{machine.modal.motion / 10:g}", what)
+        raise block.fault(machine.modal.code, what)
     begin = list(machine.modal.position)
-    radii = [math.hypot(p[first] - centre[0], p[second] - centre[1]) for p in (begin, end)]
-    from_rad = math.atan2(begin[second] - centre[1], begin[first] - centre[0])
+    x, y, radii = path.centre.real, path.centre.imag, path.radii
     step = 2.0 * math.acos(max(0.0, 1.0 - _CHORD_ERROR_MM / max(radii)))
-    chords = min(math.ceil(abs(angle) / step), machine.budget.max_motions_per_block)
+    chords = min(math.ceil(abs(path.angle_rad) / step), machine.budget.max_motions_per_block)
     for number in range(1, chords):
         share = number / chords
         place = [a + (b - a) * share for a, b in zip(begin, end, strict=True)]
-        radius, turned = radii[0] + (radii[1] - radii[0]) * share, from_rad + angle * share
-        place[first], place[second] = centre[0] + radius * math.cos(turned), centre[1] + radius * math.sin(turned)
-        machine.feed_at(block, place, feed)
-    machine.feed_at(block, end, feed)
+        radius, turned = radii[0] + (radii[1] - radii[0]) * share, path.begin_rad + path.angle_rad * share
+        place[first], place[second] = x + radius * math.cos(turned), y + radius * math.sin(turned)
+        machine.line_to(block, place, feed)
+    machine.line_to(block, end, feed)
 
 
 def _turns(block: Block) -> int:
     value = block.words.get("p", 1.0)
     turns = round(value)
-    if abs(value - turns) > 1e-4 or not 1 <= turns <= 1_000_000:
+    if not is_whole(value) or not 1 <= turns <= 1_000_000:
         raise block.fault("p", "is no number of turns; P must be a whole number from 1 to 1000000")
     return turns
 
 
-def _centre_of_offsets(modal: Modal, block: Block, first: int, second: int) -> tuple[float, float]:
+def _centre_of_offsets(modal: Modal, block: Block, first: int, second: int) -> complex:
     letters = _OFFSETS[first], _OFFSETS[second]
     given = [letter for letter in letters if letter in block.words]
     wrong = [letter for letter in _OFFSETS if letter in block.words and letter not in letters]
     if wrong:
         raise block.fault(wrong[0], f"gives no centre in the {modal.plane_name} plane; choose the plane or the letter")
     if not given:
-        raise ProgramError(block.line, f"G{modal.motion / 10:g}", "an arc wants its centre (I J K) or its radius (R)")
+        raise block.fault(modal.code, "an arc wants its centre (I J K) or its radius (R)")
     if modal.arc_absolute and len(given) < 2:
         raise block.fault(given[0], "an absolute centre (G90.1) wants both of its words")
     values = [block.words.get(letter, 0.0) * modal.scale for letter in letters]
-    if modal.arc_absolute:
-        return values[0], values[1]
-    return modal.position[first] + values[0], modal.position[second] + values[1]
+    centre = complex(values[0], values[1])
+    return centre if modal.arc_absolute else complex(modal.position[first], modal.position[second]) + centre
 
 
-def _check_radii(
-    block: Block, modal: Modal, centre: tuple[float, float], end: list[float], first: int, second: int
-) -> None:
-    begin = math.hypot(modal.position[first] - centre[0], modal.position[second] - centre[1])
-    finish = math.hypot(end[first] - centre[0], end[second] - centre[1])
+def _check_radii(block: Block, modal: Modal, begin_mm: float, finish_mm: float, axes: str) -> None:
     word = next(letter for letter in _OFFSETS if letter in block.words)
-    if begin < _MIN_RADIUS_MM or finish < _MIN_RADIUS_MM:
+    if begin_mm < _MIN_RADIUS_MM or finish_mm < _MIN_RADIUS_MM:
         raise block.fault(word, "the arc has no radius; move the centre away from start and end")
-    if not radii_agree(begin, finish, modal.scale):
-        raise block.fault(word, f"the radius is {begin:.4f} mm at the start and {finish:.4f} mm at the end of the arc; "
-                                f"correct centre or end ({AXES[first].upper()}, {AXES[second].upper()})")  # fmt: skip
+    if not radii_agree(begin_mm, finish_mm, modal.scale):
+        raise block.fault(word, f"the radius is {begin_mm:.4f} mm at the start and {finish_mm:.4f} mm at the end of "
+                                f"the arc; correct centre or end ({axes})")  # fmt: skip
 
 
 def radii_agree(begin_mm: float, finish_mm: float, scale: float) -> bool:
@@ -115,46 +108,18 @@ def radii_agree(begin_mm: float, finish_mm: float, scale: float) -> bool:
     return off <= small or off <= min(_SPIRAL_LARGE * small, _SPIRAL_RELATIVE * max(begin_mm, finish_mm))
 
 
-def _centre_of_radius(
-    modal: Modal, block: Block, start: tuple[float, float], end: tuple[float, float], clockwise: bool
-) -> tuple[float, float]:
-    """Centre of the arc of radius R between two points; a negative R takes the longer way round."""
-    radius = block.words["r"] * modal.scale
-    dx, dy = end[0] - start[0], end[1] - start[1]
-    half = math.hypot(dx, dy) / 2.0
+def _centre_of_radius_word(block: Block, start: complex, end: complex, radius_mm: float, clockwise: bool) -> complex:
+    half = abs(end - start) / 2.0
     if half < _MIN_RADIUS_MM:
         raise block.fault("r", "an arc by radius ends where it starts; give the centre of a full circle")
-    if abs(radius) < half * (1.0 - _CHORD_RELATIVE):
+    if abs(radius_mm) < half * (1.0 - _CHORD_RELATIVE):
         raise block.fault("r", f"is too small a radius to reach the end, {2 * half:.4f} mm away")
+    return centre_of_radius(start, end, radius_mm, clockwise)
+
+
+def centre_of_radius(start: complex, end: complex, radius: float, clockwise: bool) -> complex:
+    """Return the centre of the arc of a radius between two points; a negative one takes the longer way round."""
+    half = abs(end - start) / 2.0
     height = math.sqrt(max(0.0, radius * radius - half * half))
     side = -1.0 if clockwise == (radius > 0) else 1.0
-    return (
-        (start[0] + end[0]) / 2.0 - side * height * dy / (2.0 * half),
-        (start[1] + end[1]) / 2.0 + side * height * dx / (2.0 * half),
-    )
-
-
-def _extent(
-    start: list[float], end: list[float], centre: tuple[float, float], turns: int, axes: tuple[int, int, int]
-) -> tuple[float, float]:
-    """Return the signed angle (rad) and the length (mm) of an arc or helix."""
-    first, second, normal = axes
-    begin = (start[first] - centre[0], start[second] - centre[1])
-    finish = (end[first] - centre[0], end[second] - centre[1])
-    angle = sweep(begin, finish, turns)
-    radius = (math.hypot(*begin) + math.hypot(*finish)) / 2.0
-    return angle, math.hypot(radius * angle, end[normal] - start[normal])
-
-
-def sweep(begin: tuple[float, float], finish: tuple[float, float], turns: int) -> float:
-    """Return the signed angle (rad) from one radius to the other: coincident ones are a whole circle."""
-    angle = math.atan2(finish[1], finish[0]) - math.atan2(begin[1], begin[0])
-    circle = 2.0 * math.pi
-    angle = math.remainder(angle, circle)
-    if abs(angle) < 1e-12:
-        angle = 0.0
-    if turns > 0 and angle <= 0.0:
-        angle += circle
-    elif turns < 0 and angle >= 0.0:
-        angle -= circle
-    return angle + (turns - (1 if turns > 0 else -1)) * circle
+    return (start + end) / 2.0 + side * height * 1j * (end - start) / (2.0 * half)

@@ -1,4 +1,4 @@
-"""What a program may spend before it is refused: no input may hold the machine's computer for ever."""
+"""A budget bounds what a program may spend: no input may hold the machine's computer for ever."""
 
 from __future__ import annotations
 

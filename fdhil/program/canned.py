@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from fdhil.errors import ProgramError
+from fdhil.program.expressions import is_whole
 from fdhil.program.machine import Machine
 from fdhil.program.modal import AXES, Modal
 from fdhil.program.motions import PLANE_AXES
@@ -32,7 +32,7 @@ _MEANING = {"r": "its clearance level", "q": "its peck", "p": "its dwell", "i": 
 
 @dataclass(slots=True)
 class Series:
-    """What a series of cycle blocks shares: its words and the level at which it began, both in program units.
+    """A series of cycle blocks shares its words and the level at which it began, both in program units.
 
     The numbers stay what they are when the units or the plane change, as in the reference.
     """
@@ -50,14 +50,14 @@ def cycle(machine: Machine, block: Block, series: Series, fresh: bool) -> None:
     words = {letter: _mm(modal, letter, value) for letter, value in _words(modal, block, series.words).items()}
     _check(modal, block, given, words)
     repeats = round(block.words.get("l", 1.0))
-    if "l" in block.words and (repeats < 1 or abs(block.words["l"] - repeats) > 1e-4):
+    if "l" in block.words and (repeats < 1 or not is_whole(block.words["l"])):
         raise block.fault("l", "is no number of repeats; L must be a whole number from 1")
     if series.began is None:
         series.began = modal.position[normal] / modal.scale
     old = series.began * modal.scale
     depth, clearance = _levels(modal, words, old)
     if depth > clearance:
-        raise ProgramError(block.line, f"G{modal.motion / 10:g}", "its clearance level R lies below its depth")
+        raise block.fault(modal.code, "its clearance level R lies below its depth")
     if old < clearance:
         machine.rapid_to(block, _with(modal.position, {normal: clearance}))
     hole = Hole(machine, block, words, depth, clearance, clearance if modal.retract_to_r else max(old, clearance))
@@ -95,33 +95,30 @@ def _mm(modal: Modal, letter: str, value: float) -> float:
 
 def _check(modal: Modal, block: Block, given: Mapping[str, float], words: Mapping[str, float]) -> None:
     """Raise ProgramError for what the cycle cannot do; ``given`` are the words it may take its own from."""
-    code = f"G{modal.motion / 10:g}"
+    code = modal.code
     first, second, normal = (AXES[axis] for axis in PLANE_AXES[modal.plane_name])
     if modal.feed_mode == 930:
-        raise ProgramError(block.line, code, "cannot be used in inverse-time mode (G93); use G94 or G95")
+        raise block.fault(code, "cannot be used in inverse-time mode (G93); use G94 or G95")
     if not any(letter in block.words for letter in (first, second, normal, "@", "^")):
-        raise ProgramError(block.line, code, f"wants a word of {first.upper()}, {second.upper()} or {normal.upper()}")
+        raise block.fault(code, f"wants a word of {first.upper()}, {second.upper()} or {normal.upper()}")
     for letter in "abcuvw":
         if letter in block.words:
             raise block.fault(letter, "cannot be moved by a canned cycle")
-    needs = [
-        _DEPTH,
-        "r",
-        *("q" for m in _PECKING if m == modal.motion),
-        *("p" for m in _WITH_DWELL if m == modal.motion),
-    ]
+    needs = [_DEPTH, "r"]
+    needs += ["q"] if modal.motion in _PECKING else []
+    needs += ["p"] if modal.motion in _WITH_DWELL else []
     for letter in needs + (["i", "j", "k"] if modal.motion == _BACK_BORING else []):
         if letter not in given:
             shown = normal if letter == _DEPTH else letter
-            raise ProgramError(block.line, code, f"wants {shown.upper()}, {_MEANING.get(letter, 'its depth')}")
+            raise block.fault(code, f"wants {shown.upper()}, {_MEANING.get(letter, 'its depth')}")
     if modal.motion in _PECKING and not words["q"] > 0.0:
-        raise ProgramError(block.line, f"Q{words['q']:g}", "is no depth of a peck; Q must be positive")
+        raise block.fault(f"Q{words['q']:g}", "is no depth of a peck; Q must be positive")
     if words.get("p", 0.0) < 0.0:
-        raise ProgramError(block.line, f"P{words['p']:g}", "is no time to dwell; P must not be negative")
+        raise block.fault(f"P{words['p']:g}", "is no time to dwell; P must not be negative")
     if modal.motion in _SPINNING and modal.spindle_turns == 0:
-        raise ProgramError(block.line, code, "wants a turning spindle; give M3 or M4 first")
+        raise block.fault(code, "wants a turning spindle; give M3 or M4 first")
     if modal.motion in _TAPPING and modal.spindle_turns != _TAPPING[modal.motion]:
-        raise ProgramError(block.line, code, "wants the spindle to turn into the hole; G84 by M3, G74 by M4")
+        raise block.fault(code, "wants the spindle to turn into the hole; G84 by M3, G74 by M4")
 
 
 def _levels(modal: Modal, words: dict[str, float], began: float) -> tuple[float, float]:

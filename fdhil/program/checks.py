@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from fdhil.errors import ProgramError
-from fdhil.program.words import Block
+from fdhil.program.expressions import is_whole
+from fdhil.program.words import Block, g_word
 
 CYCLES = frozenset({730, 740, *range(810, 900, 10)})
 _COMPENSATION = frozenset({400, 410, 411, 420, 421})
@@ -42,12 +42,12 @@ def check_machine_words(block: Block) -> None:
     """Raise ProgramError for values that a tool, a spindle, an input or an output cannot have."""
     words, m = block.words, block.m
     tool = words.get("t", 0.0)
-    if tool < 0.0 or not _is_whole(tool):
+    if tool < 0.0 or not is_whole(tool):
         raise block.fault("t", "is no number of a tool; T must be a whole number from 0")
     if words.get("$", 0.0) not in (0.0, -1.0):
         raise block.fault("$", "is no spindle; the machine has spindle 0 alone")
     if m.get("tool") == 61 and words.get("q", -1.0) < 0.0:
-        raise ProgramError(block.line, "M61", "wants the tool's number as Q, not negative")
+        raise block.fault("M61", "wants the tool's number as Q, not negative")
     if m.get("spindle") == 19:
         if not 0.0 <= words.get("r", 0.0) <= 360.0:
             raise block.fault("r", "is no angle of the spindle; R must be 0 to 360")
@@ -66,18 +66,14 @@ def _check_signal(block: Block, code: int) -> None:
     given = [letter for letter in ("pe" if code == 66 else wanted) if words.get(letter, -1.0) >= 0.0]
     if len(given) != 1:
         what = "one input as P or E" if code == 66 else f"the output's number as {wanted.upper()}"
-        raise ProgramError(block.line, f"M{code}", f"wants {what}, not negative")
+        raise block.fault(f"M{code}", f"wants {what}, not negative")
     if code != 66:
         return
     wait = words.get("l", 0.0)
     if wait not in (0.0, 1.0, 2.0, 3.0, 4.0) or (given == ["e"] and wait != 0.0):
-        raise ProgramError(block.line, "M66", "wants L from 0 to 4, and 0 for an analogue input")
+        raise block.fault("M66", "wants L from 0 to 4, and 0 for an analogue input")
     if wait != 0.0 and words.get("q", 0.0) <= 0.0:
-        raise ProgramError(block.line, "M66", "wants the longest time to wait as Q")
-
-
-def _is_whole(value: float) -> bool:
-    return abs(value - round(value)) <= 1e-4
+        raise block.fault("M66", "wants the longest time to wait as Q")
 
 
 def one_reader_of_axes(block: Block) -> None:
@@ -86,5 +82,5 @@ def one_reader_of_axes(block: Block) -> None:
                if (group == "one-shot" and code in (100, 280, 300, 520, 920))
                or (group == "motion" and code != 800)]  # fmt: skip
     if len(wanting) > 1:
-        names = " and ".join(f"G{code / 10:g}" for code in sorted(wanting))
-        raise ProgramError(block.line, f"G{wanting[-1] / 10:g}", f"{names} would both use the axis words; keep one")
+        names = " and ".join(g_word(code) for code in sorted(wanting))
+        raise block.fault(g_word(wanting[-1]), f"{names} would both use the axis words; keep one")

@@ -117,6 +117,14 @@ class Contour:
         back = self.turn.conjugate() * place
         return back.conjugate() if self.mirrored else back
 
+    def lay_out(self, along_x: bool) -> None:
+        """Turn and mirror it for a cut along Z or ``along_x``, and work its corners; ContourError where that fails."""
+        if along_x:
+            self.quarter()
+        self.lead_down()
+        self.finish_corners()
+        self.check_falling()
+
     def quarter(self) -> None:
         """Turn it so that x becomes z."""
         self._map(-1j, False)

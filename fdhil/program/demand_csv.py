@@ -30,28 +30,25 @@ def read_demand_csv(path: Path, config: MachineConfig) -> Trajectory:
     not uniform, or an axis moves that the machine lacks. ConfigError when its step is not the SYNC period.
     """
     text = read_csv_text(path)
-    columns = [name.strip() for name in text.partition("\n")[0][:4096].split(",")]
-    missing = [f"{name}_mm" for name in config.axis if f"{name}_mm" not in columns and name in "XYZ"]
-    if "time_s" not in columns or missing:
-        absent = ", ".join((["time_s"] if "time_s" not in columns else []) + missing)
-        wanted = ",".join(["time_s", *(f"{name}_mm" for name in config.axis if name in "XYZ")])
-        raise RecordingError(f"{path}: there is no column {absent}; a demand begins with the line {wanted}")
-    table = _numbers(path, text, len(columns))
-    time_s = table[:, columns.index("time_s")]
-    _check_times(path, time_s, config.machine.sync_period_s)
-    for place, name in enumerate(columns):
-        axis = name.removesuffix("_mm")
-        if name.endswith("_mm") and axis not in config.axis and np.ptp(table[:, place]) > _MOVED_MM:
+    names = [name.strip() for name in text.partition("\n")[0][:4096].split(",")]
+    wanted = ["time_s", *(f"{axis}_mm" for axis in config.axis if axis in "XYZ")]
+    if absent := [name for name in wanted if name not in names]:
+        what = f"there is no column {', '.join(absent)}; a demand begins with the line {','.join(wanted)}"
+        raise RecordingError(f"{path}: {what}")
+    table = _numbers(path, text, len(names))
+    columns = {name: table[:, names.index(name)] for name in names}
+    _check_times(path, columns["time_s"], config.machine.sync_period_s)
+    moved = {name.removesuffix("_mm"): column for name, column in columns.items() if name.endswith("_mm")}
+    for axis, column in moved.items():
+        if axis not in config.axis and np.ptp(column) > _MOVED_MM:
             raise RecordingError(f"{path}: axis {axis} moves, which the configuration lacks; add [axis.{axis}] to it")
-    _check_speeds(path, {n: table[:, columns.index(f"{n}_mm")] for n in config.axis if f"{n}_mm" in columns}, config)
-    n = time_s.size
-    position = {
-        axis: frozen(table[:, columns.index(f"{axis}_mm")]) if f"{axis}_mm" in columns else frozen(np.zeros(n))
-        for axis in config.axis
-    }
-    rapid = np.zeros(n, dtype=np.bool_)
+    _check_speeds(path, {axis: moved[axis] for axis in config.axis if axis in moved}, config)
+    still = np.zeros(len(table))
+    rapid = still.astype(np.bool_)
     rapid.setflags(write=False)
-    return Trajectory(config.machine.sync_period_s, frozen(time_s), position, rapid, frozen_ints(np.zeros(n)))
+    position_mm = {axis: frozen(moved.get(axis, still)) for axis in config.axis}
+    time_s = frozen(columns["time_s"])
+    return Trajectory(config.machine.sync_period_s, time_s, position_mm, rapid, frozen_ints(still))
 
 
 def _numbers(path: Path, text: str, width: int) -> Float:

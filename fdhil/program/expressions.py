@@ -173,9 +173,14 @@ class Reader:
         raise self.fault("EXISTS wants the name of a parameter: EXISTS[#<name>]", "exists")
 
 
+def is_whole(value: float) -> bool:
+    """Tell whether a value counts as a whole number."""
+    return abs(value - round(value)) <= _EQUAL
+
+
 def whole(context: Context, value: float, what: str) -> int:
     """Return the whole number that a value must be."""
-    if abs(value - round(value)) > _EQUAL:
+    if not is_whole(value):
         raise _fault(context, f"{what}{value:g}", "is no whole number, as it must be here")
     return round(value)
 

@@ -5,30 +5,25 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 from fdhil.errors import ProgramError
 from fdhil.program.budget import Budget
+from fdhil.program.expressions import Reader, Value
 from fdhil.program.interpreter import Interpreter, interpret
 from fdhil.program.modal import MM_PER_INCH
 from fdhil.program.motions import Arc, Feed, Motion
+from fdhil.program.parameters import Variables
+from fdhil.program.words import read_word, without_number
 
 _COMMENT = re.compile(r"\([^)]*\)?|;.*")
 _NUMBER = re.compile(r"[+-]?\s*(?:\d[\d\s]*\.?[\d\s]*|\.[\d\s]+)")
 _UNITS = re.compile(r"[Gg]\s*0*(2[01])(?![\d.])")
 _DIGITS = 3
 _SAME = 1e-6  # relative, of a feed that is written and read again
-
-
-@dataclass(frozen=True, slots=True)
-class Word:
-    """A word's letter, and where its value stands in the line."""
-
-    letter: str
-    start: int
-    end: int
 
 
 def with_feeds(program: Path, shares: Mapping[int, float], budget: Budget) -> bytes:
@@ -63,44 +58,19 @@ def cut(value: float) -> float:
     return math.floor(value / unit * (1 + 1e-9)) * unit
 
 
-def words(text: str) -> Iterator[Word]:
-    """Yield the words of a line whose comments are blanked; parameters that it sets are none."""
-    at = 0
-    while at < len(text):
-        letter = text[at].lower()
-        if letter.isalpha():
-            end = _value_end(text, at + 1)
-            yield Word(letter, at + 1, end)
-            at = max(end, at + 1)
-        elif letter in "#=":
-            at = _value_end(text, at if letter == "#" else at + 1)
-        else:
-            at += 1
-
-
-def _value_end(text: str, at: int) -> int:
-    """Return where the value that begins at ``at`` ends: a number, a parameter, brackets, a function of brackets."""
-    while at < len(text) and text[at].isspace():
-        at += 1
-    if number := _NUMBER.match(text, at):
-        return at + len(number.group().rstrip())
-    while at < len(text) and (text[at] in "#+-" or text[at].isalpha() or text[at].isspace()):
-        at += 1
-    if text.startswith("<", at):
-        return max(text.find(">", at) + 1, at + 1)
-    if number := _NUMBER.match(text, at):
-        return at + len(number.group().rstrip())
-    return _brackets_end(text, at)
-
-
-def _brackets_end(text: str, at: int) -> int:
-    depth = 0
-    while at < len(text):
-        depth += (text[at] == "[") - (text[at] == "]")
-        at += 1
-        if depth <= 0 and not text.startswith("/[", at):  # ATAN[y]/[x]
-            return at
-    return at
+def _feed_word(code: str) -> slice | None:
+    """Return where the value of the F word stands in a line whose comments are blanked, None where it has none."""
+    places = [place for place, character in enumerate(code) if not character.isspace()]
+    text = "".join(code[place] for place in places).lower()
+    reader = Reader(text, Variables(0, {}, {}), Budget().max_nesting)
+    reader.at = len(text) - len(without_number(text.lstrip("/")))
+    words: list[tuple[str, Value]] = []
+    with suppress(ProgramError):  # what cannot be read is never executed
+        while not reader.done() and not text.startswith(("o", "%"), reader.at):
+            read_word(reader, words, [])
+            if words and words[-1][0] == "f":
+                return slice(places[reader.word_at] + 1, places[reader.at - 1] + 1)
+    return None
 
 
 class _Writer:
@@ -120,12 +90,12 @@ class _Writer:
         code = _COMMENT.sub(lambda found: " " * len(found.group()), raw.rstrip("\r\n"))
         if units := _UNITS.search(code):
             self._scale = MM_PER_INCH if units.group(1) == "20" else 1.0
-        feed = next((word for word in words(code) if word.letter == "f"), None)
+        feed = _feed_word(code)
         share = self._shares.get(number, 1.0) if number in self._feeds else 1.0
         if feed is not None:
-            self._in_force = code[feed.start : feed.end].strip()
+            self._in_force = code[feed].strip()
             self._changed = share < 1.0
-            return raw if share == 1.0 else f"{raw[: feed.start]}{self._value(number, share)}{raw[feed.end :]}"
+            return raw if share == 1.0 else f"{raw[: feed.start]}{self._value(number, share)}{raw[feed.stop :]}"
         if number not in self._feeds or not (share < 1.0 or self._changed or self._everywhere):
             return raw
         self._changed = share < 1.0

@@ -1,6 +1,6 @@
 """Flow of a program: O-words (sub, call, return, while, do, repeat, if) and Fanuc calls (M98, M99).
 
-Nothing is compiled: a jump is a seek to a mark in the source, and what must not be executed is read over. A label
+Nothing is compiled: a jump is a seek to a place in the source, and what must not be executed is read over. A label
 belongs to the subroutine it stands in; each call has labels, #1 to #30 and local names of its own.
 """
 
@@ -13,9 +13,10 @@ from pathlib import Path
 from fdhil.errors import ProgramError
 from fdhil.program.budget import Budget
 from fdhil.program.commands import FANUC, Command
-from fdhil.program.frames import Frame, Label, Place, Skip
+from fdhil.program.expressions import is_whole
+from fdhil.program.frames import Frame, Label, Skip
 from fdhil.program.parameters import LOCAL_NUMBERS, Variables
-from fdhil.program.source import Source
+from fdhil.program.source import Place, Source
 from fdhil.program.words import Block, clean, without_number
 
 _MAYBE_O_WORD = re.compile(r"[\s/]*(?:n[\d.\s]*)?o", re.IGNORECASE)
@@ -104,7 +105,7 @@ class Flow:
         if self._entering:
             self._begin_sub(label, command.keyword)
         elif skip.execute:
-            self._do(label, command, line)
+            self.execute(command, line)
 
     def read(self, text: str) -> Command:
         """Read a cleaned line that begins with O (after its line number)."""
@@ -112,9 +113,7 @@ class Flow:
 
     def execute(self, command: Command, line: int) -> None:
         """Execute an O-word."""
-        self._do(command.label(), command, line)
-
-    def _do(self, label: str, command: Command, line: int) -> None:
+        label = command.label()
         self.repeats = True
         match command.keyword:
             case "sub":
@@ -144,7 +143,7 @@ class Flow:
             case "break" | "continue":
                 self._leave_loop(label, command, line)
             case _:
-                self._subs.setdefault(label, (Place(self.source, self.source.here()), True))
+                self._subs.setdefault(label, (self.source.here(), True))
         if command.keyword not in _WITH_VALUES and command.values():
             raise command.fault(f"{command.keyword} takes no value")
 
@@ -157,9 +156,9 @@ class Flow:
             raise ProgramError(line, f"O<{label}>", f"is the label of line {known.line} already; choose another one")
         if known is None and len(labels) >= self._budget.max_labels:
             raise ProgramError(line, f"O<{label}>", f"is one label more than the {self._budget.max_labels} allowed")
-        mark = self.source.after() if kind in ("do", "repeat") else self.source.here()
         if known is None:
-            known = labels[label] = Label(kind, line, mark)
+            place = self.source.after() if kind in ("do", "repeat") else self.source.here()
+            known = labels[label] = Label(kind, line, place)
         return known
 
     def _label(self, label: str, kinds: tuple[str, ...], command: Command) -> Label:
@@ -174,7 +173,7 @@ class Flow:
         self.repeating = True
         if state.turns.one_more(self._whole_state):
             raise command.fault("ends a turn that changes nothing, so the loop never ends; let its condition change")
-        self.source.go(state.mark)
+        self.source.go(state.place)
 
     def _left(self, label: str) -> None:
         """Note that a loop has ended."""
@@ -254,31 +253,30 @@ class Flow:
             raise ProgramError(line, f"O<{label}>", "is a subroutine that is defined already; choose another name")
         if self.depth:
             raise ProgramError(line, f"O<{label}>", "is defined within a subroutine; move it out")
-        self._subs[label] = (Place(self.source, self.source.here()), False)
+        self._subs[label] = (self.source.here(), False)
         self._skip = Skip(label, ("endsub",), line)
 
     def _call(self, name: str, command: Command, line: int) -> None:
         arguments = command.values()
         if len(arguments) > LOCAL_NUMBERS:
             raise command.fault(f"has {len(arguments)} arguments; {LOCAL_NUMBERS} are allowed")
-        self._enter(Frame(name, Place(self.source, self.source.after())), line)
+        self._enter(Frame(name, self.source.after()), line)
         self._variables.enter(arguments)
 
     def call_or_end(self, block: Block, text: str) -> bool:
         """M98 and M99: they begin their line (``text``), whose other words are not executed; False ends the program."""
         code = block.m["call"]
         if not text.startswith(f"m{code}") or (code == 99 and text != "m99"):
-            raise ProgramError(block.line, f"M{code}", "must begin its line; M99 stands alone, M98 with P and L")
+            raise block.fault(f"M{code}", "must begin its line; M99 stands alone, M98 with P and L")
         if code == 99:
             return self._end_fanuc()
         name, times = block.words.get("p", -1.0), block.words.get("l", 1.0)
-        off = max(abs(name - round(name)), abs(times - round(times)))
-        if name < 0.0 or off > 1e-4 or not 0 <= times < 1e9:
-            raise ProgramError(block.line, "M98", "wants the subroutine's number as P and may have its repeats as L")
+        if name < 0.0 or not 0 <= times < 1e9 or not (is_whole(name) and is_whole(times)):
+            raise block.fault("M98", "wants the subroutine's number as P and may have its repeats as L")
         if round(times) > 0:
-            back = Place(self.source, self.source.after())
+            back = self.source.after()
             self._enter(Frame(str(round(name)), back, fanuc=True, again=round(times) - 1), block.line)
-            self._variables.enter_names()
+            self._variables.enter(None)
         return True
 
     def call_contour(self, block: Block, name: str) -> None:
@@ -286,7 +284,7 @@ class Flow:
         known = self._subs.get(name)
         if known is None or known[1]:
             raise block.fault("q", "names no subroutine that stands before this line")
-        self._enter(Frame(name, Place(self.source, self.source.after())), block.line)
+        self._enter(Frame(name, self.source.after()), block.line)
         self._variables.enter([])
 
     def _enter(self, frame: Frame, line: int) -> None:
@@ -304,8 +302,7 @@ class Flow:
             if fanuc != frame.fanuc:
                 how = "M98" if fanuc else "call"
                 raise ProgramError(line, f"O<{frame.name}>", f"is a subroutine that wants to be called by {how}")
-            self.source = place.source
-            self.source.go(place.mark)
+            self._go(place)
             return
         path = self._file_of(frame.name)
         if path is not None:
@@ -320,9 +317,8 @@ class Flow:
 
     def _begin_sub(self, label: str, keyword: str) -> None:
         self._entering = False
-        here = Place(self.source, self.source.here())
-        self._subs.setdefault(label, (here, keyword == FANUC))
-        self._frames[-1].entry = Place(self.source, self.source.after())
+        self._subs.setdefault(label, (self.source.here(), keyword == FANUC))
+        self._frames[-1].entry = self.source.after()
 
     def _return(self, label: str, command: Command) -> None:
         frame = self._frames[-1]
@@ -332,7 +328,7 @@ class Flow:
             raise command.fault(f"names another subroutine than O<{frame.name}>, which is under way")
         values = command.values()
         self._variables.leave()
-        self._variables.set_returned(values[0] if values else None)
+        self._variables.returned = values[0] if values else None
         self._go_back()
 
     def _end_fanuc(self) -> bool:
@@ -347,9 +343,9 @@ class Flow:
         if frame.again > 0 and frame.entry is not None:
             frame.again -= 1
             frame.repeated = self.repeating = True
-            self.source.go(frame.entry.mark)
+            self.source.go(frame.entry)
             return True
-        self._variables.leave_names()
+        self._variables.leave()
         self._go_back()
         return True
 
@@ -358,5 +354,8 @@ class Flow:
         self.repeating = self._frames[-1].repeated or bool(self._frames[-1].turning)
         self._on_return(self.depth + 1)
         if frame.back is not None:
-            self.source = frame.back.source
-            self.source.go(frame.back.mark)
+            self._go(frame.back)
+
+    def _go(self, place: Place) -> None:
+        self.source = place.source
+        self.source.go(place)

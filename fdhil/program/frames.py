@@ -1,12 +1,11 @@
-"""What a program's flow keeps: places, labels, calls, and the turns of a loop, which show when it never ends."""
+"""The flow of a program keeps places, labels, calls, and the turns of a loop, which show when it never ends."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
-from fdhil.program.source import Mark, Source
+from fdhil.program.source import Place
 
 _FIRST = 64  # short loops pay nothing
 _LOOKED_AT = 8  # so many turns are compared with every state that is kept
@@ -41,20 +40,13 @@ class Turns:
         self.count, self.kept = 0, None
 
 
-class Place(NamedTuple):
-    """A mark in one source."""
-
-    source: Source
-    mark: Mark
-
-
 @dataclass(slots=True)
 class Label:
     """What is known of a label in this call: what opened it where, and how far it is."""
 
     kind: str
     line: int
-    mark: Mark
+    place: Place
     done: bool = False
     left: float = 0.0
     turns: Turns = field(default_factory=Turns)

@@ -9,19 +9,20 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from copy import deepcopy
+from functools import partial
 from pathlib import Path
 
 from fdhil.errors import ProgramError
-from fdhil.program import arcs, canned, curves, lathe, modes, nurbs, offsets, probing, roughing, targets
+from fdhil.program import arcs, canned, lathe, modes, offsets, probing, roughing, splines, targets
 from fdhil.program.budget import Budget
 from fdhil.program.checks import CYCLES, check_machine_words, check_readers, one_reader_of_axes
 from fdhil.program.commands import Command
 from fdhil.program.expressions import now
 from fdhil.program.flow import Flow
 from fdhil.program.machine import Machine
-from fdhil.program.modal import NO_MOTION, Modal
+from fdhil.program.modal import Modal
 from fdhil.program.motions import Feed, Motion, Rapid
 from fdhil.program.parameters import Variables
 from fdhil.program.source import Source
@@ -68,8 +69,9 @@ class Interpreter:
         self._kept = KeptModes(modal, self._variables)
         self._flow = Flow(first, self._variables, budget, self._kept.returned, self._state)
         self._series = canned.Series()
-        self._spline = curves.Spline()
-        self._nurbs = nurbs.Nurbs()
+        self._spline = splines.Series()
+        self._nurbs = splines.Nurbs()
+        self._orders = self._other_orders()
         self._known: dict[str, Command | Line] = {}
         self._blocks = self._again = 0
         self._empty_so_far = True
@@ -129,11 +131,8 @@ class Interpreter:
         if self._flow.repeating:
             self._again += 1
             if self._again > self._budget.max_repeated_blocks:
-                most = self._budget.max_repeated_blocks
-                what = (
-                    f"more than {most} blocks were executed again; is a loop endless? If not, raise max_repeated_blocks"
-                )
-                raise ProgramError(line, raw.strip()[:24], what)
+                what = f"more than {self._budget.max_repeated_blocks} blocks were executed again; is a loop endless?"
+                raise ProgramError(line, raw.strip()[:24], f"{what} If not, raise max_repeated_blocks")
 
     def _state(self) -> object:
         """Return a copy of all that the program has changed so far but its place."""
@@ -278,7 +277,7 @@ class Interpreter:
         modes.set_switches(modal, block)
         self._change_tool(block)
         if "modal state" in block.m and not self._kept.do(block.m["modal state"], self._flow.depth):
-            raise ProgramError(block.line, "M72", "has no modes to restore; keep them by M70 first")
+            raise block.fault("M72", "has no modes to restore; keep them by M70 first")
         if block.g.get("one-shot") == 40:
             modes.dwell(machine, block)
         modes.set_units(modal, block)
@@ -326,42 +325,40 @@ class Interpreter:
         if "motion" in block.g:
             modal.motion = block.g["motion"]
         elif "machine co-ordinates" in block.g and modal.motion not in (0, 10):
-            raise ProgramError(block.line, "G53", "wants G0 or G1")
+            raise block.fault("G53", "wants G0 or G1")
         elif axes_used or _motion_of(modal, block) is None:
             return
         code = modal.motion
         if code not in CYCLES:
             self._series.began = None
-        if code not in curves.CODES:
+        if code not in splines.BEZIER_CODES:
             self._spline.leaving = None
-        if code not in (nurbs.BEGIN, nurbs.END):
+        if code not in (splines.NURBS_BEGIN, splines.NURBS_END):
             self._nurbs.points.clear()
-        if code == 0:
-            machine.rapid_to(block, targets.target(modal, block))
-        elif code == 10:
-            machine.feed_to(block, targets.target(modal, block))
-        elif code in arcs.CODES:
-            arcs.arc(machine, block)
+        if code in roughing.CODES:
+            self._work_contour(block, before)
         elif code in CYCLES:
             canned.cycle(machine, block, self._series, before != code)
-        elif code in probing.CODES:
-            probing.probe(machine, self._variables, block)
-        elif code in (330, 331):
-            lathe.synchronised(machine, block)
-        elif code == 760:
-            lathe.threading(machine, block)
-        elif code in curves.CODES:
-            curves.spline(machine, block, self._spline)
-        elif code in roughing.CODES:
-            self._work_contour(block, before)
-        elif code == nurbs.BEGIN:
-            self._nurbs.gather(machine, block)
-        elif code == nurbs.END:
-            self._nurbs.order_motions(machine, block)
-        elif code != NO_MOTION:
-            raise ProgramError(block.line, f"G{code / 10:g}", "is a G code that fdhil does not know")
+        elif code in self._orders:
+            self._orders[code](block)
         elif axis is not None and not axes_used:
             raise block.fault(axis, "has no motion to go with; give G0, G1, G2 or G3")
+
+    def _other_orders(self) -> Mapping[int, Callable[[Block], None]]:
+        """Return what the motion codes other than cycles order of the machine."""
+        machine, modal = self._machine, self._machine.modal
+        return {
+            0: lambda block: machine.rapid_to(block, targets.target(modal, block)),
+            10: lambda block: machine.feed_to(block, targets.target(modal, block)),
+            **dict.fromkeys(arcs.CODES, partial(arcs.arc, machine)),
+            **dict.fromkeys(probing.CODES, partial(probing.probe, machine, self._variables)),
+            330: partial(lathe.synchronised, machine),
+            331: partial(lathe.synchronised, machine),
+            760: partial(lathe.threading, machine),
+            **dict.fromkeys(splines.BEZIER_CODES, partial(splines.spline, machine, self._spline)),
+            splines.NURBS_BEGIN: partial(self._nurbs.gather, machine),
+            splines.NURBS_END: partial(self._nurbs.order_motions, machine),
+        }
 
     def _work_contour(self, block: Block, before: int) -> None:
         """G70 to G72.2: read the contour that the subroutine Q describes, without executing its blocks, and work it."""

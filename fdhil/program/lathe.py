@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from fdhil.errors import ProgramError
 from fdhil.program.machine import Machine
 from fdhil.program.modal import Modal
 from fdhil.program.targets import axis_words, target
@@ -18,22 +17,22 @@ _MAX_PASSES = 10_000
 def synchronised(machine: Machine, block: Block) -> None:
     """G33 is a feed of K per revolution to its target; G33.1 feeds there and back to where it started."""
     modal = machine.modal
-    code = f"G{modal.motion / 10:g}"
+    code = modal.code
     if not axis_words(block):
-        raise ProgramError(block.line, code, "wants axis words")
+        raise block.fault(code, "wants axis words")
     if "k" not in block.words:
-        raise ProgramError(block.line, code, "wants K, the distance per revolution")
+        raise block.fault(code, "wants K, the distance per revolution")
     start = list(modal.position)
     feed = _synchronous_feed(modal, block, abs(block.words["k"]) * modal.scale)
-    machine.feed_at(block, target(modal, block), feed)
+    machine.line_to(block, target(modal, block), feed)
     if modal.motion == 331:
-        machine.feed_at(block, start, feed * abs(block.words.get("i", 1.0)))
+        machine.line_to(block, start, feed * abs(block.words.get("i", 1.0)))
 
 
 def _synchronous_feed(modal: Modal, block: Block, pitch_mm: float) -> float:
     if modal.spindle_turns == 0:
-        code = f"G{modal.motion / 10:g}"
-        raise ProgramError(block.line, code, "wants a turning spindle; give S and M3 or M4 first")
+        code = modal.code
+        raise block.fault(code, "wants a turning spindle; give S and M3 or M4 first")
     return pitch_mm * modal.spindle_rpm
 
 
@@ -93,22 +92,22 @@ def _cut(machine: Machine, block: Block, thread: Thread, start: list[float], end
 
     machine.rapid_to(block, at(clear, first_z))
     if thread.at_entry:
-        machine.feed_at(block, at(crest, first_z), thread.taper_feed)
-        machine.feed_at(block, at(root, first_z + along * thread.taper), thread.taper_feed)
+        machine.line_to(block, at(crest, first_z), thread.taper_feed)
+        machine.line_to(block, at(root, first_z + along * thread.taper), thread.taper_feed)
     else:
         machine.rapid_to(block, at(root, first_z))
     if thread.at_exit:
-        machine.feed_at(block, at(root, last_z - along * thread.taper), thread.feed)
-        machine.feed_at(block, at(crest, last_z), thread.taper_feed)
+        machine.line_to(block, at(root, last_z - along * thread.taper), thread.feed)
+        machine.line_to(block, at(crest, last_z), thread.taper_feed)
     else:
-        machine.feed_at(block, at(root, last_z), thread.feed)
+        machine.line_to(block, at(root, last_z), thread.feed)
     machine.rapid_to(block, at(clear, last_z))
 
 
 def _thread(modal: Modal, block: Block) -> Thread:
     words = block.words
     if not axis_words(block):
-        raise ProgramError(block.line, "G76", "wants Z, the thread's end")
+        raise block.fault("G76", "wants Z, the thread's end")
     for letter, meaning in (
         ("p", "the pitch"),
         ("i", "the thread's offset"),
@@ -116,13 +115,13 @@ def _thread(modal: Modal, block: Block) -> Thread:
         ("k", "the depth"),
     ):
         if letter not in words:
-            raise ProgramError(block.line, "G76", f"wants {letter.upper()}, {meaning}")
+            raise block.fault("G76", f"wants {letter.upper()}, {meaning}")
     if words["i"] == 0.0 or words["p"] <= 0.0 or not 0.0 < words["j"] < words["k"]:
-        raise ProgramError(block.line, "G76", "wants P and J greater than 0, K greater than J, and I other than 0")
+        raise block.fault("G76", "wants P and J greater than 0, K greater than J, and I other than 0")
     ends = round(words.get("l", 0.0))
     degression, springs, angle = words.get("r", 1.0), words.get("h", 0.0), words.get("q", 0.0)
     if ends < 0 or springs != round(springs) or springs > _MAX_PASSES or not abs(angle) < 89.0:
-        raise ProgramError(block.line, "G76", "wants H whole, L not negative, and Q below 89 degrees")
+        raise block.fault("G76", "wants H whole, L not negative, and Q below 89 degrees")
     half = modal.scale * (0.5 if modal.diameter else 1.0)
     return Thread(
         feed=_synchronous_feed(modal, block, words["p"] * modal.scale),

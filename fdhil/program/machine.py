@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from fdhil.errors import ProgramError
 from fdhil.program.budget import Budget
 from fdhil.program.compensation import Compensation, Piece, Waiting
 from fdhil.program.modal import Modal
@@ -30,7 +29,7 @@ class Machine:
 
     def rapid_to(self, block: Block, target: list[float]) -> None:
         """Order a rapid to a position in active co-ordinates."""
-        self._straight(block, target, None)
+        self.line_to(block, target, None)
 
     def rapid_beside(self, block: Block, target: list[float]) -> None:
         """Order a rapid without cutter compensation, which the next move enters again."""
@@ -43,11 +42,22 @@ class Machine:
 
     def feed_to(self, block: Block, target: list[float]) -> None:
         """Order a straight feed to a position in active co-ordinates, at the feed in force."""
-        self._straight(block, target, feed_mm_min(self.modal, block, straight_length(self.modal.position, target)))
+        self.line_to(block, target, feed_mm_min(self.modal, block, straight_length(self.modal.position, target)))
 
-    def feed_at(self, block: Block, target: list[float], feed: float) -> None:
-        """Order a straight feed at ``feed`` mm/min."""
-        self._straight(block, target, feed)
+    def line_to(self, block: Block, target: list[float], feed: float | None) -> None:
+        """Order a straight line to a position in active co-ordinates at ``feed`` mm/min, a rapid where that is None."""
+        start = self.modal.position
+        self.modal.position = target
+        self.just_left = False
+        if self.compensation is None:
+            self._line(block, target, feed)
+            return
+        self._checked(block, target)
+        a, b = self._flat(start), self._flat(target)
+        if abs(b - a) < _TINY_MM and self.compensation.entered:
+            self.compensation.wait(Waiting(block, None, target, feed))
+            return
+        self._give(self.compensation.line(block, a, b, target, feed))
 
     def dwell(self, block: Block, seconds: float) -> None:
         """Order a dwell."""
@@ -55,12 +65,10 @@ class Machine:
         if self.compensation is None or not self.compensation.wait(Waiting(block, dwell)):
             self._order(block, dwell)
 
-    def arc_to(
-        self, block: Block, target: list[float], centre: tuple[float, float], turns: int, feed: float, angle: float
-    ) -> None:
-        """Order an arc to ``target`` about ``centre`` (in the plane's order of axes), both in active co-ordinates."""
+    def arc_to(self, block: Block, target: list[float], centre: complex, turns: int, feed: float, angle: float) -> None:
+        """Order an arc to ``target`` about ``centre`` (first + j second axis), both in active co-ordinates."""
         if self.just_left:
-            raise ProgramError(block.line, f"G{self.modal.motion / 10:g}", "the move after G40 must be straight")
+            raise block.fault(self.modal.code, "the move after G40 must be straight")
         if self.compensation is None:
             self._arc(block, target, centre, turns, feed)
             return
@@ -68,10 +76,6 @@ class Machine:
         self.modal.position = target
         self._checked(block, target)
         self._give(self.compensation.arc(block, start, corner, centre, turns, target, feed, angle))
-
-    def start_compensation(self, compensation: Compensation) -> None:
-        """Turn cutter compensation on."""
-        self.compensation = compensation
 
     def settle(self) -> None:
         """Order what waits for the next corner, since the machine stops here (M0, M1, M60)."""
@@ -85,74 +89,50 @@ class Machine:
             self.just_left = self.compensation.entered
             self.compensation = None
 
-    def _straight(self, block: Block, target: list[float], feed: float | None) -> None:
-        start = self.modal.position
-        self.modal.position = target
-        self.just_left = False
-        if self.compensation is None:
-            end = self._checked(block, target)
-            self._order_straight(block, end, feed)
-            return
-        self._checked(block, target)
-        a, b = self._flat(start), self._flat(target)
-        if abs(a[0] - b[0]) < _TINY_MM and abs(a[1] - b[1]) < _TINY_MM and self.compensation.entered:
-            self.compensation.wait(Waiting(block, None, target, feed))
-            return
-        self._give(self.compensation.line(block, a, b, target, feed))
-
-    def _flat(self, position: list[float]) -> tuple[float, float]:
+    def _flat(self, position: list[float]) -> complex:
         first, second, _ = PLANE_AXES[self.modal.plane_name]
-        return position[first], position[second]
+        return complex(position[first], position[second])
+
+    def _lifted(self, place: complex, whole: list[float]) -> list[float]:
+        """Return a place in the plane with the other axes of ``whole``."""
+        first, second, _ = PLANE_AXES[self.modal.plane_name]
+        lifted = list(whole)
+        lifted[first], lifted[second] = place.real, place.imag
+        return lifted
 
     def _give(self, pieces: list[Piece]) -> None:
         """Order compensated pieces and what waited for their ends."""
-        first, second, _ = PLANE_AXES[self.modal.plane_name]
-        tip = self.compensation.tip if self.compensation is not None else (0.0, 0.0)
-
-        def shifted(place: tuple[float, float]) -> tuple[float, float]:
-            return place[0] + tip[0], place[1] + tip[1]
-
+        tip = self.compensation.tip if self.compensation is not None else 0.0
         for piece in pieces:
-            end = list(piece.whole)
-            end[first], end[second] = shifted(piece.end)
+            end = self._lifted(piece.end + tip, piece.whole)
             if piece.given:
                 pass
             elif piece.centre is not None and piece.feed is not None:
-                self._arc(piece.block, end, shifted(piece.centre), piece.turns, piece.feed)
+                self._arc(piece.block, end, piece.centre + tip, piece.turns, piece.feed)
             else:
                 self._line(piece.block, end, piece.feed)
             for waiting in piece.waiting:
                 if waiting.dwell is not None:
                     self._order(waiting.block, waiting.dwell)
                 else:
-                    there = list(waiting.whole)
-                    there[first], there[second] = shifted(piece.end)
-                    self._line(waiting.block, there, waiting.feed)
+                    self._line(waiting.block, self._lifted(piece.end + tip, waiting.whole), waiting.feed)
 
     def _line(self, block: Block, target: list[float], feed: float | None) -> None:
-        end = self._checked(block, target)
-        self._order_straight(block, end, feed)
+        end, corner = self._checked(block, target), self.modal.corner
+        self._order(block, Rapid(block.line, end, corner) if feed is None else Feed(block.line, end, feed, corner))
 
-    def _arc(self, block: Block, target: list[float], centre: tuple[float, float], turns: int, feed: float) -> None:
-        first, second, normal = PLANE_AXES[self.modal.plane_name]
-        whole = list(target)
-        whole[first], whole[second] = centre
-        shown: list[float | None] = list(self.modal.machine(whole))
-        shown[normal] = None
+    def _arc(self, block: Block, target: list[float], centre: complex, turns: int, feed: float) -> None:
+        about: list[float | None] = list(self.modal.machine(self._lifted(centre, target)))
+        about[PLANE_AXES[self.modal.plane_name][2]] = None
         if self.compensation is None:
             self.modal.position = target
-        end = self._checked(block, target)
-        about = (shown[0], shown[1], shown[2])
-        self._order(block, Arc(block.line, end, about, turns, self.modal.plane_name, feed, self.modal.corner))
-
-    def _order_straight(self, block: Block, end: Point, feed: float | None) -> None:
-        corner = self.modal.corner
-        self._order(block, Rapid(block.line, end, corner) if feed is None else Feed(block.line, end, feed, corner))
+        end, plane = self._checked(block, target), self.modal.plane_name
+        self._order(block, Arc(block.line, end, (about[0], about[1], about[2]), turns, plane, feed, self.modal.corner))
 
     def _order(self, block: Block, motion: Motion) -> None:
         if len(self.out) >= self.budget.max_motions_per_block:
             most = self.budget.max_motions_per_block
-            raise ProgramError(block.line, "", f"orders more than {most} motions; split it")
+            raise block.fault("", f"orders more than {most} motions; split it")
         self.out.append(motion)
 
     def _checked(self, block: Block, position: list[float]) -> Point:

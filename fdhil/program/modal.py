@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, field
 
 from fdhil.program.motions import BLEND, PLANES, Corner, Point
+from fdhil.program.words import g_word
 
 AXES = "xyzabcuvw"
 INDEX = {letter: place for place, letter in enumerate(AXES)}
@@ -77,9 +78,18 @@ class Modal:
         return Corner("blend", self.path_tolerance_mm or math.inf, self.joining_mm)
 
     @property
+    def code(self) -> str:
+        """The motion in force as a program has it: G38.2."""
+        return g_word(self.motion)
+
+    @property
     def plane_name(self) -> str:
         """XY, XZ, YZ, UV, UW or VW."""
         return (*PLANES, "UV", "UW", "VW")[self.plane]
+
+    def unit(self, index: int) -> float:
+        """Return what one program unit of an axis is, in mm or degrees."""
+        return self.scale if AXES[index] in LINEAR else 1.0
 
     def machine(self, position: list[float] | None = None) -> Point:
         """Return X, Y, Z of a position (default: the present one) in machine millimetres."""

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from fdhil.errors import ProgramError
-from fdhil.program import arcs, nurbs, roughing
+from fdhil.program import arcs, roughing, splines
 from fdhil.program.compensation import Compensation
+from fdhil.program.expressions import is_whole
 from fdhil.program.machine import Machine
 from fdhil.program.modal import MM_PER_INCH, NO_MOTION, PLANE_CODES, Modal
-from fdhil.program.words import Block
+from fdhil.program.words import Block, g_word
 
 
 def set_feed(modal: Modal, block: Block) -> None:
@@ -33,7 +33,7 @@ def set_spindle(modal: Modal, block: Block) -> None:
     if "spindle mode" in block.g:
         modal.surface_speed = block.g["spindle mode"] == 960
     if block.g.get("spindle mode") == 960 and "s" not in block.words:
-        raise ProgramError(block.line, "G96", "constant surface speed wants the speed as S")
+        raise block.fault("G96", "constant surface speed wants the speed as S")
     if "spindle" in block.m:
         modal.spindle_turns = {3: 1, 4: -1}.get(block.m["spindle"], 0)
 
@@ -58,7 +58,7 @@ def dwell(machine: Machine, block: Block) -> None:
     """G4: LinuxCNC takes P-1 for a P that is missing, and lets any other negative dwell end at once."""
     seconds = block.words.get("p", _NO_DWELL)
     if seconds == _NO_DWELL:
-        raise ProgramError(block.line, "G4", "a dwell wants its seconds as P, not negative")
+        raise block.fault("G4", "a dwell wants its seconds as P, not negative")
     machine.dwell(block, max(0.0, seconds))
 
 
@@ -94,11 +94,11 @@ _ORIGINS = (280, 281, 300, 301, 520, 920, 923)
 def check_compensated(modal: Modal, block: Block) -> None:
     """Raise ProgramError for codes that cannot be used while cutter compensation is on."""
     g, m = block.g, block.m
-    refused = [f"G{g[group] / 10:g}" for group in _GROUPS_REFUSED if group in g]
+    refused = [g_word(g[group]) for group in _GROUPS_REFUSED if group in g]
     if g.get("plane", PLANE_CODES[modal.plane]) != PLANE_CODES[modal.plane]:
-        refused.append(f"G{g['plane'] / 10:g}")
+        refused.append(g_word(g["plane"]))
     if g.get("one-shot") in _ORIGINS:
-        refused.append(f"G{g['one-shot'] / 10:g}")
+        refused.append(g_word(g["one-shot"]))
     sets_system = g.get("one-shot") == 100 and block.words.get("l") in (2.0, 20.0)
     if sets_system and int(block.words.get("p", 0.0)) in (0, modal.system):
         refused.append("G10")
@@ -106,10 +106,10 @@ def check_compensated(modal: Modal, block: Block) -> None:
     if m.get("tool") == 6:
         refused.append("M6")
     motion = g.get("motion", modal.motion)
-    if motion not in (0, 10, *arcs.CODES, nurbs.BEGIN, roughing.FINISH, NO_MOTION):
-        refused.append(f"G{motion / 10:g}")
+    if motion not in (0, 10, *arcs.CODES, splines.NURBS_BEGIN, roughing.FINISH, NO_MOTION):
+        refused.append(g_word(motion))
     if refused:
-        raise ProgramError(block.line, refused[0], "cannot be used with cutter compensation on; end it by G40 first")
+        raise block.fault(refused[0], "cannot be used with cutter compensation on; end it by G40 first")
 
 
 def compensate(machine: Machine, block: Block, tool: bool) -> None:
@@ -123,26 +123,26 @@ def compensate(machine: Machine, block: Block, tool: bool) -> None:
         machine.end_compensation()
         return
     if machine.compensation is not None:
-        raise ProgramError(block.line, f"G{code / 10:g}", "compensation is on already; end it by G40 first")
+        raise block.fault(g_word(code), "compensation is on already; end it by G40 first")
     diameter = block.words.get("d")
     if modal.plane >= 2:
         what = f"does not work in the {modal.plane_name} plane; use G17 or G18"
-        raise ProgramError(block.line, f"G{code / 10:g}", what)
+        raise block.fault(g_word(code), what)
     if code % 10 == 0:
         if diameter or tool:
             what = "fdhil has no tool table, so the radius is not known; give the diameter by G41.1 or G42.1 D"
-            raise ProgramError(block.line, f"G{code / 10:g}", what)
+            raise block.fault(g_word(code), what)
         diameter = 0.0
     if diameter is None:
-        raise ProgramError(block.line, f"G{code / 10:g}", "wants the tool's diameter as D")
+        raise block.fault(g_word(code), "wants the tool's diameter as D")
     radius = diameter / 2.0 * modal.scale
     side = (1 if code in (410, 411) else -1) * (1 if radius >= 0.0 else -1)
-    machine.start_compensation(Compensation(abs(radius), side, _orientation(modal, block)))
+    machine.compensation = Compensation(abs(radius), side, _orientation(modal, block))
 
 
 def _orientation(modal: Modal, block: Block) -> int:
     """Return L of G41.1 and G42.1: where the tip of a turning tool lies about the centre of its nose."""
     value = block.words.get("l", 0.0)
-    if value < 0.0 or abs(value - round(value)) > 1e-4 or (value and modal.plane != 1):
+    if value < 0.0 or not is_whole(value) or (value and modal.plane != 1):
         raise block.fault("l", "is no orientation of a turning tool; L must be 0 to 9, in the XZ plane (G18)")
     return round(value)

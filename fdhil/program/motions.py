@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import cmath
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 Point = tuple[float, float, float]
 PLANES = ("XY", "XZ", "YZ")
@@ -75,6 +77,54 @@ class Dwell:
 
 
 Motion = Rapid | Feed | Arc | Dwell
+
+
+class Swept(NamedTuple):
+    """An arc as it is gone along, in mm and rad: its ``centre`` and the ``radii`` and the angle at its ends.
+
+    Places in a plane are complex: first + j second axis.
+    """
+
+    centre: complex
+    radii: tuple[float, float]
+    begin_rad: float
+    angle_rad: float
+    rise_mm: float
+    length_mm: float
+
+    @staticmethod
+    def of(motion: Arc, start: Point) -> Swept:
+        """Return what an arc sweeps from ``start`` on."""
+        axes = PLANE_AXES[motion.plane]
+        centre = complex(motion.centre[axes[0]] or 0.0, motion.centre[axes[1]] or 0.0)
+        return swept(start, motion.end, centre, motion.turns, axes)
+
+
+def swept(
+    start: Sequence[float], end: Sequence[float], centre: complex, turns: int, axes: tuple[int, int, int]
+) -> Swept:
+    """Return what an arc sweeps from start to end about a centre in the plane of ``axes`` (first, second, normal)."""
+    first, second, normal = axes
+    begin = complex(start[first], start[second]) - centre
+    finish = complex(end[first], end[second]) - centre
+    radii = abs(begin), abs(finish)
+    angle = _swept_rad(begin, finish, turns)
+    rise = end[normal] - start[normal]
+    length = math.hypot((radii[0] + radii[1]) / 2.0 * angle, rise)
+    return Swept(centre, radii, cmath.phase(begin), angle, rise, length)
+
+
+def _swept_rad(begin: complex, finish: complex, turns: int) -> float:
+    """Return the signed angle (rad) from one radius to the other: coincident ones are a whole circle."""
+    circle = 2.0 * math.pi
+    angle = math.remainder(cmath.phase(finish) - cmath.phase(begin), circle)
+    if abs(angle) < 1e-12:
+        angle = 0.0
+    if turns > 0 and angle <= 0.0:
+        angle += circle
+    elif turns < 0 and angle >= 0.0:
+        angle -= circle
+    return angle + (turns - (1 if turns > 0 else -1)) * circle
 
 
 def as_json(motion: Motion) -> dict[str, Any]:

@@ -6,7 +6,7 @@ apart, with the rotation as the tenth; #5211 and on for G92, in force while #521
 
 from __future__ import annotations
 
-from fdhil.errors import ProgramError
+from fdhil.program.expressions import is_whole
 from fdhil.program.machine import Machine
 from fdhil.program.modal import AXES, Modal, rotate
 from fdhil.program.parameters import Variables
@@ -17,6 +17,7 @@ G92_IN_FORCE, G92_FIRST = 5210, 5211
 HOME_FIRST = {280: 5161, 300: 5181}
 _TABLE = (1, 10, 11)
 SYSTEMS = {540: 1, 550: 2, 560: 3, 570: 4, 580: 5, 590: 6, 591: 7, 592: 8, 593: 9}
+CODE_OF_SYSTEM = {system: code for code, system in SYSTEMS.items()}
 
 
 def first_of(system: int) -> int:
@@ -52,11 +53,11 @@ def set_data(modal: Modal, variables: Variables, block: Block) -> None:
     L1, L10 and L11 change the tool table, which moves nothing: fdhil reads them and keeps no table.
     """
     kind = block.words.get("l")
-    if kind is None or round(kind) not in (*_TABLE, 2, 20) or abs(kind - round(kind)) > 1e-4:
+    if kind is None or round(kind) not in (*_TABLE, 2, 20) or not is_whole(kind):
         raise block.fault("l" if kind is not None else "G10", "sets nothing; fdhil knows G10 L1, L2, L10, L11 and L20")
     if round(kind) in _TABLE:
         if block.words.get("p", 0.0) < 1.0:
-            raise ProgramError(block.line, "G10", "wants the tool's number as P, from 1")
+            raise block.fault("G10", "wants the tool's number as P, from 1")
         return
     for letter in "ij":
         if letter in block.words:
@@ -99,7 +100,7 @@ def set_g92(modal: Modal, variables: Variables, block: Block) -> None:
     words = axis_words(block)
     local = block.g["one-shot"] == 520
     if not words:
-        raise ProgramError(block.line, "G52" if local else "G92", "wants axis words")
+        raise block.fault("G52" if local else "G92", "wants axis words")
     new = list(modal.g92)
     for axis, value in words.items():
         value = length_mm(modal, axis, value)
@@ -133,7 +134,7 @@ def set_tool_length(modal: Modal, block: Block) -> None:
     code = block.g["tool length"]
     if code == 432:
         if "h" not in block.words and not axis_words(block):
-            raise ProgramError(block.line, "G43.2", "wants the tool's number as H, or axis words")
+            raise block.fault("G43.2", "wants the tool's number as H, or axis words")
         return
     words = {axis: length_mm(modal, axis, value) for axis, value in axis_words(block).items()}
     tool = [words.get(axis, modal.tool[axis]) if code == 431 else 0.0 for axis in range(9)]

@@ -8,27 +8,16 @@ from fdhil.errors import ProgramError
 
 LAST_NUMBER = 5601
 LOCAL_NUMBERS = 30
+_LOCAL = range(1, LOCAL_NUMBERS + 1)
 _READ_ONLY = frozenset({*range(5400, 5410), *range(5420, 5429)})
 
 
 class Variables:
     """The parameters #1 to #5602 and #<name>; #1 to #30 and names without leading underscore belong to the call.
 
-    ``line`` is the line being executed; ``state_numbers`` and ``state_names`` read the machine's state. KeyError for a
-    parameter that is not there.
+    ``line`` is the line being executed, ``returned`` the value of the last subroutine; ``state_numbers`` and
+    ``state_names`` read the machine's state. KeyError for a parameter that is not there.
     """
-
-    __slots__ = (
-        "_globals",
-        "_locals",
-        "_max",
-        "_numbers",
-        "_stack",
-        "_state_names",
-        "_state_numbers",
-        "line",
-        "returned",
-    )
 
     def __init__(
         self,
@@ -42,7 +31,7 @@ class Variables:
         self._numbers: dict[int, float] = {}
         self._globals: dict[str, float] = {}
         self._locals: dict[str, float] = {}
-        self._stack: list[tuple[dict[int, float], dict[str, float]]] = []
+        self._stack: list[tuple[dict[int, float] | None, dict[str, float]]] = []
         self._state_numbers = state_numbers
         self._state_names = state_names
 
@@ -57,7 +46,7 @@ class Variables:
     def named(self, name: str) -> float:
         """Return #<name>."""
         if name in self._state_names:
-            return self._state_names[name]()
+            return float(self._state_names[name]())
         return (self._globals if name.startswith("_") else self._locals)[name]
 
     def set(self, key: int | str, value: float, line: int) -> None:
@@ -82,29 +71,19 @@ class Variables:
         """Return a copy of what the call at hand and the whole program have set."""
         return dict(self._numbers), dict(self._globals), dict(self._locals), self.returned
 
-    def set_returned(self, value: float | None) -> None:
-        """Keep what a subroutine returned, as #<_value> and #<_value_returned>."""
-        self.returned = value
-
-    def enter(self, arguments: list[float]) -> None:
-        """Begin a call: its own #1 to #30, the arguments first, and its own local names."""
-        saved = {index: self._numbers.pop(index) for index in range(1, LOCAL_NUMBERS + 1) if index in self._numbers}
+    def enter(self, arguments: list[float] | None) -> None:
+        """Begin a call: its own local names and #1 to #30, the arguments first; None (M98) keeps the numbers."""
+        saved = None
+        if arguments is not None:
+            saved = {index: self._numbers.pop(index) for index in _LOCAL if index in self._numbers}
+            self._numbers.update(enumerate(arguments, start=1))
         self._stack.append((saved, self._locals))
         self._locals = {}
-        self._numbers.update(enumerate(arguments, start=1))
-
-    def enter_names(self) -> None:
-        """Begin a call by M98: its own local names, while #1 to #30 are the caller's."""
-        self._stack.append(({}, self._locals))
-        self._locals = {}
-
-    def leave_names(self) -> None:
-        """End a call by M98: the caller's local names are back."""
-        _, self._locals = self._stack.pop()
 
     def leave(self) -> None:
         """End a call: the caller's local parameters are back."""
-        for index in range(1, LOCAL_NUMBERS + 1):
-            self._numbers.pop(index, None)
         saved, self._locals = self._stack.pop()
-        self._numbers.update(saved)
+        if saved is not None:
+            for index in _LOCAL:
+                self._numbers.pop(index, None)
+            self._numbers.update(saved)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from fdhil.errors import ProgramError
 from fdhil.program.machine import Machine
 from fdhil.program.parameters import Variables
 from fdhil.program.targets import axis_words, straight_length, target
@@ -16,15 +15,15 @@ _PROBED_FIRST, _HIT = 5061, 5070
 def probe(machine: Machine, variables: Variables, block: Block) -> None:
     """Be at the target of a probe move, with #5061 and on as its end and #5070 as 0 (no touch)."""
     modal = machine.modal
-    code = f"G{modal.motion / 10:g}"
+    code = modal.code
     if modal.feed_mode == 930 or modal.feed_mm_min <= 0.0:
-        raise ProgramError(block.line, code, "wants a feed rate per minute; give F")
+        raise block.fault(code, "wants a feed rate per minute; give F")
     end = target(modal, block)
     if not axis_words(block):
-        raise ProgramError(block.line, code, "wants the axis words of its target")
+        raise block.fault(code, "wants the axis words of its target")
     if straight_length(modal.position, end) < _MIN_LENGTH_MM:
-        raise ProgramError(block.line, code, "starts too near to its target to probe")
+        raise block.fault(code, "starts too near to its target to probe")
     machine.stand_at(block, end)
     for axis, value in enumerate(end):
-        variables.store(_PROBED_FIRST + axis, value / (modal.scale if axis not in (3, 4, 5) else 1.0))
+        variables.store(_PROBED_FIRST + axis, value / modal.unit(axis))
     variables.store(_HIT, 0.0)

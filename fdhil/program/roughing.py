@@ -6,16 +6,15 @@ depth of a cut, R the retract; G70 follows the contour P times from the distance
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
-from fdhil.errors import ProgramError
-from fdhil.program.arcs import radii_agree, sweep
+from fdhil.program.arcs import centre_of_radius, radii_agree
 from fdhil.program.contour import Contour, ContourError, Part
 from fdhil.program.machine import Machine
 from fdhil.program.modal import Modal
+from fdhil.program.motions import PLANE_AXES, swept
 from fdhil.program.targets import feed_mm_min, length_mm
-from fdhil.program.words import Block
+from fdhil.program.words import Block, g_word
 
 CODES = (700, 710, 711, 712, 720, 721, 722)
 FINISH = 700
@@ -76,14 +75,11 @@ class Drawn:
         words = block.words
         given = [letter for letter in "ik" if letter in words]
         if ("r" in words) == bool(given):
-            raise ProgramError(block.line, f"G{self.motion / 10:g}", "an arc wants its centre (I K) or its radius (R)")
+            raise block.fault(g_word(self.motion), "an arc wants its centre (I K) or its radius (R)")
         if "r" in words:
-            chord = new - old
-            square = words["r"] ** 2 - abs(chord) ** 2 / 4.0
-            if square < 0.0:
+            if words["r"] ** 2 < abs(new - old) ** 2 / 4.0:
                 raise block.fault("r", "is too small a radius to reach the end")
-            aside = 1j * (math.sqrt(square) / abs(chord)) * chord
-            return (old + new) / 2.0 + (aside if self.motion == 30 else -aside)
+            return centre_of_radius(old, new, abs(words["r"]), self.motion == 20)
         centre = complex(words.get("k", 0.0), words.get("i", 0.0))
         return centre if self.modal.arc_absolute else old + centre
 
@@ -91,15 +87,15 @@ class Drawn:
 def start_of(machine: Machine, block: Block) -> complex:
     """Go to where a cycle begins, X and Z of its block, and return that; ProgramError when it cannot begin."""
     modal, words = machine.modal, block.words
-    code = f"G{modal.motion / 10:g}"
+    code = modal.code
     if "q" not in words:
-        raise ProgramError(block.line, code, "wants Q, the number of the subroutine with its contour")
+        raise block.fault(code, "wants Q, the number of the subroutine with its contour")
     if modal.plane != 1:
-        raise ProgramError(block.line, code, "works in the XZ plane; give G18")
+        raise block.fault(code, "works in the XZ plane; give G18")
     if words.get("i", 1.0) <= 0.0:
         raise block.fault("i", "is no depth of a cut; I must be positive")
     if machine.compensation is not None and modal.motion != FINISH:
-        raise ProgramError(block.line, code, "cannot be used with cutter compensation on")
+        raise block.fault(code, "cannot be used with cutter compensation on")
     start, first = list(modal.position), list(modal.position)
     for axis, letter in ((0, "x"), (2, "z")):
         if letter in words:
@@ -123,7 +119,7 @@ def work(machine: Machine, block: Block, drawn: Drawn, start: complex) -> None:
         else:
             _rough(tool, code, block.words)
     except ContourError as error:
-        raise ProgramError(block.line, f"G{code / 10:g}", str(error)) from None
+        raise block.fault(g_word(code), str(error)) from None
 
 
 @dataclass(slots=True)
@@ -153,14 +149,12 @@ class Tool:
         centre, there = (self.contour.programmed(place) * modal.scale for place in (part.centre, end))
         if max(abs((there - here).real), abs((there - here).imag)) < _SAME_PLACE * modal.scale:
             return
-        begin, finish = here - centre, there - centre
-        if not radii_agree(abs(begin), abs(finish), modal.scale):
+        target, turns = self.whole(end), 1 if ccw else -1
+        path = swept(modal.position, target, centre, turns, PLANE_AXES["XZ"])
+        if not radii_agree(*path.radii, modal.scale):
             raise ContourError("an arc of its contour ends at another radius than it begins; correct its centre")
-        turns = 1 if ccw else -1
-        angle = sweep((begin.real, begin.imag), (finish.real, finish.imag), turns)
-        feed = feed_mm_min(modal, block, abs(angle) * (abs(begin) + abs(finish)) / 2.0)
-        target = self.whole(end)
-        self.machine.arc_to(block, target, (centre.real, centre.imag), turns, feed, angle)
+        feed = feed_mm_min(modal, block, path.length_mm)
+        self.machine.arc_to(block, target, centre, turns, feed, path.angle_rad)
 
     def whole(self, place: complex) -> list[float]:
         """Return a place in active co-ordinates of all axes."""
@@ -172,13 +166,9 @@ class Tool:
 
 def _finish(tool: Tool, first: float, last: float, passes: float) -> None:
     if passes > tool.machine.budget.max_motions_per_block:
-        raise ProgramError(tool.block.line, f"P{passes:g}", "are too many passes; split them")
+        raise tool.block.fault(f"P{passes:g}", "are too many passes; split them")
     contour = tool.contour
-    if _wants_turn(contour):
-        contour.quarter()
-    contour.lead_down()
-    contour.finish_corners()
-    contour.check_falling()
+    contour.lay_out(along_x=_wants_turn(contour))
     for number in range(int(passes), 0, -1):
         path = contour.copy()
         path.widen((number - 1) * (first - last) / passes + last)
@@ -202,11 +192,7 @@ def _wants_turn(contour: Contour) -> bool:
 
 def _rough(tool: Tool, code: int, words: dict[str, float]) -> None:
     contour = tool.contour
-    if code in _ALONG_X:
-        contour.quarter()
-    contour.lead_down()
-    contour.finish_corners()
-    contour.check_falling()
+    contour.lay_out(along_x=code in _ALONG_X)
     contour.widen(words.get("d", 0.0))
     first, last = contour.parts[0], contour.parts[-1]
     tool.rapid(first.start)
@@ -359,15 +345,10 @@ class Roughing:
             self.tool.feed(part.end)
             self.at = part.end
             return False
-        if part.ccw:
-            if self.at.real < part.centre.real:
-                return True
+        behind = self.at.real < part.centre.real if part.ccw else self.at.real > part.centre.real
+        if not behind:
             self._follow_up(part)
-            return True
-        if self.at.real > part.centre.real:
-            return True
-        self._follow_up(part)
-        return False
+        return behind or part.ccw
 
     def _climb_only(self, part: Part) -> None:
         if part.centre is None and part.end.imag < part.start.imag:

@@ -1,4 +1,4 @@
-"""Where the lines of a program come from: a file or any iterable of lines, read once, with marks to return to.
+"""A source reads the lines of a program, a file or any iterable of lines, once, with places to return to.
 
 Only what a loop or a call may come back to is kept: a place in the file. Memory stays flat however long the program.
 """
@@ -20,15 +20,16 @@ _MAX_KEPT = 2000
 _BYTE_ORDER_MARK = codecs.BOM_UTF8.decode("latin-1")  # editors on Windows begin a file in UTF-8 with it
 
 
-class Mark(NamedTuple):
-    """A place before a line: its byte offset and how many lines stand before it."""
+class Place(NamedTuple):
+    """A place before a line of a source: its byte offset and how many lines stand before it."""
 
+    source: Source
     offset: int
     lines: int
 
 
 class Source:
-    """A program that is read line by line and can go back to a mark; ProgramError when it cannot be read.
+    """A program that is read line by line and can go back to a place; ProgramError when it cannot be read.
 
     ``line`` is the 1-based number of the line last read; ``folder`` is where its subroutines lie, None for an iterable.
     """
@@ -60,19 +61,19 @@ class Source:
         """Close the file."""
         self._open.close()
 
-    def here(self) -> Mark:
+    def here(self) -> Place:
         """Return the place before the line last read."""
-        return Mark(self._begin, self.line - 1)
+        return Place(self, self._begin, self.line - 1)
 
-    def after(self) -> Mark:
+    def after(self) -> Place:
         """Return the place after the line last read."""
-        return Mark(self._end, self.line)
+        return Place(self, self._end, self.line)
 
-    def go(self, mark: Mark) -> None:
-        """Return to a place."""
-        self._begin = self._end = mark.offset
+    def go(self, place: Place) -> None:
+        """Return to a place of this source."""
+        self._begin = self._end = place.offset
         self._moved = True
-        self.line = mark.lines
+        self.line = place.lines
 
     def next(self, again: bool = False) -> str | None:
         """Return the next line without its end, None after the last one; lines that come ``again`` are kept."""

@@ -1,13 +1,14 @@
-"""What a program may read of the machine (#5420, #<_feed> and the like), and M70 to M73."""
+"""The machine's state as a program reads it (#5420, #<_feed> and the like), and keeps it by M70 to M73."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-from fdhil.program.modal import AXES, INDEX, LINEAR, PLANE_CODES, Modal
-from fdhil.program.offsets import G92_IN_FORCE, drop_g92, select_system
+from fdhil.program.modal import AXES, PLANE_CODES, Modal
+from fdhil.program.offsets import CODE_OF_SYSTEM, G92_IN_FORCE, drop_g92, select_system
 from fdhil.program.parameters import Variables
 
 Reading = Callable[[], float]
@@ -21,19 +22,15 @@ _KEPT = (
 
 def numbers_of(modal: Modal) -> Mapping[int, Reading]:
     """Return the numbered parameters that show the machine's state: #5420 to #5428, the controlled point."""
-
-    def place(index: int) -> Reading:
-        return lambda: modal.position[index] / (modal.scale if AXES[index] in LINEAR else 1.0)
-
     fixed = {5400 + index: (lambda: 0.0) for index in range(14)}
-    return {**fixed, **{5420 + index: place(index) for index in range(9)}}
+    return {**fixed, **{5420 + index: _own(modal, index) for index in range(9)}}
 
 
 def names_of(
     modal: Modal, line: Callable[[], int], depth: Callable[[], int], value: Callable[[], float | None]
 ) -> Mapping[str, Reading]:
-    """Return the named parameters that show the machine's state."""
-    flags: dict[str, Callable[[], bool]] = {
+    """Return the named parameters that show the machine's state; a flag is 1 or 0."""
+    readings: dict[str, Reading] = {
         "_metric": lambda: modal.scale == 1.0,
         "_imperial": lambda: modal.scale != 1.0,
         "_absolute": lambda: modal.absolute,
@@ -45,12 +42,6 @@ def names_of(
         "_retract_old_z": lambda: not modal.retract_to_r,
         "_spindle_rpm_mode": lambda: not modal.surface_speed,
         "_spindle_css_mode": lambda: modal.surface_speed,
-        "_flood": lambda: modal.flood,
-        "_mist": lambda: modal.mist,
-        "_feed_override": lambda: modal.feed_override,
-        "_speed_override": lambda: modal.speed_override,
-        "_adaptive_feed": lambda: modal.adaptive_feed,
-        "_feed_hold": lambda: modal.feed_hold,
         "_ijk_absolute_mode": lambda: modal.arc_absolute,
         "_lathe_diameter_mode": lambda: modal.diameter,
         "_lathe_radius_mode": lambda: not modal.diameter,
@@ -58,15 +49,12 @@ def names_of(
         "_spindle_cw": lambda: modal.spindle_turns > 0,
         "_tool_offset": lambda: any(modal.tool),
         "_value_returned": lambda: value() is not None,
-    }
-    readings: dict[str, Reading] = {name: _as_number(flag) for name, flag in flags.items()}
-    readings |= {
-        "_line": lambda: float(line()),
-        "_call_level": lambda: float(depth()),
-        "_motion_mode": lambda: float(modal.motion),
-        "_plane": lambda: float(PLANE_CODES[modal.plane]),
-        "_ccomp": lambda: float(modal.compensation),
-        "_coord_system": lambda: (540, 550, 560, 570, 580, 590, 591, 592, 593)[modal.system - 1] * 1.0,
+        "_line": line,
+        "_call_level": depth,
+        "_motion_mode": lambda: modal.motion,
+        "_plane": lambda: PLANE_CODES[modal.plane],
+        "_ccomp": lambda: modal.compensation,
+        "_coord_system": lambda: CODE_OF_SYSTEM[modal.system],
         "_feed": lambda: modal.feed_word,
         "_rpm": lambda: modal.spindle_rpm,
         "_value": lambda: value() or 0.0,
@@ -74,30 +62,22 @@ def names_of(
         "_current_pocket": lambda: 1.0,
         "_selected_pocket": lambda: -1.0,
     }
-    for name in (
-        "_vminor",
-        "_task",
-        "_remap_level",
-        "_current_tool",
-        "_selected_tool",
-    ):
+    for name in ("_vminor", "_task", "_remap_level", "_current_tool", "_selected_tool"):
         readings[name] = lambda: 0.0
-    for letter in AXES:
-        readings[f"_{letter}"] = _own(modal, INDEX[letter])
-        readings[f"_abs_{letter}"] = _machine(modal, INDEX[letter])
+    for switch in ("flood", "mist", "feed_override", "speed_override", "adaptive_feed", "feed_hold"):
+        readings[f"_{switch}"] = partial(getattr, modal, switch)
+    for index, letter in enumerate(AXES):
+        readings[f"_{letter}"] = _own(modal, index)
+        readings[f"_abs_{letter}"] = _machine(modal, index)
     return readings
 
 
-def _as_number(flag: Callable[[], bool]) -> Reading:
-    return lambda: float(flag())
-
-
 def _own(modal: Modal, index: int) -> Reading:
-    return lambda: modal.position[index] / (modal.scale if AXES[index] in LINEAR else 1.0)
+    return lambda: modal.position[index] / modal.unit(index)
 
 
 def _machine(modal: Modal, index: int) -> Reading:
-    return lambda: (modal.machine_all()[index] + modal.tool[index]) / (modal.scale if AXES[index] in LINEAR else 1.0)
+    return lambda: (modal.machine_all()[index] + modal.tool[index]) / modal.unit(index)
 
 
 @dataclass(frozen=True)

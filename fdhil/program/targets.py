@@ -1,11 +1,10 @@
-"""What the words of a block say: where it leads, how long that is, at which feed."""
+"""The words of a block give its target, its length and its feed."""
 
 from __future__ import annotations
 
 import math
 
-from fdhil.errors import ProgramError
-from fdhil.program.modal import AXES, INDEX, LINEAR, Modal
+from fdhil.program.modal import AXES, INDEX, Modal
 from fdhil.program.motions import PLANE_AXES
 from fdhil.program.words import Block
 
@@ -25,14 +24,14 @@ def feed_mm_min(modal: Modal, block: Block, length_mm: float) -> float:
     """Return the feed of a move of this length; ProgramError when none is in force."""
     if modal.feed_mode == 930:
         if "f" not in block.words:
-            raise ProgramError(block.line, "G93", "a feed move in inverse-time mode wants an F word of its own")
+            raise block.fault("G93", "a feed move in inverse-time mode wants an F word of its own")
         modal.feed_mm_min = max(_MIN_INVERSE_TIME_FEED * modal.scale, length_mm * block.words["f"])
         return modal.feed_mm_min
     if modal.feed_mm_min <= 0.0:
-        raise ProgramError(block.line, f"G{modal.motion / 10:g}", "there is no feed rate; give F before a feed move")
+        raise block.fault(modal.code, "there is no feed rate; give F before a feed move")
     if modal.feed_mode == 950:
         if modal.spindle_rpm <= 0.0:
-            raise ProgramError(block.line, "G95", "feed per revolution wants a spindle speed; give S")
+            raise block.fault("G95", "feed per revolution wants a spindle speed; give S")
         return modal.feed_mm_min * modal.spindle_rpm
     return modal.feed_mm_min
 
@@ -41,11 +40,11 @@ def spline_feed_mm_min(modal: Modal, block: Block) -> float:
     """Return the feed of a spline, which LinuxCNC does not work by inverse time: under G93 that of the move before."""
     if modal.feed_mode != 930:
         return feed_mm_min(modal, block, 0.0)
-    code = f"G{modal.motion / 10:g}"
+    code = modal.code
     if "f" not in block.words and modal.motion in (50, 51):
-        raise ProgramError(block.line, code, "a feed move in inverse-time mode wants an F word of its own")
+        raise block.fault(code, "a feed move in inverse-time mode wants an F word of its own")
     if modal.feed_mm_min <= 0.0:
-        raise ProgramError(block.line, code, "keeps the feed in force under G93, and there is none; give G94 and F")
+        raise block.fault(code, "keeps the feed in force under G93, and there is none; give G94 and F")
     return modal.feed_mm_min
 
 
@@ -54,7 +53,7 @@ def plane_axes(modal: Modal, block: Block) -> tuple[int, int, int]:
     axes = PLANE_AXES.get(modal.plane_name)
     if axes is None:
         what = f"cannot be worked in the {modal.plane_name} plane, whose axes fdhil does not list; use G17, G18 or G19"
-        raise ProgramError(block.line, f"G{modal.motion / 10:g}", what)
+        raise block.fault(modal.code, what)
     return axes
 
 
@@ -71,11 +70,9 @@ def axis_words(block: Block) -> dict[int, float]:
 
 def length_mm(modal: Modal, index: int, value: float) -> float:
     """Return an axis word in mm or degrees; X is a diameter under G7."""
-    if AXES[index] not in LINEAR:
-        return value
     if index == 0 and modal.diameter:
         value /= 2.0
-    return value * modal.scale
+    return value * modal.unit(index)
 
 
 def target(modal: Modal, block: Block) -> list[float]:
@@ -84,7 +81,7 @@ def target(modal: Modal, block: Block) -> list[float]:
     polar = "@" in block.words or "^" in block.words
     if "machine co-ordinates" in block.g:
         if polar or not modal.absolute or modal.motion not in (0, 10):
-            raise ProgramError(block.line, "G53", "wants absolute X Y Z words (G90) and G0 or G1")
+            raise block.fault("G53", "wants absolute X Y Z words (G90) and G0 or G1")
         whole = [c + t for c, t in zip(modal.machine_all(), modal.tool, strict=True)]
         for index, value in words.items():
             whole[index] = length_mm(modal, index, value)

@@ -1,4 +1,4 @@
-"""From a line of text to a block: its words, codes by modal group, and parameter settings.
+"""Lines of text become blocks: words, codes by modal group, and parameter settings.
 
 Blanks, comments and case mean nothing outside names. A block has each letter once, except G, M and parameter settings.
 G codes are held times ten (G38.2 is 382).
@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from string import ascii_lowercase, ascii_uppercase
 
 from fdhil.errors import ProgramError
-from fdhil.program.expressions import Context, Reader, Value, now, whole
+from fdhil.program.expressions import Context, Reader, Value, is_whole, now, whole
 
-_PLAIN = re.compile(r"(?:[a-z@^][+-]?(?:\d++\.?\d*+|\.\d++))*+")
-_WORD = re.compile(r"([a-z@^])([+-]?(?:\d++\.?\d*+|\.\d++))")
 _NUMBER = re.compile(r"n(\d++)(?:\.\d++)?+")
 _CLEANED = str.maketrans(ascii_uppercase, ascii_lowercase, " \t\r\v\f")
 _COMMENT = "("
@@ -59,6 +57,11 @@ M_GROUPS: Mapping[int, str] = _groups(
     ("overrides", (48, 49, 50, 51, 52, 53)),
     ("modal state", (70, 71, 72, 73)),
 )
+
+
+def g_word(code: int) -> str:
+    """Return a G code that is held times ten as a program has it: G38.2."""
+    return f"G{code / 10:g}"
 
 
 @dataclass(slots=True)
@@ -161,30 +164,17 @@ def _ended(block: Block) -> Block:
 
 def read(text: str, context: Context, max_nesting: int) -> Line:
     """Read a cleaned line; ProgramError with line and word for what the language does not allow."""
-    if _PLAIN.fullmatch(text) is not None:
-        block = Block(context.line)
-        for letter, digits in _WORD.findall(text):
-            value = float(digits)
-            if value - value != 0.0:
-                raise ProgramError(context.line, letter.upper() + digits[:12], "is too large a number")
-            _add(block, letter, value)
-        return _fixed(_ended(block))
     reader = Reader(text, context, max_nesting)
     words: list[tuple[str, Value]] = []
     settings: list[tuple[Value | str, Value]] = []
     while not reader.done():
-        _next(reader, words, settings)
+        read_word(reader, words, settings)
     if settings:
         return Line(None, tuple(words), tuple(settings))
-    return Line(None, tuple(words), (), *_straight(words))
-
-
-def _fixed(block: Block) -> Line:
-    code = block.g.get("motion")
-    straight = not block.m and len(block.g) == (code is not None) and code in (None, 0, 10)
-    if not straight or not block.words.keys() <= _STRAIGHT:
-        return Line(block)
-    return Line(block, code=code, straight=tuple(block.words.get(letter) for letter in "xyzf"))
+    line = Line(None, tuple(words), (), *_straight(words))
+    if not words or any(callable(value) for _, value in words):
+        return line
+    return replace(line, fixed=line.block(context))
 
 
 def _straight(words: list[tuple[str, Value]]) -> tuple[int | None, tuple[Value | None, ...] | None]:
@@ -199,7 +189,8 @@ def _straight(words: list[tuple[str, Value]]) -> tuple[int | None, tuple[Value |
     return number, tuple(by_letter.get(letter) for letter in "xyzf")
 
 
-def _next(reader: Reader, words: list[tuple[str, Value]], settings: list[tuple[Value | str, Value]]) -> None:
+def read_word(reader: Reader, words: list[tuple[str, Value]], settings: list[tuple[Value | str, Value]]) -> None:
+    """Read the next word or the next setting of a parameter; ProgramError for what is neither."""
     reader.word_at = reader.at
     letter = reader.text[reader.at]
     if letter == "#":
@@ -212,10 +203,14 @@ def _next(reader: Reader, words: list[tuple[str, Value]], settings: list[tuple[V
     if letter == _COMMENT:
         reader.at += 1
         return
-    if letter not in _LETTERS:
+    if letter not in _LETTERS and letter not in "no":
         raise reader.fault("is no word of the language; check the characters")
     reader.at += 1
-    words.append((letter, reader.value()))
+    value = reader.value()
+    if letter in "no":
+        word = f"{letter}{value:g}" if isinstance(value, float) else None
+        raise reader.fault("stands where it may not; N and O begin a line", word)
+    words.append((letter, value))
 
 
 def _add(block: Block, letter: str, value: float) -> None:
@@ -224,9 +219,7 @@ def _add(block: Block, letter: str, value: float) -> None:
     elif letter == "m":
         _add_m(block, value)
     elif letter in block.words:
-        raise ProgramError(block.line, f"{letter.upper()}{value:g}", "this letter stands twice in the block; keep one")
-    elif letter not in _LETTERS:
-        raise ProgramError(block.line, f"{letter.upper()}{value:g}", "stands where it may not; N and O begin a line")
+        raise block.fault(f"{letter.upper()}{value:g}", "this letter stands twice in the block; keep one")
     else:
         block.words[letter] = value
 
@@ -235,18 +228,18 @@ def _add_g(block: Block, value: float) -> None:
     code = round(value * 10.0)
     group = G_GROUPS.get(code) if abs(value * 10.0 - code) < 1e-3 else None
     if group is None:
-        raise ProgramError(block.line, f"G{value:g}", "is a G code that fdhil does not know; see the list of codes")
+        raise block.fault(f"G{value:g}", "is a G code that fdhil does not know; see the list of codes")
     if group in block.g and group != "cycle end":
-        other = f"G{block.g[group] / 10:g}"
-        raise ProgramError(block.line, f"G{value:g}", f"contradicts {other} in the same block; keep one of them")
+        other = g_word(block.g[group])
+        raise block.fault(f"G{value:g}", f"contradicts {other} in the same block; keep one of them")
     block.g[group] = code
 
 
 def _add_m(block: Block, value: float) -> None:
     code = round(value)
-    group = M_GROUPS.get(code) if abs(value - code) < 1e-4 else None
+    group = M_GROUPS.get(code) if is_whole(value) else None
     if group is None:
-        raise ProgramError(block.line, f"M{value:g}", "is an M code that fdhil does not know; see the list of codes")
+        raise block.fault(f"M{value:g}", "is an M code that fdhil does not know; see the list of codes")
     if group in block.m:
-        raise ProgramError(block.line, f"M{value:g}", f"contradicts M{block.m[group]} in the same block; keep one")
+        raise block.fault(f"M{value:g}", f"contradicts M{block.m[group]} in the same block; keep one")
     block.m[group] = code

@@ -1,4 +1,4 @@
-"""What becomes of a path: reference, prediction and correction."""
+"""Paths: reference, prediction and correction."""
 
 from __future__ import annotations
 

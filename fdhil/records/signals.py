@@ -1,4 +1,4 @@
-"""What is measured: samples, windows and recordings of an axis."""
+"""Signals: samples, windows and recordings of an axis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is told of a drive: estimates, and whether they are believed."""
+"""Verdicts on a drive: estimates, and whether they are believed."""
 
 from __future__ import annotations
 

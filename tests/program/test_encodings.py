@@ -1,4 +1,4 @@
-"""How the text of a program may be stored, and what is said of text that no NC reads."""
+"""Encodings: the text of a program may be stored in several, and text that no NC reads is named."""
 
 from __future__ import annotations
 

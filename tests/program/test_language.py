@@ -1,4 +1,4 @@
-"""What goes beyond single moves: flow, subroutines in files, cycles, compensation, threads, splines, kept modes."""
+"""The language beyond single moves: flow, subroutines in files, cycles, compensation, threads, splines, kept modes."""
 
 from __future__ import annotations
 

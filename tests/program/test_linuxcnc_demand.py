@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from fdhil import config as configuration
+from fdhil.config import MachineConfig, parse
 from fdhil.correction import mirror
 from fdhil.correction import plan as correct
 from fdhil.prediction import predict_corrected
@@ -41,12 +41,12 @@ def program(path: str, mode: str, feed: float) -> str:
     return f"G21 G90 G17 {mode}\nF{feed:g}\n{PATHS[path]}M2\n"
 
 
-def machine(acceleration_mm_s2: float, profile: str = "trapezoidal") -> configuration.MachineConfig:
+def machine(acceleration_mm_s2: float, profile: str = "trapezoidal") -> MachineConfig:
     document = bench_document("XYZ")
     for axis in document["axis"].values():
         axis["max_acceleration_mm_s2"] = acceleration_mm_s2
     document["nc"] = {"profile": profile, "rapid_stop": False, "end_rest_s": 0.0}
-    return configuration.parse(document)
+    return parse(document)
 
 
 def ours(text: str, acceleration_mm_s2: float = ACCELERATION_MM_S2, profile: str = "trapezoidal") -> Float:

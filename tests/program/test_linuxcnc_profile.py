@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from fdhil import config as configuration
+from fdhil.config import MachineConfig, parse
 from fdhil.program import Arc, Dwell, Feed, Motion, Rapid, interpret, plan
 from fdhil.program.motions import Corner
 from fdhil.program.planner import stream
@@ -27,12 +27,12 @@ STOP_MM = 1e-3  # what the joints' interpolation over three points makes of a st
 EXACT_PATH, EXACT_STOP = Corner("exact_path", 0.0), Corner("exact_stop", 0.0)
 
 
-def machine(**keys: object) -> configuration.MachineConfig:
+def machine(**keys: object) -> MachineConfig:
     document = bench_document("XYZ")
     for axis in document["axis"].values():
         axis["max_acceleration_mm_s2"] = ACCELERATION_MM_S2
     document["nc"] = {"profile": "linuxcnc", "end_rest_s": 0.0, **keys}
-    return configuration.parse(document)
+    return parse(document)
 
 
 def rows_of(moves: list[Motion], **keys: object) -> Float:

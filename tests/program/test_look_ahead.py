@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from fdhil import config as configuration
+from fdhil.config import MachineConfig, parse
 from fdhil.correction import plan as correct
 from fdhil.correction import streaming
 from fdhil.prediction.models import nominal_models
@@ -31,12 +31,12 @@ PROFILES = ("trapezoidal", "jerk_limited")
 EXACT_PATH, EXACT_STOP = Corner("exact_path", 0.0), Corner("exact_stop", 0.0)
 
 
-def machine(profile: str, axes: str = "XY", **keys: object) -> configuration.MachineConfig:
+def machine(profile: str, axes: str = "XY", **keys: object) -> MachineConfig:
     document = bench_document(axes)
     document["nc"] = {"profile": profile, **keys}
     document["axis"]["Y"]["max_acceleration_mm_s2"] = 2500.0  # so that the axes differ
     document["axis"]["X"]["max_jerk_mm_s3"] = 150_000.0
-    return configuration.parse(document)
+    return parse(document)
 
 
 def cornered(moves: Sequence[Motion], corner: Corner) -> list[Motion]:
@@ -61,7 +61,7 @@ def random_moves(seed: int, count: int = 12) -> list[Motion]:
     return moves
 
 
-def dense_path(moves: Sequence[Motion], config: configuration.MachineConfig) -> Float:
+def dense_path(moves: Sequence[Motion], config: MachineConfig) -> Float:
     """The programmed path itself, finely."""
     at, parts = (0.0, 0.0, 0.0), []
     for move in moves:
@@ -77,7 +77,7 @@ def columns(reference: Trajectory) -> Float:
     return np.column_stack([reference.position_mm[axis] for axis in reference.axes])
 
 
-def check_limits(reference: Trajectory, config: configuration.MachineConfig) -> None:
+def check_limits(reference: Trajectory, config: MachineConfig) -> None:
     """Speed, acceleration and, for jerk_limited, jerk of every axis, as differences of what is ordered."""
     for axis, path in reference.position_mm.items():
         settings = config.axis[axis]
@@ -128,7 +128,7 @@ def test_a_wider_tolerance_is_faster(profile: str) -> None:
 def test_a_trapezoid_takes_its_time() -> None:
     document = bench_document()
     document["nc"] = {"profile": "trapezoidal", "end_rest_s": 0.0}
-    reference = plan([Feed(3, (100.0, 0.0, 0.0), 6000.0)], configuration.parse(document))
+    reference = plan([Feed(3, (100.0, 0.0, 0.0), 6000.0)], parse(document))
     assert reference.time_s[-1] == pytest.approx(100.0 / 100.0 + 100.0 / 4000.0, abs=2e-3)
     t = reference.time_s
     np.testing.assert_allclose(reference.position_mm["X"][:26], 2000.0 * t[:26] ** 2, atol=1e-9)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from fdhil import config as configuration
+from fdhil.config import MachineConfig, parse
 from fdhil.errors import ProgramError
 from fdhil.program import Arc, Dwell, Feed, Motion, Rapid, plan
 from fdhil.program.planner import stream
@@ -26,10 +26,10 @@ MOVES: list[Motion] = [
 PROFILES = ("fir", "trapezoidal", "jerk_limited", "linuxcnc")
 
 
-def profiled(profile: str) -> configuration.MachineConfig:
+def profiled(profile: str) -> MachineConfig:
     document = bench_document()
     document["nc"] = {"profile": profile}
-    return configuration.parse(document)
+    return parse(document)
 
 
 def test_a_feed_is_the_programmed_speed_through_two_moving_averages() -> None:
@@ -45,10 +45,21 @@ def test_a_feed_is_the_programmed_speed_through_two_moving_averages() -> None:
     assert not reference.rapid.any()
 
 
+@pytest.mark.parametrize("profile", PROFILES)
+def test_an_arc_is_slowed_only_by_the_axes_that_it_moves(profile: str) -> None:
+    document = bench_document("XYZ")
+    document["nc"] = {"profile": profile}
+    document["axis"]["Z"]["rapid_speed_mm_s"] = 50.0
+    arc = [Arc(1, (200.0, 0.0, 0.0), (100.0, 0.0, None), 1, "XY", 6000.0)]
+    reference = plan(arc, parse(document))
+    speed = np.hypot(np.diff(reference.position_mm["X"]), np.diff(reference.position_mm["Y"])) / 1e-3
+    assert speed.max() == pytest.approx(100.0, rel=0.01)
+
+
 def test_the_path_is_run_at_the_programmed_feed_without_a_stop_between_feeds() -> None:
     document = bench_document()
     document["nc"] = {"smoothing_s": [], "end_rest_s": 0.0}
-    reference = plan(MOVES[:4], configuration.parse(document))
+    reference = plan(MOVES[:4], parse(document))
     x, y = reference.position_mm["X"], reference.position_mm["Y"]
     speed = np.hypot(np.diff(x), np.diff(y)) / 1e-3
     length = 55 + 100 + 50 * math.pi + 50
@@ -63,7 +74,7 @@ def test_rapids_keep_each_axis_within_its_limits_and_run_straight() -> None:
     document = bench_document()
     document["nc"] = {"smoothing_s": []}
     document["axis"]["Y"]["max_acceleration_mm_s2"] = 1000.0
-    reference = plan([Rapid(1, (300.0, 200.0, 0.0))], configuration.parse(document))
+    reference = plan([Rapid(1, (300.0, 200.0, 0.0))], parse(document))
     x, y = reference.position_mm["X"], reference.position_mm["Y"]
     np.testing.assert_allclose(y, x * 2 / 3, atol=1e-9)
     assert np.abs(np.diff(x)).max() <= 0.5 + 1e-9
@@ -85,7 +96,7 @@ def test_rapid_and_feed_are_parted_by_an_exact_stop() -> None:
 def test_exact_stop_between_feeds_is_an_option() -> None:
     document = bench_document()
     document["nc"] = {"corner": "exact_stop", "settle_s": 0.01}
-    reference = plan(MOVES[:2], configuration.parse(document))
+    reference = plan(MOVES[:2], parse(document))
     corner = np.hypot(reference.position_mm["X"], reference.position_mm["Y"] - 55.0)
     assert np.count_nonzero(corner < 1e-9) >= 10
 
@@ -98,7 +109,7 @@ def test_a_dwell_holds_all_axes() -> None:
     assert reference.time_s[-1] == pytest.approx(0.1 + 0.088 + 0.5 + 0.088 + 0.1 + 0.088 + 0.5, abs=0.003)
 
 
-def check_blocks(moves: Sequence[Motion], config: configuration.MachineConfig, atol: float = 1e-9) -> None:
+def check_blocks(moves: Sequence[Motion], config: MachineConfig, atol: float = 1e-9) -> None:
     """Planned at once and in blocks of 333 rows: the same."""
     whole = plan(moves, config)
     blocks = list(stream(moves, config, 333))

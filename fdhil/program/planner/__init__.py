@@ -23,7 +23,6 @@ from fdhil.records import Float, Int, Trajectory, frozen, frozen_ints
 
 MAX_ROWS = 10_000_000
 _BLOCK_ROWS = 1 << 16
-Part = tuple[Float, Int, Int]  # position (n, 3) in mm, source line (n,), rapid (n,) 0 or 1
 
 
 def plan(motions: Iterable[Motion], config: MachineConfig) -> Trajectory:
@@ -32,16 +31,7 @@ def plan(motions: Iterable[Motion], config: MachineConfig) -> Trajectory:
     ProgramError for an axis that the machine does not have, a feed of nothing, and a duration of more than
     ``MAX_ROWS`` SYNC periods.
     """
-    blocks = list(stream(motions, config, _BLOCK_ROWS, MAX_ROWS))
-    rapid = np.concatenate([block.rapid for block in blocks])
-    rapid.setflags(write=False)
-    return Trajectory(
-        dt_s=config.machine.sync_period_s,
-        time_s=frozen(np.concatenate([block.time_s for block in blocks])),
-        position_mm={axis: frozen(np.concatenate([b.position_mm[axis] for b in blocks])) for axis in config.axis},
-        rapid=rapid,
-        line=frozen_ints(np.concatenate([block.line for block in blocks])),
-    )
+    return _trajectory(np.concatenate(list(_parts(motions, config, _BLOCK_ROWS, MAX_ROWS))), 0, config)
 
 
 def stream(
@@ -52,48 +42,48 @@ def stream(
     A block is there as soon as the motions that reach into it were read; its times go on from the block before.
     """
     row = 0
-    kept: list[Part] = []
-    waiting = 0
-    parts = {"fir": _smoothed, "linuxcnc": _cycle_by_cycle}.get(config.nc.profile, _looked_ahead)
-    for part in parts(motions, config, block_rows, max_rows):
-        kept.append(part)
-        waiting += part[1].size
-        while waiting >= block_rows:
-            block, kept = _cut(kept, block_rows)
-            yield _trajectory(block, row, config)
+    waiting = np.empty((0, 5))
+    for part in _parts(motions, config, block_rows, max_rows):
+        waiting = np.concatenate([waiting, part])
+        while len(waiting) >= block_rows:
+            yield _trajectory(waiting[:block_rows], row, config)
+            waiting = waiting[block_rows:]
             row += block_rows
-            waiting -= block_rows
-    if waiting:
-        block, _ = _cut(kept, waiting)
-        yield _trajectory(block, row, config)
+    if len(waiting):
+        yield _trajectory(waiting, row, config)
 
 
-def _smoothed(motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float) -> Iterator[Part]:
+def _parts(motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float) -> Iterator[Float]:
+    """Yield X, Y, Z in mm, source line and rapid (0 or 1) of the next rows, (n, 5)."""
+    if config.nc.profile == "linuxcnc":
+        return linuxcnc.Planner(config, max_rows).parts(motions, block_rows)
+    made = _smoothed if config.nc.profile == "fir" else _looked_ahead
+    return made(motions, config, block_rows, max_rows)
+
+
+def _smoothed(motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float) -> Iterator[Float]:
     dt_s = config.machine.sync_period_s
     smoother = Smoother(config.nc.smoothing_s, dt_s)
     timeline = Timeline(config, smoother.settle_rows, max_rows)
     for segments in timeline.batches(motions):
         for rows in _spans(segments.first_row, segments.end_row, block_rows):
-            raw, line, rapid = segments.sample(rows, dt_s)
-            yield smoother(raw), line, rapid
+            part = segments.sample(rows, dt_s)
+            part[:, :3] = smoother(part[:, :3])
+            yield part
 
 
-def _looked_ahead(motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float) -> Iterator[Part]:
+def _looked_ahead(
+    motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float
+) -> Iterator[Float]:
     dt_s = config.machine.sync_period_s
     ahead = LookAhead(config, max_rows)
     smoother = Smoother((ahead.filter_rows * dt_s,), dt_s)
     for stretch in ahead.stretches(motions):
         for rows in _spans(stretch.first_row, stretch.end_row, block_rows):
-            path, line, rapid = stretch.sample(rows, dt_s)
-            smooth = smoother(path[:, None])[:, 0]
-            yield ahead.curve.at(smooth), line, rapid
-            ahead.curve.forget(float(smooth[-1]))
-
-
-def _cycle_by_cycle(
-    motions: Iterable[Motion], config: MachineConfig, block_rows: int, max_rows: float
-) -> Iterator[Part]:
-    return linuxcnc.Planner(config, max_rows).parts(motions, block_rows)
+            sampled = stretch.sample(rows, dt_s)
+            path_mm = smoother(sampled[:, :1])[:, 0]
+            yield np.column_stack([ahead.curve.at(path_mm), sampled[:, 1:]])
+            ahead.curve.forget(float(path_mm[-1]))
 
 
 def _spans(first_row: int, end_row: int, block_rows: int) -> Iterator[Int]:
@@ -101,24 +91,16 @@ def _spans(first_row: int, end_row: int, block_rows: int) -> Iterator[Int]:
         yield np.arange(first, min(first + block_rows, end_row))
 
 
-def _cut(kept: list[Part], rows: int) -> tuple[Part, list[Part]]:
-    position = np.concatenate([part[0] for part in kept])
-    line = np.concatenate([part[1] for part in kept])
-    rapid = np.concatenate([part[2] for part in kept])
-    rest = [(position[rows:], line[rows:], rapid[rows:])] if line.size > rows else []
-    return (position[:rows], line[:rows], rapid[:rows]), rest
-
-
-def _trajectory(block: Part, first_row: int, config: MachineConfig) -> Trajectory:
-    position, line, rapid_rows = block
-    n = line.size
-    rapid = rapid_rows.astype(np.bool_)
+def _trajectory(rows: Float, first_row: int, config: MachineConfig) -> Trajectory:
+    n, dt_s = len(rows), config.machine.sync_period_s
+    rapid = rows[:, 4].astype(np.bool_)
     rapid.setflags(write=False)
-    columns = {axis: position[:, "XYZ".index(axis)] if axis in "XYZ" else np.zeros(n) for axis in config.axis}
     return Trajectory(
-        dt_s=config.machine.sync_period_s,
-        time_s=frozen((first_row + np.arange(n)) * config.machine.sync_period_s),
-        position_mm={axis: frozen(column) for axis, column in columns.items()},
+        dt_s=dt_s,
+        time_s=frozen((first_row + np.arange(n)) * dt_s),
+        position_mm={
+            axis: frozen(rows[:, "XYZ".index(axis)] if axis in "XYZ" else np.zeros(n)) for axis in config.axis
+        },
         rapid=rapid,
-        line=frozen_ints(line),
+        line=frozen_ints(rows[:, 3]),
     )

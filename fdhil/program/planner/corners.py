@@ -51,10 +51,10 @@ class _Turn:
 class CornerRules:
     """The rules of one machine; ``filter_s`` is the length of the jerk-limiting average, 0 for trapezoidal."""
 
-    def __init__(self, limits: AxisLimits, dt_s: float, filter_s: float) -> None:
+    def __init__(self, limits: AxisLimits, filter_s: float) -> None:
         self._acceleration = np.minimum(np.array(limits.acceleration), _UNLIMITED)
         self._jerk = np.minimum(np.array(limits.jerk), _UNLIMITED)
-        self._dt_s = dt_s
+        self._dt_s = limits.dt_s
         self._filter_s = filter_s
 
     def pieces(self, pieces: Float) -> tuple[Float, Float]:

@@ -1,4 +1,4 @@
-"""What the axes can do, and the motions that no planner takes."""
+"""The limits that every planner keeps: the axes' own, the longest program, and the grid of SYNC rows."""
 
 from __future__ import annotations
 
@@ -7,52 +7,57 @@ from dataclasses import dataclass
 
 from fdhil.config import MachineConfig
 from fdhil.errors import ProgramError
-from fdhil.program.motions import PLANE_AXES, Arc, Dwell, Feed, Point, Rapid
+from fdhil.program.motions import PLANE_AXES, Arc, Dwell, Motion, Point, Rapid
 
+TICK_TOLERANCE = 1e-6  # of a row: an end so little after a row counts as on it
 _TINY_MM = 1e-9
 _MAX_DWELL_ROWS = 1e9
 
 
 @dataclass(frozen=True, slots=True)
 class AxisLimits:
-    """Per axis X, Y, Z: whether it is there, and its speed (mm/s), acceleration (mm/s2) and jerk (mm/s3), else inf."""
+    """Per axis X, Y, Z: speed (mm/s), acceleration (mm/s2) and jerk (mm/s3), infinite for an axis that is not there."""
 
-    present: tuple[bool, bool, bool]
     speed: Point
     acceleration: Point
     jerk: Point
+    dt_s: float
 
     @staticmethod
     def of(config: MachineConfig) -> AxisLimits:
-        """Return the limits of a machine's axes."""
-        x, y, z = (config.axis.get(name) for name in "XYZ")
-        axes = (x, y, z)
-        speed = [axis.rapid_speed_mm_s if axis else math.inf for axis in axes]
-        acceleration = [axis.max_acceleration_mm_s2 if axis else math.inf for axis in axes]
-        jerk = [axis.jerk_mm_s3 if axis else math.inf for axis in axes]
-        return AxisLimits(
-            (x is not None, y is not None, z is not None),
-            (speed[0], speed[1], speed[2]),
-            (acceleration[0], acceleration[1], acceleration[2]),
-            (jerk[0], jerk[1], jerk[2]),
-        )
+        """Return the limits of a machine's axes and its SYNC period."""
 
-    def check(self, motion: Rapid | Feed | Arc, start: Point) -> None:
-        """Raise ProgramError for a feed of nothing, and for a motion of an axis that the machine lacks."""
+        def each(name: str) -> Point:
+            x, y, z = (getattr(config.axis[axis], name) if axis in config.axis else math.inf for axis in "XYZ")
+            return x, y, z
+
+        speed, acceleration = each("rapid_speed_mm_s"), each("max_acceleration_mm_s2")
+        return AxisLimits(speed, acceleration, each("jerk_mm_s3"), config.machine.sync_period_s)
+
+    def check(self, motion: Motion, start: Point) -> None:
+        """Raise ProgramError for an endless feed or dwell, and for a motion of an axis that the machine lacks."""
+        if isinstance(motion, Dwell):
+            if motion.seconds / self.dt_s > _MAX_DWELL_ROWS:
+                raise ProgramError(motion.line, f"P{motion.seconds:g}", "is too long a dwell to plan")
+            return
         if not isinstance(motion, Rapid) and not motion.feed > 0.0:
             raise ProgramError(motion.line, "F", "the feed rate is 0, so the move would never end; give F")
         moved = [abs(b - a) > _TINY_MM for a, b in zip(start, motion.end, strict=True)]
         if isinstance(motion, Arc):
             for axis in PLANE_AXES[motion.plane][:2]:
                 moved[axis] = True
-        for name, moves, present in zip("XYZ", moved, self.present, strict=True):
-            if moves and not present:
+        for name, moves, speed in zip("XYZ", moved, self.speed, strict=True):
+            if moves and speed == math.inf:
                 raise ProgramError(
                     motion.line, name, f"moves axis {name}, which the configuration lacks; add [axis.{name}]"
                 )
 
+    def rows(self, seconds: float) -> int:
+        """Return the first SYNC row that is not before a time."""
+        return math.ceil(seconds / self.dt_s - TICK_TOLERANCE)
 
-def check_dwell(motion: Dwell, dt_s: float) -> None:
-    """Raise ProgramError for a dwell that cannot be counted."""
-    if motion.seconds / dt_s > _MAX_DWELL_ROWS:
-        raise ProgramError(motion.line, f"P{motion.seconds:g}", "is too long a dwell to plan")
+
+def check_duration(line: int, seconds: float, most_s: float) -> None:
+    """Raise ProgramError for a program that lasts too long."""
+    if seconds > most_s:
+        raise ProgramError(line, "", f"by here the program lasts {seconds / 3600:.3g} h; split it")

@@ -14,18 +14,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.errors import ProgramError
 from fdhil.program.motions import Arc, Dwell, Feed, Motion, Point, Rapid
 from fdhil.program.planner import speed
 from fdhil.program.planner.corners import CornerRules
 from fdhil.program.planner.curve import Curve
-from fdhil.program.planner.limits import AxisLimits, check_dwell
+from fdhil.program.planner.limits import TICK_TOLERANCE, AxisLimits, check_duration
 from fdhil.program.planner.pieces import LENGTH, LINE, RAPID, WIDTH, Row, piece
 from fdhil.records import Float, Int
 
 _BATCH = 512  # pieces that are planned together
 _MOST = 4096  # pieces that may wait for what comes after them; then a stop behind them is assumed
-_TICK_TOLERANCE = 1e-6
 _SHARP_ROWS = 1.5
 _BATCH_ROWS = 1 << 18
 
@@ -38,11 +36,10 @@ class Stretch:
     first_row: int
     end_row: int
 
-    def sample(self, rows: Int, dt_s: float) -> tuple[Float, Int, Int]:
-        """Return length of path (n,) in mm, source line (n,) and rapid (n,) 0 or 1 at SYNC ``rows`` (n,)."""
-        path, at = speed.at(self.table, np.asarray(rows * dt_s), _TICK_TOLERANCE * dt_s)
-        place = at.astype(np.int64)
-        return path, place // 2, place % 2
+    def sample(self, rows: Int, dt_s: float) -> Float:
+        """Return length of path in mm, source line and rapid (0 or 1) at SYNC ``rows`` (n,): (n, 3)."""
+        path, place = speed.at(self.table, np.asarray(rows * dt_s), TICK_TOLERANCE * dt_s)
+        return np.column_stack([path, place // 2, place % 2])
 
 
 class LookAhead:
@@ -52,20 +49,19 @@ class LookAhead:
     """
 
     def __init__(self, config: MachineConfig, max_rows: float = math.inf) -> None:
-        self._dt_s = config.machine.sync_period_s
+        self._limits = limits = AxisLimits.of(config)
+        self._dt_s = limits.dt_s
         self._max_s = max_rows * self._dt_s
-        self._limits = AxisLimits.of(config)
         self._rapid_stop = config.nc.rapid_stop
         self._stop_always = config.nc.corner == "exact_stop"
         smooth = config.nc.profile == "jerk_limited"
-        self.filter_rows = _filter_rows(config) if smooth else 1
-        filter_s = self.filter_rows * self._dt_s if smooth else 0.0
-        self._filter_s = filter_s
-        fastest = math.hypot(*(v for v in self._limits.speed if math.isfinite(v)))
-        self._reach_mm = fastest * filter_s / 2.0
-        self._settle_rows = self.filter_rows - 1 + math.ceil(config.nc.settle_s / self._dt_s - _TICK_TOLERANCE)
-        self._end_rows = self.filter_rows + math.ceil(config.nc.end_rest_s / self._dt_s - _TICK_TOLERANCE)
-        self._rules = CornerRules(self._limits, self._dt_s, filter_s)
+        self.filter_rows = _filter_rows(config, limits) if smooth else 1
+        self._filter_s = self.filter_rows * self._dt_s if smooth else 0.0
+        fastest = math.hypot(*(v for v in limits.speed if math.isfinite(v)))
+        self._reach_mm = fastest * self._filter_s / 2.0
+        self._settle_rows = self.filter_rows - 1 + limits.rows(config.nc.settle_s)
+        self._end_rows = self.filter_rows + limits.rows(config.nc.end_rest_s)
+        self._rules = CornerRules(limits, self._filter_s)
         self.curve = Curve(smooth)
         self._at: Point = (0.0, 0.0, 0.0)
         self._new: list[Row] = []
@@ -83,6 +79,7 @@ class LookAhead:
     def stretches(self, motions: Iterable[Motion]) -> Iterator[Stretch]:
         """Yield the phases of all motions, the rest before them and the settling after them."""
         for motion in motions:
+            self._limits.check(motion, self._at)
             if isinstance(motion, Dwell):
                 self._dwell(motion)
             else:
@@ -97,14 +94,13 @@ class LookAhead:
 
     def _due(self) -> Stretch:
         """Hand out the rows whose phases are known."""
-        end_row = max(self._row, math.ceil(self._now_s / self._dt_s - _TICK_TOLERANCE))
+        end_row = max(self._row, self._limits.rows(self._now_s))
         stretch = Stretch(np.concatenate(self._table), self._row, end_row)
         self._row = end_row
         self._table = [stretch.table[-1:]]
         return stretch
 
     def _take(self, motion: Rapid | Feed | Arc) -> None:
-        self._limits.check(motion, self._at)
         row = piece(motion, self._at, self._limits)
         self._at = motion.end
         if row is None:
@@ -117,10 +113,9 @@ class LookAhead:
         self._new.append(row)
 
     def _dwell(self, motion: Dwell) -> None:
-        check_dwell(motion, self._dt_s)
         self._stop(self._settle_rows)
         self._place = 2.0 * motion.line
-        self._hold(math.ceil(motion.seconds / self._dt_s - _TICK_TOLERANCE))
+        self._hold(self._limits.rows(motion.seconds))
 
     def _stop(self, rows: int) -> None:
         """Plan to a stop, and rest until the next row and ``rows`` more."""
@@ -131,14 +126,13 @@ class LookAhead:
         self._hold(rows)
 
     def _hold(self, rows: int) -> None:
-        end_row = math.ceil(self._now_s / self._dt_s - _TICK_TOLERANCE) + rows
+        end_row = self._limits.rows(self._now_s) + rows
         self._table.append(np.array([[self._now_s, self._planned_mm, 0.0, 0.0, self._place]]))
         self._pass_time(end_row * self._dt_s)
 
     def _pass_time(self, now_s: float) -> None:
         self._now_s = now_s
-        if now_s > self._max_s:
-            raise ProgramError(int(self._place) // 2, "", f"by here the program lasts {now_s / 3600:.3g} h; split it")
+        check_duration(int(self._place) // 2, now_s, self._max_s)
 
     def _plan(self, stop: bool) -> None:
         """Plan what is new with what waits; with ``stop`` all of it, to rest at its end."""
@@ -200,8 +194,8 @@ class LookAhead:
         self._ahead = self._ahead[self._ahead[:, speed.HIGH] > self._planned_mm]
 
 
-def _filter_rows(config: MachineConfig) -> int:
+def _filter_rows(config: MachineConfig, limits: AxisLimits) -> int:
     """Length of the average that turns steps of acceleration, from one limit to the other, into ramps of the jerk."""
-    axes = config.axis.values()
-    longest_s = max(2.0 * axis.max_acceleration_mm_s2 / axis.jerk_mm_s3 for axis in axes)
-    return max(1, math.ceil(longest_s / config.machine.sync_period_s - _TICK_TOLERANCE))
+    return max(
+        1, limits.rows(max(2.0 * axis.max_acceleration_mm_s2 / axis.jerk_mm_s3 for axis in config.axis.values()))
+    )

@@ -7,16 +7,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fdhil.program.arcs import sweep
-from fdhil.program.motions import PLANE_AXES, PLANES, Arc, Feed, Point, Rapid
+from fdhil.program.motions import PLANE_AXES, PLANES, Arc, Feed, Point, Rapid, Swept
 from fdhil.program.planner.limits import AxisLimits
 from fdhil.records import Float, Int
 
-# columns of a piece; a line's kind is -1, an arc's the index of its plane
+# columns of a piece; the kind of an arc is the index of its plane
 KIND, LINE, RAPID, LENGTH, SPEED, ACCELERATION, JERK, BLENDS, TOLERANCE = range(9)
 START, STOP = slice(9, 12), slice(12, 15)
 _EXTRA = slice(15, 21)  # of an arc: centre, radius at start and end, angle at the start, angle swept
 WIDTH = 21
+LINE_KIND = -1.0
 _NO_EXTRA = (0.0,) * 6
 Row = tuple[float, ...]
 
@@ -24,10 +24,13 @@ Row = tuple[float, ...]
 def piece(motion: Rapid | Feed | Arc, start: Point, limits: AxisLimits) -> Row | None:
     """Return the row of one motion, None where it has no length. Speeds keep each axis within its own limit."""
     extra: Row = _NO_EXTRA
-    kind = -1.0
+    kind = LINE_KIND
     if isinstance(motion, Arc):
-        share, length, extra = _arc(motion, start)
-        kind = float(PLANES.index(motion.plane))
+        path = Swept.of(motion, start)
+        kind, length = float(PLANES.index(motion.plane)), path.length_mm
+        share = [1.0, 1.0, 1.0]
+        share[PLANE_AXES[motion.plane][2]] = abs(path.rise_mm) / length if length else 0.0
+        extra = (path.centre.real, path.centre.imag, *path.radii, path.begin_rad, path.angle_rad)
     else:
         length = math.dist(start, motion.end)
         share = [abs(b - a) / length if length else 0.0 for a, b in zip(start, motion.end, strict=True)]
@@ -46,20 +49,6 @@ def piece(motion: Rapid | Feed | Arc, start: Point, limits: AxisLimits) -> Row |
     )  # fmt: skip
 
 
-def _arc(motion: Arc, start: Point) -> tuple[list[float], float, Row]:
-    first, second, normal = PLANE_AXES[motion.plane]
-    centre = (motion.centre[first] or 0.0, motion.centre[second] or 0.0)
-    begin = (start[first] - centre[0], start[second] - centre[1])
-    finish = (motion.end[first] - centre[0], motion.end[second] - centre[1])
-    angle = sweep(begin, finish, motion.turns)
-    radii = math.hypot(*begin), math.hypot(*finish)
-    rise = motion.end[normal] - start[normal]
-    length = math.hypot((radii[0] + radii[1]) / 2.0 * angle, rise)
-    share = [1.0, 1.0, 1.0]
-    share[normal] = abs(rise) / length if length else 0.0
-    return share, length, (*centre, *radii, math.atan2(begin[1], begin[0]), angle)
-
-
 def _turning(pieces: Float) -> Iterator[tuple[Int, tuple[int, int, int]]]:
     """Yield the rows of the arcs of each plane with the plane's axes."""
     for plane, name in enumerate(PLANES):
@@ -70,7 +59,11 @@ def _turning(pieces: Float) -> Iterator[tuple[Int, tuple[int, int, int]]]:
 
 def points(pieces: Float, distance: Float) -> Float:
     """Return the points (n, 3) of pieces (n, WIDTH) at ``distance`` (n,) mm from their starts."""
-    share = np.clip(distance / pieces[:, LENGTH], 0.0, 1.0)
+    return points_at(pieces, np.clip(distance / pieces[:, LENGTH], 0.0, 1.0))
+
+
+def points_at(pieces: Float, share: Float) -> Float:
+    """Return the points (n, 3) of pieces (n, WIDTH) at ``share`` (n,) of their lengths, 0 to 1."""
     start, stop = pieces[:, START], pieces[:, STOP]
     position = start + (stop - start) * share[:, None]
     at_end = share >= 1.0

@@ -14,41 +14,38 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.errors import ProgramError
 from fdhil.program.motions import Arc, Dwell, Feed, Motion, Point, Rapid
-from fdhil.program.planner.limits import AxisLimits, check_dwell
-from fdhil.program.planner.linuxcnc.blends import Machine, join
+from fdhil.program.planner.limits import AxisLimits, check_duration
+from fdhil.program.planner.linuxcnc.blends import join
 from fdhil.program.planner.linuxcnc.cycles import Cycles
 from fdhil.program.planner.linuxcnc.joining import joined
 from fdhil.program.planner.linuxcnc.segments import STOP, TANGENT, Segment, segment
-from fdhil.records import Float, Int
+from fdhil.records import Float
 
 _DEPTH = 50
 _UNSETTLED = 3  # of the newest segments the limits have just changed
-_TICK_TOLERANCE = 1e-6
 _INTERPOLATED_ROWS = 2
-Row = tuple[float, float, float, int, bool]
+Row = tuple[float, float, float, int, bool]  # X, Y, Z, source line, rapid
 
 
 class Planner:
     """Turns motions into rows; ProgramError when they last longer than ``max_rows``."""
 
     def __init__(self, config: MachineConfig, max_rows: float = math.inf) -> None:
-        self._dt_s = config.machine.sync_period_s
-        self._max_rows = max_rows
         self._limits = AxisLimits.of(config)
-        self._machine = Machine(self._limits.speed, self._limits.acceleration, self._dt_s)
+        self._dt_s = self._limits.dt_s
+        self._max_s = max_rows * self._dt_s
         self._stop_always = config.nc.corner == "exact_stop"
-        self._settle_rows = math.ceil(config.nc.settle_s / self._dt_s - _TICK_TOLERANCE)
-        self._end_rows = math.ceil(config.nc.end_rest_s / self._dt_s - _TICK_TOLERANCE)
+        self._settle_rows = self._limits.rows(config.nc.settle_s)
+        self._end_rows = self._limits.rows(config.nc.end_rest_s)
         self._queue: deque[Segment] = deque()
         self._cycles = Cycles(self._queue, self._dt_s)
         self._at: Point = (0.0, 0.0, 0.0)
         self._line = 0
         self._count = 0
 
-    def parts(self, motions: Iterable[Motion], block_rows: int) -> Iterator[tuple[Float, Int, Int]]:
-        """Yield position (n, 3) in mm, source line (n,) and rapid (n,) 0 or 1 in blocks; the first row is the rest."""
+    def parts(self, motions: Iterable[Motion], block_rows: int) -> Iterator[Float]:
+        """Yield X, Y, Z in mm, source line and rapid (0 or 1) in blocks (n, 5); the first row is the rest."""
         rows: list[Row] = []
         past = np.zeros((2, 3))
         for row in self._rows(motions):
@@ -63,11 +60,11 @@ class Planner:
     def _rows(self, motions: Iterable[Motion]) -> Iterator[Row]:
         yield (*self._at, 0, False)
         for motion in joined(motions):
+            self._limits.check(motion, self._at)
             if isinstance(motion, Dwell):
-                check_dwell(motion, self._dt_s)
                 yield from self._run(0)
                 self._line = motion.line
-                yield from self._rest(math.ceil(motion.seconds / self._dt_s - _TICK_TOLERANCE))
+                yield from self._rest(self._limits.rows(motion.seconds))
             else:
                 self._take(motion)
                 yield from self._run(_DEPTH)
@@ -75,7 +72,6 @@ class Planner:
         yield from self._rest(self._end_rows + _INTERPOLATED_ROWS)
 
     def _take(self, motion: Rapid | Feed | Arc) -> None:
-        self._limits.check(motion, self._at)
         new = segment(motion, self._at, self._limits)
         self._at = motion.end
         if new is None:
@@ -85,7 +81,7 @@ class Planner:
         if self._stop_always:
             new.ending = STOP
         if self._queue:
-            for ready in join(self._queue.pop(), new, self._machine):
+            for ready in join(self._queue.pop(), new, self._limits):
                 ready.settle(self._dt_s)
                 self._queue.append(ready)
         self._queue.append(new)
@@ -125,14 +121,12 @@ class Planner:
 
     def _check(self, rows: int = 1, ahead: float = 0.0) -> None:
         self._count += rows
-        if self._count + ahead > self._max_rows:
-            hours = (self._count + ahead) * self._dt_s / 3600
-            raise ProgramError(self._line, "", f"by here the program lasts {hours:.3g} h; split it")
+        check_duration(self._line, (self._count + ahead) * self._dt_s, self._max_s)
 
 
-def _part(rows: list[Row], past: Float) -> tuple[tuple[Float, Int, Int], Float]:
+def _part(rows: list[Row], past: Float) -> tuple[Float, Float]:
     """Return a block of rows and its last two points: the joints' cubic interpolation weighs three points in a row."""
-    table = np.array(rows)
+    table = np.array(rows, dtype=np.float64)
     points = np.concatenate([past, table[:, :3]])
-    smooth = points[1:-1] + (points[:-2] - 2.0 * points[1:-1] + points[2:]) / 6.0
-    return (smooth, table[:, 3].astype(np.int64), table[:, 4].astype(np.int64)), points[-2:]
+    table[:, :3] = points[1:-1] + (points[:-2] - 2.0 * points[1:-1] + points[2:]) / 6.0
+    return table, points[-2:]

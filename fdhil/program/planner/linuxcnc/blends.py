@@ -1,4 +1,4 @@
-"""How two segments meet: straight through, with a stop, by a parabola, or by an arc that touches both.
+"""Blends decide how two segments meet: straight through, with a stop, by a parabola, or by an arc that touches both.
 
 What LinuxCNC's planner does, as its demand shows: a kink so slight that its step takes less than a tenth of the axes'
 acceleration is passed; under G64 the better of an arc and a parabola is taken, a parabola counting half, since both of
@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass
 
 from fdhil.program.motions import Point
+from fdhil.program.planner.limits import AxisLimits
 from fdhil.program.planner.linuxcnc.segments import (
     ALONG_SHARE,
     EXACT,
@@ -34,30 +35,21 @@ _ARC_SHARE, _ARC_SHARE_AT_END = 1.0 / 3.0, 2.0 / 3.0  # of an arc's angle that o
 _LEAST_HALF_OF_ARCS_RAD = math.pi / 12.0  # sharper corners of two arcs get no arc
 
 
-@dataclass(frozen=True, slots=True)
-class Machine:
-    """What blends keep: the axes' limits and the period of a cycle."""
-
-    speed: Point
-    acceleration: Point
-    dt_s: float
-
-
-def join(before: Segment, after: Segment, machine: Machine) -> tuple[Segment, ...]:
+def join(before: Segment, after: Segment, limits: AxisLimits) -> tuple[Segment, ...]:
     """Decide how ``before`` goes over into ``after``; return what stands for ``before`` from then on.
 
     That is itself, with an arc behind it where one is put between them, or the arc alone where that takes it in.
     """
     if before.rapid != after.rapid:
         before.ending = STOP
-    if before.ending == STOP or _passed(before, after, machine) or before.ending == EXACT:
+    if before.ending == STOP or _passed(before, after, limits) or before.ending == EXACT:
         return (before,)
-    arc = _arc(before, after, machine)
+    arc = _arc(before, after, limits)
     parabola = blend_speeds(before, after, probing=True)[2] / 2.0
     if arc is not None and arc.segment.top >= max(parabola, before.kink_speed):
         _forget_kink(before, after)
         before.ending = TANGENT
-        return arc.put_between(before, after, machine.dt_s)
+        return arc.put_between(before, after, limits.dt_s)
     if before.kink_speed > parabola:
         before.ending = TANGENT
     else:
@@ -70,15 +62,15 @@ def _forget_kink(before: Segment, after: Segment) -> None:
     before.kink_speed, before.kept_back, after.kept_back_before = math.inf, 0.0, 0.0
 
 
-def _passed(before: Segment, after: Segment, machine: Machine) -> bool:
+def _passed(before: Segment, after: Segment, limits: AxisLimits) -> bool:
     """Tell whether the kink may be passed at full speed; else what speed it allows is kept."""
     t1, t2 = before.shape.tangent(before.shape.length), after.shape.tangent(0.0)
     if dot(t1, t2) < _REVERSAL:
         before.ending = EXACT  # measured: a stop, and nothing is kept back for it
         return False
     speed = min(before.free, after.free)
-    step = speed / machine.dt_s + after.acceleration
-    share = max(abs(b - a) * step / limit for a, b, limit in zip(t1, t2, machine.acceleration, strict=True))
+    step = speed / limits.dt_s + after.acceleration
+    share = max(abs(b - a) * step / limit for a, b, limit in zip(t1, t2, limits.acceleration, strict=True))
     if isinstance(before.shape, Turn) or isinstance(after.shape, Turn):
         share /= _KINK_SHARE_OF_ARC
     kept = min(share, _KINK_SHARE)
@@ -132,7 +124,7 @@ class _Arc:
         return (arc,)
 
 
-def _arc(before: Segment, after: Segment, machine: Machine) -> _Arc | None:
+def _arc(before: Segment, after: Segment, limits: AxisLimits) -> _Arc | None:
     """Return the arc that touches both, None where none fits: they are to lie in one plane."""
     one, two = before.shape, after.shape
     if isinstance(one, Led) or isinstance(two, Led):
@@ -144,14 +136,14 @@ def _arc(before: Segment, after: Segment, machine: Machine) -> _Arc | None:
         return None
     if not (_in_plane(one, normal) and _in_plane(two, normal)):
         return None
-    limit = _within_plane(machine.acceleration, normal)
+    limit = _within_plane(limits.acceleration, normal)
     tolerance = min(_tolerance(before), _tolerance(after))
     room1, room2 = _room(before, t2, half, True), _room(after, t1, half, False)
     half_taken = half - max(room1.steeper, room2.steeper)
     if isinstance(one, Turn) and isinstance(two, Turn) and half_taken < _LEAST_HALF_OF_ARCS_RAD:
         return None
     reach = min(room1.reach, room2.reach, math.cos(half_taken) * tolerance / (1.0 - math.sin(half_taken)))
-    goal = min(max(before.free, after.free), _fastest(before, after, half, machine, normal))
+    goal = min(max(before.free, after.free), _fastest(before, after, half, limits, normal))
     widest = math.tan(half_taken) * reach
     speed = min(math.sqrt(NORMAL_SHARE * limit * widest), goal)
     # measured: where there is room, the arc lasts as long as half of the acceleration needs for its speed
@@ -211,9 +203,9 @@ def _within_plane(limits: Point, normal: Point) -> float:
     return min(limit / scale for limit, scale in zip(limits, scales, strict=True) if scale > 1e-9)
 
 
-def _fastest(before: Segment, after: Segment, half: float, machine: Machine, normal: Point) -> float:
+def _fastest(before: Segment, after: Segment, half: float, limits: AxisLimits, normal: Point) -> float:
     """Return the speed at which the axes' speeds are kept along the whole of an arc from one way to the other."""
-    plane = _within_plane(machine.speed, normal)
+    plane = _within_plane(limits.speed, normal)
     if isinstance(before.shape, Turn) or isinstance(after.shape, Turn):
         return plane
     turned = min(math.pi - 2.0 * half, 0.49 * math.pi)

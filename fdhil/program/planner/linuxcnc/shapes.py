@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from fdhil.program.arcs import sweep
-from fdhil.program.motions import PLANE_AXES, Arc, Point
+from fdhil.program.motions import PLANE_AXES, Arc, Point, Swept
 
 
 def plus(a: Point, b: Point, share: float = 1.0) -> Point:
@@ -140,14 +139,11 @@ def line(start: Point, end: Point) -> Line:
 def turn(motion: Arc, start: Point) -> Turn:
     """Return the arc or helix of a motion."""
     first, second, normal = PLANE_AXES[motion.plane]
-    centre = (motion.centre[first] or 0.0, motion.centre[second] or 0.0)
-    begin = (start[first] - centre[0], start[second] - centre[1])
-    finish = (motion.end[first] - centre[0], motion.end[second] - centre[1])
-    angle = sweep(begin, finish, motion.turns)
-    radius, last = math.hypot(*begin), math.hypot(*finish)
-    c, s = begin[0] / radius, begin[1] / radius
-    sense = math.copysign(1.0, angle)
-    rise = motion.end[normal] - start[normal]
+    path = Swept.of(motion, start)
+    radius, last = path.radii
+    x, y = path.centre.real, path.centre.imag
+    c, s = (start[first] - x) / radius, (start[second] - y) / radius
+    sense = math.copysign(1.0, path.angle_rad)
 
     def whole(a: float, b: float, n: float) -> Point:
         place = [0.0, 0.0, 0.0]
@@ -155,7 +151,7 @@ def turn(motion: Arc, start: Point) -> Turn:
         return (place[0], place[1], place[2])
 
     return Turn(
-        centre=whole(*centre, start[normal]), u=whole(c, s, 0.0), v=whole(-s * sense, c * sense, 0.0), radius=radius,
-        growth=last - radius, angle=abs(angle), rise=whole(0.0, 0.0, rise),
-        length=math.hypot((radius + last) / 2.0 * angle, rise),
+        centre=whole(x, y, start[normal]), u=whole(c, s, 0.0), v=whole(-s * sense, c * sense, 0.0),
+        radius=radius, growth=last - radius, angle=abs(path.angle_rad), rise=whole(0.0, 0.0, path.rise_mm),
+        length=path.length_mm,
     )  # fmt: skip
