@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fdhil.identification.batch_filter import whiten
+from fdhil.identification.innovations import whiten
 from fdhil.identification.motion import Motion, Noise
 from fdhil.records import Float
 

@@ -15,13 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdhil.config import Identification
-from fdhil.identification.batch_filter import whiten
 from fdhil.identification.covariance import TESTED_LAGS, aliasing, robust, suspicious
 from fdhil.identification.delay import coarse_delay
 from fdhil.identification.estimators import least_squares
 from fdhil.identification.estimators.least_squares import Signals
 from fdhil.identification.identifiability import judge
-from fdhil.identification.innovations import Gains, gains_of, innovations
+from fdhil.identification.innovations import Gains, gains_of, innovations, whiten
 from fdhil.identification.motion import UNKNOWN, Motion, Noise, prepare
 from fdhil.identification.noise import fit_noise
 from fdhil.identification.normal import inverse_of, solve
