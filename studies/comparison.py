@@ -19,14 +19,14 @@ from typing import Any
 import numpy as np
 
 from fdhil.config import Identification
-from fdhil.identification.derivatives import OPERATORS
-from fdhil.identification.estimators import instrumental_variables, least_squares, maximum_likelihood, partial_moments
+from fdhil.identification.estimators import least_squares, maximum_likelihood, partial_moments
 from fdhil.identification.filtering import zero_phase
 from fdhil.identification.normal import solve
 from fdhil.records import PARAMETERS, Recording, Window, frozen
 from fdhil.store.recording_csv import parse_recording
-from studies import bench, pages
+from studies import bench, instrumental_variables, pages
 from studies.comparison_page import figure, text
+from studies.derivative_operators import OPERATORS
 from studies.estimators import TRUTH, Array, bound, noisy
 
 NOISES = (0.001, 0.005, 0.01)

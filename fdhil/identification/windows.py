@@ -184,13 +184,7 @@ def _plateau(moving: Float) -> float:
 
 def longest(flags: Bool) -> tuple[int, int]:
     """Return the half-open range of the longest run of True; (0, 0) when there is none."""
-    padded = np.concatenate([[False], flags, [False]])
-    edges = np.flatnonzero(np.diff(padded.astype(np.int8)))
-    if edges.size == 0:
-        return 0, 0
-    starts, ends = edges[::2], edges[1::2]
-    k = int(np.argmax(ends - starts))
-    return int(starts[k]), int(ends[k])
+    return next(iter(runs_of(flags, 1)), (0, 0))
 
 
 def runs_of(flags: Bool, least: int) -> list[tuple[int, int]]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from fdhil.config import Identification
 from fdhil.identification.covariance import aliasing, attenuation, residual_gammas, two_step
-from fdhil.identification.derivatives import OPERATORS, ZERO_FORCING_1, Operator, derivative
+from fdhil.identification.derivatives import ZERO_FORCING_1, Operator, derivative
 from fdhil.identification.filtering import all_about, impulse_response, reach, zero_phase
 from fdhil.identification.identifiability import empty_estimate, judge
 from fdhil.identification.motion import noise_levels, surely_moving
@@ -82,20 +82,15 @@ def regressors(signals: Signals, dt_s: float, operator: Operator = ZERO_FORCING_
 
 
 def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
-    """Fit [5] and [6] to the windows together; see :func:`estimate_with` for another operator."""
-    return estimate_with(windows, settings, ZERO_FORCING_1.name)
-
-
-def estimate_with(windows: Sequence[Window], settings: Identification, operator: str) -> Estimate:
-    """Fit [5] and [6] with a named derivative operator."""
-    parts = [regressors(align(w, settings), w.dt_s, OPERATORS[operator]) for w in windows if w.voltage_v is not None]
+    """Fit [5] and [6] to the windows together."""
+    parts = [regressors(align(w, settings), w.dt_s) for w in windows if w.voltage_v is not None]
     parts = [p for p in parts if p[0].shape[0] > 0]
     rows = sum(p[0].shape[0] for p in parts)
     if rows < 8:
         return too_short(NAME, rows)
     noise = np.mean([noise_levels(w).vector() ** 2 for w in windows], axis=0)
     impulse = impulse_response(settings.lowpass_hz, windows[0].dt_s)
-    slope = np.nan_to_num(derivative(impulse, windows[0].dt_s, OPERATORS[operator]))
+    slope = np.nan_to_num(derivative(impulse, windows[0].dt_s))
     return fit_two_steps(NAME, parts, noise, impulse, slope, aliasing(windows[0].voltage_sampling, windows[0].dt_s))
 
 
