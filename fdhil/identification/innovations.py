@@ -42,7 +42,7 @@ def gains_of(motion: Motion, theta: Float, noise: Noise) -> Gains:
     """Return the filter's gains for ``theta`` (7,) = [R, L, K, Jt, ft, Cd, delay]."""
     variances = noise.vector() ** 2
     if motion.slow is not None:
-        return Gains(NOTHING, innovations_of(motion, theta, variances, float(theta[DELAY])).logdet, variances)
+        return Gains(NOTHING, innovations_of(motion, theta, variances).logdet, variances)
     gains = np.zeros((motion.n, 7))
     return Gains(gains, float(_whitened(motion, theta[None], variances[None], gains)[1][0]))
 
@@ -58,7 +58,7 @@ def whiten(motion: Motion, thetas: Float, variances: Float) -> tuple[Float, Floa
         white, logdet = _whitened(motion, thetas, variances, NOTHING)
         return white.reshape(len(thetas), -1).T, logdet
     pairs = zip(thetas, variances, strict=True)
-    made = [innovations_of(motion, theta, v, float(theta[DELAY])) for theta, v in pairs]
+    made = [innovations_of(motion, theta, v) for theta, v in pairs]
     return np.column_stack([one.whitened for one in made]), np.array([one.logdet for one in made])
 
 
@@ -95,12 +95,7 @@ def _course(motion: Motion, emf_share: float) -> tuple[Float, float]:
 
 
 def innovations(
-    motion: Motion,
-    theta: Float,
-    gains: Gains,
-    delay_s: float = 0.0,
-    load_nm: Float | None = None,
-    emf_share: float = 1.0,
+    motion: Motion, theta: Float, gains: Gains, load_nm: Float | None = None, emf_share: float = 1.0
 ) -> Float:
     """Return the whitened innovations (m,) by a filter that was made before, in the order of :func:`whiten`.
 
@@ -108,11 +103,10 @@ def innovations(
     of the back-EMF's ramp within a voltage sample is taken.
     """
     if motion.slow is not None:
-        late = np.append(theta[:DELAY], delay_s)
-        return innovations_of(motion, late, gains.variances, delay_s, load_nm).whitened
+        return innovations_of(motion, theta, gains.variances, load_nm=load_nm).whitened
     load = theta[CD] * motion.mode
     rise_v, share = _course(motion, emf_share)
-    signals = np.stack([load, motion.delayed(delay_s), motion.current, motion.speed])
+    signals = np.stack([load, motion.delayed(float(theta[DELAY])), motion.current, motion.speed])
     loads = (load if load_nm is None else load + load_nm)[None]
     return _responses(motion, theta, gains, signals, LOAD, loads, rise_v[None], share)[:, 0]
 

@@ -108,18 +108,19 @@ def innovations_of(
     motion: Motion,
     theta: Float,
     variances: Float,
-    ordered_for_s: float,
+    ordered_for_s: float | None = None,
     load_nm: Float | None = None,
     spread: Float | None = None,
 ) -> Innovations:
     """Return the innovations by the filter that is right for ``theta`` (7,) = [R, L, K, Jt, ft, Cd, delay].
 
-    ``variances`` (3,) are those of voltage, current and speed; ``ordered_for_s`` as in :func:`marks_of`; ``load_nm``
-    (n,) is a torque against the positive direction over each row's interval; ``spread`` (n, 2) stands in the place of
-    what :func:`spread_of` gives.
+    ``variances`` (3,) are those of voltage, current and speed; ``ordered_for_s`` as in :func:`marks_of`, the delay
+    itself when left out; ``load_nm`` (n,) is a torque against the positive direction over each row's interval;
+    ``spread`` (n, 2) stands in the place of what :func:`spread_of` gives.
     """
     assert motion.slow is not None
-    marks = marks_of(motion, float(theta[DELAY]), ordered_for_s)
+    delay_s = float(theta[DELAY])
+    marks = marks_of(motion, delay_s, delay_s if ordered_for_s is None else ordered_for_s)
     made = slow_innovations(
         theta,
         motion.dt_s,
@@ -153,14 +154,13 @@ def course_effect(motion: Motion, theta: Float, variances: Float) -> Float:
     accelerating = theta[JT] / theta[K] * np.gradient(moving_mean(motion.speed, SMOOTH_ROWS), motion.dt_s)
     late_rows = max(CURRENT_LATE, CURRENT_LATE_S / motion.dt_s)  # finer rows make no finer regulators
     mean = replace(motion, current=motion.current + late_rows * slope - CURRENT_ABOVE * accelerating)
-    delay = float(theta[DELAY])
-    changed: Float = innovations_of(mean, theta, variances, delay).whitened
-    return changed - innovations_of(motion, theta, variances, delay).whitened
+    changed: Float = innovations_of(mean, theta, variances).whitened
+    return changed - innovations_of(motion, theta, variances).whitened
 
 
 def left_open_v(motion: Motion, theta: Float, variances: Float) -> float:
     """Return the standard deviation (V) of what current and speed leave open of a voltage sample, in the median."""
-    made = innovations_of(motion, theta, variances, float(theta[DELAY]))
+    made = innovations_of(motion, theta, variances)
     known = made.values[2 * motion.n :] != 0.0
     if not known.any():
         return 0.0

@@ -158,7 +158,7 @@ class Bench:
         elif kind == SPEED:
             motion = replace(motion, speed=motion.speed + course)
         load = course if kind == LOAD else None
-        change: Float = self.fit.residuals - innovations(motion, theta, gains, theta[6], load).ravel()
+        change: Float = self.fit.residuals - innovations(motion, theta, gains, load)
         return change
 
     def scores(self, directions: Float) -> tuple[Float, Float, Float]:
@@ -209,7 +209,7 @@ def courses(fit: Fit) -> Float:
     missed = doubt * theta[0] * theta[3] / theta[2] * rate
     if motion.slow is not None:
         moved = replace(motion, voltage_mean=motion.voltage_mean + motion.at_voltage(missed))
-        return np.column_stack([shape, innovations(moved, theta, fit.problem.filters[0], theta[6]) - fit.residuals])
+        return np.column_stack([shape, innovations(moved, theta, fit.problem.filters[0]) - fit.residuals])
     answer = answers(motion, theta, fit.problem.filters[0], VOLTAGE, missed[None], np.zeros((1, motion.n)))
     return np.column_stack([shape, answer])
 

@@ -23,6 +23,7 @@ from fdhil.identification.windows import carried
 from fdhil.records import PARAMETERS, Bool, Estimate, Float, Reason, Result, Window
 
 NAME = "least_squares"
+ORDER = [1, 0, 2, 3, 4, 5]  # from L, R, K to R, L, K, and back
 # of [L, R, K, Jt, ft, Cd]: what stencils and the voltage's course within a sample leave open, however low the noise
 OPEN_SHARE = np.array([1e-3, 5e-4, 5e-5, 3e-4, 0.0, 0.0])
 
@@ -88,10 +89,15 @@ def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
     rows = sum(p[0].shape[0] for p in parts)
     if rows < 8:
         return too_short(NAME, rows)
-    noise = np.mean([noise_levels(w).vector() ** 2 for w in windows], axis=0)
+    alias = aliasing(windows[0].voltage_sampling, windows[0].dt_s)
+    return fit_two_steps(NAME, parts, *noise_through(windows, settings), alias)
+
+
+def noise_through(windows: Sequence[Window], settings: Identification) -> tuple[Float, Float, Float]:
+    """Return the variances (3,) of voltage, current and speed, and what low-pass and operator make of one sample."""
     impulse = impulse_response(settings.lowpass_hz, windows[0].dt_s)
-    slope = np.nan_to_num(derivative(impulse, windows[0].dt_s))
-    return fit_two_steps(NAME, parts, noise, impulse, slope, aliasing(windows[0].voltage_sampling, windows[0].dt_s))
+    noise = np.mean([noise_levels(w).vector() ** 2 for w in windows], axis=0)
+    return noise, impulse, np.nan_to_num(derivative(impulse, windows[0].dt_s))
 
 
 def too_short(method: str, rows: int) -> Estimate:
@@ -113,27 +119,44 @@ def fit_two_steps(
     if not (np.isfinite(electrical).all() and np.isfinite(mechanical).all()):
         reason = Reason("NotFinite", "a filtered signal is not finite", "check the sensor")
         return empty_estimate(method, Result.NOT_FINITE, reason)
-    first, condition_1 = solve(electrical[:, 1:], electrical[:, 0])
-    torque = mechanical[:, 0] * first[2]
-    second, condition_2 = solve(mechanical[:, 1:], torque)
-    theta = np.concatenate([first, second])
-    residual_u = electrical[:, 0] - electrical[:, 1:] @ first
-    residual_t = torque - mechanical[:, 1:] @ second
+    theta, condition = solve_two_steps(electrical, mechanical)
+    residual_u, residual_t = residuals_of(theta, electrical, mechanical)
     noise = np.append(_voltage_variance(residual_u, theta, impulse, slope, noise), noise[1:])
     gammas = residual_gammas(theta, impulse, slope, noise)
     covariance = two_step(electrical, mechanical, (residual_u, residual_t), gammas, [p[0].shape[0] for p in parts])
     bias = attenuation(electrical, mechanical, theta, impulse, slope, noise)
     covariance += np.outer(bias, bias) + np.diag(np.square(OPEN_SHARE * theta))
-    order = [1, 0, 2, 3, 4, 5]  # from L, R, K to R, L, K
+    covariance += np.diag(np.square(alias[ORDER] * theta))
+    return two_step_estimate(method, theta, covariance, (residual_u, residual_t), condition, mechanical)
+
+
+def solve_two_steps(electrical: Float, mechanical: Float) -> tuple[Float, float]:
+    """Return [L, R, K, Jt, ft, Cd] (6,) by least squares on [5], then on [6], and the larger condition number."""
+    first, condition_1 = solve(electrical[:, 1:], electrical[:, 0])
+    second, condition_2 = solve(mechanical[:, 1:], mechanical[:, 0] * first[2])
+    return np.concatenate([first, second]), max(condition_1, condition_2)
+
+
+def residuals_of(theta: Float, electrical: Float, mechanical: Float) -> tuple[Float, Float]:
+    """Return what ``theta`` = [L, R, K, Jt, ft, Cd] leaves of [5] (m,) in V, and of K times [6] (m,) in N.m."""
+    torque = mechanical[:, 0] * theta[2]
+    return electrical[:, 0] - electrical[:, 1:] @ theta[:3], torque - mechanical[:, 1:] @ theta[3:]
+
+
+def two_step_estimate(
+    method: str, theta: Float, covariance: Float, residuals: tuple[Float, Float], condition: float, mechanical: Float
+) -> Estimate:
+    """Return the judged estimate of ``theta`` = [L, R, K, Jt, ft, Cd] with its covariance (6, 6) in that order."""
+    electrical, torque = residuals
     answer = Estimate(
         method=method,
         names=PARAMETERS,
-        values=theta[order],
-        covariance=covariance[np.ix_(order, order)] + np.diag(np.square(alias * theta[order])),
-        residuals={"electrical": residual_u, "mechanical": residual_t / first[2] if first[2] else residual_t},
+        values=theta[ORDER],
+        covariance=covariance[np.ix_(ORDER, ORDER)],
+        residuals={"electrical": electrical, "mechanical": torque / theta[2] if theta[2] else torque},
         result=Result.OK,
     )
-    return judge(answer, max(condition_1, condition_2), float(np.abs(mechanical[:, 2]).max()))
+    return judge(answer, condition, float(np.abs(mechanical[:, 2]).max()))
 
 
 def _voltage_variance(residual_u: Float, theta: Float, impulse: Float, slope: Float, noise: Float) -> float:
@@ -151,6 +174,4 @@ def raw_values(signals: Sequence[Signals], dt_s: Sequence[float]) -> Float | Non
     electrical, mechanical = (np.vstack([p[k] for p in parts]) for k in (0, 1))
     if not (np.isfinite(electrical).all() and np.isfinite(mechanical).all()):
         return None
-    (inductance, resistance, constant), _ = solve(electrical[:, 1:], electrical[:, 0])
-    second, _ = solve(mechanical[:, 1:], mechanical[:, 0] * constant)
-    return np.array([resistance, inductance, constant, *second])
+    return solve_two_steps(electrical, mechanical)[0][ORDER]
