@@ -1,4 +1,4 @@
-"""How the parameters move from rapid to rapid: jumps held back, a changed load, maintenance alarms.
+"""Follows the parameters from rapid to rapid: jumps held back, a changed load, maintenance alarms.
 
 Pure: the same estimates in the same order give the same notices. Nothing here reads a clock.
 """

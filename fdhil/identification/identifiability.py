@@ -1,4 +1,4 @@
-"""What the data can tell: a parameter without an interval is not published, it has a reason instead."""
+"""Withholds what the data cannot tell: a parameter without an interval has a reason instead."""
 
 from __future__ import annotations
 

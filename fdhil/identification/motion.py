@@ -1,4 +1,4 @@
-"""A window made ready for the estimators: where the drive surely moves, and the voltage over each interval."""
+"""Makes a window ready for the estimators: where the drive surely moves, and the voltage over each interval."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Noise levels of voltage, current and speed by maximum likelihood of the innovations, for given parameters."""
+"""Tells the noise levels of voltage, current and speed, for given parameters, by the likelihood of the innovations."""
 
 from __future__ import annotations
 

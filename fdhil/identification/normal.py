@@ -1,4 +1,4 @@
-"""Linear least squares by scaled normal equations: small, fast, and on one thread.
+"""Solves linear least squares by scaled normal equations: small, fast, and on one thread.
 
 The regressions here have a handful of well-scaled columns and thousands of rows; an orthogonal factorisation would
 cost ten times more and, in a library with its own threads, disturb the bus's receive thread. At six columns most of a

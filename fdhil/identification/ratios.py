@@ -1,4 +1,4 @@
-"""Without voltage [5] cannot be fitted, and K stays open; [6] alone still gives Jt/K, ft/K and Cd/K."""
+"""Fits [6] alone where there is no voltage: K stays open, and Jt/K, ft/K and Cd/K are told."""
 
 from __future__ import annotations
 

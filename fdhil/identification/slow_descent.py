@@ -1,4 +1,4 @@
-"""The most likely parameters of windows with a slow voltage: Fisher's scoring on the likelihood of all innovations.
+"""Climbs to the most likely parameters of windows with a slow voltage, by Fisher's scoring on all innovations.
 
 How sure an innovation is depends on the parameters too: half of what a slow voltage is off by is the current at the
 ends of its samples, times L / T. So the likelihood is taken whole, determinant and all; its steps are those of the

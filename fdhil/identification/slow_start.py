@@ -1,4 +1,4 @@
-"""Where the fit of windows with a slow voltage starts: [5] over the sensor's own samples, and the delay to some ms."""
+"""Starts the fit of windows with a slow voltage: by [5] over the sensor's own samples, with the delay to some ms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Innovations of a window whose voltage comes from a sensor slower than the drive: one row per voltage sample.
+"""Gives innovations of a window whose voltage is from a sensor slower than the drive: one row per voltage sample.
 
 The voltage is never brought to the drive's grid. A Kalman filter runs over the drive's rows: [2] drives the speed from
 the current, the current's slope is a random walk, and each voltage sample is one more measurement, of [1] over its

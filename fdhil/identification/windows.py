@@ -1,4 +1,4 @@
-"""Rapid moves in a recording: where each begins and ends, and its stages.
+"""Finds rapid moves in a recording: where each begins and ends, and its stages.
 
 A window is a maximal run in which the smoothed speed is at least 2 % of the rapid speed, extended to rest. A run whose
 peak stays below 60 % of the rapid speed is a feed move and is not listed.

@@ -1,4 +1,4 @@
-"""What a sensor should have read over some rows, told by the other two sensors and by its own rows beside them.
+"""Tells what a sensor should have read over some rows, by the other two and by its own rows beside them.
 
 The drive's equations with the fitted parameters, and the voltage as a third state that walks from row to row: a Kalman
 filter tells how much less likely the most likely course is with the doubted readings than without them.

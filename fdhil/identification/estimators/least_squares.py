@@ -1,4 +1,4 @@
-"""The paper's method: one low-pass on every signal, operator [4], least squares on [5] and [6] of [DES].
+"""Estimates by the paper's method: one low-pass on every signal, operator [4], least squares on [5] and [6] of [DES].
 
 Each interval mean of voltage belongs to the middle of its interval; current and speed are brought to the same interval
 means, so that all three are treated alike. [6] is fitted as K i = Jt Dw + ft w + Cd sign(w) with K from [5]. Standard

@@ -1,4 +1,4 @@
-"""All six parameters together from noisy voltage, current and speed: maximum likelihood by Kalman innovations.
+"""Estimates all six parameters together from noisy signals: maximum likelihood by Kalman innovations.
 
 The voltage is noisy too, so the model driven by it is off by noise that the drive has filtered. The innovations of
 :mod:`fdhil.identification.innovations` undo that filter: they are white, and the sum of their squares is the exponent
