@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fdhil.identification import kalman
-from fdhil.identification.kalman import CD, CURRENT, DELAY, LOAD, SPEED, VOLTAGE
+from fdhil.identification.kalman import CD, CURRENT, DELAY, LOAD, SPEED, VOLTAGE, Readings
 from fdhil.identification.motion import Motion, Noise
 from fdhil.identification.slow_voltage import innovations_of
-from fdhil.records import Float, read_only
+from fdhil.records import Float
 
 __all__ = ["CURRENT", "LOAD", "SPEED", "VOLTAGE", "Gains", "answers", "gains_of", "innovations", "whiten"]
 NOTHING: Float = np.zeros((0, 0))
@@ -66,32 +66,7 @@ def _whitened(motion: Motion, thetas: Float, variances: Float, gains: Float) -> 
     delays = thetas[:, DELAY]
     together = bool((delays == delays[0]).all())
     voltages = [motion.delayed(float(d)) for d in (delays[:1] if together else delays)]
-    rise_v, emf_share = _course(motion, 1.0)
-    return kalman.whiten(
-        thetas,
-        variances,
-        motion.dt_s,
-        motion.mode,
-        motion.observed,
-        np.array(voltages),
-        rise_v,
-        emf_share,
-        read_only(motion.current),
-        read_only(motion.speed),
-        motion.speed_walk,
-        gains,
-    )
-
-
-def _course(motion: Motion, emf_share: float) -> tuple[Float, float]:
-    """Return the rises (n,) of the voltage within its intervals, none of means, and the back-EMF's share beside them.
-
-    Of the course of an interval mean within its sample only the back-EMF's ramp is certain: what the current regulator
-    adds depends on the drive, and to take it from neighbouring means biases L.
-    """
-    if motion.voltage_sampling == "interval_mean":
-        return NOTHING.ravel(), emf_share
-    return motion.voltage_rise, emf_share - 1.0
+    return kalman.whiten(thetas, variances, Readings.of(motion), np.array(voltages), gains)
 
 
 def innovations(
@@ -105,10 +80,11 @@ def innovations(
     if motion.slow is not None:
         return innovations_of(motion, theta, gains.variances, load_nm=load_nm).whitened
     load = theta[CD] * motion.mode
-    rise_v, share = _course(motion, emf_share)
+    readings = Readings.of(motion, emf_share)
     signals = np.stack([load, motion.delayed(float(theta[DELAY])), motion.current, motion.speed])
     loads = (load if load_nm is None else load + load_nm)[None]
-    return _responses(motion, theta, gains, signals, LOAD, loads, rise_v[None], share)[:, 0]
+    white = kalman.respond(theta, readings, signals, LOAD, loads, readings.rise_v[None], gains.gains)
+    return white.ravel()
 
 
 def answers(
@@ -124,16 +100,8 @@ def answers(
     ``kind`` names the signal: ``LOAD`` (N.m against the positive direction), ``VOLTAGE`` (V, over each interval with
     ``rises`` within them), ``CURRENT`` (A) or ``SPEED`` (rad/s). The window's voltage must come with its rows.
     """
-    means = motion.voltage_sampling == "interval_mean"
-    within = NOTHING if means or rises is None else np.asarray(rises)
+    readings = Readings.of(motion)
+    within = NOTHING if rises is None or not readings.rise_v.size else np.asarray(rises)
     signals = np.zeros((4, motion.n))
-    return _responses(motion, theta, gains, signals, kind, np.asarray(courses), within, _course(motion, 1.0)[1])
-
-
-def _responses(
-    motion: Motion, theta: Float, gains: Gains, signals: Float, kind: int, courses: Float, rises: Float, share: float
-) -> Float:
-    white = kalman.respond(
-        theta, motion.dt_s, motion.mode, motion.observed, signals, kind, courses, rises, share, gains.gains
-    )
+    white = kalman.respond(theta, readings, signals, kind, np.asarray(courses), within, gains.gains)
     return white.reshape(len(courses), -1).T

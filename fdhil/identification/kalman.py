@@ -12,14 +12,15 @@ Of two states and one input all is written out: a matrix library's way there and
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from fdhil.identification.motion import BROKEN, DIFFUSE, UNKNOWN, Modes
+from fdhil.identification.motion import BROKEN, DIFFUSE, UNKNOWN, Modes, Motion
 from fdhil.model.compiled import compiled
 from fdhil.model.feed_drive import transition
-from fdhil.records import Bool, Float
+from fdhil.records import Bool, Float, read_only
 
 Rows = npt.NDArray[np.int64]
 
@@ -36,6 +37,57 @@ STATE_U = 2  # of the filter whose voltage walks
 STATES = 4
 NO_SAMPLE = -1
 LOG_ROWS = 16  # determinants, at most DIFFUSE^2 of the measurement's, that are multiplied before a logarithm is taken
+
+
+class Readings(NamedTuple):
+    """The rows (n,) of a window as the filters take them; ``mode`` and ``observed`` as in :class:`Motion`.
+
+    ``emf_share`` of the back-EMF's rise within an interval is taken, beside the voltage's own ``rise_v``, which may
+    have no rows; ``walk`` is the standard deviation of the speed's change over an interval of unknown friction.
+    """
+
+    dt_s: float
+    mode: Modes
+    observed: Bool
+    current: Float
+    speed: Float
+    rise_v: Float
+    emf_share: float
+    walk: float
+
+    @classmethod
+    def of(cls, motion: Motion, emf_share: float = 1.0) -> Readings:
+        """Return the readings of a motion.
+
+        Of the course of an interval mean within its sample only the back-EMF's ramp is certain: what the current
+        regulator adds depends on the drive, and to take it from neighbouring means biases L.
+        """
+        means = motion.voltage_sampling == "interval_mean"
+        rise_v, share = (np.zeros(0), emf_share) if means else (motion.voltage_rise, emf_share - 1.0)
+        current, speed = read_only(motion.current), read_only(motion.speed)
+        return cls(motion.dt_s, motion.mode, motion.observed, current, speed, rise_v, share, motion.speed_walk)
+
+
+class Marks(NamedTuple):
+    """Where the samples of a slow voltage lie among the rows, in order of time (b,).
+
+    Mark b comes after the drive's row ``row``, at ``time_s``; there ends the voltage sample ``sample`` (-1: none is
+    wholly known), and the next begins. Instants are marks that begin nothing.
+    """
+
+    row: Rows
+    sample: Rows
+    time_s: Float
+
+
+class SlowSensor(NamedTuple):
+    """The samples (m,) of a slow voltage, means over ``period_s`` or instants; ``shape_variance`` (m,) is their own."""
+
+    voltage: Float
+    instant: bool
+    period_s: float
+    shape_variance: Float
+    marks: Marks
 
 
 @compiled
@@ -74,23 +126,11 @@ def _moved(steps: Float, known: int, i: float, w: float, u: float, torque: float
 
 
 @compiled
-def _whiten_one(
-    theta: Float,
-    variances: Float,
-    dt: float,
-    mode: Modes,
-    observed: Bool,
-    mean_v: Float,
-    rise_v: Float,
-    emf_share: float,
-    current: Float,
-    speed: Float,
-    walk: float,
-    white: Float,
-    gains: Float,
-) -> float:
+def _whiten_one(theta: Float, variances: Float, readings: Readings, mean_v: Float, white: Float, gains: Float) -> float:
     """Fill ``white`` (n, 2), and ``gains`` (n, 7) unless it has no rows; return the innovations' log determinant."""
-    steps = interval_steps(theta, dt, emf_share)
+    steps = interval_steps(theta, readings.dt_s, readings.emf_share)
+    mode, observed, rise_v = readings.mode, readings.observed, readings.rise_v
+    current, speed = readings.current, readings.speed
     vu, vi, vw = variances
     unit = 1.0 / (vi * vw)
     p11, p12, p22 = DIFFUSE * vi, 0.0, DIFFUSE * vw
@@ -128,7 +168,8 @@ def _whiten_one(
         b1, b2, v1 = steps[known, I_U], steps[known, W_U], steps[known, I_WALK]
         q11, q12 = f00 * p11 + f01 * p12, f00 * p12 + f01 * p22
         q21, q22 = f10 * p11 + f11 * p12, f10 * p12 + f11 * p22
-        own = 0.0 if known else walk  # of the speed over the interval; it reaches the current through the back-EMF
+        # the speed's own walk over the interval reaches the current through the back-EMF
+        own = 0.0 if known else readings.walk
         p11 = q11 * f00 + q12 * f01 + b1 * b1 * vu + v1 * v1 * own * own
         p12 = q11 * f10 + q12 * f11 + b1 * b2 * vu + v1 * own * own
         p22 = q21 * f10 + q22 * f11 + b2 * b2 * vu + own * own
@@ -138,41 +179,25 @@ def _whiten_one(
 
 
 @compiled
-def whiten(
-    thetas: Float,
-    variances: Float,
-    dt: float,
-    mode: Modes,
-    observed: Bool,
-    mean_v: Float,
-    rise_v: Float,
-    emf_share: float,
-    current: Float,
-    speed: Float,
-    walk: float,
-    gains: Float,
-) -> tuple[Float, Float]:
+def whiten(thetas: Float, variances: Float, readings: Readings, mean_v: Float, gains: Float) -> tuple[Float, Float]:
     """Return whitened innovations (q, n, 2) and log determinants (q,) for the rows of ``thetas`` (q, 7).
 
     ``variances`` (q, 3) are those of voltage, current and speed; ``mean_v`` is (q, n) or, when all share it, (1, n).
     ``gains`` (n, 7), or of no rows, takes those of the last filter.
     """
     q = thetas.shape[0]
-    white = np.empty((q, mode.size, 2))
+    white = np.empty((q, readings.mode.size, 2))
     logdet = np.zeros(q)
     for c in range(q):
-        mean, noise = mean_v[min(c, mean_v.shape[0] - 1)], variances[c]
-        logdet[c] = _whiten_one(
-            thetas[c], noise, dt, mode, observed, mean, rise_v, emf_share, current, speed, walk, white[c], gains
-        )
+        mean = mean_v[min(c, mean_v.shape[0] - 1)]
+        logdet[c] = _whiten_one(thetas[c], variances[c], readings, mean, white[c], gains)
     return white, logdet
 
 
 @compiled
-def _respond_one(
-    steps: Float, mode: Modes, observed: Bool, signals: Float, rise_v: Float, gains: Float, white: Float
-) -> None:
+def _respond_one(steps: Float, readings: Readings, signals: Float, rise_v: Float, gains: Float, white: Float) -> None:
     """Fill ``white`` (n, 2) with the whitened innovations of ``signals`` (4, n) by the filter of ``gains`` (n, 7)."""
+    mode, observed = readings.mode, readings.observed
     i, w = signals[CURRENT, 0], signals[SPEED, 0]
     begin = 0
     while begin < mode.size and not signals[:, begin].any() and (rise_v.size == 0 or rise_v[begin] == 0.0):
@@ -195,28 +220,19 @@ def _respond_one(
 
 @compiled
 def respond(
-    theta: Float,
-    dt: float,
-    mode: Modes,
-    observed: Bool,
-    signals: Float,
-    kind: int,
-    courses: Float,
-    rises: Float,
-    emf_share: float,
-    gains: Float,
+    theta: Float, readings: Readings, signals: Float, kind: int, courses: Float, rises: Float, gains: Float
 ) -> Float:
     """Return the whitened innovations (q, n, 2) by the filter of ``gains`` (n, 7), which are linear in all signals.
 
     Of ``signals`` (4, n) that of ``kind`` is each of ``courses`` (q, n), with ``rises`` (q, n) of the voltage within
     the intervals, or none. The load is friction, and what comes on top, against the positive direction.
     """
-    steps = interval_steps(theta, dt, emf_share)
-    white = np.empty((courses.shape[0], mode.size, 2))
+    steps = interval_steps(theta, readings.dt_s, readings.emf_share)
+    white = np.empty((courses.shape[0], readings.mode.size, 2))
     none = np.zeros(0)
     for c in range(courses.shape[0]):
         signals[kind] = courses[c]
-        _respond_one(steps, mode, observed, signals, rises[c] if rises.size else none, gains, white[c])
+        _respond_one(steps, readings, signals, rises[c] if rises.size else none, gains, white[c])
     return white
 
 
@@ -287,29 +303,16 @@ def _begin_sample(x: Float, p: Float, lever: float) -> None:
 
 @compiled
 def slow_innovations(
-    theta: Float,
-    dt: float,
-    mode: Modes,
-    spread: Float,
-    load: Float,
-    current: Float,
-    speed: Float,
-    voltage: Float,
-    instant: bool,
-    period: float,
-    row: Rows,
-    sample: Rows,
-    time: Float,
-    shape: Float,
-    noise: Float,
-    speed_walk: float,
-    slope_walk: Float,
+    theta: Float, readings: Readings, sensor: SlowSensor, noise: Float, spread: Float, load: Float, slope_walk: Float
 ) -> tuple[Float, Float]:
-    """Return the innovations (2 n + m,) of rows and of the samples of a slow ``voltage`` (m,), and their variances.
+    """Return the innovations (2 n + m,) of rows and of the samples of a slow voltage (m,), and their variances.
 
-    ``noise`` (3,) = variances of voltage, current, speed; ``shape`` (m,) adds to the first, and ``spread`` (n, 2) are
-    the others of each row, infinite where nothing was read. After ``row`` (b,), at ``time``, ends ``sample``.
+    ``noise`` (3,) = variances of voltage, current, speed; ``spread`` (n, 2) are the last two of each row, infinite
+    where nothing was read. ``load`` (n,) may have no rows.
     """
+    dt, mode, current, speed = readings.dt_s, readings.mode, readings.current, readings.speed
+    voltage, period, instant = sensor.voltage, sensor.period_s, sensor.instant
+    row, sample, time = sensor.marks
     n = current.size
     values, variance = np.zeros(2 * n + voltage.size), np.ones(2 * n + voltage.size)
     x = np.array([current[0], speed[0], 0.0, 0.0])
@@ -326,7 +329,7 @@ def slow_innovations(
             values[2 * k + 1], variance[2 * k + 1] = _take(x, p, of_speed, speed[k], spread[k, 1])
         known, now = mode[k] != UNKNOWN, k * dt
         push = -(theta[CD] * mode[k] + (load[k] if load.size else 0.0)) / theta[JT] if known else 0.0
-        stray = 0.0 if known else speed_walk * speed_walk / dt
+        stray = 0.0 if known else readings.walk * readings.walk / dt
         while b < row.size and row[b] == k:
             _advance(theta, x, p, time[b] - now, known, push, slope_walk[k], period)
             p[STATE_W, STATE_W] += stray * (time[b] - now)
@@ -334,7 +337,8 @@ def slow_innovations(
             j = sample[b]
             if j != NO_SAMPLE:
                 at = 2 * n + j
-                values[at], variance[at] = _take(x, p, of_voltage, voltage[j], noise[OF_VOLTAGE] + shape[j])
+                noisy = noise[OF_VOLTAGE] + sensor.shape_variance[j]
+                values[at], variance[at] = _take(x, p, of_voltage, voltage[j], noisy)
             if not instant:
                 _begin_sample(x, p, lever)
             b += 1

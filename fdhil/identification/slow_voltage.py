@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdhil.identification.filtering import moving_mean
-from fdhil.identification.kalman import DELAY, JT, NO_SAMPLE, K, Rows, slow_innovations
+from fdhil.identification.kalman import DELAY, JT, NO_SAMPLE, K, Marks, Readings, SlowSensor, slow_innovations
 from fdhil.identification.motion import Motion
 from fdhil.records import Float, read_only
 
@@ -26,19 +26,6 @@ CURRENT_LATE_S, CURRENT_LATE = 1e-5, 0.01  # in s, and of a row: one standard de
 CURRENT_ABOVE = 2.5e-4  # of the accelerating current, one standard deviation
 CORNER_ROWS = 5
 SMOOTH_ROWS = 15
-
-
-@dataclass(frozen=True, slots=True)
-class Marks:
-    """Where the samples of a slow voltage lie among the rows, in order of time (b,).
-
-    Mark b comes after the drive's row ``row``, at ``time_s``; there ends the voltage sample ``sample`` (-1: none is
-    wholly known), and the next begins. Instants are marks that begin nothing.
-    """
-
-    row: Rows
-    sample: Rows
-    time_s: Float
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,26 +108,13 @@ def innovations_of(
     assert motion.slow is not None
     delay_s = float(theta[DELAY])
     marks = marks_of(motion, delay_s, delay_s if ordered_for_s is None else ordered_for_s)
-    made = slow_innovations(
-        theta,
-        motion.dt_s,
-        motion.mode,
-        spread_of(motion, variances) if spread is None else spread,
-        np.zeros(0) if load_nm is None else load_nm,
-        read_only(motion.current),
-        read_only(motion.speed),
-        read_only(motion.voltage_mean),
-        motion.voltage_sampling == "instant",
-        motion.slow.period_s,
-        marks.row,
-        marks.sample,
-        marks.time_s,
-        motion.shape_variance,
-        variances,
-        motion.speed_walk,
-        motion.slope_walk,
-    )
-    return Innovations(*made)
+    instant = motion.voltage_sampling == "instant"
+    voltage = read_only(motion.voltage_mean)
+    sensor = SlowSensor(voltage, instant, motion.slow.period_s, motion.shape_variance, marks)
+    spread = spread_of(motion, variances) if spread is None else spread
+    load = np.zeros(0) if load_nm is None else load_nm
+    readings = Readings.of(motion)
+    return Innovations(*slow_innovations(theta, readings, sensor, variances, spread, load, motion.slope_walk))
 
 
 def course_effect(motion: Motion, theta: Float, variances: Float) -> Float:
