@@ -126,6 +126,25 @@ def _moved(steps: Float, known: int, i: float, w: float, u: float, torque: float
 
 
 @compiled
+def _spread(
+    steps: Float, known: int, p11: float, p12: float, p22: float, vu: float, walk: float
+) -> tuple[float, float, float]:
+    """Return variance of current, covariance, and variance of speed at the end of an interval.
+
+    ``vu`` is the voltage's variance; the speed's own ``walk`` reaches the current through the back-EMF.
+    """
+    s = steps[known]
+    q11, q12 = s[I_I] * p11 + s[I_W] * p12, s[I_I] * p12 + s[I_W] * p22
+    q21, q22 = s[W_I] * p11 + s[W_W] * p12, s[W_I] * p12 + s[W_W] * p22
+    b1, b2, v1 = s[I_U], s[W_U], s[I_WALK]
+    return (
+        q11 * s[I_I] + q12 * s[I_W] + b1 * b1 * vu + v1 * v1 * walk * walk,
+        q11 * s[W_I] + q12 * s[W_W] + b1 * b2 * vu + v1 * walk * walk,
+        q21 * s[W_I] + q22 * s[W_W] + b2 * b2 * vu + walk * walk,
+    )
+
+
+@compiled
 def _whiten_one(theta: Float, variances: Float, readings: Readings, mean_v: Float, white: Float, gains: Float) -> float:
     """Fill ``white`` (n, 2), and ``gains`` (n, 7) unless it has no rows; return the innovations' log determinant."""
     steps = interval_steps(theta, readings.dt_s, readings.emf_share)
@@ -164,15 +183,7 @@ def _whiten_one(theta: Float, variances: Float, readings: Readings, mean_v: Floa
             p11, p12, p22 = DIFFUSE * vi, 0.0, DIFFUSE * vw
             continue
         known = 0 if mode[k] == UNKNOWN else 1
-        f00, f01, f10, f11 = steps[known, I_I], steps[known, I_W], steps[known, W_I], steps[known, W_W]
-        b1, b2, v1 = steps[known, I_U], steps[known, W_U], steps[known, I_WALK]
-        q11, q12 = f00 * p11 + f01 * p12, f00 * p12 + f01 * p22
-        q21, q22 = f10 * p11 + f11 * p12, f10 * p12 + f11 * p22
-        # the speed's own walk over the interval reaches the current through the back-EMF
-        own = 0.0 if known else readings.walk
-        p11 = q11 * f00 + q12 * f01 + b1 * b1 * vu + v1 * v1 * own * own
-        p12 = q11 * f10 + q12 * f11 + b1 * b2 * vu + v1 * own * own
-        p22 = q21 * f10 + q22 * f11 + b2 * b2 * vu + own * own
+        p11, p12, p22 = _spread(steps, known, p11, p12, p22, vu, 0.0 if known else readings.walk)
         rise = rise_v[k] if rise_v.size else 0.0
         i, w = _moved(steps, known, i, w, mean_v[k], theta[CD] * mode[k], rise)
     return float(logdet + np.log(product) - counted * np.log(unit))
@@ -293,15 +304,6 @@ def _advance(theta: Float, x: Float, p: Float, h: float, known: bool, push: floa
 
 
 @compiled
-def _begin_sample(x: Float, p: Float, lever: float) -> None:
-    """Begin a new voltage sample: nothing is summed yet but - L i / T, ``lever`` = L / T, of the present current."""
-    x[STATE_SUM] = -lever * x[STATE_I]
-    for a in range(STATE_SUM):
-        p[STATE_SUM, a] = p[a, STATE_SUM] = -lever * p[STATE_I, a]
-    p[STATE_SUM, STATE_SUM] = lever * lever * p[STATE_I, STATE_I]
-
-
-@compiled
 def slow_innovations(
     theta: Float, readings: Readings, sensor: SlowSensor, noise: Float, spread: Float, load: Float, slope_walk: Float
 ) -> tuple[Float, Float]:
@@ -339,8 +341,11 @@ def slow_innovations(
                 at = 2 * n + j
                 noisy = noise[OF_VOLTAGE] + sensor.shape_variance[j]
                 values[at], variance[at] = _take(x, p, of_voltage, voltage[j], noisy)
-            if not instant:
-                _begin_sample(x, p, lever)
+            if not instant:  # a sample begins: nothing is summed yet but - L i / T of the present current
+                x[STATE_SUM] = -lever * x[STATE_I]
+                for a in range(STATE_SUM):
+                    p[STATE_SUM, a] = p[a, STATE_SUM] = -lever * p[STATE_I, a]
+                p[STATE_SUM, STATE_SUM] = lever * lever * p[STATE_I, STATE_I]
             b += 1
         _advance(theta, x, p, (k + 1) * dt - now, known, push, slope_walk[k], period)
         p[STATE_W, STATE_W] += stray * ((k + 1) * dt - now)
