@@ -12,7 +12,6 @@ from typing import Any
 ESTIMATORS: Mapping[str, str] = {
     "least_squares": "fdhil.identification.estimators.least_squares:estimate",
     "partial_moments": "fdhil.identification.estimators.partial_moments:estimate",
-    "instrumental_variables": "fdhil.identification.estimators.instrumental_variables:estimate",
     "maximum_likelihood": "fdhil.identification.estimators.maximum_likelihood:estimate",
 }
 DEFAULT_ESTIMATOR = "maximum_likelihood"

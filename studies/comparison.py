@@ -19,14 +19,13 @@ from typing import Any
 import numpy as np
 
 from fdhil.config import Identification
-from fdhil.identification.derivatives import OPERATORS
-from fdhil.identification.estimators import instrumental_variables, least_squares, maximum_likelihood, partial_moments
+from fdhil.identification.estimators import least_squares, maximum_likelihood, partial_moments
 from fdhil.identification.filtering import zero_phase
-from fdhil.identification.normal import solve
 from fdhil.records import PARAMETERS, Recording, Window, frozen
 from fdhil.store.recording_csv import parse_recording
-from studies import bench, pages
+from studies import bench, instrumental_variables, pages
 from studies.comparison_page import Figures, figure, text
+from studies.derivative_operators import OPERATORS
 from studies.estimators import TRUTH, Array, bound, noisy
 
 NOISES = (0.001, 0.005, 0.01)
@@ -65,9 +64,7 @@ def values_of(windows: Sequence[Window], lowpass_hz: float) -> list[Array]:
 def two_steps(parts: Sequence[tuple[Array, Array]]) -> Array:
     """Return [R, L, K, Jt, ft, Cd] (6,) of rows (m, 4) of [u, Di, i, w] and of [i, Dw, w, sign w]."""
     electrical, mechanical = (np.vstack([part[k] for part in parts]) for k in (0, 1))
-    (inductance, resistance, constant), _ = solve(electrical[:, 1:], electrical[:, 0])
-    second, _ = solve(mechanical[:, 1:], mechanical[:, 0] * constant)
-    return np.array([resistance, inductance, constant, *second])
+    return least_squares.solve_two_steps(electrical, mechanical)[0][least_squares.ORDER]
 
 
 def voltage_left_raw(windows: Sequence[Window]) -> Array:

@@ -25,7 +25,7 @@ from fdhil.identification.motion import Noise, prepare
 from fdhil.identification.windows import find_windows
 from fdhil.records import PARAMETERS, Estimate, Recording, Window
 from fdhil.store.recording_csv import parse_recording
-from studies import bench, pages
+from studies import bench, instrumental_variables, pages
 
 Array = npt.NDArray[np.float64]
 Method = Callable[[list[Window]], Estimate]
@@ -98,12 +98,10 @@ def left_over(period_s: float) -> Array:
 
 
 def methods() -> dict[str, Method]:
-    """Return the listed estimators by name, each with the product's settings."""
-    settings = Identification()
-    return {
-        name.replace("_", " "): partial(tables.load(tables.ESTIMATORS, name), settings=settings)
-        for name in tables.ESTIMATORS
-    }
+    """Return the listed estimators by name, each with the product's settings, and instrumental variables."""
+    listed = {name: tables.load(tables.ESTIMATORS, name) for name in tables.ESTIMATORS}
+    found = listed | {instrumental_variables.NAME: instrumental_variables.estimate}
+    return {name.replace("_", " "): partial(estimate, settings=Identification()) for name, estimate in found.items()}
 
 
 def monte_carlo(method: Method, recording: Recording, noise: float, runs: int) -> tuple[Array, Array, Array]:

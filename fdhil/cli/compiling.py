@@ -16,8 +16,7 @@ NEEDS: Mapping[str, Mapping[str, float]] = {
     "predict": {"fdhil.model.kernels": 4, "fdhil.prediction.kernels": 1},
     "correct": {"fdhil.correction.kernels": 10},
     "identify": {
-        "fdhil.identification.batch_filter": 9,
-        "fdhil.identification.innovations": 5,
+        "fdhil.identification.kalman": 7,
         "fdhil.model.feed_drive": 2,
     },
 }

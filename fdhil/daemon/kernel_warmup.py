@@ -9,10 +9,10 @@ import numpy as np
 from fdhil import correction
 from fdhil.config import Axis, MachineConfig
 from fdhil.correction.kernels import project
+from fdhil.identification.kalman import departure
 from fdhil.pipeline import AxisPipeline
 from fdhil.records import Float, Parameters, Stages, Trajectory, Window, frozen, frozen_ints
 from fdhil.validation.repeated_readings import log_chance
-from fdhil.validation.sensor_reconstruction import Crossing
 
 
 def warm(config: MachineConfig, method: str | None = None) -> None:
@@ -38,7 +38,7 @@ def _warm_what_is_rare() -> None:
     project(np.linspace(0.0, 2.0, 8), np.ones(3), np.zeros(2))
     log_chance(np.arange(12.0), 4, 8, 3, 3, 2, 1.0)
     theta, rows = np.array([0.5, 0.005, 0.8, 0.075, 0.05, 5.0, 0.0]), np.ones((4, 3))
-    assert Crossing(theta, 0.001, np.ones(4), rows, rows, rows, 0, 0, 0).free
+    departure(theta, 0.001, np.ones(4, dtype=np.int8), rows, rows, rows, 0)
 
 
 def nominal_rapid(name: str, axis: Axis, dt_s: float, direction: int = 1, seed: int = 1) -> Window:

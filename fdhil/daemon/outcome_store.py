@@ -52,7 +52,7 @@ def _point(window: StoredWindow) -> Point:
         frozen([math.nan if (number := told.get(name, {}).get(key)) is None else number for name in PARAMETERS])
         for key in ("value", "std")
     )
-    return Point(values, stds, window.start_tick, window.temperature_c)
+    return Point(values, stds, window.start_tick)
 
 
 class Keeper:

@@ -1,4 +1,4 @@
-"""Covariances that stay honest when residuals are coloured and regressors are noisy."""
+"""Keeps covariances honest when residuals are coloured and regressors are noisy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The delay of the voltage against current and speed, in whole samples, from the electrical equation alone."""
+"""Finds the delay of the voltage against current and speed, in whole samples, from the electrical equation alone."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
-"""Derivative operators as stencils: Dx(t) = 1/h sum_j b_j x(t + j h). Operator [4] of [DES] is zero forcing #1."""
+"""Differentiates by stencils: Dx(t) = 1/h sum_j b_j x(t + j h). Operator [4] of [DES] is zero forcing #1."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,30 +31,12 @@ class Operator:
         return max(0, self.offsets[-1])
 
 
-def _savitzky_golay(half: int) -> Operator:
-    """Return the slope of a parabola fitted to 2 half + 1 samples."""
-    offsets = tuple(range(-half, half + 1))
-    norm = sum(j * j for j in offsets)
-    return Operator(f"savitzky_golay_{2 * half + 1}", offsets, tuple(j / norm for j in offsets))
-
-
 # [DES] eq. 4 after [SOD 97]; exact: moments 0, 1, 0 and no |tau|^3 term, the root (7 - sqrt 73) / 12
 ZERO_FORCING_1 = Operator(
     "zero_forcing_1",
     (-2, -1, 0, 1),
     ((_ROOT - 5) / 12, (3 - _ROOT) / 4, (_ROOT - 5) / 4, (11 - _ROOT) / 12),
 )
-OPERATORS: Mapping[str, Operator] = {
-    op.name: op
-    for op in (
-        ZERO_FORCING_1,
-        Operator("zero_forcing_3_tap", (-1, 0, 1), ((math.sqrt(2) - 1) / 2, -math.sqrt(2), (1 + math.sqrt(2)) / 2)),
-        Operator("central", (-1, 0, 1), (-0.5, 0.0, 0.5)),
-        Operator("backward", (-1, 0), (-1.0, 1.0)),
-        _savitzky_golay(3),
-        _savitzky_golay(7),
-    )
-}
 
 
 def derivative(values: Float, dt_s: float, operator: Operator = ZERO_FORCING_1) -> Float:

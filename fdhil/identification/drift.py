@@ -1,4 +1,4 @@
-"""How the parameters move from rapid to rapid: jumps held back, a changed load, maintenance alarms.
+"""Follows the parameters from rapid to rapid: jumps held back, a changed load, maintenance alarms.
 
 Pure: the same estimates in the same order give the same notices. Nothing here reads a clock.
 """
@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fdhil.config import Maintenance
-from fdhil.identification.trends import Slope, slope
 from fdhil.records import PARAMETERS, UNITS, Float, Notice, Parameters
 
 HISTORY = 32
@@ -34,7 +33,6 @@ class Point:
     values: Float
     stds: Float
     tick: int
-    temperature_c: float | None
 
 
 @dataclass(slots=True)
@@ -48,16 +46,14 @@ class DriftTracker:
     alarms: set[str] = field(default_factory=set)
     _held: list[Point] = field(default_factory=list)
 
-    def update(
-        self, values: Parameters, covariance: Float, tick: int = 0, temperature_c: float | None = None
-    ) -> list[Notice]:
+    def update(self, values: Parameters, covariance: Float, tick: int = 0) -> list[Notice]:
         """Take a validated estimate with its covariance (6, 6); return what is to be said about it.
 
         ``ParameterJump`` holds the estimate back for ``HELD_EPISODES`` further ones; a step of Jt alone is
         ``LoadChanged``: the correction must be withdrawn at once, and the new Jt is used from the second agreeing one.
         """
         stds = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-        point = Point(np.array(list(values.as_dict().values())), stds, tick, temperature_c)
+        point = Point(np.array(list(values.as_dict().values())), stds, tick)
         if self.reference is None:
             self.reference = values
         moved = self._moved(point)
@@ -79,16 +75,6 @@ class DriftTracker:
     def holding(self) -> bool:
         """Return whether the newest estimate is held back: it must not be used yet."""
         return bool(self._held)
-
-    def trend(self, name: str, against: str = "temperature") -> Slope | None:
-        """Return the slope of a parameter against ``temperature`` (per degC) or ``tick``."""
-        k = PARAMETERS.index(name)
-        x = [
-            float(p.tick) if against == "tick" else (np.nan if p.temperature_c is None else p.temperature_c)
-            for p in self.points
-        ]
-        y = np.array([p.values[k] for p in self.points])
-        return slope(y, np.array(x, dtype=np.float64), np.array([p.stds[k] for p in self.points]))
 
     def _moved(self, point: Point) -> list[str]:
         """Return the parameters that lie beyond chance and drift from the recent history (median and MAD)."""

@@ -1,4 +1,4 @@
-"""Filters that move nothing in time: the paper's low-pass, and averages about each row.
+"""Filters without moving anything in time: the paper's low-pass, and averages about each row.
 
 The same low-pass on every signal keeps the identification unbiased ([DES] eq. 8). They are a few lines of numpy: the
 library that has them as well takes a second to import, which the daemon's start cannot spare.

@@ -1,4 +1,4 @@
-"""What the data can tell: a parameter without an interval is not published, it has a reason instead."""
+"""Withholds what the data cannot tell: a parameter without an interval has a reason instead."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdhil.records import PARAMETERS, Estimate, Reason, Result
+from fdhil.records import PARAMETERS, Estimate, Float, Reason, Result
 
 CONDITION_LIMIT = 1e6
 RELATIVE_STD_LIMIT: Mapping[str, float] = {"R": 0.10, "L": 0.25, "K": 0.05, "Jt": 0.10, "ft": 0.5, "Cd": 0.5}
@@ -21,6 +21,11 @@ PHYSICAL: Mapping[str, tuple[float, float]] = {
     "ft": (-np.inf, 10.0),
     "Cd": (-np.inf, 1e3),
 }
+
+
+def admissible(theta: Float) -> bool:
+    """Return whether R, L, K and Jt of ``theta`` = [R, L, K, Jt, ...] are above 0 and all is finite."""
+    return bool(np.isfinite(theta).all() and (theta[:4] > 0).all())
 
 
 def empty_estimate(method: str, result: Result, reason: Reason) -> Estimate:

@@ -1,4 +1,4 @@
-"""A window made ready for the estimators: where the drive surely moves, and the voltage over each interval."""
+"""Makes a window ready for the estimators: where the drive surely moves, and the voltage over each interval."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fdhil.identification.filtering import all_about, moving_mean
-from fdhil.identification.windows import RUN_SHARE, carried, noise_of
+from fdhil.identification.windows import RUN_SHARE, carried, noise_of, runs_of
 from fdhil.model.feed_drive import interval_shape
 from fdhil.records import Bool, Float, SlowVoltage, VoltageSampling, Window
 
@@ -151,8 +151,7 @@ def prepare(window: Window) -> Motion:
 def _majority(side: Modes, sure: Bool) -> Modes:
     """Return for every row the direction that most rows of its moving stretch have (noise may flip single rows)."""
     result = np.zeros_like(side)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], sure.astype(np.int8), [0]])))
-    for a, b in zip(edges[::2], edges[1::2], strict=True):
+    for a, b in runs_of(sure, 1):
         result[a:b] = 1 if side[a:b].sum(dtype=np.int64) >= 0 else -1
     return result
 

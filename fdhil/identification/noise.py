@@ -1,4 +1,4 @@
-"""Noise levels of voltage, current and speed by maximum likelihood of the innovations, for given parameters."""
+"""Tells the noise levels of voltage, current and speed, for given parameters, by the likelihood of the innovations."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from fdhil.identification.batch_filter import whiten
+from fdhil.identification.innovations import whiten
 from fdhil.identification.motion import Motion, Noise
 from fdhil.records import Float
 

@@ -1,4 +1,4 @@
-"""Linear least squares by scaled normal equations: small, fast, and on one thread.
+"""Solves linear least squares by scaled normal equations: small, fast, and on one thread.
 
 The regressions here have a handful of well-scaled columns and thousands of rows; an orthogonal factorisation would
 cost ten times more and, in a library with its own threads, disturb the bus's receive thread. At six columns most of a
@@ -7,11 +7,9 @@ library call is its way there and back, so the small matrix is taken apart here.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from numba import njit
 
+from fdhil.model.compiled import compiled
 from fdhil.records import Float
 
 NIL = 1e-15  # of the largest power: below it a direction is rounding
@@ -45,7 +43,8 @@ def root_of(information: Float) -> Float:
     return root
 
 
-def _turned_plain(matrix: Float) -> tuple[Float, Float]:
+@compiled
+def _turned(matrix: Float) -> tuple[Float, Float]:
     """Return eigenvalues (k,) and eigenvectors (k, k) of a symmetric matrix by Jacobi's rotations."""
     a = matrix.copy()
     k = a.shape[0]
@@ -72,10 +71,8 @@ def _turned_plain(matrix: Float) -> tuple[Float, Float]:
     return np.diag(a).copy(), axes
 
 
-_turned: Callable[[Float], tuple[Float, Float]] = njit(cache=True, nogil=True, error_model="numpy")(_turned_plain)
-
-
-def _parted_plain(gram: Float) -> tuple[Float, float, bool]:
+@compiled
+def _parted(gram: Float) -> tuple[Float, float, bool]:
     """Return a root (k, r) of the inverse, the condition number, and whether all is finite.
 
     The matrix is scaled to a unit diagonal first, and directions of no power are left out.
@@ -104,10 +101,8 @@ def _parted_plain(gram: Float) -> tuple[Float, float, bool]:
     return root[:, :kept], condition, True
 
 
-_parted: Callable[[Float], tuple[Float, float, bool]] = njit(cache=True, nogil=True, error_model="numpy")(_parted_plain)
-
-
-def _inverse_plain(gram: Float) -> tuple[Float, float]:
+@compiled
+def _inverse(gram: Float) -> tuple[Float, float]:
     root, condition, _ = _parted(gram)
     k = gram.shape[0]
     inverse = np.zeros((k, k))
@@ -116,6 +111,3 @@ def _inverse_plain(gram: Float) -> tuple[Float, float]:
             for q in range(root.shape[1]):
                 inverse[a, b] += root[a, q] * root[b, q]
     return inverse, condition
-
-
-_inverse: Callable[[Float], tuple[Float, float]] = njit(cache=True, nogil=True, error_model="numpy")(_inverse_plain)

@@ -1,4 +1,4 @@
-"""Without voltage [5] cannot be fitted, and K stays open; [6] alone still gives Jt/K, ft/K and Cd/K."""
+"""Fits [6] alone where there is no voltage: K stays open, and Jt/K, ft/K and Cd/K are told."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from fdhil.config import Identification
-from fdhil.identification.covariance import coloured_meat
-from fdhil.identification.derivatives import derivative
-from fdhil.identification.estimators.least_squares import mechanical_signals
-from fdhil.identification.filtering import impulse_response
+from fdhil.identification.covariance import coloured_meat, residual_gammas
+from fdhil.identification.estimators.least_squares import mechanical_signals, noise_through
 from fdhil.identification.identifiability import empty_estimate
-from fdhil.identification.motion import noise_levels
 from fdhil.identification.normal import inverse_gram
-from fdhil.records import PARAMETERS, RATIOS, Estimate, Float, Reason, Result, Window
+from fdhil.records import PARAMETERS, RATIOS, Estimate, Reason, Result, Window
 
 METHOD = "least_squares"
 
@@ -32,7 +29,11 @@ def estimate_ratios(windows: Sequence[Window], settings: Identification) -> Esti
     inverse, _ = inverse_gram(phi)
     theta = inverse @ (phi.T @ y)
     residual = y - phi @ theta
-    covariance = inverse @ _meat(phi, residual, theta, [p.shape[0] for p in parts], windows, settings) @ inverse
+    # [6] divided by K: the residual is the noise of current and speed, filtered
+    noise, impulse, slope = noise_through(windows, settings)
+    gamma = residual_gammas(np.array([0.0, 0.0, 1.0, *theta]), impulse, slope, noise)[1][1]
+    excess = max(1.0, float(np.mean(residual**2)) / float(gamma.max()))
+    covariance = inverse @ coloured_meat([phi], [[gamma * excess]], [p.shape[0] for p in parts]) @ inverse
     known, k = len(RATIOS), len(PARAMETERS)
     whole = np.full((k + known, k + known), np.nan)
     whole[k:, k:] = covariance
@@ -45,17 +46,3 @@ def estimate_ratios(windows: Sequence[Window], settings: Identification) -> Esti
         result=Result.UNDER_EXCITED,
         missing=dict.fromkeys(PARAMETERS, reason),
     )
-
-
-def _meat(
-    phi: Float, residual: Float, theta: Float, lengths: list[int], windows: Sequence[Window], settings: Identification
-) -> Float:
-    """Return the covariance (3, 3) of the scores; the residual is the noise of current and speed, filtered."""
-    dt = windows[0].dt_s
-    impulse = impulse_response(settings.lowpass_hz, dt)
-    slope = np.nan_to_num(derivative(impulse, dt))
-    noise = np.mean([noise_levels(w).vector() ** 2 for w in windows], axis=0)
-    from_speed = theta[0] * slope + theta[1] * impulse
-    gamma = noise[1] * np.correlate(impulse, impulse, "full") + noise[2] * np.correlate(from_speed, from_speed, "full")
-    excess = max(1.0, float(np.mean(residual**2)) / float(gamma.max()))
-    return coloured_meat([phi], [[gamma * excess]], lengths)

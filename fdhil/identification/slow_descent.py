@@ -1,4 +1,4 @@
-"""The most likely parameters of windows with a slow voltage: Fisher's scoring on the likelihood of all innovations.
+"""Climbs to the most likely parameters of windows with a slow voltage, by Fisher's scoring on all innovations.
 
 How sure an innovation is depends on the parameters too: half of what a slow voltage is off by is the current at the
 ends of its samples, times L / T. So the likelihood is taken whole, determinant and all; its steps are those of the
@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fdhil.identification.identifiability import admissible
+from fdhil.identification.kalman import DELAY
 from fdhil.identification.motion import Motion, Noise
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import Innovations, innovations_of, room_s
@@ -34,8 +36,11 @@ class Likelihood:
     motions: tuple[Motion, ...]
     noises: tuple[Noise, ...]
 
-    def at(self, theta: Float, ordered_for_s: float) -> Innovations:
-        """Return all innovations for ``theta`` (7,), rows and samples in the order of a delay of ``ordered_for_s``."""
+    def at(self, theta: Float, ordered_for_s: float | None = None) -> Innovations:
+        """Return all innovations for ``theta`` (7,), rows and samples in the order of a delay of ``ordered_for_s``.
+
+        That is its own when left out.
+        """
         pairs = zip(self.motions, self.noises, strict=True)
         made = [innovations_of(m, theta, s.vector() ** 2, ordered_for_s) for m, s in pairs]
         return Innovations(np.concatenate([one.values for one in made]), np.concatenate([one.variance for one in made]))
@@ -46,11 +51,11 @@ class Likelihood:
         The order of rows and samples is held: an innovation must stay the same row's. So the delay is varied to the
         side on which the samples are further from a row that they would pass, and by no more than that.
         """
-        deviation, order = np.sqrt(here.variance), float(theta[6])
+        deviation, order = np.sqrt(here.variance), float(theta[DELAY])
         of_mean, of_variance = np.empty((here.values.size, len(free))), np.empty((here.values.size, len(free)))
         for k, j in enumerate(free):
             moved = theta.copy()
-            moved[j] += self._delay_step(order) if j == 6 else DIFFERENCE * sizes[j]
+            moved[j] += self._delay_step(order) if j == DELAY else DIFFERENCE * sizes[j]
             there = self.at(moved, order)
             change = moved[j] - theta[j]
             of_mean[:, k] = (here.values - there.values) / deviation / change
@@ -71,7 +76,7 @@ def ascend(likelihood: Likelihood, theta: Float, free: Sequence[int], sizes: Flo
 
     ``sizes`` (7,) are the parameters' typical ones.
     """
-    here = likelihood.at(theta, float(theta[6]))
+    here = likelihood.at(theta)
     for _ in range(STEPS):
         white = here.whitened
         mean, variance = likelihood.slopes(here, theta, free, sizes)
@@ -102,9 +107,9 @@ def _along(
     def tried(share: float) -> tuple[Float, Innovations] | None:
         trial = theta.copy()
         trial[list(free)] += share * step
-        if not (np.isfinite(trial).all() and (trial[:4] > 0).all()):
+        if not admissible(trial):
             return None
-        there = likelihood.at(trial, float(trial[6]))
+        there = likelihood.at(trial)
         return (trial, there) if there.cost <= here.cost else None
 
     share = 1.0
@@ -131,14 +136,14 @@ def likelier_delay(likelihood: Likelihood, theta: Float, information: Float, per
     other parameters follow the delay as the ``information`` (7, 7) says.
     """
     inverse = inverse_of(information)[0]
-    if not (np.isfinite(inverse).all() and inverse[6, 6] > 0.0):
+    if not (np.isfinite(inverse).all() and inverse[DELAY, DELAY] > 0.0):
         return None
-    ridge = inverse[:, 6] / inverse[6, 6]
+    ridge = inverse[:, DELAY] / inverse[DELAY, DELAY]
     shifts = np.arange(-REACH, REACH + SPACING / 2, SPACING) * period_s
     trials: list[Float] = [theta + shift * ridge for shift in shifts]
-    possible = [t for t in trials if np.isfinite(t).all() and (t[:4] > 0).all()]
-    costs = np.array([likelihood.at(t, float(t[6])).cost for t in possible])
-    here = likelihood.at(theta, float(theta[6])).cost
+    possible = [t for t in trials if admissible(t)]
+    costs = np.array([likelihood.at(t).cost for t in possible])
+    here = likelihood.at(theta).cost
     if costs.size == 0 or not costs.min() < here - GAIN:
         return None
     return possible[int(np.argmin(costs))]

@@ -1,4 +1,4 @@
-"""Where the fit of windows with a slow voltage starts: [5] over the sensor's own samples, and the delay to some ms."""
+"""Starts the fit of windows with a slow voltage: by [5] over the sensor's own samples, with the delay to some ms."""
 
 from __future__ import annotations
 
@@ -9,14 +9,22 @@ import numpy as np
 
 from fdhil.config import Identification
 from fdhil.identification.covariance import aliasing
-from fdhil.identification.estimators.least_squares import NAME, mechanical_signals, too_short
+from fdhil.identification.estimators.least_squares import (
+    NAME,
+    ORDER,
+    mechanical_signals,
+    residuals_of,
+    solve_two_steps,
+    too_short,
+    two_step_estimate,
+)
 from fdhil.identification.filtering import moving_mean, zero_phase
-from fdhil.identification.identifiability import judge
+from fdhil.identification.kalman import DELAY, L, R
 from fdhil.identification.motion import Motion, prepare
 from fdhil.identification.normal import inverse_gram, solve
 from fdhil.identification.slow_voltage import CORNER_ROWS, innovations_of
 from fdhil.identification.windows import carried
-from fdhil.records import PARAMETERS, Estimate, Float, Result, Window
+from fdhil.records import Estimate, Float, Window
 
 SPAN_S = 0.025
 SPAN_SAMPLES = 3
@@ -29,7 +37,7 @@ FLOORS = 10.0 ** np.arange(-6.0, 1.01, 0.5)  # of the variance of the current's 
 
 
 def slow_start(windows: Sequence[Window], settings: Identification) -> tuple[Float, list[float], list[Motion]] | None:
-    """Return theta (7,) = [R, L, K, Jt, ft, Cd, 0], each window's coarse delay in s, and the windows prepared.
+    """Return [R, L, K, Jt, ft, Cd] (6,), each window's coarse delay in s, and the windows prepared.
 
     None when there are too few samples to start from.
     """
@@ -38,13 +46,11 @@ def slow_start(windows: Sequence[Window], settings: Identification) -> tuple[Flo
     if rows is None:
         return None
     electrical, mechanical = rows
-    inductance, resistance, constant = solve(electrical[:, 1:], electrical[:, 0])[0]
-    second = solve(mechanical[:, 1:], mechanical[:, 0] * constant)[0]
-    if resistance > 0.0 and inductance < LEAST_TIME_CONSTANT_S * resistance:
+    theta = solve_two_steps(electrical, mechanical)[0][ORDER]
+    if theta[R] > 0.0 and theta[L] < LEAST_TIME_CONSTANT_S * theta[R]:
         # so coarse a delay is taken for L: the voltage R i + L di/dt is that of R i, earlier by L / R
-        shifts = [shift + TIME_CONSTANT_S - float(inductance / resistance) for shift in shifts]
-        inductance = TIME_CONSTANT_S * resistance
-    theta = np.array([resistance, inductance, constant, *second, 0.0])
+        shifts = [shift + TIME_CONSTANT_S - float(theta[L] / theta[R]) for shift in shifts]
+        theta[L] = TIME_CONSTANT_S * theta[R]
     return theta, shifts, [prepare(w) for w in windows]
 
 
@@ -68,23 +74,12 @@ def slow_least_squares(windows: Sequence[Window], settings: Identification) -> E
     if rows is None:
         return too_short(NAME, 0)
     electrical, mechanical = rows
-    first, condition = solve(electrical[:, 1:], electrical[:, 0])
-    torque = mechanical[:, 0] * first[2]
-    second, other = solve(mechanical[:, 1:], torque)
-    order = [1, 0, 2, 3, 4, 5]  # from L, R, K to R, L, K
-    left = electrical[:, 0] - electrical[:, 1:] @ first, torque - mechanical[:, 1:] @ second
+    theta, condition = solve_two_steps(electrical, mechanical)
+    left = residuals_of(theta, electrical, mechanical)
     covariance = np.zeros((6, 6))
     for block, x, e in zip((slice(0, 3), slice(3, 6)), (electrical, mechanical), left, strict=True):
         covariance[block, block] = inverse_gram(x[:, 1:])[0] * float(e @ e) / e.size
-    answer = Estimate(
-        method=NAME,
-        names=PARAMETERS,
-        values=np.concatenate([first, second])[order],
-        covariance=covariance[np.ix_(order, order)],
-        residuals={"electrical": left[0], "mechanical": left[1] / first[2] if first[2] else left[1]},
-        result=Result.OK,
-    )
-    return judge(answer, max(condition, other), float(np.abs(mechanical[:, 2]).max()))
+    return two_step_estimate(NAME, theta, covariance, left, condition, mechanical)
 
 
 def sample_rows(window: Window, delay_s: float, lowpass_hz: float) -> tuple[Float, Float]:
@@ -142,7 +137,7 @@ def with_course(motion: Motion, theta: Float) -> Motion:
     trials = [replace(sampled, slope_walk=(shown + share * chance) / motion.dt_s**3) for share in FLOORS]
     costs = []
     for trial in trials:
-        made = innovations_of(trial, theta, trial.noise.vector() ** 2, float(theta[6]))
+        made = innovations_of(trial, theta, trial.noise.vector() ** 2)
         costs.append(made.logdet + float(made.whitened @ made.whitened))
     return trials[int(np.nanargmin(costs))] if np.isfinite(costs).any() else trials[FLOORS.size // 2]
 
@@ -153,6 +148,6 @@ def _shape_variance(motion: Motion, theta: Float) -> Float:
     What they do to L di/dt is the same wherever the current is on its way, and so is taken for L.
     """
     share = aliasing(motion.voltage_sampling, motion.dt_s)[0]
-    course = motion.aligned(float(theta[6])).at_voltage(moving_mean(motion.current, CORNER_ROWS))
-    doubt: Float = (share * theta[0] * course) ** 2
+    course = motion.aligned(float(theta[DELAY])).at_voltage(moving_mean(motion.current, CORNER_ROWS))
+    doubt: Float = (share * theta[R] * course) ** 2
     return doubt

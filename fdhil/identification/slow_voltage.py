@@ -1,4 +1,4 @@
-"""Innovations of a window whose voltage comes from a sensor slower than the drive: one row per voltage sample.
+"""Gives innovations of a window whose voltage is from a sensor slower than the drive: one row per voltage sample.
 
 The voltage is never brought to the drive's grid. A Kalman filter runs over the drive's rows: [2] drives the speed from
 the current, the current's slope is a random walk, and each voltage sample is one more measurement, of [1] over its
@@ -13,39 +13,19 @@ own. A delay of the voltage moves the ends of its samples among the rows: it is 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
-from numba import njit
 
 from fdhil.identification.filtering import moving_mean
-from fdhil.identification.motion import DIFFUSE, UNKNOWN, Motion
+from fdhil.identification.kalman import DELAY, JT, NO_SAMPLE, K, Marks, Readings, SlowSensor, slow_innovations
+from fdhil.identification.motion import Motion
 from fdhil.records import Float, read_only
-
-STATES = 4
-NO_SAMPLE = -1
 
 CURRENT_LATE_S, CURRENT_LATE = 1e-5, 0.01  # in s, and of a row: one standard deviation, see course_effect()
 CURRENT_ABOVE = 2.5e-4  # of the accelerating current, one standard deviation
 CORNER_ROWS = 5
 SMOOTH_ROWS = 15
-
-Rows = npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True, slots=True)
-class Marks:
-    """Where the samples of a slow voltage lie among the rows, in order of time (b,).
-
-    Mark b comes after the drive's row ``row``, at ``time_s``; there ends the voltage sample ``sample`` (-1: none is
-    wholly known), and the next begins. Instants are marks that begin nothing.
-    """
-
-    row: Rows
-    sample: Rows
-    time_s: Float
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,140 +86,6 @@ def room_s(motion: Motion, delay_s: float) -> tuple[float, float]:
     return float(after.min(initial=motion.dt_s)), float((motion.dt_s - after).min(initial=motion.dt_s))
 
 
-def _advance_plain(
-    theta: Float, x: Float, p: Float, h: float, known: bool, push: float, walk: float, period: float
-) -> None:
-    """Move state ``x`` (4,) and covariance ``p`` (4, 4) on by ``h``; Jt w' = K i - ft w + Jt ``push`` where known.
-
-    ``walk`` is the variance of di/dt per second; terms of third order in h ft/Jt are left out: they are nil.
-    """
-    pull, drag = (theta[2] / theta[3], theta[4] / theta[3]) if known else (0.0, 0.0)
-    drop, emf, square = theta[0] / period, theta[2] / period, h * h / 2
-    keep, on_i, on_s = 1.0 - drag * h + drag * drag * square, pull * (h - drag * square), pull * square
-    m_w = emf * (h - drag * square)
-    m_i, m_s = drop * h + emf * on_s, drop * square + emf * pull * square * h / 3
-    x[3] += m_i * x[0] + m_w * x[1] + m_s * x[2] + emf * push * square
-    x[1] = on_i * x[0] + keep * x[1] + on_s * x[2] + push * (h - drag * square)
-    x[0] += h * x[2]
-    for c in range(STATES):
-        i, w, s = p[0, c], p[1, c], p[2, c]
-        p[3, c] += m_i * i + m_w * w + m_s * s
-        p[1, c] = on_i * i + keep * w + on_s * s
-        p[0, c] = i + h * s
-    for c in range(STATES):
-        i, w, s = p[c, 0], p[c, 1], p[c, 2]
-        p[c, 3] += m_i * i + m_w * w + m_s * s
-        p[c, 1] = on_i * i + keep * w + on_s * s
-        p[c, 0] = i + h * s
-    both, third = walk * square, walk * square * h / 3
-    p[2, 2] += walk * h
-    p[0, 2] += both
-    p[2, 0] += both
-    p[0, 0] += 2 * third
-    p[2, 3] += drop * third
-    p[3, 2] += drop * third
-    p[0, 3] += drop * third * h * 0.75
-    p[3, 0] += drop * third * h * 0.75
-    p[3, 3] += drop * drop * third * h * h * 0.3
-
-
-_advance: Callable[..., None] = njit(cache=True, nogil=True, error_model="numpy")(_advance_plain)
-
-
-def _take_plain(x: Float, p: Float, h: Float, value: float, noise: float) -> tuple[float, float]:
-    """Take in a measurement ``value`` = h x with the variance ``noise``; return its innovation and variance."""
-    error, variance = value, noise
-    s0 = p[0, 0] * h[0] + p[0, 1] * h[1] + p[0, 2] * h[2] + p[0, 3] * h[3]
-    s1 = p[1, 0] * h[0] + p[1, 1] * h[1] + p[1, 2] * h[2] + p[1, 3] * h[3]
-    s2 = p[2, 0] * h[0] + p[2, 1] * h[1] + p[2, 2] * h[2] + p[2, 3] * h[3]
-    s3 = p[3, 0] * h[0] + p[3, 1] * h[1] + p[3, 2] * h[2] + p[3, 3] * h[3]
-    variance += h[0] * s0 + h[1] * s1 + h[2] * s2 + h[3] * s3
-    error -= h[0] * x[0] + h[1] * x[1] + h[2] * x[2] + h[3] * x[3]
-    part = 1.0 / variance
-    for a, gain in enumerate((s0 * part, s1 * part, s2 * part, s3 * part)):
-        x[a] += gain * error
-        p[a, 0] -= gain * s0
-        p[a, 1] -= gain * s1
-        p[a, 2] -= gain * s2
-        p[a, 3] -= gain * s3
-    return error, variance
-
-
-_take: Callable[..., tuple[float, float]] = njit(cache=True, nogil=True, error_model="numpy")(_take_plain)
-
-
-def _begin_sample_plain(x: Float, p: Float, lever: float) -> None:
-    """Begin a new voltage sample: nothing is summed yet but - L i / T, ``lever`` = L / T, of the present current."""
-    x[3] = -lever * x[0]
-    for a in range(3):
-        p[3, a] = p[a, 3] = -lever * p[0, a]
-    p[3, 3] = lever * lever * p[0, 0]
-
-
-_begin_sample: Callable[[Float, Float, float], None] = njit(cache=True, nogil=True)(_begin_sample_plain)
-
-
-def _filter_plain(
-    theta: Float,
-    dt: float,
-    mode: Float,
-    spread: Float,
-    load: Float,
-    current: Float,
-    speed: Float,
-    voltage: Float,
-    instant: bool,
-    period: float,
-    row: Rows,
-    sample: Rows,
-    time: Float,
-    shape: Float,
-    noise: Float,
-    speed_walk: float,
-    slope_walk: Float,
-) -> tuple[Float, Float]:
-    """Return the innovations (2 n + m,) and their variances.
-
-    ``noise`` (3,) = variances of voltage, current, speed; ``shape`` (m,) adds to the first, and ``spread`` (n, 2) are
-    the others of each row, infinite where nothing was read.
-    """
-    n = current.size
-    values, variance = np.zeros(2 * n + voltage.size), np.ones(2 * n + voltage.size)
-    x = np.array([current[0], speed[0], 0.0, 0.0])
-    p = np.zeros((STATES, STATES))
-    p[0, 0], p[1, 1], p[2, 2] = DIFFUSE * noise[1], DIFFUSE * noise[2], DIFFUSE * noise[1] / (dt * dt)
-    of_current, of_speed = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0, 0.0])
-    lever, b = theta[1] / period, 0
-    of_voltage = np.array([lever, 0.0, 0.0, 1.0])
-    if instant:
-        of_voltage[:] = theta[0], theta[2], theta[1], 0.0
-    for k in range(n):
-        if spread[k, 0] < np.inf:
-            values[2 * k], variance[2 * k] = _take(x, p, of_current, current[k], spread[k, 0])
-        if spread[k, 1] < np.inf:
-            values[2 * k + 1], variance[2 * k + 1] = _take(x, p, of_speed, speed[k], spread[k, 1])
-        known, now = mode[k] != UNKNOWN, k * dt
-        push = -(theta[5] * mode[k] + (load[k] if load.size else 0.0)) / theta[3] if known else 0.0
-        stray = 0.0 if known else speed_walk * speed_walk / dt
-        while b < row.size and row[b] == k:
-            _advance(theta, x, p, time[b] - now, known, push, slope_walk[k], period)
-            p[1, 1] += stray * (time[b] - now)
-            now = time[b]
-            j = sample[b]
-            if j != NO_SAMPLE:
-                at = 2 * n + j
-                values[at], variance[at] = _take(x, p, of_voltage, voltage[j], noise[0] + shape[j])
-            if not instant:
-                _begin_sample(x, p, lever)
-            b += 1
-        _advance(theta, x, p, (k + 1) * dt - now, known, push, slope_walk[k], period)
-        p[1, 1] += stray * ((k + 1) * dt - now)
-    return values, variance
-
-
-_filter: Callable[..., tuple[Float, Float]] = njit(cache=True, nogil=True, error_model="numpy")(_filter_plain)
-
-
 def spread_of(motion: Motion, variances: Float) -> Float:
     """Return the variances (n, 2) of each row's current and speed, infinite where they are lost."""
     return np.where(motion.observed[:, None], variances[1:], np.inf)
@@ -249,38 +95,26 @@ def innovations_of(
     motion: Motion,
     theta: Float,
     variances: Float,
-    ordered_for_s: float,
+    ordered_for_s: float | None = None,
     load_nm: Float | None = None,
     spread: Float | None = None,
 ) -> Innovations:
     """Return the innovations by the filter that is right for ``theta`` (7,) = [R, L, K, Jt, ft, Cd, delay].
 
-    ``variances`` (3,) are those of voltage, current and speed; ``ordered_for_s`` as in :func:`marks_of`; ``load_nm``
-    (n,) is a torque against the positive direction over each row's interval; ``spread`` (n, 2) stands in the place of
-    what :func:`spread_of` gives.
+    ``variances`` (3,) are those of voltage, current and speed; ``ordered_for_s`` as in :func:`marks_of`, the delay
+    itself when left out; ``load_nm`` (n,) is a torque against the positive direction over each row's interval;
+    ``spread`` (n, 2) stands in the place of what :func:`spread_of` gives.
     """
     assert motion.slow is not None
-    marks = marks_of(motion, float(theta[6]), ordered_for_s)
-    made = _filter(
-        theta,
-        motion.dt_s,
-        motion.mode,
-        spread_of(motion, variances) if spread is None else spread,
-        np.zeros(0) if load_nm is None else load_nm,
-        read_only(motion.current),
-        read_only(motion.speed),
-        read_only(motion.voltage_mean),
-        motion.voltage_sampling == "instant",
-        motion.slow.period_s,
-        marks.row,
-        marks.sample,
-        marks.time_s,
-        motion.shape_variance,
-        variances,
-        motion.speed_walk,
-        motion.slope_walk,
-    )
-    return Innovations(*made)
+    delay_s = float(theta[DELAY])
+    marks = marks_of(motion, delay_s, delay_s if ordered_for_s is None else ordered_for_s)
+    instant = motion.voltage_sampling == "instant"
+    voltage = read_only(motion.voltage_mean)
+    sensor = SlowSensor(voltage, instant, motion.slow.period_s, motion.shape_variance, marks)
+    spread = spread_of(motion, variances) if spread is None else spread
+    load = np.zeros(0) if load_nm is None else load_nm
+    readings = Readings.of(motion)
+    return Innovations(*slow_innovations(theta, readings, sensor, variances, spread, load, motion.slope_walk))
 
 
 def course_effect(motion: Motion, theta: Float, variances: Float) -> Float:
@@ -291,17 +125,16 @@ def course_effect(motion: Motion, theta: Float, variances: Float) -> Float:
     Set-points that are interpolated by straight lines leave an accelerating current above its mean where they meet.
     """
     slope = np.gradient(moving_mean(motion.current, CORNER_ROWS))
-    accelerating = theta[3] / theta[2] * np.gradient(moving_mean(motion.speed, SMOOTH_ROWS), motion.dt_s)
+    accelerating = theta[JT] / theta[K] * np.gradient(moving_mean(motion.speed, SMOOTH_ROWS), motion.dt_s)
     late_rows = max(CURRENT_LATE, CURRENT_LATE_S / motion.dt_s)  # finer rows make no finer regulators
     mean = replace(motion, current=motion.current + late_rows * slope - CURRENT_ABOVE * accelerating)
-    delay = float(theta[6])
-    changed: Float = innovations_of(mean, theta, variances, delay).whitened
-    return changed - innovations_of(motion, theta, variances, delay).whitened
+    changed: Float = innovations_of(mean, theta, variances).whitened
+    return changed - innovations_of(motion, theta, variances).whitened
 
 
 def left_open_v(motion: Motion, theta: Float, variances: Float) -> float:
     """Return the standard deviation (V) of what current and speed leave open of a voltage sample, in the median."""
-    made = innovations_of(motion, theta, variances, float(theta[6]))
+    made = innovations_of(motion, theta, variances)
     known = made.values[2 * motion.n :] != 0.0
     if not known.any():
         return 0.0

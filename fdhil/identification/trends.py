@@ -1,4 +1,4 @@
-"""What a parameter's history tells: its slope, where it stepped, when it will reach a limit, each with its interval.
+"""Reads a parameter's history: its slope, where it stepped, when it will reach a limit, each with its interval.
 
 Pure: rows in, figures out; nothing here reads a clock.
 """

@@ -1,4 +1,4 @@
-"""Rapid moves in a recording: where each begins and ends, and its stages.
+"""Finds rapid moves in a recording: where each begins and ends, and its stages.
 
 A window is a maximal run in which the smoothed speed is at least 2 % of the rapid speed, extended to rest. A run whose
 peak stays below 60 % of the rapid speed is a feed move and is not listed.
@@ -184,13 +184,7 @@ def _plateau(moving: Float) -> float:
 
 def longest(flags: Bool) -> tuple[int, int]:
     """Return the half-open range of the longest run of True; (0, 0) when there is none."""
-    padded = np.concatenate([[False], flags, [False]])
-    edges = np.flatnonzero(np.diff(padded.astype(np.int8)))
-    if edges.size == 0:
-        return 0, 0
-    starts, ends = edges[::2], edges[1::2]
-    k = int(np.argmax(ends - starts))
-    return int(starts[k]), int(ends[k])
+    return next(iter(runs_of(flags, 1)), (0, 0))
 
 
 def runs_of(flags: Bool, least: int) -> list[tuple[int, int]]:

@@ -231,7 +231,7 @@ class AxisPipeline:
         estimate, window = outcome.estimate, outcome.window
         assert estimate is not None
         tick = window.start_tick
-        notices = self._tracker.update(estimate.parameters(), estimate.covariance, tick, window.temperature_c)
+        notices = self._tracker.update(estimate.parameters(), estimate.covariance, tick)
         if self._tracker.holding:
             self._held.append(outcome)
             return notices

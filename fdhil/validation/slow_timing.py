@@ -67,7 +67,7 @@ def _shift(fit: Fit) -> tuple[float, float]:
     width = 2 * round(SMOOTHING_S / 2 / motion.dt_s) + 1
     earlier = replace(motion, current=motion.current + np.gradient(moving_mean(motion.current, width)))
     gains, theta = fit.problem.filters[0], fit.theta
-    answer = innovations(earlier, theta, gains, theta[6]).ravel() - innovations(motion, theta, gains, theta[6]).ravel()
+    answer = innovations(earlier, theta, gains) - innovations(motion, theta, gains)
     rest = answer - fit.jacobian @ (inverse_of(fit.information)[0] @ (fit.jacobian.T @ answer))
     power = float(rest @ rest)
     return (-float(rest @ fit.residuals) / power, power**-0.5) if power > 0.0 else (0.0, np.inf)

@@ -13,11 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from fdhil.identification import batch_filter as sweeps
 from fdhil.identification.covariance import aliasing
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.filtering import moving_mean
-from fdhil.identification.innovations import innovations
+from fdhil.identification.innovations import CURRENT, LOAD, SPEED, VOLTAGE, answers, innovations
 from fdhil.identification.motion import UNKNOWN, Motion
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import innovations_of
@@ -33,7 +32,7 @@ LEAST_OFFSET = 0.01  # of the signal's peak
 IMITATED = 1e-6  # share of a direction below which only rounding is left of it
 LAGS = 25
 SLOPE_S = 0.005  # over which the acceleration is taken
-_KINDS = {"current": sweeps.CURRENT, "speed": sweeps.SPEED}
+_KINDS = {"current": CURRENT, "speed": SPEED}
 STRIBECK_SPEEDS = (0.01, 0.03, 0.06, 0.12)  # of the rapid speed
 
 
@@ -96,14 +95,14 @@ class Bench:
 
     def load_answers(self, loads: Float) -> Float:
         """Return minus the change (m, q) of the innovations under each of ``loads`` (q, n), N.m."""
-        return self._answers(sweeps.LOAD, loads, None)
+        return self._answers(LOAD, loads, None)
 
     def gain_answers(self, name: str, courses: Float) -> Float:
         """Return minus the change (m, q) of innovations when the gain of ``name`` grows by ``courses`` (q, n)."""
         motion = self._foretold()
         if name == "voltage":
             at = np.array([motion.at_voltage(c) for c in courses])
-            answers = self._answers(sweeps.VOLTAGE, motion.voltage_mean * at, motion.voltage_rise * at)
+            answers = self._answers(VOLTAGE, motion.voltage_mean * at, motion.voltage_rise * at)
         else:
             answers = self._answers(_KINDS[name], getattr(motion, name) * courses, None)
         # a drive that creeps to rest is no random walk, for which its speed is taken there: its innovations lean
@@ -137,7 +136,7 @@ class Bench:
         if name != "voltage":
             return self._answers(_KINDS[name], courses, None)
         at_samples = np.array([motion.at_voltage(c) for c in courses])
-        return self._answers(sweeps.VOLTAGE, at_samples, np.zeros_like(at_samples))
+        return self._answers(VOLTAGE, at_samples, np.zeros_like(at_samples))
 
     def _answers(self, kind: int, courses: Float, rises: Float | None) -> Float:
         motion, theta, gains = self.motion, self.fit.theta, self.fit.problem.filters[0]
@@ -146,20 +145,20 @@ class Bench:
         if rises is not None and theta[6] != 0.0:
             both = zip(courses, rises, strict=True)
             courses = np.array([replace(motion, voltage_mean=c, voltage_rise=r).delayed(theta[6]) for c, r in both])
-        answered: Float = -sweeps.answers(motion, theta, gains, kind, courses, rises)
+        answered: Float = -answers(motion, theta, gains, kind, courses, rises)
         return answered
 
     def _slow_answer(self, kind: int, course: Float) -> Float:
         """Return minus the change (m,) of the innovations, a slow voltage's among them."""
         motion, theta, gains = self.motion, self.fit.theta, self.fit.problem.filters[0]
-        if kind == sweeps.VOLTAGE:
+        if kind == VOLTAGE:
             motion = replace(motion, voltage_mean=motion.voltage_mean + course)
-        elif kind == sweeps.CURRENT:
+        elif kind == CURRENT:
             motion = replace(motion, current=motion.current + course)
-        elif kind == sweeps.SPEED:
+        elif kind == SPEED:
             motion = replace(motion, speed=motion.speed + course)
-        load = course if kind == sweeps.LOAD else None
-        change: Float = self.fit.residuals - innovations(motion, theta, gains, theta[6], load).ravel()
+        load = course if kind == LOAD else None
+        change: Float = self.fit.residuals - innovations(motion, theta, gains, load)
         return change
 
     def scores(self, directions: Float) -> tuple[Float, Float, Float]:
@@ -210,10 +209,8 @@ def courses(fit: Fit) -> Float:
     missed = doubt * theta[0] * theta[3] / theta[2] * rate
     if motion.slow is not None:
         moved = replace(motion, voltage_mean=motion.voltage_mean + motion.at_voltage(missed))
-        return np.column_stack([shape, innovations(moved, theta, fit.problem.filters[0], theta[6]) - fit.residuals])
-    answer = sweeps.answers(
-        motion, theta, fit.problem.filters[0], sweeps.VOLTAGE, missed[None], np.zeros((1, motion.n))
-    )
+        return np.column_stack([shape, innovations(moved, theta, fit.problem.filters[0]) - fit.residuals])
+    answer = answers(motion, theta, fit.problem.filters[0], VOLTAGE, missed[None], np.zeros((1, motion.n)))
     return np.column_stack([shape, answer])
 
 
@@ -231,7 +228,7 @@ def expected_correlation(fit: Fit) -> Float:
     pulse = np.zeros(motion.n)
     # what the fit needs beyond the sensor's noise is the regulators' doing, and is not shared in that way
     pulse[row] = min(fit.problem.noises[0].voltage_v, motion.noise.voltage_v)
-    answer = sweeps.answers(motion, fit.theta, gains, sweeps.VOLTAGE, pulse[None], np.zeros((1, motion.n)))
+    answer = answers(motion, fit.theta, gains, VOLTAGE, pulse[None], np.zeros((1, motion.n)))
     h = np.zeros(3 * LAGS)
     part = answer.reshape(-1, 2)[row : row + h.size, 0]
     h[: part.size] = part

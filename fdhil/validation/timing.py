@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdhil.identification import batch_filter as sweeps
 from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.filtering import moving_mean
+from fdhil.identification.innovations import CURRENT, VOLTAGE, answers
 from fdhil.identification.normal import inverse_of
 from fdhil.records import Float, Reason, Window
 from fdhil.validation.structure import courses, expected_correlation
@@ -102,9 +102,9 @@ def shifts(fit: Fit) -> tuple[Shift, Shift]:
     coloured = 1.0 + 2.0 * max(0.0, float(expected_correlation(fit)[0]))
     whole = np.column_stack([e, courses(fit)])
     whole = whole - jacobian @ (inverse @ (jacobian.T @ whole))
-    for kind, values in ((sweeps.VOLTAGE, motion.delayed(float(fit.theta[6]))), (sweeps.CURRENT, motion.current)):
+    for kind, values in ((VOLTAGE, motion.delayed(float(fit.theta[6]))), (CURRENT, motion.current)):
         slope = np.gradient(moving_mean(values, width))
-        answer = sweeps.answers(motion, fit.theta, gains, kind, [slope], _no_rise(kind, motion.n))[:, 0]
+        answer = answers(motion, fit.theta, gains, kind, [slope], _no_rise(kind, motion.n))[:, 0]
         rest = answer - jacobian @ (inverse @ (jacobian.T @ answer))
         power = float(rest @ rest)
         if not power > 0.0:
@@ -116,7 +116,7 @@ def shifts(fit: Fit) -> tuple[Shift, Shift]:
 
 
 def _no_rise(kind: int, n: int) -> list[Float] | None:
-    return [np.zeros(n)] if kind == sweeps.VOLTAGE else None
+    return [np.zeros(n)] if kind == VOLTAGE else None
 
 
 def searched(fit: Fit, first: Shift) -> float | None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fdhil.identification.derivatives import OPERATORS, ZERO_FORCING_1, Operator, derivative
+from fdhil.identification.derivatives import ZERO_FORCING_1, Operator, derivative
+from studies.derivative_operators import OPERATORS
 
 
 def test_zero_forcing_is_the_papers() -> None:

@@ -10,19 +10,13 @@ from scipy.signal import lfilter
 
 from fdhil import tables
 from fdhil.config import Identification
-from fdhil.identification.estimators import (
-    Estimator,
-    chosen,
-    instrumental_variables,
-    least_squares,
-    maximum_likelihood,
-)
+from fdhil.identification.estimators import Estimator, chosen, least_squares, maximum_likelihood
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.windows import find_windows
 from fdhil.records import PARAMETERS, Estimate, Float, Result, Window, frozen
 from fdhil.store.recording_csv import parse_recording
 from fdhil.validation.pooled import weighted
-from studies import bench
+from studies import bench, instrumental_variables
 from tests.identification.recorded import signals, windows
 
 SETTINGS = Identification()
@@ -36,13 +30,15 @@ REACH: dict[str, tuple[float, ...]] = {
 }
 
 
-@pytest.fixture(params=list(tables.ESTIMATORS))
+@pytest.fixture(params=[*tables.ESTIMATORS, instrumental_variables.NAME])
 def name(request: pytest.FixtureRequest) -> str:
-    """The name of a listed estimator."""
+    """The name of a listed estimator, or of the one that only studies compare."""
     return str(request.param)
 
 
 def _estimator(name: str) -> Estimator:
+    if name == instrumental_variables.NAME:
+        return instrumental_variables.estimate
     return chosen(SETTINGS.model_copy(update={"method": name}))[1]
 
 

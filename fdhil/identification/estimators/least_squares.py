@@ -1,4 +1,4 @@
-"""The paper's method: one low-pass on every signal, operator [4], least squares on [5] and [6] of [DES].
+"""Estimates by the paper's method: one low-pass on every signal, operator [4], least squares on [5] and [6] of [DES].
 
 Each interval mean of voltage belongs to the middle of its interval; current and speed are brought to the same interval
 means, so that all three are treated alike. [6] is fitted as K i = Jt Dw + ft w + Cd sign(w) with K from [5]. Standard
@@ -14,7 +14,7 @@ import numpy as np
 
 from fdhil.config import Identification
 from fdhil.identification.covariance import aliasing, attenuation, residual_gammas, two_step
-from fdhil.identification.derivatives import OPERATORS, ZERO_FORCING_1, Operator, derivative
+from fdhil.identification.derivatives import ZERO_FORCING_1, Operator, derivative
 from fdhil.identification.filtering import all_about, impulse_response, reach, zero_phase
 from fdhil.identification.identifiability import empty_estimate, judge
 from fdhil.identification.motion import noise_levels, surely_moving
@@ -23,6 +23,7 @@ from fdhil.identification.windows import carried
 from fdhil.records import PARAMETERS, Bool, Estimate, Float, Reason, Result, Window
 
 NAME = "least_squares"
+ORDER = [1, 0, 2, 3, 4, 5]  # from L, R, K to R, L, K, and back
 # of [L, R, K, Jt, ft, Cd]: what stencils and the voltage's course within a sample leave open, however low the noise
 OPEN_SHARE = np.array([1e-3, 5e-4, 5e-5, 3e-4, 0.0, 0.0])
 
@@ -82,21 +83,21 @@ def regressors(signals: Signals, dt_s: float, operator: Operator = ZERO_FORCING_
 
 
 def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
-    """Fit [5] and [6] to the windows together; see :func:`estimate_with` for another operator."""
-    return estimate_with(windows, settings, ZERO_FORCING_1.name)
-
-
-def estimate_with(windows: Sequence[Window], settings: Identification, operator: str) -> Estimate:
-    """Fit [5] and [6] with a named derivative operator."""
-    parts = [regressors(align(w, settings), w.dt_s, OPERATORS[operator]) for w in windows if w.voltage_v is not None]
+    """Fit [5] and [6] to the windows together."""
+    parts = [regressors(align(w, settings), w.dt_s) for w in windows if w.voltage_v is not None]
     parts = [p for p in parts if p[0].shape[0] > 0]
     rows = sum(p[0].shape[0] for p in parts)
     if rows < 8:
         return too_short(NAME, rows)
-    noise = np.mean([noise_levels(w).vector() ** 2 for w in windows], axis=0)
+    alias = aliasing(windows[0].voltage_sampling, windows[0].dt_s)
+    return fit_two_steps(NAME, parts, *noise_through(windows, settings), alias)
+
+
+def noise_through(windows: Sequence[Window], settings: Identification) -> tuple[Float, Float, Float]:
+    """Return the variances (3,) of voltage, current and speed, and what low-pass and operator make of one sample."""
     impulse = impulse_response(settings.lowpass_hz, windows[0].dt_s)
-    slope = np.nan_to_num(derivative(impulse, windows[0].dt_s, OPERATORS[operator]))
-    return fit_two_steps(NAME, parts, noise, impulse, slope, aliasing(windows[0].voltage_sampling, windows[0].dt_s))
+    noise = np.mean([noise_levels(w).vector() ** 2 for w in windows], axis=0)
+    return noise, impulse, np.nan_to_num(derivative(impulse, windows[0].dt_s))
 
 
 def too_short(method: str, rows: int) -> Estimate:
@@ -118,27 +119,44 @@ def fit_two_steps(
     if not (np.isfinite(electrical).all() and np.isfinite(mechanical).all()):
         reason = Reason("NotFinite", "a filtered signal is not finite", "check the sensor")
         return empty_estimate(method, Result.NOT_FINITE, reason)
-    first, condition_1 = solve(electrical[:, 1:], electrical[:, 0])
-    torque = mechanical[:, 0] * first[2]
-    second, condition_2 = solve(mechanical[:, 1:], torque)
-    theta = np.concatenate([first, second])
-    residual_u = electrical[:, 0] - electrical[:, 1:] @ first
-    residual_t = torque - mechanical[:, 1:] @ second
+    theta, condition = solve_two_steps(electrical, mechanical)
+    residual_u, residual_t = residuals_of(theta, electrical, mechanical)
     noise = np.append(_voltage_variance(residual_u, theta, impulse, slope, noise), noise[1:])
     gammas = residual_gammas(theta, impulse, slope, noise)
     covariance = two_step(electrical, mechanical, (residual_u, residual_t), gammas, [p[0].shape[0] for p in parts])
     bias = attenuation(electrical, mechanical, theta, impulse, slope, noise)
     covariance += np.outer(bias, bias) + np.diag(np.square(OPEN_SHARE * theta))
-    order = [1, 0, 2, 3, 4, 5]  # from L, R, K to R, L, K
+    covariance += np.diag(np.square(alias[ORDER] * theta))
+    return two_step_estimate(method, theta, covariance, (residual_u, residual_t), condition, mechanical)
+
+
+def solve_two_steps(electrical: Float, mechanical: Float) -> tuple[Float, float]:
+    """Return [L, R, K, Jt, ft, Cd] (6,) by least squares on [5], then on [6], and the larger condition number."""
+    first, condition_1 = solve(electrical[:, 1:], electrical[:, 0])
+    second, condition_2 = solve(mechanical[:, 1:], mechanical[:, 0] * first[2])
+    return np.concatenate([first, second]), max(condition_1, condition_2)
+
+
+def residuals_of(theta: Float, electrical: Float, mechanical: Float) -> tuple[Float, Float]:
+    """Return what ``theta`` = [L, R, K, Jt, ft, Cd] leaves of [5] (m,) in V, and of K times [6] (m,) in N.m."""
+    torque = mechanical[:, 0] * theta[2]
+    return electrical[:, 0] - electrical[:, 1:] @ theta[:3], torque - mechanical[:, 1:] @ theta[3:]
+
+
+def two_step_estimate(
+    method: str, theta: Float, covariance: Float, residuals: tuple[Float, Float], condition: float, mechanical: Float
+) -> Estimate:
+    """Return the judged estimate of ``theta`` = [L, R, K, Jt, ft, Cd] with its covariance (6, 6) in that order."""
+    electrical, torque = residuals
     answer = Estimate(
         method=method,
         names=PARAMETERS,
-        values=theta[order],
-        covariance=covariance[np.ix_(order, order)] + np.diag(np.square(alias * theta[order])),
-        residuals={"electrical": residual_u, "mechanical": residual_t / first[2] if first[2] else residual_t},
+        values=theta[ORDER],
+        covariance=covariance[np.ix_(ORDER, ORDER)],
+        residuals={"electrical": electrical, "mechanical": torque / theta[2] if theta[2] else torque},
         result=Result.OK,
     )
-    return judge(answer, max(condition_1, condition_2), float(np.abs(mechanical[:, 2]).max()))
+    return judge(answer, condition, float(np.abs(mechanical[:, 2]).max()))
 
 
 def _voltage_variance(residual_u: Float, theta: Float, impulse: Float, slope: Float, noise: Float) -> float:
@@ -156,6 +174,4 @@ def raw_values(signals: Sequence[Signals], dt_s: Sequence[float]) -> Float | Non
     electrical, mechanical = (np.vstack([p[k] for p in parts]) for k in (0, 1))
     if not (np.isfinite(electrical).all() and np.isfinite(mechanical).all()):
         return None
-    (inductance, resistance, constant), _ = solve(electrical[:, 1:], electrical[:, 0])
-    second, _ = solve(mechanical[:, 1:], mechanical[:, 0] * constant)
-    return np.array([resistance, inductance, constant, *second])
+    return solve_two_steps(electrical, mechanical)[0][ORDER]

@@ -1,4 +1,4 @@
-"""All six parameters together from noisy voltage, current and speed: maximum likelihood by Kalman innovations.
+"""Estimates all six parameters together from noisy signals: maximum likelihood by Kalman innovations.
 
 The voltage is noisy too, so the model driven by it is off by noise that the drive has filtered. The innovations of
 :mod:`fdhil.identification.innovations` undo that filter: they are white, and the sum of their squares is the exponent
@@ -15,13 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdhil.config import Identification
-from fdhil.identification.batch_filter import whiten
 from fdhil.identification.covariance import TESTED_LAGS, aliasing, robust, suspicious
 from fdhil.identification.delay import coarse_delay
 from fdhil.identification.estimators import least_squares
-from fdhil.identification.estimators.least_squares import Signals
-from fdhil.identification.identifiability import judge
-from fdhil.identification.innovations import Gains, gains_of, innovations
+from fdhil.identification.identifiability import admissible, judge
+from fdhil.identification.innovations import Gains, gains_of, innovations, whiten
+from fdhil.identification.kalman import CD, DELAY, FT, JT, K, L, R
 from fdhil.identification.motion import UNKNOWN, Motion, Noise, prepare
 from fdhil.identification.noise import fit_noise
 from fdhil.identification.normal import inverse_of, solve
@@ -45,7 +44,7 @@ LEAST_DELAY = 0.05  # of a sample; smaller ones cannot be told from the voltage'
 CHANCE = 2.0  # standard deviations of a delay that are chance, not doubt
 SETTLED = 0.25  # squared standard deviations moved: for less, no noise level changes by a thousandth
 INSTANT_DELAY = 0.5  # of a row
-FLOORS = np.array([1e-4, 0.0, 1e-4, 1e-9])
+FLOORS = np.array([1e-4, 1e-4, 1e-9])  # of R, K and Jt
 LEAST_TIME_CONSTANT_S = 1e-4  # of the winding: noise may drive the starting L below 0
 
 
@@ -83,10 +82,8 @@ class Problem:
         return self._all(theta, 1.0 + SHAPE_DOUBT) - self._all(theta, 1.0)
 
     def _all(self, theta: Float, emf_share: float) -> Float:
-        parts = [
-            innovations(m, theta, f, theta[6], None, emf_share) for m, f in zip(self.motions, self.filters, strict=True)
-        ]
-        return np.concatenate([p.ravel() for p in parts])
+        pairs = zip(self.motions, self.filters, strict=True)
+        return np.concatenate([innovations(m, theta, f, emf_share=emf_share) for m, f in pairs])
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +123,7 @@ def pose(motions: Sequence[Motion], theta: Float, noises: Sequence[Noise]) -> Pr
 
 def jacobian(problem: Problem, theta: Float, base: Float, free: Sequence[int], scales: Float) -> Float:
     """Return minus the derivative (m, k) of the innovations by the ``free`` entries of theta, filter included."""
-    steps = np.array([DELAY_DIFFERENCE_S if j == 6 else DIFFERENCE * scales[j] for j in free])
+    steps = np.array([DELAY_DIFFERENCE_S if j == DELAY else DIFFERENCE * scales[j] for j in free])
     moved = np.tile(theta, (len(free), 1))
     moved[np.arange(len(free)), list(free)] += steps
     changes: Float = (base[:, None] - problem.columns(moved)) / steps
@@ -135,17 +132,12 @@ def jacobian(problem: Problem, theta: Float, base: Float, free: Sequence[int], s
 
 def typical(theta: Float, motions: Sequence[Motion]) -> Float:
     """Return the typical size (7,) of each entry: friction is measured against the torque and speed there are."""
-    torque = abs(theta[2]) * max(float(np.abs(m.current).max()) for m in motions)
+    torque = abs(theta[K]) * max(float(np.abs(m.current).max()) for m in motions)
     speed = max(float(np.abs(m.speed).max()) for m in motions)
     sizes = np.abs(theta)
-    sizes[4] = max(sizes[4], 1e-3 * torque / speed)
-    sizes[5] = max(sizes[5], 1e-3 * torque)
+    sizes[FT] = max(sizes[FT], 1e-3 * torque / speed)
+    sizes[CD] = max(sizes[CD], 1e-3 * torque)
     return sizes
-
-
-def admissible(theta: Float) -> bool:
-    """Return whether R, L, K and Jt are above 0 and all is finite."""
-    return bool(np.isfinite(theta).all() and (theta[:4] > 0).all())
 
 
 def descend(
@@ -211,13 +203,13 @@ def fit(motions: Sequence[Motion], start: Float, free: Sequence[int]) -> Fit:
     return Fit(theta, information, tuple(free), residuals, j, pose(motions, theta, problem.noises), converged)
 
 
-def starting_point(signals: Sequence[Signals], dt_s: Sequence[float]) -> Float | None:
-    """Return the least-squares estimate as theta (7,) without delay; None without one, or when no drive can be so."""
-    first = least_squares.raw_values(signals, dt_s)
-    if first is None or not np.isfinite(first).all() or (first[[0, 2, 3]] <= FLOORS[[0, 2, 3]]).any():
+def starting_point(first: Float | None) -> Float | None:
+    """Return theta (7,) to start from, without delay; None without a first estimate, or when no drive can be so."""
+    if first is None or not np.isfinite(first).all() or (first[[R, K, JT]] <= FLOORS).any():
         return None
-    first[1] = max(first[1], LEAST_TIME_CONSTANT_S * first[0])
-    return np.append(first, 0.0)
+    theta = np.append(first, 0.0)
+    theta[L] = max(theta[L], LEAST_TIME_CONSTANT_S * theta[R])
+    return theta
 
 
 def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | None:
@@ -231,14 +223,14 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
         return _fit_slow(slow, settings)
     usable = [w for w in windows if w.voltage_v is not None]
     signals = [least_squares.align(w, settings) for w in usable]
-    start = starting_point(signals, [w.dt_s for w in usable])
+    start = starting_point(least_squares.raw_values(signals, [w.dt_s for w in usable]))
     if start is None:
         return None
     motions = [prepare(w) for w in usable]
     delays = [coarse_delay(s, w.dt_s) for s, w in zip(signals, usable, strict=True)]
     if any(w.voltage_delay_s is not None for w in usable):
         return _fit_separate(motions, start, delays)
-    start[6] = float(np.median(delays))
+    start[DELAY] = float(np.median(delays))
     return _fit_together(motions, start)
 
 
@@ -249,7 +241,7 @@ def _fit_together(motions: Sequence[Motion], start: Float) -> Fit:
     otherwise. So a small delay is not taken out: what it would change is a doubt, and so it is about a larger one.
     """
     least = LEAST_DELAY * min(m.dt_s for m in motions)
-    if start[6] == 0.0:
+    if start[DELAY] == 0.0:
         plain = fit(motions, start, range(6))
         delay, std = delay_score(plain)
         if abs(delay) < max(SURE * std, least):
@@ -269,7 +261,7 @@ def _fit_separate(motions: Sequence[Motion], start: Float, delays: Sequence[floa
     alone = [_fit_alone(m, np.append(start[:6], delay)) for m, delay in zip(motions, delays, strict=True)]
     if len(motions) == 1:
         return replace(alone[0], delay_doubt_s=instant_doubt(motions[0]))
-    aligned = [m.aligned(f.theta[6]) if f.converged else m for m, f in zip(motions, alone, strict=True)]
+    aligned = [m.aligned(f.theta[DELAY]) if f.converged else m for m, f in zip(motions, alone, strict=True)]
     together = fit(aligned, np.append(alone[0].theta[:6], 0.0), range(7))
     return replace(together, delay_doubt_s=instant_doubt(motions[0]))
 
@@ -284,8 +276,8 @@ def _fit_alone(motion: Motion, start: Float) -> Fit:
     if better is None:
         return found
     other = fit([motion], better, range(7))
-    there = Likelihood(other.problem.motions, other.problem.noises).at(other.theta, float(other.theta[6]))
-    return other if there.cost < here.at(found.theta, float(found.theta[6])).cost else found
+    there = Likelihood(other.problem.motions, other.problem.noises).at(other.theta)
+    return other if there.cost < here.at(found.theta).cost else found
 
 
 def instant_doubt(motion: Motion) -> float:
@@ -299,10 +291,12 @@ def instant_doubt(motion: Motion) -> float:
 def _fit_slow(windows: Sequence[Window], settings: Identification) -> Fit | None:
     """Fit windows whose voltage comes more slowly than the drive's rows; the delay is always a parameter."""
     begun = slow_start(windows, settings)
-    if begun is None or not np.isfinite(begun[0]).all() or (begun[0][[0, 2, 3]] <= FLOORS[[0, 2, 3]]).any():
+    if begun is None:
         return None
-    theta, delays, motions = begun
-    theta[1] = max(theta[1], LEAST_TIME_CONSTANT_S * theta[0])
+    first, delays, motions = begun
+    theta = starting_point(first)
+    if theta is None:
+        return None
     walking = [with_course(m, np.append(theta[:6], delay)) for m, delay in zip(motions, delays, strict=True)]
     return _fit_separate(walking, theta, delays)
 
@@ -317,10 +311,10 @@ def delay_score(plain: Fit) -> tuple[float, float]:
 
 def delay_direction(result: Fit) -> Float:
     """Return minus the derivative (m,) of the innovations by the delay."""
-    if 6 in result.free:
-        return result.jacobian[:, result.free.index(6)]
+    if DELAY in result.free:
+        return result.jacobian[:, result.free.index(DELAY)]
     sizes = typical(result.theta, result.problem.motions)
-    return jacobian(result.problem, result.theta, result.residuals, [6], sizes)[:, 0]
+    return jacobian(result.problem, result.theta, result.residuals, [DELAY], sizes)[:, 0]
 
 
 def doubts(result: Fit, inverse: Float) -> Float:
@@ -336,7 +330,7 @@ def doubts(result: Fit, inverse: Float) -> Float:
     if result.delay_doubt_s > 0.0:
         six = result.jacobian[:, :6]
         columns[:6, 1] = -result.delay_doubt_s * solve(six, delay_direction(result))[0]
-        columns[6, 1] = result.delay_doubt_s
+        columns[DELAY, 1] = result.delay_doubt_s
     return columns
 
 
@@ -364,7 +358,7 @@ def robust_inverse(result: Fit, inverse: Float) -> Float:
         return inverse
     slopes = result.by_window(result.jacobian)
     scores = [
-        in_order(m, float(result.theta[6]), j * e[:, None]) for m, j, e in zip(motions, slopes, parts, strict=True)
+        in_order(m, float(result.theta[DELAY]), j * e[:, None]) for m, j, e in zip(motions, slopes, parts, strict=True)
     ]
     plain = [
         (j.reshape(m.n, 2, -1), e)
@@ -382,7 +376,7 @@ def finish(result: Fit) -> Estimate:
     alias = aliasing(first.voltage_sampling, first.voltage_period_s)
     systematic = doubts(result, inverse)
     held = robust_inverse(result, inverse)
-    late = 6 in result.free
+    late = DELAY in result.free
     answer = Estimate(
         method=NAME,
         names=PARAMETERS,
@@ -390,8 +384,8 @@ def finish(result: Fit) -> Estimate:
         covariance=inverse[:k, :k] + systematic[:k] @ systematic[:k].T + np.diag(np.square(alias * result.theta[:k])),
         residuals=result.by_equation(),
         result=Result.OK if result.converged else Result.DIVERGED,
-        delay_s=float(result.theta[6]) if late else None,
-        delay_std_s=float(np.sqrt(held[6, 6] + systematic[6] @ systematic[6])) if late else None,
+        delay_s=float(result.theta[DELAY]) if late else None,
+        delay_std_s=float(np.sqrt(held[DELAY, DELAY] + systematic[DELAY] @ systematic[DELAY])) if late else None,
         systematic=systematic[:k],
     )
     # what the data can tell is the information's to say; that residuals are coloured is no lack of excitation

@@ -1,4 +1,4 @@
-"""Reinitialised partial moments [COI 93], the method that the paper compared with its own.
+"""Estimates by reinitialised partial moments [COI 93], the method that the paper compared with its own.
 
 [1] is multiplied by the time since the start of a horizon T and integrated over it; by parts,
 

@@ -17,13 +17,23 @@ import numpy as np
 from fdhil.config import Identification
 from fdhil.identification.covariance import aliasing, coloured_meat, residual_gammas
 from fdhil.identification.derivatives import derivative
-from fdhil.identification.estimators.least_squares import OPEN_SHARE, Signals, align, regressors, too_short
-from fdhil.identification.filtering import impulse_response, zero_phase
-from fdhil.identification.identifiability import empty_estimate, judge
-from fdhil.identification.motion import noise_levels
+from fdhil.identification.estimators.least_squares import (
+    OPEN_SHARE,
+    ORDER,
+    Signals,
+    align,
+    noise_through,
+    regressors,
+    residuals_of,
+    solve_two_steps,
+    too_short,
+    two_step_estimate,
+)
+from fdhil.identification.filtering import zero_phase
+from fdhil.identification.identifiability import empty_estimate
 from fdhil.identification.normal import solve
 from fdhil.identification.windows import carried
-from fdhil.records import PARAMETERS, Estimate, Float, Reason, Result, Window
+from fdhil.records import Estimate, Float, Reason, Result, Window
 
 NAME = "instrumental_variables"
 REFINEMENTS = 4
@@ -78,7 +88,7 @@ def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
 def raw_values(windows: Sequence[Window], settings: Identification) -> Float | None:
     """Return [R, L, K, Jt, ft, Cd] (6,) unjudged; None when there are too few rows."""
     rows = gather([w for w in windows if w.voltage_v is not None], settings)
-    return None if rows is None else fit(rows)[[1, 0, 2, 3, 4, 5]]
+    return None if rows is None else fit(rows)[ORDER]
 
 
 def gather(windows: Sequence[Window], settings: Identification) -> Rows | None:
@@ -123,9 +133,7 @@ def fit(rows: Rows) -> Float:
     """Return [L, R, K, Jt, ft, Cd] (6,), NaN where the equations cannot be solved."""
     if not rows.finite:
         return np.full(6, np.nan)
-    first = solve(rows.electrical[:, 1:], rows.electrical[:, 0])[0]
-    second = solve(rows.mechanical[:, 1:], rows.mechanical[:, 0] * first[2])[0]
-    theta = np.concatenate([first, second])
+    theta = solve_two_steps(rows.electrical, rows.mechanical)[0]
     for _ in range(REFINEMENTS):
         if not np.isfinite(theta).all() or theta[2] == 0.0:
             return np.full(6, np.nan)
@@ -158,30 +166,17 @@ def _condition(instruments: Float, regressor: Float) -> float:
 def _finish(rows: Rows, theta: Float, windows: Sequence[Window], settings: Identification) -> Estimate:
     """Return the judged estimate with the sandwich covariance of both steps."""
     one, two = rows.instruments(theta)
-    torque = rows.mechanical[:, 0] * theta[2]
-    residual_u = rows.electrical[:, 0] - rows.electrical[:, 1:] @ theta[:3]
-    residuals = (residual_u, torque - rows.mechanical[:, 1:] @ theta[3:])
+    residuals = residuals_of(theta, rows.electrical, rows.mechanical)
     window = windows[0]
-    impulse = impulse_response(settings.lowpass_hz, window.dt_s)
-    slope = np.nan_to_num(derivative(impulse, window.dt_s))
-    noise = np.mean([noise_levels(w).vector() ** 2 for w in windows], axis=0)
+    noise, impulse, slope = noise_through(windows, settings)
     gammas = _gammas(theta, residuals, impulse, slope, noise)
     bread = _bread(rows, one, two)
     covariance = bread @ coloured_meat([one, two], gammas, rows.lengths) @ bread.T
     covariance += np.diag(np.square(OPEN_SHARE * theta))
-    order = [1, 0, 2, 3, 4, 5]  # from L, R, K to R, L, K
     alias = aliasing(window.voltage_sampling, window.dt_s)
-    values = theta[order]
-    answer = Estimate(
-        method=NAME,
-        names=PARAMETERS,
-        values=values,
-        covariance=covariance[np.ix_(order, order)] + np.diag(np.square(alias * values)),
-        residuals={"electrical": residuals[0], "mechanical": residuals[1] / theta[2]},
-        result=Result.OK,
-    )
+    covariance += np.diag(np.square(alias[ORDER] * theta))
     condition = max(_condition(one, rows.electrical[:, 1:]), _condition(two, rows.mechanical[:, 1:]))
-    return judge(answer, condition, float(np.abs(rows.mechanical[:, 2]).max()))
+    return two_step_estimate(NAME, theta, covariance, residuals, condition, rows.mechanical)
 
 
 def _gammas(

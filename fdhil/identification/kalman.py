@@ -1,0 +1,396 @@
+"""Runs the Kalman filters over a window's rows: all that is compiled of them, with the entries named.
+
+Three filters share the drive's equations [1] and [2]. ``whiten`` takes the voltage of each interval as an input, which
+is noisy: with G the model's response from voltage to z = [i; w], the residual z - G u has covariance S_iw + G S_u G',
+and a filter whose process noise is the voltage's noise through the drive whitens exactly that residual.
+``slow_innovations`` takes the samples of a slower sensor as measurements, and ``departure`` the voltage as a state that
+walks. Where friction is not known (standstill, reversal) the speed is a random walk, and only [1] speaks.
+
+Of two states and one input all is written out: a matrix library's way there and back takes longer than the sums.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from fdhil.identification.motion import BROKEN, DIFFUSE, UNKNOWN, Modes, Motion
+from fdhil.model.compiled import compiled
+from fdhil.model.feed_drive import transition
+from fdhil.records import Bool, Float, read_only
+
+Rows = npt.NDArray[np.int64]
+
+R, L, K, JT, FT, CD, DELAY = range(7)  # entries of theta
+OF_VOLTAGE, OF_CURRENT, OF_SPEED = range(3)  # entries of noise variances
+LOAD, VOLTAGE, CURRENT, SPEED = range(4)  # signals that move the filter over the rows
+# columns of an interval's step: what current and speed become of those at its begin, of the mean voltage, of friction
+# and load together, of the voltage's rise within it; and how a walk of the speed over it reaches the current
+I_I, I_W, W_I, W_W, I_U, W_U, I_T, W_T, I_RISE, W_RISE, I_WALK = range(11)
+# columns of a row's gains: from the innovations of current and speed to their states, and to whitened innovations
+G_II, G_IW, G_WI, G_WW, WHITE_I, WHITE_IW, WHITE_W = range(7)
+STATE_I, STATE_W, STATE_SLOPE, STATE_SUM = range(4)  # of the filter beside a slow voltage
+STATE_U = 2  # of the filter whose voltage walks
+STATES = 4
+NO_SAMPLE = -1
+LOG_ROWS = 16  # determinants, at most DIFFUSE^2 of the measurement's, that are multiplied before a logarithm is taken
+
+
+class Readings(NamedTuple):
+    """The rows (n,) of a window as the filters take them; ``mode`` and ``observed`` as in :class:`Motion`.
+
+    ``emf_share`` of the back-EMF's rise within an interval is taken, beside the voltage's own ``rise_v``, which may
+    have no rows; ``walk`` is the standard deviation of the speed's change over an interval of unknown friction.
+    """
+
+    dt_s: float
+    mode: Modes
+    observed: Bool
+    current: Float
+    speed: Float
+    rise_v: Float
+    emf_share: float
+    walk: float
+
+    @classmethod
+    def of(cls, motion: Motion, emf_share: float = 1.0) -> Readings:
+        """Return the readings of a motion.
+
+        Of the course of an interval mean within its sample only the back-EMF's ramp is certain: what the current
+        regulator adds depends on the drive, and to take it from neighbouring means biases L.
+        """
+        means = motion.voltage_sampling == "interval_mean"
+        rise_v, share = (np.zeros(0), emf_share) if means else (motion.voltage_rise, emf_share - 1.0)
+        current, speed = read_only(motion.current), read_only(motion.speed)
+        return cls(motion.dt_s, motion.mode, motion.observed, current, speed, rise_v, share, motion.speed_walk)
+
+
+class Marks(NamedTuple):
+    """Where the samples of a slow voltage lie among the rows, in order of time (b,).
+
+    Mark b comes after the drive's row ``row``, at ``time_s``; there ends the voltage sample ``sample`` (-1: none is
+    wholly known), and the next begins. Instants are marks that begin nothing.
+    """
+
+    row: Rows
+    sample: Rows
+    time_s: Float
+
+
+class SlowSensor(NamedTuple):
+    """The samples (m,) of a slow voltage, means over ``period_s`` or instants; ``shape_variance`` (m,) is their own."""
+
+    voltage: Float
+    instant: bool
+    period_s: float
+    shape_variance: Float
+    marks: Marks
+
+
+@compiled
+def interval_steps(theta: Float, dt: float, emf_share: float) -> Float:
+    """Return the steps (2, 11) over an interval where friction is not known, and where it is.
+
+    ``emf_share`` of the back-EMF's own rise over it, which is linear in the same quantities, is part of them.
+    """
+    steps = np.empty((2, 11))
+    for known in range(2):
+        a = np.array([[-theta[R] / theta[L], -theta[K] / theta[L]], [theta[K] / theta[JT], -theta[FT] / theta[JT]]])
+        if not known:
+            a[1, :] = 0.0
+        phi, mean, ramp = transition(a, dt)
+        u = 1.0 / theta[L]
+        f = -1.0 / theta[JT] if known else 0.0  # else the friction torque is whatever keeps the speed on its walk
+        to_i = np.array([phi[0, 0], phi[0, 1], mean[0, 0] * u, mean[0, 1] * f])
+        to_w = np.array([phi[1, 0], phi[1, 1], mean[1, 0] * u, mean[1, 1] * f])
+        rise = emf_share * theta[K] * (to_w - np.array([0.0, 1.0, 0.0, 0.0]))
+        to_i, to_w = to_i + ramp[0, 0] * u * rise, to_w + ramp[1, 0] * u * rise
+        step = steps[known]
+        step[I_I], step[I_W], step[I_U], step[I_T] = to_i
+        step[W_I], step[W_W], step[W_U], step[W_T] = to_w
+        step[I_RISE], step[W_RISE], step[I_WALK] = ramp[0, 0] * u, ramp[1, 0] * u, mean[0, 1] / dt
+    return steps
+
+
+@compiled
+def _moved(steps: Float, known: int, i: float, w: float, u: float, torque: float, rise: float) -> tuple[float, float]:
+    """Return current and speed at the end of an interval."""
+    s = steps[known]
+    return (
+        s[I_I] * i + s[I_W] * w + (s[I_U] * u + s[I_T] * torque + s[I_RISE] * rise),
+        s[W_I] * i + s[W_W] * w + (s[W_U] * u + s[W_T] * torque + s[W_RISE] * rise),
+    )
+
+
+@compiled
+def _spread(
+    steps: Float, known: int, p11: float, p12: float, p22: float, vu: float, walk: float
+) -> tuple[float, float, float]:
+    """Return variance of current, covariance, and variance of speed at the end of an interval.
+
+    ``vu`` is the voltage's variance; the speed's own ``walk`` reaches the current through the back-EMF.
+    """
+    s = steps[known]
+    q11, q12 = s[I_I] * p11 + s[I_W] * p12, s[I_I] * p12 + s[I_W] * p22
+    q21, q22 = s[W_I] * p11 + s[W_W] * p12, s[W_I] * p12 + s[W_W] * p22
+    b1, b2, v1 = s[I_U], s[W_U], s[I_WALK]
+    return (
+        q11 * s[I_I] + q12 * s[I_W] + b1 * b1 * vu + v1 * v1 * walk * walk,
+        q11 * s[W_I] + q12 * s[W_W] + b1 * b2 * vu + v1 * walk * walk,
+        q21 * s[W_I] + q22 * s[W_W] + b2 * b2 * vu + walk * walk,
+    )
+
+
+@compiled
+def _whiten_one(theta: Float, variances: Float, readings: Readings, mean_v: Float, white: Float, gains: Float) -> float:
+    """Fill ``white`` (n, 2), and ``gains`` (n, 7) unless it has no rows; return the innovations' log determinant."""
+    steps = interval_steps(theta, readings.dt_s, readings.emf_share)
+    mode, observed, rise_v = readings.mode, readings.observed, readings.rise_v
+    current, speed = readings.current, readings.speed
+    vu, vi, vw = variances
+    unit = 1.0 / (vi * vw)
+    p11, p12, p22 = DIFFUSE * vi, 0.0, DIFFUSE * vw
+    i, w = current[0], speed[0]
+    logdet, product, counted = 0.0, 1.0, 0
+    for k in range(mode.size):
+        if not observed[k]:
+            white[k] = 0.0
+        else:
+            s11, s22 = p11 + vi, p22 + vw
+            det = s11 * s22 - p12 * p12
+            part = 1.0 / det
+            e1, e2 = current[k] - i, speed[k] - w
+            white[k, 0] = e1 / np.sqrt(s11)
+            white[k, 1] = (s11 * e2 - p12 * e1) * np.sqrt(part / s11)
+            g11, g12 = (p11 * s22 - p12 * p12) * part, p12 * vi * part
+            g21, g22 = p12 * vw * part, (p22 * s11 - p12 * p12) * part
+            if gains.size:
+                root = np.sqrt(part / s11)
+                gains[k, G_II], gains[k, G_IW], gains[k, G_WI], gains[k, G_WW] = g11, g12, g21, g22
+                gains[k, WHITE_I], gains[k, WHITE_IW], gains[k, WHITE_W] = 1.0 / np.sqrt(s11), -p12 * root, s11 * root
+            i += g11 * e1 + g12 * e2
+            w += g21 * e1 + g22 * e2
+            p11, p12, p22 = g11 * vi, g12 * vw, g22 * vw
+            product *= det * unit
+            counted += 1
+            if counted % LOG_ROWS == 0:
+                logdet += np.log(product)
+                product = 1.0
+        if mode[k] == BROKEN:
+            p11, p12, p22 = DIFFUSE * vi, 0.0, DIFFUSE * vw
+            continue
+        known = 0 if mode[k] == UNKNOWN else 1
+        p11, p12, p22 = _spread(steps, known, p11, p12, p22, vu, 0.0 if known else readings.walk)
+        rise = rise_v[k] if rise_v.size else 0.0
+        i, w = _moved(steps, known, i, w, mean_v[k], theta[CD] * mode[k], rise)
+    return float(logdet + np.log(product) - counted * np.log(unit))
+
+
+@compiled
+def whiten(thetas: Float, variances: Float, readings: Readings, mean_v: Float, gains: Float) -> tuple[Float, Float]:
+    """Return whitened innovations (q, n, 2) and log determinants (q,) for the rows of ``thetas`` (q, 7).
+
+    ``variances`` (q, 3) are those of voltage, current and speed; ``mean_v`` is (q, n) or, when all share it, (1, n).
+    ``gains`` (n, 7), or of no rows, takes those of the last filter.
+    """
+    q = thetas.shape[0]
+    white = np.empty((q, readings.mode.size, 2))
+    logdet = np.zeros(q)
+    for c in range(q):
+        mean = mean_v[min(c, mean_v.shape[0] - 1)]
+        logdet[c] = _whiten_one(thetas[c], variances[c], readings, mean, white[c], gains)
+    return white, logdet
+
+
+@compiled
+def _respond_one(steps: Float, readings: Readings, signals: Float, rise_v: Float, gains: Float, white: Float) -> None:
+    """Fill ``white`` (n, 2) with the whitened innovations of ``signals`` (4, n) by the filter of ``gains`` (n, 7)."""
+    mode, observed = readings.mode, readings.observed
+    i, w = signals[CURRENT, 0], signals[SPEED, 0]
+    begin = 0
+    while begin < mode.size and not signals[:, begin].any() and (rise_v.size == 0 or rise_v[begin] == 0.0):
+        begin += 1
+    white[:begin] = 0.0
+    for k in range(begin, mode.size):
+        if not observed[k]:
+            white[k] = 0.0
+        else:
+            e1, e2 = signals[CURRENT, k] - i, signals[SPEED, k] - w
+            white[k, 0] = gains[k, WHITE_I] * e1
+            white[k, 1] = gains[k, WHITE_IW] * e1 + gains[k, WHITE_W] * e2
+            i += gains[k, G_II] * e1 + gains[k, G_IW] * e2
+            w += gains[k, G_WI] * e1 + gains[k, G_WW] * e2
+        if mode[k] != BROKEN:
+            known = 0 if mode[k] == UNKNOWN else 1
+            rise = rise_v[k] if rise_v.size else 0.0
+            i, w = _moved(steps, known, i, w, signals[VOLTAGE, k], signals[LOAD, k], rise)
+
+
+@compiled
+def respond(
+    theta: Float, readings: Readings, signals: Float, kind: int, courses: Float, rises: Float, gains: Float
+) -> Float:
+    """Return the whitened innovations (q, n, 2) by the filter of ``gains`` (n, 7), which are linear in all signals.
+
+    Of ``signals`` (4, n) that of ``kind`` is each of ``courses`` (q, n), with ``rises`` (q, n) of the voltage within
+    the intervals, or none. The load is friction, and what comes on top, against the positive direction.
+    """
+    steps = interval_steps(theta, readings.dt_s, readings.emf_share)
+    white = np.empty((courses.shape[0], readings.mode.size, 2))
+    none = np.zeros(0)
+    for c in range(courses.shape[0]):
+        signals[kind] = courses[c]
+        _respond_one(steps, readings, signals, rises[c] if rises.size else none, gains, white[c])
+    return white
+
+
+@compiled
+def _take(x: Float, p: Float, h: Float, value: float, noise: float) -> tuple[float, float]:
+    """Take in a measurement ``value`` = h x with the variance ``noise``; return its innovation and variance."""
+    error, variance = value, noise
+    s0 = p[0, 0] * h[0] + p[0, 1] * h[1] + p[0, 2] * h[2] + p[0, 3] * h[3]
+    s1 = p[1, 0] * h[0] + p[1, 1] * h[1] + p[1, 2] * h[2] + p[1, 3] * h[3]
+    s2 = p[2, 0] * h[0] + p[2, 1] * h[1] + p[2, 2] * h[2] + p[2, 3] * h[3]
+    s3 = p[3, 0] * h[0] + p[3, 1] * h[1] + p[3, 2] * h[2] + p[3, 3] * h[3]
+    variance += h[0] * s0 + h[1] * s1 + h[2] * s2 + h[3] * s3
+    error -= h[0] * x[0] + h[1] * x[1] + h[2] * x[2] + h[3] * x[3]
+    part = 1.0 / variance
+    for a, gain in enumerate((s0 * part, s1 * part, s2 * part, s3 * part)):
+        x[a] += gain * error
+        p[a, 0] -= gain * s0
+        p[a, 1] -= gain * s1
+        p[a, 2] -= gain * s2
+        p[a, 3] -= gain * s3
+    return error, variance
+
+
+@compiled
+def _advance(theta: Float, x: Float, p: Float, h: float, known: bool, push: float, walk: float, period: float) -> None:
+    """Move state ``x`` (4,) and covariance ``p`` (4, 4) on by ``h``; Jt w' = K i - ft w + Jt ``push`` where known.
+
+    ``walk`` is the variance of di/dt per second; terms of third order in h ft/Jt are left out: they are nil.
+    """
+    pull, drag = (theta[K] / theta[JT], theta[FT] / theta[JT]) if known else (0.0, 0.0)
+    drop, emf, square = theta[R] / period, theta[K] / period, h * h / 2
+    keep, on_i, on_s = 1.0 - drag * h + drag * drag * square, pull * (h - drag * square), pull * square
+    m_w = emf * (h - drag * square)
+    m_i, m_s = drop * h + emf * on_s, drop * square + emf * pull * square * h / 3
+    x[STATE_SUM] += m_i * x[STATE_I] + m_w * x[STATE_W] + m_s * x[STATE_SLOPE] + emf * push * square
+    x[STATE_W] = on_i * x[STATE_I] + keep * x[STATE_W] + on_s * x[STATE_SLOPE] + push * (h - drag * square)
+    x[STATE_I] += h * x[STATE_SLOPE]
+    for c in range(STATES):
+        i, w, s = p[STATE_I, c], p[STATE_W, c], p[STATE_SLOPE, c]
+        p[STATE_SUM, c] += m_i * i + m_w * w + m_s * s
+        p[STATE_W, c] = on_i * i + keep * w + on_s * s
+        p[STATE_I, c] = i + h * s
+    for c in range(STATES):
+        i, w, s = p[c, STATE_I], p[c, STATE_W], p[c, STATE_SLOPE]
+        p[c, STATE_SUM] += m_i * i + m_w * w + m_s * s
+        p[c, STATE_W] = on_i * i + keep * w + on_s * s
+        p[c, STATE_I] = i + h * s
+    both, third = walk * square, walk * square * h / 3
+    p[STATE_SLOPE, STATE_SLOPE] += walk * h
+    p[STATE_I, STATE_SLOPE] += both
+    p[STATE_SLOPE, STATE_I] += both
+    p[STATE_I, STATE_I] += 2 * third
+    p[STATE_SLOPE, STATE_SUM] += drop * third
+    p[STATE_SUM, STATE_SLOPE] += drop * third
+    p[STATE_I, STATE_SUM] += drop * third * h * 0.75
+    p[STATE_SUM, STATE_I] += drop * third * h * 0.75
+    p[STATE_SUM, STATE_SUM] += drop * drop * third * h * h * 0.3
+
+
+@compiled
+def slow_innovations(
+    theta: Float, readings: Readings, sensor: SlowSensor, noise: Float, spread: Float, load: Float, slope_walk: Float
+) -> tuple[Float, Float]:
+    """Return the innovations (2 n + m,) of rows and of the samples of a slow voltage (m,), and their variances.
+
+    ``noise`` (3,) = variances of voltage, current, speed; ``spread`` (n, 2) are the last two of each row, infinite
+    where nothing was read. ``load`` (n,) may have no rows.
+    """
+    dt, mode, current, speed = readings.dt_s, readings.mode, readings.current, readings.speed
+    voltage, period, instant = sensor.voltage, sensor.period_s, sensor.instant
+    row, sample, time = sensor.marks
+    n = current.size
+    values, variance = np.zeros(2 * n + voltage.size), np.ones(2 * n + voltage.size)
+    x = np.array([current[0], speed[0], 0.0, 0.0])
+    p = np.zeros((STATES, STATES))
+    p[STATE_I, STATE_I], p[STATE_W, STATE_W] = DIFFUSE * noise[OF_CURRENT], DIFFUSE * noise[OF_SPEED]
+    p[STATE_SLOPE, STATE_SLOPE] = DIFFUSE * noise[OF_CURRENT] / (dt * dt)
+    of_current, of_speed = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0, 0.0])
+    lever, b = theta[L] / period, 0
+    of_voltage = np.array([theta[R], theta[K], theta[L], 0.0]) if instant else np.array([lever, 0.0, 0.0, 1.0])
+    for k in range(n):
+        if spread[k, 0] < np.inf:
+            values[2 * k], variance[2 * k] = _take(x, p, of_current, current[k], spread[k, 0])
+        if spread[k, 1] < np.inf:
+            values[2 * k + 1], variance[2 * k + 1] = _take(x, p, of_speed, speed[k], spread[k, 1])
+        known, now = mode[k] != UNKNOWN, k * dt
+        push = -(theta[CD] * mode[k] + (load[k] if load.size else 0.0)) / theta[JT] if known else 0.0
+        stray = 0.0 if known else readings.walk * readings.walk / dt
+        while b < row.size and row[b] == k:
+            _advance(theta, x, p, time[b] - now, known, push, slope_walk[k], period)
+            p[STATE_W, STATE_W] += stray * (time[b] - now)
+            now = time[b]
+            j = sample[b]
+            if j != NO_SAMPLE:
+                at = 2 * n + j
+                noisy = noise[OF_VOLTAGE] + sensor.shape_variance[j]
+                values[at], variance[at] = _take(x, p, of_voltage, voltage[j], noisy)
+            if not instant:  # a sample begins: nothing is summed yet but - L i / T of the present current
+                x[STATE_SUM] = -lever * x[STATE_I]
+                for a in range(STATE_SUM):
+                    p[STATE_SUM, a] = p[a, STATE_SUM] = -lever * p[STATE_I, a]
+                p[STATE_SUM, STATE_SUM] = lever * lever * p[STATE_I, STATE_I]
+            b += 1
+        _advance(theta, x, p, (k + 1) * dt - now, known, push, slope_walk[k], period)
+        p[STATE_W, STATE_W] += stray * ((k + 1) * dt - now)
+    return values, variance
+
+
+@compiled
+def departure(
+    theta: Float, dt: float, mode: Modes, y: Float, variance: Float, walks: Float, signal: int
+) -> tuple[float, float]:
+    """Return the sum of squares by which readings ``y`` (n, 3) depart from the best course, in units of ``variance``.
+
+    And how many of the readings of ``signal`` were news: the sum of their shares of variance that were not their own.
+    Readings are of current, speed and voltage; their variance (n, 3) is infinite where there is none.
+
+    ``walks`` (n, 3) are the variances that speed (where friction is unknown) and voltage gain over each interval, and
+    of the voltage's rise within it.
+    """
+    steps = interval_steps(theta, dt, 0.0)
+    x, p, of_signal = np.zeros(STATES), np.zeros((STATES, STATES)), np.eye(STATES)
+    rises = (steps[1, I_RISE], steps[1, W_RISE])
+    x[:3], total, news = y[0], 0.0, 0.0
+    for j in range(3):
+        p[j, j] = DIFFUSE * variance[:, j].min()
+    for k in range(mode.size):
+        for j in range(3):
+            if math.isfinite(variance[k, j]):
+                before = p[j, j]
+                error, spread = _take(x, p, of_signal[j], y[k, j], variance[k, j])
+                total += error * error / spread
+                news += before / spread if j == signal else 0.0
+        known = 0 if mode[k] == UNKNOWN else 1
+        step = steps[known]
+        for c in range(3):
+            i, w, u = p[STATE_I, c], p[STATE_W, c], p[STATE_U, c]
+            p[STATE_I, c] = step[I_I] * i + step[I_W] * w + step[I_U] * u
+            p[STATE_W, c] = step[W_I] * i + step[W_W] * w + step[W_U] * u
+        for c in range(3):
+            i, w, u = p[c, STATE_I], p[c, STATE_W], p[c, STATE_U]
+            p[c, STATE_I] = step[I_I] * i + step[I_W] * w + step[I_U] * u
+            p[c, STATE_W] = step[W_I] * i + step[W_W] * w + step[W_U] * u
+        p[STATE_W, STATE_W] += walks[k, 0] * (1 - known)
+        p[STATE_U, STATE_U] += walks[k, 1]
+        for a in range(2):
+            for b in range(2):
+                p[a, b] += walks[k, 2] * rises[a] * rises[b]
+        x[STATE_I], x[STATE_W] = _moved(steps, known, x[STATE_I], x[STATE_W], x[STATE_U], theta[CD] * mode[k], 0.0)
+    return total, news
