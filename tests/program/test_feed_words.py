@@ -32,9 +32,25 @@ def written(folder: Path, program: bytes, shares: dict[int, float]) -> bytes:
             {4: 0.5},
             b"G91 F1000\no1 repeat [3]\nG1 X1 F1000\nX2 F500\no1 endrepeat\nM2\n",
         ),
+        (
+            b"o1 if [0]\nX&& F[1/0] F3\no1 endif\n/N5 G1 X1 F100\nM2\n",
+            {4: 0.5},
+            b"o1 if [0]\nX&& F[1/0] F3\no1 endif\n/N5 G1 X1 F50\nM2\n",
+        ),
         (b"G1 X1 F100\nM2\n", {}, b"G1 X1 F100\nM2\n"),
     ],
-    ids=["modal", "blanks", "comments", "inch", "per turn", "inverse time", "expression", "loop", "nothing to do"],
+    ids=[
+        "modal",
+        "blanks",
+        "comments",
+        "inch",
+        "per turn",
+        "inverse time",
+        "expression",
+        "loop",
+        "skipped",
+        "nothing to do",
+    ],
 )
 def test_only_the_feeds_are_others(tmp_path: Path, program: bytes, shares: dict[int, float], new: bytes) -> None:
     assert written(tmp_path, program, shares) == new

@@ -107,6 +107,8 @@ def test_rotation_turns_about_the_origin_of_the_system() -> None:
         ("G0 X1 (open", "(open"),
         ("G0 X1 $", "$"),
         ("X5", "X5"),
+        ("G0 X1 N5", "N5"),
+        ("G0 O1 call", "O1"),
     ],
 )
 def test_a_wrong_word_is_named_with_its_line(line: str, word: str) -> None:
