@@ -16,7 +16,7 @@ NEEDS: Mapping[str, Mapping[str, float]] = {
     "predict": {"fdhil.model.kernels": 4, "fdhil.prediction.kernels": 1},
     "correct": {"fdhil.correction.kernels": 10},
     "identify": {
-        "fdhil.identification.kalman": 7,
+        "fdhil.identification.kalman": 12,
         "fdhil.model.feed_drive": 2,
     },
 }
