@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from fdhil.arming.checked_program import Block, Checked
+from fdhil.arming.checked_program import Block, CheckedProgram
 from fdhil.arming.program_check import SCHEMA, part_file
 from fdhil.config import MachineConfig
 from fdhil.records import Parameters, Reason
@@ -22,16 +22,16 @@ from fdhil.store.atomic import store_error
 FOLDER = "checked"
 MAX_LINE = 1 << 20
 
-Enough = Callable[[Checked], bool]
+Enough = Callable[[CheckedProgram], bool]
 
 
-class Check:
+class BackgroundCheck:
     """At most one check at a time; it goes on by itself when enough has passed, until it ends or is abandoned."""
 
     def __init__(self, config: MachineConfig) -> None:
         self._config = config
         self._folder = config.store.directory / FOLDER
-        self._going: _Going | None = None
+        self._going: _RunningCheck | None = None
 
     @property
     def progress(self) -> Mapping[str, Any] | None:
@@ -40,20 +40,20 @@ class Check:
 
     async def run(
         self, program: Path, program_digest: str, models: Mapping[str, Parameters], enough: Enough
-    ) -> Checked | tuple[Reason, ...]:
+    ) -> CheckedProgram | tuple[Reason, ...]:
         """Return the program as soon as ``enough`` of it or all has passed, or why it is refused: every place.
 
         What was checked before is not checked again; a check that still goes on is taken up, one of another program is
         ended. StoreError when no rows can be written.
         """
         key = self._key(program_digest, models)
-        known = await asyncio.to_thread(Checked.find, self._folder, key, program.parent)
+        known = await asyncio.to_thread(CheckedProgram.find, self._folder, key, program.parent)
         if known is not None:
             return known
         going = self._going
         if going is None or going.ended or going.key != key:
             await self.close()
-            going = self._going = _Going(program, key, await asyncio.to_thread(self._opened, key))
+            going = self._going = _RunningCheck(program, key, await asyncio.to_thread(self._opened, key))
             going.begin(self._request(program, program_digest, models, key))
         with contextlib.ExitStack() as left:  # who waits for it was cancelled, or cannot judge it
             left.callback(self.abandon)
@@ -65,14 +65,14 @@ class Check:
         of = [SCHEMA, program_digest, self._config.digest, {axis: m.as_dict() for axis, m in models.items()}]
         return hashlib.sha256(json.dumps(of).encode()).hexdigest()[:32]
 
-    def _opened(self, key: str) -> Checked:
+    def _opened(self, key: str) -> CheckedProgram:
         """Open the file before the process writes it: no rename or removal can come in between."""
         part = part_file(self._folder, key)
         try:
             part.parent.mkdir(parents=True, exist_ok=True)
             part.unlink(missing_ok=True)
             part.touch()
-            return Checked(part, tuple(self._config.axis))
+            return CheckedProgram(part, tuple(self._config.axis))
         except OSError as error:
             raise store_error(part, error) from None
 
@@ -102,10 +102,10 @@ class Check:
             await self._going.quiet()
 
 
-class _Going:
+class _RunningCheck:
     """One check on its way: its process, what it said last, and the rows that passed."""
 
-    def __init__(self, program: Path, key: str, checked: Checked) -> None:
+    def __init__(self, program: Path, key: str, checked: CheckedProgram) -> None:
         self.key, self.checked = key, checked
         self.ended = self._abandoned = False
         self._program = str(program)
@@ -119,7 +119,7 @@ class _Going:
         """Start the process and follow it."""
         self._task = asyncio.create_task(self._follow(request), name=f"check of {self._program}")
 
-    async def passed(self, enough: Enough) -> Checked | tuple[Reason, ...]:
+    async def passed(self, enough: Enough) -> CheckedProgram | tuple[Reason, ...]:
         """Wait until enough or all has passed, or until all is known of why it is refused."""
         while not self.ended:
             if not self.checked.refused and enough(self.checked):

@@ -50,7 +50,7 @@ class Block(NamedTuple):
     last: bool
 
 
-class Checked:
+class CheckedProgram:
     """The rows of one program that passed the gate: all of them, or while the check goes on those so far.
 
     ``header`` is what the check found of the whole, None before its end; ``refused`` why the rows end where they end.
@@ -68,7 +68,7 @@ class Checked:
         weakref.finalize(self, os.close, self._descriptor)
 
     @staticmethod
-    def find(folder: Path, key: str, beside: Path) -> Checked | None:
+    def find(folder: Path, key: str, beside: Path) -> CheckedProgram | None:
         """Return what was checked under ``key``; None when nothing was, by other code, or not all its rows are there.
 
         ``beside`` is the program's folder: the subroutines there must be those of the check.
@@ -77,7 +77,7 @@ class Checked:
             header = json.loads((folder / (key + HEADER)).read_bytes())
             if header.pop("digest") != header_digest(header):
                 return None
-            found = Checked(folder / (key + ROWS), header["axes"])
+            found = CheckedProgram(folder / (key + ROWS), header["axes"])
             good = header["schema"] == SCHEMA and header["code"] == code_digest() and not header["refused"]
             good = good and all(program_digest(beside / name) == sha for name, sha in header["files"].items())
             blocks = [Block(end, sha256, end == header["rows"]) for end, sha256 in header["blocks"]]
@@ -134,10 +134,10 @@ class Checked:
         return content
 
 
-class Stream:
+class RowStream:
     """The rows of one checked program in the guard's increments; ``end`` is one past the last row handed out."""
 
-    def __init__(self, checked: Checked, program_digest: str, sync_period_s: float) -> None:
+    def __init__(self, checked: CheckedProgram, program_digest: str, sync_period_s: float) -> None:
         """Begin at the first row; nothing is read yet."""
         self.checked, self.program_digest = checked, program_digest
         self.axes = checked.axes

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from fdhil import tables
-from fdhil.arming.background_check import Check
-from fdhil.arming.checked_program import Checked
+from fdhil.arming.background_check import BackgroundCheck
+from fdhil.arming.checked_program import CheckedProgram
 from fdhil.arming.guard_link import GONE, REST, GuardLink
 from fdhil.arming.passes import Passes
 from fdhil.arming.preparing import (
@@ -31,11 +31,11 @@ from fdhil.arming.preparing import (
     standing_facts,
 )
 from fdhil.arming.standing import ADOPT, RAMPING_DOWN, START_AND_ADOPT, Standing, verdict
-from fdhil.arming.stream_feeder import Supply
+from fdhil.arming.stream_feeder import StreamFeeder
 from fdhil.arming.token import ensure_token
 from fdhil.config import MachineConfig
 from fdhil.daemon.control import Answer, refusal
-from fdhil.daemon.outcome_store import Keeper, boot_id
+from fdhil.daemon.outcome_store import OutcomeStore, boot_id
 from fdhil.errors import DeviceError
 from fdhil.records import AxisSamples, Notice, Outcome, ParameterSet, Skill, Temperature
 from fdhil.store.history import Revision
@@ -49,12 +49,12 @@ Tell = Callable[[Sequence[Notice]], None]
 Prepared = TypeVar("Prepared", bound=Armament | StreamedArmament | Feeding)
 
 
-class Armory:
+class ArmingDesk:
     """Knows when a correction may be armed, and withdraws what it no longer vouches for."""
 
-    def __init__(self, config: MachineConfig, keeper: Keeper, run_directory: Path) -> None:
+    def __init__(self, config: MachineConfig, store: OutcomeStore, run_directory: Path) -> None:
         self._config = config
-        self._keeper = keeper
+        self._store = store
         self._run_directory = run_directory
         self._token = ""
         self._published: dict[str, tuple[ParameterSet, float]] = {}
@@ -63,9 +63,9 @@ class Armory:
         self._skills = Skills(list(config.axis))
         self._arming = asyncio.Lock()
         self._armed: tuple[Armament | StreamedArmament | Feeding, Mapping[str, Any]] | None = None
-        self._check = Check(config)
+        self._check = BackgroundCheck(config)
         self._passes = Passes(config)
-        self._supply: Supply | None = None
+        self._feeder: StreamFeeder | None = None
         self._given_up = False
         self._disarming: asyncio.Future[Answer] | None = None
         self.guard = GuardLink(config.guard.run_directory or run_directory)
@@ -178,7 +178,7 @@ class Armory:
         if self._armed is not None and not isinstance(self._armed[0], Feeding):
             cause = "GuardLost" if self.guard.state in GONE else (self.guard.status.get("cause") or {}).get("code", "")
             self._passes.end(cause, self._armed[0].summary())
-        self._armed = self._supply = None
+        self._armed = self._feeder = None
 
     async def _feed_forward(self, token: str) -> Answer:
         """Switch the on-line feed-forward on: it needs no program."""
@@ -198,7 +198,7 @@ class Armory:
         """Ask the guard in a thread; what it grants is armed, what it refuses is answered with what was planned."""
         if self._given_up:
             return refusal("Abandoned", "the arming was abandoned while it was prepared", "arm again when it is wanted")
-        prepared.facts["journal_writable"] = self._keeper.fault is None
+        prepared.facts["journal_writable"] = self._store.fault is None
         if not isinstance(prepared, Feeding):
             self._passes.begin(prepared.first().demand, prepared.rows)
         try:
@@ -210,7 +210,7 @@ class Armory:
             self._passes.forget()
             return dict(answer) | {"planned": summary}
         self._armed = (prepared, summary)
-        self._supply = Supply(prepared, self.guard) if isinstance(prepared, StreamedArmament) else None
+        self._feeder = StreamFeeder(prepared, self.guard) if isinstance(prepared, StreamedArmament) else None
         return dict(answer)
 
     async def _arm(self, program: Path, method: str | None, token: str, whole: bool) -> Answer:
@@ -231,7 +231,7 @@ class Armory:
     async def _checked(self, long: Long, whole: bool) -> StreamedArmament | Refused:
         """Have a long program checked as far as arming asks, or as a ``whole``; it is armed with its first rows."""
 
-        def enough(checked: Checked) -> bool:
+        def enough(checked: CheckedProgram) -> bool:
             return not whole and may_begin(checked, self._config, self._known())
 
         checked = await self._check.run(long.program, long.program_digest, long.models, enough)
@@ -247,11 +247,11 @@ class Armory:
     def abandon(self) -> bool:
         """Arm nothing of what is being prepared; return whether its check was ended. That of what is armed goes on."""
         self._given_up = True
-        return self._supply is None and self._check.abandon()
+        return self._feeder is None and self._check.abandon()
 
     async def disarm(self) -> Answer:
         """Have the guard ramp to zero: ok only when it is reached. What is being planned or checked is not armed."""
-        self._supply = None  # no more rows, no more words about them
+        self._feeder = None  # no more rows, no more words about them
         abandoned = self.abandon()
         if self._disarming is None:  # who asks again meanwhile waits for the same ramp
             self._disarming = asyncio.ensure_future(self._to_zero())
@@ -302,8 +302,8 @@ class Armory:
         """Hand a long program's rows to the guard as they pass and as it runs, and tell what is refused of them."""
         while True:
             await asyncio.sleep(STREAM_S)
-            if self._supply is not None:
-                tell(await asyncio.to_thread(self._supply.go_on))
+            if self._feeder is not None:
+                tell(await asyncio.to_thread(self._feeder.go_on))
             tell(await asyncio.to_thread(self._passes.digest))
             await self._check.attend()
 
@@ -316,11 +316,11 @@ class Armory:
             facts = feeding_facts(tuple(armed.laws), self._config, self._known())
         else:
             facts = standing_facts(armed.axes, self._config, self._known(), armed.gain_um)
-        return facts | {"journal_writable": self._keeper.fault is None}
+        return facts | {"journal_writable": self._store.fault is None}
 
     async def stand_down(self) -> Standing:
         """Have a running correction ramped to zero and wait for it; return what may still be applied."""
-        self._supply = None
+        self._feeder = None
         self.abandon()
         if self.guard.connected:
             with contextlib.suppress(DeviceError):

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from fdhil import correction
-from fdhil.arming.checked_program import FIRST_S, Checked, Piece, Stream, longer_than_ring
+from fdhil.arming.checked_program import FIRST_S, CheckedProgram, Piece, RowStream, longer_than_ring
 from fdhil.commissioning.feedforward import feedforward_object
 from fdhil.commissioning.record import CommissioningRecord, axis_digest, load_record
 from fdhil.config import MachineConfig
@@ -108,7 +108,7 @@ class StreamedArmament:
     """
 
     program: str
-    stream: Stream
+    stream: RowStream
     begin: Piece
     facts: dict[str, bool]
     begun_um: float
@@ -217,7 +217,7 @@ def prepare(
     return Armament(str(program), planned, table, facts, predicted)
 
 
-def may_begin(checked: Checked, config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> bool:
+def may_begin(checked: CheckedProgram, config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> bool:
     """Whether a program may be armed while its check goes on: far ahead, and nothing left to learn that forbids it.
 
     What the rest could still change, the largest offset and the gain, must be good enough already as it is.
@@ -231,10 +231,10 @@ def may_begin(checked: Checked, config: MachineConfig, known: Mapping[str, AxisK
 
 
 def prepare_stream(
-    long: Long, checked: Checked, config: MachineConfig, known: Mapping[str, AxisKnowledge]
+    long: Long, checked: CheckedProgram, config: MachineConfig, known: Mapping[str, AxisKnowledge]
 ) -> StreamedArmament:
     """Make a checked program ready with the rows that it is armed with. StoreError when its rows cannot be read."""
-    stream, gain_um = Stream(checked, long.program_digest, config.machine.sync_period_s), checked.gain_um
+    stream, gain_um = RowStream(checked, long.program_digest, config.machine.sync_period_s), checked.gain_um
     facts = standing_facts(stream.axes, config, known, gain_um)
     facts |= _commissioned(stream.axes, checked.largest_um, config)
     skill_um = skill_of({axis: found.skills for axis, found in known.items()}, stream.axes)

@@ -14,7 +14,7 @@ RESERVE_S = 1.0  # with which left the guard ramps to zero
 SCARCE_S = 5.0  # half the ring: a check that lets it fall so far is told before the guard ends the correction
 
 
-class Supply:
+class StreamFeeder:
     """Feeds the guard with one program's rows; ``go_on`` blocks and is called every few cycles of the daemon."""
 
     def __init__(self, armed: StreamedArmament, guard: GuardLink) -> None:

@@ -55,7 +55,7 @@ def _point(window: StoredWindow) -> Point:
     return Point(values, stds, window.start_tick, window.temperature_c)
 
 
-class Keeper:
+class OutcomeStore:
     """Writes outcomes to the windows' folder and to the history. Safe to call from several worker threads.
 
     A store that refuses never stops the daemon: ``fault`` is the class of the refusal (None while all is well), the

@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 
 from fdhil.arming.checked_program import Piece
-from fdhil.arming.desk import ALIVE_S, Armory
+from fdhil.arming.desk import ALIVE_S, ArmingDesk
 from fdhil.arming.guard_link import TRIPPED, GuardLink
 from fdhil.arming.token import read_token
 from fdhil.config import MachineConfig
-from fdhil.daemon.outcome_store import Keeper
+from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.errors import DeviceError
 from tests.arming.guard_peer import FINE, Guard
 from tests.daemon.machine import config_of
@@ -84,15 +84,15 @@ async def test_a_slow_guard_still_hears_that_the_daemon_lives(
 ) -> None:
     """Its answers are not waited for, not even while something is armed."""
     guard.says = lambda _kind: None
-    armory = Armory(config, Keeper(config), folder)
-    attending = asyncio.create_task(armory.attend(lambda _told: None))
+    desk = ArmingDesk(config, OutcomeStore(config), folder)
+    attending = asyncio.create_task(desk.attend(lambda _told: None))
     async with asyncio.timeout(60.0):
         while guard.heard.count("alive") < 20:  # noqa: ASYNC110 - it is another thread that hears
             await asyncio.sleep(ALIVE_S)
     assert [kind for kind in guard.heard if kind != "alive"] == ["status"]
     attending.cancel()
     guard.close()
-    await asyncio.to_thread(armory.guard.close)
+    await asyncio.to_thread(desk.guard.close)
 
 
 @pytest.mark.parametrize("how", ["disarm", "abandon"])
@@ -109,18 +109,18 @@ async def test_what_is_given_up_while_it_is_planned_is_not_armed(
 
     monkeypatch.setattr("fdhil.arming.desk.prepare", slow)
     guard.says = lambda _kind: {**FINE, "state": "OFF"}
-    armory = Armory(config, Keeper(config), folder)
-    armory.begin({}, [])
+    desk = ArmingDesk(config, OutcomeStore(config), folder)
+    desk.begin({}, [])
     request = {"request": "arm", "program": "a.ngc", "token": read_token(folder)}
-    arming = asyncio.create_task(armory.arm(request))
+    arming = asyncio.create_task(desk.arm(request))
     assert await asyncio.to_thread(planning.wait, 60.0)
     if how == "disarm":
-        await armory.disarm()
+        await desk.disarm()
     else:
-        armory.abandon()
+        desk.abandon()
     planned.set()
     answer = await arming
     assert (answer["ok"], answer["code"]) == (False, "Abandoned")
     assert set(guard.heard) <= {"disarm", "status"}
-    assert armory.armed is None
-    armory.guard.close()
+    assert desk.armed is None
+    desk.guard.close()

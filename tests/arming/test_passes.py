@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fdhil.arming import passes
-from fdhil.arming.desk import Armory
+from fdhil.arming.desk import ArmingDesk
 from fdhil.arming.passes import Pass
 from fdhil.arming.preparing import Armament, prepare
 from fdhil.config import MachineConfig
@@ -109,9 +109,9 @@ def test_a_pass_that_never_began_measures_nothing(config: MachineConfig, armamen
     assert running.measured() is None
 
 
-def measured(armory: Armory, count: int) -> bool:
+def measured(desk: ArmingDesk, count: int) -> bool:
     """Whether so many passes were measured."""
-    return len(armory.passes) == count
+    return len(desk.passes) == count
 
 
 async def test_each_pass_is_told_beside_what_was_predicted(
@@ -134,14 +134,14 @@ async def test_each_pass_is_told_beside_what_was_predicted(
             assert " ± " in answer["text"]
             assert answer["after"]["uncertainty_um"] > 0.5  # no better than the last moves were predicted
             for block in heard(reference, is_at):
-                shop.armory.hear(block)
+                shop.desk.hear(block)
             mill.state, mill.cause = "OFF", cause
-            await shop.until(partial(measured, shop.armory, number))
-            told = shop.armory.passes[-1]
+            await shop.until(partial(measured, shop.desk, number))
+            told = shop.desk.passes[-1]
             notice = next(notice for notice in reversed(shop.told) if notice.code == "PassMeasured")
             assert (notice.severity, notice.text.startswith(told["text"])) == (severity, True)
             assert (told["pass"], told["ended_by"]) == (number, cause)
-    first, second, third = shop.armory.passes
+    first, second, third = shop.desk.passes
     assert first["measured"]["rms_um"] == pytest.approx(first["predicted"]["rms_um"], rel=1e-3)
     assert second["measured"]["rms_um"] == pytest.approx(second["predicted_without"]["rms_um"], rel=1e-3)
     assert "pass 1 of gentle.ngc: contour error measured" in first["text"]

@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 
-from fdhil.arming.desk import Armory
+from fdhil.arming.desk import ArmingDesk
 from fdhil.arming.preparing import MODEL_AGE_S, Armament, AxisKnowledge, Refused, prepare, standing_facts
 from fdhil.arming.token import read_token
 from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
 from fdhil.config import MachineConfig
-from fdhil.daemon.outcome_store import Keeper
+from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.records import Notice, Skill
 from fdhil.store.history import Revision, Stamp
 from tests.daemon.machine import config_of
@@ -143,30 +143,30 @@ def test_without_parameters_or_limits_nothing_is_planned(config: MachineConfig, 
 
 
 async def test_the_operators_token_decides_and_a_missing_guard_is_told(config: MachineConfig, program: Path) -> None:
-    keeper = Keeper(config)
+    store = OutcomeStore(config)
     assert config.store.run_directory is not None
     config.store.run_directory.mkdir(parents=True)
-    armory = Armory(config, keeper, config.store.run_directory)
+    desk = ArmingDesk(config, store, config.store.run_directory)
     stamp = Stamp(0.0, "another boot", 0)
     newest = replace(published(), config_digest=config.digest)
     skills = [Skill(axis, 1, 0.5, 1.0, 0.0, 30.0) for axis in ("X", "Y")]
-    armory.begin({axis: Revision(1, replace(newest, axis=axis), (), stamp) for axis in ("X", "Y")}, skills)
+    desk.begin({axis: Revision(1, replace(newest, axis=axis), (), stamp) for axis in ("X", "Y")}, skills)
     request = {"request": "arm", "program": str(program)}
     for token in (None, "", 5, "wrong", "ä"):
-        answer = await armory.arm(request | {"token": token})
+        answer = await desk.arm(request | {"token": token})
         assert (answer["ok"], answer["code"]) == (False, "AuthRequired")
     token = read_token(config.store.run_directory)
-    assert (await armory.arm(request | {"token": token}))["code"] == "GuardAbsent"
-    assert (await armory.arm(request | {"token": token, "method": "magic"}))["code"] == "BadRequest"
-    assert (await armory.arm({"request": "arm", "token": token}))["code"] == "BadRequest"
-    assert (await armory.disarm())["code"] == "GuardAbsent"
-    assert not (await armory.stand_down()).heard
+    assert (await desk.arm(request | {"token": token}))["code"] == "GuardAbsent"
+    assert (await desk.arm(request | {"token": token, "method": "magic"}))["code"] == "BadRequest"
+    assert (await desk.arm({"request": "arm", "token": token}))["code"] == "BadRequest"
+    assert (await desk.disarm())["code"] == "GuardAbsent"
+    assert not (await desk.stand_down()).heard
 
 
 def test_a_changed_load_is_remembered_until_new_parameters_come(config: MachineConfig, tmp_path: Path) -> None:
-    armory = Armory(config, Keeper(config), tmp_path)
-    armory.note([replace(published(), config_digest=config.digest)])
-    armory.note([Notice("LoadChanged", "MAJOR", "Jt rose", "X")])
-    assert armory._known()["X"].load_changed
-    armory.note([replace(published(2), config_digest=config.digest)])
-    assert not armory._known()["X"].load_changed
+    desk = ArmingDesk(config, OutcomeStore(config), tmp_path)
+    desk.note([replace(published(), config_digest=config.digest)])
+    desk.note([Notice("LoadChanged", "MAJOR", "Jt rose", "X")])
+    assert desk._known()["X"].load_changed
+    desk.note([replace(published(2), config_digest=config.digest)])
+    assert not desk._known()["X"].load_changed
