@@ -8,9 +8,10 @@ import hmac
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from fdhil import tables
+from fdhil.arming.answers import Answer, refusal
 from fdhil.arming.background_check import BackgroundCheck
 from fdhil.arming.checked_program import CheckedProgram
 from fdhil.arming.guard_link import GONE, REST, GuardLink
@@ -34,8 +35,6 @@ from fdhil.arming.standing import ADOPT, RAMPING_DOWN, START_AND_ADOPT, Standing
 from fdhil.arming.stream_feeder import StreamFeeder
 from fdhil.arming.token import ensure_token
 from fdhil.config import MachineConfig
-from fdhil.daemon.control import Answer, refusal
-from fdhil.daemon.outcome_store import OutcomeStore, boot_id
 from fdhil.errors import DeviceError
 from fdhil.records import AxisSamples, Notice, Outcome, ParameterSet, Skill, Temperature
 from fdhil.store.history import Revision
@@ -49,10 +48,17 @@ Tell = Callable[[Sequence[Notice]], None]
 Prepared = TypeVar("Prepared", bound=Armament | StreamedArmament | Feeding)
 
 
+class Storing(Protocol):
+    """What stores the outcomes."""
+
+    fault: str | None
+    """Why nothing can be stored now; None while all is well."""
+
+
 class ArmingDesk:
     """Knows when a correction may be armed, and withdraws what it no longer vouches for."""
 
-    def __init__(self, config: MachineConfig, store: OutcomeStore, run_directory: Path) -> None:
+    def __init__(self, config: MachineConfig, store: Storing, run_directory: Path) -> None:
         self._config = config
         self._store = store
         self._run_directory = run_directory
@@ -73,13 +79,8 @@ class ArmingDesk:
     def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
         """Start from what the history knows; the token is made where there is none. DeviceError when it cannot be."""
         self._token = ensure_token(self._run_directory)
-        boot, now_s = boot_id(), time.monotonic()
         for axis, revision in newest.items():
-            stamp = revision.stamp
-            same_boot = bool(boot) and stamp.boot == boot
-            age_s = now_s - stamp.monotonic_ns * 1e-9 if same_boot else time.time() - stamp.wall_s
-            # an age below 0 (a wall clock that was set back) stays one: it is not believed
-            self._published[axis] = (revision.set, now_s - age_s)
+            self._published[axis] = (revision.set, time.monotonic() - revision.stamp.age_s())
         for skill in skills:
             self._skills.add(skill)
 
@@ -332,4 +333,4 @@ class ArmingDesk:
 
 def _refused(refused: Refused) -> Answer:
     first, *_ = refused.reasons
-    return dict(refusal(first.code, first.text, first.advice)) | {"refused": list(map(str, refused.reasons))}
+    return refusal(first.code, first.text, first.advice) | {"refused": list(map(str, refused.reasons))}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from pathlib import Path
 
 from pydantic import Field, ValidationInfo, model_validator
 
@@ -62,6 +63,16 @@ class MachineConfig(Section):
     def node_id(self, axis: str) -> int:
         """Return the CANopen node-ID of an axis' drive."""
         return self.axis[axis].drive.node_id or list(self.axis).index(axis) + 1
+
+    @property
+    def run_directory(self) -> Path:
+        """The folder of the daemon's socket and token."""
+        return self.store.run_directory or self.store.directory / "run"
+
+    @property
+    def guard_directory(self) -> Path:
+        """The folder of the guard's socket: its own, or the daemon's."""
+        return self.guard.run_directory or self.run_directory
 
     @property
     def digest(self) -> str:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections import deque
 from collections.abc import Sequence
-from pathlib import Path
 
 from fdhil.config import MachineConfig
 from fdhil.drivers.cia402.profile import load_profile
@@ -20,14 +18,6 @@ from fdhil.store.windows import RawScale, Scales, WindowStore
 
 WINDOWS_FOLDER = "windows"
 SKILLS = 3
-
-
-def boot_id() -> str:
-    """Return the kernel's identifier of this boot; monotonic times compare only within one."""
-    try:
-        return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
-    except OSError:
-        return ""
 
 
 def raw_scales(config: MachineConfig, axis: str) -> Scales:
@@ -67,7 +57,6 @@ class OutcomeStore:
         self._directory = config.store.directory
         self._lock = threading.Lock()
         self._scales = {axis: raw_scales(config, axis) for axis in config.axis}
-        self._boot = boot_id()
         self._history: History | None = None
         self._windows: WindowStore | None = None
         self._pool_ids = {axis: deque[int](maxlen=POOL_WINDOWS) for axis in config.axis}
@@ -177,7 +166,7 @@ class OutcomeStore:
     def _keep(self, outcome: Outcome) -> None:
         assert self._history is not None
         assert self._windows is not None
-        stamp = Stamp(time.time(), self._boot, time.monotonic_ns())
+        stamp = Stamp.now()
         if isinstance(outcome, WindowOutcome):
             axis = outcome.window.axis
             last = self._history.last_window_number()

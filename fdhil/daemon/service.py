@@ -15,13 +15,14 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
+from fdhil.arming.answers import Answer, refusal
 from fdhil.arming.desk import ArmingDesk
 from fdhil.arming.guard_link import TRIPPED, VOIDING
 from fdhil.arming.standing import ADOPT, START_AND_ADOPT, Standing
 from fdhil.commissioning.void import void_record
 from fdhil.config import MachineConfig, unlikely
 from fdhil.daemon import blackbox, journal
-from fdhil.daemon.control import SOCKET_NAME, Answer, ControlServer, refusal
+from fdhil.daemon.control import SOCKET_NAME, ControlServer
 from fdhil.daemon.kernel_warmup import warm
 from fdhil.daemon.lock import sole_owner
 from fdhil.daemon.notify import notify
@@ -67,7 +68,7 @@ class Service:
         self._config = config
         self._open_source = open_source
         self._method = method
-        self._run_directory = config.store.run_directory or config.store.directory / "run"
+        self._run_directory = config.run_directory
         self._store = OutcomeStore(config)
         self._desk = ArmingDesk(config, self._store, self._run_directory)
         self._watch = Watch(config, time.monotonic())

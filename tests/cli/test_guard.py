@@ -18,8 +18,9 @@ from pathlib import Path
 import pytest
 
 from fdhil import config as machine_config
+from fdhil.arming.guard_settings import heartbeat_timeout_s, limits_of, settings_of
 from fdhil.cli.bus_lock import lock_bus
-from fdhil.cli.guard import guard, heartbeat_timeout_s, limits_of, open_bus, settings_of
+from fdhil.cli.guard import guard, open_bus
 from fdhil.cli.main import cli, run_safely
 from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
 from fdhil.commissioning.void import void_record

@@ -18,8 +18,9 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.arming.guard_client import GuardClient, GuardLost
+from fdhil.arming.guard_settings import settings_of
 from fdhil.cli.failing import run_safely
-from fdhil.cli.guard import open_bus, settings_of
+from fdhil.cli.guard import open_bus
 from fdhil.cli.main import cli
 from fdhil.guard.settings import to_json
 from tests.guard import impatient
