@@ -12,7 +12,8 @@ from typing import BinaryIO
 import pytest
 
 from fdhil.arming.checked_program import CheckedProgram
-from fdhil.arming.program_check import HEADER, SCHEMA, code_digest, keep
+from fdhil.arming.code_digest import code_digest
+from fdhil.arming.program_check import HEADER, SCHEMA, keep
 from fdhil.arming.token import TOKEN_NAME, ensure_token, read_token
 from fdhil.config import Nc
 from fdhil.errors import ConfigError, FdhilError, ProgramError

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.arming.checked_program import Block, CheckedProgram
+from fdhil.arming.code_digest import MAKER
 from fdhil.arming.program_check import SCHEMA, part_file
 from fdhil.config import MachineConfig
 from fdhil.records import Parameters, Reason
@@ -157,7 +158,7 @@ class _RunningCheck:
             self._process = process = await asyncio.create_subprocess_exec(
                 sys.executable,
                 "-m",
-                "fdhil.arming.program_check",
+                MAKER,
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.PIPE,
                 limit=MAX_LINE,

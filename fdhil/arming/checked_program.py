@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdhil.arming.program_check import HEADER, ROWS, SCHEMA, code_digest, header_digest, reference_blocks
+from fdhil.arming.code_digest import code_digest
+from fdhil.arming.program_check import HEADER, ROWS, SCHEMA, header_digest, reference_blocks
 from fdhil.config import MachineConfig
 from fdhil.correction import gate
 from fdhil.errors import ProgramError, StoreError

@@ -22,11 +22,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import numba
 import numpy as np
-import scipy
 
-import fdhil
+from fdhil.arming.code_digest import code_digest
 from fdhil.config import MachineConfig
 from fdhil.correction import gate
 from fdhil.correction.streaming import StreamBlock, stream
@@ -46,26 +44,8 @@ PIECE_ROWS = 2000
 MOST_REFUSED = 20  # places that are listed
 TELL_S = 0.5
 NICENESS = 10
-# what the rows depend on: their code and the libraries that compute them
-ROOMS = ("program", "correction", "prediction", "model", "records", "config", "tables.py", "cia402.py", "csv_text.py")
-OWN = "arming/program_check.py"
-LIBRARIES = (np, scipy, numba)
 
 Tell = Callable[[Mapping[str, Any]], None]
-
-
-def code_digest() -> str:
-    """Return the digest of the code that makes the rows, as it is on disk now, and of its libraries' versions.
-
-    What another planner made under the same version is not reused.
-    """
-    home = Path(fdhil.__file__).parent
-    digest = hashlib.sha256(json.dumps([sys.version, *(library.__version__ for library in LIBRARIES)]).encode())
-    for room in (*ROOMS, OWN):
-        place = home / room
-        for file in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
-            digest.update(str(file.relative_to(home)).encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()
 
 
 def reference_blocks(program: Path, config: MachineConfig) -> Iterator[Trajectory]:

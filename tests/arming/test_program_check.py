@@ -21,8 +21,9 @@ import fdhil
 from fdhil import correction
 from fdhil.arming.background_check import FOLDER, BackgroundCheck
 from fdhil.arming.checked_program import CheckedProgram, Piece, RowStream
+from fdhil.arming.code_digest import code_digest
 from fdhil.arming.preparing import Long, StreamedArmament, prepare, prepare_stream
-from fdhil.arming.program_check import KEPT, SCHEMA, check, code_digest, keep
+from fdhil.arming.program_check import KEPT, SCHEMA, check, keep
 from fdhil.config import MachineConfig
 from fdhil.errors import ProgramError, StoreError
 from fdhil.prediction.models import nominal_models
