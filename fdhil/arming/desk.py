@@ -1,4 +1,4 @@
-"""The operator's side of the daemon: what it knows of the models, arming and disarming, and vouching while armed."""
+"""Arms and disarms for the operator, by what is known of the models, and vouches for what is armed."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import hmac
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -17,23 +18,21 @@ from fdhil.arming.checked_program import CheckedProgram
 from fdhil.arming.guard_link import GONE, REST, GuardLink
 from fdhil.arming.passes import Passes
 from fdhil.arming.preparing import (
+    SKILL_MOVES,
     Armament,
+    ArmRequest,
     AxisKnowledge,
     Feeding,
-    Long,
     Refused,
-    Skills,
-    StreamedArmament,
-    feeding_facts,
     may_begin,
     prepare,
+    prepare_armament,
     prepare_feeding,
-    prepare_stream,
-    standing_facts,
 )
 from fdhil.arming.standing import ADOPT, RAMPING_DOWN, START_AND_ADOPT, Standing, verdict
 from fdhil.arming.stream_feeder import StreamFeeder
 from fdhil.arming.token import ensure_token
+from fdhil.arming.whole_plan import plan_whole
 from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError
 from fdhil.records import AxisSamples, Notice, Outcome, ParameterSet, Skill, Temperature
@@ -45,7 +44,7 @@ REFRESH_S = 0.5
 LANDING_S = 1.0  # without a SYNC; while there is SYNC, what ended a moment ago comes to rest by itself
 
 Tell = Callable[[Sequence[Notice]], None]
-Prepared = TypeVar("Prepared", bound=Armament | StreamedArmament | Feeding)
+Prepared = TypeVar("Prepared", Armament, Feeding)
 
 
 class Storing(Protocol):
@@ -66,9 +65,9 @@ class ArmingDesk:
         self._published: dict[str, tuple[ParameterSet, float]] = {}
         self._temperature: dict[str, float] = {}
         self._load_changed: set[str] = set()
-        self._skills = Skills(list(config.axis))
+        self._skills = {axis: deque[Skill](maxlen=SKILL_MOVES) for axis in config.axis}
         self._arming = asyncio.Lock()
-        self._armed: tuple[Armament | StreamedArmament | Feeding, Mapping[str, Any]] | None = None
+        self._armed: tuple[Armament | Feeding, Mapping[str, Any]] | None = None
         self._check = BackgroundCheck(config)
         self._passes = Passes(config)
         self._feeder: StreamFeeder | None = None
@@ -81,8 +80,7 @@ class ArmingDesk:
         self._token = ensure_token(self._run_directory)
         for axis, revision in newest.items():
             self._published[axis] = (revision.set, time.monotonic() - revision.stamp.age_s())
-        for skill in skills:
-            self._skills.add(skill)
+        self.note(skills)
 
     def note(self, outcomes: Sequence[Outcome]) -> None:
         """Take what the pipelines say."""
@@ -91,7 +89,7 @@ class ArmingDesk:
                 self._published[outcome.axis] = (outcome, time.monotonic())
                 self._load_changed.discard(outcome.axis)
             elif isinstance(outcome, Skill):
-                self._skills.add(outcome)
+                self._skills[outcome.axis].append(outcome)
             elif isinstance(outcome, Notice) and outcome.code == "LoadChanged" and outcome.severity == "MAJOR":
                 self._load_changed.add(outcome.axis)
 
@@ -115,11 +113,11 @@ class ArmingDesk:
 
     @property
     def armed(self) -> Mapping[str, Any] | None:
-        """What was armed last and still is, None otherwise; of a long program also how far its check is."""
+        """What was armed last and still is, None otherwise; of a program also how far its check is."""
         if self._armed is None:
             return None
-        prepared, summary = self._armed
-        return {**summary, "check": prepared.stream.status()} if isinstance(prepared, StreamedArmament) else summary
+        armed, summary = self._armed
+        return {**summary, **armed.progress()}
 
     def _known(self) -> dict[str, AxisKnowledge]:
         now_s = time.monotonic()
@@ -130,7 +128,7 @@ class ArmingDesk:
                 published,
                 now_s - since_s,
                 self._temperature.get(axis),
-                self._skills.of(axis),
+                tuple(self._skills[axis]),
                 axis in self._load_changed,
             )
         return known
@@ -176,7 +174,7 @@ class ArmingDesk:
         return f"{ADOPT if self.guard.connected else START_AND_ADOPT}, then arm again"
 
     def _release(self) -> None:
-        if self._armed is not None and not isinstance(self._armed[0], Feeding):
+        if self._armed is not None:
             cause = "GuardLost" if self.guard.state in GONE else (self.guard.status.get("cause") or {}).get("code", "")
             self._passes.end(cause, self._armed[0].summary())
         self._armed = self._feeder = None
@@ -200,45 +198,46 @@ class ArmingDesk:
         if self._given_up:
             return refusal("Abandoned", "the arming was abandoned while it was prepared", "arm again when it is wanted")
         prepared.facts["journal_writable"] = self._store.fault is None
-        if not isinstance(prepared, Feeding):
-            self._passes.begin(prepared.first().demand, prepared.rows)
         try:
             answer = await asyncio.to_thread(ask, prepared, token)
         except DeviceError as error:
-            self._passes.forget()
             return self._without_guard(error)
         if not answer["ok"]:
-            self._passes.forget()
-            return dict(answer) | {"planned": summary}
+            return {**answer, "planned": summary}
         self._armed = (prepared, summary)
-        self._feeder = StreamFeeder(prepared, self.guard) if isinstance(prepared, StreamedArmament) else None
         return dict(answer)
 
     async def _arm(self, program: Path, method: str | None, token: str, whole: bool) -> Answer:
-        found = await asyncio.to_thread(prepare, program, method, self._config, self._known())
-        prepared = await self._checked(found, whole) if isinstance(found, Long) else found
-        if isinstance(prepared, Refused):
-            return _refused(prepared)
-        summary = prepared.summary()
-        answer = await self._hand_over(self.guard.arm, prepared, summary, token)
+        request = await asyncio.to_thread(prepare, program, method, self._config, self._known())
+        if isinstance(request, Refused):
+            return _refused(request)
+        checked = await self._checked(request, whole)
+        if isinstance(checked, Refused):
+            return _refused(checked)
+        armament = await asyncio.to_thread(prepare_armament, request, checked, self._config, self._known())
+        summary = armament.summary()
+        self._passes.begin(armament.begin.demand, armament.rows)
+        answer = await self._hand_over(self.guard.arm, armament, summary, token)
         if not answer["ok"]:
+            self._passes.forget()
             return answer
+        self._feeder = StreamFeeder(armament, self.guard)
         text = f"armed {program.name} by {summary['method']}: {summary['promise']}"
-        if not summary.get("check", {"whole": True})["whole"]:
+        if not summary["check"]["whole"]:
             text += f" in its first {summary['check']['checked_s']:.0f} s; the check of the rest goes on ahead of it"
         text += "; start the program, its error is measured as it runs"
         return {"ok": True, "state": answer.get("state", "ARMED"), "text": text, **summary}
 
-    async def _checked(self, long: Long, whole: bool) -> StreamedArmament | Refused:
-        """Have a long program checked as far as arming asks, or as a ``whole``; it is armed with its first rows."""
+    async def _checked(self, request: ArmRequest, whole: bool) -> CheckedProgram | Refused:
+        """Have a program checked: at once, or ahead of the motion as far as arming asks, or as a ``whole``."""
+        if not request.ahead:
+            return await asyncio.to_thread(plan_whole, request, self._config, self._known())
 
         def enough(checked: CheckedProgram) -> bool:
             return not whole and may_begin(checked, self._config, self._known())
 
-        checked = await self._check.run(long.program, long.program_digest, long.models, enough)
-        if isinstance(checked, tuple):
-            return Refused(checked)
-        return await asyncio.to_thread(prepare_stream, long, checked, self._config, self._known())
+        checked = await self._check.run(request.program, request.program_digest, request.models, enough)
+        return Refused(checked) if isinstance(checked, tuple) else checked
 
     @property
     def checking(self) -> Mapping[str, Any] | None:
@@ -312,11 +311,7 @@ class ArmingDesk:
         """What is still vouched for while a correction runs; None while none does."""
         if self._armed is None:
             return None
-        armed = self._armed[0]
-        if isinstance(armed, Feeding):
-            facts = feeding_facts(tuple(armed.laws), self._config, self._known())
-        else:
-            facts = standing_facts(armed.axes, self._config, self._known(), armed.gain_um)
+        facts = self._armed[0].standing_facts(self._config, self._known())
         return facts | {"journal_writable": self._store.fault is None}
 
     async def stand_down(self) -> Standing:

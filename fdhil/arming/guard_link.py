@@ -1,4 +1,4 @@
-"""The daemon's link to the guard process: found again when it was gone, told that the daemon lives, asked to arm."""
+"""Links the daemon to the guard process: finds it, tells it that the daemon lives, asks it to arm."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from fdhil.arming.checked_program import Piece
 from fdhil.arming.guard_client import GuardClient
-from fdhil.arming.preparing import Armament, Feeding, StreamedArmament
+from fdhil.arming.preparing import Armament, Feeding
 from fdhil.arming.standing import ABSENT, AT_REST, START_AND_ADOPT, Standing, landed, lost, standing
 from fdhil.errors import DeviceError
 from fdhil.records import Notice
@@ -117,19 +117,20 @@ class GuardLink:
             except DeviceError:
                 self._status = {**self._status, "text": "the connection is lost"}
 
-    def arm(self, armament: Armament | StreamedArmament, token: str) -> Mapping[str, Any]:
+    def arm(self, armament: Armament, token: str) -> Mapping[str, Any]:
         """Load the table and arm (blocking); return the guard's answer. DeviceError when there is no guard."""
         with self._asked(arming=True) as client:
-            answer = self._load(client, armament, armament.first())
+            answer = self._load(client, armament, armament.begin)
             if not answer["ok"]:
                 return answer
-            return self._ask(client, lambda: client.arm(token, armament.program_digest, armament.facts))
+            return self._ask(client, lambda: client.arm(token, armament.stream.program_digest, armament.facts))
 
     @staticmethod
-    def _load(client: GuardClient, armament: Armament | StreamedArmament, piece: Piece) -> Mapping[str, Any]:
-        return client.load(armament.axes, piece.demand, piece.offset, armament.program_digest, piece.first, piece.final)
+    def _load(client: GuardClient, armament: Armament, piece: Piece) -> Mapping[str, Any]:
+        digest = armament.stream.program_digest
+        return client.load(armament.stream.axes, piece.demand, piece.offset, digest, piece.first, piece.final)
 
-    def extend(self, armament: StreamedArmament, piece: Piece) -> Mapping[str, Any]:
+    def extend(self, armament: Armament, piece: Piece) -> Mapping[str, Any]:
         """Hand on more rows of a running stream (blocking); DeviceError when there is no guard."""
         with self._asked() as client:
             return self._load(client, armament, piece)

@@ -44,6 +44,7 @@ PIECE_ROWS = 2000
 MOST_REFUSED = 20  # places that are listed
 TELL_S = 0.5
 NICENESS = 10
+INT32_END = 2**31
 
 Tell = Callable[[Mapping[str, Any]], None]
 
@@ -219,13 +220,16 @@ class _Pace:
 
 
 def encoded(demand_mm: Mapping[str, Float], offset_um: Mapping[str, Float], config: MachineConfig) -> bytes:
-    """Return rows of demand and offset in increments, in the drives' own sign."""
+    """Return rows of demand and offset in increments, in the drives' own sign. ValueError where one is no int32."""
     columns = []
     for values, per_mm in ((demand_mm, 1.0), (offset_um, 1e-3)):
         for axis, settings in config.axis.items():
             scale = settings.scaling.sign * settings.scaling.increments_per_mm * per_mm
             columns.append(np.rint(values[axis] * scale))
-    return np.column_stack(columns).astype("<i4").tobytes()
+    rows = np.column_stack(columns)
+    if not np.all(np.abs(rows) < INT32_END):
+        raise ValueError("a row is not finite, or too large for the guard's table")
+    return rows.astype("<i4").tobytes()
 
 
 def header_digest(header: Mapping[str, Any]) -> str:

@@ -20,7 +20,7 @@ import pytest
 from fdhil.arming.checked_program import Block, CheckedProgram, Piece, RowStream
 from fdhil.arming.desk import ArmingDesk
 from fdhil.arming.guard_link import GuardLink
-from fdhil.arming.preparing import AHEAD_S, StreamedArmament, may_begin
+from fdhil.arming.preparing import AHEAD_S, Armament, may_begin
 from fdhil.arming.program_check import encoded
 from fdhil.arming.stream_feeder import StreamFeeder
 from fdhil.arming.token import read_token
@@ -301,7 +301,7 @@ def feeder_of(checked: CheckedProgram, mill: Mill, folder: Path) -> tuple[Stream
     link = GuardLink(folder)
     link.look()
     stream = RowStream(checked, "digest", 0.001)
-    armed = StreamedArmament("long.ngc", stream, Piece(0, {}, {}, False), {}, 29.0)
+    armed = Armament("long.ngc", stream, Piece(0, {}, {}, False), {}, 29.0)
     return StreamFeeder(armed, link), link
 
 

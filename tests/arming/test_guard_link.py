@@ -49,8 +49,7 @@ def guard(folder: Path) -> Iterator[Guard]:
 class Long:
     """A streamed program, as far as handing on its rows asks."""
 
-    axes = ("X",)
-    program_digest = "digest"
+    stream = SimpleNamespace(axes=("X",), program_digest="digest")
 
 
 def test_a_trip_that_another_request_saw_is_told_all_the_same(guard: Guard, folder: Path) -> None:
@@ -105,9 +104,13 @@ async def test_what_is_given_up_while_it_is_planned_is_not_armed(
         planning.set()
         assert planned.wait(60.0)
 
-        return SimpleNamespace(facts={}, summary=lambda: {"method": "inverse"})
+        demand = {"X": [0], "Y": [0]}
+        begin = Piece(0, demand, demand, True)
+        return SimpleNamespace(facts={}, begin=begin, rows=1, summary=lambda: {"method": "inverse"})
 
-    monkeypatch.setattr("fdhil.arming.desk.prepare", slow)
+    monkeypatch.setattr("fdhil.arming.desk.prepare", lambda *_: SimpleNamespace(ahead=False))
+    monkeypatch.setattr("fdhil.arming.desk.plan_whole", lambda *_: None)
+    monkeypatch.setattr("fdhil.arming.desk.prepare_armament", slow)
     guard.says = lambda _kind: {**FINE, "state": "OFF"}
     desk = ArmingDesk(config, OutcomeStore(config), folder)
     desk.begin({}, [])

@@ -22,7 +22,7 @@ from fdhil import correction
 from fdhil.arming.background_check import FOLDER, BackgroundCheck
 from fdhil.arming.checked_program import CheckedProgram, Piece, RowStream
 from fdhil.arming.code_digest import code_digest
-from fdhil.arming.preparing import Long, StreamedArmament, prepare, prepare_stream
+from fdhil.arming.preparing import ArmRequest, prepare, prepare_armament
 from fdhil.arming.program_check import KEPT, SCHEMA, check, keep
 from fdhil.config import MachineConfig
 from fdhil.errors import ProgramError, StoreError
@@ -133,15 +133,15 @@ def test_a_checked_program_is_armed_with_its_first_rows_and_goes_on(config: Mach
     program = written(tmp_path, LONG)
     save_records(config)
     found = prepare(program, None, config, known(config))
-    assert isinstance(found, Long)
+    assert isinstance(found, ArmRequest)
+    assert found.ahead
     first, again = asyncio.run(_twice(config, found))
     assert isinstance(first, CheckedProgram)
     assert isinstance(again, CheckedProgram)
-    armament = prepare_stream(found, first, config, known(config))
-    assert isinstance(armament, StreamedArmament)
+    armament = prepare_armament(found, first, config, known(config))
     assert all(armament.facts.values()), armament.facts
-    assert armament.program_digest == program_digest(program)
-    stream, pieces = armament.stream, [armament.first()]
+    assert armament.stream.program_digest == program_digest(program)
+    stream, pieces = armament.stream, [armament.begin]
     assert len(pieces[0].demand["X"]) == 10_000
     assert first.whole
     assert stream.lacks({"rows": [0, 10_000], "row": 1})
@@ -161,7 +161,7 @@ def whole(_checked: CheckedProgram) -> bool:
     return False
 
 
-async def _twice(config: MachineConfig, found: Long) -> list[CheckedProgram | tuple[Reason, ...]]:
+async def _twice(config: MachineConfig, found: ArmRequest) -> list[CheckedProgram | tuple[Reason, ...]]:
     """Check in a process; the second time nothing is started."""
     check, heard = BackgroundCheck(config), list[Mapping[str, Any]]()
 
