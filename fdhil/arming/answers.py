@@ -1,4 +1,4 @@
-"""Answers to who asks for something: yes with what is known, or no with its class, cause and next action."""
+"""Answers who asks for something: yes with what is known, or no with its class, cause and next action."""
 
 from __future__ import annotations
 

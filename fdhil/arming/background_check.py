@@ -1,4 +1,4 @@
-"""The check of a long program, seen from the daemon: started, followed ahead of the motion, abandoned, remembered."""
+"""Starts the check of a long program, follows it ahead of the motion, abandons and remembers it."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ Prepared = TypeVar("Prepared", Armament, Feeding)
 
 
 class Storing(Protocol):
-    """What stores the outcomes."""
+    """The store of the outcomes, as far as arming asks."""
 
     fault: str | None
     """Why nothing can be stored now; None while all is well."""

@@ -1,4 +1,4 @@
-"""The daemon's end of the guard's control socket. Blocking and small; ``alive`` never blocks.
+"""Speaks to the guard over its control socket. Blocking and small; ``alive`` never blocks.
 
 Call ``alive`` at least every 0.2 s from the loop turn that checks the daemon's own health, not from a thread of its
 own: a daemon that hangs must look dead. The connection that armed is the one whose end ramps the offset down.

@@ -32,7 +32,7 @@ UNGUARDED_UM = 20.0  # the largest offset that may stay in a drive whose watchdo
 
 @dataclass(frozen=True, slots=True)
 class AxisKnowledge:
-    """What the daemon knows of an axis when it arms: newest published set with its age, last moves' skills."""
+    """An axis when it is armed, as the daemon knows it: newest published set with its age, last moves' skills."""
 
     published: ParameterSet | None
     age_s: float

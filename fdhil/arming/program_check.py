@@ -1,4 +1,4 @@
-"""A whole program through the planner, the correction and the gate, block by block, ahead of the motion.
+"""Checks a whole program: planner, correction and gate, block by block, ahead of the motion.
 
 A process of its own (``python -m fdhil.arming.program_check``, one JSON request on stdin): it may take minutes for an
 hour's program, at low priority, without holding up what the daemon listens to, and can be ended at any moment. Each
@@ -29,10 +29,9 @@ from fdhil.config import MachineConfig
 from fdhil.correction import gate
 from fdhil.correction.streaming import StreamBlock, stream
 from fdhil.errors import FdhilError, ProgramError, StoreError
-from fdhil.program import Budget, program_digest
+from fdhil.program import Budget, planner, program_digest
 from fdhil.program.demand_csv import read_demand_csv
 from fdhil.program.interpreter import Interpreter
-from fdhil.program.planner import stream as planned
 from fdhil.records import Float, Parameters, Reason, Trajectory
 from fdhil.store.atomic import store_error, sync_folder, write_file
 
@@ -59,11 +58,11 @@ def _opened(program: Path, config: MachineConfig) -> tuple[Iterator[Trajectory],
     if program.suffix.lower() == ".csv":
         return iter([read_demand_csv(program, config)]), lambda: [program]
     interpreter = Interpreter(program, Budget.of(config.nc), block_delete=False)
-    return planned(interpreter.run(), config, PIECE_ROWS), lambda: interpreter.files
+    return planner.stream(interpreter.run(), config, PIECE_ROWS), lambda: interpreter.files
 
 
 class _Files:
-    """What the files of a program held when they were first used: its subroutines may lie beside it."""
+    """The digests of a program's files when they were first used: its subroutines may lie beside it."""
 
     def __init__(self, program: Path, digest: str) -> None:
         self._digests = {program: digest}
@@ -115,7 +114,7 @@ class _Path:
 
 @dataclass(slots=True)
 class _Findings:
-    """What is known of the blocks so far."""
+    """Sums up the blocks so far."""
 
     rows: int = 0
     before_square: float = 0.0
@@ -200,7 +199,7 @@ def check(
 
 
 class _Pace:
-    """How far the check is and how fast; told now and then."""
+    """Tells now and then how far the check is and how fast."""
 
     def __init__(self, dt_s: float) -> None:
         self._dt_s, self._begun_s, self._told_s = dt_s, time.monotonic(), -math.inf

@@ -1,4 +1,4 @@
-"""What may still be applied in the drives, by what the guard said last: one rule, and its sentence for the operator."""
+"""Knows what may still be applied in the drives by what the guard said last, and says it to the operator."""
 
 from __future__ import annotations
 

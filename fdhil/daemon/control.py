@@ -1,4 +1,4 @@
-"""The control socket: one JSON object per line and request, one per answer, over a UNIX socket.
+"""Serves the control socket: one JSON object per line and request, one per answer, over a UNIX socket.
 
 A request is {"request": "status" | "arm" | "disarm" | "stop", ...}; an answer is {"ok": true, ...} or
 {"ok": false, "code", "text", "advice"}. With "progress": true lines {"progress": {...}} come before an answer that

@@ -1,4 +1,4 @@
-"""One log line per outcome, for a person; under systemd with the priority that the journal understands."""
+"""Writes one log line per outcome, for a person; under systemd with the priority that the journal understands."""
 
 from __future__ import annotations
 

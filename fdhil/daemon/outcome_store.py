@@ -1,4 +1,4 @@
-"""What the daemon keeps of each outcome, and what happens when the disk refuses: a notice, and it goes on in shadow."""
+"""Stores each outcome of the daemon; when the disk refuses it says so, and the daemon goes on in shadow."""
 
 from __future__ import annotations
 

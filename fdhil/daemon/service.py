@@ -1,4 +1,4 @@
-"""The daemon: one task group that carries records from the machine to the pipelines, and outcomes to the store.
+"""Runs the daemon: one task group that carries records from the machine to the pipelines, and outcomes to the store.
 
 Sources restart with back-off; a pipeline never does. An unexpected exception in any task ramps the correction down
 (the guard is told to disarm) and ends the process: there is no half-alive daemon. Nothing is ever sent from here.
@@ -42,7 +42,7 @@ STUCK_S = 60.0  # a batch that is digested for so long hangs
 
 
 class Source(Protocol):
-    """What the daemon needs of a machine: its records in blocks, and what was received and lost."""
+    """A machine as the daemon needs it: its records in blocks, and counts of what was received and lost."""
 
     def records(self) -> AsyncIterator[Record | Notice]:
         """Yield records as they come, until the source ends; DeviceError when a device fails for good."""

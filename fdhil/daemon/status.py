@@ -1,4 +1,4 @@
-"""What the daemon tells about itself: gathered from what passes through it. Pure but for the times it is given."""
+"""Gathers the status document from the outcomes that pass. Pure but for the times it is given."""
 
 from __future__ import annotations
 

@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fdhil import config as configuration
 from fdhil import correction
 from fdhil.arming.preparing import Refused
 from fdhil.arming.program_check import encoded
-from fdhil.config import MachineConfig
+from fdhil.config import MachineConfig, parse
 from fdhil.prediction.models import nominal_models
 from tests.arming.test_preparing import whole
 from tests.bench import bench_config, bench_document
@@ -30,7 +29,7 @@ def test_rows_are_in_the_drives_increments_and_sign() -> None:
     """Demand and offset are rounded, and turned where the drive counts against the axis."""
     document = copy.deepcopy(bench_document())
     document["axis"]["Y"]["drive"] = {"sign": -1}
-    config = configuration.parse(document)
+    config = parse(document)
     planned = correction.plan(bench_trajectory(10), nominal_models(config), config, "mirror")
     position = planned.before.reference.position_mm
     rows = np.frombuffer(encoded(position, planned.offset_um, config), "<i4").reshape(-1, 4)
