@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import hmac
-import time
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -15,13 +13,12 @@ from fdhil import tables
 from fdhil.arming.answers import Answer, refusal
 from fdhil.arming.background_check import BackgroundCheck
 from fdhil.arming.checked_program import CheckedProgram
-from fdhil.arming.guard_link import GONE, REST, GuardLink
+from fdhil.arming.guard_link import GuardLink
+from fdhil.arming.knowledge import Knowledge
 from fdhil.arming.passes import Passes
 from fdhil.arming.preparing import (
-    SKILL_MOVES,
     Armament,
     ArmRequest,
-    AxisKnowledge,
     Feeding,
     Refused,
     may_begin,
@@ -29,13 +26,13 @@ from fdhil.arming.preparing import (
     prepare_armament,
     prepare_feeding,
 )
-from fdhil.arming.standing import ADOPT, RAMPING_DOWN, START_AND_ADOPT, Standing, verdict
+from fdhil.arming.standing import ADOPT, GONE, RAMPING_DOWN, REST, START_AND_ADOPT, Standing, landed, verdict
 from fdhil.arming.stream_feeder import StreamFeeder
 from fdhil.arming.token import ensure_token
 from fdhil.arming.whole_plan import plan_whole
 from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError
-from fdhil.records import AxisSamples, Notice, Outcome, ParameterSet, Skill, Temperature
+from fdhil.records import AxisSamples, Notice, Skill
 from fdhil.store.history import Revision
 
 STREAM_S = 0.05
@@ -62,10 +59,7 @@ class ArmingDesk:
         self._store = store
         self._run_directory = run_directory
         self._token = ""
-        self._published: dict[str, tuple[ParameterSet, float]] = {}
-        self._temperature: dict[str, float] = {}
-        self._load_changed: set[str] = set()
-        self._skills = {axis: deque[Skill](maxlen=SKILL_MOVES) for axis in config.axis}
+        self.knowledge = Knowledge(config.axis)
         self._arming = asyncio.Lock()
         self._armed: tuple[Armament | Feeding, Mapping[str, Any]] | None = None
         self._check = BackgroundCheck(config)
@@ -78,24 +72,7 @@ class ArmingDesk:
     def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
         """Start from what the history knows; the token is made where there is none. DeviceError when it cannot be."""
         self._token = ensure_token(self._run_directory)
-        for axis, revision in newest.items():
-            self._published[axis] = (revision.set, time.monotonic() - revision.stamp.age_s())
-        self.note(skills)
-
-    def note(self, outcomes: Sequence[Outcome]) -> None:
-        """Take what the pipelines say."""
-        for outcome in outcomes:
-            if isinstance(outcome, ParameterSet):
-                self._published[outcome.axis] = (outcome, time.monotonic())
-                self._load_changed.discard(outcome.axis)
-            elif isinstance(outcome, Skill):
-                self._skills[outcome.axis].append(outcome)
-            elif isinstance(outcome, Notice) and outcome.code == "LoadChanged" and outcome.severity == "MAJOR":
-                self._load_changed.add(outcome.axis)
-
-    def note_temperature(self, reading: Temperature) -> None:
-        """Take a temperature."""
-        self._temperature[reading.axis] = reading.celsius
+        self.knowledge.begin(newest, skills)
 
     def hear(self, samples: AxisSamples) -> None:
         """Take samples: those of a pass of the armed program are compared with what was predicted."""
@@ -107,31 +84,12 @@ class ArmingDesk:
         return list(self._passes.told)
 
     @property
-    def temperatures(self) -> Mapping[str, float]:
-        """The newest temperature of each axis that has one."""
-        return self._temperature
-
-    @property
     def armed(self) -> Mapping[str, Any] | None:
         """What was armed last and still is, None otherwise; of a program also how far its check is."""
         if self._armed is None:
             return None
         armed, summary = self._armed
         return {**summary, **armed.progress()}
-
-    def _known(self) -> dict[str, AxisKnowledge]:
-        now_s = time.monotonic()
-        known = {}
-        for axis in self._config.axis:
-            published, since_s = self._published.get(axis, (None, now_s))
-            known[axis] = AxisKnowledge(
-                published,
-                now_s - since_s,
-                self._temperature.get(axis),
-                tuple(self._skills[axis]),
-                axis in self._load_changed,
-            )
-        return known
 
     async def arm(self, request: Mapping[str, Any]) -> Answer:
         """Plan, load and arm one program; every no has its class, cause and next action."""
@@ -158,13 +116,7 @@ class ArmingDesk:
 
     async def _landed(self) -> bool:
         """Wait a moment for the end of what ramps down; return whether the guard is at rest, or absent."""
-        tick, moved_s = None, time.monotonic()
-        await asyncio.to_thread(self.guard.look)
-        while self.guard.state not in REST and time.monotonic() - moved_s < LANDING_S:
-            if self.guard.state in RAMPING_DOWN and self.guard.status.get("tick") != tick:
-                tick, moved_s = self.guard.status.get("tick"), time.monotonic()
-            await asyncio.sleep(STREAM_S)
-            await asyncio.to_thread(self.guard.look)
+        await asyncio.to_thread(landed, self.guard.look, LANDING_S, RAMPING_DOWN)
         if self.guard.state in REST:
             self._release()
         return self.guard.state in REST
@@ -181,7 +133,7 @@ class ArmingDesk:
 
     async def _feed_forward(self, token: str) -> Answer:
         """Switch the on-line feed-forward on: it needs no program."""
-        prepared = await asyncio.to_thread(prepare_feeding, self._config, self._known())
+        prepared = await asyncio.to_thread(prepare_feeding, self._config, self.knowledge.now())
         if isinstance(prepared, Refused):
             return _refused(prepared)
         summary = prepared.summary()
@@ -208,13 +160,13 @@ class ArmingDesk:
         return dict(answer)
 
     async def _arm(self, program: Path, method: str | None, token: str, whole: bool) -> Answer:
-        request = await asyncio.to_thread(prepare, program, method, self._config, self._known())
+        request = await asyncio.to_thread(prepare, program, method, self._config, self.knowledge.now())
         if isinstance(request, Refused):
             return _refused(request)
         checked = await self._checked(request, whole)
         if isinstance(checked, Refused):
             return _refused(checked)
-        armament = await asyncio.to_thread(prepare_armament, request, checked, self._config, self._known())
+        armament = await asyncio.to_thread(prepare_armament, request, checked, self._config, self.knowledge.now())
         summary = armament.summary()
         self._passes.begin(armament.begin.demand, armament.rows)
         answer = await self._hand_over(self.guard.arm, armament, summary, token)
@@ -231,10 +183,10 @@ class ArmingDesk:
     async def _checked(self, request: ArmRequest, whole: bool) -> CheckedProgram | Refused:
         """Have a program checked: at once, or ahead of the motion as far as arming asks, or as a ``whole``."""
         if not request.ahead:
-            return await asyncio.to_thread(plan_whole, request, self._config, self._known())
+            return await asyncio.to_thread(plan_whole, request, self._config, self.knowledge.now())
 
         def enough(checked: CheckedProgram) -> bool:
-            return not whole and may_begin(checked, self._config, self._known())
+            return not whole and may_begin(checked, self._config, self.knowledge.now())
 
         checked = await self._check.run(request.program, request.program_digest, request.models, enough)
         return Refused(checked) if isinstance(checked, tuple) else checked
@@ -311,7 +263,7 @@ class ArmingDesk:
         """What is still vouched for while a correction runs; None while none does."""
         if self._armed is None:
             return None
-        facts = self._armed[0].standing_facts(self._config, self._known())
+        facts = self._armed[0].standing_facts(self._config, self.knowledge.now())
         return facts | {"journal_writable": self._store.fault is None}
 
     async def stand_down(self) -> Standing:

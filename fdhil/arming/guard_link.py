@@ -12,7 +12,7 @@ from typing import Any, Literal
 from fdhil.arming.checked_program import Piece
 from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.preparing import Armament, Feeding
-from fdhil.arming.standing import ABSENT, AT_REST, START_AND_ADOPT, Standing, landed, lost, standing
+from fdhil.arming.standing import ABSENT, AT_REST, GONE, START_AND_ADOPT, Standing, landed, lost, standing
 from fdhil.errors import DeviceError
 from fdhil.records import Notice
 
@@ -21,10 +21,8 @@ SETTLING_S = 0.2
 CHARGED = {"ARMED", "RAMPING", "ACTIVE", "HOLD", "FEEDFORWARD"}
 ORDERED = {"Disarmed", "Finished", "Stopped"}
 TRIPPED = "GuardTripped"
-GONE = {"absent", "lost"}
 RECORD_VOID = "RecordVoid"
 VOIDING = {RECORD_VOID, "NodeRebooted"}
-REST = {*AT_REST, *GONE}
 
 
 class GuardLink:
@@ -67,10 +65,11 @@ class GuardLink:
         """The row of the path where the machine is, 0 before it has begun."""
         return int(self._status.get("row") or 0)
 
-    def look(self) -> None:
-        """Connect where needed and ask for the status (blocking); what changed is told by the next ``refresh``."""
+    def look(self) -> Mapping[str, Any]:
+        """Connect where needed, ask for the status and return it (blocking); the next ``refresh`` tells the change."""
         with contextlib.suppress(DeviceError), self._asked():
             pass
+        return self._status
 
     def refresh(self) -> list[Notice]:
         """Look at the status (blocking); return what changed since the last call."""
@@ -156,7 +155,7 @@ class GuardLink:
         with self._asked() as client:
             answer = client.disarm()
             if answer["ok"]:
-                landed(client)
+                landed(client.status)
             return answer
 
     def close(self) -> None:

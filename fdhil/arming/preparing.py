@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.arming.checked_program import FIRST_S, CheckedProgram, Piece, RowStream
+from fdhil.arming.knowledge import SKILL_MOVES, AxisKnowledge
 from fdhil.arming.program_check import reference_blocks
 from fdhil.commissioning.feedforward import feedforward_object
 from fdhil.commissioning.record import CommissioningRecord, axis_digest, load_record
@@ -20,25 +21,13 @@ from fdhil.correction import gate, online
 from fdhil.drivers.cia402.profile import load_profile
 from fdhil.prediction.gain import Gain, skill_of
 from fdhil.program import program_digest
-from fdhil.records import Parameters, ParameterSet, Reason, Skill
+from fdhil.records import Parameters, Reason, Skill
 
 MODEL_AGE_S = 8 * 3600.0  # a shift: older parameters are of another state of the machine
 MODEL_KELVIN = 3.0
-SKILL_MOVES = 3  # FAULTS E19: the last three recorded moves ...
-SKILL_SHARE = 0.5  # ... must be predicted within half of the gain that is promised
+SKILL_SHARE = 0.5  # of the gain that is promised, within which the last moves must be predicted (FAULTS E19)
 AHEAD_S = 60.0  # of a program that must have passed before it is armed ahead of its check
 UNGUARDED_UM = 20.0  # the largest offset that may stay in a drive whose watchdog on us is not proven
-
-
-@dataclass(frozen=True, slots=True)
-class AxisKnowledge:
-    """An axis when it is armed, as the daemon knows it: newest published set with its age, last moves' skills."""
-
-    published: ParameterSet | None
-    age_s: float
-    temperature_c: float | None
-    skills: tuple[Skill, ...]
-    load_changed: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
-from fdhil.arming.guard_link import REST, GuardLink
+from fdhil.arming.guard_link import GuardLink
 from fdhil.arming.preparing import Armament
+from fdhil.arming.standing import REST
 from fdhil.errors import DeviceError, StoreError
 from fdhil.records import Notice
 

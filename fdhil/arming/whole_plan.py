@@ -10,7 +10,8 @@ import numpy as np
 
 from fdhil import correction
 from fdhil.arming.checked_program import Block, CheckedProgram
-from fdhil.arming.preparing import ArmRequest, AxisKnowledge, Refused
+from fdhil.arming.knowledge import AxisKnowledge
+from fdhil.arming.preparing import ArmRequest, Refused
 from fdhil.arming.program_check import encoded
 from fdhil.config import MachineConfig
 from fdhil.correction import gate

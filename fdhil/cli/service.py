@@ -156,7 +156,7 @@ def _disarm_at_the_guard(config: Path, silent: DeviceError) -> Mapping[str, Any]
     try:
         with GuardClient(machine.guard_directory) as guard:
             answer = guard.disarm()
-            return {**verdict(landed(guard)), "asked": "guard"} if answer["ok"] else answer
+            return {**verdict(landed(guard.status)), "asked": "guard"} if answer["ok"] else answer
     except DeviceError as error:
         text = f"{silent}; nor does the guard answer ({error}): it is unknown what is applied"
         raise ConnectError("machine", text) from None
@@ -201,7 +201,7 @@ def _adopted(guard: GuardClient, token: Callable[[], str], yes: bool, quiet: boo
         click.confirm("Is the feed held? Ramp it to zero now?", abort=True, err=True)
     try:
         answer = guard.adopt(token())
-        return verdict(landed(guard)) if answer["ok"] else {**answer, "may_stand_um": dict(stands.offset_um)}
+        return verdict(landed(guard.status)) if answer["ok"] else {**answer, "may_stand_um": dict(stands.offset_um)}
     except DeviceError as error:
         raise ConnectError("adoption", f"{error}; {stands}") from None
 

@@ -190,7 +190,7 @@ class Service:
             self._tell([record])
             return
         if isinstance(record, Temperature):
-            self._desk.note_temperature(record)
+            self._desk.knowledge.note_temperature(record)
         elif isinstance(record, AxisSamples):
             self._desk.hear(record)
         for axis in self._config.axis if isinstance(record, TickTimes) else (record.axis,):
@@ -210,7 +210,7 @@ class Service:
             self._busy_since_s[axis] = time.monotonic()
             outcomes, notices = await asyncio.to_thread(self._digest, axis, batch)
             del self._busy_since_s[axis]
-            self._desk.note(outcomes)
+            self._desk.knowledge.note(outcomes)
             self._say([*outcomes, *notices])
             for _ in batch:
                 queue.task_done()
@@ -309,7 +309,7 @@ class Service:
         }
         status = self._watch.status(time.monotonic())
         guard = self._desk.guard
-        for axis, celsius in self._desk.temperatures.items():
+        for axis, celsius in self._desk.knowledge.temperatures.items():
             status["axes"][axis]["slideway_c"] = celsius
         return {
             "ok": True,

@@ -124,7 +124,7 @@ async def opened(config: MachineConfig, mill: Mill) -> AsyncIterator[Shop]:
     skills = [Skill(axis, 1, 0.5, 1.0, 0.0, 30.0) for axis in ("X", "Y")]
     desk.begin({axis: Revision(1, replace(newest, axis=axis), (), stamp) for axis in ("X", "Y")}, skills)
     for axis in ("X", "Y"):
-        desk.note([replace(newest, axis=axis)])
+        desk.knowledge.note([replace(newest, axis=axis)])
     told: list[Notice] = []
     tasks = [asyncio.create_task(work(told.extend)) for work in (desk.attend, desk.stream)]
     yield Shop(desk, mill, read_token(config.store.run_directory), told)

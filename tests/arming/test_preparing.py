@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 
 from fdhil.arming.desk import ArmingDesk
+from fdhil.arming.knowledge import AxisKnowledge
 from fdhil.arming.preparing import (
     MODEL_AGE_S,
     Armament,
     ArmRequest,
-    AxisKnowledge,
     Refused,
     prepare,
     prepare_armament,
@@ -209,8 +209,8 @@ async def test_the_operators_token_decides_and_a_missing_guard_is_told(config: M
 
 def test_a_changed_load_is_remembered_until_new_parameters_come(config: MachineConfig, tmp_path: Path) -> None:
     desk = ArmingDesk(config, OutcomeStore(config), tmp_path)
-    desk.note([replace(published(), config_digest=config.digest)])
-    desk.note([Notice("LoadChanged", "MAJOR", "Jt rose", "X")])
-    assert desk._known()["X"].load_changed
-    desk.note([replace(published(2), config_digest=config.digest)])
-    assert not desk._known()["X"].load_changed
+    desk.knowledge.note([replace(published(), config_digest=config.digest)])
+    desk.knowledge.note([Notice("LoadChanged", "MAJOR", "Jt rose", "X")])
+    assert desk.knowledge.now()["X"].load_changed
+    desk.knowledge.note([replace(published(2), config_digest=config.digest)])
+    assert not desk.knowledge.now()["X"].load_changed
