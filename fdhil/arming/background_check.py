@@ -54,8 +54,8 @@ class BackgroundCheck:
         going = self._going
         if going is None or going.ended or going.key != key:
             await self.close()
-            going = self._going = _RunningCheck(program, key, await asyncio.to_thread(self._opened, key))
-            going.begin(self._request(program, program_digest, models, key))
+            request = self._request(program, program_digest, models, key)
+            going = self._going = _RunningCheck(request, await asyncio.to_thread(self._opened, key))
         with contextlib.ExitStack() as left:  # who waits for it was cancelled, or cannot judge it
             left.callback(self.abandon)
             found = await going.passed(enough)
@@ -94,31 +94,28 @@ class BackgroundCheck:
     async def attend(self) -> None:
         """Raise what went wrong in following a check that goes on by itself."""
         if self._going is not None and self._going.ended:
-            await self._going.over()
+            await self._going.task
 
     async def close(self) -> None:
         """End a check that runs and wait for its end."""
         self.abandon()
         if self._going is not None:
-            await self._going.quiet()
+            await asyncio.wait([self._going.task])
 
 
 class _RunningCheck:
     """One check on its way: its process, what it said last, and the rows that passed."""
 
-    def __init__(self, program: Path, key: str, checked: CheckedProgram) -> None:
-        self.key, self.checked = key, checked
+    def __init__(self, request: Mapping[str, Any], checked: CheckedProgram) -> None:
+        """Start to follow the process that answers the request; what goes wrong in that is raised by ``task``."""
+        self.key, self.checked = str(request["key"]), checked
         self.ended = self._abandoned = False
-        self._program = str(program)
+        self._program = str(request["program"])
         self.progress: Mapping[str, Any] = {}
         self._hear({"progress": {"checked_s": 0.0, "line": 0, "times_real_time": 0.0, "refused": 0}})
         self._news = asyncio.Event()
         self._process: asyncio.subprocess.Process | None = None
-        self._task: asyncio.Task[None] | None = None
-
-    def begin(self, request: Mapping[str, Any]) -> None:
-        """Start the process and follow it."""
-        self._task = asyncio.create_task(self._follow(request), name=f"check of {self._program}")
+        self.task = asyncio.create_task(self._follow(request), name=f"check of {self._program}")
 
     async def passed(self, enough: Enough) -> CheckedProgram | tuple[Reason, ...]:
         """Wait until enough or all has passed, or until all is known of why it is refused."""
@@ -127,18 +124,8 @@ class _RunningCheck:
                 return self.checked
             self._news.clear()
             await self._news.wait()
-        await self.over()
+        await self.task
         return self.checked if self.checked.whole else self.checked.refused
-
-    async def over(self) -> None:
-        """Wait for the end; what went wrong in following the process is raised here."""
-        if self._task is not None:
-            await self._task
-
-    async def quiet(self) -> None:
-        """Wait for the end, whatever it is."""
-        if self._task is not None:
-            await asyncio.wait([self._task])
 
     def abandon(self) -> bool:
         """End the process; return whether it ran."""
@@ -198,14 +185,12 @@ class _RunningCheck:
         elif "block" in told:
             end, sha256 = told["block"]
             checked.take(Block(end, sha256, told["last"]), told["errors"])
-        elif "refused" in told:
-            checked.refused += (_reason(told["refused"]),)
-        elif "error" in told:
-            checked.refused += (_reason(told["error"]),)
         elif "header" in told:
-            checked.refused = tuple(map(_reason, told["header"]["refused"]))
+            checked.refused = tuple(Reason(**each) for each in told["header"]["refused"])
             if not checked.refused:
                 checked.conclude(told["header"])
+        elif refused := told.get("refused") or told.get("error"):
+            checked.refused += (Reason(**refused),)
 
     def _conclude(self, code: int | None) -> None:
         """A check that ended without a word on the whole has died."""
@@ -217,7 +202,3 @@ class _RunningCheck:
             text = f"the check ended with exit code {code} and no answer"
             died = Reason("InternalError", text, "see the daemon's log, then report it")
         self.checked.refused += (died,)
-
-
-def _reason(told: Mapping[str, Any]) -> Reason:
-    return Reason(told["code"], told["text"], told["advice"])

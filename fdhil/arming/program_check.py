@@ -18,7 +18,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -158,12 +158,8 @@ class _Findings:
         """Return the figures of the whole; what it gains is asked last."""
         errors = self.errors()
         refused = self.refused or list(gate.gains(errors["before"]["rms_um"], errors["after"]["rms_um"]))
-        told = [_told(reason) for reason in refused[:MOST_REFUSED]]
+        told = [asdict(reason) for reason in refused[:MOST_REFUSED]]
         return {"rows": self.rows, **errors, "largest_um": self.largest_um, "refused": told}
-
-
-def _told(reason: Reason) -> dict[str, str]:
-    return {"code": reason.code, "text": reason.text, "advice": reason.advice}
 
 
 def check(
@@ -184,7 +180,7 @@ def check(
         files.take(opened())
         findings.take(block)
         for reason in findings.refuse(block, path, config.machine.sync_period_s):
-            tell({"refused": _told(reason)})
+            tell({"refused": asdict(reason)})
         if len(findings.refused) >= MOST_REFUSED:
             break
         if not findings.refused:

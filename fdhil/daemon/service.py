@@ -103,10 +103,10 @@ class Service:
 
     def _say_stopped(self, stands: Standing) -> None:
         if stands.nothing:
-            self._log(f"stopped, {stands}")
+            journal.write_line(f"stopped, {stands}")
         else:
             advice = START_AND_ADOPT if self._desk.guard.state == "lost" else ADOPT
-            self._log(f"stopped, {stands}; {advice}", "MAJOR")
+            journal.write_line(f"stopped, {stands}; {advice}", "MAJOR")
 
     @property
     def standing(self) -> Standing:
@@ -147,13 +147,9 @@ class Service:
 
     async def _say_ready(self) -> None:
         await self._opened.wait()
-        self._log(
-            f"ready: {self._config.machine.name}, axes {', '.join(self._config.axis)}; listening, sending nothing"
-        )
+        axes = ", ".join(self._config.axis)
+        journal.write_line(f"ready: {self._config.machine.name}, axes {axes}; listening, sending nothing")
         notify("READY=1\nSTATUS=listening, sending nothing")
-
-    def _log(self, text: str, severity: journal.Severity = "info") -> None:
-        journal.write_line(text, severity)
 
     # from the machine to the pipelines -------------------------------------------------------------------------
 
@@ -244,7 +240,7 @@ class Service:
         try:
             void_record(self._config.store.directory, notice.axis, notice.text)
         except StoreError as error:
-            self._log(str(error), "MAJOR")
+            journal.write_line(str(error), "MAJOR")
 
     def _say(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
         """Show outcomes: one log line each (a flood becomes a count), the newest in the status. Return those shown."""
@@ -255,7 +251,7 @@ class Service:
             held = self._gate.admit(outcome.code if isinstance(outcome, Notice) else type(outcome).__name__, now_s)
             if held is not None:
                 shown.append(outcome)
-                self._log(text + (f" ({held} more like this were not written)" if held else ""), severity)
+                journal.write_line(text + (f" ({held} more like this were not written)" if held else ""), severity)
         return shown
 
     async def _feed_watchdog(self) -> None:
