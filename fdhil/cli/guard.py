@@ -1,13 +1,11 @@
-"""``fdhil-guard CONFIG``: opens the transmit descriptor of the machine's bus and becomes the guard's process."""
+"""``fdhil-guard CONFIG``: owns the machine's bus and becomes the guard's process."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
-import socket
 import sys
-import time
 from pathlib import Path
 
 import click
@@ -15,12 +13,11 @@ import click
 from fdhil import config as machine_config
 from fdhil.cli.bus_lock import lock_bus
 from fdhil.cli.main import run_safely
-from fdhil.config import CanBus
-from fdhil.errors import ConnectError, DeviceError, ProtocolError
+from fdhil.errors import DeviceError
 from fdhil.guard.settings import from_json, to_json
+from fdhil.guard.transmit_socket import connect_bus, greet
 
 SETTINGS_NAME = "guard.json"
-CONNECT_S = 5.0
 
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
@@ -75,72 +72,6 @@ def _write(file: Path, text: str) -> None:
         temporary.replace(file)
     except OSError as error:
         raise DeviceError(str(file), f"cannot be written ({error.strerror}); check the run directory") from None
-
-
-def open_bus(name: str, bus: CanBus) -> socket.socket:
-    """Return a descriptor on which frames can be sent; ConnectError when the bus cannot be had."""
-    transmit = connect_bus(name, bus)
-    greet(name, bus, transmit)
-    return transmit
-
-
-def connect_bus(name: str, bus: CanBus) -> socket.socket:
-    """Open the transmit descriptor; a hub still has to be greeted. ConnectError when the bus cannot be had."""
-    if bus.interface == "socketcan":
-        return _open_raw(name, bus.channel)
-    if bus.interface == "socketcand":
-        try:
-            return socket.create_connection((bus.host, bus.port), timeout=CONNECT_S)
-        except OSError as error:
-            text = f"no hub answers at {bus.host} port {bus.port} ({error.strerror or error}); start the hub first"
-            raise ConnectError(f"bus {name}", text) from None
-    text = f"the interface {bus.interface!r} lives inside one process; set socketcan or socketcand"
-    raise ConnectError(f"bus {name}", text)
-
-
-def _open_raw(name: str, channel: str) -> socket.socket:
-    raw = None
-    try:
-        raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
-        raw.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")  # what comes before the guard listens is old
-        raw.bind((channel,))
-    except OSError as error:
-        if raw is not None:
-            raw.close()
-        text = f"the CAN interface {channel} cannot be opened ({error.strerror}); bring it up with ip link"
-        raise ConnectError(f"bus {name}", text) from None
-    return raw
-
-
-def greet(name: str, bus: CanBus, hub: socket.socket) -> None:
-    """Go through the greeting of a hub, byte by byte, so that no frame is swallowed."""
-    if bus.interface != "socketcand":
-        return
-    deadline_s = time.monotonic() + CONNECT_S
-    hub.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    try:
-        _expect(hub, "hi", deadline_s)
-        for command in (f"open {bus.channel}", "rawmode"):
-            hub.sendall(f"< {command} >".encode("ascii"))
-            _expect(hub, "ok", deadline_s)
-    except OSError as error:
-        hub.close()
-        text = f"the hub at {bus.host} port {bus.port} broke off its greeting ({error}); check that it is a socketcand"
-        raise ConnectError(f"bus {name}", text) from None
-
-
-def _expect(hub: socket.socket, word: str, deadline_s: float) -> None:
-    answer = b""
-    while not answer.endswith(b">"):
-        hub.settimeout(max(0.001, deadline_s - time.monotonic()))
-        byte = hub.recv(1)
-        if not byte or len(answer) > 200:
-            raise ConnectionError("connection closed")
-        answer += byte
-    if answer.split() != [b"<", word.encode(), b">"]:
-        hub.close()
-        shown = answer.decode("ascii", "replace")
-        raise ProtocolError("hub", f"answered {shown!r} where '< {word} >' belongs; check [bus] channel and port")
 
 
 def main() -> None:

@@ -20,7 +20,7 @@ import pytest
 from fdhil import config as machine_config
 from fdhil.arming.guard_settings import heartbeat_timeout_s, limits_of, settings_of
 from fdhil.cli.bus_lock import lock_bus
-from fdhil.cli.guard import guard, open_bus
+from fdhil.cli.guard import guard
 from fdhil.cli.main import cli, run_safely
 from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
 from fdhil.commissioning.void import void_record
@@ -29,7 +29,7 @@ from fdhil.errors import ConnectError, ProtocolError
 from fdhil.guard.limits import Limits
 from fdhil.guard.settings import from_json, load, to_json
 from tests.guard.machine import DEMAND_AT_REST
-from tests.guard.peer import Peer, write_config
+from tests.guard.peer import Peer, open_bus, write_config
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
