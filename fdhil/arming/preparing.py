@@ -15,7 +15,7 @@ from fdhil.arming.checked_program import FIRST_S, CheckedProgram, Piece, RowStre
 from fdhil.arming.knowledge import SKILL_MOVES, AxisKnowledge
 from fdhil.arming.program_check import reference_blocks
 from fdhil.commissioning.feedforward import feedforward_object
-from fdhil.commissioning.record import CommissioningRecord, axis_digest, load_record
+from fdhil.commissioning.record import CommissioningRecord, holds, load_record
 from fdhil.config import MachineConfig
 from fdhil.correction import gate, online
 from fdhil.drivers.cia402.profile import load_profile
@@ -196,12 +196,12 @@ def prepare_feeding(config: MachineConfig, known: Mapping[str, AxisKnowledge]) -
         if published is None:
             return _not_validated(name)
         laws[name] = online.law(published.parameters, config.axis[name], config.machine.sync_period_s)
-    records = {name: _record(config, name) for name in axes}
+    records = _records(axes, config)
     facts = feeding_facts(axes, config, known) | {
-        "commissioned": all(_valid(record, config, name) for name, record in records.items()),
+        "commissioned": all(holds(record, config, axis) for axis, record in records.items()),
         "feedforward_commissioned": all(_feeds(record, config, name) for name, record in records.items()),
         "model_validated": True,
-        "watchdog_proven": all(r is not None and r.watchdog == "proven" for r in records.values()),
+        "watchdog_proven": _all_proven(records),
     }
     return Feeding(laws, facts)
 
@@ -251,20 +251,23 @@ def _skilled(skills: Sequence[Skill], gain_um: float) -> bool:
 
 
 def _commissioned(axes: Sequence[str], largest_um: float, config: MachineConfig) -> dict[str, bool]:
-    records = {axis: _record(config, axis) for axis in axes}
+    records = _records(axes, config)
     return {
-        "commissioned": all(_valid(record, config, axis) for axis, record in records.items()),
+        "commissioned": all(holds(record, config, axis) for axis, record in records.items()),
         # the plans assume an offset that the feed-forward sees; another drive would be made worse
         "offset_in_feedforward_known": all(r is not None and r.offset_in_feedforward is True for r in records.values()),
-        "watchdog_proven": largest_um <= UNGUARDED_UM
-        or all(r is not None and r.watchdog == "proven" for r in records.values()),
+        "watchdog_proven": largest_um <= UNGUARDED_UM or _all_proven(records),
     }
 
 
-def _record(config: MachineConfig, axis: str) -> CommissioningRecord | None:
-    """Read an axis' record; a daemon that may not read the key leaves the seal to the guard."""
-    return load_record(config.store.directory, axis, config.store.commissioning_key, may_lack_key=True)
+Records = Mapping[str, CommissioningRecord | None]
 
 
-def _valid(record: CommissioningRecord | None, config: MachineConfig, axis: str) -> bool:
-    return record is not None and record.readback_ok and record.config_digest == axis_digest(config, axis)
+def _records(axes: Sequence[str], config: MachineConfig) -> Records:
+    """Read the axes' records; a daemon that may not read the key leaves the seal to the guard."""
+    store = config.store
+    return {axis: load_record(store.directory, axis, store.commissioning_key, may_lack_key=True) for axis in axes}
+
+
+def _all_proven(records: Records) -> bool:
+    return all(r is not None and r.watchdog == "proven" for r in records.values())
