@@ -107,9 +107,9 @@ class ArmingDesk:
                 text = f"what was armed before is still on, in state {self.guard.state}"
                 return refusal("NotOff", text, "run fdhil disarm or wait until it has ended, then arm again")
             if self.guard.state in ("FROZEN", "lost"):
-                return refusal(
-                    "OffsetStands", f"the guard is {self.guard.state}: {self.guard.standing}", self._way_out()
-                )
+                way_out = ADOPT if self.guard.connected else START_AND_ADOPT
+                text = f"the guard is {self.guard.state}: {self.guard.standing}"
+                return refusal("OffsetStands", text, f"{way_out}, then arm again")
             if feeding:
                 return await self._feed_forward(token)
             return await self._arm(Path(str(program)), method, token, request.get("whole") is True)
@@ -120,10 +120,6 @@ class ArmingDesk:
         if self.guard.state in REST:
             self._release()
         return self.guard.state in REST
-
-    def _way_out(self) -> str:
-        """Return what to do about what may still be applied before anything is armed."""
-        return f"{ADOPT if self.guard.connected else START_AND_ADOPT}, then arm again"
 
     def _release(self) -> None:
         if self._armed is not None:
@@ -205,14 +201,10 @@ class ArmingDesk:
         """Have the guard ramp to zero: ok only when it is reached. What is being planned or checked is not armed."""
         self._feeder = None  # no more rows, no more words about them
         abandoned = self.abandon()
-        if self._disarming is None:  # who asks again meanwhile waits for the same ramp
+        if self._disarming is None or self._disarming.done():  # who asks again meanwhile waits for the same ramp
             self._disarming = asyncio.ensure_future(self._to_zero())
-            self._disarming.add_done_callback(self._disarmed)
         answer = await asyncio.shield(self._disarming)
         return {**answer, "text": f"{answer['text']}; the check was abandoned"} if abandoned else answer
-
-    def _disarmed(self, _: asyncio.Future[Answer]) -> None:
-        self._disarming = None
 
     async def _to_zero(self) -> Answer:
         try:

@@ -90,17 +90,14 @@ class GuardLink:
                 if self._client is None:
                     self._client = GuardClient(self._run_directory)
                 yield self._client
-                self._note(before, self._client.status())
+                self._status, self._heard_s = self._client.status(), time.monotonic()
+                self._untold += _changes(before, self._status)
             except DeviceError as error:
                 reached = self._client is not None
                 self._drop()
                 self._status = lost(before, arming and reached)
                 self._untold += _gone(before, self._status, error)
                 raise
-
-    def _note(self, before: Mapping[str, Any], status: Mapping[str, Any]) -> None:
-        self._untold += _changes(before, status)
-        self._status, self._heard_s = status, time.monotonic()
 
     def _drop(self) -> None:
         if self._client is not None:

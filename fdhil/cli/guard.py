@@ -48,7 +48,7 @@ def guard(config: Path, check: bool) -> None:
         return
     with connect_bus(name, bus) as transmit, lock_bus(bus, transmit, run_directory) as lock:
         # where no NC runs the bus, the drives are asked whether they still are what was signed off
-        compare_again(machine, name, _tell_void)
+        compare_again(machine, name, lambda text: click.echo(json.dumps({"event": "record_void", "text": text})))
         _write(file, to_json(guard_settings.settings_of(machine, name, run_directory, token_sha256)))
         greet(name, bus, transmit)
         os.set_inheritable(lock.fileno(), True)
@@ -56,10 +56,6 @@ def guard(config: Path, check: bool) -> None:
         arguments = ["-m", "fdhil.guard", "--settings", str(file), "--descriptor", str(transmit.fileno())]
         sys.stdout.flush()
         os.execv(sys.executable, [sys.executable, *arguments])
-
-
-def _tell_void(text: str) -> None:
-    click.echo(json.dumps({"event": "record_void", "text": text}))
 
 
 def _write(file: Path, text: str) -> None:

@@ -216,11 +216,7 @@ def _tell(answer: Mapping[str, Any], as_json: bool) -> None:
         advice = f"; {answer['advice']}" if answer.get("advice") else ""
         click.echo(f"refused: {answer['code']}: {answer['text']}{advice}", err=True)
         for more in answer.get("refused", [])[1:]:
-            click.echo(f"also: {more if isinstance(more, str) else _reason(more)}", err=True)
+            told = more if isinstance(more, str) else f"{more['code']}: {more['text']}; {more['advice']}"
+            click.echo(f"also: {told}", err=True)
     if not answer["ok"]:
         click.get_current_context().exit(1)
-
-
-def _reason(told: Mapping[str, Any]) -> str:
-    """Return a refusal of the guard as one line."""
-    return f"{told['code']}: {told['text']}; {told['advice']}"
