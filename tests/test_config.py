@@ -98,7 +98,7 @@ def test_increments_too_coarse_for_the_limits_are_refused(
     if told:
         assert told in faults(document)
     else:
-        assert config.OffsetLimits.of(config.parse(document).axis["X"], 0.001).whole[2] == 1
+        assert config.OffsetBounds.of(config.parse(document).axis["X"], 0.001).whole[2] == 1
 
 
 def test_two_drives_with_one_node_id_are_refused() -> None:

@@ -11,8 +11,9 @@ from typing import BinaryIO
 
 import pytest
 
-from fdhil.arming.checked_program import Checked
-from fdhil.arming.program_check import HEADER, SCHEMA, code_digest, keep
+from fdhil.arming.checked_program import CheckedProgram
+from fdhil.arming.code_digest import code_digest
+from fdhil.arming.program_check import HEADER, SCHEMA, keep
 from fdhil.arming.token import TOKEN_NAME, ensure_token, read_token
 from fdhil.config import Nc
 from fdhil.errors import ConfigError, FdhilError, ProgramError
@@ -103,7 +104,7 @@ def test_a_checked_program_with_a_flipped_bit_is_checked_again(tmp_path: Path) -
         return header
 
     keep(tmp_path, "key", write)
-    found = Checked.find(tmp_path, "key", tmp_path)
+    found = CheckedProgram.find(tmp_path, "key", tmp_path)
     assert found is not None
     assert (found.rows, found.errors) == (512, errors)
     for file, most in ((f"key{HEADER}", 400), ("key.rows", 40)):
@@ -111,7 +112,7 @@ def test_a_checked_program_with_a_flipped_bit_is_checked_again(tmp_path: Path) -
         whole = path.read_bytes()
         for flipped in flips(whole, most, 4):
             path.write_bytes(flipped)
-            assert Checked.find(tmp_path, "key", tmp_path) is None
+            assert CheckedProgram.find(tmp_path, "key", tmp_path) is None
         path.write_bytes(whole)
 
 

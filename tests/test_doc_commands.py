@@ -17,7 +17,7 @@ from fdhil import config
 from fdhil.cli.guard import guard
 from fdhil.cli.main import cli
 from fdhil.daemon.kernel_warmup import nominal_rapid
-from fdhil.daemon.outcome_store import Keeper
+from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.store.windows import encode_window
 from studies import bench
 from tests.bench import bench_document
@@ -107,10 +107,10 @@ def house(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of configs/ with a store in which one rapid and a set of parameters are kept, as after ``fdhil run``."""
     shutil.copytree(ROOT / "configs", tmp_path / "configs")
     machine = config.load(tmp_path / "configs" / "sim.toml")
-    keeper = Keeper(machine)
-    keeper.open()
-    keeper.keep([published(1), published(1, "Y")])
-    keeper.close()
+    store = OutcomeStore(machine)
+    store.open()
+    store.keep([published(1), published(1, "Y")])
+    store.close()
     rapid = encode_window(nominal_rapid("X", machine.axis["X"], machine.machine.sync_period_s), machine.digest)
     (tmp_path / WINDOW).parent.mkdir(exist_ok=True)
     (tmp_path / WINDOW).write_bytes(rapid)

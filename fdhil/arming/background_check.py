@@ -1,4 +1,4 @@
-"""The check of a long program, seen from the daemon: started, followed ahead of the motion, abandoned, remembered."""
+"""Starts the check of a long program, follows it ahead of the motion, abandons and remembers it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from fdhil.arming.checked_program import Block, Checked
+from fdhil.arming.checked_program import Block, CheckedProgram
+from fdhil.arming.code_digest import MAKER
 from fdhil.arming.program_check import SCHEMA, part_file
 from fdhil.config import MachineConfig
 from fdhil.records import Parameters, Reason
@@ -22,16 +23,16 @@ from fdhil.store.atomic import store_error
 FOLDER = "checked"
 MAX_LINE = 1 << 20
 
-Enough = Callable[[Checked], bool]
+Enough = Callable[[CheckedProgram], bool]
 
 
-class Check:
+class BackgroundCheck:
     """At most one check at a time; it goes on by itself when enough has passed, until it ends or is abandoned."""
 
     def __init__(self, config: MachineConfig) -> None:
         self._config = config
         self._folder = config.store.directory / FOLDER
-        self._going: _Going | None = None
+        self._going: _RunningCheck | None = None
 
     @property
     def progress(self) -> Mapping[str, Any] | None:
@@ -40,21 +41,21 @@ class Check:
 
     async def run(
         self, program: Path, program_digest: str, models: Mapping[str, Parameters], enough: Enough
-    ) -> Checked | tuple[Reason, ...]:
+    ) -> CheckedProgram | tuple[Reason, ...]:
         """Return the program as soon as ``enough`` of it or all has passed, or why it is refused: every place.
 
         What was checked before is not checked again; a check that still goes on is taken up, one of another program is
         ended. StoreError when no rows can be written.
         """
         key = self._key(program_digest, models)
-        known = await asyncio.to_thread(Checked.find, self._folder, key, program.parent)
+        known = await asyncio.to_thread(CheckedProgram.find, self._folder, key, program.parent)
         if known is not None:
             return known
         going = self._going
         if going is None or going.ended or going.key != key:
             await self.close()
-            going = self._going = _Going(program, key, await asyncio.to_thread(self._opened, key))
-            going.begin(self._request(program, program_digest, models, key))
+            request = self._request(program, program_digest, models, key)
+            going = self._going = _RunningCheck(request, await asyncio.to_thread(self._opened, key))
         with contextlib.ExitStack() as left:  # who waits for it was cancelled, or cannot judge it
             left.callback(self.abandon)
             found = await going.passed(enough)
@@ -65,14 +66,14 @@ class Check:
         of = [SCHEMA, program_digest, self._config.digest, {axis: m.as_dict() for axis, m in models.items()}]
         return hashlib.sha256(json.dumps(of).encode()).hexdigest()[:32]
 
-    def _opened(self, key: str) -> Checked:
+    def _opened(self, key: str) -> CheckedProgram:
         """Open the file before the process writes it: no rename or removal can come in between."""
         part = part_file(self._folder, key)
         try:
             part.parent.mkdir(parents=True, exist_ok=True)
             part.unlink(missing_ok=True)
             part.touch()
-            return Checked(part, tuple(self._config.axis))
+            return CheckedProgram(part, tuple(self._config.axis))
         except OSError as error:
             raise store_error(part, error) from None
 
@@ -93,51 +94,38 @@ class Check:
     async def attend(self) -> None:
         """Raise what went wrong in following a check that goes on by itself."""
         if self._going is not None and self._going.ended:
-            await self._going.over()
+            await self._going.task
 
     async def close(self) -> None:
         """End a check that runs and wait for its end."""
         self.abandon()
         if self._going is not None:
-            await self._going.quiet()
+            await asyncio.wait([self._going.task])
 
 
-class _Going:
+class _RunningCheck:
     """One check on its way: its process, what it said last, and the rows that passed."""
 
-    def __init__(self, program: Path, key: str, checked: Checked) -> None:
-        self.key, self.checked = key, checked
+    def __init__(self, request: Mapping[str, Any], checked: CheckedProgram) -> None:
+        """Start to follow the process that answers the request; what goes wrong in that is raised by ``task``."""
+        self.key, self.checked = str(request["key"]), checked
         self.ended = self._abandoned = False
-        self._program = str(program)
+        self._program = str(request["program"])
         self.progress: Mapping[str, Any] = {}
         self._hear({"progress": {"checked_s": 0.0, "line": 0, "times_real_time": 0.0, "refused": 0}})
         self._news = asyncio.Event()
         self._process: asyncio.subprocess.Process | None = None
-        self._task: asyncio.Task[None] | None = None
+        self.task = asyncio.create_task(self._follow(request), name=f"check of {self._program}")
 
-    def begin(self, request: Mapping[str, Any]) -> None:
-        """Start the process and follow it."""
-        self._task = asyncio.create_task(self._follow(request), name=f"check of {self._program}")
-
-    async def passed(self, enough: Enough) -> Checked | tuple[Reason, ...]:
+    async def passed(self, enough: Enough) -> CheckedProgram | tuple[Reason, ...]:
         """Wait until enough or all has passed, or until all is known of why it is refused."""
         while not self.ended:
             if not self.checked.refused and enough(self.checked):
                 return self.checked
             self._news.clear()
             await self._news.wait()
-        await self.over()
+        await self.task
         return self.checked if self.checked.whole else self.checked.refused
-
-    async def over(self) -> None:
-        """Wait for the end; what went wrong in following the process is raised here."""
-        if self._task is not None:
-            await self._task
-
-    async def quiet(self) -> None:
-        """Wait for the end, whatever it is."""
-        if self._task is not None:
-            await asyncio.wait([self._task])
 
     def abandon(self) -> bool:
         """End the process; return whether it ran."""
@@ -157,7 +145,7 @@ class _Going:
             self._process = process = await asyncio.create_subprocess_exec(
                 sys.executable,
                 "-m",
-                "fdhil.arming.program_check",
+                MAKER,
                 stdin=asyncio.subprocess.PIPE,
                 stdout=asyncio.subprocess.PIPE,
                 limit=MAX_LINE,
@@ -197,14 +185,12 @@ class _Going:
         elif "block" in told:
             end, sha256 = told["block"]
             checked.take(Block(end, sha256, told["last"]), told["errors"])
-        elif "refused" in told:
-            checked.refused += (_reason(told["refused"]),)
-        elif "error" in told:
-            checked.refused += (_reason(told["error"]),)
         elif "header" in told:
-            checked.refused = tuple(map(_reason, told["header"]["refused"]))
+            checked.refused = tuple(Reason(**each) for each in told["header"]["refused"])
             if not checked.refused:
                 checked.conclude(told["header"])
+        elif refused := told.get("refused") or told.get("error"):
+            checked.refused += (Reason(**refused),)
 
     def _conclude(self, code: int | None) -> None:
         """A check that ended without a word on the whole has died."""
@@ -216,7 +202,3 @@ class _Going:
             text = f"the check ended with exit code {code} and no answer"
             died = Reason("InternalError", text, "see the daemon's log, then report it")
         self.checked.refused += (died,)
-
-
-def _reason(told: Mapping[str, Any]) -> Reason:
-    return Reason(told["code"], told["text"], told["advice"])

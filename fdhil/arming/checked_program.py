@@ -1,4 +1,4 @@
-"""A program longer than the guard's ring: armed with its first seconds, the rest is handed on as it runs.
+"""Holds a program's checked rows: it is armed with its first seconds, the rest is handed on as it runs.
 
 What is handed on are the very rows of the check, each block compared with the digest that the check told of it, so
 nothing is computed while it runs. The check may still be ahead of the motion: a block that it has not passed does not
@@ -18,8 +18,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fdhil.arming.program_check import HEADER, ROWS, SCHEMA, code_digest, header_digest, reference_blocks
-from fdhil.config import MachineConfig
+from fdhil.arming.code_digest import code_digest
+from fdhil.arming.program_check import HEADER, ROWS, SCHEMA, header_digest
 from fdhil.correction import gate
 from fdhil.errors import ProgramError, StoreError
 from fdhil.program import program_digest
@@ -50,25 +50,29 @@ class Block(NamedTuple):
     last: bool
 
 
-class Checked:
+class CheckedProgram:
     """The rows of one program that passed the gate: all of them, or while the check goes on those so far.
 
     ``header`` is what the check found of the whole, None before its end; ``refused`` why the rows end where they end.
-    The file stays open: what is armed is read from it whatever becomes of its name.
+    ``half_um`` is half the 95 % interval of the error that is left, as a plan of the whole has it; None: the skill of
+    the last moves is all that is known. The file stays open: what is armed is read from it, whatever its name becomes.
     """
 
-    def __init__(self, rows_file: Path, axes: Sequence[str]) -> None:
-        """Open the rows; OSError when they are not there."""
+    def __init__(self, rows: Path | int, axes: Sequence[str]) -> None:
+        """Open the rows, or take over the descriptor of those in memory; OSError when they are not there."""
         self.axes = tuple(axes)
+        self.method = "inverse"
+        self.half_um: float | None = None
+        self.warnings: tuple[Reason, ...] = ()
         self.blocks: list[Block] = []
         self.errors: Mapping[str, Mapping[str, float]] = {"before": NO_ERROR, "after": NO_ERROR}
         self.header: Mapping[str, Any] | None = None
         self.refused: tuple[Reason, ...] = ()
-        self._descriptor = os.open(rows_file, os.O_RDONLY | os.O_CLOEXEC)
+        self._descriptor = rows if isinstance(rows, int) else os.open(rows, os.O_RDONLY | os.O_CLOEXEC)
         weakref.finalize(self, os.close, self._descriptor)
 
     @staticmethod
-    def find(folder: Path, key: str, beside: Path) -> Checked | None:
+    def find(folder: Path, key: str, beside: Path) -> CheckedProgram | None:
         """Return what was checked under ``key``; None when nothing was, by other code, or not all its rows are there.
 
         ``beside`` is the program's folder: the subroutines there must be those of the check.
@@ -77,7 +81,7 @@ class Checked:
             header = json.loads((folder / (key + HEADER)).read_bytes())
             if header.pop("digest") != header_digest(header):
                 return None
-            found = Checked(folder / (key + ROWS), header["axes"])
+            found = CheckedProgram(folder / (key + ROWS), header["axes"])
             good = header["schema"] == SCHEMA and header["code"] == code_digest() and not header["refused"]
             good = good and all(program_digest(beside / name) == sha for name, sha in header["files"].items())
             blocks = [Block(end, sha256, end == header["rows"]) for end, sha256 in header["blocks"]]
@@ -134,10 +138,10 @@ class Checked:
         return content
 
 
-class Stream:
+class RowStream:
     """The rows of one checked program in the guard's increments; ``end`` is one past the last row handed out."""
 
-    def __init__(self, checked: Checked, program_digest: str, sync_period_s: float) -> None:
+    def __init__(self, checked: CheckedProgram, program_digest: str, sync_period_s: float) -> None:
         """Begin at the first row; nothing is read yet."""
         self.checked, self.program_digest = checked, program_digest
         self.axes = checked.axes
@@ -195,16 +199,3 @@ class Stream:
             "whole": checked.whole,
             "refused": [str(reason) for reason in checked.refused],
         }
-
-
-def longer_than_ring(program: Path, config: MachineConfig) -> bool:
-    """Whether a program is longer than what the guard is given at first; no more of it is read than that takes.
-
-    ProgramError, RecordingError or ConfigError when what was read cannot be used.
-    """
-    rows = 0
-    for block in reference_blocks(program, config):
-        rows += block.time_s.size
-        if rows * config.machine.sync_period_s > FIRST_S:
-            return True
-    return False

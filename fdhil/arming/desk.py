@@ -1,44 +1,39 @@
-"""The operator's side of the daemon: what it knows of the models, arming and disarming, and vouching while armed."""
+"""Arms and disarms for the operator, by what is known of the models, and vouches for what is armed."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import hmac
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from fdhil import tables
-from fdhil.arming.background_check import Check
-from fdhil.arming.checked_program import Checked
-from fdhil.arming.guard_link import GONE, REST, GuardLink
+from fdhil.arming.answers import Answer, refusal
+from fdhil.arming.background_check import BackgroundCheck
+from fdhil.arming.checked_program import CheckedProgram
+from fdhil.arming.guard_link import GuardLink
+from fdhil.arming.knowledge import Knowledge
 from fdhil.arming.passes import Passes
 from fdhil.arming.preparing import (
     Armament,
-    AxisKnowledge,
+    ArmRequest,
     Feeding,
-    Long,
     Refused,
-    Skills,
-    StreamedArmament,
-    feeding_facts,
     may_begin,
     prepare,
+    prepare_armament,
     prepare_feeding,
-    prepare_stream,
-    standing_facts,
 )
-from fdhil.arming.standing import ADOPT, START_AND_ADOPT, Standing, verdict
-from fdhil.arming.stream_feeder import Supply
+from fdhil.arming.standing import ADOPT, GONE, REST, START_AND_ADOPT, Standing, landed, verdict
+from fdhil.arming.stream_feeder import StreamFeeder
 from fdhil.arming.token import ensure_token
+from fdhil.arming.whole_plan import plan_whole
 from fdhil.config import MachineConfig
-from fdhil.daemon.control import Answer, refusal
-from fdhil.daemon.outcome_store import Keeper, boot_id
 from fdhil.errors import DeviceError
 from fdhil.guard.protocol import LANDING
-from fdhil.records import AxisSamples, Notice, Outcome, ParameterSet, Skill, Temperature
+from fdhil.records import AxisSamples, Notice, Skill
 from fdhil.store.history import Revision
 
 STREAM_S = 0.05
@@ -47,26 +42,30 @@ REFRESH_S = 0.5
 LANDING_S = 1.0  # without a SYNC; while there is SYNC, what ended a moment ago comes to rest by itself
 
 Tell = Callable[[Sequence[Notice]], None]
-Prepared = TypeVar("Prepared", bound=Armament | StreamedArmament | Feeding)
+Prepared = TypeVar("Prepared", Armament, Feeding)
 
 
-class Armory:
+class Storing(Protocol):
+    """The store of the outcomes, as far as arming asks."""
+
+    fault: str | None
+    """Why nothing can be stored now; None while all is well."""
+
+
+class ArmingDesk:
     """Knows when a correction may be armed, and withdraws what it no longer vouches for."""
 
-    def __init__(self, config: MachineConfig, keeper: Keeper, run_directory: Path) -> None:
+    def __init__(self, config: MachineConfig, store: Storing, run_directory: Path) -> None:
         self._config = config
-        self._keeper = keeper
+        self._store = store
         self._run_directory = run_directory
         self._token = ""
-        self._published: dict[str, tuple[ParameterSet, float]] = {}
-        self._temperature: dict[str, float] = {}
-        self._load_changed: set[str] = set()
-        self._skills = Skills(list(config.axis))
+        self.knowledge = Knowledge(config.axis)
         self._arming = asyncio.Lock()
-        self._armed: tuple[Armament | StreamedArmament | Feeding, Mapping[str, Any]] | None = None
-        self._check = Check(config)
+        self._armed: tuple[Armament | Feeding, Mapping[str, Any]] | None = None
+        self._check = BackgroundCheck(config)
         self._passes = Passes(config)
-        self._supply: Supply | None = None
+        self._feeder: StreamFeeder | None = None
         self._given_up = False
         self._disarming: asyncio.Future[Answer] | None = None
         self.guard = GuardLink(config.guard.run_directory or run_directory)
@@ -74,30 +73,7 @@ class Armory:
     def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
         """Start from what the history knows; the token is made where there is none. DeviceError when it cannot be."""
         self._token = ensure_token(self._run_directory)
-        boot, now_s = boot_id(), time.monotonic()
-        for axis, revision in newest.items():
-            stamp = revision.stamp
-            same_boot = bool(boot) and stamp.boot == boot
-            age_s = now_s - stamp.monotonic_ns * 1e-9 if same_boot else time.time() - stamp.wall_s
-            # an age below 0 (a wall clock that was set back) stays one: it is not believed
-            self._published[axis] = (revision.set, now_s - age_s)
-        for skill in skills:
-            self._skills.add(skill)
-
-    def note(self, outcomes: Sequence[Outcome]) -> None:
-        """Take what the pipelines say."""
-        for outcome in outcomes:
-            if isinstance(outcome, ParameterSet):
-                self._published[outcome.axis] = (outcome, time.monotonic())
-                self._load_changed.discard(outcome.axis)
-            elif isinstance(outcome, Skill):
-                self._skills.add(outcome)
-            elif isinstance(outcome, Notice) and outcome.code == "LoadChanged" and outcome.severity == "MAJOR":
-                self._load_changed.add(outcome.axis)
-
-    def note_temperature(self, reading: Temperature) -> None:
-        """Take a temperature."""
-        self._temperature[reading.axis] = reading.celsius
+        self.knowledge.begin(newest, skills)
 
     def hear(self, samples: AxisSamples) -> None:
         """Take samples: those of a pass of the armed program are compared with what was predicted."""
@@ -109,31 +85,12 @@ class Armory:
         return list(self._passes.told)
 
     @property
-    def temperatures(self) -> Mapping[str, float]:
-        """The newest temperature of each axis that has one."""
-        return self._temperature
-
-    @property
     def armed(self) -> Mapping[str, Any] | None:
-        """What was armed last and still is, None otherwise; of a long program also how far its check is."""
+        """What was armed last and still is, None otherwise; of a program also how far its check is."""
         if self._armed is None:
             return None
-        prepared, summary = self._armed
-        return {**summary, "check": prepared.stream.status()} if isinstance(prepared, StreamedArmament) else summary
-
-    def _known(self) -> dict[str, AxisKnowledge]:
-        now_s = time.monotonic()
-        known = {}
-        for axis in self._config.axis:
-            published, since_s = self._published.get(axis, (None, now_s))
-            known[axis] = AxisKnowledge(
-                published,
-                now_s - since_s,
-                self._temperature.get(axis),
-                self._skills.of(axis),
-                axis in self._load_changed,
-            )
-        return known
+        armed, summary = self._armed
+        return {**summary, **armed.progress()}
 
     async def arm(self, request: Mapping[str, Any]) -> Answer:
         """Plan, load and arm one program; every no has its class, cause and next action."""
@@ -151,39 +108,29 @@ class Armory:
                 text = f"what was armed before is still on, in state {self.guard.state}"
                 return refusal("NotOff", text, "run fdhil disarm or wait until it has ended, then arm again")
             if self.guard.state in ("FROZEN", "lost"):
-                return refusal(
-                    "OffsetStands", f"the guard is {self.guard.state}: {self.guard.standing}", self._way_out()
-                )
+                way_out = ADOPT if self.guard.connected else START_AND_ADOPT
+                text = f"the guard is {self.guard.state}: {self.guard.standing}"
+                return refusal("OffsetStands", text, f"{way_out}, then arm again")
             if feeding:
                 return await self._feed_forward(token)
             return await self._arm(Path(str(program)), method, token, request.get("whole") is True)
 
     async def _landed(self) -> bool:
         """Wait a moment for the end of what ramps down; return whether the guard is at rest, or absent."""
-        tick, moved_s = None, time.monotonic()
-        await asyncio.to_thread(self.guard.look)
-        while self.guard.state not in REST and time.monotonic() - moved_s < LANDING_S:
-            if self.guard.state in LANDING and self.guard.status.get("tick") != tick:
-                tick, moved_s = self.guard.status.get("tick"), time.monotonic()
-            await asyncio.sleep(STREAM_S)
-            await asyncio.to_thread(self.guard.look)
+        await asyncio.to_thread(landed, self.guard.look, LANDING_S, LANDING)
         if self.guard.state in REST:
             self._release()
         return self.guard.state in REST
 
-    def _way_out(self) -> str:
-        """Return what to do about what may still be applied before anything is armed."""
-        return f"{ADOPT if self.guard.connected else START_AND_ADOPT}, then arm again"
-
     def _release(self) -> None:
-        if self._armed is not None and not isinstance(self._armed[0], Feeding):
+        if self._armed is not None:
             cause = "GuardLost" if self.guard.state in GONE else (self.guard.status.get("cause") or {}).get("code", "")
             self._passes.end(cause, self._armed[0].summary())
-        self._armed = self._supply = None
+        self._armed = self._feeder = None
 
     async def _feed_forward(self, token: str) -> Answer:
         """Switch the on-line feed-forward on: it needs no program."""
-        prepared = await asyncio.to_thread(prepare_feeding, self._config, self._known())
+        prepared = await asyncio.to_thread(prepare_feeding, self._config, self.knowledge.now())
         if isinstance(prepared, Refused):
             return _refused(prepared)
         summary = prepared.summary()
@@ -199,46 +146,47 @@ class Armory:
         """Ask the guard in a thread; what it grants is armed, what it refuses is answered with what was planned."""
         if self._given_up:
             return refusal("Abandoned", "the arming was abandoned while it was prepared", "arm again when it is wanted")
-        prepared.facts["journal_writable"] = self._keeper.fault is None
-        if not isinstance(prepared, Feeding):
-            self._passes.begin(prepared.first().demand, prepared.rows)
+        prepared.facts["journal_writable"] = self._store.fault is None
         try:
             answer = await asyncio.to_thread(ask, prepared, token)
         except DeviceError as error:
-            self._passes.forget()
             return self._without_guard(error)
         if not answer["ok"]:
-            self._passes.forget()
-            return dict(answer) | {"planned": summary}
+            return {**answer, "planned": summary}
         self._armed = (prepared, summary)
-        self._supply = Supply(prepared, self.guard) if isinstance(prepared, StreamedArmament) else None
         return dict(answer)
 
     async def _arm(self, program: Path, method: str | None, token: str, whole: bool) -> Answer:
-        found = await asyncio.to_thread(prepare, program, method, self._config, self._known())
-        prepared = await self._checked(found, whole) if isinstance(found, Long) else found
-        if isinstance(prepared, Refused):
-            return _refused(prepared)
-        summary = prepared.summary()
-        answer = await self._hand_over(self.guard.arm, prepared, summary, token)
+        request = await asyncio.to_thread(prepare, program, method, self._config, self.knowledge.now())
+        if isinstance(request, Refused):
+            return _refused(request)
+        checked = await self._checked(request, whole)
+        if isinstance(checked, Refused):
+            return _refused(checked)
+        armament = await asyncio.to_thread(prepare_armament, request, checked, self._config, self.knowledge.now())
+        summary = armament.summary()
+        self._passes.begin(armament.begin.demand, armament.rows)
+        answer = await self._hand_over(self.guard.arm, armament, summary, token)
         if not answer["ok"]:
+            self._passes.forget()
             return answer
+        self._feeder = StreamFeeder(armament, self.guard)
         text = f"armed {program.name} by {summary['method']}: {summary['promise']}"
-        if not summary.get("check", {"whole": True})["whole"]:
+        if not summary["check"]["whole"]:
             text += f" in its first {summary['check']['checked_s']:.0f} s; the check of the rest goes on ahead of it"
         text += "; start the program, its error is measured as it runs"
         return {"ok": True, "state": answer.get("state", "ARMED"), "text": text, **summary}
 
-    async def _checked(self, long: Long, whole: bool) -> StreamedArmament | Refused:
-        """Have a long program checked as far as arming asks, or as a ``whole``; it is armed with its first rows."""
+    async def _checked(self, request: ArmRequest, whole: bool) -> CheckedProgram | Refused:
+        """Have a program checked: at once, or ahead of the motion as far as arming asks, or as a ``whole``."""
+        if not request.ahead:
+            return await asyncio.to_thread(plan_whole, request, self._config, self.knowledge.now())
 
-        def enough(checked: Checked) -> bool:
-            return not whole and may_begin(checked, self._config, self._known())
+        def enough(checked: CheckedProgram) -> bool:
+            return not whole and may_begin(checked, self._config, self.knowledge.now())
 
-        checked = await self._check.run(long.program, long.program_digest, long.models, enough)
-        if isinstance(checked, tuple):
-            return Refused(checked)
-        return await asyncio.to_thread(prepare_stream, long, checked, self._config, self._known())
+        checked = await self._check.run(request.program, request.program_digest, request.models, enough)
+        return Refused(checked) if isinstance(checked, tuple) else checked
 
     @property
     def checking(self) -> Mapping[str, Any] | None:
@@ -248,20 +196,16 @@ class Armory:
     def abandon(self) -> bool:
         """Arm nothing of what is being prepared; return whether its check was ended. That of what is armed goes on."""
         self._given_up = True
-        return self._supply is None and self._check.abandon()
+        return self._feeder is None and self._check.abandon()
 
     async def disarm(self) -> Answer:
         """Have the guard ramp to zero: ok only when it is reached. What is being planned or checked is not armed."""
-        self._supply = None  # no more rows, no more words about them
+        self._feeder = None  # no more rows, no more words about them
         abandoned = self.abandon()
-        if self._disarming is None:  # who asks again meanwhile waits for the same ramp
+        if self._disarming is None or self._disarming.done():  # who asks again meanwhile waits for the same ramp
             self._disarming = asyncio.ensure_future(self._to_zero())
-            self._disarming.add_done_callback(self._disarmed)
         answer = await asyncio.shield(self._disarming)
         return {**answer, "text": f"{answer['text']}; the check was abandoned"} if abandoned else answer
-
-    def _disarmed(self, _: asyncio.Future[Answer]) -> None:
-        self._disarming = None
 
     async def _to_zero(self) -> Answer:
         try:
@@ -303,8 +247,8 @@ class Armory:
         """Hand a long program's rows to the guard as they pass and as it runs, and tell what is refused of them."""
         while True:
             await asyncio.sleep(STREAM_S)
-            if self._supply is not None:
-                tell(await asyncio.to_thread(self._supply.go_on))
+            if self._feeder is not None:
+                tell(await asyncio.to_thread(self._feeder.go_on))
             tell(await asyncio.to_thread(self._passes.digest))
             await self._check.attend()
 
@@ -312,16 +256,12 @@ class Armory:
         """What is still vouched for while a correction runs; None while none does."""
         if self._armed is None:
             return None
-        armed = self._armed[0]
-        if isinstance(armed, Feeding):
-            facts = feeding_facts(tuple(armed.laws), self._config, self._known())
-        else:
-            facts = standing_facts(armed.axes, self._config, self._known(), armed.gain_um)
-        return facts | {"journal_writable": self._keeper.fault is None}
+        facts = self._armed[0].standing_facts(self._config, self.knowledge.now())
+        return facts | {"journal_writable": self._store.fault is None}
 
     async def stand_down(self) -> Standing:
         """Have a running correction ramped to zero and wait for it; return what may still be applied."""
-        self._supply = None
+        self._feeder = None
         self.abandon()
         if self.guard.connected:
             with contextlib.suppress(DeviceError):
@@ -333,4 +273,4 @@ class Armory:
 
 def _refused(refused: Refused) -> Answer:
     first, *_ = refused.reasons
-    return dict(refusal(first.code, first.text, first.advice)) | {"refused": list(map(str, refused.reasons))}
+    return refusal(first.code, first.text, first.advice) | {"refused": list(map(str, refused.reasons))}

@@ -1,4 +1,4 @@
-"""The daemon's link to the guard process: found again when it was gone, told that the daemon lives, asked to arm."""
+"""Links the daemon to the guard process: finds it, tells it that the daemon lives, asks it to arm."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 from fdhil.arming.checked_program import Piece
 from fdhil.arming.guard_client import GuardClient
-from fdhil.arming.preparing import Armament, Feeding, StreamedArmament
-from fdhil.arming.standing import ABSENT, START_AND_ADOPT, Standing, landed, lost, standing
+from fdhil.arming.preparing import Armament, Feeding
+from fdhil.arming.standing import ABSENT, GONE, START_AND_ADOPT, Standing, landed, lost, standing
 from fdhil.errors import DeviceError
 from fdhil.guard.protocol import AT_REST, CHARGED
 from fdhil.records import Notice
@@ -21,10 +21,8 @@ SETTLING_TRIES = 25
 SETTLING_S = 0.2
 ORDERED = {"Disarmed", "Finished", "Stopped"}
 TRIPPED = "GuardTripped"
-GONE = {"absent", "lost"}
 RECORD_VOID = "RecordVoid"
 VOIDING = {RECORD_VOID, "NodeRebooted"}
-REST = {*AT_REST, *GONE}
 
 
 class GuardLink:
@@ -67,10 +65,11 @@ class GuardLink:
         """The row of the path where the machine is, 0 before it has begun."""
         return int(self._status.get("row") or 0)
 
-    def look(self) -> None:
-        """Connect where needed and ask for the status (blocking); what changed is told by the next ``refresh``."""
+    def look(self) -> Mapping[str, Any]:
+        """Connect where needed, ask for the status and return it (blocking); the next ``refresh`` tells the change."""
         with contextlib.suppress(DeviceError), self._asked():
             pass
+        return self._status
 
     def refresh(self) -> list[Notice]:
         """Look at the status (blocking); return what changed since the last call."""
@@ -91,17 +90,14 @@ class GuardLink:
                 if self._client is None:
                     self._client = GuardClient(self._run_directory)
                 yield self._client
-                self._note(before, self._client.status())
+                self._status, self._heard_s = self._client.status(), time.monotonic()
+                self._untold += _changes(before, self._status)
             except DeviceError as error:
                 reached = self._client is not None
                 self._drop()
                 self._status = lost(before, arming and reached)
                 self._untold += _gone(before, self._status, error)
                 raise
-
-    def _note(self, before: Mapping[str, Any], status: Mapping[str, Any]) -> None:
-        self._untold += _changes(before, status)
-        self._status, self._heard_s = status, time.monotonic()
 
     def _drop(self) -> None:
         if self._client is not None:
@@ -117,19 +113,20 @@ class GuardLink:
             except DeviceError:
                 self._status = {**self._status, "text": "the connection is lost"}
 
-    def arm(self, armament: Armament | StreamedArmament, token: str) -> Mapping[str, Any]:
+    def arm(self, armament: Armament, token: str) -> Mapping[str, Any]:
         """Load the table and arm (blocking); return the guard's answer. DeviceError when there is no guard."""
         with self._asked(arming=True) as client:
-            answer = self._load(client, armament, armament.first())
+            answer = self._load(client, armament, armament.begin)
             if not answer["ok"]:
                 return answer
-            return self._ask(client, lambda: client.arm(token, armament.program_digest, armament.facts))
+            return self._ask(client, lambda: client.arm(token, armament.stream.program_digest, armament.facts))
 
     @staticmethod
-    def _load(client: GuardClient, armament: Armament | StreamedArmament, piece: Piece) -> Mapping[str, Any]:
-        return client.load(armament.axes, piece.demand, piece.offset, armament.program_digest, piece.first, piece.final)
+    def _load(client: GuardClient, armament: Armament, piece: Piece) -> Mapping[str, Any]:
+        digest = armament.stream.program_digest
+        return client.load(armament.stream.axes, piece.demand, piece.offset, digest, piece.first, piece.final)
 
-    def extend(self, armament: StreamedArmament, piece: Piece) -> Mapping[str, Any]:
+    def extend(self, armament: Armament, piece: Piece) -> Mapping[str, Any]:
         """Hand on more rows of a running stream (blocking); DeviceError when there is no guard."""
         with self._asked() as client:
             return self._load(client, armament, piece)
@@ -155,7 +152,7 @@ class GuardLink:
         with self._asked() as client:
             answer = client.disarm()
             if answer["ok"]:
-                landed(client)
+                landed(client.status)
             return answer
 
     def close(self) -> None:

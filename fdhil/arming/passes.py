@@ -1,4 +1,4 @@
-"""What a correction really leaves: the contour error of each pass of the armed program, by the drives' own feedback.
+"""Measures the contour error that a correction leaves in each pass of its program, by the drives' own feedback.
 
 The daemon hears the NC's targets and the drives' positions; from the first motion after the arming to the program's
 end they are compared as a prediction is. Samples are taken in the loop, all else is done in ``digest``, in a thread.

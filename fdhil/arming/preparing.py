@@ -1,4 +1,4 @@
-"""From a program to what the guard is asked to send: plan, gate, table, and the facts that the daemon vouches for.
+"""Makes a checked program ready for the guard: its first rows, its promise, and the facts that the daemon vouches for.
 
 Pure but for reading the program and the commissioning records; what says no is a value (:class:`Refused`).
 """
@@ -6,113 +6,55 @@ Pure but for reading the program and the commissioning records; what says no is 
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from fdhil import correction
-from fdhil.arming.checked_program import FIRST_S, Checked, Piece, Stream, longer_than_ring
+from fdhil.arming.checked_program import FIRST_S, CheckedProgram, Piece, RowStream
+from fdhil.arming.knowledge import SKILL_MOVES, AxisKnowledge
+from fdhil.arming.program_check import reference_blocks
 from fdhil.commissioning.feedforward import feedforward_object
-from fdhil.commissioning.record import CommissioningRecord, axis_digest, load_record
+from fdhil.commissioning.record import CommissioningRecord, holds, load_record
 from fdhil.config import MachineConfig
 from fdhil.correction import gate, online
 from fdhil.drivers.cia402.profile import load_profile
-from fdhil.prediction.gain import Gain, gain, skill_of
-from fdhil.program import load_trajectory, program_digest
-from fdhil.records import Correction, CorrectionTable, Float, Parameters, ParameterSet, Reason, Skill
+from fdhil.prediction.gain import Gain, skill_of
+from fdhil.program import program_digest
+from fdhil.records import Parameters, Reason, Skill
 
 MODEL_AGE_S = 8 * 3600.0  # a shift: older parameters are of another state of the machine
 MODEL_KELVIN = 3.0
-SKILL_MOVES = 3  # FAULTS E19: the last three recorded moves ...
-SKILL_SHARE = 0.5  # ... must be predicted within half of the gain that is promised
+SKILL_SHARE = 0.5  # of the gain that is promised, within which the last moves must be predicted (FAULTS E19)
 AHEAD_S = 60.0  # of a program that must have passed before it is armed ahead of its check
 UNGUARDED_UM = 20.0  # the largest offset that may stay in a drive whose watchdog on us is not proven
 
 
 @dataclass(frozen=True, slots=True)
-class AxisKnowledge:
-    """What the daemon knows of an axis when it arms: newest published set with its age, last moves' skills."""
+class ArmRequest:
+    """A program that may be corrected, and by which models; ``ahead``: its rows are checked ahead of the motion."""
 
-    published: ParameterSet | None
-    age_s: float
-    temperature_c: float | None
-    skills: tuple[Skill, ...]
-    load_changed: bool = False
+    program: Path
+    program_digest: str
+    models: Mapping[str, Parameters]
+    method: str | None = None
+    ahead: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Armament:
-    """A correction ready for the guard: its table, what is promised, and the facts (see the guard's interlocks)."""
+    """A correction ready for the guard: its first rows, the stream of all that passed and will pass, and the facts.
 
-    program: str
-    correction: Correction
-    table: CorrectionTable
-    facts: dict[str, bool]
-    predicted: Gain
-
-    @property
-    def rows(self) -> int:
-        """How many rows the table has."""
-        return int(self.correction.before.contour_um.size)
-
-    @property
-    def axes(self) -> tuple[str, ...]:
-        """The axes that are corrected."""
-        return self.table.axes
-
-    @property
-    def program_digest(self) -> str:
-        """Which program it is for."""
-        return self.table.program_digest
-
-    @property
-    def gain_um(self) -> float:
-        """What is promised."""
-        return promised_um(self.correction)
-
-    def first(self) -> Piece:
-        """Return the rows to arm with: all of them."""
-        demand, offset = self.table.demand_increments, self.table.offset_increments
-        return Piece(0, {a: demand[a].tolist() for a in self.axes}, {a: offset[a].tolist() for a in self.axes}, True)
-
-    def summary(self) -> dict[str, Any]:
-        """Return what the operator is told."""
-        before, after, predicted = self.correction.before, self.correction.after, self.predicted
-        return {
-            "program": self.program,
-            "program_digest": self.table.program_digest,
-            "method": self.correction.method,
-            "rows": self.rows,
-            "before": {"rms_um": predicted.before_um, "max_um": float(before.contour_um.max())},
-            "after": {
-                "rms_um": predicted.after_um,
-                "max_um": float(after.contour_um.max()),
-                "uncertainty_um": predicted.half_um,
-            },
-            "promise": _promise(predicted),
-            "warnings": [str(reason) for reason in self.correction.warnings],
-            "facts": dict(self.facts),
-        }
-
-
-@dataclass(frozen=True, slots=True)
-class StreamedArmament:
-    """A long program: its first rows, ready for the guard, and the stream of all that passed and will pass the gate.
-
-    ``begun_um`` is what the rows promised that were checked when it was armed, ``skill_um`` how well the last moves
-    were predicted.
+    ``begun_um`` is what the rows promised that were checked when it was armed, ``half_um`` half the 95 % interval of
+    the error that is left, None: not known.
     """
 
     program: str
-    stream: Stream
+    stream: RowStream
     begin: Piece
     facts: dict[str, bool]
     begun_um: float
-    skill_um: float | None = None
+    half_um: float | None = None
 
     @property
     def rows(self) -> int | None:
@@ -120,51 +62,36 @@ class StreamedArmament:
         return self.stream.checked.rows if self.stream.checked.whole else None
 
     @property
-    def axes(self) -> tuple[str, ...]:
-        """The axes that are corrected."""
-        return self.stream.axes
+    def predicted(self) -> Gain:
+        """What the rows promise that were checked by now."""
+        errors = self.stream.checked.errors
+        return Gain(errors["before"]["rms_um"], errors["after"]["rms_um"], self.half_um)
 
-    @property
-    def program_digest(self) -> str:
-        """Which program it is for."""
-        return self.stream.program_digest
+    def standing_facts(self, config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> dict[str, bool]:
+        """Return the facts that may be withdrawn while it runs; the gain is the whole's, once that is known."""
+        checked = self.stream.checked
+        return standing_facts(self.stream.axes, config, known, checked.gain_um if checked.whole else self.begun_um)
 
-    @property
-    def gain_um(self) -> float:
-        """What is promised: of the whole, once that is known."""
-        return self.stream.checked.gain_um if self.stream.checked.whole else self.begun_um
-
-    def first(self) -> Piece:
-        """Return the rows to arm with."""
-        return self.begin
+    def progress(self) -> dict[str, Any]:
+        """Return what of the summary changes while it is armed."""
+        return {"check": self.stream.status()}
 
     def summary(self) -> dict[str, Any]:
         """Return what the operator is told; errors and rows are those that were checked by now."""
-        checked = self.stream.checked
+        checked, predicted = self.stream.checked, self.predicted
         return {
             "program": self.program,
-            "program_digest": self.program_digest,
-            "method": "inverse",
+            "program_digest": self.stream.program_digest,
+            "method": checked.method,
             "rows": checked.rows,
-            "streamed": True,
+            "streamed": not self.begin.final,
             "before": dict(checked.errors["before"]),
-            "after": {**checked.errors["after"], "uncertainty_um": self.skill_um},
-            "promise": _promise(
-                Gain(checked.errors["before"]["rms_um"], checked.errors["after"]["rms_um"], self.skill_um)
-            ),
-            "check": self.stream.status(),
-            "warnings": [],
+            "after": {**checked.errors["after"], "uncertainty_um": self.half_um},
+            "promise": f"contour error {predicted.before_um:.1f} um RMS is predicted to become {predicted}",
+            **self.progress(),
+            "warnings": [str(reason) for reason in checked.warnings],
             "facts": dict(self.facts),
         }
-
-
-@dataclass(frozen=True, slots=True)
-class Long:
-    """A program longer than the guard's ring: it is to be checked in a process of its own, ahead of the motion."""
-
-    program: Path
-    program_digest: str
-    models: Mapping[str, Parameters]
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,50 +101,42 @@ class Refused:
     reasons: tuple[Reason, ...]
 
 
-def _promise(predicted: Gain) -> str:
-    return f"contour error {predicted.before_um:.1f} um RMS is predicted to become {predicted}"
-
-
-def rms(values: Float) -> float:
-    """Return the root mean square of (n,)."""
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def prepare(
     program: Path, method: str | None, config: MachineConfig, known: Mapping[str, AxisKnowledge]
-) -> Armament | Long | Refused:
-    """Plan the correction of a program with the newest validated parameters; a long one is only recognised.
+) -> ArmRequest | Refused:
+    """Find the newest validated parameters for a program, and whether it is checked ahead of the motion.
 
-    ProgramError, RecordingError or ConfigError when the program cannot be used; StoreError for a damaged record.
+    ProgramError, RecordingError or ConfigError when the program cannot be used.
     """
     models = {}
     for axis in config.axis:
-        published = known[axis].published if axis in known else None
+        published = known[axis].published
         if published is None:
-            text = f"axis {axis} has no validated parameters yet"
-            return Refused((Reason("ModelNotValidated", text, "let the machine make a few rapids of this axis"),))
+            return _not_validated(axis)
         models[axis] = published.parameters
     digest = program_digest(program)
-    if method in (None, "inverse") and longer_than_ring(program, config):
-        off = gate.writing_off(list(config.axis), config)
-        return Refused(off) if off else Long(program, digest, models)
-    reference = load_trajectory(program, config)
-    planned = correction.plan(reference, models, config, method)
-    if planned.refused:
-        return Refused(planned.refused)
-    if not any(np.any(offset) for offset in planned.offset_um.values()):
-        text = f"the method {planned.method} plans no position offset"
-        return Refused((Reason("HarmPredicted", text, "use inverse or mirror; flatness is armed without a program"),))
-    table = correction.table(planned, config, digest)
-    facts = standing_facts(reference.axes, config, known, promised_um(planned))
-    largest_um = max(float(np.abs(offset).max()) for offset in planned.offset_um.values())
-    facts |= _commissioned(tuple(planned.offset_um), largest_um, config)
-    covariances = {axis: found.published.covariance for axis, found in known.items() if found.published is not None}
-    predicted = gain(planned, models, config, covariances, {axis: found.skills for axis, found in known.items()})
-    return Armament(str(program), planned, table, facts, predicted)
+    ahead = method in (None, "inverse") and _longer_than_ring(program, config)
+    if ahead and (off := gate.writing_off(list(config.axis), config)):
+        return Refused(off)
+    return ArmRequest(program, digest, models, method, ahead)
 
 
-def may_begin(checked: Checked, config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> bool:
+def _not_validated(axis: str) -> Refused:
+    text = f"axis {axis} has no validated parameters yet"
+    return Refused((Reason("ModelNotValidated", text, "let the machine make a few rapids of this axis"),))
+
+
+def _longer_than_ring(program: Path, config: MachineConfig) -> bool:
+    """Whether a program is longer than what the guard is given at first; no more of it is read than that takes."""
+    rows = 0
+    for block in reference_blocks(program, config):
+        rows += block.time_s.size
+        if rows * config.machine.sync_period_s > FIRST_S:
+            return True
+    return False
+
+
+def may_begin(checked: CheckedProgram, config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> bool:
     """Whether a program may be armed while its check goes on: far ahead, and nothing left to learn that forbids it.
 
     What the rest could still change, the largest offset and the gain, must be good enough already as it is.
@@ -230,15 +149,17 @@ def may_begin(checked: Checked, config: MachineConfig, known: Mapping[str, AxisK
     return certain == standing_facts(axes, config, known, math.inf) | _commissioned(axes, 0.0, config)
 
 
-def prepare_stream(
-    long: Long, checked: Checked, config: MachineConfig, known: Mapping[str, AxisKnowledge]
-) -> StreamedArmament:
+def prepare_armament(
+    request: ArmRequest, checked: CheckedProgram, config: MachineConfig, known: Mapping[str, AxisKnowledge]
+) -> Armament:
     """Make a checked program ready with the rows that it is armed with. StoreError when its rows cannot be read."""
-    stream, gain_um = Stream(checked, long.program_digest, config.machine.sync_period_s), checked.gain_um
+    stream, gain_um = RowStream(checked, request.program_digest, config.machine.sync_period_s), checked.gain_um
     facts = standing_facts(stream.axes, config, known, gain_um)
     facts |= _commissioned(stream.axes, checked.largest_um, config)
-    skill_um = skill_of({axis: found.skills for axis, found in known.items()}, stream.axes)
-    return StreamedArmament(str(long.program), stream, stream.take(FIRST_S), facts, gain_um, skill_um)
+    half_um = checked.half_um
+    if half_um is None:
+        half_um = skill_of({axis: found.skills for axis, found in known.items()}, stream.axes)
+    return Armament(str(request.program), stream, stream.take(FIRST_S), facts, gain_um, half_um)
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,6 +168,14 @@ class Feeding:
 
     laws: Mapping[str, Mapping[str, Any]]
     facts: dict[str, bool]
+
+    def standing_facts(self, config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> dict[str, bool]:
+        """Return the facts that may be withdrawn while it runs."""
+        return feeding_facts(tuple(self.laws), config, known)
+
+    def progress(self) -> dict[str, Any]:
+        """Return what of the summary changes while it is on: nothing."""
+        return {}
 
     def summary(self) -> dict[str, Any]:
         """Return what the operator is told."""
@@ -265,15 +194,14 @@ def prepare_feeding(config: MachineConfig, known: Mapping[str, AxisKnowledge]) -
                 (Reason("FeedforwardOff", text, "add the section with its limits, then run fdhil commission"),)
             )
         if published is None:
-            text = f"axis {name} has no validated parameters yet"
-            return Refused((Reason("ModelNotValidated", text, "let the machine make a few rapids of this axis"),))
+            return _not_validated(name)
         laws[name] = online.law(published.parameters, config.axis[name], config.machine.sync_period_s)
-    records = {name: _record(config, name) for name in axes}
+    records = _records(axes, config)
     facts = feeding_facts(axes, config, known) | {
-        "commissioned": all(_valid(record, config, name) for name, record in records.items()),
+        "commissioned": all(holds(record, config, axis) for axis, record in records.items()),
         "feedforward_commissioned": all(_feeds(record, config, name) for name, record in records.items()),
         "model_validated": True,
-        "watchdog_proven": all(r is not None and r.watchdog == "proven" for r in records.values()),
+        "watchdog_proven": _all_proven(records),
     }
     return Feeding(laws, facts)
 
@@ -290,11 +218,6 @@ def _feeds(record: CommissioningRecord | None, config: MachineConfig, axis: str)
     if record is None or found is None:
         return False
     return record.options.get(feedforward_object(found[0].number)) == found[0].cob_base + config.node_id(axis)
-
-
-def promised_um(planned: Correction) -> float:
-    """Return by how much the contour error's RMS is predicted to shrink."""
-    return rms(planned.before.contour_um) - rms(planned.after.contour_um)
 
 
 def standing_facts(
@@ -328,35 +251,23 @@ def _skilled(skills: Sequence[Skill], gain_um: float) -> bool:
 
 
 def _commissioned(axes: Sequence[str], largest_um: float, config: MachineConfig) -> dict[str, bool]:
-    records = {axis: _record(config, axis) for axis in axes}
+    records = _records(axes, config)
     return {
-        "commissioned": all(_valid(record, config, axis) for axis, record in records.items()),
+        "commissioned": all(holds(record, config, axis) for axis, record in records.items()),
         # the plans assume an offset that the feed-forward sees; another drive would be made worse
         "offset_in_feedforward_known": all(r is not None and r.offset_in_feedforward is True for r in records.values()),
-        "watchdog_proven": largest_um <= UNGUARDED_UM
-        or all(r is not None and r.watchdog == "proven" for r in records.values()),
+        "watchdog_proven": largest_um <= UNGUARDED_UM or _all_proven(records),
     }
 
 
-def _record(config: MachineConfig, axis: str) -> CommissioningRecord | None:
-    """Read an axis' record; a daemon that may not read the key leaves the seal to the guard."""
-    return load_record(config.store.directory, axis, config.store.commissioning_key, may_lack_key=True)
+Records = Mapping[str, CommissioningRecord | None]
 
 
-def _valid(record: CommissioningRecord | None, config: MachineConfig, axis: str) -> bool:
-    return record is not None and record.readback_ok and record.config_digest == axis_digest(config, axis)
+def _records(axes: Sequence[str], config: MachineConfig) -> Records:
+    """Read the axes' records; a daemon that may not read the key leaves the seal to the guard."""
+    store = config.store
+    return {axis: load_record(store.directory, axis, store.commissioning_key, may_lack_key=True) for axis in axes}
 
 
-class Skills:
-    """The last skills of each axis."""
-
-    def __init__(self, axes: Sequence[str]) -> None:
-        self._last = {axis: deque[Skill](maxlen=SKILL_MOVES) for axis in axes}
-
-    def add(self, skill: Skill) -> None:
-        """Take the newest."""
-        self._last[skill.axis].append(skill)
-
-    def of(self, axis: str) -> tuple[Skill, ...]:
-        """Return the last of an axis, oldest first."""
-        return tuple(self._last[axis])
+def _all_proven(records: Records) -> bool:
+    return all(r is not None and r.watchdog == "proven" for r in records.values())

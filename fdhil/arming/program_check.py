@@ -1,4 +1,4 @@
-"""A whole program through the planner, the correction and the gate, block by block, ahead of the motion.
+"""Checks a whole program: planner, correction and gate, block by block, ahead of the motion.
 
 A process of its own (``python -m fdhil.arming.program_check``, one JSON request on stdin): it may take minutes for an
 hour's program, at low priority, without holding up what the daemon listens to, and can be ended at any moment. Each
@@ -18,23 +18,20 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import numba
 import numpy as np
-import scipy
 
-import fdhil
+from fdhil.arming.code_digest import code_digest
 from fdhil.config import MachineConfig
 from fdhil.correction import gate
 from fdhil.correction.streaming import StreamBlock, stream
 from fdhil.errors import FdhilError, ProgramError, StoreError
-from fdhil.program import Budget, program_digest
+from fdhil.program import Budget, planner, program_digest
 from fdhil.program.demand_csv import read_demand_csv
 from fdhil.program.interpreter import Interpreter
-from fdhil.program.planner import stream as planned
 from fdhil.records import Float, Parameters, Reason, Trajectory
 from fdhil.store.atomic import store_error, sync_folder, write_file
 
@@ -46,26 +43,9 @@ PIECE_ROWS = 2000
 MOST_REFUSED = 20  # places that are listed
 TELL_S = 0.5
 NICENESS = 10
-# what the rows depend on: their code and the libraries that compute them
-ROOMS = ("program", "correction", "prediction", "model", "records", "config", "tables.py", "cia402.py", "csv_text.py")
-OWN = "arming/program_check.py"
-LIBRARIES = (np, scipy, numba)
+INT32_END = 2**31
 
 Tell = Callable[[Mapping[str, Any]], None]
-
-
-def code_digest() -> str:
-    """Return the digest of the code that makes the rows, as it is on disk now, and of its libraries' versions.
-
-    What another planner made under the same version is not reused.
-    """
-    home = Path(fdhil.__file__).parent
-    digest = hashlib.sha256(json.dumps([sys.version, *(library.__version__ for library in LIBRARIES)]).encode())
-    for room in (*ROOMS, OWN):
-        place = home / room
-        for file in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
-            digest.update(str(file.relative_to(home)).encode() + b"\0" + file.read_bytes())
-    return digest.hexdigest()
 
 
 def reference_blocks(program: Path, config: MachineConfig) -> Iterator[Trajectory]:
@@ -78,11 +58,11 @@ def _opened(program: Path, config: MachineConfig) -> tuple[Iterator[Trajectory],
     if program.suffix.lower() == ".csv":
         return iter([read_demand_csv(program, config)]), lambda: [program]
     interpreter = Interpreter(program, Budget.of(config.nc), block_delete=False)
-    return planned(interpreter.run(), config, PIECE_ROWS), lambda: interpreter.files
+    return planner.stream(interpreter.run(), config, PIECE_ROWS), lambda: interpreter.files
 
 
 class _Files:
-    """What the files of a program held when they were first used: its subroutines may lie beside it."""
+    """The digests of a program's files when they were first used: its subroutines may lie beside it."""
 
     def __init__(self, program: Path, digest: str) -> None:
         self._digests = {program: digest}
@@ -134,7 +114,7 @@ class _Path:
 
 @dataclass(slots=True)
 class _Findings:
-    """What is known of the blocks so far."""
+    """Sums up the blocks so far."""
 
     rows: int = 0
     before_square: float = 0.0
@@ -178,12 +158,8 @@ class _Findings:
         """Return the figures of the whole; what it gains is asked last."""
         errors = self.errors()
         refused = self.refused or list(gate.gains(errors["before"]["rms_um"], errors["after"]["rms_um"]))
-        told = [_told(reason) for reason in refused[:MOST_REFUSED]]
+        told = [asdict(reason) for reason in refused[:MOST_REFUSED]]
         return {"rows": self.rows, **errors, "largest_um": self.largest_um, "refused": told}
-
-
-def _told(reason: Reason) -> dict[str, str]:
-    return {"code": reason.code, "text": reason.text, "advice": reason.advice}
 
 
 def check(
@@ -204,7 +180,7 @@ def check(
         files.take(opened())
         findings.take(block)
         for reason in findings.refuse(block, path, config.machine.sync_period_s):
-            tell({"refused": _told(reason)})
+            tell({"refused": asdict(reason)})
         if len(findings.refused) >= MOST_REFUSED:
             break
         if not findings.refused:
@@ -219,7 +195,7 @@ def check(
 
 
 class _Pace:
-    """How far the check is and how fast; told now and then."""
+    """Tells now and then how far the check is and how fast."""
 
     def __init__(self, dt_s: float) -> None:
         self._dt_s, self._begun_s, self._told_s = dt_s, time.monotonic(), -math.inf
@@ -239,13 +215,16 @@ class _Pace:
 
 
 def encoded(demand_mm: Mapping[str, Float], offset_um: Mapping[str, Float], config: MachineConfig) -> bytes:
-    """Return rows of demand and offset in increments, in the drives' own sign."""
+    """Return rows of demand and offset in increments, in the drives' own sign. ValueError where one is no int32."""
     columns = []
     for values, per_mm in ((demand_mm, 1.0), (offset_um, 1e-3)):
         for axis, settings in config.axis.items():
             scale = settings.scaling.sign * settings.scaling.increments_per_mm * per_mm
             columns.append(np.rint(values[axis] * scale))
-    return np.column_stack(columns).astype("<i4").tobytes()
+    rows = np.column_stack(columns)
+    if not np.all(np.abs(rows) < INT32_END):
+        raise ValueError("a row is not finite, or too large for the guard's table")
+    return rows.astype("<i4").tobytes()
 
 
 def header_digest(header: Mapping[str, Any]) -> str:

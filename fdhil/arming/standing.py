@@ -1,18 +1,17 @@
-"""What may still be applied in the drives, by what the guard said last: one rule, and its sentence for the operator."""
+"""Knows what may still be applied in the drives by what the guard said last, and says it to the operator."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fdhil.guard.protocol import AT_REST
 
-if TYPE_CHECKING:
-    from fdhil.arming.guard_client import GuardClient
-
+GONE = frozenset({"absent", "lost"})
+REST: frozenset[str] = AT_REST | GONE
 ABSENT: Mapping[str, Any] = {"state": "absent", "text": "no guard runs: nothing can be armed, nothing is sent"}
 LANDING_S = 3.0  # without a SYNC; the ramp and the zeros after it are counted in SYNC by the guard
 LOOK_S = 0.02
@@ -96,7 +95,7 @@ def lost(before: Mapping[str, Any], arming: bool) -> Mapping[str, Any]:
 
     ``arming``: it went while it was asked to arm, so that it may have armed.
     """
-    if before["state"] in ("absent", "lost") and not arming:
+    if before["state"] in GONE and not arming:
         return before
     last = {**before, "state": "lost" if arming or before["state"] not in AT_REST else before["state"]}
     stands = standing(last)
@@ -107,14 +106,19 @@ def lost(before: Mapping[str, Any], arming: bool) -> Mapping[str, Any]:
     return {"state": "lost", "text": f"the guard is gone; {stands}; {START_AND_ADOPT}", **kept}
 
 
-def landed(client: GuardClient) -> Mapping[str, Any]:
-    """Wait until the guard is at rest, as long as SYNC moves it on, and return its status (blocking). DeviceError."""
-    status, tick, moved_s = client.status(), None, time.monotonic()
-    while status["state"] not in AT_REST and time.monotonic() - moved_s < LANDING_S:
-        if status.get("tick") != tick:
+def landed(
+    look: Callable[[], Mapping[str, Any]], patience_s: float = LANDING_S, landing: Set[str] | None = None
+) -> Mapping[str, Any]:
+    """Wait until the guard is at rest, or gone, as long as SYNC moves it on, and return its status (blocking).
+
+    ``look`` gives the status; in states that are no ``landing`` its SYNC does not count. What ``look`` raises goes on.
+    """
+    status, tick, moved_s = look(), None, time.monotonic()
+    while status["state"] not in REST and time.monotonic() - moved_s < patience_s:
+        if status.get("tick") != tick and (landing is None or status["state"] in landing):
             tick, moved_s = status.get("tick"), time.monotonic()
         time.sleep(LOOK_S)
-        status = client.status()
+        status = look()
     return status
 
 

@@ -1,12 +1,13 @@
-"""What an armed long program still gets: its checked rows as it runs, and word of what the check found of the rest."""
+"""Feeds checked rows to the guard as their program runs, and tells what the check found of the rest."""
 
 from __future__ import annotations
 
 import contextlib
 from pathlib import Path
 
-from fdhil.arming.guard_link import REST, GuardLink
-from fdhil.arming.preparing import StreamedArmament
+from fdhil.arming.guard_link import GuardLink
+from fdhil.arming.preparing import Armament
+from fdhil.arming.standing import REST
 from fdhil.errors import DeviceError, StoreError
 from fdhil.guard.protocol import RESERVE_S
 from fdhil.records import Notice
@@ -14,10 +15,10 @@ from fdhil.records import Notice
 SCARCE_S = 5.0  # half the ring: a check that lets it fall so far is told before the guard ends the correction
 
 
-class Supply:
+class StreamFeeder:
     """Feeds the guard with one program's rows; ``go_on`` blocks and is called every few cycles of the daemon."""
 
-    def __init__(self, armed: StreamedArmament, guard: GuardLink) -> None:
+    def __init__(self, armed: Armament, guard: GuardLink) -> None:
         self._armed, self._guard = armed, guard
         self._name = Path(armed.program).name
         self._told = 0

@@ -1,4 +1,4 @@
-"""The operator's token: who can read it (mode 0600, in the run directory) may arm. It is never logged nor shown."""
+"""Keeps the operator's token: who can read it (mode 0600, in the run directory) may arm. It is never logged."""
 
 from __future__ import annotations
 
@@ -11,6 +11,33 @@ from fdhil.errors import ConnectError, DeviceError
 
 TOKEN_NAME = "token"
 MAX_BYTES = 256
+
+
+def operator_token(run_directory: Path) -> str:
+    """Return the token that arming needs, made at the first start of guard or daemon. DeviceError.
+
+    Under a user of its own the guard is given it by systemd (LoadCredential=token:...).
+    """
+    given = given_credential(TOKEN_NAME)
+    if given is not None:
+        return read_token(given.parent)
+    make_directory(run_directory)
+    return ensure_token(run_directory)
+
+
+def given_credential(name: str) -> Path | None:
+    """Return the credential of that name, None where systemd gives none."""
+    folder = os.environ.get("CREDENTIALS_DIRECTORY")
+    return Path(folder) / name if folder and (Path(folder) / name).exists() else None
+
+
+def make_directory(run_directory: Path) -> None:
+    """Make a run directory (mode 0700) where there is none; DeviceError when that fails."""
+    try:
+        run_directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+    except OSError as error:
+        text = f"cannot be made ({error.strerror}), and nothing is sent; check run_directory and its rights"
+        raise DeviceError(str(run_directory), text) from None
 
 
 def ensure_token(run_directory: Path) -> str:

@@ -1,4 +1,4 @@
-"""One owner per bus: a lock on the place that a bus leads to, whatever its name, in a file that others cannot reach.
+"""Locks a bus for one owner: the place that it leads to, whatever its name, in a file that others cannot reach.
 
 It covers every process of the same user, and root with the guard's own user. It does not cover what looks like another
 place: two addresses of one distant hub, a tunnel, two interfaces on one cable, another computer. There the guards see

@@ -173,15 +173,14 @@ def _tell_compared(machine: MachineConfig, found: Sequence[Place]) -> None:
 def _guard_told(machine: MachineConfig, seen: Mapping[str, str]) -> set[str]:
     """Tell the guard, where one runs, which drives were compared; return the axes whose records stay void there."""
     from fdhil.arming.guard_client import GuardClient
-    from fdhil.cli.guard import operator_token
-    from fdhil.cli.service import guard_directory, run_directory
+    from fdhil.arming.token import operator_token
 
-    directory = guard_directory(machine)
+    directory = machine.guard_directory
     if not seen or not (directory / SOCKET_NAME).exists():
         return set()
     try:
         with GuardClient(directory) as guard:
-            answer = guard.compared(operator_token(run_directory(machine)), seen)
+            answer = guard.compared(operator_token(machine.run_directory), seen)
     except DeviceError as error:
         click.echo(f"the guard was not told: {error}", err=True)
         return set()

@@ -92,15 +92,12 @@ def remember(past: Past, now: Comparison, config: MachineConfig) -> None:
     """Store this prediction, unless it is the last one again; a store that takes nothing is told, and no more."""
     if past.comparisons and _same(past.comparisons[0][1], now):
         return
-    import time
-
-    from fdhil.daemon.outcome_store import boot_id
     from fdhil.errors import StoreError
     from fdhil.store.history import History, Stamp
 
     try:
         with History.open(config.store.directory) as history:
-            history.add_comparison(now, Stamp(time.time(), boot_id(), time.monotonic_ns()))
+            history.add_comparison(now, Stamp.now())
     except StoreError as error:
         click.echo(f"this prediction is not kept for the next one to compare with: {error}", err=True)
 

@@ -152,19 +152,13 @@ def _history(machine: machine_config.MachineConfig, axis: str | None) -> tuple[l
 
 
 def _row(revision: Revision) -> dict[str, Any]:
-    from fdhil.daemon.outcome_json import parameters_status
+    from fdhil.daemon.outcome_json import set_document
 
-    published = revision.set
     return {
-        "axis": published.axis,
-        "revision": published.revision,
+        **set_document(revision.set),
         "time": datetime.fromtimestamp(revision.stamp.wall_s, UTC).isoformat(timespec="seconds"),
-        "tick": published.tick,
-        "temperature_c": published.temperature_c,
-        "windows_used": published.windows,
         "window_ids": list(revision.window_ids),
-        "config_digest": published.config_digest,
-        "parameters": parameters_status(published),
+        "config_digest": revision.set.config_digest,
     }
 
 

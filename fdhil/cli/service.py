@@ -21,16 +21,6 @@ DISARM_S = 15.0  # the daemon waits for the guard's answer and for the ramp
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 
 
-def run_directory(config: machine_config.MachineConfig) -> Path:
-    """Return the folder of the daemon's socket and token."""
-    return config.store.run_directory or config.store.directory / "run"
-
-
-def guard_directory(config: machine_config.MachineConfig) -> Path:
-    """Return the folder of the guard's socket: its own, or the daemon's."""
-    return config.guard.run_directory or run_directory(config)
-
-
 @click.command()
 @CONFIG
 @click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Left out: the config's, else the best.")
@@ -61,7 +51,7 @@ def _ask(
     machine = machine_config.load(config)
     from fdhil.daemon.control import SOCKET_NAME, ask
 
-    return ask(run_directory(machine) / SOCKET_NAME, request, timeout_s, progress)
+    return ask(machine.run_directory / SOCKET_NAME, request, timeout_s, progress)
 
 
 @click.command()
@@ -109,7 +99,7 @@ def arm(config: Path, program: Path | None, method: str | None, whole: bool, as_
         "program": None if program is None else str(program.resolve()),
         "method": method,
         "whole": whole,
-        "token": read_token(run_directory(machine)),
+        "token": read_token(machine.run_directory),
     }
     shown = _Shown(as_json)
     answer = _ask(config, request, 600.0, shown)
@@ -164,9 +154,9 @@ def _disarm_at_the_guard(config: Path, silent: DeviceError) -> Mapping[str, Any]
     from fdhil.arming.standing import landed, verdict
 
     try:
-        with GuardClient(guard_directory(machine)) as guard:
+        with GuardClient(machine.guard_directory) as guard:
             answer = guard.disarm()
-            return {**verdict(landed(guard)), "asked": "guard"} if answer["ok"] else answer
+            return {**verdict(landed(guard.status)), "asked": "guard"} if answer["ok"] else answer
     except DeviceError as error:
         text = f"{silent}; nor does the guard answer ({error}): it is unknown what is applied"
         raise ConnectError("machine", text) from None
@@ -189,8 +179,8 @@ def adopt(config: Path, yes: bool, as_json: bool) -> None:
     from fdhil.arming.guard_client import GuardClient
     from fdhil.arming.token import read_token
 
-    with GuardClient(guard_directory(machine)) as guard:
-        answer = _adopted(guard, lambda: read_token(run_directory(machine)), yes, quiet=as_json)
+    with GuardClient(machine.guard_directory) as guard:
+        answer = _adopted(guard, lambda: read_token(machine.run_directory), yes, quiet=as_json)
     _tell(answer, as_json)
 
 
@@ -212,7 +202,7 @@ def _adopted(guard: GuardClient, token: Callable[[], str], yes: bool, quiet: boo
         click.confirm("Is the feed held? Ramp it to zero now?", abort=True, err=True)
     try:
         answer = guard.adopt(token())
-        return verdict(landed(guard)) if answer["ok"] else {**answer, "may_stand_um": dict(stands.offset_um)}
+        return verdict(landed(guard.status)) if answer["ok"] else {**answer, "may_stand_um": dict(stands.offset_um)}
     except DeviceError as error:
         raise ConnectError("adoption", f"{error}; {stands}") from None
 
@@ -227,11 +217,7 @@ def _tell(answer: Mapping[str, Any], as_json: bool) -> None:
         advice = f"; {answer['advice']}" if answer.get("advice") else ""
         click.echo(f"refused: {answer['code']}: {answer['text']}{advice}", err=True)
         for more in answer.get("refused", [])[1:]:
-            click.echo(f"also: {more if isinstance(more, str) else _reason(more)}", err=True)
+            told = more if isinstance(more, str) else f"{more['code']}: {more['text']}; {more['advice']}"
+            click.echo(f"also: {told}", err=True)
     if not answer["ok"]:
         click.get_current_context().exit(1)
-
-
-def _reason(told: Mapping[str, Any]) -> str:
-    """Return a refusal of the guard as one line."""
-    return f"{told['code']}: {told['text']}; {told['advice']}"

@@ -1,4 +1,4 @@
-"""The daemon's status and the stored history as tables for a person."""
+"""Shows the daemon's status and the stored history as tables for a person."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ from fdhil.config.axis import (
 )
 from fdhil.config.controller import Identification, Nc
 from fdhil.config.machine import MachineConfig
-from fdhil.config.offset_limits import VARIATION_MM, OffsetLimits, share_fault
+from fdhil.config.offset_bounds import VARIATION_MM, OffsetBounds, share_fault
 from fdhil.config.reading import load, parse, toml_document, unlikely
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import Section
@@ -40,7 +40,7 @@ __all__ = [
     "Nc",
     "Noise",
     "Nominal",
-    "OffsetLimits",
+    "OffsetBounds",
     "Regulators",
     "Section",
     "SimAxis",

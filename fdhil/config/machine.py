@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from pathlib import Path
 
 from pydantic import Field, ValidationInfo, model_validator
 
 from fdhil.config.axis import Axis
 from fdhil.config.controller import G0, Identification, Nc
-from fdhil.config.offset_limits import limit_faults
+from fdhil.config.offset_bounds import limit_faults
 from fdhil.config.plausible import doubts
 from fdhil.config.regulators import period_faults
 from fdhil.config.section import AxisName, Positive, Section
@@ -62,6 +63,16 @@ class MachineConfig(Section):
     def node_id(self, axis: str) -> int:
         """Return the CANopen node-ID of an axis' drive."""
         return self.axis[axis].drive.node_id or list(self.axis).index(axis) + 1
+
+    @property
+    def run_directory(self) -> Path:
+        """The folder of the daemon's socket and token."""
+        return self.store.run_directory or self.store.directory / "run"
+
+    @property
+    def guard_directory(self) -> Path:
+        """The folder of the guard's socket: its own, or the daemon's."""
+        return self.guard.run_directory or self.run_directory
 
     @property
     def digest(self) -> str:

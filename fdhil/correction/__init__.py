@@ -1,8 +1,8 @@
-"""Plans offsets that make up for the predicted path error: methods, limits, the gate, and the guard's table."""
+"""Plans offsets that make up for the predicted path error: methods, limits, the gate."""
 
 from __future__ import annotations
 
 from fdhil.correction.limits import PlanLimits, check
-from fdhil.correction.planning import plan, table
+from fdhil.correction.planning import plan
 
-__all__ = ["PlanLimits", "check", "plan", "table"]
+__all__ = ["PlanLimits", "check", "plan"]

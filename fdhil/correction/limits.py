@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from scipy.ndimage import minimum_filter1d
 
-from fdhil.config import VARIATION_MM, Axis, OffsetLimits
+from fdhil.config import VARIATION_MM, Axis, OffsetBounds
 from fdhil.correction import kernels
 from fdhil.records import Bool, Float, Int, Reason
 
@@ -24,7 +24,7 @@ _SLACK = 0.05  # increments by which a seam may miss, far below the rounding
 
 
 @dataclass(frozen=True, slots=True)
-class PlanLimits(OffsetLimits):
+class PlanLimits(OffsetBounds):
     """The limits of an offset in increments, and the size of these."""
 
     um_per_increment: float
@@ -32,7 +32,7 @@ class PlanLimits(OffsetLimits):
     @staticmethod
     def of(axis: Axis, sync_period_s: float) -> PlanLimits:
         """Return the limits of an axis; ValueError when writing is off (no ``[axis.X.correction]``)."""
-        allowed = OffsetLimits.of(axis, sync_period_s)
+        allowed = OffsetBounds.of(axis, sync_period_s)
         return PlanLimits(**asdict(allowed), um_per_increment=1e3 / axis.scaling.increments_per_mm)
 
     @property

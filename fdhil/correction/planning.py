@@ -1,9 +1,7 @@
-"""Plans a correction from a reference: method, limits, gate; and turns it into the guard's table."""
+"""Plans a correction from a reference: method, limits, gate."""
 
 from __future__ import annotations
 
-import hashlib
-import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -16,15 +14,12 @@ from fdhil.correction.method import Method, Plan
 from fdhil.prediction.predict import predict, predict_corrected
 from fdhil.records import (
     Correction,
-    CorrectionTable,
     Float,
-    Int,
     Parameters,
     Prediction,
     Reason,
     Trajectory,
     frozen,
-    frozen_ints,
 )
 
 MASK_PASSES = 3
@@ -104,24 +99,3 @@ def _mask_harm(
     if not wanted.untouched:
         text += " and are left as they are"
     return offset, after, (Reason("HarmPredicted", text, "try the method inverse, or lower the feed there"),)
-
-
-def table(correction: Correction, config: MachineConfig, program_digest: str) -> CorrectionTable:
-    """Return the guard's table: demand and offset in drive increments, in the drive's own sign.
-
-    ValueError for a refused correction, and for a value that is not finite.
-    """
-    if correction.refused:
-        raise ValueError(f"a refused correction ({correction.refused[0].code}) has no table")
-    reference = correction.before.reference
-    demand: dict[str, Int] = {}
-    offset: dict[str, Int] = {}
-    digest = hashlib.sha256(program_digest.encode())
-    for axis in reference.axes:
-        scaling = config.axis[axis].scaling
-        for into, values in ((demand, reference.position_mm[axis]), (offset, correction.offset_um[axis] * 1e-3)):
-            if not math.isfinite(float(np.abs(values).max(initial=0.0))):
-                raise ValueError(f"axis {axis} has a value that is not finite")
-            into[axis] = frozen_ints(np.rint(values * scaling.sign * scaling.increments_per_mm))
-            digest.update(into[axis].tobytes())
-    return CorrectionTable(reference.axes, demand, offset, program_digest, digest.hexdigest())

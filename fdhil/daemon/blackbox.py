@@ -1,4 +1,4 @@
-"""The black box: what was on the buses before and after the guard stopped a correction, one file per trip."""
+"""Keeps the frames that were on the buses before and after the guard stopped a correction, one file per trip."""
 
 from __future__ import annotations
 

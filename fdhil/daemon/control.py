@@ -1,4 +1,4 @@
-"""The control socket: one JSON object per line and request, one per answer, over a UNIX socket.
+"""Serves the control socket: one JSON object per line and request, one per answer, over a UNIX socket.
 
 A request is {"request": "status" | "arm" | "disarm" | "stop", ...}; an answer is {"ok": true, ...} or
 {"ok": false, "code", "text", "advice"}. With "progress": true lines {"progress": {...}} come before an answer that
@@ -19,6 +19,7 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
+from fdhil.arming.answers import Answer, refusal
 from fdhil.errors import ConnectError, DeviceTimeout, FdhilError
 
 SOCKET_NAME = "daemon.sock"
@@ -29,14 +30,8 @@ ALWAYS_HEARD = ("disarm", "status")
 IDLE_S = 60.0
 PROGRESS_S = 0.5
 
-Answer = Mapping[str, Any]
 Handler = Callable[[Mapping[str, Any]], Awaitable[Answer]]
 Progress = Callable[[], Mapping[str, Any] | None]
-
-
-def refusal(code: str, text: str, advice: str = "") -> Answer:
-    """Return the answer that says no: its class, cause and next action."""
-    return {"ok": False, "code": code, "text": text, "advice": advice}
 
 
 class ControlServer:

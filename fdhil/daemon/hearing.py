@@ -1,4 +1,4 @@
-"""What is heard of the machine, now: frames, SYNC and samples with their ages, and what is not as the config says.
+"""Hears the machine: frames, SYNC and samples with their ages, and what is not as the config says.
 
 Pure but for the times it is given. What was not heard within the last second is silent, whatever came before.
 """

@@ -1,4 +1,4 @@
-"""One log line per outcome, for a person; under systemd with the priority that the journal understands."""
+"""Writes one log line per outcome, for a person; under systemd with the priority that the journal understands."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from typing import Literal
@@ -20,8 +20,6 @@ BURST = 20  # lines of one class that are written before a flood of it is only c
 REFILL_PER_S = 1.0
 
 _for_programs = threading.Event()  # whether lines are JSON
-
-Log = Callable[[str, Severity], None]
 
 
 def printable(text: str) -> str:

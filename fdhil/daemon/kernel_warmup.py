@@ -1,4 +1,4 @@
-"""Compiling before the daemon says READY: a compile under way holds the interpreter for seconds."""
+"""Compiles the kernels before the daemon says READY: a compile under way holds the interpreter for seconds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One daemon per machine: a lock that the kernel releases with the process, however that ends."""
+"""Locks a machine for one daemon; the kernel releases the lock with the process, however that ends."""
 
 from __future__ import annotations
 

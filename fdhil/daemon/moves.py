@@ -1,4 +1,4 @@
-"""The moves of an axis as the bus shows them: what they are worth to identification, and whether the scales agree.
+"""Follows the moves of an axis on the bus: are they of use to identification, and do the scales agree?
 
 Nothing is identified here: it is counted what never becomes a window, so that silence has a reason. Pure.
 """
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.drivers.moves import inferred as g0_inferred
+from fdhil.drivers.moves import inferred
 from fdhil.identification.windows import PLATEAU_BAND, PLATEAU_S, RAPID_SHARE, RUN_SHARE
 from fdhil.records import AxisSamples, Float, Int
 
@@ -29,7 +29,7 @@ def _columns(samples: AxisSamples) -> tuple[Int, Float, Float, Float]:
 
 
 class Moves:
-    """What the demand of one axis does, from rest to rest."""
+    """The moves of one axis' demand, from rest to rest."""
 
     def __init__(self, axis: str, config: MachineConfig) -> None:
         settings = config.axis[axis]
@@ -37,7 +37,7 @@ class Moves:
         self._rapid_mm_s = settings.rapid_speed_mm_s
         self._mm_per_rad = settings.screw_pitch_mm / (2 * math.pi)
         self._source = config.g0.source
-        self._needed = g0_inferred.RAPID_SHARE if self._source == "inferred" else RAPID_SHARE
+        self._needed = inferred.RAPID_SHARE if self._source == "inferred" else RAPID_SHARE
         # one increment per cycle is the rounding of the set-point, not a motion
         self._still_mm_s = max(RUN_SHARE * self._rapid_mm_s, 2 / settings.scaling.increments_per_mm / self._period_s)
         self._last: AxisSamples | None = None

@@ -1,4 +1,4 @@
-"""Telling systemd how the service is (sd_notify), without a library."""
+"""Tells systemd how the service is (sd_notify), without a library."""
 
 from __future__ import annotations
 

@@ -32,20 +32,24 @@ def parameters_status(published: ParameterSet) -> Mapping[str, Mapping[str, Any]
     return told
 
 
+def set_document(published: ParameterSet) -> dict[str, Any]:
+    """Return a published set as JSON has it."""
+    return {
+        "axis": published.axis,
+        "revision": published.revision,
+        "windows_used": published.windows,
+        "tick": published.tick,
+        "temperature_c": published.temperature_c,
+        "parameters": parameters_status(published),
+    }
+
+
 def as_document(outcome: Outcome) -> dict[str, Any]:
     """Return an outcome as JSON has it; ``kind`` is window, parameters, skill or notice."""
     if isinstance(outcome, WindowOutcome):
         return _window(outcome)
     if isinstance(outcome, ParameterSet):
-        return {
-            "kind": "parameters",
-            "axis": outcome.axis,
-            "revision": outcome.revision,
-            "windows_used": outcome.windows,
-            "tick": outcome.tick,
-            "temperature_c": outcome.temperature_c,
-            "parameters": parameters_status(outcome),
-        }
+        return {"kind": "parameters", **set_document(outcome)}
     assert isinstance(outcome, Skill | Notice)
     return {"kind": "skill" if isinstance(outcome, Skill) else "notice", **asdict(outcome)}
 

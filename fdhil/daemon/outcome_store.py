@@ -1,13 +1,11 @@
-"""What the daemon keeps of each outcome, and what happens when the disk refuses: a notice, and it goes on in shadow."""
+"""Stores each outcome of the daemon; when the disk refuses it says so, and the daemon goes on in shadow."""
 
 from __future__ import annotations
 
 import math
 import threading
-import time
 from collections import deque
 from collections.abc import Sequence
-from pathlib import Path
 
 from fdhil.config import MachineConfig
 from fdhil.drivers.cia402.profile import load_profile
@@ -20,14 +18,6 @@ from fdhil.store.windows import RawScale, Scales, WindowStore
 
 WINDOWS_FOLDER = "windows"
 SKILLS = 3
-
-
-def boot_id() -> str:
-    """Return the kernel's identifier of this boot; monotonic times compare only within one."""
-    try:
-        return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
-    except OSError:
-        return ""
 
 
 def raw_scales(config: MachineConfig, axis: str) -> Scales:
@@ -55,7 +45,7 @@ def _point(window: StoredWindow) -> Point:
     return Point(values, stds, window.start_tick)
 
 
-class Keeper:
+class OutcomeStore:
     """Writes outcomes to the windows' folder and to the history. Safe to call from several worker threads.
 
     A store that refuses never stops the daemon: ``fault`` is the class of the refusal (None while all is well), the
@@ -67,7 +57,6 @@ class Keeper:
         self._directory = config.store.directory
         self._lock = threading.Lock()
         self._scales = {axis: raw_scales(config, axis) for axis in config.axis}
-        self._boot = boot_id()
         self._history: History | None = None
         self._windows: WindowStore | None = None
         self._pool_ids = {axis: deque[int](maxlen=POOL_WINDOWS) for axis in config.axis}
@@ -177,7 +166,7 @@ class Keeper:
     def _keep(self, outcome: Outcome) -> None:
         assert self._history is not None
         assert self._windows is not None
-        stamp = Stamp(time.time(), self._boot, time.monotonic_ns())
+        stamp = Stamp.now()
         if isinstance(outcome, WindowOutcome):
             axis = outcome.window.axis
             last = self._history.last_window_number()

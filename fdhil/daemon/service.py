@@ -1,4 +1,4 @@
-"""The daemon: one task group that carries records from the machine to the pipelines, and outcomes to the store.
+"""Runs the daemon: one task group that carries records from the machine to the pipelines, and outcomes to the store.
 
 Sources restart with back-off; a pipeline never does. An unexpected exception in any task ramps the correction down
 (the guard is told to disarm) and ends the process: there is no half-alive daemon. Nothing is ever sent from here.
@@ -15,17 +15,18 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
-from fdhil.arming.desk import Armory
+from fdhil.arming.answers import Answer, refusal
+from fdhil.arming.desk import ArmingDesk
 from fdhil.arming.guard_link import TRIPPED, VOIDING
 from fdhil.arming.standing import ADOPT, START_AND_ADOPT, Standing
 from fdhil.commissioning.void import void_record
 from fdhil.config import MachineConfig, unlikely
 from fdhil.daemon import blackbox, journal
-from fdhil.daemon.control import SOCKET_NAME, Answer, ControlServer, refusal
+from fdhil.daemon.control import SOCKET_NAME, ControlServer
 from fdhil.daemon.kernel_warmup import warm
 from fdhil.daemon.lock import sole_owner
 from fdhil.daemon.notify import notify
-from fdhil.daemon.outcome_store import Keeper
+from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.daemon.status import Watch
 from fdhil.errors import DeviceError, FdhilError, StoreError
 from fdhil.pipeline import AxisPipeline, Record
@@ -41,7 +42,7 @@ STUCK_S = 60.0  # a batch that is digested for so long hangs
 
 
 class Source(Protocol):
-    """What the daemon needs of a machine: its records in blocks, and what was received and lost."""
+    """A machine as the daemon needs it: its records in blocks, and counts of what was received and lost."""
 
     def records(self) -> AsyncIterator[Record | Notice]:
         """Yield records as they come, until the source ends; DeviceError when a device fails for good."""
@@ -67,9 +68,9 @@ class Service:
         self._config = config
         self._open_source = open_source
         self._method = method
-        self._run_directory = config.store.run_directory or config.store.directory / "run"
-        self._keeper = Keeper(config)
-        self._armory = Armory(config, self._keeper, self._run_directory)
+        self._run_directory = config.run_directory
+        self._store = OutcomeStore(config)
+        self._desk = ArmingDesk(config, self._store, self._run_directory)
         self._watch = Watch(config, time.monotonic())
         self._pipelines: dict[str, AxisPipeline] = {}
         self._queues = {axis: asyncio.Queue[Record](QUEUE_RECORDS) for axis in config.axis}
@@ -92,8 +93,8 @@ class Service:
                 await self._serve()
             finally:
                 notify("STOPPING=1")
-                stands = await self._armory.stand_down()
-                await asyncio.to_thread(self._keeper.close)
+                stands = await self._desk.stand_down()
+                await asyncio.to_thread(self._store.close)
                 for number in (signal.SIGTERM, signal.SIGINT):
                     loop.remove_signal_handler(number)
                 if self._opened.is_set() or not stands.nothing:  # else it never ran, and the error alone is told
@@ -102,33 +103,33 @@ class Service:
 
     def _say_stopped(self, stands: Standing) -> None:
         if stands.nothing:
-            self._log(f"stopped, {stands}")
+            journal.write_line(f"stopped, {stands}")
         else:
-            advice = START_AND_ADOPT if self._armory.guard.state == "lost" else ADOPT
-            self._log(f"stopped, {stands}; {advice}", "MAJOR")
+            advice = START_AND_ADOPT if self._desk.guard.state == "lost" else ADOPT
+            journal.write_line(f"stopped, {stands}; {advice}", "MAJOR")
 
     @property
     def standing(self) -> Standing:
         """What may still be applied, as far as the daemon knows."""
-        return self._armory.guard.standing
+        return self._desk.guard.standing
 
     async def _serve(self) -> None:
-        self._say(await asyncio.to_thread(self._keeper.open))
+        self._say(await asyncio.to_thread(self._store.open))
         self._say([Notice("ConfigUnlikely", "minor", text) for text in unlikely(self._config)])
         await asyncio.to_thread(self._prepare)
-        control = ControlServer(self._handle, lambda: self._armory.checking, self._armory.abandon)
+        control = ControlServer(self._handle, lambda: self._desk.checking, self._desk.abandon)
         async with control.serving(self._run_directory / SOCKET_NAME), asyncio.TaskGroup() as tasks:
             acquiring = tasks.create_task(self._acquire(), name="acquire")
             others = [tasks.create_task(self._work(axis), name=f"axis {axis}") for axis in self._config.axis]
             others.append(tasks.create_task(self._keep_notices(), name="notices"))
-            others.append(tasks.create_task(self._armory.attend(self._tell), name="guard"))
-            others.append(tasks.create_task(self._armory.stream(self._tell), name="stream"))
+            others.append(tasks.create_task(self._desk.attend(self._tell), name="guard"))
+            others.append(tasks.create_task(self._desk.stream(self._tell), name="stream"))
             others.append(tasks.create_task(self._feed_watchdog(), name="watchdog"))
             others.append(tasks.create_task(self._listen(), name="listen"))
             others.append(tasks.create_task(self._say_ready(), name="ready"))
             await self._stop.wait()
             notify("STOPPING=1")
-            await self._armory.stand_down()
+            await self._desk.stand_down()
             acquiring.cancel()
             await asyncio.wait([acquiring])
             await asyncio.gather(*(queue.join() for queue in self._queues.values()), self._notices.join())
@@ -137,22 +138,18 @@ class Service:
 
     def _prepare(self) -> None:
         """Begin each axis with what the history knows, and compile the kernels."""
-        self._armory.begin(self._keeper.newest(), self._keeper.skills())
+        self._desk.begin(self._store.newest(), self._store.skills())
         for axis in self._config.axis:
-            known = self._keeper.known(axis)
+            known = self._store.known(axis)
             self._pipelines[axis] = AxisPipeline(axis, self._config, self._method, known)
-            self._watch.begin(axis, known.newest, self._keeper.counts(axis))
+            self._watch.begin(axis, known.newest, self._store.counts(axis))
         warm(self._config, self._method)
 
     async def _say_ready(self) -> None:
         await self._opened.wait()
-        self._log(
-            f"ready: {self._config.machine.name}, axes {', '.join(self._config.axis)}; listening, sending nothing"
-        )
+        axes = ", ".join(self._config.axis)
+        journal.write_line(f"ready: {self._config.machine.name}, axes {axes}; listening, sending nothing")
         notify("READY=1\nSTATUS=listening, sending nothing")
-
-    def _log(self, text: str, severity: journal.Severity = "info") -> None:
-        journal.write_line(text, severity)
 
     # from the machine to the pipelines -------------------------------------------------------------------------
 
@@ -189,9 +186,9 @@ class Service:
             self._tell([record])
             return
         if isinstance(record, Temperature):
-            self._armory.note_temperature(record)
+            self._desk.knowledge.note_temperature(record)
         elif isinstance(record, AxisSamples):
-            self._armory.hear(record)
+            self._desk.hear(record)
         for axis in self._config.axis if isinstance(record, TickTimes) else (record.axis,):
             if axis in self._queues:
                 if self._queues[axis].full():
@@ -209,7 +206,7 @@ class Service:
             self._busy_since_s[axis] = time.monotonic()
             outcomes, notices = await asyncio.to_thread(self._digest, axis, batch)
             del self._busy_since_s[axis]
-            self._armory.note(outcomes)
+            self._desk.knowledge.note(outcomes)
             self._say([*outcomes, *notices])
             for _ in batch:
                 queue.task_done()
@@ -217,7 +214,7 @@ class Service:
     def _digest(self, axis: str, batch: Sequence[Record]) -> tuple[list[Outcome], list[Notice]]:
         """In the worker thread: records through the pipeline, outcomes into the store."""
         outcomes = [outcome for record in batch for outcome in self._pipelines[axis].feed(record)]
-        return outcomes, self._keeper.keep(outcomes) if outcomes else []
+        return outcomes, self._store.keep(outcomes) if outcomes else []
 
     # what is said and kept -------------------------------------------------------------------------------------
 
@@ -230,7 +227,7 @@ class Service:
     async def _keep_notices(self) -> None:
         while True:
             notice = await self._notices.get()
-            self._say(await asyncio.to_thread(self._keeper.keep, [notice]))
+            self._say(await asyncio.to_thread(self._store.keep, [notice]))
             if notice.code in VOIDING:
                 await asyncio.to_thread(self._void, notice)
             if notice.code == TRIPPED and self._source is not None:
@@ -243,7 +240,7 @@ class Service:
         try:
             void_record(self._config.store.directory, notice.axis, notice.text)
         except StoreError as error:
-            self._log(str(error), "MAJOR")
+            journal.write_line(str(error), "MAJOR")
 
     def _say(self, outcomes: Sequence[Outcome]) -> list[Outcome]:
         """Show outcomes: one log line each (a flood becomes a count), the newest in the status. Return those shown."""
@@ -254,7 +251,7 @@ class Service:
             held = self._gate.admit(outcome.code if isinstance(outcome, Notice) else type(outcome).__name__, now_s)
             if held is not None:
                 shown.append(outcome)
-                self._log(text + (f" ({held} more like this were not written)" if held else ""), severity)
+                journal.write_line(text + (f" ({held} more like this were not written)" if held else ""), severity)
         return shown
 
     async def _feed_watchdog(self) -> None:
@@ -289,11 +286,11 @@ class Service:
         if request["request"] == "status":
             return self._status()
         if request["request"] == "arm":
-            answer = await self._armory.arm(request)
+            answer = await self._desk.arm(request)
             self._tell([_told(answer)])
             return answer
         if request["request"] == "disarm":
-            return await self._armory.disarm()
+            return await self._desk.disarm()
         if request["request"] == "stop":
             self._stop.set()
             return {"ok": True, "text": "stopping"}
@@ -303,12 +300,12 @@ class Service:
         counters = dict(self._source.counters()) if self._source is not None else {}
         store = {
             "directory": str(self._config.store.directory),
-            "fault": self._keeper.fault,
-            "strays": list(self._keeper.strays),
+            "fault": self._store.fault,
+            "strays": list(self._store.strays),
         }
         status = self._watch.status(time.monotonic())
-        guard = self._armory.guard
-        for axis, celsius in self._armory.temperatures.items():
+        guard = self._desk.guard
+        for axis, celsius in self._desk.knowledge.temperatures.items():
             status["axes"][axis]["slideway_c"] = celsius
         return {
             "ok": True,
@@ -319,9 +316,9 @@ class Service:
             "dropped": self._dropped,
             "guard": dict(guard.status),
             "may_stand": {"nothing": guard.standing.nothing, "text": str(guard.standing)},
-            "armed": self._armory.armed,
-            "checking": self._armory.checking,
-            "passes": self._armory.passes,
+            "armed": self._desk.armed,
+            "checking": self._desk.checking,
+            "passes": self._desk.passes,
             "store": store,
         }
 

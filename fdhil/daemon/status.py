@@ -1,4 +1,4 @@
-"""What the daemon tells about itself: gathered from what passes through it. Pure but for the times it is given."""
+"""Gathers the status document from the outcomes that pass. Pure but for the times it is given."""
 
 from __future__ import annotations
 
@@ -83,31 +83,26 @@ class Watch:
             **self.hearing.status(now_s),
             "troubles": [{"code": code, "axis": axis, "text": text} for (code, axis), text in self._troubles.items()],
             "axes": {axis: self._axis_status(axis, now_s) for axis in self._axes},
-            "notices": [_notice_status(now_s - at_s, notice) for at_s, notice in self._notices],
+            "notices": [{"age_s": round(now_s - at_s, 3), **asdict(notice)} for at_s, notice in self._notices],
         }
 
     def _axis_status(self, axis: str, now_s: float) -> dict[str, Any]:
+        watch = self._axes[axis]
+        published, last = watch.published, watch.last
         return {
-            **_axis_status(self._axes[axis]),
+            "accepted": watch.accepted,
+            "refused": watch.refused,
+            "refused_by": dict(watch.refused_by),
+            "revision": published and published.revision,
+            "windows_used": published and published.windows,
+            "tick": published and published.tick,
+            "temperature_c": published and published.temperature_c,
+            "parameters": parameters_status(published) if published else None,
+            "last_window": _window_status(last) if last else None,
+            "skill": asdict(watch.skill) if watch.skill else None,
             "samples_s_ago": self.hearing.samples_s_ago(axis, now_s),
             "moves": self.hearing.moves[axis].status(),
         }
-
-
-def _axis_status(watch: _AxisWatch) -> dict[str, Any]:
-    published, last, skill = watch.published, watch.last, watch.skill
-    return {
-        "accepted": watch.accepted,
-        "refused": watch.refused,
-        "refused_by": dict(watch.refused_by),
-        "revision": published and published.revision,
-        "windows_used": published and published.windows,
-        "tick": published and published.tick,
-        "temperature_c": published and published.temperature_c,
-        "parameters": parameters_status(published) if published else None,
-        "last_window": _window_status(last) if last else None,
-        "skill": asdict(skill) if skill else None,
-    }
 
 
 def _window_status(outcome: WindowOutcome) -> dict[str, Any]:
@@ -117,15 +112,4 @@ def _window_status(outcome: WindowOutcome) -> dict[str, Any]:
         "accepted": outcome.verdict.accepted,
         "fit_percent": outcome.verdict.fit_percent,
         "reasons": [str(reason) for reason in outcome.verdict.reasons],
-    }
-
-
-def _notice_status(age_s: float, notice: Notice) -> dict[str, Any]:
-    return {
-        "age_s": round(age_s, 3),
-        "code": notice.code,
-        "severity": notice.severity,
-        "axis": notice.axis,
-        "text": notice.text,
-        "tick": notice.tick,
     }

@@ -1,12 +1,12 @@
 """The immutable records that cross rooms. Arrays are read-only float64 unless said; the unit is in the name.
 
 Physics is SI (V, A, rad/s, N.m, kg.m2, s), path geometry is millimetres, path errors are micrometres where the
-name says ``_um``. Drive increments appear in :class:`CorrectionTable` alone.
+name says ``_um``. Drive increments appear in none of them.
 """
 
 from __future__ import annotations
 
-from fdhil.records.paths import Correction, CorrectionTable, Prediction, Skill, Trajectory, Zone
+from fdhil.records.paths import Correction, Prediction, Skill, Trajectory, Zone
 from fdhil.records.signals import (
     AxisSamples,
     MoveEvent,
@@ -46,7 +46,6 @@ __all__ = [
     "AxisSamples",
     "Bool",
     "Correction",
-    "CorrectionTable",
     "Estimate",
     "Float",
     "Int",

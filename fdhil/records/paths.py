@@ -112,14 +112,3 @@ class Correction:
     delay_s: float = 0.0
     speed_offset_rad_s: Mapping[str, Float] = field(default_factory=dict)
     torque_offset_nm: Mapping[str, Float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class CorrectionTable:
-    """What the guard loads: rows of demand and offset in drive increments, (n,) int64 per axis."""
-
-    axes: tuple[str, ...]
-    demand_increments: Mapping[str, Int]
-    offset_increments: Mapping[str, Int]
-    program_digest: str
-    digest: str

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import sqlite3
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
@@ -37,6 +38,26 @@ class Stamp:
     wall_s: float
     boot: str
     monotonic_ns: int
+
+    @staticmethod
+    def now() -> Stamp:
+        """Return the stamp of this moment."""
+        return Stamp(time.time(), _boot_id(), time.monotonic_ns())
+
+    def age_s(self) -> float:
+        """Return how long ago that was; below 0 where a wall clock was set back, which is not to be believed."""
+        now = Stamp.now()
+        if now.boot and self.boot == now.boot:
+            return (now.monotonic_ns - self.monotonic_ns) * 1e-9
+        return now.wall_s - self.wall_s
+
+
+def _boot_id() -> str:
+    """Return the kernel's identifier of this boot; monotonic times compare only within one."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
+    except OSError:
+        return ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,15 +17,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdhil.arming.checked_program import Block, Checked, Piece, Stream
-from fdhil.arming.desk import Armory
+from fdhil.arming.checked_program import Block, CheckedProgram, Piece, RowStream
+from fdhil.arming.desk import ArmingDesk
 from fdhil.arming.guard_link import GuardLink
-from fdhil.arming.preparing import AHEAD_S, StreamedArmament, may_begin
+from fdhil.arming.preparing import AHEAD_S, Armament, may_begin
 from fdhil.arming.program_check import encoded
-from fdhil.arming.stream_feeder import Supply
+from fdhil.arming.stream_feeder import StreamFeeder
 from fdhil.arming.token import read_token
 from fdhil.config import MachineConfig
-from fdhil.daemon.outcome_store import Keeper
+from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.records import Notice, Reason, Skill
 from fdhil.store.history import Revision, Stamp
 from tests.arming.mill import RESERVE_ROWS, Mill
@@ -64,14 +64,14 @@ def mill(config: MachineConfig, monkeypatch: pytest.MonkeyPatch) -> Iterator[Mil
 class Shop:
     """The operator's side of a daemon whose guard is the mill."""
 
-    armory: Armory
+    desk: ArmingDesk
     mill: Mill
     token: str
     told: list[Notice]
 
     async def arm(self, program: Path, **options: Any) -> dict[str, Any]:
         """Arm a program."""
-        return dict(await self.armory.arm({"request": "arm", "program": str(program), "token": self.token, **options}))
+        return dict(await self.desk.arm({"request": "arm", "program": str(program), "token": self.token, **options}))
 
     async def until(self, done: Callable[[], object]) -> None:
         """Wait for what other tasks and processes bring about."""
@@ -101,15 +101,15 @@ class Shop:
     @property
     def process(self) -> int:
         """The check's process."""
-        going = self.armory._check._going
+        going = self.desk._check._going
         assert going is not None
         assert going._process is not None
         return going._process.pid
 
     @property
-    def checked(self) -> Checked:
+    def checked(self) -> CheckedProgram:
         """What has passed."""
-        going = self.armory._check._going
+        going = self.desk._check._going
         assert going is not None
         return going.checked
 
@@ -118,18 +118,18 @@ class Shop:
 async def opened(config: MachineConfig, mill: Mill) -> AsyncIterator[Shop]:
     """Run the two tasks of the daemon that look after what is armed."""
     assert config.store.run_directory is not None
-    armory = Armory(config, Keeper(config), config.store.run_directory)
+    desk = ArmingDesk(config, OutcomeStore(config), config.store.run_directory)
     stamp = Stamp(0.0, "another boot", 0)
     newest = replace(published(), config_digest=config.digest, temperature_c=None)
     skills = [Skill(axis, 1, 0.5, 1.0, 0.0, 30.0) for axis in ("X", "Y")]
-    armory.begin({axis: Revision(1, replace(newest, axis=axis), (), stamp) for axis in ("X", "Y")}, skills)
+    desk.begin({axis: Revision(1, replace(newest, axis=axis), (), stamp) for axis in ("X", "Y")}, skills)
     for axis in ("X", "Y"):
-        armory.note([replace(newest, axis=axis)])
+        desk.knowledge.note([replace(newest, axis=axis)])
     told: list[Notice] = []
-    tasks = [asyncio.create_task(work(told.extend)) for work in (armory.attend, armory.stream)]
-    yield Shop(armory, mill, read_token(config.store.run_directory), told)
+    tasks = [asyncio.create_task(work(told.extend)) for work in (desk.attend, desk.stream)]
+    yield Shop(desk, mill, read_token(config.store.run_directory), told)
     assert not any(task.done() for task in tasks)
-    await armory.stand_down()
+    await desk.stand_down()
     for task in tasks:
         task.cancel()
     await asyncio.gather(*tasks, return_exceptions=True)
@@ -168,8 +168,8 @@ async def _is_not_abandoned_by_another(shop: Shop, program: Path) -> None:
     """Who is refused because something runs, and leaves, ends nothing of what runs."""
     answer = await shop.arm(program)
     assert (answer["code"], answer["text"]) == ("NotOff", "what was armed before is still on, in state ACTIVE")
-    assert not shop.armory.abandon()
-    assert shop.armory.checking is not None
+    assert not shop.desk.abandon()
+    assert shop.desk.checking is not None
 
 
 async def _starves_with_a_word(shop: Shop) -> None:
@@ -203,13 +203,13 @@ async def _dies_with_a_word(shop: Shop) -> None:
     assert left, died.text
     end = shop.checked.rows
     assert float(left[1]) == pytest.approx((end - shop.mill.row - RESERVE_ROWS) / 1000, abs=0.06)
-    armed = shop.armory.armed
+    armed = shop.desk.armed
     assert armed is not None
     assert armed["check"]["refused"][0].startswith("InternalError: ")
     await shop.walk(end - RESERVE_ROWS, end)
     shop.mill.move(end - RESERVE_ROWS + 1)
     assert (shop.mill.state, shop.mill.cause, len(shop.mill.rows)) == ("OFF", "TableStarved", end)
-    await shop.until(lambda: shop.armory.armed is None)
+    await shop.until(lambda: shop.desk.armed is None)
     assert [notice.text for notice in shop.told if notice.code == "GuardTripped"] == ["TableStarved: "]
     assert len(shop.major()) == 2
 
@@ -236,7 +236,7 @@ async def test_a_place_that_is_refused_later_is_told_long_before_the_motion_reac
         await shop.walk(end - RESERVE_ROWS, end)
         mill.move(end - RESERVE_ROWS + 1)
         assert (mill.state, mill.cause, len(mill.rows)) == ("OFF", "TableStarved", end)
-        await shop.until(lambda: shop.armory.checking is None and shop.armory.armed is None)
+        await shop.until(lambda: shop.desk.checking is None and shop.desk.armed is None)
         assert {notice.code for notice in shop.told} >= {"DemandTooHigh", "GuardTripped"}
         again = await shop.arm(tmp_path / "long.ngc", whole=True)  # now it is known, and nothing is armed
         assert (again["ok"], again["code"]) == (False, "DemandTooHigh")
@@ -252,7 +252,7 @@ async def test_a_whole_check_is_waited_for_when_it_is_asked_for(
         assert answer["check"] == {"checked_s": answer["rows"] / 1000, "whole": True, "refused": []}
         assert answer["rows"] > 1000 * NEAR_S
         assert "ahead" not in answer["text"]
-        assert shop.armory.checking is None
+        assert shop.desk.checking is None
         await shop.walk(answer["rows"] - 1, answer["rows"])
         assert (len(mill.rows), mill.final, mill.state) == (answer["rows"], True, "ACTIVE")
 
@@ -279,41 +279,41 @@ async def test_what_ended_a_moment_ago_is_waited_for(
         )
 
 
-def checked_of(config: MachineConfig, folder: Path, seconds: float, after_um: float = 1.0) -> Checked:
+def checked_of(config: MachineConfig, folder: Path, seconds: float, after_um: float = 1.0) -> CheckedProgram:
     """Rows at rest that passed, with an error of 30 um before."""
     folder.mkdir(exist_ok=True)
     rows = {axis: np.zeros(round(seconds / 0.001)) for axis in config.axis}
     (folder / "rows").write_bytes(encoded(rows, rows, config))
-    checked = Checked(folder / "rows", tuple(config.axis))
+    checked = CheckedProgram(folder / "rows", tuple(config.axis))
     pass_on(checked, round(seconds / 0.001), after_um)
     return checked
 
 
-def pass_on(checked: Checked, end: int, after_um: float = 1.0, *, last: bool = False) -> None:
+def pass_on(checked: CheckedProgram, end: int, after_um: float = 1.0, *, last: bool = False) -> None:
     """Let the rows at rest up to ``end`` pass."""
     digest = hashlib.sha256(bytes(16 * (end - checked.rows))).hexdigest()
     before, after = ({"rms_um": rms, "max_um": 2 * rms} for rms in (30.0, after_um))
     checked.take(Block(end, digest, last), {"before": before, "after": after})
 
 
-def supply_of(checked: Checked, mill: Mill, folder: Path) -> tuple[Supply, GuardLink]:
+def feeder_of(checked: CheckedProgram, mill: Mill, folder: Path) -> tuple[StreamFeeder, GuardLink]:
     """What feeds the mill with these rows, of which it has none yet."""
     link = GuardLink(folder)
     link.look()
-    stream = Stream(checked, "digest", 0.001)
-    armed = StreamedArmament("long.ngc", stream, Piece(0, {}, {}, False), {}, 29.0)
-    return Supply(armed, link), link
+    stream = RowStream(checked, "digest", 0.001)
+    armed = Armament("long.ngc", stream, Piece(0, {}, {}, False), {}, 29.0)
+    return StreamFeeder(armed, link), link
 
 
 def test_what_is_refused_before_it_begins_is_disarmed(config: MachineConfig, mill: Mill, tmp_path: Path) -> None:
     """Nothing has moved: it is as if it had been refused at once; further places are told as they are found."""
     checked = checked_of(config, tmp_path / "c", 62.0)
     assert config.store.run_directory is not None
-    supply, link = supply_of(checked, mill, config.store.run_directory)
+    feeder, link = feeder_of(checked, mill, config.store.run_directory)
     mill.state = "ARMED"
-    assert {notice.code for notice in supply.go_on()} == {"GuardFound", "GuardState"}
+    assert {notice.code for notice in feeder.go_on()} == {"GuardFound", "GuardState"}
     checked.refused = (Reason("DemandTooHigh", "line 7, at 63.00 s: axis X has", "lower the feed"),)
-    (found,) = supply.go_on()
+    (found,) = feeder.go_on()
     assert (found.code, found.severity, mill.state) == ("DemandTooHigh", "MAJOR", "OFF")
     assert found.text == (
         "line 7, at 63.00 s: axis X has; lower the feed; long.ngc was armed ahead of its check: it had not begun and is"
@@ -327,9 +327,9 @@ def test_a_block_that_is_not_what_was_checked_is_not_sent(config: MachineConfig,
     with (tmp_path / "c" / "rows").open("r+b") as file:
         file.write(b"\1")
     assert config.store.run_directory is not None
-    supply, link = supply_of(checked, mill, config.store.run_directory)
+    feeder, link = feeder_of(checked, mill, config.store.run_directory)
     mill.state, mill.rows = "ACTIVE", [(0, 0, 0, 0)] * 5_000
-    notices = [notice for _ in range(3) for notice in supply.go_on()]
+    notices = [notice for _ in range(3) for notice in feeder.go_on()]
     assert [notice.code for notice in notices if notice.severity == "MAJOR"] == ["CorruptFile"]
     assert "the correction ends before these rows" in notices[-1].text
     assert len(mill.rows) == 5_000
@@ -344,7 +344,7 @@ def test_the_last_block_waits_for_what_is_found_of_the_whole(
     checked = checked_of(config, tmp_path / "c", 4.0)
     (tmp_path / "c" / "rows").write_bytes(bytes(16 * 5_000))
     pass_on(checked, 5_000, last=True)
-    stream = Stream(checked, "digest", 0.001)
+    stream = RowStream(checked, "digest", 0.001)
     piece = stream.take(10.0)
     assert (stream.end, piece.final, stream.ready, stream.done, stream.reach_s) == (4_000, False, False, False, 4.0)
     if refused:
@@ -363,7 +363,7 @@ def test_a_check_that_falls_behind_twice_is_told_twice(config: MachineConfig, mi
     with (tmp_path / "c" / "rows").open("ab") as file:
         file.write(bytes(16 * 8_000))
     assert config.store.run_directory is not None
-    supply, link = supply_of(checked, mill, config.store.run_directory)
+    feeder, link = feeder_of(checked, mill, config.store.run_directory)
     mill.state = "ACTIVE"
     told = []
     for row, end in ((0, 10_000), (3_000, 10_000), (4_500, 10_000), (4_600, 10_000), (4_600, 14_000), (3_900, 14_000),
@@ -372,8 +372,8 @@ def test_a_check_that_falls_behind_twice_is_told_twice(config: MachineConfig, mi
             pass_on(checked, end)
         mill.row = row
         if not mill.rows:
-            assert link.extend(supply._armed, supply._armed.stream.take())["ok"]
-        told.append([notice.code for notice in supply.go_on() if notice.severity == "MAJOR"])
+            assert link.extend(feeder._armed, feeder._armed.stream.take())["ok"]
+        told.append([notice.code for notice in feeder.go_on() if notice.severity == "MAJOR"])
     behind = ["CheckBehind"]
     assert told == [[], [], behind, [], [], [], [], behind]
     assert len(mill.rows) == 14_000

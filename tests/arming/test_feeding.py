@@ -33,7 +33,7 @@ def save_records(config: MachineConfig, **changes: Any) -> None:
 
 
 def test_a_good_machine_is_vouched_for(config: MachineConfig) -> None:
-    """All facts but the journal's, which the armory adds; laws that the guard takes."""
+    """All facts but the journal's, which the desk adds; laws that the guard takes."""
     save_records(config)
     feeding = prepare_feeding(config, known(config))
     assert isinstance(feeding, Feeding)

@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 
 from fdhil.arming.checked_program import Piece
-from fdhil.arming.desk import ALIVE_S, Armory
+from fdhil.arming.desk import ALIVE_S, ArmingDesk
 from fdhil.arming.guard_link import TRIPPED, GuardLink
 from fdhil.arming.token import read_token
 from fdhil.config import MachineConfig
-from fdhil.daemon.outcome_store import Keeper
+from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.errors import DeviceError
 from tests.arming.guard_peer import FINE, Guard
 from tests.daemon.machine import config_of
@@ -49,8 +49,7 @@ def guard(folder: Path) -> Iterator[Guard]:
 class Long:
     """A streamed program, as far as handing on its rows asks."""
 
-    axes = ("X",)
-    program_digest = "digest"
+    stream = SimpleNamespace(axes=("X",), program_digest="digest")
 
 
 def test_a_trip_that_another_request_saw_is_told_all_the_same(guard: Guard, folder: Path) -> None:
@@ -84,15 +83,15 @@ async def test_a_slow_guard_still_hears_that_the_daemon_lives(
 ) -> None:
     """Its answers are not waited for, not even while something is armed."""
     guard.says = lambda _kind: None
-    armory = Armory(config, Keeper(config), folder)
-    attending = asyncio.create_task(armory.attend(lambda _told: None))
+    desk = ArmingDesk(config, OutcomeStore(config), folder)
+    attending = asyncio.create_task(desk.attend(lambda _told: None))
     async with asyncio.timeout(60.0):
         while guard.heard.count("alive") < 20:  # noqa: ASYNC110 - it is another thread that hears
             await asyncio.sleep(ALIVE_S)
     assert [kind for kind in guard.heard if kind != "alive"] == ["status"]
     attending.cancel()
     guard.close()
-    await asyncio.to_thread(armory.guard.close)
+    await asyncio.to_thread(desk.guard.close)
 
 
 @pytest.mark.parametrize("how", ["disarm", "abandon"])
@@ -105,22 +104,26 @@ async def test_what_is_given_up_while_it_is_planned_is_not_armed(
         planning.set()
         assert planned.wait(60.0)
 
-        return SimpleNamespace(facts={}, summary=lambda: {"method": "inverse"})
+        demand = {"X": [0], "Y": [0]}
+        begin = Piece(0, demand, demand, True)
+        return SimpleNamespace(facts={}, begin=begin, rows=1, summary=lambda: {"method": "inverse"})
 
-    monkeypatch.setattr("fdhil.arming.desk.prepare", slow)
+    monkeypatch.setattr("fdhil.arming.desk.prepare", lambda *_: SimpleNamespace(ahead=False))
+    monkeypatch.setattr("fdhil.arming.desk.plan_whole", lambda *_: None)
+    monkeypatch.setattr("fdhil.arming.desk.prepare_armament", slow)
     guard.says = lambda _kind: {**FINE, "state": "OFF"}
-    armory = Armory(config, Keeper(config), folder)
-    armory.begin({}, [])
+    desk = ArmingDesk(config, OutcomeStore(config), folder)
+    desk.begin({}, [])
     request = {"request": "arm", "program": "a.ngc", "token": read_token(folder)}
-    arming = asyncio.create_task(armory.arm(request))
+    arming = asyncio.create_task(desk.arm(request))
     assert await asyncio.to_thread(planning.wait, 60.0)
     if how == "disarm":
-        await armory.disarm()
+        await desk.disarm()
     else:
-        armory.abandon()
+        desk.abandon()
     planned.set()
     answer = await arming
     assert (answer["ok"], answer["code"]) == (False, "Abandoned")
     assert set(guard.heard) <= {"disarm", "status"}
-    assert armory.armed is None
-    armory.guard.close()
+    assert desk.armed is None
+    desk.guard.close()

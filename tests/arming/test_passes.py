@@ -11,18 +11,21 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fdhil import correction
 from fdhil.arming import passes
-from fdhil.arming.desk import Armory
+from fdhil.arming.desk import ArmingDesk
 from fdhil.arming.passes import Pass
-from fdhil.arming.preparing import Armament, prepare
+from fdhil.arming.preparing import Armament
 from fdhil.config import MachineConfig
 from fdhil.prediction import contour_error_um
 from fdhil.prediction.gain import Gain, plus_minus
-from fdhil.records import AxisSamples, Float, Skill, frozen, frozen_ints
+from fdhil.program import load_trajectory
+from fdhil.records import AxisSamples, Correction, Float, Skill, frozen, frozen_ints
 from tests.arming.mill import Mill
 from tests.arming.test_ahead import opened
-from tests.arming.test_preparing import GENTLE, known, save_records
+from tests.arming.test_preparing import GENTLE, save_records, whole
 from tests.daemon.machine import config_of
+from tests.store.made import published
 
 REST_ROWS = 300
 
@@ -55,10 +58,17 @@ def program(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def armament(config: MachineConfig, program: Path) -> Armament:
-    """The corner, planned."""
-    found = prepare(program, None, config, known(config))
+    """The corner, ready for the guard."""
+    found = whole(program, config)
     assert isinstance(found, Armament)
     return found
+
+
+@pytest.fixture
+def planned(config: MachineConfig, program: Path) -> Correction:
+    """The corner, planned."""
+    models = {axis: published().parameters for axis in "XY"}
+    return correction.plan(load_trajectory(program, config), models, config)
 
 
 def heard(demand: Mapping[str, Float], position: Mapping[str, Float]) -> Iterator[AxisSamples]:
@@ -75,12 +85,12 @@ def heard(demand: Mapping[str, Float], position: Mapping[str, Float]) -> Iterato
 
 
 def test_a_pass_is_measured_as_a_prediction_is_whatever_its_pieces(
-    config: MachineConfig, armament: Armament, monkeypatch: pytest.MonkeyPatch
+    config: MachineConfig, armament: Armament, planned: Correction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Chunks, margins and joined blocks change nothing: the figures are those of all rows at once."""
     monkeypatch.setattr(passes, "CHUNK_S", 0.2)
-    reference, after = armament.correction.before.reference, armament.correction.after
-    demand = armament.first().demand
+    reference, after = planned.before.reference, planned.after
+    demand = armament.begin.demand
     for rows in (armament.rows, None):
         running = Pass(config, demand, rows)
         samples = sorted(heard(reference.position_mm, after.predicted_mm), key=lambda block: int(block.tick[-1]))
@@ -100,25 +110,26 @@ def test_a_pass_is_measured_as_a_prediction_is_whatever_its_pieces(
             assert told["rows"] >= armament.rows
 
 
-def test_a_pass_that_never_began_measures_nothing(config: MachineConfig, armament: Armament) -> None:
-    reference = armament.correction.before.reference
-    running = Pass(config, armament.first().demand, armament.rows)
+def test_a_pass_that_never_began_measures_nothing(
+    config: MachineConfig, armament: Armament, planned: Correction
+) -> None:
+    reference = planned.before.reference
+    running = Pass(config, armament.begin.demand, armament.rows)
     away = {axis: values + 5.0 for axis, values in reference.position_mm.items()}
     for block in heard(away, away):
         running.take(block)
     assert running.measured() is None
 
 
-def measured(armory: Armory, count: int) -> bool:
+def measured(desk: ArmingDesk, count: int) -> bool:
     """Whether so many passes were measured."""
-    return len(armory.passes) == count
+    return len(desk.passes) == count
 
 
 async def test_each_pass_is_told_beside_what_was_predicted(
-    config: MachineConfig, mill: Mill, program: Path, armament: Armament, monkeypatch: pytest.MonkeyPatch
+    config: MachineConfig, mill: Mill, program: Path, planned: Correction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(passes, "LATE_S", 0.0)
-    planned = armament.correction
     reference = planned.before.reference.position_mm
     worse = {axis: 3 * planned.before.predicted_mm[axis] - 2 * reference[axis] for axis in reference}
     cases = [
@@ -134,14 +145,14 @@ async def test_each_pass_is_told_beside_what_was_predicted(
             assert " ± " in answer["text"]
             assert answer["after"]["uncertainty_um"] > 0.5  # no better than the last moves were predicted
             for block in heard(reference, is_at):
-                shop.armory.hear(block)
+                shop.desk.hear(block)
             mill.state, mill.cause = "OFF", cause
-            await shop.until(partial(measured, shop.armory, number))
-            told = shop.armory.passes[-1]
+            await shop.until(partial(measured, shop.desk, number))
+            told = shop.desk.passes[-1]
             notice = next(notice for notice in reversed(shop.told) if notice.code == "PassMeasured")
             assert (notice.severity, notice.text.startswith(told["text"])) == (severity, True)
             assert (told["pass"], told["ended_by"]) == (number, cause)
-    first, second, third = shop.armory.passes
+    first, second, third = shop.desk.passes
     assert first["measured"]["rms_um"] == pytest.approx(first["predicted"]["rms_um"], rel=1e-3)
     assert second["measured"]["rms_um"] == pytest.approx(second["predicted_without"]["rms_um"], rel=1e-3)
     assert "pass 1 of gentle.ngc: contour error measured" in first["text"]
@@ -152,7 +163,7 @@ async def test_each_pass_is_told_beside_what_was_predicted(
 
 def test_a_gain_is_bounded_by_the_parameters_spread_and_by_the_skill(config: MachineConfig, program: Path) -> None:
     def predicted(**changes: Any) -> Gain:
-        found = prepare(program, None, config, known(config, **changes))
+        found = whole(program, config, **changes)
         assert isinstance(found, Armament)
         return found.predicted
 

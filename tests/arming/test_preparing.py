@@ -9,12 +9,23 @@ from typing import Any
 
 import pytest
 
-from fdhil.arming.desk import Armory
-from fdhil.arming.preparing import MODEL_AGE_S, Armament, AxisKnowledge, Refused, prepare, standing_facts
+from fdhil.arming.desk import ArmingDesk
+from fdhil.arming.knowledge import AxisKnowledge
+from fdhil.arming.preparing import (
+    MODEL_AGE_S,
+    Armament,
+    ArmRequest,
+    Refused,
+    prepare,
+    prepare_armament,
+    standing_facts,
+)
 from fdhil.arming.token import read_token
+from fdhil.arming.whole_plan import plan_whole
 from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
 from fdhil.config import MachineConfig
-from fdhil.daemon.outcome_store import Keeper
+from fdhil.daemon.outcome_store import OutcomeStore
+from fdhil.program import program_digest
 from fdhil.records import Notice, Skill
 from fdhil.store.history import Revision, Stamp
 from tests.daemon.machine import config_of
@@ -73,15 +84,27 @@ def save_records(config: MachineConfig, **changes: Any) -> None:
     save_record(other, config.store.directory)
 
 
+def whole(program: Path, config: MachineConfig, method: str | None = None, **changes: Any) -> Armament | Refused:
+    """Make a program ready that is planned at once, where it may be."""
+    request = prepare(program, method, config, known(config, **changes))
+    assert isinstance(request, ArmRequest)
+    assert not request.ahead
+    checked = plan_whole(request, config, known(config, **changes))
+    if isinstance(checked, Refused):
+        return checked
+    return prepare_armament(request, checked, config, known(config, **changes))
+
+
 def test_a_good_machine_is_vouched_for(config: MachineConfig, program: Path) -> None:
     save_records(config)
-    armament = prepare(program, None, config, known(config))
+    armament = whole(program, config)
     assert isinstance(armament, Armament)
     assert all(armament.facts.values()), armament.facts
     told = armament.summary()
     assert told["after"]["rms_um"] < 0.2 * told["before"]["rms_um"]
-    assert told["program_digest"] == armament.table.program_digest
-    assert told["rows"] == armament.table.offset_increments["X"].size
+    assert told["program_digest"] == program_digest(program)
+    assert told["rows"] == len(armament.begin.offset["X"])
+    assert armament.begin.final
 
 
 @pytest.mark.parametrize(
@@ -126,7 +149,7 @@ def test_a_drive_that_is_not_commissioned_is_not_vouched_for(
     program.write_text(GENTLE.replace("F4000", "F9000"))  # an offset larger than what may stay in a drive
     if changes is not None:
         save_records(config, **changes)
-    armament = prepare(program, None, config, known(config))
+    armament = whole(program, config)
     assert isinstance(armament, Armament)
     assert [name for name, holds in armament.facts.items() if not holds] == withheld
 
@@ -137,36 +160,57 @@ def test_without_parameters_or_limits_nothing_is_planned(config: MachineConfig, 
     assert refused.reasons[0].code == "ModelNotValidated"
     listening = {axis: settings.model_copy(update={"correction": None}) for axis, settings in config.axis.items()}
     shadow = config.model_copy(update={"axis": listening})
-    refused = prepare(program, None, shadow, known(shadow))
+    off = whole(program, shadow)
+    assert isinstance(off, Refused)
+    assert off.reasons[0].code == "WritingOff"
+
+
+def test_another_method_takes_the_same_road_however_long_the_program_is(config: MachineConfig, tmp_path: Path) -> None:
+    program = tmp_path / "long.ngc"
+    program.write_text(GENTLE.replace("G4 P0.2", "G4 P12"))
+    save_records(config)
+    armament = whole(program, config, "mirror")
+    assert isinstance(armament, Armament)
+    assert (armament.summary()["method"], armament.summary()["streamed"], armament.begin.final) == (
+        "mirror",
+        True,
+        False,
+    )
+    pieces = [armament.begin]
+    while armament.stream.ready:
+        pieces.append(armament.stream.take())
+    assert sum(len(piece.offset["X"]) for piece in pieces) == armament.rows
+    assert [piece.final for piece in pieces] == [False] * (len(pieces) - 1) + [True]
+    refused = whole(program, config, "flatness")
     assert isinstance(refused, Refused)
-    assert refused.reasons[0].code == "WritingOff"
+    assert refused.reasons[0].text == "the method flatness plans no position offset"
 
 
 async def test_the_operators_token_decides_and_a_missing_guard_is_told(config: MachineConfig, program: Path) -> None:
-    keeper = Keeper(config)
+    store = OutcomeStore(config)
     assert config.store.run_directory is not None
     config.store.run_directory.mkdir(parents=True)
-    armory = Armory(config, keeper, config.store.run_directory)
+    desk = ArmingDesk(config, store, config.store.run_directory)
     stamp = Stamp(0.0, "another boot", 0)
     newest = replace(published(), config_digest=config.digest)
     skills = [Skill(axis, 1, 0.5, 1.0, 0.0, 30.0) for axis in ("X", "Y")]
-    armory.begin({axis: Revision(1, replace(newest, axis=axis), (), stamp) for axis in ("X", "Y")}, skills)
+    desk.begin({axis: Revision(1, replace(newest, axis=axis), (), stamp) for axis in ("X", "Y")}, skills)
     request = {"request": "arm", "program": str(program)}
     for token in (None, "", 5, "wrong", "ä"):
-        answer = await armory.arm(request | {"token": token})
+        answer = await desk.arm(request | {"token": token})
         assert (answer["ok"], answer["code"]) == (False, "AuthRequired")
     token = read_token(config.store.run_directory)
-    assert (await armory.arm(request | {"token": token}))["code"] == "GuardAbsent"
-    assert (await armory.arm(request | {"token": token, "method": "magic"}))["code"] == "BadRequest"
-    assert (await armory.arm({"request": "arm", "token": token}))["code"] == "BadRequest"
-    assert (await armory.disarm())["code"] == "GuardAbsent"
-    assert not (await armory.stand_down()).heard
+    assert (await desk.arm(request | {"token": token}))["code"] == "GuardAbsent"
+    assert (await desk.arm(request | {"token": token, "method": "magic"}))["code"] == "BadRequest"
+    assert (await desk.arm({"request": "arm", "token": token}))["code"] == "BadRequest"
+    assert (await desk.disarm())["code"] == "GuardAbsent"
+    assert not (await desk.stand_down()).heard
 
 
 def test_a_changed_load_is_remembered_until_new_parameters_come(config: MachineConfig, tmp_path: Path) -> None:
-    armory = Armory(config, Keeper(config), tmp_path)
-    armory.note([replace(published(), config_digest=config.digest)])
-    armory.note([Notice("LoadChanged", "MAJOR", "Jt rose", "X")])
-    assert armory._known()["X"].load_changed
-    armory.note([replace(published(2), config_digest=config.digest)])
-    assert not armory._known()["X"].load_changed
+    desk = ArmingDesk(config, OutcomeStore(config), tmp_path)
+    desk.knowledge.note([replace(published(), config_digest=config.digest)])
+    desk.knowledge.note([Notice("LoadChanged", "MAJOR", "Jt rose", "X")])
+    assert desk.knowledge.now()["X"].load_changed
+    desk.knowledge.note([replace(published(2), config_digest=config.digest)])
+    assert not desk.knowledge.now()["X"].load_changed

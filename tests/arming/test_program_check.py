@@ -19,10 +19,11 @@ import pytest
 
 import fdhil
 from fdhil import correction
-from fdhil.arming.background_check import FOLDER, Check
-from fdhil.arming.checked_program import Checked, Piece, Stream
-from fdhil.arming.preparing import Long, StreamedArmament, prepare, prepare_stream
-from fdhil.arming.program_check import KEPT, SCHEMA, check, code_digest, keep
+from fdhil.arming.background_check import FOLDER, BackgroundCheck
+from fdhil.arming.checked_program import CheckedProgram, Piece, RowStream
+from fdhil.arming.code_digest import code_digest
+from fdhil.arming.preparing import ArmRequest, prepare, prepare_armament
+from fdhil.arming.program_check import KEPT, SCHEMA, check, encoded, keep
 from fdhil.config import MachineConfig
 from fdhil.errors import ProgramError, StoreError
 from fdhil.prediction.models import nominal_models
@@ -62,10 +63,8 @@ def test_the_rows_are_those_of_the_whole_plan(config: MachineConfig, tmp_path: P
     program = written(tmp_path, LONG)
     header, body, told = checked(program, config)
     planned = correction.plan(load_trajectory(program, config), nominal_models(config), config, "inverse")
-    table = correction.table(planned, config, "digest")
+    assert body == encoded(planned.before.reference.position_mm, planned.offset_um, config)
     rows = np.frombuffer(body, "<i4").reshape(-1, 4)
-    for column, values in enumerate((*table.demand_increments.values(), *table.offset_increments.values())):
-        assert np.array_equal(rows[:, column], values)
     assert header["refused"] == []
     assert header["rows"] == len(rows)
     assert header["before"]["rms_um"] == pytest.approx(np.sqrt(np.mean(planned.before.contour_um**2)))
@@ -132,15 +131,15 @@ def test_a_checked_program_is_armed_with_its_first_rows_and_goes_on(config: Mach
     program = written(tmp_path, LONG)
     save_records(config)
     found = prepare(program, None, config, known(config))
-    assert isinstance(found, Long)
+    assert isinstance(found, ArmRequest)
+    assert found.ahead
     first, again = asyncio.run(_twice(config, found))
-    assert isinstance(first, Checked)
-    assert isinstance(again, Checked)
-    armament = prepare_stream(found, first, config, known(config))
-    assert isinstance(armament, StreamedArmament)
+    assert isinstance(first, CheckedProgram)
+    assert isinstance(again, CheckedProgram)
+    armament = prepare_armament(found, first, config, known(config))
     assert all(armament.facts.values()), armament.facts
-    assert armament.program_digest == program_digest(program)
-    stream, pieces = armament.stream, [armament.first()]
+    assert armament.stream.program_digest == program_digest(program)
+    stream, pieces = armament.stream, [armament.begin]
     assert len(pieces[0].demand["X"]) == 10_000
     assert first.whole
     assert stream.lacks({"rows": [0, 10_000], "row": 1})
@@ -155,14 +154,14 @@ def test_a_checked_program_is_armed_with_its_first_rows_and_goes_on(config: Mach
     assert not stream.lacks({"rows": [0, 10_000], "row": 9_999})
 
 
-def whole(_checked: Checked) -> bool:
+def whole(_checked: CheckedProgram) -> bool:
     """Nothing but the whole is enough."""
     return False
 
 
-async def _twice(config: MachineConfig, found: Long) -> list[Checked | tuple[Reason, ...]]:
+async def _twice(config: MachineConfig, found: ArmRequest) -> list[CheckedProgram | tuple[Reason, ...]]:
     """Check in a process; the second time nothing is started."""
-    check, heard = Check(config), list[Mapping[str, Any]]()
+    check, heard = BackgroundCheck(config), list[Mapping[str, Any]]()
 
     async def listen() -> None:
         while True:
@@ -182,7 +181,7 @@ async def _twice(config: MachineConfig, found: Long) -> list[Checked | tuple[Rea
 
 async def test_an_abandoned_check_says_so_and_leaves_nothing(config: MachineConfig, tmp_path: Path) -> None:
     program = written(tmp_path, HEAD + SQUARE * 2000 + "M2\n")
-    check = Check(config)
+    check = BackgroundCheck(config)
     running = asyncio.create_task(check.run(program, program_digest(program), nominal_models(config), whole))
     async with asyncio.timeout(500):
         while not (check.progress or {}).get("checked_s"):  # noqa: ASYNC110 - what another process says has no event
@@ -206,23 +205,23 @@ async def test_a_subroutine_beside_the_program_belongs_to_it(config: MachineConf
     beside.write_text(BESIDE)
     program = written(tmp_path, CALLS)
     digest, models = program_digest(program), nominal_models(config)
-    folder, key = config.store.directory / FOLDER, Check(config)._key(digest, models)
+    folder, key = config.store.directory / FOLDER, BackgroundCheck(config)._key(digest, models)
     header = keep(folder, key, lambda body: check(program, digest, models, config, body, lambda _told: None))
     assert header["files"] == {"square.ngc": program_digest(beside)}
-    first = await Check(config).run(program, digest, models, whole)
-    assert isinstance(first, Checked)
+    first = await BackgroundCheck(config).run(program, digest, models, whole)
+    assert isinstance(first, CheckedProgram)
     assert [list(block[:2]) for block in first.blocks] == header["blocks"]  # it is known
     (file,) = folder.glob("*.rows")
-    assert Checked.find(file.parent, file.stem, tmp_path) is not None
+    assert CheckedProgram.find(file.parent, file.stem, tmp_path) is not None
     beside.write_text(BESIDE.replace("X40", "X41"))
-    assert Checked.find(file.parent, file.stem, tmp_path) is None
-    again = await Check(config).run(program, digest, models, whole)
-    assert isinstance(again, Checked)
+    assert CheckedProgram.find(file.parent, file.stem, tmp_path) is None
+    again = await BackgroundCheck(config).run(program, digest, models, whole)
+    assert isinstance(again, CheckedProgram)
     assert again.blocks != first.blocks
     assert again.header is not None
     assert again.header["files"] == {"square.ngc": program_digest(beside)}
     beside.unlink()
-    assert Checked.find(file.parent, file.stem, tmp_path) is None
+    assert CheckedProgram.find(file.parent, file.stem, tmp_path) is None
 
 
 @pytest.mark.parametrize("which", ["program.ngc", "square.ngc"])
@@ -244,7 +243,7 @@ async def test_a_process_that_dies_within_a_line_is_told(
 ) -> None:
     program = written(tmp_path, LONG)
     says_instead(monkeypatch, tmp_path, 'read line\nprintf \'{"header": {"ref\'\nexit 9\n')
-    refused = await Check(config).run(program, program_digest(program), nominal_models(config), whole)
+    refused = await BackgroundCheck(config).run(program, program_digest(program), nominal_models(config), whole)
     assert isinstance(refused, tuple)
     assert (refused[0].code, "exit code 9" in refused[0].text) == ("InternalError", True)
 
@@ -252,7 +251,7 @@ async def test_a_process_that_dies_within_a_line_is_told(
 async def test_a_process_that_cannot_be_started_is_told(
     config: MachineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    program, check = written(tmp_path, LONG), Check(config)
+    program, check = written(tmp_path, LONG), BackgroundCheck(config)
     monkeypatch.setattr(sys, "executable", str(tmp_path / "absent"))
     refused = await check.run(program, program_digest(program), nominal_models(config), whole)
     assert isinstance(refused, tuple)
@@ -269,7 +268,7 @@ async def test_a_broken_program_is_refused_with_its_line_by_a_process_that_ends(
     assert json.loads(answer.splitlines()[-1])["error"]["code"] == "ProgramError"
     (tmp_path / "answer").write_bytes(answer)
     says_instead(monkeypatch, tmp_path, f"read line\nexec cat '{tmp_path / 'answer'}'\n")
-    refused = await Check(config).run(program, program_digest(program), nominal_models(config), whole)
+    refused = await BackgroundCheck(config).run(program, program_digest(program), nominal_models(config), whole)
     assert isinstance(refused, tuple)
     assert refused[0].code == "ProgramError"
     assert "43" in refused[0].text
@@ -301,15 +300,15 @@ def made(folder: Path, key: str) -> Path:
 
 def test_what_was_checked_is_only_believed_whole(tmp_path: Path) -> None:
     file = made(tmp_path, "a")
-    found = Checked.find(tmp_path, "a", tmp_path)
+    found = CheckedProgram.find(tmp_path, "a", tmp_path)
     assert found is not None
     assert (found.whole, found.rows, found.gain_um) == (True, 8, 1.5)
-    assert Checked.find(tmp_path, "b", tmp_path) is None
-    stream = Stream(found, "digest", 0.001)
+    assert CheckedProgram.find(tmp_path, "b", tmp_path) is None
+    stream = RowStream(found, "digest", 0.001)
     content = bytearray(file.read_bytes())
     content[70] ^= 1
     file.write_bytes(content)
-    assert Checked.find(tmp_path, "a", tmp_path) is None
+    assert CheckedProgram.find(tmp_path, "a", tmp_path) is None
     assert stream.take() == Piece(
         0, {"X": [0, 4, 8, 12], "Y": [1, 5, 9, 13]}, {"X": [2, 6, 10, 14], "Y": [3, 7, 11, 15]}, False
     )
@@ -317,19 +316,19 @@ def test_what_was_checked_is_only_believed_whole(tmp_path: Path) -> None:
         stream.take()
     file.write_bytes(content[:40])
     with pytest.raises(StoreError, match="damaged"):
-        Stream(found, "digest", 0.001).take()
-    assert Checked.find(tmp_path, "a", tmp_path) is None
+        RowStream(found, "digest", 0.001).take()
+    assert CheckedProgram.find(tmp_path, "a", tmp_path) is None
     file.unlink()
-    assert Checked.find(tmp_path, "a", tmp_path) is None
+    assert CheckedProgram.find(tmp_path, "a", tmp_path) is None
 
 
 def test_what_is_armed_outlives_its_file(tmp_path: Path) -> None:
     """Another program may take its place in the store while it runs."""
     file = made(tmp_path, "a")
-    found = Checked.find(tmp_path, "a", tmp_path)
+    found = CheckedProgram.find(tmp_path, "a", tmp_path)
     assert found is not None
     file.unlink()
-    assert Stream(found, "digest", 0.001).take(1.0).final
+    assert RowStream(found, "digest", 0.001).take(1.0).final
 
 
 def test_what_other_code_made_is_checked_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -338,12 +337,12 @@ def test_what_other_code_made_is_checked_again(tmp_path: Path, monkeypatch: pyte
     home = tmp_path / "fdhil"
     shutil.copytree(Path(fdhil.__file__).parent, home, ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(fdhil, "__file__", str(home / "__init__.py"))
-    assert Checked.find(tmp_path, "a", tmp_path) is not None
+    assert CheckedProgram.find(tmp_path, "a", tmp_path) is not None
     (home / "guard" / "core.py").write_text("")  # makes no row
-    assert Checked.find(tmp_path, "a", tmp_path) is not None
+    assert CheckedProgram.find(tmp_path, "a", tmp_path) is not None
     with (home / "program" / "planner" / "smoothing.py").open("a") as file:
         file.write("# otherwise\n")
-    assert Checked.find(tmp_path, "a", tmp_path) is None
+    assert CheckedProgram.find(tmp_path, "a", tmp_path) is None
 
 
 def test_a_refused_program_is_not_kept_and_old_ones_go(tmp_path: Path) -> None:

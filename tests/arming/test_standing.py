@@ -12,12 +12,12 @@ from typing import Any
 import pytest
 
 from fdhil.arming import standing
-from fdhil.arming.desk import Armory
+from fdhil.arming.desk import ArmingDesk
 from fdhil.arming.guard_link import GuardLink
 from fdhil.arming.token import ensure_token, read_token
 from fdhil.config import MachineConfig
 from fdhil.daemon.control import ask
-from fdhil.daemon.outcome_store import Keeper
+from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.errors import ConnectError, DeviceError
 from tests.arming.guard_peer import Guard
 from tests.daemon.machine import Machine, config_of
@@ -146,19 +146,19 @@ async def test_disarm_is_ok_at_zero_only(config: MachineConfig, guard: Guard, fo
     """The ramp is waited for; FROZEN, and an offset that nobody knows, are no zero."""
     ramp = iter([{**ACTIVE, "state": "RAMP_DOWN"}] * 3)
     guard.says = lambda kind: OFF if kind == "disarm" else next(ramp, OFF)
-    armory = Armory(config, Keeper(config), folder)
-    assert await armory.disarm() == {
+    desk = ArmingDesk(config, OutcomeStore(config), folder)
+    assert await desk.disarm() == {
         "ok": True,
         "text": "guard: OFF, offset 0",
         "state": "OFF",
         "may_stand_um": {"X": 0.0, "Y": 0.0},
     }
     guard.says = lambda _kind: FROZEN
-    answer = await armory.disarm()
+    answer = await desk.disarm()
     assert (answer["ok"], answer["code"], answer["state"]) == (False, "OffsetStands", "FROZEN")
     assert answer["text"] == f"the guard is FROZEN (the CAN controller is bus-off): {STANDS}"
     assert "run fdhil adopt" in answer["advice"]
-    armory.guard.close()
+    desk.guard.close()
 
 
 async def test_disarm_that_never_reaches_zero_is_no(
@@ -166,12 +166,12 @@ async def test_disarm_that_never_reaches_zero_is_no(
 ) -> None:
     monkeypatch.setattr(standing, "LANDING_S", 0.05)
     guard.says = lambda _kind: {**ACTIVE, "state": "RAMP_DOWN"}
-    armory = Armory(config, Keeper(config), folder)
-    answer = await armory.disarm()
+    desk = ArmingDesk(config, OutcomeStore(config), folder)
+    answer = await desk.disarm()
     assert (answer["ok"], answer["state"]) == (False, "RAMP_DOWN")
     assert "-38 um on axis X" in answer["text"]
     guard.close()
-    answer = await armory.disarm()
+    answer = await desk.disarm()
     assert (answer["ok"], answer["code"]) == (False, "OffsetStands")
     assert "-38 um on axis X" in answer["text"]
     assert "start fdhil-guard" in answer["advice"]
@@ -181,14 +181,14 @@ async def test_arming_a_frozen_guard_says_adopt_and_not_disarm(
     config: MachineConfig, guard: Guard, folder: Path, tmp_path: Path
 ) -> None:
     guard.says = lambda _kind: FROZEN
-    armory = Armory(config, Keeper(config), folder)
-    armory.begin({}, [])
+    desk = ArmingDesk(config, OutcomeStore(config), folder)
+    desk.begin({}, [])
     request = {"request": "arm", "program": str(tmp_path / "a.ngc"), "token": read_token(folder)}
-    answer = await armory.arm(request)
+    answer = await desk.arm(request)
     assert (answer["ok"], answer["code"]) == (False, "OffsetStands")
     assert STANDS in answer["text"]
     assert answer["advice"] == "hold the feed, then run fdhil adopt, then arm again"
-    armory.guard.close()
+    desk.guard.close()
 
 
 def running(machine: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any, meanwhile: Any) -> tuple[int, str]:

@@ -19,14 +19,12 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.cli.bus_lock import lock_bus
-from fdhil.cli.guard import guard, heartbeat_timeout_s, limits_of, open_bus, settings_of
+from fdhil.cli.guard import guard
 from fdhil.cli.main import cli, run_safely
-from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
-from fdhil.commissioning.void import void_record
-from fdhil.config import CanBus, CorrectionLimits
-from fdhil.errors import ConnectError, ProtocolError
+from fdhil.commissioning.record import axis_digest, save_record
 from fdhil.guard.limits import OffsetLimits
-from fdhil.guard.settings import from_json, load, to_json
+from fdhil.guard.settings import load
+from tests.arming.test_guard_settings import RECORD
 from tests.guard.machine import DEMAND_AT_REST
 from tests.guard.peer import Peer, write_config
 
@@ -70,63 +68,6 @@ def test_check_writes_the_settings_and_a_token(
     assert settings.axes[0].window == 32768
 
 
-def test_limits_are_whole_increments_rounded_down(tmp_path: Path) -> None:
-    config = machine_config.load(write_config(tmp_path, 1))
-    axis = config.axis["X"].model_copy(update={"correction": CorrectionLimits()})
-    assert limits_of(axis, 0.002) == OffsetLimits(163, 13, 3, 9830, 500)
-    slow = config.axis["X"].model_copy(update={"rapid_speed_mm_s": 100.0, "max_acceleration_mm_s2": 1000.0})
-    # 10 mm/s and 500 mm/s2 are the axis' shares; braked at one increment per SYNC^2, zero is near enough from less
-    assert limits_of(slow, 0.001) == OffsetLimits(819, 20, 1, 9830, 1000)
-
-
-RECORD = CommissioningRecord(
-    "X", 1, 2, 3, 4, "c0ffee", "f1f2", {"1017": 100}, 1e4, True, 9.8, True, "proven", "2026-01-01T00:00:00+00:00"
-)
-
-
-def test_the_drives_heartbeat_is_watched_as_it_was_commissioned(tmp_path: Path) -> None:
-    counted = machine_config.load(write_config(tmp_path, 1))
-    assert counted.guard.clock == "sync"
-    config = counted.model_copy(update={"guard": counted.guard.model_copy(update={"clock": "monotonic"})})
-    assert heartbeat_timeout_s(config, "X") == 0
-    path = save_record(RECORD, config.store.directory)
-    assert heartbeat_timeout_s(config, "X") == 0.2
-    assert [axis.heartbeat_timeout_s for axis in settings_of(config, "can0", tmp_path, "").axes] == [0.2, 0]
-    assert heartbeat_timeout_s(counted, "X") == 0  # heartbeats come by the wall clock
-    save_record(replace(RECORD, options={"6007": 1}), config.store.directory)
-    assert heartbeat_timeout_s(config, "X") == 0  # the drive has none
-    path.write_text("changed by hand")
-    assert heartbeat_timeout_s(config, "X") == 0  # and nothing is armed with such a record
-
-
-def test_the_software_limits_are_those_of_the_commissioning(tmp_path: Path) -> None:
-    config = machine_config.load(write_config(tmp_path, 1))
-    assert [axis.travel for axis in settings_of(config, "can0", tmp_path, "").axes] == [None, None]
-    save_record(replace(RECORD, options={"607D01": -1000, "607D02": 820_000}), config.store.directory)
-    made = settings_of(config, "can0", tmp_path, "")
-    assert [axis.travel for axis in made.axes] == [(-1000, 820_000), None]
-    assert from_json(to_json(made)) == made
-
-
-def test_the_guard_knows_the_record_and_whether_it_holds(tmp_path: Path) -> None:
-    config = machine_config.load(write_config(tmp_path, 1))
-    store, signed = config.store.directory, replace(RECORD, config_digest=axis_digest(config, "X"))
-
-    def known() -> list[tuple[str, bool]]:
-        return [(axis.record, axis.record_void) for axis in settings_of(config, "can0", tmp_path, "").axes]
-
-    save_record(RECORD, store)
-    assert known() == [("", False), ("", False)]  # it was made with another configuration
-    save_record(replace(signed, readback_ok=False), store)
-    assert known() == [("", False), ("", False)]
-    save_record(signed, store)
-    assert known() == [(signed.fingerprint, False), ("", False)]
-    void_record(store, "X", "booted")
-    assert known() == [(signed.fingerprint, True), ("", False)]
-    made = settings_of(config, "can0", tmp_path, "")
-    assert from_json(to_json(made)) == made
-
-
 def test_without_a_correction_section_writing_is_off(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -145,32 +86,6 @@ def test_no_hub_is_one_sentence(
     told = capsys.readouterr().err
     assert "start the hub first" in told
     assert len(told.splitlines()) == 1
-
-
-def test_buses_that_cannot_be_opened() -> None:
-    with pytest.raises(ConnectError, match="inside one process"):
-        open_bus("can0", CanBus(interface="virtual"))
-    with pytest.raises(ConnectError, match="cannot be opened"):
-        open_bus("can0", CanBus(interface="socketcan", channel="none9"))
-
-
-@pytest.mark.parametrize(
-    ("greeting", "error"), [(b"< hello >", ProtocolError), (b"", ConnectError), (b"x" * 300, ConnectError)]
-)
-def test_a_peer_that_is_no_hub(greeting: bytes, error: type[Exception]) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        import threading
-
-        def greet() -> None:
-            client, _ = server.accept()
-            with client:
-                client.sendall(greeting)
-
-        thread = threading.Thread(target=greet)
-        thread.start()
-        with pytest.raises(error):
-            open_bus("can0", CanBus(port=server.getsockname()[1]))
-        thread.join()
 
 
 def test_no_drive_is_commissioned_while_a_guard_owns_the_bus(

@@ -14,7 +14,7 @@ from click.testing import CliRunner, Result
 from fdhil.cli.main import cli
 from fdhil.cli.records import read_windows
 from fdhil.daemon.kernel_warmup import nominal_rapid
-from fdhil.daemon.outcome_store import Keeper
+from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.records import frozen
 from fdhil.store.recording_csv import read_recording
 from fdhil.store.windows import encode_window
@@ -29,10 +29,10 @@ def machine(tmp_path: Path) -> Path:
     """A machine's config with a history of three revisions."""
     path = tmp_path / "machine.toml"
     path.write_text(BENCH)
-    keeper = Keeper(config_of(tmp_path, ("X", "Y")))
-    keeper.open()
-    keeper.keep([outcome(), published(1), outcome(accepted=False), outcome(), published(2), published(1, "Y")])
-    keeper.close()
+    store = OutcomeStore(config_of(tmp_path, ("X", "Y")))
+    store.open()
+    store.keep([outcome(), published(1), outcome(accepted=False), outcome(), published(2), published(1, "Y")])
+    store.close()
     return path
 
 
@@ -156,14 +156,14 @@ def test_history_as_a_table_and_a_plot(machine: Path, tmp_path: Path, capsys: An
 def test_history_says_how_the_parameters_follow_the_temperature(tmp_path: Path, capsys: Any) -> None:
     path = tmp_path / "machine.toml"
     path.write_text(BENCH)
-    keeper = Keeper(config_of(tmp_path, ("X", "Y")))
-    keeper.open()
+    store = OutcomeStore(config_of(tmp_path, ("X", "Y")))
+    store.open()
     for k in range(6):
         warm = outcome(of=window(temperature_c=20.0 + k))
         assert warm.estimate is not None
         values = warm.estimate.values * np.where(np.array(warm.estimate.names) == "ft", 1 - 0.1 * k, 1.0)
-        keeper.keep([replace(warm, estimate=replace(warm.estimate, values=frozen(values))), published(k + 1)])
-    keeper.close()
+        store.keep([replace(warm, estimate=replace(warm.estimate, values=frozen(values))), published(k + 1)])
+    store.close()
     _, out, _ = fdhil("history", path, "--json", capsys=capsys)
     told = json.loads(out)["slopes"]["X"]
     assert told["ft"]["per_kelvin"] == pytest.approx(-0.005)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fdhil import config as configuration
-from fdhil.cli.guard import limits_of
+from fdhil.arming.guard_settings import limits_of
 from fdhil.correction import PlanLimits, check, mirror, plan
 from fdhil.correction.inverse import BLOCK_S
 from fdhil.correction.linear import delay_s, inverse

@@ -1,4 +1,4 @@
-"""Corrections of the bench path: what each method leaves, what the gate refuses, and the guard's table."""
+"""Corrections of the bench path: what each method leaves and what the gate refuses."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fdhil import config as configuration
-from fdhil.correction import PlanLimits, check, plan, table
+from fdhil.correction import PlanLimits, check, plan
 from fdhil.model import closed_loop
 from fdhil.prediction import contour_error_um, predict
 from fdhil.prediction.models import nominal_models
@@ -96,25 +96,3 @@ def test_nothing_to_correct_is_no_gain() -> None:
     """A path at rest needs no offsets."""
     correction = plan(trajectory(np.zeros((200, 2))), MODELS, CONFIG, "mirror")
     assert [reason.code for reason in correction.refused] == ["NoGain"]
-
-
-def test_the_table_is_in_the_drives_increments_and_sign() -> None:
-    """Demand and offset are rounded, and turned where the drive counts against the axis."""
-    document = bench_document()
-    document["axis"]["Y"]["drive"] = {"sign": -1}
-    config = configuration.parse(document)
-    correction = plan(bench_trajectory(10), MODELS, config, "mirror")
-    result = table(correction, config, "abc")
-    per_mm = 65536 / 20
-    reference = correction.before.reference
-    assert np.array_equal(result.demand_increments["X"], np.rint(reference.position_mm["X"] * per_mm))
-    assert np.array_equal(result.offset_increments["Y"], np.rint(-correction.offset_um["Y"] * 1e-3 * per_mm))
-    assert result.program_digest == "abc"
-    assert table(correction, config, "abd").digest != result.digest
-
-
-def test_a_refused_correction_has_no_table() -> None:
-    """What was refused cannot be sent."""
-    correction = plan(trajectory(np.zeros((200, 2))), MODELS, CONFIG, "mirror")
-    with pytest.raises(ValueError, match="NoGain"):
-        table(correction, CONFIG, "abc")

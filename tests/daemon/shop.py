@@ -17,7 +17,7 @@ from fdhil.cli.main import cli, run_safely
 from fdhil.commissioning.steps import commission, save_record
 from fdhil.config import MachineConfig
 from fdhil.daemon.control import ask
-from fdhil.drivers.can import sdo as canopen_sdo
+from fdhil.drivers.can import sdo
 from fdhil.errors import ConnectError
 from tests.bench import axis_toml
 
@@ -42,7 +42,7 @@ def patient() -> Iterator[None]:
     """Wait long for a drive's answer by SDO."""
     with pytest.MonkeyPatch.context() as patch:
         for name in ("RESPONSE_TIMEOUT_S", "DEADLINE_S"):
-            patch.setattr(canopen_sdo, name, 20.0)
+            patch.setattr(sdo, name, 20.0)
         yield
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdhil.daemon.outcome_store import Keeper, raw_scales
+from fdhil.daemon.outcome_store import OutcomeStore, raw_scales
 from fdhil.records import Notice, Outcome
 from fdhil.store.history import FILE_NAME, History
 from fdhil.store.windows import encode_window, list_windows
@@ -19,18 +19,18 @@ from tests.daemon.machine import config_of
 from tests.store.made import outcome, published, window
 
 
-def opened(folder: Path) -> tuple[Keeper, list[Notice]]:
-    """Return an open keeper of a store in ``folder``, and what it said."""
-    keeper = Keeper(config_of(folder))
-    return keeper, keeper.open()
+def opened(folder: Path) -> tuple[OutcomeStore, list[Notice]]:
+    """Return an open store of a store in ``folder``, and what it said."""
+    store = OutcomeStore(config_of(folder))
+    return store, store.open()
 
 
 def test_outcomes_are_kept_in_their_order_and_known_again(tmp_path: Path) -> None:
-    keeper, said = opened(tmp_path)
+    store, said = opened(tmp_path)
     told: list[Outcome] = [outcome(), outcome(accepted=False), outcome(), published(1), Notice("A", "info", "b", "X")]
     assert said == []
-    assert keeper.keep(told) == []
-    keeper.close()
+    assert store.keep(told) == []
+    store.close()
     again, _ = opened(tmp_path)
     known = again.known("X")
     assert again.counts("X") == (2, 1)
@@ -55,22 +55,22 @@ def test_a_drives_window_is_kept_as_integers(tmp_path: Path) -> None:
 def test_a_disk_that_refuses_is_told_once_and_recovers(
     number: int, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    keeper, _ = opened(tmp_path)
+    store, _ = opened(tmp_path)
 
     def refuse(*_: Any, **__: Any) -> int:
         raise OSError(number, os.strerror(number))
 
     with monkeypatch.context() as patch:
         patch.setattr("fdhil.store.atomic.os.write", refuse)
-        said = keeper.keep([outcome()])
+        said = store.keep([outcome()])
         assert [notice.code for notice in said] == [code]
         assert "goes on in shadow" in said[0].text
-        assert keeper.fault == code
-        assert keeper.keep([outcome()]) == []
-    assert [notice.code for notice in keeper.keep([outcome()])] == ["StoreRecovered"]
-    assert keeper.fault != code
+        assert store.fault == code
+        assert store.keep([outcome()]) == []
+    assert [notice.code for notice in store.keep([outcome()])] == ["StoreRecovered"]
+    assert store.fault != code
     assert len(list_windows(tmp_path / "fdhil-data" / "windows").windows) == 1
-    keeper.close()
+    store.close()
 
 
 def test_a_damaged_history_is_put_aside_and_a_new_one_begun(tmp_path: Path) -> None:
@@ -78,11 +78,11 @@ def test_a_damaged_history_is_put_aside_and_a_new_one_begun(tmp_path: Path) -> N
     directory.mkdir()
     for k in (1, 2):
         (directory / FILE_NAME).write_bytes(b"garbage" * 1000)
-        keeper, said = opened(tmp_path)
+        store, said = opened(tmp_path)
         assert [notice.code for notice in said] == ["CorruptFile"]
-        assert keeper.fault is None
-        assert keeper.keep([published(k)]) == []
-        keeper.close()
+        assert store.fault is None
+        assert store.keep([published(k)]) == []
+        store.close()
         assert (directory / f"{FILE_NAME}.corrupt-{k}").read_bytes().startswith(b"garbage")
 
 
@@ -92,26 +92,26 @@ def test_a_newer_schema_is_left_alone_in_shadow(tmp_path: Path) -> None:
     db = sqlite3.connect(directory / FILE_NAME)
     db.execute("PRAGMA user_version = 99")
     db.close()
-    keeper, said = opened(tmp_path)
+    store, said = opened(tmp_path)
     assert [notice.code for notice in said] == ["SchemaVersion"]
-    assert keeper.fault == "SchemaVersion"
-    assert keeper.keep([outcome()]) == []
-    assert keeper.known("X").newest is None
-    keeper.close()
+    assert store.fault == "SchemaVersion"
+    assert store.keep([outcome()]) == []
+    assert store.known("X").newest is None
+    store.close()
 
 
 def test_a_store_that_cannot_be_made_is_told(tmp_path: Path) -> None:
     (tmp_path / "fdhil-data").write_text("in the way")
-    keeper, said = opened(tmp_path)
+    store, said = opened(tmp_path)
     assert [notice.severity for notice in said] == ["MAJOR"]
-    assert keeper.keep([outcome()]) == []
+    assert store.keep([outcome()]) == []
 
 
 def test_strays_are_named(tmp_path: Path) -> None:
     folder = tmp_path / "fdhil-data" / "windows"
     folder.mkdir(parents=True)
     (folder / "notes.txt").write_text("")
-    keeper, said = opened(tmp_path)
+    store, said = opened(tmp_path)
     assert [notice.code for notice in said] == ["StrayFiles"]
     assert "notes.txt" in said[0].text
-    keeper.close()
+    store.close()

@@ -9,6 +9,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from fdhil.config import CanBus
+from fdhil.guard.transmit_socket import connect_bus, greet
 from tests.bench import bench_toml
 from tests.guard.machine import Drive, Frame
 
@@ -16,6 +18,13 @@ ANSWER_S = 0.3
 NEVER = 1 << 30
 SLOW_S = 0.02
 HOLDING_ANSWER_S = 8.0
+
+
+def open_bus(name: str, bus: CanBus) -> socket.socket:
+    """A descriptor on which a guard can send, as fdhil-guard opens it."""
+    transmit = connect_bus(name, bus)
+    greet(name, bus, transmit)
+    return transmit
 
 
 def encode(frames: list[Frame]) -> bytes:

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdhil import config as machine_config
-from fdhil.cli.guard import settings_of
+from fdhil.arming.guard_settings import settings_of
 from fdhil.config import CEILING_ACCELERATION_MM_S2, CEILING_OFFSET_UM, CEILING_SPEED_MM_S, VARIATION_MM, OffsetLimits
 from fdhil.correction import PlanLimits, check
 from fdhil.correction.gate import writing_off

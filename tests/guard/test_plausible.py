@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.cli.guard import settings_of
+from fdhil.arming.guard_settings import settings_of
 from fdhil.guard.plausibility import observe
 from fdhil.guard.protocol import Mode
 from fdhil.guard.settings import Settings, from_json, to_json

@@ -18,13 +18,13 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.arming.guard_client import GuardClient, GuardLost
+from fdhil.arming.guard_settings import settings_of
 from fdhil.cli.failing import run_safely
-from fdhil.cli.guard import open_bus, settings_of
 from fdhil.cli.main import cli
 from fdhil.guard.settings import to_json
 from tests.guard import impatient
 from tests.guard.machine import DIGEST, FACTS_GIVEN, LIMITS, commissioned, smooth_path
-from tests.guard.peer import NEVER, Peer, write_config
+from tests.guard.peer import NEVER, Peer, open_bus, write_config
 
 DEMAND, OFFSET = smooth_path(rows=800)
 TOKEN = "the operator's"

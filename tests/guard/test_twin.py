@@ -15,10 +15,10 @@ from typing import Any
 
 from fdhil import config as machine_config
 from fdhil.arming.guard_client import GuardClient
-from fdhil.cli.guard import open_bus, settings_of
+from fdhil.arming.guard_settings import settings_of
 from fdhil.guard.settings import to_json
 from tests.guard.machine import FACTS_GIVEN, commissioned
-from tests.guard.peer import write_config
+from tests.guard.peer import open_bus, write_config
 
 ROWS = 900
 TOKEN = "the operator's"

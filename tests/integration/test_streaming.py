@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdhil.arming.checked_program import FIRST_S, Block, Checked, Stream
+from fdhil.arming.checked_program import FIRST_S, Block, CheckedProgram, RowStream
 from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.program_check import check
 from fdhil.arming.token import read_token
@@ -69,7 +69,7 @@ def written(folder: Path, path: Float) -> Path:
     return demand
 
 
-def play(bench: Bench, client: GuardClient, demand: Path, stream: Stream) -> None:
+def play(bench: Bench, client: GuardClient, demand: Path, stream: RowStream) -> None:
     """Arm a stream and let the NC play its demand, handing on what the guard lacks."""
     bench.command('{"command": "nc", "on": true}')
     bench.event("nc")
@@ -102,12 +102,12 @@ def test_rows_end_before_a_place_that_is_refused(bench: Bench, client: GuardClie
     place = len(path) - len(hard)
     demand = written(tmp_path, path)
     (tmp_path / "rows").touch()
-    checked = Checked(tmp_path / "rows", "XY")
+    checked = CheckedProgram(tmp_path / "rows", "XY")
     checking = threading.Thread(target=grow, args=(checked, demand, tmp_path / "rows", bench.config))
     checking.start()
     while checked.rows < 10_000:
         time.sleep(0.01)
-    stream = Stream(checked, DIGEST, 0.001)
+    stream = RowStream(checked, DIGEST, 0.001)
     play(bench, client, demand, stream)
     checking.join()
     assert checked.refused[0].code == "DemandTooHigh"
@@ -123,7 +123,7 @@ def test_rows_end_before_a_place_that_is_refused(bench: Bench, client: GuardClie
         assert check_limits(sent.astype(np.int64), limits) == []
 
 
-def grow(checked: Checked, demand: Path, rows: Path, config: MachineConfig) -> None:
+def grow(checked: CheckedProgram, demand: Path, rows: Path, config: MachineConfig) -> None:
     """Check a demand as the process does; what it tells is known at once."""
 
     def hear(told: Mapping[str, Any]) -> None:

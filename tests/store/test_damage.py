@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from fdhil.daemon.outcome_store import Keeper
+from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.errors import RecordingError, StoreError
 from fdhil.records import Notice, Parameters, Skill
 from fdhil.store import schema
@@ -137,14 +137,14 @@ def test_the_daemon_begins_anew_or_goes_on_whatever_bit_is_flipped(tmp_path: Pat
         flipped = bytearray(whole)
         flipped[byte] ^= 1 << bit
         (directory / FILE_NAME).write_bytes(flipped)
-        keeper = Keeper(config_of(folder))
-        first = [notice.code for notice in keeper.open()]
-        keeper.close()
+        store = OutcomeStore(config_of(folder))
+        first = [notice.code for notice in store.open()]
+        store.close()
         if "SchemaVersion" in first:
             assert (directory / FILE_NAME).read_bytes() == flipped
             continue
         assert first in ([], ["CorruptFile"])
-        again = Keeper(config_of(folder))
+        again = OutcomeStore(config_of(folder))
         assert again.open() == []
         assert again.keep([published(9), outcome()]) == []
         again.close()

@@ -19,7 +19,7 @@ _ULPS = 1e-9  # so that 20 mm/s of 50 per mm are one increment, and not one less
 
 
 @dataclass(frozen=True, slots=True)
-class OffsetLimits:
+class OffsetBounds:
     """``offset`` increments, ``rate`` per cycle, ``acceleration`` per cycle^2, ``variation`` per ``window`` cycles."""
 
     offset: float
@@ -29,12 +29,12 @@ class OffsetLimits:
     window: int
 
     @staticmethod
-    def given(axis: Axis, sync_period_s: float) -> OffsetLimits:
+    def given(axis: Axis, sync_period_s: float) -> OffsetBounds:
         """Return the limits as they stand in the configuration; ValueError when writing is off."""
         if axis.correction is None:
             raise ValueError("writing is off for this axis")
         own, scale = axis.correction, axis.scaling.increments_per_mm
-        return OffsetLimits(
+        return OffsetBounds(
             offset=own.max_offset_um * 1e-3 * scale,
             rate=own.max_speed_mm_s * scale * sync_period_s,
             acceleration=own.max_acceleration_mm_s2 * scale * sync_period_s**2,
@@ -43,12 +43,12 @@ class OffsetLimits:
         )
 
     @staticmethod
-    def of(axis: Axis, sync_period_s: float) -> OffsetLimits:
+    def of(axis: Axis, sync_period_s: float) -> OffsetBounds:
         """Return what an offset may do: the given limits within the axis' share, lowered until zero is near enough.
 
         ValueError when writing is off (no ``[axis.X.correction]``).
         """
-        given, scale = OffsetLimits.given(axis, sync_period_s), axis.scaling.increments_per_mm
+        given, scale = OffsetBounds.given(axis, sync_period_s), axis.scaling.increments_per_mm
         share = AXIS_ACCELERATION_SHARE * axis.max_acceleration_mm_s2 * scale * sync_period_s**2
         limits = replace(
             given,
@@ -88,7 +88,7 @@ def limit_faults(axis: Axis, sync_period_s: float) -> list[str]:
     """Say why the given limits cannot be kept: the increments are too coarse, or the way to zero is too long."""
     if axis.correction is None:
         return []
-    limits = OffsetLimits.given(axis, sync_period_s)
+    limits = OffsetBounds.given(axis, sync_period_s)
     if limits.too_coarse:
         return [_too_coarse(axis, limits)]
     needed_s = limits.time_to_safe_s(sync_period_s)
@@ -102,11 +102,11 @@ def limit_faults(axis: Axis, sync_period_s: float) -> list[str]:
 
 def share_fault(axis: Axis, sync_period_s: float) -> str | None:
     """Say why an axis so slow cannot be corrected: its share of speed or acceleration is less than one increment."""
-    limits = OffsetLimits.of(axis, sync_period_s)
+    limits = OffsetBounds.of(axis, sync_period_s)
     return _too_coarse(axis, limits) if limits.too_coarse else None
 
 
-def _too_coarse(axis: Axis, limits: OffsetLimits) -> str:
+def _too_coarse(axis: Axis, limits: OffsetBounds) -> str:
     """Name the finest limit that is less than one increment, and the resolution that would do for all."""
     name, finest = min(
         ("max_offset_um", limits.offset),

@@ -1,0 +1,13 @@
+"""Answers who asks for something: yes with what is known, or no with its class, cause and next action."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+Answer = Mapping[str, Any]
+
+
+def refusal(code: str, text: str, advice: str = "") -> dict[str, Any]:
+    """Return the answer that says no: its class, cause and next action."""
+    return {"ok": False, "code": code, "text": text, "advice": advice}

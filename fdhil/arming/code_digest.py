@@ -1,0 +1,56 @@
+"""Digests the code that makes checked rows: what other code made under the same version is not reused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numba
+import numpy as np
+import scipy
+
+import fdhil
+
+MAKER = "fdhil.arming.program_check"
+LIBRARIES = (np, scipy, numba)  # that compute the rows
+_IMPORT = re.compile(r"^\s*from (fdhil[\w.]*) import (\([^)]*\)|.*)$", re.MULTILINE)
+_LISTED = re.compile(r'"(fdhil\.[\w.]+):\w+"')  # in a table of tables.py
+
+
+def code_digest() -> str:
+    """Return the digest of the code that makes the rows, as it is on disk now, and of its libraries' versions."""
+    home = Path(fdhil.__file__).parent
+    digest = hashlib.sha256(json.dumps([sys.version, *(library.__version__ for library in LIBRARIES)]).encode())
+    for name, content in sorted(code_files(home).items()):
+        digest.update(name.encode() + b"\0" + content)
+    return digest.hexdigest()
+
+
+def code_files(home: Path) -> dict[str, bytes]:
+    """Return the files of the package in ``home`` that the maker of rows imports, or that a table lists for it."""
+    found: dict[str, bytes] = {}
+    waiting, seen = [MAKER], set[str]()
+    while waiting:
+        module = waiting.pop()
+        if module in seen:
+            continue
+        seen.add(module)
+        place = home.joinpath(*module.split(".")[1:])
+        for file in (place.with_suffix(".py"), place / "__init__.py"):
+            if file.is_file():
+                content = found[str(file.relative_to(home))] = file.read_bytes()
+                waiting += _imported(content.decode())
+        waiting.append(module.rpartition(".")[0] or "fdhil")  # a package is imported with its modules
+    return found
+
+
+def _imported(text: str) -> Iterator[str]:
+    """Yield what may be a module: what is imported from, and each name that is."""
+    yield from _LISTED.findall(text)
+    for module, names in _IMPORT.findall(text):
+        yield module
+        yield from (f"{module}.{name}" for name in re.findall(r"\w+", names))

@@ -1,0 +1,180 @@
+"""Makes the settings of the guard's process from the machine's config, its drives' profiles and their records."""
+
+from __future__ import annotations
+
+import math
+import pwd
+from pathlib import Path
+from typing import Any
+
+from fdhil.arming.token import given_credential
+from fdhil.commissioning.record import KEY_NAME, CommissioningRecord, holds, load_record
+from fdhil.commissioning.void import is_void
+from fdhil.config import Axis, MachineConfig, OffsetBounds, share_fault
+from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec, load_profile
+from fdhil.errors import ConfigError, ConfigFault, StoreError
+from fdhil.guard.feedforward import FeedforwardLimits
+from fdhil.guard.limits import OffsetLimits
+from fdhil.guard.settings import AxisSettings, Feedforward, Pdo, Settings
+
+SPEED_STEPS = 2.0  # times the motor's power: room for the load's own inertia and for the sensor's noise
+HEARTBEATS_AWAITED = 2.0  # periods of the drive's heartbeat until it counts as lost
+
+
+def with_given_key(machine: MachineConfig) -> MachineConfig:
+    """Take the key of the commissioning records from systemd, where it gives one (LoadCredential)."""
+    given = given_credential(KEY_NAME)
+    if given is None:
+        return machine
+    return machine.model_copy(update={"store": machine.store.model_copy(update={"commissioning_key": given})})
+
+
+def corrected_bus(machine: MachineConfig, source: str) -> str:
+    """Return the one bus with axes that may be corrected; ConfigError when there is none, or more than one."""
+    buses = {axis.drive.bus for axis in machine.axis.values() if axis.correction is not None}
+    if not buses:
+        fault = ConfigFault(
+            "axis.*.correction", "no axis has this section, so that writing is off", "add it to an axis"
+        )
+        raise ConfigError(source, [fault])
+    if len(buses) > 1:
+        fault = ConfigFault("axis.*.drive.bus", f"corrected axes are on {', '.join(sorted(buses))}", "use one bus")
+        raise ConfigError(source, [fault])
+    return buses.pop()
+
+
+def settings_of(machine: MachineConfig, bus: str, run_directory: Path, token_sha256: str) -> Settings:
+    """Return what the guard needs of the config and the drives' profiles; ConfigError when a profile cannot do it."""
+    axes = [_axis(machine, name, axis) for name, axis in machine.axis.items() if axis.correction is not None]
+    return Settings(
+        bus=bus,
+        transport="can_raw" if machine.bus[bus].interface == "socketcan" else "socketcand",
+        sync_period_s=machine.machine.sync_period_s,
+        clock=machine.guard.clock,
+        heartbeat_s=machine.guard.heartbeat_s,
+        node_id=machine.guard.node_id,
+        token_sha256=token_sha256,
+        run_directory=str(run_directory),
+        axes=tuple(axes),
+        daemon_uid=_user_id(machine.guard.daemon_user),
+    )
+
+
+def _user_id(name: str | None) -> int | None:
+    if name is None:
+        return None
+    try:
+        return pwd.getpwnam(name).pw_uid
+    except KeyError:
+        fault = ConfigFault("guard.daemon_user", f"there is no user {name!r}", "the user of fdhil.service")
+        raise ConfigError("config", [fault]) from None
+
+
+def limits_of(axis: Axis, sync_period_s: float) -> OffsetLimits:
+    """Return the limits in whole increments per SYNC cycle, as the planner has them, rounded down. ConfigError."""
+    if fault := share_fault(axis, sync_period_s):
+        raise ConfigError("config", [ConfigFault("axis.*.correction", fault, "leave this axis uncorrected")])
+    return OffsetLimits(*OffsetBounds.of(axis, sync_period_s).whole)
+
+
+def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
+    profile = load_profile(axis.drive.profile)
+    node_id, period_s = machine.node_id(name), machine.machine.sync_period_s
+    per_rad = axis.drive.increments_per_rev / (2 * math.pi)
+    target, offset = _rpdo(profile, profile.target, name), _rpdo(profile, profile.offset, name)
+    if len(offset.entries) != 1:
+        fault = ConfigFault(
+            f"axis.{name}.drive.profile", "its offset RPDO maps more than 0x60B0", "give it its own RPDO"
+        )
+        raise ConfigError(profile.name, [fault])
+    record = _record(machine, name)
+    return AxisSettings(
+        name=name,
+        node_id=node_id,
+        target=_pdo(target, node_id),
+        offset=_pdo(offset, node_id),
+        tpdos=tuple(_pdo(spec, node_id) for spec in profile.tpdos if spec.valid),
+        increments_per_mm=axis.scaling.increments_per_mm,
+        max_speed_mm_s=axis.top_speed_mm_s,
+        max_acceleration_mm_s2=axis.max_acceleration_mm_s2,
+        sign=axis.drive.sign,
+        limits=limits_of(axis, period_s),
+        window=round(axis.drive.following_error_window_mm * axis.scaling.increments_per_mm),
+        setpoint_delay_cycles=axis.drive.setpoint_delay_cycles,
+        heartbeat_timeout_s=heartbeat_timeout_s(machine, name),
+        feedforward=_feedforward(profile, machine, name, axis),
+        speed_count=abs(profile.speed_rad_s_per_count(axis)) * per_rad * period_s,
+        speed_step=SPEED_STEPS * _largest_acceleration_rad_s2(axis) * per_rad * period_s**2,
+        travel=None if record is None else record.travel,
+        **_commissioned(machine, name, record),
+    )
+
+
+def _commissioned(machine: MachineConfig, name: str, record: CommissioningRecord | None) -> dict[str, Any]:
+    """The fingerprint of the drive as it was signed off, and whether something against that was seen since."""
+    if record is None or not holds(record, machine, name):
+        return {}
+    return {"record": record.fingerprint, "record_void": is_void(machine.store.directory, name)}
+
+
+def _largest_acceleration_rad_s2(axis: Axis) -> float:
+    """What the motor can do at its current limit, or what the NC asks for where that is more."""
+    of_the_motor = axis.regulators.current_limit_a * axis.nominal.K / axis.nominal.Jt
+    return max(of_the_motor, axis.max_acceleration_mm_s2 * 2 * math.pi / axis.screw_pitch_mm)
+
+
+def _feedforward(profile: DriveProfile, machine: MachineConfig, name: str, axis: Axis) -> Feedforward | None:
+    """Return what the on-line feed-forward of an axis may send; None without [axis.X.feedforward]."""
+    limits = axis.feedforward
+    if limits is None:
+        return None
+    found = profile.find_rpdo(profile.speed_offset)
+    if found is None or [(e.index, e.sub) for e in found[0].entries] != [profile.speed_offset, profile.torque_offset]:
+        text = f"{profile.name} maps no RPDO with 60B1 and 60B2 alone"
+        fault = ConfigFault(f"axis.{name}.feedforward", text, "leave the section out, or give the profile such an RPDO")
+        raise ConfigError(profile.name, [fault])
+    period = machine.machine.sync_period_s
+    speed = axis.drive.increments_per_rev / (2 * math.pi)
+    torque = 1e3 / (axis.nominal.K * axis.drive.rated_current_a)
+    return Feedforward(
+        _pdo(found[0], machine.node_id(name)),
+        FeedforwardLimits(
+            speed=max(1, math.floor(limits.max_speed_rad_s * speed)),
+            speed_rate=max(1, math.floor(limits.max_speed_rate_rad_s2 * speed * period)),
+            torque=min(0x7FFF, max(1, math.floor(limits.max_torque_nm * torque))),
+            torque_rate=max(1, math.floor(limits.max_torque_rate_nm_s * torque * period)),
+        ),
+    )
+
+
+def heartbeat_timeout_s(machine: MachineConfig, axis: str) -> float:
+    """How long the drive's heartbeat may be missing, from the 0x1017 that the axis was commissioned with.
+
+    0, never: without a record that can be read (nothing is armed then), for a drive that sends none, and where time is
+    the count of SYNC, which says nothing about heartbeats of the wall clock.
+    """
+    record = _record(machine, axis)
+    if record is None or machine.guard.clock == "sync":
+        return 0.0
+    return HEARTBEATS_AWAITED * record.options.get("1017", 0) * 1e-3
+
+
+def _record(machine: MachineConfig, axis: str) -> CommissioningRecord | None:
+    """The axis' commissioning; None without one that can be read."""
+    try:
+        return load_record(machine.store.directory, axis, machine.store.commissioning_key)
+    except StoreError:
+        return None
+
+
+def _rpdo(profile: DriveProfile, key: tuple[int, int], axis: str) -> PdoSpec:
+    found = profile.find_rpdo(key)
+    if found is None or not found[0].valid:
+        fault = ConfigFault(f"axis.{axis}.drive.profile", f"{profile.name} maps no {key[0]:04X} into an RPDO", "map it")
+        raise ConfigError(profile.name, [fault])
+    return found[0]
+
+
+def _pdo(spec: PdoSpec, node_id: int) -> Pdo:
+    layout = tuple((entry.index, entry.sub, entry.bits, entry.signed) for entry in spec.entries)
+    return Pdo(spec.cob_base + node_id, layout, spec.every_sync)

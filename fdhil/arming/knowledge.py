@@ -1,0 +1,77 @@
+"""Gathers what is known of each axis' model: what the history had, and what the pipelines say since."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from fdhil.records import Notice, Outcome, ParameterSet, Skill, Temperature
+from fdhil.store.history import Revision
+
+SKILL_MOVES = 3  # FAULTS E19: the last three recorded moves
+
+
+@dataclass(frozen=True, slots=True)
+class AxisKnowledge:
+    """An axis when it is armed, as the daemon knows it: newest published set with its age, last moves' skills."""
+
+    published: ParameterSet | None
+    age_s: float
+    temperature_c: float | None
+    skills: tuple[Skill, ...]
+    load_changed: bool = False
+
+
+@dataclass(slots=True)
+class _Axis:
+    published: ParameterSet | None = None
+    published_s: float = 0.0
+    temperature_c: float | None = None
+    skills: deque[Skill] = field(default_factory=lambda: deque(maxlen=SKILL_MOVES))
+    load_changed: bool = False
+
+
+class Knowledge:
+    """The newest of every axis."""
+
+    def __init__(self, axes: Iterable[str]) -> None:
+        self._axes = {axis: _Axis() for axis in axes}
+
+    def begin(self, newest: Mapping[str, Revision], skills: Sequence[Skill]) -> None:
+        """Start from what the history knows."""
+        for name, revision in newest.items():
+            axis = self._axes[name]
+            axis.published, axis.published_s = revision.set, time.monotonic() - revision.stamp.age_s()
+        self.note(skills)
+
+    def note(self, outcomes: Sequence[Outcome]) -> None:
+        """Take what the pipelines say."""
+        for outcome in outcomes:
+            if isinstance(outcome, ParameterSet):
+                axis = self._axes[outcome.axis]
+                axis.published, axis.published_s, axis.load_changed = outcome, time.monotonic(), False
+            elif isinstance(outcome, Skill):
+                self._axes[outcome.axis].skills.append(outcome)
+            elif isinstance(outcome, Notice) and outcome.code == "LoadChanged" and outcome.severity == "MAJOR":
+                self._axes[outcome.axis].load_changed = True
+
+    def note_temperature(self, reading: Temperature) -> None:
+        """Take a temperature."""
+        self._axes[reading.axis].temperature_c = reading.celsius
+
+    @property
+    def temperatures(self) -> dict[str, float]:
+        """The newest temperature of each axis that has one."""
+        return {name: axis.temperature_c for name, axis in self._axes.items() if axis.temperature_c is not None}
+
+    def now(self) -> dict[str, AxisKnowledge]:
+        """Return what is known of every axis now."""
+        now_s = time.monotonic()
+        return {
+            name: AxisKnowledge(
+                axis.published, now_s - axis.published_s, axis.temperature_c, tuple(axis.skills), axis.load_changed
+            )
+            for name, axis in self._axes.items()
+        }

@@ -1,0 +1,78 @@
+"""Plans a program at once, which is short or whose method needs all of it; what passes are checked rows in memory."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+
+import numpy as np
+
+from fdhil import correction
+from fdhil.arming.checked_program import Block, CheckedProgram
+from fdhil.arming.knowledge import AxisKnowledge
+from fdhil.arming.preparing import ArmRequest, Refused
+from fdhil.arming.program_check import encoded
+from fdhil.config import MachineConfig
+from fdhil.errors import StoreError
+from fdhil.prediction.gain import gain
+from fdhil.program import load_trajectory
+from fdhil.records import Correction, Float, Reason, rms
+
+BLOCK_S = 2.0
+
+
+def plan_whole(
+    request: ArmRequest, config: MachineConfig, known: Mapping[str, AxisKnowledge]
+) -> CheckedProgram | Refused:
+    """Return the rows of the planned correction, or why there is none.
+
+    ProgramError, RecordingError or ConfigError when the program cannot be used; StoreError when memory is short.
+    """
+    reference = load_trajectory(request.program, config)
+    planned = correction.plan(reference, request.models, config, request.method)
+    if planned.refused:
+        return Refused(planned.refused)
+    if not any(np.any(offset) for offset in planned.offset_um.values()):
+        text = f"the method {planned.method} plans no position offset"
+        return Refused((Reason("HarmPredicted", text, "use inverse or mirror; flatness is armed without a program"),))
+    rows = encoded(reference.position_mm, planned.offset_um, config)
+    checked = CheckedProgram(_in_memory(rows), tuple(config.axis))
+    errors = {"before": _errors(planned.before.contour_um), "after": _errors(planned.after.contour_um)}
+    size, total = 8 * len(config.axis), reference.time_s.size
+    block_rows = round(BLOCK_S / config.machine.sync_period_s)
+    for first in range(0, total, block_rows):
+        end = min(total, first + block_rows)
+        checked.take(Block(end, hashlib.sha256(rows[size * first : size * end]).hexdigest(), end == total), errors)
+    _conclude(checked, planned, request, config, known)
+    return checked
+
+
+def _conclude(
+    checked: CheckedProgram,
+    planned: Correction,
+    request: ArmRequest,
+    config: MachineConfig,
+    known: Mapping[str, AxisKnowledge],
+) -> None:
+    covariances = {axis: found.published.covariance for axis, found in known.items() if found.published is not None}
+    skills = {axis: found.skills for axis, found in known.items()}
+    checked.half_um = gain(planned, request.models, config, covariances, skills).half_um
+    checked.method, checked.warnings = planned.method, planned.warnings
+    largest_um = max(float(np.abs(offset).max()) for offset in planned.offset_um.values())
+    checked.conclude({**checked.errors, "largest_um": largest_um})
+
+
+def _errors(contour_um: Float) -> dict[str, float]:
+    return {"rms_um": rms(contour_um), "max_um": float(contour_um.max())}
+
+
+def _in_memory(rows: bytes) -> int:
+    """Return a descriptor of the rows."""
+    try:
+        descriptor = os.memfd_create("fdhil-rows")
+    except OSError as error:
+        raise StoreError(f"the planned rows cannot be kept ({error.strerror}); free memory, then arm again") from None
+    with os.fdopen(os.dup(descriptor), "wb") as file:
+        file.write(rows)
+    return descriptor

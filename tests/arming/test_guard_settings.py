@@ -1,0 +1,72 @@
+"""The guard's settings: what is made of a config, its profiles and the records of commissioning."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from fdhil import config as machine_config
+from fdhil.arming.guard_settings import heartbeat_timeout_s, limits_of, settings_of
+from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
+from fdhil.commissioning.void import void_record
+from fdhil.config import CorrectionLimits
+from fdhil.guard.limits import OffsetLimits
+from fdhil.guard.settings import from_json, to_json
+from tests.guard.peer import write_config
+
+
+def test_limits_are_whole_increments_rounded_down(tmp_path: Path) -> None:
+    config = machine_config.load(write_config(tmp_path, 1))
+    axis = config.axis["X"].model_copy(update={"correction": CorrectionLimits()})
+    assert limits_of(axis, 0.002) == OffsetLimits(163, 13, 3, 9830, 500)
+    slow = config.axis["X"].model_copy(update={"rapid_speed_mm_s": 100.0, "max_acceleration_mm_s2": 1000.0})
+    # 10 mm/s and 500 mm/s2 are the axis' shares; braked at one increment per SYNC^2, zero is near enough from less
+    assert limits_of(slow, 0.001) == OffsetLimits(819, 20, 1, 9830, 1000)
+
+
+RECORD = CommissioningRecord(
+    "X", 1, 2, 3, 4, "c0ffee", "f1f2", {"1017": 100}, 1e4, True, 9.8, True, "proven", "2026-01-01T00:00:00+00:00"
+)
+
+
+def test_the_drives_heartbeat_is_watched_as_it_was_commissioned(tmp_path: Path) -> None:
+    counted = machine_config.load(write_config(tmp_path, 1))
+    assert counted.guard.clock == "sync"
+    config = counted.model_copy(update={"guard": counted.guard.model_copy(update={"clock": "monotonic"})})
+    assert heartbeat_timeout_s(config, "X") == 0
+    path = save_record(RECORD, config.store.directory)
+    assert heartbeat_timeout_s(config, "X") == 0.2
+    assert [axis.heartbeat_timeout_s for axis in settings_of(config, "can0", tmp_path, "").axes] == [0.2, 0]
+    assert heartbeat_timeout_s(counted, "X") == 0  # heartbeats come by the wall clock
+    save_record(replace(RECORD, options={"6007": 1}), config.store.directory)
+    assert heartbeat_timeout_s(config, "X") == 0  # the drive has none
+    path.write_text("changed by hand")
+    assert heartbeat_timeout_s(config, "X") == 0  # and nothing is armed with such a record
+
+
+def test_the_software_limits_are_those_of_the_commissioning(tmp_path: Path) -> None:
+    config = machine_config.load(write_config(tmp_path, 1))
+    assert [axis.travel for axis in settings_of(config, "can0", tmp_path, "").axes] == [None, None]
+    save_record(replace(RECORD, options={"607D01": -1000, "607D02": 820_000}), config.store.directory)
+    made = settings_of(config, "can0", tmp_path, "")
+    assert [axis.travel for axis in made.axes] == [(-1000, 820_000), None]
+    assert from_json(to_json(made)) == made
+
+
+def test_the_guard_knows_the_record_and_whether_it_holds(tmp_path: Path) -> None:
+    config = machine_config.load(write_config(tmp_path, 1))
+    store, signed = config.store.directory, replace(RECORD, config_digest=axis_digest(config, "X"))
+
+    def known() -> list[tuple[str, bool]]:
+        return [(axis.record, axis.record_void) for axis in settings_of(config, "can0", tmp_path, "").axes]
+
+    save_record(RECORD, store)
+    assert known() == [("", False), ("", False)]  # it was made with another configuration
+    save_record(replace(signed, readback_ok=False), store)
+    assert known() == [("", False), ("", False)]
+    save_record(signed, store)
+    assert known() == [(signed.fingerprint, False), ("", False)]
+    void_record(store, "X", "booted")
+    assert known() == [(signed.fingerprint, True), ("", False)]
+    made = settings_of(config, "can0", tmp_path, "")
+    assert from_json(to_json(made)) == made
