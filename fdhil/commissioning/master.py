@@ -53,7 +53,7 @@ class Master:
         self.bus = CanBus(settings.drive.bus, config.bus[settings.drive.bus], transmit=True)
         self._lockstep = config.guard.clock == "sync"
         self._patience = LOCKSTEP_PATIENCE if self._lockstep else 1.0
-        self.sdo = SdoLink(self.device, self.node_id, self.bus, self._patience)
+        self.sdo = SdoLink(self.device, self.node_id, self.bus.send, self._patience)
         self.heard = Heard()
         self.cycle = 0
         self.controlword = 0

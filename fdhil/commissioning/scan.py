@@ -146,7 +146,7 @@ class Ear:
     def read(self, node_id: int, index: int, sub: int = 0) -> bytes | None:
         """Read an object, None when the node does not have it or gives no answer that can be used."""
         self.require_alone()
-        link = self._links.setdefault(node_id, SdoLink(f"node {node_id}", node_id, self._bus))
+        link = self._links.setdefault(node_id, SdoLink(f"node {node_id}", node_id, self._bus.send))
         try:
             return link.read(index, sub)
         except (ProtocolError, DeviceTimeout):
