@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from fdhil.config import CanBus as BusSettings
 from fdhil.drivers.can.bus import CanBus
-from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, Ring
+from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, FrameRing
 from fdhil.drivers.can.ports import HubClock, SocketcandPort
 from fdhil.errors import ConnectError, DeviceError
 
@@ -183,7 +183,7 @@ def test_hub_clock_takes_the_quickest_reading() -> None:
 def test_rubbish_is_counted_not_raised(pieces: list[bytes]) -> None:
     port = SocketcandPort.__new__(SocketcandPort)
     port._rest, port._clock, port.malformed = b"", HubClock(), 0
-    ring = Ring(64)
+    ring = FrameRing(64)
     for piece in pieces:
         port._split(piece + b" >", ring, 1)
     port._split(b"< frame 181 1.0 01 >", ring, 1)

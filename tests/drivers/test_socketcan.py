@@ -12,7 +12,7 @@ import pytest
 
 from fdhil.config import CanBus as BusSettings
 from fdhil.drivers.can.bus import CanBus
-from fdhil.drivers.can.frames import Ring
+from fdhil.drivers.can.frames import FrameRing
 from fdhil.drivers.can.ports import SocketCanPort
 
 pytestmark = pytest.mark.socketcan
@@ -53,7 +53,7 @@ def test_frames_come_in_order_with_stamps_of_the_kernel(sender: socket.socket) -
 def test_what_the_kernel_dropped_is_counted_exactly(sender: socket.socket) -> None:
     port = SocketCanPort("can0", "vcan0")
     port._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    ring = Ring(1 << 14)
+    ring = FrameRing(1 << 14)
     for number in range(600):
         send(sender, number)
     for _ in range(5):

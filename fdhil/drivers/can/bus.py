@@ -12,7 +12,7 @@ import time
 from types import TracebackType
 
 from fdhil import config
-from fdhil.drivers.can.frames import DEFAULT_RING_FRAMES, Frames, Latch, Ring
+from fdhil.drivers.can.frames import DEFAULT_RING_FRAMES, Frames, Latch, FrameRing
 from fdhil.drivers.can.ports import BusEnded, Port, SocketcandPort, SocketCanPort, VirtualPort
 from fdhil.errors import DeviceError
 
@@ -44,7 +44,7 @@ class CanBus:
         self.name = name
         self._port = open_port(name, settings)
         self._ring_frames = ring_frames
-        self._ring = Ring(ring_frames)
+        self._ring = FrameRing(ring_frames)
         self._transmit = transmit
         self._stopping = threading.Event()
         self._end = Latch()

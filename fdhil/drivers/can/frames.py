@@ -40,7 +40,7 @@ def frames_of(rows: Iterable[tuple[int, int, bytes]]) -> Frames:
     return np.frombuffer(raw, FRAME)
 
 
-class Ring:
+class FrameRing:
     """A ring of frames between one writer (the receive thread) and one reader.
 
     Slots are reused, nothing is allocated while it runs. When the reader is late the newest frames are refused and

@@ -20,7 +20,7 @@ from typing import Protocol
 
 import can
 
-from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Ring
+from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameRing
 from fdhil.errors import ConnectError, DeviceError
 
 RECEIVE_BUFFER_BYTES = 8 << 20
@@ -50,7 +50,7 @@ class Port(Protocol):
     def kernel_drops(self) -> int:
         """Frames the kernel dropped because they were not read in time."""
 
-    def receive(self, ring: Ring, timeout_s: float) -> None:
+    def receive(self, ring: FrameRing, timeout_s: float) -> None:
         """Append what arrives within ``timeout_s`` to ``ring``; BusEnded when the bus is gone."""
 
     def send(self, can_id: int, data: bytes) -> None:
@@ -130,7 +130,7 @@ class SocketCanPort:
         raw.setsockopt(socket.SOL_CAN_RAW, CAN_RAW_ERR_FILTER, 0x1FFFFFFF)
         raw.setblocking(False)
 
-    def receive(self, ring: Ring, timeout_s: float) -> None:
+    def receive(self, ring: FrameRing, timeout_s: float) -> None:
         """Read all that waits; the kernel's wall-clock stamps become monotonic ones at once."""
         if not select.select([self._socket], [], [], timeout_s)[0]:
             return
@@ -233,7 +233,7 @@ class SocketcandPort:
         if said.strip() + b" >" != answer and said.strip() + b">" != answer:
             raise ConnectError(self._name, f"{otherwise}; check host, port and channel")
 
-    def receive(self, ring: Ring, timeout_s: float) -> None:
+    def receive(self, ring: FrameRing, timeout_s: float) -> None:
         """Read what has come in one piece and split it; the hub's stamps become host-monotonic ones."""
         self._socket.settimeout(timeout_s)
         try:
@@ -246,7 +246,7 @@ class SocketcandPort:
             raise BusEnded("the CAN hub ended the connection")
         self._split(chunk, ring, time.monotonic_ns())
 
-    def _split(self, chunk: bytes, ring: Ring, now_ns: int) -> None:
+    def _split(self, chunk: bytes, ring: FrameRing, now_ns: int) -> None:
         lines = (self._rest + chunk).decode("latin-1").split(">")
         self._rest = lines.pop().encode("latin-1")
         if len(self._rest) > MAX_LINE_BYTES:
@@ -294,7 +294,7 @@ class VirtualPort:
         except can.CanError as error:
             raise ConnectError(name, f"the virtual bus {channel} cannot be opened ({error})") from None
 
-    def receive(self, ring: Ring, timeout_s: float) -> None:
+    def receive(self, ring: FrameRing, timeout_s: float) -> None:
         """Append one frame, and all others that wait; the sender's wall-clock stamps become monotonic ones."""
         wait: float = timeout_s
         wall_ahead_ns = self._wall_clock.ahead_ns()
