@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import CommissioningRecord, fingerprint, load_record
-from fdhil.commissioning.scan import Ear
+from fdhil.commissioning.scan import BusListener
 from fdhil.commissioning.survey import Finding, Survey, survey
 from fdhil.commissioning.void import confirm_record, void_record
 from fdhil.config import MachineConfig
@@ -107,7 +107,7 @@ def _records(config: MachineConfig, bus: str) -> list[CommissioningRecord]:
 
 
 def _an_nc_runs(config: MachineConfig, bus: str) -> bool:
-    with Ear(bus, config) as ear:
+    with BusListener(bus, config) as ear:
         for _ in range(round(LISTEN_S / TURN_S)):
             ear.listen(TURN_S)
             if ear.traffic.master is not None:

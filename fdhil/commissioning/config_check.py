@@ -13,7 +13,7 @@ from fdhil.cia402 import PdoEntry
 from fdhil.commissioning.compare import POINT, compare_record
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import load_record
-from fdhil.commissioning.scan import LISTEN_S, Ear, Traffic
+from fdhil.commissioning.scan import LISTEN_S, BusListener, Traffic
 from fdhil.commissioning.survey import Finding, Survey, read_optional, survey
 from fdhil.config import MachineConfig
 from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec, load_profile
@@ -35,7 +35,7 @@ def check_machine(config: MachineConfig, say: Callable[[str], None] = lambda _te
     found: list[Place] = []
     for bus in dict.fromkeys(axis.drive.bus for axis in config.axis.values()):
         say(f"listening on bus {bus}")
-        with Ear(bus, config) as ear:
+        with BusListener(bus, config) as ear:
             ear.listen(LISTEN_S)
             traffic = ear.traffic
         found += [(f"bus {bus}", finding) for finding in compare_bus(traffic, config)]

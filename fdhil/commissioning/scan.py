@@ -93,7 +93,7 @@ class Traffic:
         return None if data is None else known.get(data & 0x7F, f"unknown ({data & 0x7F:02X})")
 
 
-class Ear:
+class BusListener:
     """A bus that is listened to and, where no master is heard, asked; a context manager."""
 
     def __init__(self, name: str, config: MachineConfig) -> None:
@@ -158,7 +158,7 @@ class Ear:
         self._thread.join(timeout=2.0)
         self._bus.close()
 
-    def __enter__(self) -> Ear:
+    def __enter__(self) -> BusListener:
         return self
 
     def __exit__(
@@ -235,7 +235,7 @@ class BusScan:
 def scan_bus(name: str, config: MachineConfig, descriptions: Sequence[Description]) -> BusScan:
     """Listen, then ask where no master is heard. ConnectError when the bus cannot be reached or is silent."""
     axes = {config.node_id(axis): axis for axis, settings in config.axis.items() if settings.drive.bus == name}
-    with Ear(name, config) as ear:
+    with BusListener(name, config) as ear:
         ear.listen(LISTEN_S)
         master = ear.traffic.master
         answering = set() if master else ear.answering()
@@ -254,7 +254,7 @@ def _node(traffic: Traffic, node_id: int, axis: str | None, answers: Answers | N
     return Node(node_id, axis, traffic.nmt(node_id), traffic.heartbeat_s(node_id), told, answers)
 
 
-def _ask(ear: Ear, node_id: int, descriptions: Sequence[Description]) -> Answers:
+def _ask(ear: BusListener, node_id: int, descriptions: Sequence[Description]) -> Answers:
     def number(index: int, sub: int = 0) -> int | None:
         data = ear.read(node_id, index, sub)
         return None if data is None else int.from_bytes(data, "little")

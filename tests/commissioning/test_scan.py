@@ -12,7 +12,7 @@ import pytest
 from fdhil.commissioning import config_check
 from fdhil.commissioning import scan as bus_scan
 from fdhil.commissioning.config_check import check_machine, compare_heard
-from fdhil.commissioning.scan import Description, Ear, EdsMatch, Traffic, printable, read_descriptions, scan_bus
+from fdhil.commissioning.scan import BusListener, Description, EdsMatch, Traffic, printable, read_descriptions, scan_bus
 from fdhil.commissioning.survey import Finding, Identity
 from fdhil.config import MachineConfig
 from fdhil.drivers.can import sdo as canopen_sdo
@@ -123,14 +123,14 @@ def test_a_node_that_lacks_objects_is_listed_all_the_same(peer: tuple[DrivePeer,
     assert answers is not None
     assert answers.eds == EdsMatch("b.eds", "exact")
     assert answers.is_drive
-    with Ear("can0", settings) as ear:
+    with BusListener("can0", settings) as ear:
         assert ear.read(1, 0x5FFF) is None
         assert ear.read(9, 0x1000) is None
 
 
 def test_nothing_is_asked_once_a_master_is_heard(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
-    with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as nc, Ear("can0", settings) as ear:
+    with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as nc, BusListener("can0", settings) as ear:
         nc.send(can.Message(arbitration_id=0x80, is_extended_id=False))
         ear.listen(0.1)
         with pytest.raises(ProtocolError, match=r"an NC came on the bus \(SYNC\)"):

@@ -12,7 +12,7 @@ import time
 from types import TracebackType
 
 from fdhil import config
-from fdhil.drivers.can.frames import DEFAULT_RING_FRAMES, Frames, Latch, FrameRing
+from fdhil.drivers.can.frames import DEFAULT_RING_FRAMES, FrameRing, Frames, Latch
 from fdhil.drivers.can.ports import BusEnded, Port, SocketcandPort, SocketCanPort, VirtualPort
 from fdhil.errors import DeviceError
 
