@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from fdhil.commissioning.bus_listener import BusListener
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import CommissioningRecord, fingerprint, load_record
-from fdhil.commissioning.scan import BusListener
 from fdhil.commissioning.survey import Finding, Survey, survey
 from fdhil.commissioning.void import confirm_record, void_record
 from fdhil.config import MachineConfig
+from fdhil.drivers.can.bus import CanBus
 from fdhil.errors import DeviceError, StoreError
 
 POINT = "commissioning record"
@@ -107,9 +108,9 @@ def _records(config: MachineConfig, bus: str) -> list[CommissioningRecord]:
 
 
 def _an_nc_runs(config: MachineConfig, bus: str) -> bool:
-    with BusListener(bus, config) as ear:
+    with BusListener(CanBus(bus, config.bus[bus])) as listener:
         for _ in range(round(LISTEN_S / TURN_S)):
-            ear.listen(TURN_S)
-            if ear.traffic.master is not None:
+            listener.listen(TURN_S)
+            if listener.traffic.master is not None:
                 return True
     return False

@@ -10,12 +10,13 @@ import math
 from collections.abc import Awaitable, Callable, Iterator
 
 from fdhil.cia402 import PdoEntry
+from fdhil.commissioning.bus_listener import LISTEN_S, BusListener, Traffic
 from fdhil.commissioning.compare import POINT, compare_record
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import load_record
-from fdhil.commissioning.scan import LISTEN_S, BusListener, Traffic
 from fdhil.commissioning.survey import Finding, Survey, read_optional, survey
 from fdhil.config import MachineConfig
+from fdhil.drivers.can.bus import CanBus
 from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec, load_profile
 from fdhil.drivers.modbus.link import ModbusLink, float32
 from fdhil.drivers.modbus.voltage import ALL_REGISTERS, parse_block
@@ -35,9 +36,9 @@ def check_machine(config: MachineConfig, say: Callable[[str], None] = lambda _te
     found: list[Place] = []
     for bus in dict.fromkeys(axis.drive.bus for axis in config.axis.values()):
         say(f"listening on bus {bus}")
-        with BusListener(bus, config) as ear:
-            ear.listen(LISTEN_S)
-            traffic = ear.traffic
+        with BusListener(CanBus(bus, config.bus[bus])) as listener:
+            listener.listen(LISTEN_S)
+            traffic = listener.traffic
         found += [(f"bus {bus}", finding) for finding in compare_bus(traffic, config)]
         for axis in (name for name, settings in config.axis.items() if settings.drive.bus == bus):
             say(f"comparing axis {axis}")

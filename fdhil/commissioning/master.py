@@ -11,12 +11,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Self
 
 from fdhil import cia402
+from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.bus import CanBus
 from fdhil.drivers.can.sdo import SdoLink
 from fdhil.drivers.cia402.profile import DriveProfile, load_profile
 from fdhil.errors import DeviceError, DeviceTimeout
@@ -50,7 +49,7 @@ class Master:
         self.profile: DriveProfile = profile.with_feedforward() if settings.feedforward else profile
         self.period_s = config.machine.sync_period_s
         self.device = f"drive {axis}"
-        self.bus = CanBus(settings.drive.bus, config.bus[settings.drive.bus], transmit=True)
+        self.bus = TransmitBus(settings.drive.bus, config.bus[settings.drive.bus])
         self._lockstep = config.guard.clock == "sync"
         self._patience = LOCKSTEP_PATIENCE if self._lockstep else 1.0
         self.sdo = SdoLink(self.device, self.node_id, self.bus.send, self._patience)
@@ -244,7 +243,5 @@ class Master:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self.close()

@@ -14,29 +14,22 @@ from datetime import UTC, datetime
 
 from fdhil import cia402
 from fdhil.cia402 import Mode, NmtCommand, Object, State
-from fdhil.commissioning import survey as checks
 from fdhil.commissioning.feedforward import feedforward_open, prove_feedforward
 from fdhil.commissioning.master import Master
-from fdhil.commissioning.record import (
-    CommissioningRecord,
-    axis_digest,
-    load_record,
-    record_path,
-    save_record,
+from fdhil.commissioning.record import CommissioningRecord, axis_digest
+from fdhil.commissioning.survey import (
+    Survey,
+    faulted,
+    listen,
+    read_optional,
+    require,
+    require_alone,
+    require_enabled,
+    survey,
 )
 from fdhil.commissioning.watchdog import watchdog_test
 from fdhil.config import CorrectionLimits, MachineConfig
 from fdhil.errors import DeviceError, DriveFault, ProtocolError
-
-__all__ = [
-    "CommissioningRecord",
-    "axis_digest",
-    "check_axis",
-    "commission",
-    "load_record",
-    "record_path",
-    "save_record",
-]
 
 SIGN_TEST_UM = 10.0
 ENABLE_TIMEOUT_S = 5.0
@@ -50,7 +43,7 @@ FEEDFORWARD_TRIES = 3
 
 def prepare(master: Master) -> None:
     """Select CSP, start SYNC and the node, and take the actual position as target; the drive is not enabled yet."""
-    overflow = checks.read_optional(master, Object.SYNC_COUNTER_OVERFLOW) or 0
+    overflow = read_optional(master, Object.SYNC_COUNTER_OVERFLOW) or 0
     master.sdo.write_int(Object.MODE, 0, Mode.CYCLIC_SYNC_POSITION, 1)
     master.produce_sync(overflow)
     master.nmt(NmtCommand.START)
@@ -75,7 +68,7 @@ def enable(master: Master) -> None:
             )
         if master.state() is State.FAULT:
             if reset_tried:
-                raise checks.faulted(master, "it is in fault")
+                raise faulted(master, "it is in fault")
             master.controlword, reset_tried = 0, True
             master.wait_cycles(10)
         word = cia402.controlword_toward_enabled(master.state())
@@ -91,7 +84,7 @@ def enable(master: Master) -> None:
             "it does not take the mode cyclic synchronous position; check 0x6060 and 0x6502",
         )
     master.wait_cycles(SETTLE_CYCLES)
-    checks.require_enabled(master)
+    require_enabled(master)
 
 
 def disable(master: Master) -> None:
@@ -154,7 +147,7 @@ def sign_test(master: Master) -> float:
     table = master.average(profile.position, AVERAGE_CYCLES)
     ramp(master, step, 1)
     master.wait_cycles(SETTLE_CYCLES)
-    checks.require_enabled(master)
+    require_enabled(master)
     held = master.sdo.read_int(*profile.offset, signed=True)
     if held != step:
         raise DriveFault(
@@ -190,7 +183,7 @@ def feedforward_test(master: Master) -> bool | None:
     if share == 0.0:
         return True  # there is no feed-forward that could miss it
     step = _ramp_step(master.config, master.axis)
-    if step < 1 or checks.read_optional(master, Object.VELOCITY_DEMAND, signed=True) is None:
+    if step < 1 or read_optional(master, Object.VELOCITY_DEMAND, signed=True) is None:
         return None
     excess: list[float] = []
     for number in range(RAMPS):
@@ -198,7 +191,7 @@ def feedforward_test(master: Master) -> bool | None:
         excess += _early_excess(master, goal, step, gain)
         master.wait_cycles(SETTLE_CYCLES // 2)
     ramp(master, 0, 1)
-    checks.require_enabled(master)
+    require_enabled(master)
     if len(excess) < RAMPS:
         return None
     mean = sum(excess) / len(excess)
@@ -247,10 +240,10 @@ def _early_excess(master: Master, goal: int, step: int, gain_per_s: float) -> li
     return excess
 
 
-def check_axis(master: Master) -> checks.Survey:
+def check_axis(master: Master) -> Survey:
     """All that can be checked without moving; DriveFault for the first point that differs."""
-    found = checks.survey(master)
-    checks.require(master, found.findings)
+    found = survey(master)
+    require(master, found.findings)
     return found
 
 
@@ -266,12 +259,12 @@ def commission(
     """
     with Master(config, axis) as master:
         report("listen")
-        checks.listen(master)
+        listen(master)
         with feedforward_open(master) as feeding:
             report("compare")
             found = check_axis(master)
             report("enable")
-            checks.require_alone(master)
+            require_alone(master)
             with rolled_back(master):
                 prepare(master)
                 prove_feedforward(master)

@@ -6,8 +6,8 @@ import contextlib
 from collections.abc import Callable
 
 from fdhil.cia402 import Object, State
-from fdhil.commissioning import survey as checks
 from fdhil.commissioning.master import Master
+from fdhil.commissioning.survey import require_enabled
 from fdhil.drivers.can.sdo import NO_OBJECT, NO_SUB_INDEX
 from fdhil.errors import DeviceError, DriveFault, SdoAbort
 
@@ -66,7 +66,7 @@ def _feed(master: Master, sub: int, entry: int, enable: Callable[[Master], None]
             return
         codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[told:]]
         if EMCY_HEARTBEAT not in codes:
-            checks.require_enabled(master)
+            require_enabled(master)
         master.heartbeat = False
         master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, 0, 4)
         enable(master)

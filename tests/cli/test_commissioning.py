@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import io
 import json
 import signal
@@ -26,20 +25,20 @@ from tests.sim.twin_process import TwinProcess, write_config
 
 # shorter waits than on a real machine: module, name, value
 WAITS: tuple[tuple[str, str, float], ...] = (
-    ("bus_scan", "LISTEN_S", 0.3),
-    ("config_check", "LISTEN_S", 0.3),
-    ("commissioning_checks", "LISTEN_S", 0.3),
-    ("commissioning", "SETTLE_CYCLES", 120),
-    ("commissioning", "AVERAGE_CYCLES", 60),
-    ("canopen_sdo", "RESPONSE_TIMEOUT_S", 1.0),
-    ("canopen_sdo", "DEADLINE_S", 20.0),
-    ("canopen_sdo", "QUIET_S", 0.1),
+    ("commissioning.scan", "LISTEN_S", 0.3),
+    ("commissioning.config_check", "LISTEN_S", 0.3),
+    ("commissioning.survey", "LISTEN_S", 0.3),
+    ("commissioning.steps", "SETTLE_CYCLES", 120),
+    ("commissioning.steps", "AVERAGE_CYCLES", 60),
+    ("drivers.can.sdo", "RESPONSE_TIMEOUT_S", 1.0),
+    ("drivers.can.sdo", "DEADLINE_S", 20.0),
+    ("drivers.can.sdo", "QUIET_S", 0.1),
 )
 # fdhil as a process of its own with these waits
 QUICK = f"""
 import importlib
 for module, name, value in {WAITS!r}:
-    setattr(importlib.import_module("fdhil.drivers." + module), name, value)
+    setattr(importlib.import_module("fdhil." + module), name, value)
 from fdhil.cli.main import main
 main()
 """
@@ -92,7 +91,7 @@ Said = Callable[..., tuple[int, str, str]]
 def fdhil(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Said:
     """Run a command in this process, with shorter waits than on a real machine: exit code, stdout and stderr."""
     for module, name, value in WAITS:
-        monkeypatch.setattr(importlib.import_module(f"fdhil.drivers.{module}"), name, value)
+        monkeypatch.setattr(f"fdhil.{module}.{name}", value)
 
     def run(*arguments: object, said: str = "") -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["fdhil", *map(str, arguments)])

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from fdhil import tables
 from fdhil.config import MachineConfig
-from fdhil.drivers import machine as machine_module
 from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.cia402.profile import load_profile
 from fdhil.drivers.machine import MachineSource, Outlet, SensorSource
@@ -104,7 +103,7 @@ async def test_nobody_there_is_said() -> None:
 
 
 async def test_a_source_survives_and_tells_both_edges(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(machine_module, "POLL_S", 0.01)
+    monkeypatch.setattr("fdhil.drivers.machine.POLL_S", 0.01)
     out = Outlet()
     codes: list[tuple[str, str]] = []
 

@@ -8,7 +8,6 @@ decoded with shifts and masks instead of a loop.
 from __future__ import annotations
 
 import struct
-import threading
 from collections.abc import Iterable
 
 import numpy as np
@@ -115,22 +114,3 @@ def error_notices(frames: Frames) -> list[Notice]:
         text = "The CAN controller counts errors (warning level); check termination and shield."
         notices.append(Notice("ErrorPassive", "minor", text))
     return notices
-
-
-class Latch:
-    """A text set by one thread and taken by another, at most one at a time: how a receive thread reports its end."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._text: str | None = None
-
-    def set(self, text: str) -> None:
-        """Keep ``text`` unless an older one still waits."""
-        with self._lock:
-            self._text = self._text or text
-
-    def take(self) -> str | None:
-        """Return what waits, and forget it."""
-        with self._lock:
-            text, self._text = self._text, None
-            return text
