@@ -25,6 +25,7 @@ REGULATORS: Mapping[str, str] = {
     "double_pi": "fdhil.model.double_pi:prepare",
     "pid": "fdhil.model.pid:prepare",
 }
+DRIVE_VOLTAGE = "drive"  # comes with the drive's samples; every other source is a sensor of its own
 VOLTAGE_SOURCES: Mapping[str, str] = {
     "drive": "fdhil.drivers.cia402.drive:VoltageObject",
     "modbus": "fdhil.drivers.modbus.voltage:ModbusVoltage",

@@ -6,8 +6,7 @@ Where an NC runs the bus nothing is sent: what its own traffic shows is compared
 from __future__ import annotations
 
 import asyncio
-import math
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Callable, Iterator
 
 from fdhil.cia402 import PdoEntry
 from fdhil.commissioning.bus_listener import LISTEN_S, BusListener, Traffic
@@ -18,8 +17,8 @@ from fdhil.commissioning.survey import Finding, Survey, read_optional, survey
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.bus import CanBus
 from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec, load_profile
-from fdhil.drivers.modbus.link import ModbusLink, float32
-from fdhil.drivers.modbus.voltage import ALL_REGISTERS, parse_block
+from fdhil.drivers.moves import load_event_source
+from fdhil.drivers.sensor_source import Sensor, sensors_of
 from fdhil.errors import DeviceError, StoreError
 
 RATE_TOLERANCE = 0.1
@@ -111,8 +110,8 @@ def _heartbeat(period_ms: int | None) -> Finding:
 
 def _rapid(config: MachineConfig, profile: DriveProfile, read: Callable[[], int | None]) -> Iterator[Finding]:
     """The NC's signal of a rapid move, where the config counts on it."""
-    if config.g0.source != "digital_input":
-        yield Finding("rapid signal", "inferred", "inferred from the demand's speed")
+    if not load_event_source(config.g0.source).needs_input:
+        yield Finding("rapid signal", config.g0.source, f"{config.g0.source} from the demand's speed")
         return
     bit = config.g0.input_bit
     expected = f"bit {bit} of 0x60FD in a TPDO"
@@ -130,7 +129,7 @@ def _rapid(config: MachineConfig, profile: DriveProfile, read: Callable[[], int 
 
 
 def _voltage_object(config: MachineConfig, axis: str, profile: DriveProfile, master: Master) -> Iterator[Finding]:
-    if config.axis[axis].voltage.source != "drive":
+    if config.axis[axis].voltage.separate:
         return
     if profile.voltage is None:
         cause = f"profile {profile.name} has no object of the terminal voltage"
@@ -195,38 +194,15 @@ def _bits(data: int, entry: PdoEntry) -> int:
 
 
 async def compare_sensors(config: MachineConfig, axis: str) -> list[Finding]:
-    """Reach and read the Modbus sensors of one axis; only reading, so that a running daemon misses nothing."""
-    settings, found = config.axis[axis], []
-    if settings.voltage.source == "modbus":
-        where = settings.voltage
-        link = ModbusLink(f"voltage sensor {axis}", where.host, where.port, where.unit, where.timeout_s)
-        found.append(await _sensor("voltage", f"Modbus {where.host}:{where.port}", link, _voltage))
-    if settings.temperature is not None:
-        place = settings.temperature
-        link = ModbusLink(f"thermometer {axis}", place.host, place.port, place.unit, place.timeout_s)
-
-        async def celsius(link: ModbusLink) -> str:
-            value = float32(await link.read_input(place.address, 2))
-            if not math.isfinite(value) or not -50.0 < value < 150.0:
-                text = f"register {place.address} gives {value:g} degC; compare the register map with the config"
-                raise DeviceError(link.name, text)
-            return f"{value:.2f} degC"
-
-        found.append(await _sensor("temperature", f"Modbus {place.host}:{place.port}", link, celsius))
-    return found
+    """Reach and read the sensors of one axis; only reading, so that a running daemon misses nothing."""
+    return [await _sensor(point, sensor) for point, sensor in sensors_of(axis, config).items()]
 
 
-async def _voltage(link: ModbusLink) -> str:
-    registers = await link.read_input(0, ALL_REGISTERS)
-    block = parse_block(link.name, registers)
-    return f"{float32(registers):.2f} V at {block.rate_hz:g} Hz"
-
-
-async def _sensor(point: str, expected: str, link: ModbusLink, read: Callable[[ModbusLink], Awaitable[str]]) -> Finding:
+async def _sensor(point: str, sensor: Sensor) -> Finding:
     try:
-        await link.connect()
-        return Finding(point, expected, await read(link))
+        await sensor.link.connect()
+        return Finding(point, sensor.link.place, await sensor.reading())
     except DeviceError as error:
-        return _unreachable(point, expected, error)
+        return _unreachable(point, sensor.link.place, error)
     finally:
-        link.close()
+        sensor.link.close()

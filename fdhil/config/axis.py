@@ -78,7 +78,9 @@ class Drive(Section):
 class Voltage(Section):
     """[axis.X.voltage]: where the motor's terminal voltage comes from."""
 
-    source: str = Field("drive", description="drive (a vendor object in a TPDO) or modbus (a separate sensor)")
+    source: str = Field(
+        tables.DRIVE_VOLTAGE, description="drive (a vendor object in a TPDO) or modbus (a separate sensor)"
+    )
     sampling: Literal["interval_mean", "instant"] = Field(
         "interval_mean", description="the drive's value is the mean since the last sample, or an instant"
     )
@@ -91,6 +93,11 @@ class Voltage(Section):
     @classmethod
     def _known(cls, name: str) -> str:
         return listed(name, tables.VOLTAGE_SOURCES)
+
+    @property
+    def separate(self) -> bool:
+        """Whether a sensor of its own tells the voltage; else the drive does, with its other samples."""
+        return self.source != tables.DRIVE_VOLTAGE
 
 
 class Thermometer(Section):

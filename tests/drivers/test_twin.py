@@ -80,12 +80,21 @@ def rapid(folder: Path) -> Path:
 
 
 async def gather(source: MachineSource, until: Callable[[list[Record]], bool], seconds: float = 300) -> list[Record]:
+    """Return the records of a source, from now on, up to the one with which it is enough."""
     records: list[Record] = []
-    async with asyncio.timeout(seconds):
-        async for record in source.records():
+    enough = asyncio.Event()
+
+    def take(record: Record) -> None:
+        if not enough.is_set():
             records.append(record)
             if until(records):
-                break
+                enough.set()
+
+    running = asyncio.create_task(source.run(take))
+    async with asyncio.timeout(seconds):
+        await enough.wait()
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
     return records
 
 

@@ -37,11 +37,15 @@ class InputSamples:
 
 
 class VoltageObject:
-    """The voltage source ``drive``: a vendor object of the profile, decoded with the other TPDOs."""
+    """The voltage source ``drive``: a vendor object of the profile, decoded with the other TPDOs.
 
-    def __init__(self, axis: str, config: MachineConfig, profile: DriveProfile) -> None:
+    ``key`` None: the profile has none, or a sensor of its own tells the voltage.
+    """
+
+    def __init__(self, axis: str, config: MachineConfig, profile: DriveProfile | None = None) -> None:
         settings = config.axis[axis]
-        self.key = profile.voltage if settings.voltage.source == "drive" else None
+        profile = profile or load_profile(settings.drive.profile)
+        self.key = None if settings.voltage.separate else profile.voltage
         self.v_per_count = settings.drive.sign * profile.voltage_v_per_count
         self.rows_back = 1 if settings.voltage.sampling == "interval_mean" else 0
 
@@ -75,6 +79,11 @@ class Cia402Decoder:
         self._mismatches = 0
         self._told: set[str] = set()
         self._notices: list[Notice] = []
+
+    @property
+    def voltage_key(self) -> ObjectKey | None:
+        """The object that tells the terminal voltage, None when the drive does not."""
+        return self._voltage.key
 
     def _place(self, key: ObjectKey) -> tuple[str, PdoEntry]:
         found = self.profile.find_tpdo(key)

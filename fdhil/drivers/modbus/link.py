@@ -18,7 +18,7 @@ from pymodbus.pdu import ModbusPDU
 
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
 
-MAX_REGISTERS = 125
+PLAUSIBLE_C = (-50.0, 150.0)  # of a slide-way; NaN is outside, too
 BUSY = 6
 CONNECT_S = 2.0  # beyond the time an answer may take: the library has one time-out for both, and ours is the shorter
 EXCEPTIONS = {
@@ -61,10 +61,13 @@ def uint32(registers: Sequence[int], at: int = 0) -> int:
 class ModbusLink:
     """A connection to one unit; ``name`` is used in messages."""
 
+    wire = "modbus"
+
     def __init__(self, name: str, host: str, port: int, unit: int, timeout_s: float) -> None:
         self.name = name
         self._host, self._port = host, port
         self._where = f"{host}:{port}"
+        self.place = f"Modbus {host}:{port}"
         self._unit = unit
         self._timeout_s = timeout_s
         self._client: AsyncModbusTcpClient | None = None
@@ -131,6 +134,14 @@ class ModbusLink:
                 self.name, f"register {address} is refused ({what}); compare the register map with the config", code
             )
         return answer
+
+    def fault_code(self, error: DeviceError) -> str | None:
+        """Return the class under which ``error`` is told; None for a unit that is only busy."""
+        if isinstance(error, ModbusRefused):
+            return None if error.code == BUSY else "ModbusException"
+        if isinstance(error, DeviceTimeout):
+            return "ModbusTimeout"
+        return "ModbusPortGone" if isinstance(error, ConnectError) else "ModbusShape"
 
     def _silent(self, address: int) -> DeviceError:
         # a late answer must not be taken for the next one's: the connection is made anew

@@ -14,6 +14,9 @@ from fdhil.records import AxisSamples, MoveEvent, MoveKind
 class DigitalInputG0:
     """Says RAPID while the bit is set, REST when it falls."""
 
+    needs_input = True
+    least_share = 0.0
+
     def __init__(self, axis: str, config: MachineConfig) -> None:
         self._axis = axis
         self._mask = 1 << config.g0.input_bit
