@@ -1,4 +1,4 @@
-"""``fdhil scan``, ``check`` and ``commission``: what is on the bus, does it match the config, and the guided set-up."""
+"""``fdhil scan``, ``check`` and ``commission``: list a bus, compare it with the config, and set its drives up."""
 
 from __future__ import annotations
 
@@ -298,7 +298,7 @@ def _commission_axis(machine: MachineConfig, axis: str, yes: bool, quiet: bool) 
 
 
 def _guide(machine: MachineConfig, axis: str, yes: bool, quiet: bool) -> Callable[[str], None]:
-    """What is told, and asked, before each step."""
+    """Return the function that tells, and asks, before each step."""
     numbers = {step: number for number, step in enumerate(STEPS, 1)}
 
     def guide(step: str) -> None:

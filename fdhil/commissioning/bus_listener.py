@@ -1,4 +1,4 @@
-"""Listens to a bus beside whoever runs it: what is heard of an NC and of the nodes. Nothing is sent from here."""
+"""Listens to a bus beside whoever runs it, and gathers the traffic of an NC and of the nodes. Sends nothing."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _NODE_FUNCTIONS = (0x080, 0x180, 0x280, 0x380, 0x480, COB_SDO_RESPONSE, COB_HEAR
 
 @dataclass(slots=True)
 class Traffic:
-    """What was heard: per COB-ID the frames counted, the newest length and data; heartbeats and EMCY per node."""
+    """The frames heard: per COB-ID those counted, the newest length and data; heartbeats and EMCY per node."""
 
     count: dict[int, int] = field(default_factory=dict)
     length: dict[int, int] = field(default_factory=dict)

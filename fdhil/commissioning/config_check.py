@@ -1,4 +1,4 @@
-"""Does the machine on the bus match its configuration: drives, mapping, scales, cycle, rapid signal and sensors.
+"""Compares the machine on the bus with its configuration: drives, mapping, scales, cycle, rapid signal and sensors.
 
 Where an NC runs the bus nothing is sent: what its own traffic shows is compared, the rest is told as not compared.
 """
@@ -27,7 +27,7 @@ SDO_POINTS = ("identity", "cycle", "scale", "rated current", "communication lost
 NC_OFF = "switch the NC off and check again"
 
 Place = tuple[str, Finding]
-"""Where a finding belongs (``bus can0``, ``axis X``) and the finding."""
+"""The place of a finding (``bus can0``, ``axis X``) and the finding."""
 
 
 def check_machine(config: MachineConfig, say: Callable[[str], None] = lambda _text: None) -> list[Place]:
@@ -48,7 +48,7 @@ def check_machine(config: MachineConfig, say: Callable[[str], None] = lambda _te
 
 
 def compare_bus(traffic: Traffic, config: MachineConfig) -> Iterator[Finding]:
-    """Who runs the bus, and at which period."""
+    """Tell who runs the bus, and at which period."""
     wanted = config.machine.sync_period_s
     expected, period_s = f"{wanted * 1e3:g} ms", traffic.sync_period_s
     if traffic.master is None:
@@ -67,7 +67,7 @@ def compare_bus(traffic: Traffic, config: MachineConfig) -> Iterator[Finding]:
 
 
 def compare_asked(config: MachineConfig, axis: str) -> list[Finding]:
-    """What the drive answers by SDO, with no NC on the bus."""
+    """Compare the answers of the drive by SDO, with no NC on the bus."""
     node = f"node-ID {config.node_id(axis)}"
     with Master(config, axis) as master:
         try:
@@ -143,7 +143,7 @@ def _voltage_object(config: MachineConfig, axis: str, profile: DriveProfile, mas
 
 
 def compare_heard(traffic: Traffic, config: MachineConfig, axis: str) -> Iterator[Finding]:
-    """What the traffic of a running NC shows of one drive; nothing is sent."""
+    """Compare the traffic of a running NC as far as it shows one drive; nothing is sent."""
     profile, node_id = load_profile(config.axis[axis].drive.profile), config.node_id(axis)
     nmt = traffic.nmt(node_id)
     cause = f"nothing was heard of node-ID {node_id}"

@@ -1,4 +1,4 @@
-"""The bus in the hands of the commissioning: SYNC producer, set-points of one drive, SDO, and what the drive says.
+"""Runs the bus for the commissioning: produces SYNC, sends one drive its set-points, asks by SDO and hears the drive.
 
 One thread turns the cycle: it sends what is due (heartbeat, SYNC, set-points), drains the bus and keeps what came.
 Everything that is sent leaves from this turn, so a program that hangs sends nothing more.
@@ -23,7 +23,7 @@ from fdhil.errors import DeviceError, DeviceTimeout
 
 @dataclass(slots=True)
 class Heard:
-    """What the drive said last: mapped objects by key, EMCY frames, and its NMT state."""
+    """The drive's newest: mapped objects by key, EMCY frames, and its NMT state."""
 
     objects: dict[tuple[int, int], int] = field(default_factory=dict)
     cycle: dict[tuple[int, int], int] = field(default_factory=dict)
@@ -219,16 +219,6 @@ class Master:
         if not values:
             raise DeviceTimeout(self.device, f"0x{key[0]:04X} does not come any more; check its TPDO")
         return sum(values) / len(values)
-
-    @staticmethod
-    def now() -> float:
-        """Monotonic time, s."""
-        return time.monotonic()
-
-    @staticmethod
-    def pause(seconds: float) -> None:
-        """Let the cycle turn for a while."""
-        time.sleep(seconds)
 
     def state(self) -> cia402.State:
         """The power state of the newest statusword."""

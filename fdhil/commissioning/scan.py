@@ -1,4 +1,4 @@
-"""What is on a CAN bus: listening first, and reading by SDO only where no master is heard.
+"""Lists the nodes of a CAN bus: listens first, and reads by SDO only where no master is heard.
 
 The default SDO channel of a drive has one client at a time, so beside an NC nothing at all is sent. Nothing is ever
 written, no NMT command and no SYNC leaves from here.
@@ -101,7 +101,7 @@ class EdsMatch:
 
 @dataclass(frozen=True, slots=True)
 class Answers:
-    """What a node answered by SDO; None where it has no such object."""
+    """A node's answers by SDO; None where it has no such object."""
 
     identity: Identity
     device_type: int

@@ -1,4 +1,4 @@
-"""Commissioning of one axis with no NC on the bus: read, compare, move by 10 um, prove the watchdog, sign off.
+"""Commissions one axis with no NC on the bus: reads, compares, moves by 10 um, proves the watchdog, signs off.
 
 ``commission`` runs all steps; each step is a function of its own. Whatever fails, the offset goes back to 0, the drive
 is disabled and what was written is restored. See CiA 402-2 for the objects, CiA 301 7.2.8 for the heartbeat consumer.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -58,10 +59,10 @@ def prepare(master: Master) -> None:
 
 def enable(master: Master) -> None:
     """Bring the drive to Operation enabled, holding its position; DriveFault when it does not get there."""
-    deadline = master.now() + ENABLE_TIMEOUT_S
+    deadline = time.monotonic() + ENABLE_TIMEOUT_S
     reset_tried = False
     while master.state() is not State.OPERATION_ENABLED:
-        if master.now() > deadline:
+        if time.monotonic() > deadline:
             raise DriveFault(
                 master.device,
                 f"it stays in {master.state().value!r}; check supply, enable input and safe torque off",
@@ -207,7 +208,7 @@ def _ramp_step(config: MachineConfig, axis: str) -> int:
 
 
 def largest_move_um(config: MachineConfig, axis: str) -> float:
-    """How far a commissioning moves the axis at most."""
+    """Return the longest way that a commissioning moves the axis."""
     settings = config.axis[axis]
     ramped = _ramp_step(config, axis) * RAMP_CYCLES / settings.scaling.increments_per_mm * 1e3
     return max(SIGN_TEST_UM, ramped)

@@ -1,4 +1,4 @@
-"""Commissioning, first half: what is read from the drive and compared with the configuration. Nothing moves.
+"""Reads a drive by SDO and compares it with its configuration, the first half of commissioning. Nothing moves.
 
 ``survey`` reads and compares everything and raises only for a drive that does not answer (SdoAbort, DeviceTimeout,
 ProtocolError); ``require`` turns the first point that differs into a DriveFault.
@@ -7,6 +7,7 @@ ProtocolError); ``require`` turns the first point that differs into a DriveFault
 from __future__ import annotations
 
 import hashlib
+import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
@@ -60,7 +61,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """What was read of a drive: its identity, the mapping's fingerprint, its options, and every point compared."""
+    """A drive as it was read: its identity, the mapping's fingerprint, its options, and every point compared."""
 
     identity: Identity
     fingerprint: str
@@ -81,10 +82,10 @@ def read_optional(master: Master, index: int, sub: int = 0, *, signed: bool = Fa
 
 def listen(master: Master) -> None:
     """Listen without sending: on a silent bus nothing is sent, and beside an NC we are not the master."""
-    end = master.now() + LISTEN_S
-    while master.now() < end and master.heard.sync == 0:
+    end = time.monotonic() + LISTEN_S
+    while time.monotonic() < end and master.heard.sync == 0:
         master.check()
-        master.pause(0.01)
+        time.sleep(0.01)
     require_alone(master)
     if master.heard.frames == 0:
         text = "there is no drive on the bus; check the drives' supply, wiring and bit rate"
@@ -156,7 +157,7 @@ class PdoFound:
 
     @property
     def words(self) -> tuple[int, ...]:
-        """What goes into the mapping's fingerprint."""
+        """The numbers that the mapping's fingerprint is made of."""
         return self.parameter, self.cob_id, self.kind, *self.mapped
 
 

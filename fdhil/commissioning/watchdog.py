@@ -1,4 +1,4 @@
-"""The commissioning's proof that a drive stops by itself when fdhil dies: CiA 301 7.2.8, the heartbeat consumer."""
+"""Proves that a drive stops by itself when fdhil dies: CiA 301 7.2.8, the heartbeat consumer."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from fdhil.records import AxisSamples, MoveEvent, Notice, Temperature, TickTimes
 
 Record = AxisSamples | VoltageSamples | TickTimes | MoveEvent | Temperature | Notice
 Take = Callable[[Record], None]
-"""Where a source puts its records: never waits, for nothing may hold a source up."""
+"""Takes a source's records; it never waits, for nothing may hold a source up."""
 
 POLL_S = 0.05
 BACK_OFF_S = (0.1, 5.0)

@@ -1,4 +1,4 @@
-"""CAN frames in bulk: the record, the preallocated ring between receive thread and decoder, error frames as notices.
+"""Holds CAN frames in bulk: in a preallocated ring between receive thread and decoder; tells error frames as notices.
 
 A frame is 24 bytes: ``t_ns`` host-monotonic receive stamp, ``id`` with the flags of SocketCAN (0x20000000 error,
 0x40000000 remote, 0x80000000 extended), ``dlc`` and ``data`` as a little-endian 64 bit word, so that a block is

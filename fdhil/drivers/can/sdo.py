@@ -1,4 +1,4 @@
-"""SDO transfers with one node by the canopen library's client, within bounds of size and time.
+"""Reads and writes objects of one node by the canopen library's SDO client, within bounds of size and time.
 
 The library has no limit on size or duration, and takes a late answer to an earlier request of the same object for the
 answer to the present one. So after a time-out the line is left quiet until nothing more can come, and then the object
@@ -57,7 +57,7 @@ class SdoLink:
         self._late = False
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """What the library's client calls to send; remote frames are never sent."""
+        """Send for the library's client; remote frames are never sent."""
         self._send(can_id, bytes(data))
 
     def deliver(self, data: bytes) -> None:

@@ -1,4 +1,4 @@
-"""From frames on the SYNC grid to an axis' samples: the decoder of one CiA 402 drive. Pure: no clock, no I/O.
+"""Decodes one CiA 402 drive: frames on the SYNC grid become an axis' samples. Pure: no clock, no I/O.
 
 A sample of tick k is made of the TPDOs received after SYNC k and before SYNC k+1. The demand r[k] is the target
 (0x607A) that was latched ``setpoint_delay_cycles`` before SYNC k, since the drive runs its set-point late; the offset

@@ -1,4 +1,4 @@
-"""EDS and DCF files (CiA 306) as they are found in the field, made readable for the canopen library.
+"""Reads EDS and DCF files (CiA 306) as they are found in the field, mended for the canopen library.
 
 Of 363 real files the library refuses 45: Windows text, sections or keys twice, blank numbers, leading zeros, comments
 behind values, incomplete [DummyUsage], [Comments] that count wrong. This module reads the file line by line, mends what

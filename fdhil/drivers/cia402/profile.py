@@ -1,4 +1,4 @@
-"""What must be known of a drive model, as data: its PDOs, which object carries which signal, and in which unit.
+"""Describes drive models as data: their PDOs, which object carries which signal, and in which unit.
 
 A new vendor is a new module in ``profiles`` with one ``PROFILE`` and a line in ``tables.DRIVE_PROFILES``.
 """
@@ -76,8 +76,6 @@ class DriveProfile:
     voltage_v_per_count: float = 0.0
     speed_unit: Literal["increments_per_s", "rpm", "millirpm"] = "increments_per_s"
     current_unit: Literal["permille_of_rated", "mA"] = "permille_of_rated"
-    temperature: ObjectKey | None = None
-    temperature_c_per_count: float = 0.01
     strict_abort_options: tuple[int, ...] = (1, 3)
     vendor_id: int | None = None
     product_code: int | None = None

@@ -1,4 +1,4 @@
-"""A Modbus TCP unit behind pymodbus: one request at a time, our own deadline and retries, one error per fault.
+"""Asks a Modbus TCP unit through pymodbus: one request at a time, our own deadline, one error per fault.
 
 pymodbus repeats a request by itself (12 s of silence by default), logs every fault at ERROR and closes the line after
 a few silent requests; none of it suits a sensor that is asked 20 times a second, so ``retries`` is 0 and its logger is

@@ -1,4 +1,4 @@
-"""A slide-way thermometer behind Modbus TCP: one float32 in two input registers, asked now and then."""
+"""Reads a slide-way thermometer behind Modbus TCP now and then: one float32 in two input registers."""
 
 from __future__ import annotations
 

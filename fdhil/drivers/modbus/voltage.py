@@ -1,4 +1,4 @@
-"""A voltage sensor on Modbus TCP that samples by itself and hands its samples over in blocks.
+"""Reads a voltage sensor on Modbus TCP that samples by itself and hands its samples over in blocks.
 
 Register map (16 bit words, big-endian, the same for input and holding registers): 0-1 newest voltage float32, 2-3
 its sample counter uint32, 4-5 sample rate Hz float32, 6-7 volts per count of the block float32, 8-9 slide-way
@@ -131,7 +131,7 @@ class ModbusVoltage:
 
     @property
     def line(self) -> Line | None:
-        """Where the sensor's samples lie on the SYNC count, None before that is known."""
+        """The sensor's samples on the SYNC count, None before that is known."""
         return self._tick_clock.line() if self._tick_clock else None
 
     def _continuity(self, block: SensorBlock) -> list[Notice]:

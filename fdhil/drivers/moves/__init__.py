@@ -1,4 +1,4 @@
-"""Sources of move events: which moves were ordered as rapids (G0). ``fdhil.tables`` lists them."""
+"""Tells which moves were ordered as rapids (G0); ``tables.EVENT_SOURCES`` lists the ways."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""G0 events from the NC's own signal: a bit of the drive's digital inputs (0x60FD). Pure.
+"""Tells G0 by the NC's own signal: a bit of the drive's digital inputs (0x60FD). Pure.
 
 The input comes with a slower TPDO than the samples, so an edge is known to that TPDO's period: the beginning is given
 as the tick of the sample before the edge, the end as the tick of the first sample after it.

@@ -1,4 +1,4 @@
-"""G0 events from the demand alone: a move whose demand reaches the rapid speed was ordered as a rapid. Pure.
+"""Tells G0 by the demand alone: a move whose demand reaches the rapid speed was ordered as a rapid. Pure.
 
 Which kind a move is shows only when it is fast enough, or over; the event then carries the tick at which it began.
 """

@@ -1,1 +1,1 @@
-"""Drive models, one module each with a ``PROFILE``."""
+"""Lists drive models, one module each with a ``PROFILE``."""

@@ -1,4 +1,4 @@
-"""The simulated drive's default mapping; also a sensible one for a real drive with a terminal-voltage object."""
+"""Describes the simulated drive's default mapping, a sensible one for a real drive with a terminal-voltage object."""
 
 from __future__ import annotations
 
@@ -19,5 +19,4 @@ PROFILE = DriveProfile(
     ),
     voltage=(0x2101, 0),
     voltage_v_per_count=0.02,
-    temperature=(0x2110, 1),
 )
