@@ -63,10 +63,8 @@ def enable(master: Master) -> None:
     reset_tried = False
     while master.state() is not State.OPERATION_ENABLED:
         if time.monotonic() > deadline:
-            raise DriveFault(
-                master.device,
-                f"it stays in {master.state().value!r}; check supply, enable input and safe torque off",
-            )
+            text = f"it stays in {master.state().value!r}; check supply, enable input and safe torque off"
+            raise DriveFault(master.device, text)
         if master.state() is State.FAULT:
             if reset_tried:
                 raise faulted(master, "it is in fault")
@@ -151,9 +149,8 @@ def sign_test(master: Master) -> float:
     require_enabled(master)
     held = master.sdo.read_int(*profile.offset, signed=True)
     if held != step:
-        raise DriveFault(
-            master.device, f"an offset of {step} increments was sent and 0x60B0 holds {held}; check the RPDO's mapping"
-        )
+        text = f"an offset of {step} increments was sent and 0x60B0 holds {held}; check the RPDO's mapping"
+        raise DriveFault(master.device, text)
     demanded = master.average(profile.position_demand, AVERAGE_CYCLES) - demand
     moved = master.average(profile.position, AVERAGE_CYCLES) - table
     if abs(demanded - step) > 1.5:

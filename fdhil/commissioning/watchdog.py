@@ -37,16 +37,13 @@ def watchdog_test(master: Master, enable: Callable[[Master], None]) -> str:
             master.wait(lambda: master.state() is not State.OPERATION_ENABLED, STARVE_TIMEOUT_S, "")
         master.check()
         if master.state() is State.OPERATION_ENABLED:
-            raise DriveFault(
-                master.device,
-                "it went on although our heartbeat stopped: its watchdog does not work; check 0x1016 and 0x6007",
-            )
+            text = "it went on although our heartbeat stopped: its watchdog does not work; check 0x1016 and 0x6007"
+            raise DriveFault(master.device, text)
         codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[told:]]
         if EMCY_HEARTBEAT not in codes:
             shown = ", ".join(f"{code:04X}" for code in codes) or "none"
-            raise DriveFault(
-                master.device, f"it stopped with the EMCY {shown} instead of 8130; find out what else stops it"
-            )
+            text = f"it stopped with the EMCY {shown} instead of 8130; find out what else stops it"
+            raise DriveFault(master.device, text)
     return "proven"
 
 
@@ -70,10 +67,8 @@ def _feed(master: Master, sub: int, entry: int, enable: Callable[[Master], None]
         master.heartbeat = False
         master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, 0, 4)
         enable(master)
-    raise DriveFault(
-        master.device,
-        f"it missed our heartbeat {FEEDING_TRIES} times; take load off this computer and try again",
-    )
+    text = f"it missed our heartbeat {FEEDING_TRIES} times; take load off this computer and try again"
+    raise DriveFault(master.device, text)
 
 
 def _consumer_slot(master: Master, node_id: int) -> tuple[int, int]:

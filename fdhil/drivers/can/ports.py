@@ -106,18 +106,15 @@ class SocketCanPort:
         try:
             self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         except OSError as error:
-            raise ConnectError(
-                name, f"this kernel has no CAN ({error.strerror}); use the socketcand interface or another kernel"
-            ) from None
+            text = f"this kernel has no CAN ({error.strerror}); use the socketcand interface or another kernel"
+            raise ConnectError(name, text) from None
         try:
             self._configure()
             self._socket.bind((settings.channel,))
         except OSError as error:
             self._socket.close()
-            raise ConnectError(
-                name,
-                f"the CAN interface {settings.channel} cannot be opened ({error.strerror}); bring it up with ip link",
-            ) from None
+            text = f"the CAN interface {settings.channel} cannot be opened ({error.strerror}); bring it up with ip link"
+            raise ConnectError(name, text) from None
 
     def _configure(self) -> None:
         raw = self._socket
@@ -199,9 +196,8 @@ class SocketcandPort:
         try:
             self._socket = socket.create_connection((settings.host, settings.port), CONNECT_TIMEOUT_S)
         except OSError as error:
-            raise ConnectError(
-                name, f"the CAN hub {where} cannot be reached ({error}); start it or correct host and port"
-            ) from None
+            text = f"the CAN hub {where} cannot be reached ({error}); start it or correct host and port"
+            raise ConnectError(name, text) from None
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._expect(b"< hi >", f"{where} is no socketcand hub")

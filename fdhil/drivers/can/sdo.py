@@ -72,9 +72,8 @@ class SdoLink:
         except DeviceTimeout:
             first, second = self._upload(index, sub), self._upload(index, sub)
             if first != second:
-                raise ProtocolError(
-                    self.device, f"{_name(index, sub)} gave two answers after a time-out; check that one master asks"
-                ) from None
+                text = f"{_name(index, sub)} gave two answers after a time-out; check that one master asks"
+                raise ProtocolError(self.device, text) from None
             return second
 
     def read_int(self, index: int, sub: int = 0, *, signed: bool = False) -> int:
@@ -139,9 +138,7 @@ class SdoLink:
         except SdoCommunicationError as error:
             if "No SDO response" in str(error) or "could not be retransmitted" in str(error):
                 self._late = True
-                raise DeviceTimeout(
-                    self.device, f"{_name(index, sub)} was not answered; check the drive's supply and its node-ID"
-                ) from None
-            raise ProtocolError(
-                self.device, f"{_name(index, sub)} was answered wrongly ({error}); check that one master asks"
-            ) from None
+                text = f"{_name(index, sub)} was not answered; check the drive's supply and its node-ID"
+                raise DeviceTimeout(self.device, text) from None
+            text = f"{_name(index, sub)} was answered wrongly ({error}); check that one master asks"
+            raise ProtocolError(self.device, text) from None

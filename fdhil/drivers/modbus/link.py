@@ -85,9 +85,8 @@ class ModbusLink:
         except TimeoutError:
             pass
         if not connected:
-            raise ConnectError(
-                self.name, f"the Modbus sensor {self._where} cannot be reached; check its supply, host and port"
-            )
+            text = f"the Modbus sensor {self._where} cannot be reached; check its supply, host and port"
+            raise ConnectError(self.name, text)
 
     @property
     def connected(self) -> bool:
@@ -106,9 +105,8 @@ class ModbusLink:
         )
         registers = list(answer.registers)
         if len(registers) != count:
-            raise ProtocolError(
-                self.name, f"{len(registers)} registers came for {count} asked; check that one client asks at a time"
-            )
+            text = f"{len(registers)} registers came for {count} asked; check that one client asks at a time"
+            raise ProtocolError(self.name, text)
         return registers
 
     async def write(self, address: int, value: int) -> None:
@@ -123,9 +121,8 @@ class ModbusLink:
             raise self._silent(address) from None
         except ModbusException as error:
             if not self.connected:
-                raise ConnectError(
-                    self.name, f"the connection to the Modbus sensor {self._where} is gone; check its supply and cable"
-                ) from error
+                text = f"the connection to the Modbus sensor {self._where} is gone; check its supply and cable"
+                raise ConnectError(self.name, text) from error
             raise self._silent(address) from error
         if answer.isError():
             code = int(answer.exception_code)
