@@ -132,17 +132,10 @@ def compare_identity(profile: DriveProfile, identity: Identity) -> Finding:
     """Compare 0x1018 with the profile, where that names a vendor or product."""
     wanted = ((profile.vendor_id, identity.vendor_id), (profile.product_code, identity.product_code))
     shown = f"vendor {identity.vendor_id:08X}, product {identity.product_code:08X}"
-    return Finding(
-        "identity",
-        ", ".join(
-            f"{what} {'any' if number is None else f'{number:08X}'}"
-            for what, (number, _) in zip(("vendor", "product"), wanted, strict=True)
-        ),
-        shown,
-        all(number in (None, found) for number, found in wanted),
-        f"it is {shown}, which profile {profile.name} is not made for",
-        "choose another profile",
-    )
+    vendor, product = ("any" if number is None else f"{number:08X}" for number, _ in wanted)
+    same = all(number in (None, found) for number, found in wanted)
+    cause = f"it is {shown}, which profile {profile.name} is not made for"
+    return Finding("identity", f"vendor {vendor}, product {product}", shown, same, cause, "choose another profile")
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,14 +218,9 @@ def compare_mode(master: Master) -> Iterator[Finding]:
         return
     period_s = value * 10.0**exponent
     found, wanted = f"{period_s * 1e3:g} ms", f"{master.period_s * 1e3:g} ms"
-    yield Finding(
-        "cycle",
-        wanted,
-        found,
-        abs(period_s - master.period_s) <= 1e-6,
-        f"it interpolates over {found} (0x60C2) while SYNC comes every {wanted}",
-        "set 0x60C2 or machine.sync_period_s",
-    )
+    same = abs(period_s - master.period_s) <= 1e-6
+    cause = f"it interpolates over {found} (0x60C2) while SYNC comes every {wanted}"
+    yield Finding("cycle", wanted, found, same, cause, "set 0x60C2 or machine.sync_period_s")
 
 
 def compare_scale(master: Master) -> Iterator[Finding]:
@@ -247,14 +235,10 @@ def compare_scale(master: Master) -> Iterator[Finding]:
         per_rev, source = encoder, "0x608F"
     else:
         return
-    yield Finding(
-        "scale",
-        f"{expected} per revolution",
-        f"{per_rev:g} per revolution",
-        abs(per_rev - expected) <= 1e-6 * expected,
-        f"its position counts {per_rev:g} per motor revolution ({source}) where the config has {expected}",
-        "correct the drive's factors or drive.increments_per_rev",
-    )
+    wanted, found = f"{expected} per revolution", f"{per_rev:g} per revolution"
+    same = abs(per_rev - expected) <= 1e-6 * expected
+    cause = f"its position counts {per_rev:g} per motor revolution ({source}) where the config has {expected}"
+    yield Finding("scale", wanted, found, same, cause, "correct the drive's factors or drive.increments_per_rev")
 
 
 def _ratio(master: Master, index: int) -> float | None:
@@ -270,14 +254,10 @@ def compare_rating(master: Master) -> Iterator[Finding]:
     expected = master.config.axis[master.axis].drive.rated_current_a
     if milliamps is None:
         return
-    yield Finding(
-        "rated current",
-        f"{expected:g} A",
-        f"{milliamps / 1e3:g} A",
-        abs(milliamps / 1e3 - expected) <= 0.01 * expected,
-        f"its rated current is {milliamps / 1e3:g} A (0x6075) where the config has {expected:g} A",
-        "correct drive.rated_current_a",
-    )
+    wanted, found = f"{expected:g} A", f"{milliamps / 1e3:g} A"
+    same = abs(milliamps / 1e3 - expected) <= 0.01 * expected
+    cause = f"its rated current is {found} (0x6075) where the config has {wanted}"
+    yield Finding("rated current", wanted, found, same, cause, "correct drive.rated_current_a")
 
 
 def read_options(master: Master) -> dict[str, int]:

@@ -47,9 +47,10 @@ class BusSource:
 
     def step(self, now_ns: int) -> list[Record]:
         """Drain and decode once."""
-        if self._bus is None:
+        bus = self._bus
+        if bus is None:
             return []
-        frames = self._bus.drain()
+        frames = bus.drain()
         self.history.add(frames)
         out: list[Record] = []
         for record in self.decoder.feed(frames, now_ns):
@@ -60,20 +61,18 @@ class BusSource:
                     out += source.feed(record)
             if not isinstance(record, InputSamples):
                 out.append(record)
-        return [*out, *self._overflow(), *self._silence(now_ns)]
+        return [*out, *self._overflow(bus), *self._silence(bus, now_ns)]
 
-    def _overflow(self) -> list[Notice]:
-        assert self._bus is not None
-        lost = self._bus.counters()["lost"]
+    def _overflow(self, bus: CanBus) -> list[Notice]:
+        lost = bus.counters()["lost"]
         if lost <= self._overflow_told:
             return []
         new, self._overflow_told = lost - self._overflow_told, lost
         text = f"{new} frames of bus {self.name} were not read in time; the computer is overloaded."
         return [Notice("RxOverflow", "minor", text)]
 
-    def _silence(self, now_ns: int) -> list[Notice]:
-        assert self._bus is not None
-        silent = now_ns - self._bus.last_frame_ns > SILENCE_S * 1e9
+    def _silence(self, bus: CanBus, now_ns: int) -> list[Notice]:
+        silent = now_ns - bus.last_frame_ns > SILENCE_S * 1e9
         was, self._silent = self._silent, silent
         if silent and not was:
             text = f"Nothing is heard on bus {self.name}; check the drives' supply, the wiring and the bit rate."
@@ -97,7 +96,7 @@ class BusSource:
 
     async def _reopen(self, pause: float) -> float:
         """Wait until the bus can be opened; the SYNC count begins anew."""
-        self._close_bus()
+        self.close()
         while self._bus is None:
             await asyncio.sleep(pause)
             pause = min(2 * pause, BACK_OFF_S[1])
@@ -109,13 +108,6 @@ class BusSource:
         self._overflow_told = 0
         return pause
 
-    def _close_bus(self) -> None:
-        if self._bus is not None:
-            counters = self._bus.counters()
-            self._frames_before += counters["frames"]
-            self._bus.close()
-            self._bus = None
-
     def counters(self) -> dict[str, int]:
         """Frames received and lost on this bus."""
         own = self._bus.counters() if self._bus else {"frames": 0, "ring_overflow": 0, "kernel_drops": 0, "lost": 0}
@@ -125,5 +117,9 @@ class BusSource:
         return own | decoded
 
     def close(self) -> None:
-        """Close the bus."""
-        self._close_bus()
+        """Close the bus; its frames stay counted."""
+        if self._bus is not None:
+            counters = self._bus.counters()
+            self._frames_before += counters["frames"]
+            self._bus.close()
+            self._bus = None
