@@ -1,1 +1,1 @@
-"""Lists drive models, one module each with a ``PROFILE``."""
+"""Holds the drive models, one TOML file each."""
