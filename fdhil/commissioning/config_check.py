@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Iterator
 
-from fdhil.cia402 import PdoEntry
 from fdhil.commissioning.bus_listener import LISTEN_S, BusListener, Traffic
 from fdhil.commissioning.compare import POINT, compare_record
 from fdhil.commissioning.master import Master
@@ -186,11 +185,7 @@ def _heard_value(traffic: Traffic, profile: DriveProfile, node_id: int) -> int |
         return None
     spec, entry = mapped
     data = traffic.data.get(spec.cob_base + node_id)
-    return None if data is None else _bits(data, entry)
-
-
-def _bits(data: int, entry: PdoEntry) -> int:
-    return data >> entry.bit_offset & (1 << entry.bits) - 1
+    return None if data is None else data >> entry.bit_offset & (1 << entry.bits) - 1
 
 
 async def compare_sensors(config: MachineConfig, axis: str) -> list[Finding]:

@@ -159,13 +159,10 @@ def load_record(
     if document.get("schema") != SCHEMA or record.axis != axis or document.get("digest") != record.digest:
         raise StoreError(f"{path} was changed after it was signed off; commission the axis again")
     secret = _key(key or directory / KEY_NAME, may_lack_key)
-    if secret is not None and not _equal(str(document.get("seal")), record.seal(secret)):
+    given = str(document.get("seal")).encode("utf-8", "replace")
+    if secret is not None and not hmac.compare_digest(given, record.seal(secret).encode()):
         raise StoreError(f"{path} is not sealed with this machine's key; commission the axis again")
     return record
-
-
-def _equal(given: str, right: str) -> bool:
-    return hmac.compare_digest(given.encode("utf-8", "replace"), right.encode())
 
 
 def _made_key(path: Path) -> bytes:

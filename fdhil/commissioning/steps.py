@@ -116,7 +116,8 @@ def zero_offset(master: Master) -> None:
 
 def ramp(master: Master, goal: int, step: int | None = None) -> int:
     """Move the offset to ``goal`` increments by ``step`` per cycle; returns the cycle of the first value."""
-    step = step or max(1, round(_limits(master).max_speed_mm_s * _per_mm(master) * master.period_s / 4))
+    per_mm = master.config.axis[master.axis].scaling.increments_per_mm
+    step = step or max(1, round(_limits(master).max_speed_mm_s * per_mm * master.period_s / 4))
     start = master.offset
     count = math.ceil(abs(goal - start) / step)
     sign = 1 if goal > start else -1
@@ -128,10 +129,6 @@ def ramp(master: Master, goal: int, step: int | None = None) -> int:
 
 def _limits(master: Master) -> CorrectionLimits:
     return master.config.axis[master.axis].correction or CorrectionLimits()
-
-
-def _per_mm(master: Master) -> float:
-    return master.config.axis[master.axis].scaling.increments_per_mm
 
 
 def sign_test(master: Master) -> float:

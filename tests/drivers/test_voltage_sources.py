@@ -7,7 +7,7 @@ import pytest
 from fdhil import tables
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.tick_clock import TickClock
-from fdhil.drivers.cia402.drive import Cia402Decoder
+from fdhil.drivers.cia402.drive import VoltageObject
 from fdhil.drivers.cia402.profile import load_profile
 from fdhil.drivers.machine import MachineSource
 from fdhil.drivers.sensor_source import sensors_of
@@ -33,7 +33,7 @@ def test_the_voltage_comes_from_one_place_alone(name: str) -> None:
     assert config.axis["X"].voltage.separate == separate
     assert list(sensors_of("X", config)) == ["voltage"] * separate
     assert any(key.endswith(".X.samples") for key in MachineSource(config).counters()) == separate
-    assert Cia402Decoder("X", config).voltage_key == (None if separate else profile.voltage)
+    assert VoltageObject("X", config).key == (None if separate else profile.voltage)
     if not separate:
         assert (source.key, source.v_per_count) == (profile.voltage, profile.voltage_v_per_count)
 

@@ -80,11 +80,6 @@ class Cia402Decoder:
         self._told: set[str] = set()
         self._notices: list[Notice] = []
 
-    @property
-    def voltage_key(self) -> ObjectKey | None:
-        """The object that tells the terminal voltage, None when the drive does not."""
-        return self._voltage.key
-
     def _place(self, key: ObjectKey) -> tuple[str, PdoEntry]:
         found = self.profile.find_tpdo(key)
         if found is None:
@@ -112,7 +107,9 @@ class Cia402Decoder:
         demand = self._read_back_demand(first, stop, offset)
         out: list[AxisSamples | InputSamples | Notice] = []
         out += self._samples(first, stop, demand, offset)
-        out += self._inputs(first, stop)
+        tick, inputs = self._shown(self.profile.digital_inputs, first, stop)
+        if tick.size:
+            out.append(InputSamples(self.axis, frozen_ints(tick), frozen_ints(inputs)))
         self._forget(stop)
         told, self._notices = self._notices, []
         return [*out, *told]
@@ -201,10 +198,6 @@ class Cia402Decoder:
             statusword=frozen_ints(raw(profile.statusword)),
             lost=lost,
         )
-
-    def _inputs(self, first: int, stop: int) -> list[InputSamples]:
-        tick, inputs = self._shown(self.profile.digital_inputs, first, stop)
-        return [InputSamples(self.axis, frozen_ints(tick), frozen_ints(inputs))] if tick.size else []
 
     def _shown(self, key: ObjectKey, first: int, stop: int) -> tuple[Int, Int]:
         """Ticks and values of a slower TPDO's object; empty when the profile maps it nowhere."""

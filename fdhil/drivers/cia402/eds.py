@@ -66,7 +66,7 @@ def load_eds(path: Path, node_id: int | None = None) -> ObjectDictionary:
 
 def parse_eds(raw: bytes, name: str, node_id: int | None = None) -> ObjectDictionary:
     """Parse the bytes of an EDS or DCF file; EdsError with the line at fault."""
-    ordered = _ordered(_sections(raw, name))
+    ordered = _sections(raw, name)
     try:
         return _read(ordered, node_id)
     except _LIBRARY_ERRORS as error:
@@ -96,7 +96,7 @@ def _first_unreadable(sections: Sequence[_Section], node_id: int | None) -> int:
     return bisect_left(range(len(sections)), True, key=lambda last: fails(last + 1))
 
 
-def _sections(raw: bytes, name: str) -> dict[str, _Section]:
+def _sections(raw: bytes, name: str) -> list[_Section]:
     """Read and mend all sections; one that comes twice is merged, the later key counts."""
     if len(raw) > MAX_BYTES:
         raise EdsError(name, f"it is larger than {MAX_BYTES >> 20} MiB; this is no EDS file")
@@ -161,8 +161,8 @@ def _number(text: str) -> int | None:
         return int(text) if text.isascii() and text.isdigit() and len(text) < 20 else None
 
 
-def _complete(sections: dict[str, _Section]) -> dict[str, _Section]:
-    """Drop what the library stumbles over, and fill in what it insists on."""
+def _complete(sections: dict[str, _Section]) -> list[_Section]:
+    """Drop what the library stumbles over, fill in what it insists on, and put objects before their sub-objects."""
     for title in [t for t in sections if t.lower() in ("comments", "")]:
         del sections[title]
     sections.setdefault("DeviceInfo", _Section("DeviceInfo", 1))
@@ -180,9 +180,4 @@ def _complete(sections: dict[str, _Section]) -> dict[str, _Section]:
             section.values.setdefault("AccessType", "ro")
             if section.values.get("ObjectType") == "0":
                 del section.values["ObjectType"]
-    return sections
-
-
-def _ordered(sections: dict[str, _Section]) -> list[_Section]:
-    """Return the sections as the library must read them: objects before their sub-objects."""
     return sorted(sections.values(), key=lambda s: (bool(_OBJECT.match(s.name)) and len(s.name) > 4, s.line))
