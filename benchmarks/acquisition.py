@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from fdhil.config import CanBus, MachineConfig, parse
+from fdhil.drivers.bus_source import DRAIN_S
 from fdhil.drivers.can.bus import CanBus as Bus
 from fdhil.drivers.cia402.bus_decoder import BusDecoder
-from fdhil.drivers.machine import DRAIN_S
 from fdhil.records import AxisSamples
 
 AXES = ("X", "Y")

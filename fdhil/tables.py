@@ -1,6 +1,6 @@
-"""The literal registries: name -> "module:factory". Nothing registers itself; being listed here is being tested.
+"""The literal registries: name -> "module:factory" (a drive profile: "package:file"). Being listed is being tested.
 
-Config checks names against these tables without importing the rooms behind them.
+Nothing registers itself. Config checks names against these tables without importing the rooms behind them.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ REGULATORS: Mapping[str, str] = {
     "double_pi": "fdhil.model.double_pi:prepare",
     "pid": "fdhil.model.pid:prepare",
 }
+DRIVE_VOLTAGE = "drive"  # comes with the drive's samples; every other source is a sensor of its own
 VOLTAGE_SOURCES: Mapping[str, str] = {
     "drive": "fdhil.drivers.cia402.drive:VoltageObject",
     "modbus": "fdhil.drivers.modbus.voltage:ModbusVoltage",
@@ -35,7 +36,7 @@ EVENT_SOURCES: Mapping[str, str] = {
     "digital_input": "fdhil.drivers.moves.digital_input:DigitalInputG0",
 }
 DRIVE_PROFILES: Mapping[str, str] = {
-    "fdhil_twin": "fdhil.drivers.cia402.profiles.fdhil_twin:PROFILE",
+    "fdhil_twin": "fdhil.drivers.cia402.profiles:fdhil_twin.toml",
 }
 
 

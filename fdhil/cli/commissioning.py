@@ -1,4 +1,4 @@
-"""``fdhil scan``, ``check`` and ``commission``: what is on the bus, does it match the config, and the guided set-up."""
+"""``fdhil scan``, ``check`` and ``commission``: list a bus, compare it with the config, and set its drives up."""
 
 from __future__ import annotations
 
@@ -154,20 +154,20 @@ def check(config: Path, as_json: bool) -> int:
 
 def _tell_compared(machine: MachineConfig, found: Sequence[Place]) -> None:
     """Drives that are as they were commissioned have their records hold again, others void; a running guard is told."""
-    from fdhil.commissioning import compare as commissioning_compare
-    from fdhil.commissioning import void as commissioning_void
+    from fdhil.commissioning.compare import POINT
+    from fdhil.commissioning.void import confirm_record, void_record
 
     directory, seen = machine.store.directory, {}
     for place, finding in found:
-        if finding.point == commissioning_compare.POINT:
+        if finding.point == POINT:
             axis = place.removeprefix("axis ")
             seen[axis] = finding.found if finding.ok else ""
             if not finding.ok:
-                commissioning_void.void_record(directory, axis, finding.cause)
+                void_record(directory, axis, finding.cause)
     refused = _guard_told(machine, seen)
     for axis, digest in seen.items():
         if digest and axis not in refused:
-            commissioning_void.confirm_record(directory, axis)
+            confirm_record(directory, axis)
 
 
 def _guard_told(machine: MachineConfig, seen: Mapping[str, str]) -> set[str]:
@@ -282,11 +282,12 @@ def _stopped_like_ctrl_c() -> Iterator[None]:
 def _commission_axis(machine: MachineConfig, axis: str, yes: bool, quiet: bool) -> dict[str, Any]:
     """Run all steps for one axis and save its record; DriveFault when it is refused."""
     from fdhil.cli.bus_lock import lock_bus
-    from fdhil.commissioning import steps as commissioning
+    from fdhil.commissioning import steps
+    from fdhil.commissioning.record import save_record
 
     with lock_bus(machine.bus[machine.axis[axis].drive.bus]):  # the guard reads the record when it starts
-        record = commissioning.commission(machine, axis, _guide(machine, axis, yes, quiet))
-    path = commissioning.save_record(record, machine.store.directory, machine.store.commissioning_key)
+        record = steps.commission(machine, axis, _guide(machine, axis, yes, quiet))
+    path = save_record(record, machine.store.directory, machine.store.commissioning_key)
     if not quiet:
         click.echo(
             f"axis {axis} is commissioned: moved {record.sign_test_um:+.1f} um, "
@@ -296,7 +297,7 @@ def _commission_axis(machine: MachineConfig, axis: str, yes: bool, quiet: bool) 
 
 
 def _guide(machine: MachineConfig, axis: str, yes: bool, quiet: bool) -> Callable[[str], None]:
-    """What is told, and asked, before each step."""
+    """Return the function that tells, and asks, before each step."""
     numbers = {step: number for number, step in enumerate(STEPS, 1)}
 
     def guide(step: str) -> None:

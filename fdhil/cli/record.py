@@ -12,6 +12,7 @@ from fdhil import config as machine_config
 from fdhil.cli.options import OutputFile, Positive, Writing
 
 if TYPE_CHECKING:
+    from fdhil.drivers import Record
     from fdhil.drivers.demand_recorder import DemandRecorder, RecordedDemand
 
 _SHOWN_GAPS = 5
@@ -70,20 +71,21 @@ async def _listen(machine: machine_config.MachineConfig, recorder: DemandRecorde
     loop, stopped = asyncio.get_running_loop(), asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopped.set)
+    told = None
+
+    def take(record: Record) -> None:
+        nonlocal told
+        if not recorder.done:
+            recorder.feed(record)
+        state = "recording" if recorder.moving else "waiting for a motion" if recorder.heard else None
+        if state != told:
+            click.echo(f"{state} (Ctrl-C ends)", err=True)
+            told = state
+        if recorder.done:
+            stopped.set()
+
     async with open_machine(machine) as source:
-
-        async def feed() -> None:
-            told = None
-            async for one in source.records():
-                recorder.feed(one)
-                state = "recording" if recorder.moving else "waiting for a motion" if recorder.heard else None
-                if state != told:
-                    click.echo(f"{state} (Ctrl-C ends)", err=True)
-                    told = state
-                if recorder.done:
-                    return
-
-        tasks = [asyncio.create_task(feed()), asyncio.create_task(stopped.wait())]
+        tasks = [asyncio.create_task(source.run(take)), asyncio.create_task(stopped.wait())]
         await asyncio.wait(tasks, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
         for task in tasks:
             task.cancel()

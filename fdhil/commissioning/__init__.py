@@ -1,1 +1,1 @@
-"""Commissioning: the only room besides the guard that sends on a bus. Scan, compare, move by 10 um, sign off."""
+"""Scans, compares, moves by 10 um and signs off: the only room besides the guard that sends on a bus."""

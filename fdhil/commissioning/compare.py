@@ -1,4 +1,4 @@
-"""Is the drive still the one that was signed off? Read again by SDO, with no NC on the bus, and compared.
+"""Compares drives with their records: read again by SDO, with no NC on the bus.
 
 The answer is one finding per axis; it is ok only where the fingerprint is the record's and nothing differs from the
 configuration either.
@@ -7,28 +7,19 @@ configuration either.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
+from fdhil.commissioning.bus_listener import BusListener
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import CommissioningRecord, fingerprint, load_record
-from fdhil.commissioning.scan import Ear
 from fdhil.commissioning.survey import Finding, Survey, survey
 from fdhil.commissioning.void import confirm_record, void_record
 from fdhil.config import MachineConfig
+from fdhil.drivers.can.bus import CanBus
 from fdhil.errors import DeviceError, StoreError
 
 POINT = "commissioning record"
 LISTEN_S = 1.0
 TURN_S = 0.1
-
-
-@dataclass(frozen=True, slots=True)
-class Compared:
-    """One axis: the finding, and the fingerprint that was found; empty where anything differs or nothing answered."""
-
-    axis: str
-    finding: Finding
-    fingerprint: str = ""
 
 
 def found_fingerprint(found: Survey) -> str:
@@ -62,17 +53,14 @@ def _difference(record: CommissioningRecord, found: Survey) -> str:
     return "vendor, product or revision are others"
 
 
-def compare_drive(config: MachineConfig, record: CommissioningRecord) -> Compared:
+def compare_drive(config: MachineConfig, record: CommissioningRecord) -> Finding:
     """Read the drive by SDO and compare it; one that does not answer differs."""
     try:
         with Master(config, record.axis) as master:
-            found = survey(master)
+            return compare_record(record, survey(master))
     except DeviceError as error:
         cause, _, advice = str(error).partition("; ")
-        finding = Finding(POINT, record.fingerprint, "no answer", False, cause, advice or "check its supply")
-        return Compared(record.axis, finding)
-    finding = compare_record(record, found)
-    return Compared(record.axis, finding, found_fingerprint(found) if finding.ok else "")
+        return Finding(POINT, record.fingerprint, "no answer", False, cause, advice or "check its supply")
 
 
 def compare_again(config: MachineConfig, bus: str, say: Callable[[str], None]) -> None:
@@ -86,12 +74,12 @@ def compare_again(config: MachineConfig, bus: str, say: Callable[[str], None]) -
         return
     for record in records:
         compared = compare_drive(config, record)
-        if compared.finding.ok:
+        if compared.ok:
             confirm_record(config.store.directory, record.axis)
             continue
-        cause, advice = compared.finding.cause, compared.finding.advice
-        void_record(config.store.directory, record.axis, cause)
-        say(f"RecordVoid: axis {record.axis}: {cause}; nothing can be armed or adopted there; {advice}")
+        void_record(config.store.directory, record.axis, compared.cause)
+        text = f"RecordVoid: axis {record.axis}: {compared.cause}; nothing can be armed or adopted there"
+        say(f"{text}; {compared.advice}")
 
 
 def _records(config: MachineConfig, bus: str) -> list[CommissioningRecord]:
@@ -107,9 +95,9 @@ def _records(config: MachineConfig, bus: str) -> list[CommissioningRecord]:
 
 
 def _an_nc_runs(config: MachineConfig, bus: str) -> bool:
-    with Ear(bus, config) as ear:
+    with BusListener(CanBus(bus, config.bus[bus])) as listener:
         for _ in range(round(LISTEN_S / TURN_S)):
-            ear.listen(TURN_S)
-            if ear.traffic.master is not None:
+            listener.listen(TURN_S)
+            if listener.traffic.master is not None:
                 return True
     return False

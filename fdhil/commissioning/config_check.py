@@ -1,4 +1,4 @@
-"""Does the machine on the bus match its configuration: drives, mapping, scales, cycle, rapid signal and sensors.
+"""Compares the machine on the bus with its configuration: drives, mapping, scales, cycle, rapid signal and sensors.
 
 Where an NC runs the bus nothing is sent: what its own traffic shows is compared, the rest is told as not compared.
 """
@@ -6,19 +6,18 @@ Where an NC runs the bus nothing is sent: what its own traffic shows is compared
 from __future__ import annotations
 
 import asyncio
-import math
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Callable, Iterator
 
-from fdhil.cia402 import PdoEntry
+from fdhil.commissioning.bus_listener import LISTEN_S, BusListener, Traffic
 from fdhil.commissioning.compare import POINT, compare_record
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import load_record
-from fdhil.commissioning.scan import LISTEN_S, Ear, Traffic
 from fdhil.commissioning.survey import Finding, Survey, read_optional, survey
 from fdhil.config import MachineConfig
+from fdhil.drivers.can.bus import CanBus
 from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec, load_profile
-from fdhil.drivers.modbus.link import ModbusLink, float32
-from fdhil.drivers.modbus.voltage import ALL_REGISTERS, parse_block
+from fdhil.drivers.moves import load_event_source
+from fdhil.drivers.sensor_source import Sensor, sensors_of
 from fdhil.errors import DeviceError, StoreError
 
 RATE_TOLERANCE = 0.1
@@ -27,7 +26,7 @@ SDO_POINTS = ("identity", "cycle", "scale", "rated current", "communication lost
 NC_OFF = "switch the NC off and check again"
 
 Place = tuple[str, Finding]
-"""Where a finding belongs (``bus can0``, ``axis X``) and the finding."""
+"""The place of a finding (``bus can0``, ``axis X``) and the finding."""
 
 
 def check_machine(config: MachineConfig, say: Callable[[str], None] = lambda _text: None) -> list[Place]:
@@ -35,9 +34,9 @@ def check_machine(config: MachineConfig, say: Callable[[str], None] = lambda _te
     found: list[Place] = []
     for bus in dict.fromkeys(axis.drive.bus for axis in config.axis.values()):
         say(f"listening on bus {bus}")
-        with Ear(bus, config) as ear:
-            ear.listen(LISTEN_S)
-            traffic = ear.traffic
+        with BusListener(CanBus(bus, config.bus[bus])) as listener:
+            listener.listen(LISTEN_S)
+            traffic = listener.traffic
         found += [(f"bus {bus}", finding) for finding in compare_bus(traffic, config)]
         for axis in (name for name, settings in config.axis.items() if settings.drive.bus == bus):
             say(f"comparing axis {axis}")
@@ -48,7 +47,7 @@ def check_machine(config: MachineConfig, say: Callable[[str], None] = lambda _te
 
 
 def compare_bus(traffic: Traffic, config: MachineConfig) -> Iterator[Finding]:
-    """Who runs the bus, and at which period."""
+    """Tell who runs the bus, and at which period."""
     wanted = config.machine.sync_period_s
     expected, period_s = f"{wanted * 1e3:g} ms", traffic.sync_period_s
     if traffic.master is None:
@@ -67,7 +66,7 @@ def compare_bus(traffic: Traffic, config: MachineConfig) -> Iterator[Finding]:
 
 
 def compare_asked(config: MachineConfig, axis: str) -> list[Finding]:
-    """What the drive answers by SDO, with no NC on the bus."""
+    """Compare the answers of the drive by SDO, with no NC on the bus."""
     node = f"node-ID {config.node_id(axis)}"
     with Master(config, axis) as master:
         try:
@@ -110,8 +109,8 @@ def _heartbeat(period_ms: int | None) -> Finding:
 
 def _rapid(config: MachineConfig, profile: DriveProfile, read: Callable[[], int | None]) -> Iterator[Finding]:
     """The NC's signal of a rapid move, where the config counts on it."""
-    if config.g0.source != "digital_input":
-        yield Finding("rapid signal", "inferred", "inferred from the demand's speed")
+    if not load_event_source(config.g0.source).needs_input:
+        yield Finding("rapid signal", config.g0.source, f"{config.g0.source} from the demand's speed")
         return
     bit = config.g0.input_bit
     expected = f"bit {bit} of 0x60FD in a TPDO"
@@ -129,7 +128,7 @@ def _rapid(config: MachineConfig, profile: DriveProfile, read: Callable[[], int 
 
 
 def _voltage_object(config: MachineConfig, axis: str, profile: DriveProfile, master: Master) -> Iterator[Finding]:
-    if config.axis[axis].voltage.source != "drive":
+    if config.axis[axis].voltage.separate:
         return
     if profile.voltage is None:
         cause = f"profile {profile.name} has no object of the terminal voltage"
@@ -143,7 +142,7 @@ def _voltage_object(config: MachineConfig, axis: str, profile: DriveProfile, mas
 
 
 def compare_heard(traffic: Traffic, config: MachineConfig, axis: str) -> Iterator[Finding]:
-    """What the traffic of a running NC shows of one drive; nothing is sent."""
+    """Compare the traffic of a running NC as far as it shows one drive; nothing is sent."""
     profile, node_id = load_profile(config.axis[axis].drive.profile), config.node_id(axis)
     nmt = traffic.nmt(node_id)
     cause = f"nothing was heard of node-ID {node_id}"
@@ -186,46 +185,19 @@ def _heard_value(traffic: Traffic, profile: DriveProfile, node_id: int) -> int |
         return None
     spec, entry = mapped
     data = traffic.data.get(spec.cob_base + node_id)
-    return None if data is None else _bits(data, entry)
-
-
-def _bits(data: int, entry: PdoEntry) -> int:
-    return data >> entry.bit_offset & (1 << entry.bits) - 1
+    return None if data is None else data >> entry.bit_offset & (1 << entry.bits) - 1
 
 
 async def compare_sensors(config: MachineConfig, axis: str) -> list[Finding]:
-    """Reach and read the Modbus sensors of one axis; only reading, so that a running daemon misses nothing."""
-    settings, found = config.axis[axis], []
-    if settings.voltage.source == "modbus":
-        where = settings.voltage
-        link = ModbusLink(f"voltage sensor {axis}", where.host, where.port, where.unit, where.timeout_s)
-        found.append(await _sensor("voltage", f"Modbus {where.host}:{where.port}", link, _voltage))
-    if settings.temperature is not None:
-        place = settings.temperature
-        link = ModbusLink(f"thermometer {axis}", place.host, place.port, place.unit, place.timeout_s)
-
-        async def celsius(link: ModbusLink) -> str:
-            value = float32(await link.read_input(place.address, 2))
-            if not math.isfinite(value) or not -50.0 < value < 150.0:
-                text = f"register {place.address} gives {value:g} degC; compare the register map with the config"
-                raise DeviceError(link.name, text)
-            return f"{value:.2f} degC"
-
-        found.append(await _sensor("temperature", f"Modbus {place.host}:{place.port}", link, celsius))
-    return found
+    """Reach and read the sensors of one axis; only reading, so that a running daemon misses nothing."""
+    return [await _sensor(point, sensor) for point, sensor in sensors_of(axis, config).items()]
 
 
-async def _voltage(link: ModbusLink) -> str:
-    registers = await link.read_input(0, ALL_REGISTERS)
-    block = parse_block(link.name, registers)
-    return f"{float32(registers):.2f} V at {block.rate_hz:g} Hz"
-
-
-async def _sensor(point: str, expected: str, link: ModbusLink, read: Callable[[ModbusLink], Awaitable[str]]) -> Finding:
+async def _sensor(point: str, sensor: Sensor) -> Finding:
     try:
-        await link.connect()
-        return Finding(point, expected, await read(link))
+        await sensor.link.connect()
+        return Finding(point, sensor.link.place, await sensor.reading())
     except DeviceError as error:
-        return _unreachable(point, expected, error)
+        return _unreachable(point, sensor.link.place, error)
     finally:
-        link.close()
+        sensor.link.close()

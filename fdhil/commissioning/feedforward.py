@@ -1,4 +1,4 @@
-"""Commissioning of the on-line feed-forward: its RPDO is exchanged only by a drive that takes it as it is meant.
+"""Commissions the on-line feed-forward: its RPDO is exchanged only by a drive that takes it as it is meant.
 
 Every refusal is a DriveFault that begins with ``FeedforwardOff``, the class under which arming would be refused.
 """

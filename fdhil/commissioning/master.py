@@ -1,4 +1,4 @@
-"""The bus in the hands of the commissioning: SYNC producer, set-points of one drive, SDO, and what the drive says.
+"""Runs the bus for the commissioning: produces SYNC, sends one drive its set-points, asks by SDO and hears the drive.
 
 One thread turns the cycle: it sends what is due (heartbeat, SYNC, set-points), drains the bus and keeps what came.
 Everything that is sent leaves from this turn, so a program that hangs sends nothing more.
@@ -11,12 +11,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Self
 
 from fdhil import cia402
+from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.bus import CanBus
 from fdhil.drivers.can.sdo import SdoLink
 from fdhil.drivers.cia402.profile import DriveProfile, load_profile
 from fdhil.errors import DeviceError, DeviceTimeout
@@ -24,7 +23,7 @@ from fdhil.errors import DeviceError, DeviceTimeout
 
 @dataclass(slots=True)
 class Heard:
-    """What the drive said last: mapped objects by key, EMCY frames, and its NMT state."""
+    """The drive's newest: mapped objects by key, EMCY frames, and its NMT state."""
 
     objects: dict[tuple[int, int], int] = field(default_factory=dict)
     cycle: dict[tuple[int, int], int] = field(default_factory=dict)
@@ -50,10 +49,10 @@ class Master:
         self.profile: DriveProfile = profile.with_feedforward() if settings.feedforward else profile
         self.period_s = config.machine.sync_period_s
         self.device = f"drive {axis}"
-        self.bus = CanBus(settings.drive.bus, config.bus[settings.drive.bus], transmit=True)
+        self.bus = TransmitBus(settings.drive.bus, config.bus[settings.drive.bus])
         self._lockstep = config.guard.clock == "sync"
         self._patience = LOCKSTEP_PATIENCE if self._lockstep else 1.0
-        self.sdo = SdoLink(self.device, self.node_id, self.bus, self._patience)
+        self.sdo = SdoLink(self.device, self.node_id, self.bus.send, self._patience)
         self.heard = Heard()
         self.cycle = 0
         self.controlword = 0
@@ -221,16 +220,6 @@ class Master:
             raise DeviceTimeout(self.device, f"0x{key[0]:04X} does not come any more; check its TPDO")
         return sum(values) / len(values)
 
-    @staticmethod
-    def now() -> float:
-        """Monotonic time, s."""
-        return time.monotonic()
-
-    @staticmethod
-    def pause(seconds: float) -> None:
-        """Let the cycle turn for a while."""
-        time.sleep(seconds)
-
     def state(self) -> cia402.State:
         """The power state of the newest statusword."""
         return cia402.state_of(self.heard.objects.get(self.profile.statusword, 0))
@@ -244,7 +233,5 @@ class Master:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self.close()

@@ -1,4 +1,4 @@
-"""The signed-off record of a commissioned drive, as JSON in the store; one that was changed is refused.
+"""Keeps the signed-off record of a commissioned drive as JSON in the store; one that was changed is refused.
 
 It is sealed with a key that only its owner can read (mode 0600): who cannot read the key cannot make a record. See
 docs/decisions/0009-records-are-sealed.md for how far that goes.
@@ -6,6 +6,7 @@ docs/decisions/0009-records-are-sealed.md for how far that goes.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import hmac
 import json
@@ -31,7 +32,7 @@ SOFTWARE_LIMIT_KEYS = ("607D01", "607D02")
 
 @dataclass(frozen=True, slots=True)
 class CommissioningRecord:
-    """What was found and proven on one drive.
+    """The findings and proofs of one drive.
 
     ``config_digest`` is :func:`axis_digest`. ``options`` holds 0x6007, 0x605A, 0x605E, 0x6065, 0x6085 and 0x1017 by
     their hexadecimal index, as far as the drive has them, its software limits, and the COB-ID of the feed-forward's
@@ -158,26 +159,20 @@ def load_record(
     if document.get("schema") != SCHEMA or record.axis != axis or document.get("digest") != record.digest:
         raise StoreError(f"{path} was changed after it was signed off; commission the axis again")
     secret = _key(key or directory / KEY_NAME, may_lack_key)
-    if secret is not None and not _equal(str(document.get("seal")), record.seal(secret)):
+    given = str(document.get("seal")).encode("utf-8", "replace")
+    if secret is not None and not hmac.compare_digest(given, record.seal(secret).encode()):
         raise StoreError(f"{path} is not sealed with this machine's key; commission the axis again")
     return record
 
 
-def _equal(given: str, right: str) -> bool:
-    return hmac.compare_digest(given.encode("utf-8", "replace"), right.encode())
-
-
 def _made_key(path: Path) -> bytes:
     """Return the sealing key; make one where there is none."""
-    try:
+    with contextlib.suppress(FileExistsError):
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-    except FileExistsError:
-        return _key(path, may_lack=False) or b""
-    try:
-        os.write(descriptor, secrets.token_hex(KEY_BYTES).encode())
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(secrets.token_hex(KEY_BYTES).encode())
+            file.flush()
+            os.fsync(file.fileno())
     return _key(path, may_lack=False) or b""
 
 

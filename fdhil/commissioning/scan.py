@@ -1,4 +1,4 @@
-"""What is on a CAN bus: listening first, and reading by SDO only where no master is heard.
+"""Lists the nodes of a CAN bus: listens first, and reads by SDO only where no master is heard.
 
 The default SDO channel of a drive has one client at a time, so beside an NC nothing at all is sent. Nothing is ever
 written, no NMT command and no SYNC leaves from here.
@@ -6,120 +6,42 @@ written, no NMT command and no SYNC leaves from here.
 
 from __future__ import annotations
 
-import statistics
-import threading
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from itertools import pairwise
+from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 
-from fdhil.cia402 import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SDO_RESPONSE, COB_SYNC, Nmt, Object
+from fdhil.cia402 import COB_SDO_REQUEST, COB_SDO_RESPONSE, Object
+from fdhil.commissioning.bus_listener import LISTEN_S, BusListener, Traffic
 from fdhil.commissioning.survey import Identity
+from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.bus import CanBus
 from fdhil.drivers.can.frames import Frames
 from fdhil.drivers.can.node_watch import emcy_text
 from fdhil.drivers.can.sdo import SdoLink
 from fdhil.drivers.cia402.eds import load_eds
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, EdsError, ProtocolError
 
-LISTEN_S = 2.5  # a heartbeat of one second comes twice
 ANSWER_S = 0.3
 PACE_S = 0.001
 PROFILE_402 = 402
-_TURN_S = 0.002
 _READ_DEVICE_TYPE = bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0])
-_MASTER_FUNCTIONS = {0x200: "set-points", 0x300: "set-points", 0x400: "set-points", 0x500: "set-points"} | {
-    COB_SDO_REQUEST: "SDO requests"
-}
-_NODE_FUNCTIONS = (0x080, 0x180, 0x280, 0x380, 0x480, COB_SDO_RESPONSE, COB_HEARTBEAT)
 
 
-@dataclass(slots=True)
-class Traffic:
-    """What was heard: per COB-ID the frames counted, the newest length and data; heartbeats and EMCY per node."""
-
-    count: dict[int, int] = field(default_factory=dict)
-    length: dict[int, int] = field(default_factory=dict)
-    data: dict[int, int] = field(default_factory=dict)
-    beats: dict[int, list[int]] = field(default_factory=dict)
-    emergencies: dict[int, set[int]] = field(default_factory=dict)
-    sync_ns: list[int] = field(default_factory=list)
-
-    def take(self, frames: Frames) -> None:
-        """Take a block of frames; those with 29 bit identifiers and error frames are left aside."""
-        for frame in frames[frames["id"] <= 0x7FF]:
-            can_id, stamp, data = int(frame["id"]), int(frame["t_ns"]), int(frame["data"])
-            function, node = can_id & 0x780, can_id & 0x7F
-            self.count[can_id] = self.count.get(can_id, 0) + 1
-            self.length[can_id], self.data[can_id] = int(frame["dlc"]), data
-            if can_id == COB_SYNC:
-                self.sync_ns.append(stamp)
-            elif function == COB_EMCY:
-                self.emergencies.setdefault(node, set()).add(data & 0xFFFF)
-            elif function == COB_HEARTBEAT:
-                self.beats.setdefault(node, []).append(stamp)
-
-    @property
-    def master(self) -> str | None:
-        """What shows that a master runs the bus, None when nothing does."""
-        if self.sync_ns:
-            return "SYNC"
-        if COB_NMT in self.count:
-            return "NMT commands"
-        return next((_MASTER_FUNCTIONS[i & 0x780] for i in self.count if i & 0x780 in _MASTER_FUNCTIONS), None)
-
-    @property
-    def nodes(self) -> set[int]:
-        """Node-IDs that were heard to send."""
-        return {i & 0x7F for i in self.count if i & 0x780 in _NODE_FUNCTIONS and i & 0x7F}
-
-    @property
-    def sync_period_s(self) -> float | None:
-        """Median period of SYNC, None before the second one: a producer or a stamp that was late once says nothing."""
-        return statistics.median(later - t for t, later in pairwise(self.sync_ns)) * 1e-9 if self.sync_ns[1:] else None
-
-    def heartbeat_s(self, node_id: int) -> float | None:
-        """Mean period of a node's heartbeat, None before the second one."""
-        beats = self.beats.get(node_id, [])
-        return (beats[-1] - beats[0]) / (len(beats) - 1) * 1e-9 if len(beats) > 1 else None
-
-    def nmt(self, node_id: int) -> str | None:
-        """The NMT state of a node's newest heartbeat, None without one."""
-        data = self.data.get(COB_HEARTBEAT + node_id)
-        known = {int(state): state.name.lower().replace("_", "-") for state in Nmt}
-        return None if data is None else known.get(data & 0x7F, f"unknown ({data & 0x7F:02X})")
-
-
-class Ear:
+class BusScanner(BusListener):
     """A bus that is listened to and, where no master is heard, asked; a context manager."""
 
     def __init__(self, name: str, config: MachineConfig) -> None:
-        self.traffic = Traffic()
-        self.name = name
-        self._bus = CanBus(name, config.bus[name], transmit=True)
         self._links: dict[int, SdoLink] = {}
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._turn, name=f"fdhil-scan-{name}", daemon=True)
-        self._thread.start()
+        self._sending = TransmitBus(name, config.bus[name])
+        super().__init__(self._sending)
 
-    def _turn(self) -> None:
-        while not self._stopping.wait(_TURN_S):
-            frames = self._bus.drain()
-            self.traffic.take(frames)
-            for frame in frames[(frames["id"] & 0x780 == COB_SDO_RESPONSE) & (frames["id"] <= 0x7FF)]:
-                if link := self._links.get(int(frame["id"]) & 0x7F):
-                    link.deliver(int(frame["data"]).to_bytes(8, "little")[: int(frame["dlc"])])
-
-    def listen(self, seconds: float) -> None:
-        """Listen without sending; ConnectError when the bus ends meanwhile."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            if self._bus.ended is not None:
-                raise ConnectError(f"bus {self.name}", f"{self._bus.ended}; try again when the bus is back")
-            time.sleep(0.01)
+    def take(self, frames: Frames) -> None:
+        """Hand the answers to what was asked over."""
+        super().take(frames)
+        for frame in frames[(frames["id"] & 0x780 == COB_SDO_RESPONSE) & (frames["id"] <= 0x7FF)]:
+            if link := self._links.get(int(frame["id"]) & 0x7F):
+                link.deliver(int(frame["data"]).to_bytes(8, "little")[: int(frame["dlc"])])
 
     def answering(self) -> set[int]:
         """Ask every node-ID for its device type; return those that answer.
@@ -129,7 +51,7 @@ class Ear:
         for node_id in range(1, 128):
             self.require_alone()
             try:
-                self._bus.send(COB_SDO_REQUEST + node_id, _READ_DEVICE_TYPE)
+                self._sending.send(COB_SDO_REQUEST + node_id, _READ_DEVICE_TYPE)
             except DeviceError as error:
                 text = f"nothing acknowledges our frames ({error}); check the drives' supply, wiring and bit rate"
                 raise ConnectError(f"bus {self.name}", text) from None
@@ -146,25 +68,11 @@ class Ear:
     def read(self, node_id: int, index: int, sub: int = 0) -> bytes | None:
         """Read an object, None when the node does not have it or gives no answer that can be used."""
         self.require_alone()
-        link = self._links.setdefault(node_id, SdoLink(f"node {node_id}", node_id, self._bus))
+        link = self._links.setdefault(node_id, SdoLink(f"node {node_id}", node_id, self._sending.send))
         try:
             return link.read(index, sub)
         except (ProtocolError, DeviceTimeout):
             return None
-
-    def close(self) -> None:
-        """Stop listening and release the bus."""
-        self._stopping.set()
-        self._thread.join(timeout=2.0)
-        self._bus.close()
-
-    def __enter__(self) -> Ear:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +101,7 @@ class EdsMatch:
 
 @dataclass(frozen=True, slots=True)
 class Answers:
-    """What a node answered by SDO; None where it has no such object."""
+    """A node's answers by SDO; None where it has no such object."""
 
     identity: Identity
     device_type: int
@@ -235,17 +143,17 @@ class BusScan:
 def scan_bus(name: str, config: MachineConfig, descriptions: Sequence[Description]) -> BusScan:
     """Listen, then ask where no master is heard. ConnectError when the bus cannot be reached or is silent."""
     axes = {config.node_id(axis): axis for axis, settings in config.axis.items() if settings.drive.bus == name}
-    with Ear(name, config) as ear:
-        ear.listen(LISTEN_S)
-        master = ear.traffic.master
-        answering = set() if master else ear.answering()
-        found = sorted(ear.traffic.nodes | answering)
+    with BusScanner(name, config) as bus:
+        bus.listen(LISTEN_S)
+        master = bus.traffic.master
+        answering = set() if master else bus.answering()
+        found = sorted(bus.traffic.nodes | answering)
         if not found and master is None:
             text = "no node was heard and none answered; check the drives' supply, wiring and bit rate"
             raise ConnectError(f"bus {name}", text)
-        asked = {node_id: _ask(ear, node_id, descriptions) for node_id in sorted(answering)}
-        nodes = [_node(ear.traffic, node_id, axes.get(node_id), asked.get(node_id)) for node_id in found]
-        return BusScan(name, master, ear.traffic.sync_period_s, tuple(nodes))
+        asked = {node_id: _ask(bus, node_id, descriptions) for node_id in sorted(answering)}
+        nodes = [_node(bus.traffic, node_id, axes.get(node_id), asked.get(node_id)) for node_id in found]
+        return BusScan(name, master, bus.traffic.sync_period_s, tuple(nodes))
 
 
 def _node(traffic: Traffic, node_id: int, axis: str | None, answers: Answers | None) -> Node:
@@ -254,13 +162,13 @@ def _node(traffic: Traffic, node_id: int, axis: str | None, answers: Answers | N
     return Node(node_id, axis, traffic.nmt(node_id), traffic.heartbeat_s(node_id), told, answers)
 
 
-def _ask(ear: Ear, node_id: int, descriptions: Sequence[Description]) -> Answers:
+def _ask(bus: BusScanner, node_id: int, descriptions: Sequence[Description]) -> Answers:
     def number(index: int, sub: int = 0) -> int | None:
-        data = ear.read(node_id, index, sub)
+        data = bus.read(node_id, index, sub)
         return None if data is None else int.from_bytes(data, "little")
 
     def text(index: int) -> str | None:
-        data = ear.read(node_id, index)
+        data = bus.read(node_id, index)
         return None if data is None else printable(data)
 
     identity = Identity(*(number(Object.IDENTITY, sub) or 0 for sub in (1, 2, 3, 4)))

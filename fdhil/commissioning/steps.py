@@ -1,4 +1,4 @@
-"""Commissioning of one axis with no NC on the bus: read, compare, move by 10 um, prove the watchdog, sign off.
+"""Commissions one axis with no NC on the bus: reads, compares, moves by 10 um, proves the watchdog, signs off.
 
 ``commission`` runs all steps; each step is a function of its own. Whatever fails, the offset goes back to 0, the drive
 is disabled and what was written is restored. See CiA 402-2 for the objects, CiA 301 7.2.8 for the heartbeat consumer.
@@ -8,35 +8,29 @@ from __future__ import annotations
 
 import contextlib
 import math
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime
 
 from fdhil import cia402
 from fdhil.cia402 import Mode, NmtCommand, Object, State
-from fdhil.commissioning import survey as checks
 from fdhil.commissioning.feedforward import feedforward_open, prove_feedforward
 from fdhil.commissioning.master import Master
-from fdhil.commissioning.record import (
-    CommissioningRecord,
-    axis_digest,
-    load_record,
-    record_path,
-    save_record,
+from fdhil.commissioning.record import CommissioningRecord, axis_digest
+from fdhil.commissioning.survey import (
+    Survey,
+    faulted,
+    listen,
+    read_optional,
+    require,
+    require_alone,
+    require_enabled,
+    survey,
 )
 from fdhil.commissioning.watchdog import watchdog_test
 from fdhil.config import CorrectionLimits, MachineConfig
 from fdhil.errors import DeviceError, DriveFault, ProtocolError
-
-__all__ = [
-    "CommissioningRecord",
-    "axis_digest",
-    "check_axis",
-    "commission",
-    "load_record",
-    "record_path",
-    "save_record",
-]
 
 SIGN_TEST_UM = 10.0
 ENABLE_TIMEOUT_S = 5.0
@@ -50,7 +44,7 @@ FEEDFORWARD_TRIES = 3
 
 def prepare(master: Master) -> None:
     """Select CSP, start SYNC and the node, and take the actual position as target; the drive is not enabled yet."""
-    overflow = checks.read_optional(master, Object.SYNC_COUNTER_OVERFLOW) or 0
+    overflow = read_optional(master, Object.SYNC_COUNTER_OVERFLOW) or 0
     master.sdo.write_int(Object.MODE, 0, Mode.CYCLIC_SYNC_POSITION, 1)
     master.produce_sync(overflow)
     master.nmt(NmtCommand.START)
@@ -65,17 +59,15 @@ def prepare(master: Master) -> None:
 
 def enable(master: Master) -> None:
     """Bring the drive to Operation enabled, holding its position; DriveFault when it does not get there."""
-    deadline = master.now() + ENABLE_TIMEOUT_S
+    deadline = time.monotonic() + ENABLE_TIMEOUT_S
     reset_tried = False
     while master.state() is not State.OPERATION_ENABLED:
-        if master.now() > deadline:
-            raise DriveFault(
-                master.device,
-                f"it stays in {master.state().value!r}; check supply, enable input and safe torque off",
-            )
+        if time.monotonic() > deadline:
+            text = f"it stays in {master.state().value!r}; check supply, enable input and safe torque off"
+            raise DriveFault(master.device, text)
         if master.state() is State.FAULT:
             if reset_tried:
-                raise checks.faulted(master, "it is in fault")
+                raise faulted(master, "it is in fault")
             master.controlword, reset_tried = 0, True
             master.wait_cycles(10)
         word = cia402.controlword_toward_enabled(master.state())
@@ -91,7 +83,7 @@ def enable(master: Master) -> None:
             "it does not take the mode cyclic synchronous position; check 0x6060 and 0x6502",
         )
     master.wait_cycles(SETTLE_CYCLES)
-    checks.require_enabled(master)
+    require_enabled(master)
 
 
 def disable(master: Master) -> None:
@@ -124,7 +116,8 @@ def zero_offset(master: Master) -> None:
 
 def ramp(master: Master, goal: int, step: int | None = None) -> int:
     """Move the offset to ``goal`` increments by ``step`` per cycle; returns the cycle of the first value."""
-    step = step or max(1, round(_limits(master).max_speed_mm_s * _per_mm(master) * master.period_s / 4))
+    per_mm = master.config.axis[master.axis].scaling.increments_per_mm
+    step = step or max(1, round(_limits(master).max_speed_mm_s * per_mm * master.period_s / 4))
     start = master.offset
     count = math.ceil(abs(goal - start) / step)
     sign = 1 if goal > start else -1
@@ -136,10 +129,6 @@ def ramp(master: Master, goal: int, step: int | None = None) -> int:
 
 def _limits(master: Master) -> CorrectionLimits:
     return master.config.axis[master.axis].correction or CorrectionLimits()
-
-
-def _per_mm(master: Master) -> float:
-    return master.config.axis[master.axis].scaling.increments_per_mm
 
 
 def sign_test(master: Master) -> float:
@@ -154,12 +143,11 @@ def sign_test(master: Master) -> float:
     table = master.average(profile.position, AVERAGE_CYCLES)
     ramp(master, step, 1)
     master.wait_cycles(SETTLE_CYCLES)
-    checks.require_enabled(master)
+    require_enabled(master)
     held = master.sdo.read_int(*profile.offset, signed=True)
     if held != step:
-        raise DriveFault(
-            master.device, f"an offset of {step} increments was sent and 0x60B0 holds {held}; check the RPDO's mapping"
-        )
+        text = f"an offset of {step} increments was sent and 0x60B0 holds {held}; check the RPDO's mapping"
+        raise DriveFault(master.device, text)
     demanded = master.average(profile.position_demand, AVERAGE_CYCLES) - demand
     moved = master.average(profile.position, AVERAGE_CYCLES) - table
     if abs(demanded - step) > 1.5:
@@ -190,7 +178,7 @@ def feedforward_test(master: Master) -> bool | None:
     if share == 0.0:
         return True  # there is no feed-forward that could miss it
     step = _ramp_step(master.config, master.axis)
-    if step < 1 or checks.read_optional(master, Object.VELOCITY_DEMAND, signed=True) is None:
+    if step < 1 or read_optional(master, Object.VELOCITY_DEMAND, signed=True) is None:
         return None
     excess: list[float] = []
     for number in range(RAMPS):
@@ -198,7 +186,7 @@ def feedforward_test(master: Master) -> bool | None:
         excess += _early_excess(master, goal, step, gain)
         master.wait_cycles(SETTLE_CYCLES // 2)
     ramp(master, 0, 1)
-    checks.require_enabled(master)
+    require_enabled(master)
     if len(excess) < RAMPS:
         return None
     mean = sum(excess) / len(excess)
@@ -214,7 +202,7 @@ def _ramp_step(config: MachineConfig, axis: str) -> int:
 
 
 def largest_move_um(config: MachineConfig, axis: str) -> float:
-    """How far a commissioning moves the axis at most."""
+    """Return the longest way that a commissioning moves the axis."""
     settings = config.axis[axis]
     ramped = _ramp_step(config, axis) * RAMP_CYCLES / settings.scaling.increments_per_mm * 1e3
     return max(SIGN_TEST_UM, ramped)
@@ -247,10 +235,10 @@ def _early_excess(master: Master, goal: int, step: int, gain_per_s: float) -> li
     return excess
 
 
-def check_axis(master: Master) -> checks.Survey:
+def check_axis(master: Master) -> Survey:
     """All that can be checked without moving; DriveFault for the first point that differs."""
-    found = checks.survey(master)
-    checks.require(master, found.findings)
+    found = survey(master)
+    require(master, found.findings)
     return found
 
 
@@ -266,12 +254,12 @@ def commission(
     """
     with Master(config, axis) as master:
         report("listen")
-        checks.listen(master)
+        listen(master)
         with feedforward_open(master) as feeding:
             report("compare")
             found = check_axis(master)
             report("enable")
-            checks.require_alone(master)
+            require_alone(master)
             with rolled_back(master):
                 prepare(master)
                 prove_feedforward(master)

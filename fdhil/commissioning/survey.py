@@ -1,4 +1,4 @@
-"""Commissioning, first half: what is read from the drive and compared with the configuration. Nothing moves.
+"""Reads a drive by SDO and compares it with its configuration, the first half of commissioning. Nothing moves.
 
 ``survey`` reads and compares everything and raises only for a drive that does not answer (SdoAbort, DeviceTimeout,
 ProtocolError); ``require`` turns the first point that differs into a DriveFault.
@@ -7,6 +7,7 @@ ProtocolError); ``require`` turns the first point that differs into a DriveFault
 from __future__ import annotations
 
 import hashlib
+import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
@@ -60,7 +61,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """What was read of a drive: its identity, the mapping's fingerprint, its options, and every point compared."""
+    """A drive as it was read: its identity, the mapping's fingerprint, its options, and every point compared."""
 
     identity: Identity
     fingerprint: str
@@ -81,10 +82,10 @@ def read_optional(master: Master, index: int, sub: int = 0, *, signed: bool = Fa
 
 def listen(master: Master) -> None:
     """Listen without sending: on a silent bus nothing is sent, and beside an NC we are not the master."""
-    end = master.now() + LISTEN_S
-    while master.now() < end and master.heard.sync == 0:
+    end = time.monotonic() + LISTEN_S
+    while time.monotonic() < end and master.heard.sync == 0:
         master.check()
-        master.pause(0.01)
+        time.sleep(0.01)
     require_alone(master)
     if master.heard.frames == 0:
         text = "there is no drive on the bus; check the drives' supply, wiring and bit rate"
@@ -131,17 +132,10 @@ def compare_identity(profile: DriveProfile, identity: Identity) -> Finding:
     """Compare 0x1018 with the profile, where that names a vendor or product."""
     wanted = ((profile.vendor_id, identity.vendor_id), (profile.product_code, identity.product_code))
     shown = f"vendor {identity.vendor_id:08X}, product {identity.product_code:08X}"
-    return Finding(
-        "identity",
-        ", ".join(
-            f"{what} {'any' if number is None else f'{number:08X}'}"
-            for what, (number, _) in zip(("vendor", "product"), wanted, strict=True)
-        ),
-        shown,
-        all(number in (None, found) for number, found in wanted),
-        f"it is {shown}, which profile {profile.name} is not made for",
-        "choose another profile",
-    )
+    vendor, product = ("any" if number is None else f"{number:08X}" for number, _ in wanted)
+    same = all(number in (None, found) for number, found in wanted)
+    cause = f"it is {shown}, which profile {profile.name} is not made for"
+    return Finding("identity", f"vendor {vendor}, product {product}", shown, same, cause, "choose another profile")
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +150,7 @@ class PdoFound:
 
     @property
     def words(self) -> tuple[int, ...]:
-        """What goes into the mapping's fingerprint."""
+        """The numbers that the mapping's fingerprint is made of."""
         return self.parameter, self.cob_id, self.kind, *self.mapped
 
 
@@ -224,14 +218,9 @@ def compare_mode(master: Master) -> Iterator[Finding]:
         return
     period_s = value * 10.0**exponent
     found, wanted = f"{period_s * 1e3:g} ms", f"{master.period_s * 1e3:g} ms"
-    yield Finding(
-        "cycle",
-        wanted,
-        found,
-        abs(period_s - master.period_s) <= 1e-6,
-        f"it interpolates over {found} (0x60C2) while SYNC comes every {wanted}",
-        "set 0x60C2 or machine.sync_period_s",
-    )
+    same = abs(period_s - master.period_s) <= 1e-6
+    cause = f"it interpolates over {found} (0x60C2) while SYNC comes every {wanted}"
+    yield Finding("cycle", wanted, found, same, cause, "set 0x60C2 or machine.sync_period_s")
 
 
 def compare_scale(master: Master) -> Iterator[Finding]:
@@ -246,14 +235,10 @@ def compare_scale(master: Master) -> Iterator[Finding]:
         per_rev, source = encoder, "0x608F"
     else:
         return
-    yield Finding(
-        "scale",
-        f"{expected} per revolution",
-        f"{per_rev:g} per revolution",
-        abs(per_rev - expected) <= 1e-6 * expected,
-        f"its position counts {per_rev:g} per motor revolution ({source}) where the config has {expected}",
-        "correct the drive's factors or drive.increments_per_rev",
-    )
+    wanted, found = f"{expected} per revolution", f"{per_rev:g} per revolution"
+    same = abs(per_rev - expected) <= 1e-6 * expected
+    cause = f"its position counts {per_rev:g} per motor revolution ({source}) where the config has {expected}"
+    yield Finding("scale", wanted, found, same, cause, "correct the drive's factors or drive.increments_per_rev")
 
 
 def _ratio(master: Master, index: int) -> float | None:
@@ -269,14 +254,10 @@ def compare_rating(master: Master) -> Iterator[Finding]:
     expected = master.config.axis[master.axis].drive.rated_current_a
     if milliamps is None:
         return
-    yield Finding(
-        "rated current",
-        f"{expected:g} A",
-        f"{milliamps / 1e3:g} A",
-        abs(milliamps / 1e3 - expected) <= 0.01 * expected,
-        f"its rated current is {milliamps / 1e3:g} A (0x6075) where the config has {expected:g} A",
-        "correct drive.rated_current_a",
-    )
+    wanted, found = f"{expected:g} A", f"{milliamps / 1e3:g} A"
+    same = abs(milliamps / 1e3 - expected) <= 0.01 * expected
+    cause = f"its rated current is {found} (0x6075) where the config has {wanted}"
+    yield Finding("rated current", wanted, found, same, cause, "correct drive.rated_current_a")
 
 
 def read_options(master: Master) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""The mark beside a commissioning record that voids it: something against it was seen, and it was not compared since.
+"""Marks a commissioning record as void: something against it was seen, and it was not compared since.
 
 A drive that has rebooted may have lost what is not stored in it; one that another master wrote to may be set up anew.
 The mark is a file of its own, so that it outlives every process; comparing the drive again removes it.

@@ -1,4 +1,4 @@
-"""The commissioning's proof that a drive stops by itself when fdhil dies: CiA 301 7.2.8, the heartbeat consumer."""
+"""Proves that a drive stops by itself when fdhil dies: CiA 301 7.2.8, the heartbeat consumer."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import contextlib
 from collections.abc import Callable
 
 from fdhil.cia402 import Object, State
-from fdhil.commissioning import survey as checks
 from fdhil.commissioning.master import Master
+from fdhil.commissioning.survey import require_enabled
 from fdhil.drivers.can.sdo import NO_OBJECT, NO_SUB_INDEX
 from fdhil.errors import DeviceError, DriveFault, SdoAbort
 
@@ -37,16 +37,13 @@ def watchdog_test(master: Master, enable: Callable[[Master], None]) -> str:
             master.wait(lambda: master.state() is not State.OPERATION_ENABLED, STARVE_TIMEOUT_S, "")
         master.check()
         if master.state() is State.OPERATION_ENABLED:
-            raise DriveFault(
-                master.device,
-                "it went on although our heartbeat stopped: its watchdog does not work; check 0x1016 and 0x6007",
-            )
+            text = "it went on although our heartbeat stopped: its watchdog does not work; check 0x1016 and 0x6007"
+            raise DriveFault(master.device, text)
         codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[told:]]
         if EMCY_HEARTBEAT not in codes:
             shown = ", ".join(f"{code:04X}" for code in codes) or "none"
-            raise DriveFault(
-                master.device, f"it stopped with the EMCY {shown} instead of 8130; find out what else stops it"
-            )
+            text = f"it stopped with the EMCY {shown} instead of 8130; find out what else stops it"
+            raise DriveFault(master.device, text)
     return "proven"
 
 
@@ -66,14 +63,12 @@ def _feed(master: Master, sub: int, entry: int, enable: Callable[[Master], None]
             return
         codes = [int.from_bytes(data[:2], "little") for data in master.heard.emergencies[told:]]
         if EMCY_HEARTBEAT not in codes:
-            checks.require_enabled(master)
+            require_enabled(master)
         master.heartbeat = False
         master.sdo.write_int(Object.CONSUMER_HEARTBEAT, sub, 0, 4)
         enable(master)
-    raise DriveFault(
-        master.device,
-        f"it missed our heartbeat {FEEDING_TRIES} times; take load off this computer and try again",
-    )
+    text = f"it missed our heartbeat {FEEDING_TRIES} times; take load off this computer and try again"
+    raise DriveFault(master.device, text)
 
 
 def _consumer_slot(master: Master, node_id: int) -> tuple[int, int]:

@@ -76,7 +76,7 @@ class Voltage(Section):
     """[axis.X.voltage]: where the motor's terminal voltage comes from."""
 
     source: Annotated[str, one_of(tables.VOLTAGE_SOURCES)] = Field(
-        "drive", description="drive (a vendor object in a TPDO) or modbus (a separate sensor)"
+        tables.DRIVE_VOLTAGE, description="drive (a vendor object in a TPDO) or modbus (a separate sensor)"
     )
     sampling: Literal["interval_mean", "instant"] = Field(
         "interval_mean", description="the drive's value is the mean since the last sample, or an instant"
@@ -85,6 +85,11 @@ class Voltage(Section):
     port: int = Field(0, ge=0, le=65535, description="modbus: TCP port; 0 lets the simulator choose one")
     unit: int = Field(1, ge=0, le=247, description="modbus: unit identifier")
     timeout_s: Positive = Field(0.5, ge=1e-3, le=60, description="modbus: how long an answer may take")
+
+    @property
+    def separate(self) -> bool:
+        """Whether a sensor of its own tells the voltage; else the drive does, with its other samples."""
+        return self.source != tables.DRIVE_VOLTAGE
 
 
 class Thermometer(Section):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from fdhil.config import MachineConfig
-from fdhil.drivers.moves import inferred
+from fdhil.drivers.moves import load_event_source
 from fdhil.identification.windows import PLATEAU_BAND, PLATEAU_S, RAPID_SHARE, RUN_SHARE
 from fdhil.records import AxisSamples, Float, Int
 
@@ -37,7 +37,7 @@ class Moves:
         self._rapid_mm_s = settings.rapid_speed_mm_s
         self._mm_per_rad = settings.screw_pitch_mm / (2 * math.pi)
         self._source = config.g0.source
-        self._needed = inferred.RAPID_SHARE if self._source == "inferred" else RAPID_SHARE
+        self._needed = max(RAPID_SHARE, load_event_source(self._source).least_share)
         # one increment per cycle is the rounding of the set-point, not a motion
         self._still_mm_s = max(RUN_SHARE * self._rapid_mm_s, 2 / settings.scaling.increments_per_mm / self._period_s)
         self._last: AxisSamples | None = None

@@ -11,7 +11,7 @@ import os
 import signal
 import time
 import traceback
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
@@ -27,12 +27,12 @@ from fdhil.daemon.kernel_warmup import warm
 from fdhil.daemon.lock import sole_owner
 from fdhil.daemon.notify import notify
 from fdhil.daemon.outcome_store import OutcomeStore
+from fdhil.daemon.record_queue import RecordQueue
 from fdhil.daemon.status import Watch
 from fdhil.errors import DeviceError, FdhilError, StoreError
 from fdhil.pipeline import AxisPipeline, Record
 from fdhil.records import AxisSamples, Notice, Outcome, Temperature, TickTimes
 
-QUEUE_RECORDS = 4000  # per axis: more than half a minute of blocks; beyond it the newest are dropped and counted
 NOTICE_QUEUE = 200
 FIRST_RETRY_S = 0.1
 LAST_RETRY_S = 5.0
@@ -44,8 +44,8 @@ STUCK_S = 60.0  # a batch that is digested for so long hangs
 class Source(Protocol):
     """A machine as the daemon needs it: its records in blocks, and counts of what was received and lost."""
 
-    def records(self) -> AsyncIterator[Record | Notice]:
-        """Yield records as they come, until the source ends; DeviceError when a device fails for good."""
+    async def run(self, take: Callable[[Record | Notice], None]) -> None:
+        """Hand records over as they come, until the source ends; DeviceError when a device fails for good."""
 
     def counters(self) -> Mapping[str, Any]:
         """Return frames received, lost and the like."""
@@ -73,15 +73,15 @@ class Service:
         self._desk = ArmingDesk(config, self._store, self._run_directory)
         self._watch = Watch(config, time.monotonic())
         self._pipelines: dict[str, AxisPipeline] = {}
-        self._queues = {axis: asyncio.Queue[Record](QUEUE_RECORDS) for axis in config.axis}
+        self._queues = {axis: RecordQueue() for axis in config.axis}
         self._busy_since_s: dict[str, float] = {}
-        self._dropped = dict.fromkeys(config.axis, 0)
         self._notices = asyncio.Queue[Notice](NOTICE_QUEUE)
         self._gate = journal.FloodGate()
         self._opened = asyncio.Event()
         self._stop = asyncio.Event()
         self._source: Source | None = None
         self._frames_seen = -1
+        self._delay_s = FIRST_RETRY_S
 
     async def run(self) -> Standing:
         """Serve until SIGTERM or SIGINT; return what may still be applied. BusLocked when another daemon serves it."""
@@ -158,16 +158,14 @@ class Service:
 
         What cannot be opened at the start ends the daemon with the reason: it is a fault of the set-up.
         """
-        delay_s = FIRST_RETRY_S
+        self._delay_s = FIRST_RETRY_S
         while True:
             try:
                 async with self._open_source(self._config) as source:
                     self._source = source
                     self._watch.hearing.source_opened(time.monotonic())
                     self._opened.set()
-                    async for record in source.records():
-                        delay_s = FIRST_RETRY_S
-                        self._take(record)
+                    await source.run(self._take)
                 cause = "the source ended"
             except (DeviceError, OSError) as error:
                 if not self._opened.is_set():
@@ -175,12 +173,13 @@ class Service:
                 cause = str(error)
             self._source = None
             self._watch.hearing.source_lost(time.monotonic())
-            text = f"{cause}; it is opened again in {delay_s:.1f} s, what was learnt is kept."
+            text = f"{cause}; it is opened again in {self._delay_s:.1f} s, what was learnt is kept."
             self._tell([Notice("SourceLost", "MAJOR", text)])
-            await asyncio.sleep(delay_s)
-            delay_s = min(LAST_RETRY_S, 2 * delay_s)
+            await asyncio.sleep(self._delay_s)
+            self._delay_s = min(LAST_RETRY_S, 2 * self._delay_s)
 
     def _take(self, record: Record | Notice) -> None:
+        self._delay_s = FIRST_RETRY_S
         self._watch.hearing.record_came(record, time.monotonic())
         if isinstance(record, Notice):
             self._tell([record])
@@ -191,25 +190,19 @@ class Service:
             self._desk.hear(record)
         for axis in self._config.axis if isinstance(record, TickTimes) else (record.axis,):
             if axis in self._queues:
-                if self._queues[axis].full():
-                    self._dropped[axis] += 1
-                else:
-                    self._queues[axis].put_nowait(record)
+                self._queues[axis].put(record)
 
     async def _work(self, axis: str) -> None:
         """Feed one axis' pipeline, in order, in a worker thread; a batch takes all that waits."""
         queue = self._queues[axis]
         while True:
-            batch = [await queue.get()]
-            while not queue.empty():
-                batch.append(queue.get_nowait())
+            batch = await queue.batch()
             self._busy_since_s[axis] = time.monotonic()
             outcomes, notices = await asyncio.to_thread(self._digest, axis, batch)
             del self._busy_since_s[axis]
             self._desk.knowledge.note(outcomes)
             self._say([*outcomes, *notices])
-            for _ in batch:
-                queue.task_done()
+            queue.digested(len(batch))
 
     def _digest(self, axis: str, batch: Sequence[Record]) -> tuple[list[Outcome], list[Notice]]:
         """In the worker thread: records through the pipeline, outcomes into the store."""
@@ -298,6 +291,8 @@ class Service:
 
     def _status(self) -> Answer:
         counters = dict(self._source.counters()) if self._source is not None else {}
+        dropped = {axis: queue.dropped for axis, queue in self._queues.items()}
+        counters["records_dropped"] = sum(dropped.values())
         store = {
             "directory": str(self._config.store.directory),
             "fault": self._store.fault,
@@ -313,7 +308,7 @@ class Service:
             **status,
             "frames": {"received": counters.get("frames", 0), "lost": counters.get("lost", 0)},
             "counters": counters,
-            "dropped": self._dropped,
+            "dropped": dropped,
             "guard": dict(guard.status),
             "may_stand": {"nothing": guard.standing.nothing, "text": str(guard.standing)},
             "armed": self._desk.armed,

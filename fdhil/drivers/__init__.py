@@ -1,4 +1,4 @@
-"""Adapters between the machine's wires and the records: buses, drives, sensors, event sources."""
+"""Listens to the machine's wires and makes records of them: buses, drives, sensors, event sources."""
 
 from fdhil.drivers.machine import MachineSource, Record, open_machine
 

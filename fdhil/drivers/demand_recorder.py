@@ -1,4 +1,4 @@
-"""The demand of an air cut as it is sniffed: r[k] of every axis on the SYNC grid, from the first motion to the last.
+"""Records the demand of an air cut as it is sniffed: r[k] of every axis, from the first motion to the last.
 
 Pure: records in, a demand out. What was lost stays a gap; nothing is interpolated.
 """

@@ -89,7 +89,7 @@ class AxisPipeline:
         self._settings = _settings(config, method)
         self._period_s = config.machine.sync_period_s
         self._ring = Ring(self._ticks(RING_S), self._period_s)
-        self._separate_voltage = config.axis[axis].voltage.source != "drive"
+        self._separate_voltage = config.axis[axis].voltage.separate
         self._rapids: deque[_Rapid] = deque()
         self._first_tick: int | None = None
         self._temperature: Temperature | None = None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import io
 import json
 import signal
@@ -92,7 +91,7 @@ Said = Callable[..., tuple[int, str, str]]
 def fdhil(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Said:
     """Run a command in this process, with shorter waits than on a real machine: exit code, stdout and stderr."""
     for module, name, value in WAITS:
-        monkeypatch.setattr(importlib.import_module(f"fdhil.{module}"), name, value)
+        monkeypatch.setattr(f"fdhil.{module}.{name}", value)
 
     def run(*arguments: object, said: str = "") -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["fdhil", *map(str, arguments)])

@@ -9,13 +9,11 @@ from pathlib import Path
 import can
 import pytest
 
-from fdhil.commissioning import config_check
-from fdhil.commissioning import scan as bus_scan
+from fdhil.commissioning.bus_listener import Traffic
 from fdhil.commissioning.config_check import check_machine, compare_heard
-from fdhil.commissioning.scan import Description, Ear, EdsMatch, Traffic, printable, read_descriptions, scan_bus
+from fdhil.commissioning.scan import BusScanner, Description, EdsMatch, printable, read_descriptions, scan_bus
 from fdhil.commissioning.survey import Finding, Identity
 from fdhil.config import MachineConfig
-from fdhil.drivers.can import sdo as canopen_sdo
 from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, frames_of
 from fdhil.errors import ConnectError, ProtocolError
 from tests.drivers.peer import DrivePeer
@@ -27,10 +25,10 @@ WHO = Identity(1, 2, 3, 4)
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorter waits than on a real machine."""
-    monkeypatch.setattr(bus_scan, "LISTEN_S", 0.25)
-    monkeypatch.setattr(config_check, "LISTEN_S", 0.25)
-    monkeypatch.setattr(canopen_sdo, "QUIET_S", 0.1)
-    monkeypatch.setattr(canopen_sdo, "RESPONSE_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("fdhil.commissioning.scan.LISTEN_S", 0.25)
+    monkeypatch.setattr("fdhil.commissioning.config_check.LISTEN_S", 0.25)
+    monkeypatch.setattr("fdhil.drivers.can.sdo.QUIET_S", 0.1)
+    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.2)
 
 
 @pytest.fixture
@@ -123,20 +121,20 @@ def test_a_node_that_lacks_objects_is_listed_all_the_same(peer: tuple[DrivePeer,
     assert answers is not None
     assert answers.eds == EdsMatch("b.eds", "exact")
     assert answers.is_drive
-    with Ear("can0", settings) as ear:
-        assert ear.read(1, 0x5FFF) is None
-        assert ear.read(9, 0x1000) is None
+    with BusScanner("can0", settings) as bus:
+        assert bus.read(1, 0x5FFF) is None
+        assert bus.read(9, 0x1000) is None
 
 
 def test_nothing_is_asked_once_a_master_is_heard(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
-    with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as nc, Ear("can0", settings) as ear:
+    with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as nc, BusScanner("can0", settings) as bus:
         nc.send(can.Message(arbitration_id=0x80, is_extended_id=False))
-        ear.listen(0.1)
+        bus.listen(0.1)
         with pytest.raises(ProtocolError, match=r"an NC came on the bus \(SYNC\)"):
-            ear.answering()
+            bus.answering()
         with pytest.raises(ProtocolError, match="start again"):
-            ear.read(1, 0x1000)
+            bus.read(1, 0x1000)
     assert drive.heard == [0x80]
 
 

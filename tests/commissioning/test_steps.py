@@ -11,9 +11,7 @@ import can
 import pytest
 
 from fdhil.cia402 import Object, State
-from fdhil.commissioning import steps as commissioning
-from fdhil.commissioning import survey as commissioning_checks
-from fdhil.commissioning import watchdog as commissioning_watchdog
+from fdhil.commissioning import steps, survey
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.steps import (
     check_axis,
@@ -24,9 +22,8 @@ from fdhil.commissioning.steps import (
     rolled_back,
     sign_test,
 )
-from fdhil.commissioning.watchdog import watchdog_test
+from fdhil.commissioning.watchdog import FEEDING_TRIES, watchdog_test
 from fdhil.config import MachineConfig
-from fdhil.drivers.can import sdo as canopen_sdo
 from fdhil.errors import ConnectError, DeviceError, DriveFault, ProtocolError
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
@@ -91,13 +88,13 @@ def test_a_simulated_drive_may_sleep() -> None:
 def test_software_limits_are_kept_where_the_drive_has_them(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
     with Master(settings, "X") as master:
-        assert not {"607D01", "607D02"} & commissioning_checks.read_options(master).keys()
+        assert not {"607D01", "607D02"} & survey.read_options(master).keys()
         drive.drive.set_object(0x607D, 1, -1000)
         drive.drive.set_object(0x607D, 2, 820_000)
-        found = commissioning_checks.read_options(master)
+        found = survey.read_options(master)
         assert (found["607D01"], found["607D02"]) == (-1000, 820_000)
         drive.drive.set_object(0x607D, 2, -1000)  # both equal: switched off (CiA 402-2)
-        assert "607D01" not in commissioning_checks.read_options(master)
+        assert "607D01" not in survey.read_options(master)
 
 
 def test_an_offset_kept_out_of_the_feedforward_is_noticed() -> None:
@@ -212,7 +209,7 @@ def test_a_drive_that_takes_offsets_otherwise_is_refused_and_disabled(
 def test_a_watchdog_that_does_nothing_is_refused(
     peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(commissioning_watchdog, "STARVE_TIMEOUT_S", 0.05)  # it never stops
+    monkeypatch.setattr("fdhil.commissioning.watchdog.STARVE_TIMEOUT_S", 0.05)  # it never stops
     drive, settings = peer
     drive.drive.faults.no_heartbeat_consumer = True
     with Master(settings, "X") as master, pytest.raises(DriveFault, match="watchdog does not work"):
@@ -242,7 +239,7 @@ class LateMaster(Master):
 @pytest.fixture
 def fed(peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch) -> Iterator[LateMaster]:
     """A master that feeds the drive for a short time; afterwards the drive watches nobody any more, and is off."""
-    monkeypatch.setattr(commissioning_watchdog, "FEEDING_S", 0.15)
+    monkeypatch.setattr("fdhil.commissioning.watchdog.FEEDING_S", 0.15)
     drive, settings = peer
     with LateMaster(settings, "X") as master:
         yield master
@@ -253,14 +250,14 @@ def fed(peer: tuple[DrivePeer, MachineConfig], monkeypatch: pytest.MonkeyPatch) 
 def test_a_feeding_that_this_computer_missed_is_tried_again(fed: LateMaster) -> None:
     fed.late = 2
     run_steps(fed, lambda m: watchdog(m) == "proven" or pytest.fail("not proven"))
-    assert 2 < fed.feedings <= commissioning_watchdog.FEEDING_TRIES  # this computer may be late once by itself
+    assert 2 < fed.feedings <= FEEDING_TRIES  # this computer may be late once by itself
 
 
 def test_a_computer_that_is_always_late_is_told(fed: LateMaster) -> None:
     fed.late = 99
     with pytest.raises(DriveFault, match="missed our heartbeat 4 times; take load off this computer"):
         run_steps(fed, watchdog)
-    assert fed.feedings == commissioning_watchdog.FEEDING_TRIES
+    assert fed.feedings == FEEDING_TRIES
 
 
 def test_a_drive_that_trips_while_it_is_fed_is_not_tried_again(
@@ -289,11 +286,11 @@ class SlowReader(Master):
         if index == Object.VELOCITY_DEMAND:
             self.readings += 1
             if self.readings <= self.slow:
-                self.wait_cycles(2 * commissioning.EARLY_CYCLES + commissioning.RAMP_CYCLES)
+                self.wait_cycles(2 * steps.EARLY_CYCLES + steps.RAMP_CYCLES)
         return value
 
 
-READINGS = 1 + commissioning.RAMPS  # of a try in which each is late: whether the object is there, and one a ramp
+READINGS = 1 + steps.RAMPS  # of a try in which each is late: whether the object is there, and one a ramp
 
 
 def test_a_ramp_whose_begin_was_missed_is_asked_again(peer: tuple[DrivePeer, MachineConfig]) -> None:
@@ -302,7 +299,7 @@ def test_a_ramp_whose_begin_was_missed_is_asked_again(peer: tuple[DrivePeer, Mac
         prepare(master)
         enable(master)
         master.slow = READINGS
-        assert commissioning.tell_feedforward(master) is True
+        assert steps.tell_feedforward(master) is True
         assert master.readings > 2 * READINGS
 
 
@@ -312,8 +309,8 @@ def test_a_feedforward_that_is_never_seen_stays_untold(peer: tuple[DrivePeer, Ma
         prepare(master)
         enable(master)
         master.slow = 1_000_000
-        assert commissioning.tell_feedforward(master) is None
-        assert master.readings == commissioning.FEEDFORWARD_TRIES * READINGS
+        assert steps.tell_feedforward(master) is None
+        assert master.readings == steps.FEEDFORWARD_TRIES * READINGS
 
 
 def test_full_heartbeat_consumers_are_refused(peer: tuple[DrivePeer, MachineConfig]) -> None:
@@ -329,7 +326,7 @@ def test_an_nc_on_the_bus_is_left_alone(peer: tuple[DrivePeer, MachineConfig]) -
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as nc, Master(settings, "X") as master:
         nc.send(can.Message(arbitration_id=0x80, is_extended_id=False))
         with pytest.raises(ProtocolError, match="an NC is sending"):
-            commissioning_checks.listen(master)
+            survey.listen(master)
     assert drive.heard == [0x80]  # the NC's own
 
 
@@ -342,7 +339,7 @@ def test_a_silent_bus_gets_no_frame() -> None:
 
 
 def test_a_drive_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(canopen_sdo, "RESPONSE_TIMEOUT_S", 0.01)  # nothing ever comes
+    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.01)  # nothing ever comes
     settings = config(drive={"node_id": 9})
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as other:
         other.send(can.Message(arbitration_id=0x701, data=[5], is_extended_id=False))

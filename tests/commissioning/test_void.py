@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from fdhil import config as machine_config
-from fdhil.commissioning import compare as commissioning_compare
-from fdhil.commissioning.compare import Compared, compare_again, compare_record, found_fingerprint
+from fdhil.commissioning.compare import compare_again, compare_record, found_fingerprint
 from fdhil.commissioning.record import CommissioningRecord, load_record, save_record
 from fdhil.commissioning.survey import Finding, Identity, Survey
 from fdhil.commissioning.void import confirm_record, is_void, void_path, void_record
@@ -88,13 +87,13 @@ def test_before_the_guard_starts_each_record_is_compared(tmp_path: Path, monkeyp
     store, told = config.store.directory, list[str]()
     compared, nc = list[str](), [True]
 
-    def compare(_config: object, record: CommissioningRecord) -> Compared:
+    def compare(_config: object, record: CommissioningRecord) -> Finding:
         compared.append(record.axis)
         ok = record.axis == "Y"
-        return Compared(record.axis, Finding("", "", "", ok, "" if ok else "it differs", "mend it"))
+        return Finding("", "", "", ok, "" if ok else "it differs", "mend it")
 
-    monkeypatch.setattr(commissioning_compare, "_an_nc_runs", lambda *_: nc[0])
-    monkeypatch.setattr(commissioning_compare, "compare_drive", compare)
+    monkeypatch.setattr("fdhil.commissioning.compare._an_nc_runs", lambda *_: nc[0])
+    monkeypatch.setattr("fdhil.commissioning.compare.compare_drive", compare)
     compare_again(config, "can0", told.append)
     for axis in "XYZ":
         save_record(replace(RECORD, axis=axis), store)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -96,14 +96,14 @@ class Machine:
         self.opened += 1
         yield self
 
-    async def records(self) -> AsyncIterator[Record | Notice]:
-        """Yield what was given."""
+    async def run(self, take: Callable[[Record | Notice], None]) -> None:
+        """Hand over what was given."""
         while True:
             record = await self.queue.get()
             if isinstance(record, Exception):
                 raise record
             self.taken += 1
-            yield record
+            take(record)
 
     def black_box(self) -> dict[str, str]:
         """Return what was on the bus."""

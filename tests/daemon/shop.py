@@ -14,10 +14,10 @@ import pytest
 from fdhil import config as machine_config
 from fdhil.cli.demo.processes import Process, Twin
 from fdhil.cli.main import cli, run_safely
-from fdhil.commissioning.steps import commission, save_record
+from fdhil.commissioning.record import save_record
+from fdhil.commissioning.steps import commission
 from fdhil.config import MachineConfig
 from fdhil.daemon.control import ask
-from fdhil.drivers.can import sdo
 from fdhil.errors import ConnectError
 from tests.bench import axis_toml
 
@@ -42,7 +42,7 @@ def patient() -> Iterator[None]:
     """Wait long for a drive's answer by SDO."""
     with pytest.MonkeyPatch.context() as patch:
         for name in ("RESPONSE_TIMEOUT_S", "DEADLINE_S"):
-            patch.setattr(sdo, name, 20.0)
+            patch.setattr(f"fdhil.drivers.can.sdo.{name}", 20.0)
         yield
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 from pathlib import Path
+from typing import Any
 
 import pytest
 from canopen.objectdictionary import ObjectDictionary
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil.drivers.cia402.eds import MAX_BYTES, MAX_OBJECTS, load_eds, objects_of, parse_eds
+from fdhil.drivers.cia402.eds import MAX_BYTES, MAX_OBJECTS, load_eds, parse_eds
 from fdhil.errors import EdsError
 
 GOOD = """\
@@ -71,6 +72,18 @@ QUIRKS = {
     "blank node id": (GOOD + "[DeviceComissioning]\nNodeID=\nBaudrate=\n").encode(),
     "no access type": GOOD.replace("AccessType=rw\n", "").encode(),
 }
+
+
+def objects_of(dictionary: ObjectDictionary) -> dict[tuple[int, int], Any]:
+    """Return all variables of a dictionary by (index, sub-index)."""
+    found: dict[tuple[int, int], Any] = {}
+    for index in dictionary:
+        entry = dictionary[index]
+        if hasattr(entry, "subindices"):
+            found |= {(index, sub): variable for sub, variable in entry.subindices.items()}
+        else:
+            found[index, 0] = entry
+    return found
 
 
 @pytest.mark.parametrize("quirk", QUIRKS)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from fdhil import tables
 from fdhil.drivers.cia402.drive import InputSamples
+from fdhil.drivers.moves import load_event_source
 from fdhil.drivers.moves.digital_input import DigitalInputG0
 from fdhil.drivers.moves.inferred import InferredG0
 from fdhil.records import AxisSamples, Float, MoveEvent, MoveKind, frozen, frozen_ints
@@ -79,7 +80,7 @@ def test_the_ncs_signal_is_taken_edge_by_edge() -> None:
 
 @pytest.mark.parametrize("name", tables.EVENT_SOURCES)
 def test_contract(name: str) -> None:
-    source = tables.load(tables.EVENT_SOURCES, name)("X", machine())
+    source = load_event_source(name)("X", machine())
     for record in (
         samples(np.zeros(0)),
         samples(np.zeros(10)),
@@ -88,3 +89,30 @@ def test_contract(name: str) -> None:
         InputSamples("Y", frozen_ints([0, 10]), frozen_ints([0, 1 << 16])),
     ):
         assert source.feed(record) == []
+
+
+@pytest.mark.parametrize("name", tables.EVENT_SOURCES)
+def test_every_listed_source_tells_a_rapid_in_its_own_name(name: str) -> None:
+    """Demand and signal come in blocks, as from a drive: a rapid to and fro, with the bit set meanwhile."""
+    config = machine()
+    source = load_event_source(name)("X", config)
+    there = move(400, 500)
+    demand = np.concatenate([there, there[-1] - there])
+    high = np.abs(np.diff(demand, prepend=0.0)) > 0
+    events: list[MoveEvent] = []
+    for first in range(0, demand.size, 50):
+        ticks = np.arange(first, min(first + 50, demand.size))
+        events += source.feed(samples(demand[ticks], first))
+        inputs = np.where(high[ticks[::10]], 1 << config.g0.input_bit, 0)
+        events += source.feed(InputSamples("X", frozen_ints(ticks[::10]), frozen_ints(inputs)))
+    assert [event.kind for event in events] == [MoveKind.RAPID, MoveKind.REST] * 2
+    assert {(event.axis, event.source) for event in events} == {("X", name)}
+    edges = np.flatnonzero(np.diff(high))
+    np.testing.assert_allclose([event.tick for event in events], edges, atol=12)  # the input comes every 10 ticks
+
+
+@pytest.mark.parametrize("name", tables.EVENT_SOURCES)
+def test_every_listed_source_says_what_it_needs(name: str) -> None:
+    source = load_event_source(name)
+    assert source.needs_input in (True, False)
+    assert 0.0 <= source.least_share < 1.0

@@ -12,7 +12,7 @@ from fdhil.drivers.can.frames import (
     ERROR_CONTROLLER,
     ERROR_FLAG,
     ERROR_RESTARTED,
-    Ring,
+    FrameRing,
     error_notices,
     frames_of,
 )
@@ -20,7 +20,7 @@ from fdhil.drivers.can.frames import (
 
 @given(st.lists(st.integers(0, 12), max_size=40))
 def test_ring_gives_back_all_that_found_room(steps: list[int]) -> None:
-    ring = Ring(8)
+    ring = FrameRing(8)
     sent, kept, given_back = 0, [], []
     waiting = 0
     for step in steps:
@@ -38,7 +38,7 @@ def test_ring_gives_back_all_that_found_room(steps: list[int]) -> None:
 
 
 def test_a_frame_survives_the_ring() -> None:
-    ring = Ring(4)
+    ring = FrameRing(4)
     for length in (0, 3, 8):
         ring.append(7, 0x80000123, bytes(range(length)))
         (frame,) = ring.drain()

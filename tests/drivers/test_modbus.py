@@ -10,15 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdhil import tables
 from fdhil.config import MachineConfig
-from fdhil.drivers import machine as machine_module
 from fdhil.drivers.can.tick_clock import TickClock
-from fdhil.drivers.cia402.profile import load_profile
-from fdhil.drivers.machine import MachineSource, Outlet, SensorSource
 from fdhil.drivers.modbus.counter_clock import CounterClock
 from fdhil.drivers.modbus.link import ModbusLink
 from fdhil.drivers.modbus.voltage import ModbusVoltage, SensorBlock, parse_block
+from fdhil.drivers.sensor_source import Record, SensorSource
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
 from fdhil.records import Notice, Temperature, TickTimes, VoltageSamples
 from tests.drivers.modbus_peer import VOLTS_PER_COUNT, SensorPeer, sensor_peer
@@ -103,8 +100,8 @@ async def test_nobody_there_is_said() -> None:
 
 
 async def test_a_source_survives_and_tells_both_edges(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(machine_module, "POLL_S", 0.01)
-    out = Outlet()
+    monkeypatch.setattr("fdhil.drivers.sensor_source.POLL_S", 0.01)
+    out = asyncio.Queue[Record]()
     codes: list[tuple[str, str]] = []
 
     async def until(code: str, severity: str) -> None:
@@ -116,7 +113,7 @@ async def test_a_source_survives_and_tells_both_edges(monkeypatch: pytest.Monkey
 
     async with sensor_peer() as peer:
         source = SensorSource(ModbusVoltage("X", config(peer.port)), TickClock(0.001))
-        task = asyncio.create_task(source.run(out))
+        task = asyncio.create_task(source.run(out.put_nowait))
         for mode, code in (("silent", "ModbusTimeout"), ("exception", "ModbusException"), ("nan", "ModbusShape")):
             peer.mode = mode
             await until(code, "MAJOR")
@@ -224,22 +221,3 @@ def test_late_stamps_of_sync_do_not_move_the_samples() -> None:
         assert sensor.line is not None
         begins.append(sensor.line.at(0))
     np.testing.assert_allclose(begins[20:], 0.0, atol=0.6)
-
-
-@pytest.mark.parametrize("name", tables.VOLTAGE_SOURCES)
-async def test_every_listed_source_tells_the_voltage_of_its_axis(name: str) -> None:
-    """``drive`` is an object in a TPDO; every other is a sensor of its own, which the machine reaches and polls."""
-    async with sensor_peer() as peer:
-        settings = machine(voltage={"source": name, "port": peer.port, "timeout_s": 0.2})
-        assert ("modbus.X.samples" in MachineSource(settings).counters()) == (name != "drive")
-        if name == "drive":
-            profile = load_profile(settings.axis["X"].drive.profile)
-            assert tables.load(tables.VOLTAGE_SOURCES, name)("X", settings, profile).key == profile.voltage
-            return
-        sensor = tables.load(tables.VOLTAGE_SOURCES, name)("X", settings)
-        await sensor.link.connect()
-        records = await sensor.poll(TickClock(0.001))
-        sensor.link.close()
-    assert {r.axis for r in records if isinstance(r, VoltageSamples)} == {"X"}
-    assert sensor.samples > 0
-    assert not sensor.link.connected

@@ -56,6 +56,12 @@ def test_no_pdo_is_longer_than_a_frame_or_overlaps(profile: DriveProfile) -> Non
             assert before.bit_offset + before.bits <= after.bit_offset
 
 
+def test_every_signal_has_its_scale(profile: DriveProfile) -> None:
+    axis = machine().axis["X"]
+    assert profile.speed_rad_s_per_count(axis) > 0
+    assert profile.current_a_per_count(axis) > 0
+
+
 def test_a_drive_that_is_left_alone_can_be_told_to_stop(profile: DriveProfile) -> None:
     assert profile.strict_abort_options
     assert set(profile.strict_abort_options) <= {1, 2, 3}

@@ -10,9 +10,10 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import CanBus as BusSettings
 from fdhil.drivers.can.bus import CanBus
-from fdhil.drivers.can.frames import Ring
+from fdhil.drivers.can.frames import FrameRing
 from fdhil.drivers.can.ports import SocketCanPort
 
 pytestmark = pytest.mark.socketcan
@@ -51,9 +52,9 @@ def test_frames_come_in_order_with_stamps_of_the_kernel(sender: socket.socket) -
 
 
 def test_what_the_kernel_dropped_is_counted_exactly(sender: socket.socket) -> None:
-    port = SocketCanPort("can0", "vcan0")
+    port = SocketCanPort("can0", SETTINGS)
     port._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    ring = Ring(1 << 14)
+    ring = FrameRing(1 << 14)
     for number in range(600):
         send(sender, number)
     for _ in range(5):
@@ -67,7 +68,7 @@ def test_what_the_kernel_dropped_is_counted_exactly(sender: socket.socket) -> No
 
 
 def test_what_is_sent_arrives(sender: socket.socket) -> None:
-    with CanBus("can0", SETTINGS, transmit=True) as bus:
+    with TransmitBus("can0", SETTINGS) as bus:
         bus.send(0x601, b"\x40\x18\x10")
         can_id, length, data = struct.unpack("=IB3x8s", sender.recv(16))
     assert (can_id, data[:length]) == (0x601, b"\x40\x18\x10")

@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdhil.commissioning import steps as commissioning
-from fdhil.commissioning import survey as commissioning_checks
 from fdhil.commissioning.steps import commission
 from fdhil.config import MachineConfig
 from fdhil.drivers import MachineSource, Record, open_machine
@@ -82,12 +80,21 @@ def rapid(folder: Path) -> Path:
 
 
 async def gather(source: MachineSource, until: Callable[[list[Record]], bool], seconds: float = 300) -> list[Record]:
+    """Return the records of a source, from now on, up to the one with which it is enough."""
     records: list[Record] = []
-    async with asyncio.timeout(seconds):
-        async for record in source.records():
+    enough = asyncio.Event()
+
+    def take(record: Record) -> None:
+        if not enough.is_set():
             records.append(record)
             if until(records):
-                break
+                enough.set()
+
+    running = asyncio.create_task(source.run(take))
+    async with asyncio.timeout(seconds):
+        await enough.wait()
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
     return records
 
 
@@ -96,9 +103,9 @@ def moved(records: list[Record]) -> bool:
 
 
 def test_commissioning_of_the_process(twin: Twin, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(commissioning_checks, "LISTEN_S", 0.3)
-    monkeypatch.setattr(commissioning, "SETTLE_CYCLES", 150)
-    monkeypatch.setattr(commissioning, "AVERAGE_CYCLES", 80)
+    monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.3)
+    monkeypatch.setattr("fdhil.commissioning.steps.SETTLE_CYCLES", 150)
+    monkeypatch.setattr("fdhil.commissioning.steps.AVERAGE_CYCLES", 80)
     record = commission(twin.config(), "X")
     assert record.offset_in_feedforward is True
     assert record.watchdog == "proven"
@@ -106,7 +113,7 @@ def test_commissioning_of_the_process(twin: Twin, monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_window_that_is_off_is_refused(twin: Twin, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(commissioning_checks, "LISTEN_S", 0.3)
+    monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.3)
     settings = twin.config()
     wrong = settings.axis["X"].model_copy(
         update={"drive": settings.axis["X"].drive.model_copy(update={"increments_per_rev": 4096})}

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from fdhil import config as machine_config
 from fdhil.arming.guard_settings import settings_of
-from fdhil.config import CEILING_ACCELERATION_MM_S2, CEILING_OFFSET_UM, CEILING_SPEED_MM_S, VARIATION_MM, OffsetLimits
+from fdhil.config import CEILING_ACCELERATION_MM_S2, CEILING_OFFSET_UM, CEILING_SPEED_MM_S, VARIATION_MM, OffsetBounds
 from fdhil.correction import PlanLimits, check
 from fdhil.correction.gate import writing_off
 from fdhil.correction.limits import fit, to_increments
@@ -74,15 +74,15 @@ def test_planner_and_guard_agree_on_every_axis_and_nothing_exceeds_a_ceiling(
         assert any(words in machine for words in ("too coarse", "from the largest offset to zero", "feed drives have"))
         return
     axis, period = machine.axis["X"], machine.machine.sync_period_s
-    if OffsetLimits.of(axis, period).too_coarse:
+    if OffsetBounds.of(axis, period).too_coarse:
         with pytest.raises(ConfigError, match="too coarse"):
             settings_of(machine, "can0", Path(), "")
         assert writing_off(["X"], machine)[0].code == "CoarseIncrements"
         return
-    assert OffsetLimits.of(axis, period).time_to_safe_s(period) <= 0.120 + 1e-9
+    assert OffsetBounds.of(axis, period).time_to_safe_s(period) <= 0.120 + 1e-9
     whole = settings_of(machine, "can0", Path(), "").axes[0].limits
     planned = PlanLimits.of(axis, period)
-    assert (whole.offset, whole.rate, whole.acceleration, whole.variation, whole.window) == OffsetLimits.of(
+    assert (whole.offset, whole.rate, whole.acceleration, whole.variation, whole.window) == OffsetBounds.of(
         axis, period
     ).whole
     per_mm = axis.scaling.increments_per_mm

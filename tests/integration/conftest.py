@@ -14,8 +14,6 @@ import can
 import pytest
 
 from fdhil import config as machine_config
-from fdhil.commissioning import steps as commissioning
-from fdhil.commissioning import survey as commissioning_checks
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
 from fdhil.commissioning.survey import survey
@@ -119,9 +117,9 @@ def transport(request: pytest.FixtureRequest) -> str:
 @pytest.fixture
 def settling_soon(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shorter waits of the commissioning than on a real machine; the simulated drive settles sooner."""
-    monkeypatch.setattr(commissioning_checks, "LISTEN_S", 0.3)
-    monkeypatch.setattr(commissioning, "SETTLE_CYCLES", 150)
-    monkeypatch.setattr(commissioning, "AVERAGE_CYCLES", 80)
+    monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.3)
+    monkeypatch.setattr("fdhil.commissioning.steps.SETTLE_CYCLES", 150)
+    monkeypatch.setattr("fdhil.commissioning.steps.AVERAGE_CYCLES", 80)
 
 
 @pytest.fixture

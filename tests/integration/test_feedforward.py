@@ -14,7 +14,8 @@ import pytest
 from fdhil.arming.guard_client import GuardClient
 from fdhil.arming.token import read_token
 from fdhil.cli.demo.processes import Process
-from fdhil.commissioning.steps import commission, save_record
+from fdhil.commissioning.record import save_record
+from fdhil.commissioning.steps import commission
 from fdhil.correction.online import law
 from fdhil.guard.interlocks import FEEDFORWARD_FACTS
 from fdhil.prediction.models import nominal_models

@@ -29,13 +29,12 @@ async def recorded(bench: Bench, program: Path) -> tuple[list[Any], dict[str, in
         await asyncio.to_thread(bench.event, "nc")
         bench.command(json.dumps({"command": "play", "file": str(program)}))
         finished = asyncio.create_task(asyncio.to_thread(bench.event, "finished"))
-        stream = aiter(source.records())
+        running = asyncio.create_task(source.run(records.append))
         async with asyncio.timeout(4 * PATIENCE_S):
-            while not finished.done():
-                records.append(await anext(stream))
-            end = asyncio.get_running_loop().time() + 0.5
-            while asyncio.get_running_loop().time() < end:
-                records.append(await anext(stream))
+            await finished
+            await asyncio.sleep(0.5)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
         return records, source.counters()
 
 
@@ -97,11 +96,13 @@ def test_an_emergency_is_told(bench: Bench) -> None:
 
                 data = struct.pack("<HB5x", 0x8611, 0x21)
                 other.send(can.Message(arbitration_id=0x081, data=data, is_extended_id=False))
+                out = asyncio.Queue[Any]()
+                running = asyncio.create_task(source.run(out.put_nowait))
                 async with asyncio.timeout(PATIENCE_S):
-                    async for record in source.records():
-                        codes.add(getattr(record, "code", ""))
-                        if "DriveEmergency" in codes:
-                            return codes
+                    while "DriveEmergency" not in codes:
+                        codes.add(getattr(await out.get(), "code", ""))
+                running.cancel()
+                await asyncio.gather(running, return_exceptions=True)
             finally:
                 other.shutdown()
         return codes

@@ -1,1 +1,1 @@
-"""One CAN bus: ways onto it, its frames in bulk, the SYNC grid, SDO, and what the nodes say about themselves."""
+"""Listens to a CAN bus: ways onto it, its frames in bulk, the SYNC grid, SDO, and the watch over its nodes."""

@@ -1,20 +1,17 @@
-"""One CAN bus: a receive thread that only appends to a ring, and a reader that drains it in blocks.
+"""Listens to one CAN bus: a receive thread only appends to a ring, and its reader drains that in blocks.
 
-Receive-only by policy: ``CanBus`` sends nothing unless it was opened with ``transmit=True``, which commissioning and
-scanning alone do. No periodic sending of any library is used anywhere: a kernel that goes on sending for a process
-that hangs would make a dead program look alive.
+There is nothing here that sends: what does is in ``fdhil.commissioning.transmit``, which no other room may import.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from types import TracebackType
+from typing import Self
 
 from fdhil import config
-from fdhil.drivers.can.frames import DEFAULT_RING_FRAMES, Frames, Latch, Ring
-from fdhil.drivers.can.ports import BusEnded, Port, SocketcandPort, SocketCanPort, VirtualPort
-from fdhil.errors import DeviceError
+from fdhil.drivers.can.frames import DEFAULT_RING_FRAMES, FrameRing, Frames
+from fdhil.drivers.can.ports import PORTS, BusEnded, Port
 
 POLL_S = 0.05
 # frames are read ten milliseconds at a time: a thread that wakes for every one costs more than all the decoding, the
@@ -23,36 +20,28 @@ BATCH_S = 0.010
 HOLD_BACK_S = 0.001
 
 
-def open_port(name: str, settings: config.CanBus) -> Port:
-    """Open the port that ``[bus.NAME]`` asks for; ConnectError with cause and next action."""
-    if settings.interface == "socketcan":
-        return SocketCanPort(name, settings.channel)
-    if settings.interface == "socketcand":
-        return SocketcandPort(name, settings.host, settings.port, settings.channel)
-    return VirtualPort(name, settings.channel)
-
-
 class CanBus:
-    """A bus that is being listened to; a context manager.
+    """A bus that is listened to; a context manager.
 
     ``ended`` tells why the receive thread stopped (None while it runs).
     """
 
-    def __init__(
-        self, name: str, settings: config.CanBus, transmit: bool = False, ring_frames: int = DEFAULT_RING_FRAMES
-    ) -> None:
+    batch_s = BATCH_S
+
+    def __init__(self, name: str, settings: config.CanBus, ring_frames: int = DEFAULT_RING_FRAMES) -> None:
         self.name = name
-        self._port = open_port(name, settings)
+        self.ended: str | None = None
+        self._port = self._open(settings)
         self._ring_frames = ring_frames
-        self._ring = Ring(ring_frames)
-        self._transmit = transmit
+        self._ring = FrameRing(ring_frames)
         self._stopping = threading.Event()
-        self._end = Latch()
-        self._ended: str | None = None
-        self._send_lock = threading.Lock()
         self.last_frame_ns = time.monotonic_ns()
         self._thread = threading.Thread(target=self._receive, name=f"fdhil-{name}", daemon=True)
         self._thread.start()
+
+    def _open(self, settings: config.CanBus) -> Port:
+        """Open the port that ``[bus.NAME]`` asks for; ConnectError with cause and next action."""
+        return PORTS[settings.interface](self.name, settings)
 
     def _receive(self) -> None:
         """The receive thread: nothing but appending; its end is reported, never swallowed."""
@@ -62,16 +51,9 @@ class CanBus:
                     time.sleep(HOLD_BACK_S)  # what is not read waits in the hub
                     continue
                 self._port.receive(self._ring, POLL_S)
-                if not self._transmit:
-                    time.sleep(BATCH_S)
+                time.sleep(self.batch_s)
         except BusEnded as end:
-            self._end.set(str(end))
-
-    @property
-    def ended(self) -> str | None:
-        """Why nothing is received any more, or None."""
-        self._ended = self._end.take() or self._ended
-        return self._ended
+            self.ended = str(end)
 
     def drain(self) -> Frames:
         """Return all frames received since the last call, in order of arrival."""
@@ -79,13 +61,6 @@ class CanBus:
         if frames.size:
             self.last_frame_ns = int(frames["t_ns"][-1])
         return frames
-
-    def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame; DeviceError when the bus was opened to listen only, or does not take it."""
-        if not self._transmit:
-            raise DeviceError(self.name, "this bus was opened to listen only; commissioning opens it for sending")
-        with self._send_lock:
-            self._port.send(can_id, data)
 
     def counters(self) -> dict[str, int]:
         """Frames received, and lost in the ring and in the kernel."""
@@ -103,10 +78,8 @@ class CanBus:
         self._thread.join(timeout=20 * POLL_S)
         self._port.close()
 
-    def __enter__(self) -> CanBus:
+    def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_error: object) -> None:
         self.close()

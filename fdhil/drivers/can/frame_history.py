@@ -1,4 +1,4 @@
-"""The last seconds of all frames of a bus, as they came: what a black box needs."""
+"""Keeps the last seconds of all frames of a bus, as they came, for the black box."""
 
 from __future__ import annotations
 

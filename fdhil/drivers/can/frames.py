@@ -1,4 +1,4 @@
-"""CAN frames in bulk: the record, the preallocated ring between receive thread and decoder, error frames as notices.
+"""Holds CAN frames in bulk: in a preallocated ring between receive thread and decoder; tells error frames as notices.
 
 A frame is 24 bytes: ``t_ns`` host-monotonic receive stamp, ``id`` with the flags of SocketCAN (0x20000000 error,
 0x40000000 remote, 0x80000000 extended), ``dlc`` and ``data`` as a little-endian 64 bit word, so that a block is
@@ -8,7 +8,6 @@ decoded with shifts and masks instead of a loop.
 from __future__ import annotations
 
 import struct
-import threading
 from collections.abc import Iterable
 
 import numpy as np
@@ -40,7 +39,7 @@ def frames_of(rows: Iterable[tuple[int, int, bytes]]) -> Frames:
     return np.frombuffer(raw, FRAME)
 
 
-class Ring:
+class FrameRing:
     """A ring of frames between one writer (the receive thread) and one reader.
 
     Slots are reused, nothing is allocated while it runs. When the reader is late the newest frames are refused and
@@ -115,22 +114,3 @@ def error_notices(frames: Frames) -> list[Notice]:
         text = "The CAN controller counts errors (warning level); check termination and shield."
         notices.append(Notice("ErrorPassive", "minor", text))
     return notices
-
-
-class Latch:
-    """A text set by one thread and taken by another, at most one at a time: how a receive thread reports its end."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._text: str | None = None
-
-    def set(self, text: str) -> None:
-        """Keep ``text`` unless an older one still waits."""
-        with self._lock:
-            self._text = self._text or text
-
-    def take(self) -> str | None:
-        """Return what waits, and forget it."""
-        with self._lock:
-            text, self._text = self._text, None
-            return text

@@ -1,4 +1,4 @@
-"""What the nodes say about themselves: EMCY, boot-up, heartbeat, NMT state. Pure: ``now_ns`` comes from the caller.
+"""Watches a node by what it says: EMCY, boot-up, heartbeat, NMT state. Pure: ``now_ns`` comes from the caller.
 
 The frames are read here and not by the canopen library, which drops an EMCY shorter than 8 bytes, never notices a
 heartbeat that stops, and believes an NMT command as soon as it is sent.

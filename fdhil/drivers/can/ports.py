@@ -1,4 +1,4 @@
-"""The three ways onto a CAN bus, each a port with ``receive`` (append what came to a ring), ``send`` and ``close``.
+"""Listens to a CAN bus in three ways, each a port with ``receive`` (append what came to a ring) and ``close``.
 
 * ``SocketCanPort``: a raw socket of the standard library, because python-can neither counts the kernel's drops
   (SO_RXQ_OVFL) nor enlarges the receive buffer, and its stamps are the wall clock's alone.
@@ -15,13 +15,14 @@ import select
 import socket
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import can
 
-from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, Ring
-from fdhil.errors import ConnectError, DeviceError
+from fdhil import config
+from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameRing
+from fdhil.errors import ConnectError
 
 RECEIVE_BUFFER_BYTES = 8 << 20
 CONNECT_TIMEOUT_S = 3.0
@@ -32,7 +33,7 @@ SO_RCVBUFFORCE = 33
 SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
 CAN_RAW_ERR_FILTER = 2
-_CAN_FRAME = struct.Struct("=IB3x8s")
+CAN_FRAME = struct.Struct("=IB3x8s")
 
 
 class BusEnded(Exception):
@@ -40,7 +41,7 @@ class BusEnded(Exception):
 
 
 class Port(Protocol):
-    """What the receive thread and the commissioning master need of a bus."""
+    """A way onto a bus, as its receive thread needs it."""
 
     @property
     def holds_back(self) -> bool:
@@ -50,11 +51,8 @@ class Port(Protocol):
     def kernel_drops(self) -> int:
         """Frames the kernel dropped because they were not read in time."""
 
-    def receive(self, ring: Ring, timeout_s: float) -> None:
+    def receive(self, ring: FrameRing, timeout_s: float) -> None:
         """Append what arrives within ``timeout_s`` to ``ring``; BusEnded when the bus is gone."""
-
-    def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame now or raise DeviceError; nothing is queued."""
 
     def close(self) -> None:
         """Release the bus."""
@@ -101,24 +99,22 @@ class SocketCanPort:
 
     holds_back = False
 
-    def __init__(self, name: str, channel: str) -> None:
+    def __init__(self, name: str, settings: config.CanBus) -> None:
         self._name = name
         self.kernel_drops = 0
         self._wall_clock = WallClock()
         try:
             self._socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         except OSError as error:
-            raise ConnectError(
-                name, f"this kernel has no CAN ({error.strerror}); use the socketcand interface or another kernel"
-            ) from None
+            text = f"this kernel has no CAN ({error.strerror}); use the socketcand interface or another kernel"
+            raise ConnectError(name, text) from None
         try:
             self._configure()
-            self._socket.bind((channel,))
+            self._socket.bind((settings.channel,))
         except OSError as error:
             self._socket.close()
-            raise ConnectError(
-                name, f"the CAN interface {channel} cannot be opened ({error.strerror}); bring it up with ip link"
-            ) from None
+            text = f"the CAN interface {settings.channel} cannot be opened ({error.strerror}); bring it up with ip link"
+            raise ConnectError(name, text) from None
 
     def _configure(self) -> None:
         raw = self._socket
@@ -130,7 +126,7 @@ class SocketCanPort:
         raw.setsockopt(socket.SOL_CAN_RAW, CAN_RAW_ERR_FILTER, 0x1FFFFFFF)
         raw.setblocking(False)
 
-    def receive(self, ring: Ring, timeout_s: float) -> None:
+    def receive(self, ring: FrameRing, timeout_s: float) -> None:
         """Read all that waits; the kernel's wall-clock stamps become monotonic ones at once."""
         if not select.select([self._socket], [], [], timeout_s)[0]:
             return
@@ -142,7 +138,7 @@ class SocketCanPort:
                 return
             except OSError as error:
                 raise BusEnded(f"the CAN interface is down ({error.strerror})") from None
-            can_id, length, payload = _CAN_FRAME.unpack(data)
+            can_id, length, payload = CAN_FRAME.unpack(data)
             ring.append(self._stamp(ancillary, wall_ahead_ns), can_id, payload[:length])
 
     def _stamp(self, ancillary: list[tuple[int, int, bytes]], wall_ahead_ns: int) -> int:
@@ -154,13 +150,6 @@ class SocketCanPort:
             elif kind == SO_RXQ_OVFL:
                 (self.kernel_drops,) = struct.unpack("I", value[:4])
         return time.monotonic_ns() if stamp_ns is None else stamp_ns
-
-    def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame; a full transmit queue (ENOBUFS) is an error at once, never a wait."""
-        try:
-            self._socket.send(_CAN_FRAME.pack(can_id, len(data), data))
-        except OSError as error:
-            raise DeviceError(self._name, f"the frame {can_id:03X} was not sent ({error.strerror})") from None
 
     def close(self) -> None:
         """Close the socket."""
@@ -198,23 +187,22 @@ class SocketcandPort:
     holds_back = True
     kernel_drops = 0  # TCP loses nothing; what the hub dropped it must say itself
 
-    def __init__(self, name: str, host: str, port: int, channel: str) -> None:
+    def __init__(self, name: str, settings: config.CanBus) -> None:
         self._name = name
         self._rest = b""
         self._clock = HubClock()
         self.malformed = 0
-        where = f"{host}:{port}"
+        where = f"{settings.host}:{settings.port}"
         try:
-            self._socket = socket.create_connection((host, port), CONNECT_TIMEOUT_S)
+            self._socket = socket.create_connection((settings.host, settings.port), CONNECT_TIMEOUT_S)
         except OSError as error:
-            raise ConnectError(
-                name, f"the CAN hub {where} cannot be reached ({error}); start it or correct host and port"
-            ) from None
+            text = f"the CAN hub {where} cannot be reached ({error}); start it or correct host and port"
+            raise ConnectError(name, text) from None
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._expect(b"< hi >", f"{where} is no socketcand hub")
-            self._socket.sendall(f"< open {channel} >".encode("ascii"))
-            self._expect(b"< ok >", f"the hub {where} has no bus {channel}")
+            self._socket.sendall(f"< open {settings.channel} >".encode("ascii"))
+            self._expect(b"< ok >", f"the hub {where} has no bus {settings.channel}")
             self._socket.sendall(b"< rawmode >")
             self._expect(b"< ok >", f"the hub {where} refuses raw mode")
         except (OSError, ConnectError) as error:
@@ -233,7 +221,7 @@ class SocketcandPort:
         if said.strip() + b" >" != answer and said.strip() + b">" != answer:
             raise ConnectError(self._name, f"{otherwise}; check host, port and channel")
 
-    def receive(self, ring: Ring, timeout_s: float) -> None:
+    def receive(self, ring: FrameRing, timeout_s: float) -> None:
         """Read what has come in one piece and split it; the hub's stamps become host-monotonic ones."""
         self._socket.settimeout(timeout_s)
         try:
@@ -246,7 +234,7 @@ class SocketcandPort:
             raise BusEnded("the CAN hub ended the connection")
         self._split(chunk, ring, time.monotonic_ns())
 
-    def _split(self, chunk: bytes, ring: Ring, now_ns: int) -> None:
+    def _split(self, chunk: bytes, ring: FrameRing, now_ns: int) -> None:
         lines = (self._rest + chunk).decode("latin-1").split(">")
         self._rest = lines.pop().encode("latin-1")
         if len(self._rest) > MAX_LINE_BYTES:
@@ -266,15 +254,6 @@ class SocketcandPort:
             except (IndexError, ValueError, struct.error):
                 self.malformed += 1
 
-    def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame to the hub."""
-        words = " ".join(f"{byte:x}" for byte in data)
-        try:
-            self._socket.settimeout(CONNECT_TIMEOUT_S)
-            self._socket.sendall(f"< send {can_id:03X} {len(data):X} {words} >".encode("ascii"))
-        except OSError as error:
-            raise DeviceError(self._name, f"the frame {can_id:03X} was not sent ({error})") from None
-
     def close(self) -> None:
         """End the connection."""
         self._socket.close()
@@ -286,15 +265,15 @@ class VirtualPort:
     holds_back = False
     kernel_drops = 0
 
-    def __init__(self, name: str, channel: str) -> None:
+    def __init__(self, name: str, settings: config.CanBus) -> None:
         self._name = name
         self._wall_clock = WallClock()
         try:
-            self._bus = can.Bus(interface="virtual", channel=channel)
+            self._bus = can.Bus(interface="virtual", channel=settings.channel)
         except can.CanError as error:
-            raise ConnectError(name, f"the virtual bus {channel} cannot be opened ({error})") from None
+            raise ConnectError(name, f"the virtual bus {settings.channel} cannot be opened ({error})") from None
 
-    def receive(self, ring: Ring, timeout_s: float) -> None:
+    def receive(self, ring: FrameRing, timeout_s: float) -> None:
         """Append one frame, and all others that wait; the sender's wall-clock stamps become monotonic ones."""
         wait: float = timeout_s
         wall_ahead_ns = self._wall_clock.ahead_ns()
@@ -308,13 +287,13 @@ class VirtualPort:
             ring.append(stamp_ns, can_id, bytes(message.data[:8]))
             wait = 0.0
 
-    def send(self, can_id: int, data: bytes) -> None:
-        """Send one frame to the other buses of the channel."""
-        try:
-            self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
-        except can.CanError as error:
-            raise DeviceError(self._name, f"the frame {can_id:03X} was not sent ({error})") from None
-
     def close(self) -> None:
         """Leave the channel."""
         self._bus.shutdown()
+
+
+PORTS: Mapping[str, Callable[[str, config.CanBus], Port]] = {
+    "socketcan": SocketCanPort,
+    "socketcand": SocketcandPort,
+    "virtual": VirtualPort,
+}

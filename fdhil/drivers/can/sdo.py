@@ -1,4 +1,4 @@
-"""SDO transfers with one node by the canopen library's client, within bounds of size and time.
+"""Reads and writes objects of one node by the canopen library's SDO client, within bounds of size and time.
 
 The library has no limit on size or duration, and takes a late answer to an earlier request of the same object for the
 answer to the present one. So after a time-out the line is left quiet until nothing more can come, and then the object
@@ -11,6 +11,7 @@ import logging
 import operator
 import queue
 import time
+from collections.abc import Callable
 from typing import Any
 
 from canopen.objectdictionary import ObjectDictionary
@@ -18,15 +19,12 @@ from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from fdhil.cia402 import COB_SDO_REQUEST, COB_SDO_RESPONSE
-from fdhil.drivers.can.bus import CanBus
 from fdhil.errors import DeviceTimeout, ProtocolError, SdoAbort
 
 RESPONSE_TIMEOUT_S = 0.5
 QUIET_S = 1.0
 DEADLINE_S = 2.0
 MAX_BYTES = 64 * 1024
-MAX_DOMAIN_BYTES = 4 * 1024 * 1024
-DOMAIN_DEADLINE_S = 30.0
 NO_OBJECT = 0x06020000
 NO_SUB_INDEX = 0x06090011
 _DEADLINE_ABORT = 0x05040000
@@ -42,14 +40,14 @@ def _name(index: int, sub: int) -> str:
 class SdoLink:
     """The SDO channel of one node. ``deliver`` is called by whoever reads the bus, all else by one other thread.
 
-    ``patience``: how many times as long as a real drive this one may take.
+    ``send`` puts a frame on the bus; ``patience``: how many times as long as a real drive this one may take.
     """
 
-    def __init__(self, device: str, node_id: int, bus: CanBus, patience: float = 1.0) -> None:
+    def __init__(self, device: str, node_id: int, send: Callable[[int, bytes], None], patience: float = 1.0) -> None:
         self._patience = patience
         self.device = device
         self.response_id = COB_SDO_RESPONSE + node_id
-        self._bus = bus
+        self._send = send
         # the library's own functions are not annotated
         client: Any = SdoClient
         dictionary: Any = ObjectDictionary
@@ -59,24 +57,23 @@ class SdoLink:
         self._late = False
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """What the library's client calls to send; remote frames are never sent."""
-        self._bus.send(can_id, bytes(data))
+        """Send for the library's client; remote frames are never sent."""
+        self._send(can_id, bytes(data))
 
     def deliver(self, data: bytes) -> None:
         """Hand over a response frame of this node; one that is not 8 bytes long is no SDO."""
         if len(data) == 8:
             self._client.on_response(self.response_id, data, 0.0)
 
-    def read(self, index: int, sub: int = 0, *, block: bool = False) -> bytes:
-        """Read an object; SdoAbort, DeviceTimeout or ProtocolError. ``block`` uses a block upload (big DOMAINs)."""
+    def read(self, index: int, sub: int = 0) -> bytes:
+        """Read an object; SdoAbort, DeviceTimeout or ProtocolError."""
         try:
-            return self._upload(index, sub, block)
+            return self._upload(index, sub)
         except DeviceTimeout:
-            first, second = self._upload(index, sub, block), self._upload(index, sub, block)
+            first, second = self._upload(index, sub), self._upload(index, sub)
             if first != second:
-                raise ProtocolError(
-                    self.device, f"{_name(index, sub)} gave two answers after a time-out; check that one master asks"
-                ) from None
+                text = f"{_name(index, sub)} gave two answers after a time-out; check that one master asks"
+                raise ProtocolError(self.device, text) from None
             return second
 
     def read_int(self, index: int, sub: int = 0, *, signed: bool = False) -> int:
@@ -95,7 +92,7 @@ class SdoLink:
         try:
             self._guarded(index, sub, lambda: self._client.download(index, sub, data))
         except DeviceTimeout:
-            if self._upload(index, sub, False) == data == self._upload(index, sub, False):
+            if self._upload(index, sub) == data == self._upload(index, sub):
                 return
             self._guarded(index, sub, lambda: self._client.download(index, sub, data))
 
@@ -105,34 +102,28 @@ class SdoLink:
         self._client.responses = queue.Queue()
         self._late = False
 
-    def _upload(self, index: int, sub: int, block: bool) -> bytes:
-        data: bytes = self._guarded(index, sub, lambda: self._segments(index, sub, block))
+    def _upload(self, index: int, sub: int) -> bytes:
+        data: bytes = self._guarded(index, sub, lambda: self._segments(index, sub))
         return data
 
-    def _segments(self, index: int, sub: int, block: bool) -> bytes:
-        limit, patience = (MAX_DOMAIN_BYTES, DOMAIN_DEADLINE_S) if block else (MAX_BYTES, DEADLINE_S)
-        deadline = time.monotonic() + patience * self._patience
-        stream = self._client.open(index, sub, "rb", buffering=0, block_transfer=block)
-        parts, size = [], 0
-        with stream:
-            if stream.size is not None and stream.size > limit:
-                self._client.abort(_MEMORY_ABORT)
-                raise self._too_large(index, sub, limit)
-            while part := stream.read(7):
-                parts.append(part)
-                size += len(part)
-                if size > limit:
-                    self._client.abort(_MEMORY_ABORT)
-                    raise self._too_large(index, sub, limit)
+    def _segments(self, index: int, sub: int) -> bytes:
+        deadline = time.monotonic() + DEADLINE_S * self._patience
+        data = bytearray()
+        with self._client.open(index, sub, "rb", buffering=0) as stream:
+            size = stream.size or 0  # a drive may announce it
+            while size <= MAX_BYTES:
+                part = stream.read(7)
+                if not part:
+                    return bytes(data)
+                data += part
+                size = max(size, len(data))
                 if time.monotonic() > deadline:
                     self._client.abort(_DEADLINE_ABORT)
-                    text = f"{_name(index, sub)} was not finished after {patience:g} s; check the bus load"
+                    text = f"{_name(index, sub)} was not finished after {DEADLINE_S:g} s; check the bus load"
                     raise ProtocolError(self.device, text)
-        return b"".join(parts)
-
-    def _too_large(self, index: int, sub: int, limit: int) -> ProtocolError:
-        text = f"{_name(index, sub)} is longer than {limit} bytes; this is no object of a healthy drive"
-        return ProtocolError(self.device, text)
+            self._client.abort(_MEMORY_ABORT)
+        text = f"{_name(index, sub)} is longer than {MAX_BYTES} bytes; this is no object of a healthy drive"
+        raise ProtocolError(self.device, text)
 
     def _guarded(self, index: int, sub: int, call: Any) -> Any:
         """Run a call of the library and translate its errors into one sentence each; quiet first after a time-out."""
@@ -147,9 +138,7 @@ class SdoLink:
         except SdoCommunicationError as error:
             if "No SDO response" in str(error) or "could not be retransmitted" in str(error):
                 self._late = True
-                raise DeviceTimeout(
-                    self.device, f"{_name(index, sub)} was not answered; check the drive's supply and its node-ID"
-                ) from None
-            raise ProtocolError(
-                self.device, f"{_name(index, sub)} was answered wrongly ({error}); check that one master asks"
-            ) from None
+                text = f"{_name(index, sub)} was not answered; check the drive's supply and its node-ID"
+                raise DeviceTimeout(self.device, text) from None
+            text = f"{_name(index, sub)} was answered wrongly ({error}); check that one master asks"
+            raise ProtocolError(self.device, text) from None

@@ -1,4 +1,4 @@
-"""From frames to the SYNC grid: every frame gets the tick of the last SYNC before it. Pure: no clock, no I/O.
+"""Lays frames on the SYNC grid: each gets the tick of the last SYNC before it. Pure: no clock, no I/O.
 
 With a counter byte (0x1019, 1..240) lost SYNCs are counted and the grid stays right; without one a lost SYNC cannot
 be seen, and each SYNC is one tick. Arrival times serve one purpose only: to tell 1 from 241 periods.
@@ -80,12 +80,12 @@ class SyncGrid:
         if self._last_tick < 0 and self._last_counter is None and counted[0]:
             self._last_counter = (int(counters[0]) - 2) % COUNTER_RANGE + 1
         if self._last_counter is None and not counted.any():
-            self._finish(regular, None, syncs, clean=True)
+            self._finish(regular, None, syncs)
             return regular
         if self._last_counter is not None and counted.all():
             expected = (self._last_counter + np.arange(syncs.size)) % COUNTER_RANGE + 1
             if np.array_equal(expected, counters) and not self._long_pause(syncs):
-                self._finish(regular, int(counters[-1]), syncs, clean=True)
+                self._finish(regular, int(counters[-1]), syncs)
                 return regular
         ticks = [
             self._step(int(c) if has else None, int(t))
@@ -98,12 +98,13 @@ class SyncGrid:
         stamps = np.concatenate([[self._last_ns or syncs["t_ns"][0]], syncs["t_ns"]])
         return self._realtime and bool(np.diff(stamps).max() > _BACKWARD * self._period_ns)
 
-    def _finish(self, ticks: Int, counter: int | None, syncs: Frames, clean: bool) -> None:
+    def _finish(self, ticks: Int, counter: int | None, syncs: Frames) -> None:
+        """Take a block without any irregularity."""
         self._last_tick = int(ticks[-1])
         self._last_counter = counter
         self._last_ns = int(syncs["t_ns"][-1])
         self._suspect = None
-        self._recent_odd = (self._recent_odd + [not clean] * min(syncs.size, _HISTORY))[-_HISTORY:]
+        self._recent_odd = (self._recent_odd + [False] * min(syncs.size, _HISTORY))[-_HISTORY:]
 
     def _step(self, counter: int | None, t_ns: int) -> int:
         """One SYNC of an irregular block; returns its tick or -1."""

@@ -1,4 +1,4 @@
-"""Host time against SYNC count, from the arrivals of SYNC. Pure."""
+"""Tells host time by the SYNC count and back, from the arrivals of SYNC. Pure."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""A CiA 402 drive as it is heard: its profile and EDS, and its PDOs decoded into samples."""
+"""Decodes the PDOs of CiA 402 drives into samples, by their profiles; reads their EDS."""

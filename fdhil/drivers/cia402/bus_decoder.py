@@ -1,4 +1,4 @@
-"""One bus from frames to records: the SYNC grid, its drives' decoders and node watches. Pure: no clock, no I/O."""
+"""Decodes one bus: its SYNC grid, its drives' samples and the watch over its nodes. Pure: no clock, no I/O."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class BusDecoder:
         return [Notice("SyncLost", "info", "SYNC is back.")] if was and not silent else []
 
     def counters(self) -> dict[str, int]:
-        """What was missed, duplicated or discarded on this bus, and how many frames each drive sent."""
+        """Count what was missed, duplicated or discarded on this bus, and the frames each drive sent."""
         counters = [decoder.counters for decoder in self.decoders.values()]
         return {
             "sync_missed": self.grid.missed,

@@ -1,4 +1,4 @@
-"""From frames on the SYNC grid to an axis' samples: the decoder of one CiA 402 drive. Pure: no clock, no I/O.
+"""Decodes one CiA 402 drive: frames on the SYNC grid become an axis' samples. Pure: no clock, no I/O.
 
 A sample of tick k is made of the TPDOs received after SYNC k and before SYNC k+1. The demand r[k] is the target
 (0x607A) that was latched ``setpoint_delay_cycles`` before SYNC k, since the drive runs its set-point late; the offset
@@ -37,11 +37,15 @@ class InputSamples:
 
 
 class VoltageObject:
-    """The voltage source ``drive``: a vendor object of the profile, decoded with the other TPDOs."""
+    """The voltage source ``drive``: a vendor object of the profile, decoded with the other TPDOs.
 
-    def __init__(self, axis: str, config: MachineConfig, profile: DriveProfile) -> None:
+    ``key`` None: the profile has none, or a sensor of its own tells the voltage.
+    """
+
+    def __init__(self, axis: str, config: MachineConfig, profile: DriveProfile | None = None) -> None:
         settings = config.axis[axis]
-        self.key = profile.voltage if settings.voltage.source == "drive" else None
+        profile = profile or load_profile(settings.drive.profile)
+        self.key = None if settings.voltage.separate else profile.voltage
         self.v_per_count = settings.drive.sign * profile.voltage_v_per_count
         self.rows_back = 1 if settings.voltage.sampling == "interval_mean" else 0
 
@@ -103,7 +107,9 @@ class Cia402Decoder:
         demand = self._read_back_demand(first, stop, offset)
         out: list[AxisSamples | InputSamples | Notice] = []
         out += self._samples(first, stop, demand, offset)
-        out += self._inputs(first, stop)
+        tick, inputs = self._shown(self.profile.digital_inputs, first, stop)
+        if tick.size:
+            out.append(InputSamples(self.axis, frozen_ints(tick), frozen_ints(inputs)))
         self._forget(stop)
         told, self._notices = self._notices, []
         return [*out, *told]
@@ -192,10 +198,6 @@ class Cia402Decoder:
             statusword=frozen_ints(raw(profile.statusword)),
             lost=lost,
         )
-
-    def _inputs(self, first: int, stop: int) -> list[InputSamples]:
-        tick, inputs = self._shown(self.profile.digital_inputs, first, stop)
-        return [InputSamples(self.axis, frozen_ints(tick), frozen_ints(inputs))] if tick.size else []
 
     def _shown(self, key: ObjectKey, first: int, stop: int) -> tuple[Int, Int]:
         """Ticks and values of a slower TPDO's object; empty when the profile maps it nowhere."""

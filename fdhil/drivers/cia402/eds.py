@@ -1,4 +1,4 @@
-"""EDS and DCF files (CiA 306) as they are found in the field, made readable for the canopen library.
+"""Reads EDS and DCF files (CiA 306) as they are found in the field, mended for the canopen library.
 
 Of 363 real files the library refuses 45: Windows text, sections or keys twice, blank numbers, leading zeros, comments
 behind values, incomplete [DummyUsage], [Comments] that count wrong. This module reads the file line by line, mends what
@@ -10,11 +10,10 @@ from __future__ import annotations
 import configparser
 import io
 import re
-from collections.abc import Iterator
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import Any
 
 from canopen.objectdictionary import ObjectDictionary, import_od
 
@@ -25,6 +24,7 @@ MAX_OBJECTS = 6_000  # the library reads this many in a second; real drives have
 MAX_LINE = 4096
 MAX_SUB_INDEX = 254
 
+_LIBRARY_ERRORS = (ValueError, TypeError, AttributeError, LookupError, configparser.Error)
 _SECTION = re.compile(r"\[([^\]]*)\]")
 _OBJECT = re.compile(r"[0-9A-Fa-f]{4}(sub[0-9A-Fa-f]{1,2})?$", re.IGNORECASE)
 _KEY = re.compile(r"[A-Za-z0-9_ ]+$")
@@ -49,6 +49,10 @@ class _Section:
     line: int
     values: dict[str, str] = field(default_factory=dict)
 
+    def text(self) -> str:
+        """The section as the library reads it."""
+        return "\n".join([f"[{self.name}]", *(f"{key}={value}" for key, value in self.values.items()), ""])
+
 
 def load_eds(path: Path, node_id: int | None = None) -> ObjectDictionary:
     """Read an EDS or DCF file; ``node_id`` resolves $NODEID. EdsError when it cannot be read or is no EDS."""
@@ -62,28 +66,37 @@ def load_eds(path: Path, node_id: int | None = None) -> ObjectDictionary:
 
 def parse_eds(raw: bytes, name: str, node_id: int | None = None) -> ObjectDictionary:
     """Parse the bytes of an EDS or DCF file; EdsError with the line at fault."""
-    sections = _sections(raw, name)
-    source = io.StringIO(_text(sections))
-    source.name = "clean.eds"
+    ordered = _sections(raw, name)
     try:
-        return import_od(source, node_id)
-    except (ValueError, TypeError, AttributeError, LookupError, configparser.Error) as error:
-        where = _section_at_fault(error.__traceback__)
-        line = sections[where].line if where in sections else 1
+        return _read(ordered, node_id)
+    except _LIBRARY_ERRORS as error:
+        at_fault = ordered[_first_unreadable(ordered, node_id)]
         what = str(error).strip("'\"").splitlines()[0][:80] if str(error) else type(error).__name__
-        raise EdsError(name, f"line {line}: [{where or '?'}] is wrong ({what}); correct it or leave it out") from None
+        text = f"line {at_fault.line}: [{at_fault.name}] is wrong ({what}); correct it or leave it out"
+        raise EdsError(name, text) from None
 
 
-def _section_at_fault(trace: TracebackType | None) -> str:
-    """The section the library was reading when it stopped."""
-    where = ""
-    while trace is not None:
-        where = str(trace.tb_frame.f_locals.get("section", where))
-        trace = trace.tb_next
-    return where
+def _read(sections: Sequence[_Section], node_id: int | None) -> ObjectDictionary:
+    """Hand the sections to the library; one of ``_LIBRARY_ERRORS`` when it cannot read them."""
+    source = io.StringIO("".join(section.text() for section in sections))
+    source.name = "clean.eds"
+    return import_od(source, node_id)
 
 
-def _sections(raw: bytes, name: str) -> dict[str, _Section]:
+def _first_unreadable(sections: Sequence[_Section], node_id: int | None) -> int:
+    """Return the section that makes the file unreadable: the last of the fewest that the library cannot read."""
+
+    def fails(count: int) -> bool:
+        try:
+            _read(sections[:count], node_id)
+        except _LIBRARY_ERRORS:
+            return True
+        return False
+
+    return bisect_left(range(len(sections)), True, key=lambda last: fails(last + 1))
+
+
+def _sections(raw: bytes, name: str) -> list[_Section]:
     """Read and mend all sections; one that comes twice is merged, the later key counts."""
     if len(raw) > MAX_BYTES:
         raise EdsError(name, f"it is larger than {MAX_BYTES >> 20} MiB; this is no EDS file")
@@ -148,8 +161,8 @@ def _number(text: str) -> int | None:
         return int(text) if text.isascii() and text.isdigit() and len(text) < 20 else None
 
 
-def _complete(sections: dict[str, _Section]) -> dict[str, _Section]:
-    """Drop what the library stumbles over, and fill in what it insists on."""
+def _complete(sections: dict[str, _Section]) -> list[_Section]:
+    """Drop what the library stumbles over, fill in what it insists on, and put objects before their sub-objects."""
     for title in [t for t in sections if t.lower() in ("comments", "")]:
         del sections[title]
     sections.setdefault("DeviceInfo", _Section("DeviceInfo", 1))
@@ -167,26 +180,4 @@ def _complete(sections: dict[str, _Section]) -> dict[str, _Section]:
             section.values.setdefault("AccessType", "ro")
             if section.values.get("ObjectType") == "0":
                 del section.values["ObjectType"]
-    return sections
-
-
-def _text(sections: dict[str, _Section]) -> str:
-    """Write the sections for the library, objects before their sub-objects."""
-    ordered = sorted(sections.values(), key=lambda s: (bool(_OBJECT.match(s.name)) and len(s.name) > 4, s.line))
-    parts: list[str] = []
-    for section in ordered:
-        parts.append(f"[{section.name}]")
-        parts += [f"{key}={value}" for key, value in section.values.items()]
-    return "\n".join(parts) + "\n"
-
-
-def objects_of(dictionary: ObjectDictionary) -> dict[tuple[int, int], Any]:
-    """Return all variables of a dictionary by (index, sub-index)."""
-    found: dict[tuple[int, int], Any] = {}
-    for index in dictionary:
-        entry = dictionary[index]
-        if hasattr(entry, "subindices"):
-            found |= {(index, sub): variable for sub, variable in entry.subindices.items()}
-        else:
-            found[index, 0] = entry
-    return found
+    return sorted(sections.values(), key=lambda s: (bool(_OBJECT.match(s.name)) and len(s.name) > 4, s.line))

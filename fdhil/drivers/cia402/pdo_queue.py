@@ -1,4 +1,4 @@
-"""Frames of one PDO on their way to a dense grid of ticks, and sniffed set-points. Pure numpy, no loop per frame."""
+"""Lays the frames of a PDO on a dense grid of ticks, and follows sniffed set-points. Pure numpy, no loop per frame."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def decode(entry: PdoEntry, data: Words) -> Int:
 
 @dataclass(slots=True)
 class DecoderCounters:
-    """What a decoder counted: frames lost, too short, too long, duplicated, and ambiguous ones it put aside."""
+    """The counts of a decoder: frames lost, too short, too long, duplicated, and ambiguous ones it put aside."""
 
     lost: int = 0
     short: int = 0

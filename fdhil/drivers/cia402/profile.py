@@ -1,14 +1,18 @@
-"""What must be known of a drive model, as data: its PDOs, which object carries which signal, and in which unit.
+"""Describes drive models as data: their PDOs, which object carries which signal, and in which unit.
 
-A new vendor is a new module in ``profiles`` with one ``PROFILE`` and a line in ``tables.DRIVE_PROFILES``.
+A new vendor is a new TOML file in ``profiles``, with the names of :class:`DriveProfile`, and a line in
+``tables.DRIVE_PROFILES``.
 """
 
 from __future__ import annotations
 
 import math
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import cache
+from importlib.resources import files
+from typing import Any, Literal
 
 from fdhil import tables
 from fdhil.cia402 import PdoEntry, lay_out, pdo_length
@@ -43,13 +47,6 @@ class PdoSpec:
         return next((e for e in self.entries if (e.index, e.sub) == key), None)
 
 
-def pdo(
-    name: str, cob_base: int, entries: Sequence[tuple[int, int, int, bool]], every_sync: int = 1, valid: bool = True
-) -> PdoSpec:
-    """Build a PdoSpec; the number is the name's last character, entries are (index, sub, bits, signed)."""
-    return PdoSpec(name, int(name[-1]), cob_base, lay_out(entries), every_sync, valid)
-
-
 @dataclass(frozen=True, slots=True)
 class DriveProfile:
     """A drive model: mapping, signals and units.
@@ -76,8 +73,6 @@ class DriveProfile:
     voltage_v_per_count: float = 0.0
     speed_unit: Literal["increments_per_s", "rpm", "millirpm"] = "increments_per_s"
     current_unit: Literal["permille_of_rated", "mA"] = "permille_of_rated"
-    temperature: ObjectKey | None = None
-    temperature_c_per_count: float = 0.01
     strict_abort_options: tuple[int, ...] = (1, 3)
     vendor_id: int | None = None
     product_code: int | None = None
@@ -119,9 +114,18 @@ def _find(pdos: Sequence[PdoSpec], key: ObjectKey) -> tuple[PdoSpec, PdoEntry] |
     return None
 
 
+@cache
 def load_profile(name: str) -> DriveProfile:
-    """Return the profile that ``tables.DRIVE_PROFILES`` lists under ``name``."""
-    profile = tables.load(tables.DRIVE_PROFILES, name)
-    if not isinstance(profile, DriveProfile):
-        raise TypeError(f"{tables.DRIVE_PROFILES[name]} is no DriveProfile")
-    return profile
+    """Read the file that ``tables.DRIVE_PROFILES`` lists under ``name``; TypeError for a key that no profile has."""
+    package, _, file = tables.DRIVE_PROFILES[name].partition(":")
+    document = tomllib.loads((files(package) / file).read_text("utf-8"))
+    values: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in document.items()
+    }
+    values |= {kind: tuple(_pdo(**each) for each in document[kind]) for kind in ("rpdos", "tpdos")}
+    return DriveProfile(name, **values)
+
+
+def _pdo(name: str, entries: Sequence[tuple[int, int, int, bool]], **said: Any) -> PdoSpec:
+    """Lay the entries (index, sub-index, bits, signed) out; the PDO's number is its name's last character."""
+    return PdoSpec(name, int(name[-1]), entries=lay_out(entries), **said)

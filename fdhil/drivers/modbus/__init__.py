@@ -1,1 +1,1 @@
-"""Sensors on Modbus: one link, and what is read over it."""
+"""Reads sensors on Modbus, each over a link of its own."""

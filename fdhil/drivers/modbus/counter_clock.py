@@ -1,4 +1,4 @@
-"""Where on a timeline the samples of a free-running counter lie, from bounds. Pure.
+"""Places the samples of a free-running counter on a timeline, from bounds. Pure.
 
 Each query tells that sample ``counter`` had just been completed at some instant between asking and answer. So all
 queries together leave a narrow band of lines counter -> time, and its middle is the estimate; slow queries bound little

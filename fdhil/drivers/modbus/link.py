@@ -1,4 +1,4 @@
-"""A Modbus TCP unit behind pymodbus: one request at a time, our own deadline and retries, one error per fault.
+"""Asks a Modbus TCP unit through pymodbus: one request at a time, our own deadline, one error per fault.
 
 pymodbus repeats a request by itself (12 s of silence by default), logs every fault at ERROR and closes the line after
 a few silent requests; none of it suits a sensor that is asked 20 times a second, so ``retries`` is 0 and its logger is
@@ -18,7 +18,7 @@ from pymodbus.pdu import ModbusPDU
 
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
 
-MAX_REGISTERS = 125
+PLAUSIBLE_C = (-50.0, 150.0)  # of a slide-way; NaN is outside, too
 BUSY = 6
 CONNECT_S = 2.0  # beyond the time an answer may take: the library has one time-out for both, and ours is the shorter
 EXCEPTIONS = {
@@ -61,10 +61,13 @@ def uint32(registers: Sequence[int], at: int = 0) -> int:
 class ModbusLink:
     """A connection to one unit; ``name`` is used in messages."""
 
+    wire = "modbus"
+
     def __init__(self, name: str, host: str, port: int, unit: int, timeout_s: float) -> None:
         self.name = name
         self._host, self._port = host, port
         self._where = f"{host}:{port}"
+        self.place = f"Modbus {host}:{port}"
         self._unit = unit
         self._timeout_s = timeout_s
         self._client: AsyncModbusTcpClient | None = None
@@ -82,9 +85,8 @@ class ModbusLink:
         except TimeoutError:
             pass
         if not connected:
-            raise ConnectError(
-                self.name, f"the Modbus sensor {self._where} cannot be reached; check its supply, host and port"
-            )
+            text = f"the Modbus sensor {self._where} cannot be reached; check its supply, host and port"
+            raise ConnectError(self.name, text)
 
     @property
     def connected(self) -> bool:
@@ -103,9 +105,8 @@ class ModbusLink:
         )
         registers = list(answer.registers)
         if len(registers) != count:
-            raise ProtocolError(
-                self.name, f"{len(registers)} registers came for {count} asked; check that one client asks at a time"
-            )
+            text = f"{len(registers)} registers came for {count} asked; check that one client asks at a time"
+            raise ProtocolError(self.name, text)
         return registers
 
     async def write(self, address: int, value: int) -> None:
@@ -120,9 +121,8 @@ class ModbusLink:
             raise self._silent(address) from None
         except ModbusException as error:
             if not self.connected:
-                raise ConnectError(
-                    self.name, f"the connection to the Modbus sensor {self._where} is gone; check its supply and cable"
-                ) from error
+                text = f"the connection to the Modbus sensor {self._where} is gone; check its supply and cable"
+                raise ConnectError(self.name, text) from error
             raise self._silent(address) from error
         if answer.isError():
             code = int(answer.exception_code)
@@ -131,6 +131,14 @@ class ModbusLink:
                 self.name, f"register {address} is refused ({what}); compare the register map with the config", code
             )
         return answer
+
+    def fault_code(self, error: DeviceError) -> str | None:
+        """Return the class under which ``error`` is told; None for a unit that is only busy."""
+        if isinstance(error, ModbusRefused):
+            return None if error.code == BUSY else "ModbusException"
+        if isinstance(error, DeviceTimeout):
+            return "ModbusTimeout"
+        return "ModbusPortGone" if isinstance(error, ConnectError) else "ModbusShape"
 
     def _silent(self, address: int) -> DeviceError:
         # a late answer must not be taken for the next one's: the connection is made anew

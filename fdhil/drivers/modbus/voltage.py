@@ -1,4 +1,4 @@
-"""A voltage sensor on Modbus TCP that samples by itself and hands its samples over in blocks.
+"""Reads a voltage sensor on Modbus TCP that samples by itself and hands its samples over in blocks.
 
 Register map (16 bit words, big-endian, the same for input and holding registers): 0-1 newest voltage float32, 2-3
 its sample counter uint32, 4-5 sample rate Hz float32, 6-7 volts per count of the block float32, 8-9 slide-way
@@ -21,7 +21,7 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.modbus.counter_clock import CounterClock, Line
-from fdhil.drivers.modbus.link import ModbusLink, float32, uint32
+from fdhil.drivers.modbus.link import PLAUSIBLE_C, ModbusLink, float32, uint32
 from fdhil.errors import ProtocolError
 from fdhil.records import Float, Notice, Temperature, VoltageSamples, frozen, frozen_ints
 
@@ -97,6 +97,11 @@ class ModbusVoltage:
             await asyncio.sleep(_SETTLE_STEP_S)
         return self.accept(block, asked_ns, answered_ns, ticks)
 
+    async def reading(self) -> str:
+        """Read the map without latching anything, for people."""
+        registers = await self.link.read_input(0, ALL_REGISTERS)
+        return f"{float32(registers):.2f} V at {parse_block(self.name, registers).rate_hz:g} Hz"
+
     def accept(
         self, block: SensorBlock, asked_ns: int, answered_ns: int, ticks: TickClock
     ) -> list[VoltageSamples | Temperature | Notice]:
@@ -104,7 +109,7 @@ class ModbusVoltage:
         out: list[VoltageSamples | Temperature | Notice] = []
         self._clocks(block, asked_ns, answered_ns, ticks)
         out += self._continuity(block)
-        if math.isfinite(block.celsius) and -50.0 < block.celsius < 150.0:
+        if PLAUSIBLE_C[0] < block.celsius < PLAUSIBLE_C[1]:
             out.append(Temperature(self.axis, ticks.newest_tick, block.celsius, "slideway"))
         if block.volts.size:
             out.append(self._samples(block, ticks))
@@ -126,7 +131,7 @@ class ModbusVoltage:
 
     @property
     def line(self) -> Line | None:
-        """Where the sensor's samples lie on the SYNC count, None before that is known."""
+        """The sensor's samples on the SYNC count, None before that is known."""
         return self._tick_clock.line() if self._tick_clock else None
 
     def _continuity(self, block: SensorBlock) -> list[Notice]:

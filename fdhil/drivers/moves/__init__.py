@@ -1,1 +1,33 @@
-"""Sources of move events: which moves were ordered as rapids (G0). ``fdhil.tables`` lists them."""
+"""Tells which moves were ordered as rapids (G0); ``tables.EVENT_SOURCES`` lists the ways."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Protocol
+
+from fdhil import tables
+from fdhil.config import MachineConfig
+from fdhil.drivers.cia402.drive import InputSamples
+from fdhil.records import AxisSamples, MoveEvent
+
+
+class EventSource(Protocol):
+    """Tells the moves of one axis: blocks in, events out.
+
+    ``needs_input``: whether the NC's signal must come with the drive's digital inputs. ``least_share``: of the rapid
+    speed that a rapid must reach to be told.
+    """
+
+    needs_input: ClassVar[bool]
+    least_share: ClassVar[float]
+
+    def __init__(self, axis: str, config: MachineConfig) -> None:
+        pass
+
+    def feed(self, record: AxisSamples | InputSamples) -> list[MoveEvent]:
+        """Take a block; return the moves it shows."""
+
+
+def load_event_source(name: str) -> type[EventSource]:
+    """Return the source that ``tables.EVENT_SOURCES`` lists under ``name``."""
+    source: type[EventSource] = tables.load(tables.EVENT_SOURCES, name)
+    return source

@@ -1,4 +1,4 @@
-"""G0 events from the NC's own signal: a bit of the drive's digital inputs (0x60FD). Pure.
+"""Tells G0 by the NC's own signal: a bit of the drive's digital inputs (0x60FD). Pure.
 
 The input comes with a slower TPDO than the samples, so an edge is known to that TPDO's period: the beginning is given
 as the tick of the sample before the edge, the end as the tick of the first sample after it.
@@ -13,6 +13,9 @@ from fdhil.records import AxisSamples, MoveEvent, MoveKind
 
 class DigitalInputG0:
     """Says RAPID while the bit is set, REST when it falls."""
+
+    needs_input = True
+    least_share = 0.0
 
     def __init__(self, axis: str, config: MachineConfig) -> None:
         self._axis = axis

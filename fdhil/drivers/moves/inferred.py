@@ -1,4 +1,4 @@
-"""G0 events from the demand alone: a move whose demand reaches the rapid speed was ordered as a rapid. Pure.
+"""Tells G0 by the demand alone: a move whose demand reaches the rapid speed was ordered as a rapid. Pure.
 
 Which kind a move is shows only when it is fast enough, or over; the event then carries the tick at which it began.
 """
@@ -11,7 +11,6 @@ from fdhil.config import MachineConfig
 from fdhil.drivers.cia402.drive import InputSamples
 from fdhil.records import AxisSamples, MoveEvent, MoveKind
 
-RAPID_SHARE = 0.9  # of the rapid speed: an NC's override of 100 % is above it, any feed is below
 REST_SHARE = 0.002
 REST_S = 0.010
 DECISION_S = 2.0
@@ -20,11 +19,14 @@ DECISION_S = 2.0
 class InferredG0:
     """Feeds on an axis' samples and says RAPID, FEED and REST."""
 
+    needs_input = False
+    least_share = 0.9  # an NC's override of 100 % is above it, any feed is below
+
     def __init__(self, axis: str, config: MachineConfig) -> None:
         settings = config.axis[axis]
         self._axis = axis
         self._period_s = config.machine.sync_period_s
-        self._rapid_mm_s = RAPID_SHARE * settings.rapid_speed_mm_s
+        self._rapid_mm_s = self.least_share * settings.rapid_speed_mm_s
         # one increment per cycle is the rounding of the set-point, not a motion
         rounding = 2 / settings.scaling.increments_per_mm / self._period_s
         self._rest_mm_s = max(REST_SHARE * settings.rapid_speed_mm_s, rounding)

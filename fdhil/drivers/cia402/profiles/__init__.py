@@ -1,1 +1,1 @@
-"""Drive models, one module each with a ``PROFILE``."""
+"""Holds the drive models, one TOML file each."""

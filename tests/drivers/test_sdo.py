@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from fdhil.drivers.can import sdo as canopen_sdo
+from fdhil.drivers.can import sdo
 from fdhil.drivers.can.sdo import SdoLink
 from fdhil.errors import DeviceTimeout
 
@@ -39,11 +39,11 @@ class SlowNode:
 
 
 def test_the_roll_back_is_not_spoilt_by_a_late_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(canopen_sdo, "RESPONSE_TIMEOUT_S", 0.02)
+    monkeypatch.setattr(sdo, "RESPONSE_TIMEOUT_S", 0.02)
     node = SlowNode()
-    link = SdoLink("drive X", 1, node)  # type: ignore[arg-type]
+    link = SdoLink("drive X", 1, node.send)
     node.link = link
-    monkeypatch.setattr(canopen_sdo, "QUIET_S", 0.0)
+    monkeypatch.setattr(sdo, "QUIET_S", 0.0)
     with pytest.raises(DeviceTimeout):
         link.read_int(0x1016, 1)
     monkeypatch.setattr("fdhil.drivers.can.sdo.time.sleep", node.arrive)

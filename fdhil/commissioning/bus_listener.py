@@ -1,0 +1,118 @@
+"""Listens to a bus beside whoever runs it, and gathers the traffic of an NC and of the nodes. Sends nothing."""
+
+from __future__ import annotations
+
+import statistics
+import threading
+import time
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Self
+
+from fdhil.cia402 import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SDO_RESPONSE, COB_SYNC, Nmt
+from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.frames import Frames
+from fdhil.errors import ConnectError
+
+LISTEN_S = 2.5  # a heartbeat of one second comes twice
+_TURN_S = 0.002
+_MASTER_FUNCTIONS = {0x200: "set-points", 0x300: "set-points", 0x400: "set-points", 0x500: "set-points"} | {
+    COB_SDO_REQUEST: "SDO requests"
+}
+_NODE_FUNCTIONS = (0x080, 0x180, 0x280, 0x380, 0x480, COB_SDO_RESPONSE, COB_HEARTBEAT)
+
+
+@dataclass(slots=True)
+class Traffic:
+    """The frames heard: per COB-ID those counted, the newest length and data; heartbeats and EMCY per node."""
+
+    count: dict[int, int] = field(default_factory=dict)
+    length: dict[int, int] = field(default_factory=dict)
+    data: dict[int, int] = field(default_factory=dict)
+    beats: dict[int, list[int]] = field(default_factory=dict)
+    emergencies: dict[int, set[int]] = field(default_factory=dict)
+    sync_ns: list[int] = field(default_factory=list)
+
+    def take(self, frames: Frames) -> None:
+        """Take a block of frames; those with 29 bit identifiers and error frames are left aside."""
+        for frame in frames[frames["id"] <= 0x7FF]:
+            can_id, stamp, data = int(frame["id"]), int(frame["t_ns"]), int(frame["data"])
+            function, node = can_id & 0x780, can_id & 0x7F
+            self.count[can_id] = self.count.get(can_id, 0) + 1
+            self.length[can_id], self.data[can_id] = int(frame["dlc"]), data
+            if can_id == COB_SYNC:
+                self.sync_ns.append(stamp)
+            elif function == COB_EMCY:
+                self.emergencies.setdefault(node, set()).add(data & 0xFFFF)
+            elif function == COB_HEARTBEAT:
+                self.beats.setdefault(node, []).append(stamp)
+
+    @property
+    def master(self) -> str | None:
+        """What shows that a master runs the bus, None when nothing does."""
+        if self.sync_ns:
+            return "SYNC"
+        if COB_NMT in self.count:
+            return "NMT commands"
+        return next((_MASTER_FUNCTIONS[i & 0x780] for i in self.count if i & 0x780 in _MASTER_FUNCTIONS), None)
+
+    @property
+    def nodes(self) -> set[int]:
+        """Node-IDs that were heard to send."""
+        return {i & 0x7F for i in self.count if i & 0x780 in _NODE_FUNCTIONS and i & 0x7F}
+
+    @property
+    def sync_period_s(self) -> float | None:
+        """Median period of SYNC, None before the second one: a producer or a stamp that was late once says nothing."""
+        return statistics.median(later - t for t, later in pairwise(self.sync_ns)) * 1e-9 if self.sync_ns[1:] else None
+
+    def heartbeat_s(self, node_id: int) -> float | None:
+        """Mean period of a node's heartbeat, None before the second one."""
+        beats = self.beats.get(node_id, [])
+        return (beats[-1] - beats[0]) / (len(beats) - 1) * 1e-9 if len(beats) > 1 else None
+
+    def nmt(self, node_id: int) -> str | None:
+        """The NMT state of a node's newest heartbeat, None without one."""
+        data = self.data.get(COB_HEARTBEAT + node_id)
+        known = {int(state): state.name.lower().replace("_", "-") for state in Nmt}
+        return None if data is None else known.get(data & 0x7F, f"unknown ({data & 0x7F:02X})")
+
+
+class BusListener:
+    """Gathers the traffic of a bus in a thread of its own until it is closed; a context manager."""
+
+    def __init__(self, bus: CanBus) -> None:
+        self.traffic = Traffic()
+        self.name = bus.name
+        self._bus = bus
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._turn, name=f"fdhil-scan-{bus.name}", daemon=True)
+        self._thread.start()
+
+    def _turn(self) -> None:
+        while not self._stopping.wait(_TURN_S):
+            self.take(self._bus.drain())
+
+    def take(self, frames: Frames) -> None:
+        """Take what came since the last turn."""
+        self.traffic.take(frames)
+
+    def listen(self, seconds: float) -> None:
+        """Listen for a while; ConnectError when the bus ends meanwhile."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            if self._bus.ended is not None:
+                raise ConnectError(f"bus {self.name}", f"{self._bus.ended}; try again when the bus is back")
+            time.sleep(0.01)
+
+    def close(self) -> None:
+        """Stop listening and release the bus."""
+        self._stopping.set()
+        self._thread.join(timeout=2.0)
+        self._bus.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()

@@ -1,0 +1,83 @@
+"""Opens a bus for sending: besides the guard's the only module that does, and commissioning alone may import it.
+
+No periodic sending of any library is used anywhere: a kernel that goes on sending for a process that hangs would make
+a dead program look alive.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+import can
+
+from fdhil import config
+from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.ports import CAN_FRAME, CONNECT_TIMEOUT_S, Port, SocketcandPort, SocketCanPort, VirtualPort
+from fdhil.errors import DeviceError
+
+
+class SendingPort(Port, Protocol):
+    """A port that also sends."""
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send one frame now or raise DeviceError; nothing is queued."""
+
+
+class SocketCanSender(SocketCanPort):
+    """A raw CAN socket; a full transmit queue (ENOBUFS) is an error at once, never a wait."""
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send one frame."""
+        try:
+            self._socket.send(CAN_FRAME.pack(can_id, len(data), data))
+        except OSError as error:
+            raise DeviceError(self._name, f"the frame {can_id:03X} was not sent ({error.strerror})") from None
+
+
+class SocketcandSender(SocketcandPort):
+    """A connection to a socketcand hub."""
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send one frame to the hub."""
+        words = " ".join(f"{byte:x}" for byte in data)
+        try:
+            self._socket.settimeout(CONNECT_TIMEOUT_S)
+            self._socket.sendall(f"< send {can_id:03X} {len(data):X} {words} >".encode("ascii"))
+        except OSError as error:
+            raise DeviceError(self._name, f"the frame {can_id:03X} was not sent ({error})") from None
+
+
+class VirtualSender(VirtualPort):
+    """python-can's bus inside one process."""
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send one frame to the other buses of the channel."""
+        try:
+            self._bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+        except can.CanError as error:
+            raise DeviceError(self._name, f"the frame {can_id:03X} was not sent ({error})") from None
+
+
+SENDERS: Mapping[str, Callable[[str, config.CanBus], SendingPort]] = {
+    "socketcan": SocketCanSender,
+    "socketcand": SocketcandSender,
+    "virtual": VirtualSender,
+}
+
+
+class TransmitBus(CanBus):
+    """A bus that is listened to and sent on; answers are waited for, so it is read frame by frame."""
+
+    batch_s = 0.0
+
+    def _open(self, settings: config.CanBus) -> Port:
+        self._send_lock = threading.Lock()
+        self._sender = SENDERS[settings.interface](self.name, settings)
+        return self._sender
+
+    def send(self, can_id: int, data: bytes) -> None:
+        """Send one frame; DeviceError when the bus does not take it."""
+        with self._send_lock:
+            self._sender.send(can_id, data)

@@ -1,0 +1,125 @@
+"""Drains one bus, decodes it, and opens it again when it ended."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+
+from fdhil.config import MachineConfig
+from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.frame_history import FrameHistory
+from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.cia402.bus_decoder import BusDecoder
+from fdhil.drivers.cia402.drive import InputSamples
+from fdhil.drivers.moves import load_event_source
+from fdhil.drivers.sensor_source import BACK_OFF_S, Record, Take
+from fdhil.errors import ConnectError
+from fdhil.records import AxisSamples, Notice, TickTimes
+
+DRAIN_S = 0.05
+SILENCE_S = 2.0
+
+
+class BusSource:
+    """One bus: drains the ring, decodes, and opens it again when it ended."""
+
+    def __init__(self, name: str, config: MachineConfig) -> None:
+        self.name = name
+        self._config = config
+        self._bus: CanBus | None = None
+        self.decoder = BusDecoder(name, config)
+        self.ticks = TickClock(config.machine.sync_period_s)
+        event_source = load_event_source(config.g0.source)
+        self._events = [event_source(axis, config) for axis in self.decoder.axes]
+        self.history = FrameHistory()
+        self._silent = False
+        self._frames_before = 0
+        self._overflow_told = 0
+
+    def open(self) -> None:
+        """Open the bus; ConnectError when it cannot be reached."""
+        self._bus = CanBus(self.name, self._config.bus[self.name])
+
+    @property
+    def heard(self) -> bool:
+        """Whether any frame was received."""
+        return self._bus is not None and self._bus.counters()["frames"] > 0
+
+    def step(self, now_ns: int) -> list[Record]:
+        """Drain and decode once."""
+        bus = self._bus
+        if bus is None:
+            return []
+        frames = bus.drain()
+        self.history.add(frames)
+        out: list[Record] = []
+        for record in self.decoder.feed(frames, now_ns):
+            if isinstance(record, TickTimes):
+                self.ticks.add(record)
+            if isinstance(record, AxisSamples | InputSamples):
+                for source in self._events:
+                    out += source.feed(record)
+            if not isinstance(record, InputSamples):
+                out.append(record)
+        return [*out, *self._overflow(bus), *self._silence(bus, now_ns)]
+
+    def _overflow(self, bus: CanBus) -> list[Notice]:
+        lost = bus.counters()["lost"]
+        if lost <= self._overflow_told:
+            return []
+        new, self._overflow_told = lost - self._overflow_told, lost
+        text = f"{new} frames of bus {self.name} were not read in time; the computer is overloaded."
+        return [Notice("RxOverflow", "minor", text)]
+
+    def _silence(self, bus: CanBus, now_ns: int) -> list[Notice]:
+        silent = now_ns - bus.last_frame_ns > SILENCE_S * 1e9
+        was, self._silent = self._silent, silent
+        if silent and not was:
+            text = f"Nothing is heard on bus {self.name}; check the drives' supply, the wiring and the bit rate."
+            return [Notice("BusSilent", "MAJOR", text)]
+        return [Notice("BusSilent", "info", f"Bus {self.name} is heard again.")] if was and not silent else []
+
+    async def run(self, take: Take) -> None:
+        """Run for ever; a bus that ended is opened again with growing pauses."""
+        pause = BACK_OFF_S[0]
+        while True:
+            await asyncio.sleep(DRAIN_S)
+            for record in self.step(time.monotonic_ns()):
+                take(record)
+            if self._bus is None or self._bus.ended is None:
+                pause = BACK_OFF_S[0]
+                continue
+            reason = self._bus.ended
+            take(Notice("BusDown", "MAJOR", f"Bus {self.name}: {reason}; it is tried again until it is back."))
+            pause = await self._reopen(pause)
+            take(Notice("BusDown", "info", f"Bus {self.name} is back."))
+
+    async def _reopen(self, pause: float) -> float:
+        """Wait until the bus can be opened; the SYNC count begins anew."""
+        self.close()
+        while self._bus is None:
+            await asyncio.sleep(pause)
+            pause = min(2 * pause, BACK_OFF_S[1])
+            try:
+                await asyncio.to_thread(self.open)
+            except ConnectError:
+                continue
+        self.decoder = BusDecoder(self.name, self._config)
+        self._overflow_told = 0
+        return pause
+
+    def counters(self) -> dict[str, int]:
+        """Frames received and lost on this bus."""
+        own = self._bus.counters() if self._bus else {"frames": 0, "ring_overflow": 0, "kernel_drops": 0, "lost": 0}
+        decoded = self.decoder.counters()
+        own["frames"] += self._frames_before
+        own["lost"] += decoded["pdo_lost"] + decoded["sync_missed"]
+        return own | decoded
+
+    def close(self) -> None:
+        """Close the bus; its frames stay counted."""
+        if self._bus is not None:
+            counters = self._bus.counters()
+            self._frames_before += counters["frames"]
+            self._bus.close()
+            self._bus = None

@@ -1,0 +1,117 @@
+"""Polls a sensor that is a device of its own, and connects it again when it went away."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from fdhil import tables
+from fdhil.config import MachineConfig
+from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.modbus.temperature import ModbusTemperature
+from fdhil.errors import DeviceError
+from fdhil.records import AxisSamples, MoveEvent, Notice, Temperature, TickTimes, VoltageSamples
+
+Record = AxisSamples | VoltageSamples | TickTimes | MoveEvent | Temperature | Notice
+Take = Callable[[Record], None]
+"""Takes a source's records; it never waits, for nothing may hold a source up."""
+
+POLL_S = 0.05
+BACK_OFF_S = (0.1, 5.0)
+
+
+class Link(Protocol):
+    """The connection to a sensor; ``wire`` names its kind, ``place`` tells people where it leads."""
+
+    wire: str
+    place: str
+
+    @property
+    def connected(self) -> bool:
+        """Whether it stands."""
+
+    async def connect(self) -> None:
+        """Connect anew; ConnectError when nobody answers there."""
+
+    def fault_code(self, error: DeviceError) -> str | None:
+        """Return the class under which ``error`` is told; None for what passes by itself."""
+
+    def close(self) -> None:
+        """End the connection."""
+
+
+class Sensor(Protocol):
+    """A sensor of one axis: every source of ``tables.VOLTAGE_SOURCES`` that is separate from the drive."""
+
+    axis: str
+    name: str
+    samples: int
+    lost: int
+
+    @property
+    def link(self) -> Link:
+        """Its connection."""
+
+    async def poll(self, ticks: TickClock) -> Sequence[Record]:
+        """Ask once and return what is new; DeviceError."""
+
+    async def reading(self) -> str:
+        """Only read, so that a running daemon misses nothing, and return what people are shown; DeviceError."""
+
+
+def sensors_of(axis: str, config: MachineConfig) -> dict[str, Sensor]:
+    """Return the sensors of their own that an axis has, by what they tell: ``voltage``, ``temperature``."""
+    settings, found = config.axis[axis], {}
+    if settings.voltage.separate:
+        found["voltage"] = tables.load(tables.VOLTAGE_SOURCES, settings.voltage.source)(axis, config)
+    if settings.temperature is not None:
+        found["temperature"] = ModbusTemperature(axis, settings.temperature)
+    return found
+
+
+class SensorSource:
+    """One sensor: polled for ever."""
+
+    def __init__(self, sensor: Sensor, ticks: TickClock) -> None:
+        self.sensor = sensor
+        self._ticks = ticks
+        self._failures = 0
+        self._told: set[str] = set()
+
+    async def run(self, take: Take) -> None:
+        """Poll for ever; a fault is a notice once, its end another."""
+        pause = BACK_OFF_S[0]
+        while True:
+            begun = time.monotonic()
+            try:
+                if not self.sensor.link.connected:
+                    await self.sensor.link.connect()
+                for record in await self.sensor.poll(self._ticks):
+                    take(record)
+            except DeviceError as error:
+                self._failed(error, take)
+                await asyncio.sleep(pause)
+                pause = min(2 * pause, BACK_OFF_S[1])
+                continue
+            pause = BACK_OFF_S[0]
+            for code in sorted(self._told):
+                take(Notice(code, "info", f"The {self.sensor.name} answers again.", self.sensor.axis))
+            self._told.clear()
+            await asyncio.sleep(max(0.0, POLL_S - (time.monotonic() - begun)))
+
+    def _failed(self, error: DeviceError, take: Take) -> None:
+        self._failures += 1
+        code = self.sensor.link.fault_code(error)
+        if code is not None and code not in self._told:
+            self._told.add(code)
+            take(Notice(code, "MAJOR", str(error), self.sensor.axis))
+
+    def counters(self) -> dict[str, int]:
+        """Samples received and lost, and failed polls."""
+        return {"samples": self.sensor.samples, "lost": self.sensor.lost, "failures": self._failures}
+
+    def close(self) -> None:
+        """End the connection."""
+        self.sensor.link.close()

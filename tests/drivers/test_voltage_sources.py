@@ -1,0 +1,74 @@
+"""What every listed voltage source must do; being listed is being tested."""
+
+from __future__ import annotations
+
+import pytest
+
+from fdhil import tables
+from fdhil.config import MachineConfig
+from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.cia402.drive import VoltageObject
+from fdhil.drivers.cia402.profile import load_profile
+from fdhil.drivers.machine import MachineSource
+from fdhil.drivers.sensor_source import sensors_of
+from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
+from fdhil.records import VoltageSamples
+from tests.drivers.modbus_peer import sensor_peer
+from tests.drivers.wire import machine
+
+SEPARATE = [name for name in tables.VOLTAGE_SOURCES if name != tables.DRIVE_VOLTAGE]
+
+
+def config_of(name: str, port: int = 1) -> MachineConfig:
+    return machine(voltage={"source": name, "port": port, "timeout_s": 0.2})
+
+
+@pytest.mark.parametrize("name", tables.VOLTAGE_SOURCES)
+def test_the_voltage_comes_from_one_place_alone(name: str) -> None:
+    """``drive`` is an object in a TPDO; every other is a sensor of its own, which the machine reaches and polls."""
+    config = config_of(name)
+    profile = load_profile(config.axis["X"].drive.profile)
+    source = tables.load(tables.VOLTAGE_SOURCES, name)("X", config)
+    separate = name in SEPARATE
+    assert config.axis["X"].voltage.separate == separate
+    assert list(sensors_of("X", config)) == ["voltage"] * separate
+    assert any(key.endswith(".X.samples") for key in MachineSource(config).counters()) == separate
+    assert VoltageObject("X", config).key == (None if separate else profile.voltage)
+    if not separate:
+        assert (source.key, source.v_per_count) == (profile.voltage, profile.voltage_v_per_count)
+
+
+@pytest.mark.parametrize("name", SEPARATE)
+async def test_a_sensor_is_polled_and_read(name: str) -> None:
+    async with sensor_peer() as peer:
+        sensor = sensors_of("X", config_of(name, peer.port))["voltage"]
+        await sensor.link.connect()
+        before = sensor.samples
+        shown = await sensor.reading()
+        assert " V at " in shown
+        assert sensor.samples == before  # a reading takes nothing from a daemon that polls
+        records = await sensor.poll(TickClock(0.001))
+        sensor.link.close()
+    blocks = [record for record in records if isinstance(record, VoltageSamples)]
+    assert blocks
+    assert {(block.axis, block.sensor) for block in blocks} == {("X", sensor.name)}
+    assert sensor.samples == sum(block.voltage_v.size for block in blocks)
+    assert sensor.lost == 0
+    assert not sensor.link.connected
+
+
+@pytest.mark.parametrize("name", SEPARATE)
+async def test_a_sensor_that_is_not_there_is_told_with_its_place(name: str) -> None:
+    async with sensor_peer() as peer:
+        port = peer.port
+    sensor = sensors_of("X", config_of(name, port))["voltage"]
+    assert sensor.axis == "X"
+    assert str(port) in sensor.link.place
+    with pytest.raises(ConnectError, match=sensor.name):
+        await sensor.link.connect()
+
+
+@pytest.mark.parametrize("name", SEPARATE)
+@pytest.mark.parametrize("error", [ConnectError, DeviceTimeout, ProtocolError, DeviceError])
+def test_every_error_has_its_class(name: str, error: type[DeviceError]) -> None:
+    assert sensors_of("X", config_of(name))["voltage"].link.fault_code(error("voltage sensor X", "a fault; advice"))
