@@ -18,10 +18,10 @@ from fdhil.identification.estimators import (
     maximum_likelihood,
 )
 from fdhil.identification.normal import inverse_of
+from fdhil.identification.pooling import weighted
 from fdhil.identification.windows import find_windows
 from fdhil.records import PARAMETERS, Estimate, Float, Result, Window, frozen
 from fdhil.store.recording_csv import parse_recording
-from fdhil.validation.pooled import weighted
 from studies import bench
 from tests.identification.recorded import signals, windows
 

@@ -1,54 +1,44 @@
-"""The recent past of one axis on the SYNC grid, and the cutting of a stretch of it.
+"""Keeps the recent samples of one axis on the SYNC grid, and cuts a stretch of them.
 
 Pure: nothing here knows a clock. A lost sample stays NaN, and a separate sensor's voltage is placed by the offset
-between its own count and the SYNC count, never by single arrival times.
+between its own count and the SYNC count, never by single arrival times. Rows are copied once, from the blocks that
+came over the bus to the stretch that is cut; its windows are views of it.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from fdhil.records import AxisSamples, Bool, Float, Int, SlowVoltage, TickTimes, VoltageSamples, frozen
+from fdhil.config import Axis
+from fdhil.identification.windows import spans
+from fdhil.records import AxisSamples, Float, Int, Recording, SlowVoltage, TickTimes, VoltageSamples, frozen, read_only
 
 PLACING_BLOCKS = 40  # some 2 s of a sensor that is asked every 50 ms
 CLOCK_TOLERANCE = 500e-6  # two quartz clocks
 LEAST_FOR_RATE = 100  # samples from which the sensor's own rate is believed
 RATE_TOLERANCE = 0.01  # a sensor's rate may be off a multiple of the SYNC rate by this much
 
+Column = Literal["demand_mm", "position_mm", "speed_rad_s", "current_a", "voltage_v", "offset_mm"]
 
-@dataclass(frozen=True, slots=True)
-class Stretch:
-    """Signals of the ticks ``start_tick`` + 0..n-1, arrays (n,), NaN where lost; ``gaps`` half-open.
 
-    ``offset_mm`` is the position offset in force.
+class RecentSamples:
+    """The newest ``capacity`` ticks of one axis' samples, of its voltage sensor and of the SYNC's arrival times.
 
-    Row k of ``voltage_v`` is the mean over the period that begins at tick k (or the instant, as the source samples);
-    None without a source. ``voltage_delay_s`` is what the placing on whole ticks left over. A sensor slower than the
-    SYNC keeps its own grid: ``slow_voltage``, counted from ``start_tick``.
+    ``section`` is the axis' own of the machine's config.
     """
 
-    start_tick: int
-    demand_mm: Float
-    position_mm: Float
-    speed_rad_s: Float
-    current_a: Float
-    voltage_v: Float | None
-    voltage_delay_s: float | None
-    offset_mm: Float
-    gaps: tuple[tuple[int, int], ...]
-    slow_voltage: SlowVoltage | None = None
-
-
-class Ring:
-    """The newest ``capacity`` ticks of one axis' samples, of its voltage sensor and of the SYNC's arrival times."""
-
-    def __init__(self, capacity: int, period_s: float) -> None:
+    def __init__(self, axis: str, section: Axis, capacity: int, period_s: float) -> None:
+        self._axis = axis
+        self._section = section
         self._capacity = capacity
+        self._period_s = period_s
         self._period_ns = period_s * 1e9
+        self.separate_voltage = section.voltage.source != "drive"
+        self._first_tick: int | None = None
         self._samples: deque[AxisSamples] = deque()
         self._voltage: deque[VoltageSamples] = deque()
         self._times: deque[TickTimes] = deque()
@@ -60,6 +50,7 @@ class Ring:
 
     def clear(self) -> None:
         """Forget everything: the SYNC count began anew."""
+        self._first_tick = None
         self._samples.clear()
         self._voltage.clear()
         self._times.clear()
@@ -68,6 +59,8 @@ class Ring:
         """Append a block and let go what is older than the capacity; an empty block is nothing."""
         if isinstance(block, AxisSamples):
             if block.tick.size:
+                if self._first_tick is None:
+                    self._first_tick = int(block.tick[0])
                 self._samples.append(block)
                 while self._samples[-1].tick[-1] - self._samples[0].tick[-1] > self._capacity:
                     self._samples.popleft()
@@ -91,37 +84,41 @@ class Ring:
         place = self._placing()
         return place is not None and int(self._voltage[-1].counter[-1]) >= place.counter_of(tick + 1)
 
-    def cut(self, start: int, stop: int, separate_voltage: bool) -> Stretch:
-        """Return the ticks ``start`` .. ``stop`` - 1; what was never received is NaN."""
-        n = stop - start
+    def cut(self, start: int, stop: int) -> Recording:
+        """Return the ticks ``start`` .. ``stop`` - 1, or those since the first; what was never received is NaN.
+
+        Row k of the voltage is the mean over the period that begins at tick k (or the instant, as the source samples);
+        its delay is what the placing on whole ticks left over.
+        """
+        first = start if self._first_tick is None else self._first_tick
+        start = max(start, first)
+        stop = max(start, stop)
         blocks = [b for b in self._samples if b.tick[-1] >= start and b.tick[0] < stop]
-        tick = np.concatenate([b.tick for b in blocks]) if blocks else np.empty(0, np.int64)
-        inside = (tick >= start) & (tick < stop)
-
-        def placed(parts: Iterable[Float]) -> Float:
-            values = np.full(n, np.nan)
-            values[tick[inside] - start] = np.concatenate([np.empty(0), *parts])[inside]
-            return values
-
-        speed = placed(b.speed_rad_s for b in blocks)
+        speed = _placed(blocks, "speed_rad_s", start, stop)
         voltage, delay, slow = None, None, None
-        if separate_voltage and self._is_slow():
+        if self.separate_voltage and self._is_slow():
             slow = self._slow(start, stop)
-        elif separate_voltage:
+        elif self.separate_voltage:
             voltage, delay = self._separate(start, stop)
         elif blocks and all(b.voltage_v is not None for b in blocks):
-            voltage = placed(b.voltage_v for b in blocks if b.voltage_v is not None)
-        return Stretch(
-            start,
-            placed(b.demand_mm for b in blocks),
-            placed(b.position_mm for b in blocks),
-            speed,
-            placed(b.current_a for b in blocks),
-            voltage,
-            delay,
-            placed(b.offset_mm for b in blocks),
-            runs(~np.isfinite(speed)),
-            slow,
+            voltage = _placed(blocks, "voltage_v", start, stop)
+        return Recording(
+            axis=self._axis,
+            dt_s=self._period_s,
+            time_s=frozen(np.arange(start - first, stop - first) * self._period_s),
+            voltage_v=voltage,
+            current_a=_placed(blocks, "current_a", start, stop),
+            speed_rad_s=speed,
+            position_mm=_placed(blocks, "position_mm", start, stop),
+            demand_mm=_placed(blocks, "demand_mm", start, stop),
+            voltage_sampling=self._section.voltage.sampling,
+            pitch_mm=self._section.screw_pitch_mm,
+            rapid_speed_rad_s=self._section.rapid_speed_rad_s,
+            gaps=tuple((int(a), int(b)) for a, b in spans(~np.isfinite(speed))),
+            slow_voltage=slow,
+            start_tick=start,
+            voltage_delay_s=delay,
+            offset_mm=_placed(blocks, "offset_mm", start, stop),
         )
 
     def _is_slow(self) -> bool:
@@ -167,7 +164,7 @@ class Ring:
             values[row[inside]] = block.voltage_v[inside]
         error = float(np.median(np.concatenate([b.t_error_ns for b in self._voltage]))) * 1e-9
         period_s = self._period_ns * 1e-9
-        return SlowVoltage((line[0] + first * line[1] - start) * period_s, line[1] * period_s, error, frozen(values))
+        return SlowVoltage((line[0] + first * line[1] - start) * period_s, line[1] * period_s, error, read_only(values))
 
     def _separate(self, start: int, stop: int) -> tuple[Float | None, float | None]:
         place = self._placing()
@@ -223,7 +220,11 @@ class _Placing:
         return cls(ratio, offset, (ahead - offset) / ratio * period_ns * 1e-9)
 
 
-def runs(marked: Bool) -> tuple[tuple[int, int], ...]:
-    """Return the half-open ranges in which ``marked`` (n,) is set."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]]).astype(np.int8)))
-    return tuple((int(a), int(b)) for a, b in edges.reshape(-1, 2))
+def _placed(blocks: list[AxisSamples], column: Column, start: int, stop: int) -> Float:
+    """Return a column of the ``blocks`` at the ticks ``start`` .. ``stop`` - 1, NaN where none has one."""
+    values = np.full(stop - start, np.nan)
+    for block in blocks:
+        row = block.tick - start
+        inside = (row >= 0) & (row < values.size)
+        values[row[inside]] = getattr(block, column)[inside]
+    return read_only(values)
