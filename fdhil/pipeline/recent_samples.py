@@ -8,8 +8,9 @@ came over the bus to the stretch that is cut; its windows are views of it.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import TypeVar
 
 import numpy as np
 
@@ -22,7 +23,7 @@ CLOCK_TOLERANCE = 500e-6  # two quartz clocks
 LEAST_FOR_RATE = 100  # samples from which the sensor's own rate is believed
 RATE_TOLERANCE = 0.01  # a sensor's rate may be off a multiple of the SYNC rate by this much
 
-Column = Literal["demand_mm", "position_mm", "speed_rad_s", "current_a", "voltage_v", "offset_mm"]
+Block = TypeVar("Block")
 
 
 class RecentSamples:
@@ -59,22 +60,12 @@ class RecentSamples:
         """Append a block and let go what is older than the capacity; an empty block is nothing."""
         if isinstance(block, AxisSamples):
             if block.tick.size:
-                if self._first_tick is None:
-                    self._first_tick = int(block.tick[0])
-                self._samples.append(block)
-                while self._samples[-1].tick[-1] - self._samples[0].tick[-1] > self._capacity:
-                    self._samples.popleft()
+                self._first_tick = int(block.tick[0]) if self._first_tick is None else self._first_tick
+                _append(self._samples, block, lambda b: b.tick, self._capacity)
         elif block.t_ns.size and isinstance(block, VoltageSamples):
-            self._voltage.append(block)
-            while self._too_old(self._voltage[0].t_ns, block.t_ns):
-                self._voltage.popleft()
+            _append(self._voltage, block, lambda b: b.t_ns, self._capacity * self._period_ns)
         elif block.t_ns.size and isinstance(block, TickTimes):
-            self._times.append(block)
-            while self._too_old(self._times[0].t_ns, block.t_ns):
-                self._times.popleft()
-
-    def _too_old(self, old: Int, new: Int) -> bool:
-        return bool(new[-1] - old[-1] > self._capacity * self._period_ns)
+            _append(self._times, block, lambda b: b.t_ns, self._capacity * self._period_ns)
 
     def voltage_reaches(self, tick: int) -> bool:
         """Whether the separate sensor has delivered past ``tick``; False until its place on the grid is known."""
@@ -92,25 +83,25 @@ class RecentSamples:
         """
         first = start if self._first_tick is None else self._first_tick
         start = max(start, first)
-        stop = max(start, stop)
+        n = max(0, stop - start)
         blocks = [b for b in self._samples if b.tick[-1] >= start and b.tick[0] < stop]
-        speed = _placed(blocks, "speed_rad_s", start, stop)
+        speed = _placed(((b.tick, b.speed_rad_s) for b in blocks), start, n)
         voltage, delay, slow = None, None, None
         if self.separate_voltage and self._is_slow():
-            slow = self._slow(start, stop)
+            slow = self._slow(start, n)
         elif self.separate_voltage:
-            voltage, delay = self._separate(start, stop)
+            voltage, delay = self._separate(start, n)
         elif blocks and all(b.voltage_v is not None for b in blocks):
-            voltage = _placed(blocks, "voltage_v", start, stop)
+            voltage = _placed(((b.tick, b.voltage_v) for b in blocks if b.voltage_v is not None), start, n)
         return Recording(
             axis=self._axis,
             dt_s=self._period_s,
-            time_s=frozen(np.arange(start - first, stop - first) * self._period_s),
+            time_s=frozen(np.arange(start - first, start - first + n) * self._period_s),
             voltage_v=voltage,
-            current_a=_placed(blocks, "current_a", start, stop),
+            current_a=_placed(((b.tick, b.current_a) for b in blocks), start, n),
             speed_rad_s=speed,
-            position_mm=_placed(blocks, "position_mm", start, stop),
-            demand_mm=_placed(blocks, "demand_mm", start, stop),
+            position_mm=_placed(((b.tick, b.position_mm) for b in blocks), start, n),
+            demand_mm=_placed(((b.tick, b.demand_mm) for b in blocks), start, n),
             voltage_sampling=self._section.voltage.sampling,
             pitch_mm=self._section.screw_pitch_mm,
             rapid_speed_rad_s=self._section.rapid_speed_rad_s,
@@ -118,7 +109,7 @@ class RecentSamples:
             slow_voltage=slow,
             start_tick=start,
             voltage_delay_s=delay,
-            offset_mm=_placed(blocks, "offset_mm", start, stop),
+            offset_mm=_placed(((b.tick, b.offset_mm) for b in blocks), start, n),
         )
 
     def _is_slow(self) -> bool:
@@ -128,8 +119,11 @@ class RecentSamples:
     def _samples_per_tick(self) -> float:
         return self._period_ns * 1e-9 * self._voltage[-1].sample_rate_hz
 
-    def _slow_line(self) -> tuple[float, float] | None:
-        """Return begin (ticks) of sample 0 and ticks per sample, as the newest blocks and the SYNC's arrivals show."""
+    def _begins(self, spare_ns: float = 0.0) -> tuple[Int, Float] | None:
+        """Return count and begin (ticks) of the newest samples, looked up among the SYNC's arrivals; None without any.
+
+        The newest blocks alone are used: two clocks that drift apart move by less than 0.1 sample in that time.
+        """
         if not self._voltage or not self._times:
             return None
         recent = list(self._voltage)[-PLACING_BLOCKS:]
@@ -137,10 +131,15 @@ class RecentSamples:
         tick = np.concatenate([b.tick for b in self._times])
         counter = np.concatenate([b.counter for b in recent])
         begins_ns = np.concatenate([b.t_ns for b in recent])
-        inside = (begins_ns >= tick_ns[0]) & (begins_ns <= tick_ns[-1])
-        if not inside.any():
+        inside = (begins_ns >= tick_ns[0]) & (begins_ns <= tick_ns[-1] + spare_ns)
+        return (counter[inside], np.interp(begins_ns[inside], tick_ns, tick)) if inside.any() else None
+
+    def _slow_line(self) -> tuple[float, float] | None:
+        """Return begin (ticks) of sample 0 and ticks per sample, as the newest blocks and the SYNC's arrivals show."""
+        told = self._begins()
+        if told is None:
             return None
-        begins, counter = np.interp(begins_ns[inside], tick_ns, tick), counter[inside]
+        counter, begins = told
         nominal = 1 / self._samples_per_tick()
         spread = counter - counter.mean()
         power = float(spread @ spread)
@@ -148,45 +147,44 @@ class RecentSamples:
         slope = float(np.clip(slope, nominal * (1 - CLOCK_TOLERANCE), nominal * (1 + CLOCK_TOLERANCE)))
         return float(np.median(begins - slope * counter)), slope
 
-    def _slow(self, start: int, stop: int) -> SlowVoltage | None:
+    def _slow(self, start: int, n: int) -> SlowVoltage | None:
         """Return the sensor's samples that lie wholly between the ticks, on its own grid; None without any."""
         line = self._slow_line()
         if line is None:
             return None
         first = int(np.ceil((start - line[0]) / line[1] - 1e-9))
-        count = int(np.floor((stop - 1 - line[0]) / line[1] + 1e-9)) - first
+        count = int(np.floor((start + n - 1 - line[0]) / line[1] + 1e-9)) - first
         if count < 1:
             return None
-        values = np.full(count, np.nan)
-        for block in self._voltage:
-            row = block.counter - first
-            inside = (row >= 0) & (row < count)
-            values[row[inside]] = block.voltage_v[inside]
+        values = _placed(((b.counter, b.voltage_v) for b in self._voltage), first, count)
         error = float(np.median(np.concatenate([b.t_error_ns for b in self._voltage]))) * 1e-9
         period_s = self._period_ns * 1e-9
-        return SlowVoltage((line[0] + first * line[1] - start) * period_s, line[1] * period_s, error, read_only(values))
+        return SlowVoltage((line[0] + first * line[1] - start) * period_s, line[1] * period_s, error, values)
 
-    def _separate(self, start: int, stop: int) -> tuple[Float | None, float | None]:
+    def _separate(self, start: int, n: int) -> tuple[Float | None, float | None]:
         place = self._placing()
         if place is None:
             return None, None
-        values = np.full((stop - start) * place.ratio, np.nan)
-        for block in self._voltage:
-            row = block.counter - place.counter_of(start)
-            inside = (row >= 0) & (row < values.size)
-            values[row[inside]] = block.voltage_v[inside]
+        samples = ((b.counter, b.voltage_v) for b in self._voltage)
+        values = _placed(samples, place.counter_of(start), n * place.ratio)
         return values.reshape(-1, place.ratio).mean(axis=1), place.delay_s
 
     def _placing(self) -> _Placing | None:
-        """Return the sensor's place on the grid; None while it is not known or its rate is no multiple of SYNC's."""
-        if not self._voltage or not self._times:
-            return None
-        samples = self._samples_per_tick()
+        """Return the sensor's place on the grid; None while it is not known or its rate is no multiple of SYNC's.
+
+        The median of what each sample begins ahead of its tick decides.
+        """
+        samples = self._samples_per_tick() if self._voltage else 0.0
         ratio = round(samples)
         if ratio < 1 or abs(samples / ratio - 1) > RATE_TOLERANCE:
             return None
-        recent = list(self._voltage)[-PLACING_BLOCKS:]
-        return _Placing.fit(list(self._times), recent, ratio, self._period_ns)
+        told = self._begins(self._period_ns)
+        if told is None:
+            return None
+        counter, begins = told
+        ahead = float(np.median(counter - ratio * begins))
+        offset = round(ahead)
+        return _Placing(ratio, offset, (ahead - offset) / ratio * self._period_ns * 1e-9)
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,30 +199,19 @@ class _Placing:
         """Return the sensor's count at a tick."""
         return self.offset + self.ratio * tick
 
-    @classmethod
-    def fit(cls, times: list[TickTimes], blocks: list[VoltageSamples], ratio: int, period_ns: float) -> _Placing | None:
-        """Look up the fractional tick at which each sample begins among the SYNC's arrivals; the median decides.
 
-        The newest blocks alone are used: two clocks that drift apart move by less than 0.1 sample in that time.
-        """
-        tick_ns = np.concatenate([b.t_ns for b in times])
-        tick = np.concatenate([b.tick for b in times])
-        counter = np.concatenate([b.counter for b in blocks])
-        begins_ns = np.concatenate([b.t_ns for b in blocks])
-        inside = (begins_ns >= tick_ns[0]) & (begins_ns <= tick_ns[-1] + period_ns)
-        if not inside.any():
-            return None
-        begins = np.interp(begins_ns[inside], tick_ns, tick)
-        ahead = float(np.median(counter[inside] - ratio * begins))
-        offset = round(ahead)
-        return cls(ratio, offset, (ahead - offset) / ratio * period_ns * 1e-9)
+def _append(queue: deque[Block], block: Block, at: Callable[[Block], Int], reach: float) -> None:
+    """Append a block, and let go those whose last row is more than ``reach`` before its own."""
+    queue.append(block)
+    while at(block)[-1] - at(queue[0])[-1] > reach:
+        queue.popleft()
 
 
-def _placed(blocks: list[AxisSamples], column: Column, start: int, stop: int) -> Float:
-    """Return a column of the ``blocks`` at the ticks ``start`` .. ``stop`` - 1, NaN where none has one."""
-    values = np.full(stop - start, np.nan)
-    for block in blocks:
-        row = block.tick - start
-        inside = (row >= 0) & (row < values.size)
-        values[row[inside]] = getattr(block, column)[inside]
+def _placed(parts: Iterable[tuple[Int, Float]], first: int, n: int) -> Float:
+    """Return the values (n,) of ``parts``, each with its counts, from the count ``first`` on; NaN where none is."""
+    values = np.full(n, np.nan)
+    for counts, part in parts:
+        row = counts - first
+        inside = (row >= 0) & (row < n)
+        values[row[inside]] = part[inside]
     return read_only(values)
