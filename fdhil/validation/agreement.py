@@ -1,8 +1,8 @@
-"""Checks that the windows of one drive agree with each other."""
+"""Checks that methods agree on one window, and the windows of one drive with each other."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -21,6 +21,21 @@ GAINS: Mapping[str, Float] = {  # powers of R, L, K, Jt, ft, Cd
 }
 LEAST_GAIN_CHANGE = 0.02
 LEAST_CHANGE: Mapping[str, float] = {"R": 0.02, "L": 0.03, "K": 0.01, "Jt": 0.02, "ft": 0.15, "Cd": 0.10}
+
+
+def values_apart(estimate: Estimate, likeliest: Float) -> Iterator[Reason]:
+    """Yield a reason for each value that its own interval puts apart from the ``likeliest`` (6,) of the same window.
+
+    The structure is tested about the likeliest values: what another method says is believed as far as it agrees.
+    """
+    for name, best in zip(PARAMETERS, likeliest, strict=True):
+        value, std = estimate.value(name), estimate.std(name)
+        if abs(value - best) > max(BEYOND_CHANCE * std, LEAST_CHANGE[name] * abs(best)):
+            text = (
+                f"{name} = {value:.4g} by {estimate.method} lies {abs(value - best) / std:.1f} of its standard "
+                f"deviations from {best:.4g}, which fits the window best"
+            )
+            yield Reason("ValidationFailed", text, "identify by maximum_likelihood")
 
 
 def moved(told: Sequence[tuple[Window, Estimate]]) -> list[Reason]:

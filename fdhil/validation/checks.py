@@ -9,6 +9,7 @@ import numpy as np
 
 from fdhil.identification.identifiability import unphysical, untold
 from fdhil.records import Reason, Result
+from fdhil.validation.agreement import values_apart
 from fdhil.validation.evidence import LEAST_ROWS, Evidence
 from fdhil.validation.interruptions import interruptions
 from fdhil.validation.plausibility import clipped, gaps, missing_stages, not_finite, position_parted
@@ -123,6 +124,11 @@ def _simulation(evidence: Evidence) -> Iterator[Reason]:
         yield Reason("ValidationFailed", text, "the drive does what the model does not have")
 
 
+def _values(evidence: Evidence) -> Iterable[Reason]:
+    assert evidence.estimate is not None
+    return values_apart(evidence.estimate, evidence.judged.theta[:6])
+
+
 MODEL = ("estimate", "fit", "late voltage", "late current", "structure", "whiteness", "excess noise", "standstill")
 BEFORE_ANY_FIT: Sequence[Check] = (
     Check("finite", not_finite),
@@ -151,6 +157,7 @@ OF_THE_FIT: Sequence[Check] = (
     Check("standstill", rest_faults, _sound, ("late voltage", "late current")),
     Check("delay", _late, _fitted, MODEL[2:]),
     Check("simulation", _simulation, _fitted, (*MODEL, "delay")),
+    Check("values", _values, _fitted, (*MODEL, "delay")),
     Check("slow sensor", slow_faults_beside, _fitted, ("range", "slow readings")),
 )
 
