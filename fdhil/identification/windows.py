@@ -52,6 +52,12 @@ def carried(values: Float) -> Float:
     return np.where(last < 0, 0.0, values[np.maximum(last, 0)])
 
 
+def bridged(values: Float) -> Float:
+    """Return ``values`` with a line across each gap of non-finite rows; some row must be finite."""
+    known = np.isfinite(values)
+    return values if known.all() else np.interp(np.arange(values.size), np.flatnonzero(known), values[known])
+
+
 def noise_of(values: Float) -> float:
     """Return the standard deviation of white noise on a smooth signal, from its third differences (robust)."""
     if values.size < 4:

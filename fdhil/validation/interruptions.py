@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from fdhil.identification.filtering import moving_mean
-from fdhil.identification.windows import longest
+from fdhil.identification.windows import bridged, longest
 from fdhil.records import Float, Reason, Window
 from fdhil.validation.evidence import Evidence
 
@@ -68,10 +68,10 @@ def _plateau(window: Window, moving: Float, speed: Float) -> float:
 
 def _course(position_mm: Float, window: Window, seconds: float = SMOOTHING_S) -> Float | None:
     """Return the speed (n,) in the window's direction, mm/s, of a position; None where there is none."""
-    known = np.flatnonzero(np.isfinite(position_mm))
-    if known.size < 2 or np.ptp(position_mm[known]) == 0.0:
+    known = position_mm[np.isfinite(position_mm)]
+    if known.size < 2 or np.ptp(known) == 0.0:
         return None
-    position = np.interp(np.arange(position_mm.size), known, position_mm[known])  # across a gap: one even speed
+    position = bridged(position_mm)  # across a gap: one even speed
     width = 2 * round(seconds / window.dt_s / 2) + 1
     if position.size < width:
         return None

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from fdhil.identification.motion import resolution
-from fdhil.identification.windows import carried, longest
-from fdhil.records import Bool, Float, Reason, Window
+from fdhil.identification.windows import bridged, carried, longest
+from fdhil.records import Float, Reason, Window
 from fdhil.validation.evidence import STILL_MM, Evidence, signals_of
 from fdhil.validation.repeated_readings import beyond_chance
 from fdhil.validation.significance import BUDGET
@@ -58,17 +58,11 @@ def _kelvin(celsius: float) -> str:
     return f"; {guess:.0f} degC in kelvin?" if -50.0 < guess < HOTTEST_C else ""
 
 
-def _lost(window: Window) -> Bool:
-    """Return the rows (n,) that the window itself declares as lost."""
-    lost = np.zeros(window.n, dtype=bool)
-    for a, b in window.gaps:
-        lost[a:b] = True
-    return lost
-
-
 def not_finite(evidence: Evidence) -> Iterator[Reason]:
     """Yield a reason for each signal with values that are no numbers, and for one that no drive has."""
-    lost, largest = _lost(evidence.window), 0.0
+    lost, largest = np.zeros(evidence.window.n, dtype=bool), 0.0
+    for begin, end in evidence.window.gaps:
+        lost[begin:end] = True
     for signal in evidence.signals:
         finite = np.isfinite(signal.values)
         largest = max(largest, float(np.abs(signal.values[finite]).max(initial=0.0)))
@@ -133,7 +127,7 @@ def position_parted(evidence: Evidence) -> Iterator[Reason]:
         return
     to_mm = window.pitch_mm / (2 * math.pi)
     # lost rows are bridged for this comparison alone
-    speed, position = _bridged(window.speed_rad_s), _bridged(window.position_mm)
+    speed, position = bridged(window.speed_rad_s), bridged(window.position_mm)
     travel = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2)]) * window.dt_s * to_mm
     noise = evidence.noise.speed_rad_s * window.dt_s * to_mm
     quantum = max(resolution(position), 1e-6)
@@ -145,14 +139,6 @@ def position_parted(evidence: Evidence) -> Iterator[Reason]:
     elastic = 1e-3 * (ELASTIC_UM + 1.5 * (play.um if play is not None else 0.0))
     yield from _jump(evidence, error, noise, quantum, elastic)
     yield from _scale(travel, error, noise, quantum, elastic)
-
-
-def _bridged(values: Float) -> Float:
-    known = np.isfinite(values)
-    if known.all():
-        return values
-    bridged: Float = np.interp(np.arange(values.size), np.flatnonzero(known), values[known])
-    return bridged
 
 
 def _jump(evidence: Evidence, error: Float, noise: float, quantum: float, elastic: float) -> Iterator[Reason]:
