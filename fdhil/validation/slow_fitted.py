@@ -20,7 +20,6 @@ from fdhil.validation.evidence import Evidence
 from fdhil.validation.sensor_reconstruction import log_beyond
 from fdhil.validation.significance import BUDGET
 from fdhil.validation.slow_readings import LEAST_NOISE_SAMPLES, likely_same, runs
-from fdhil.validation.slow_stuck import slow_stuck_values
 
 LEAST_OFFSET = 0.01  # of the peak of voltage or current
 LEAST_AT_REST = 12  # samples: with fewer, their own scatter is not known
@@ -34,7 +33,6 @@ def slow_faults_beside(evidence: Evidence) -> Iterator[Reason]:
     if not (np.isfinite(fit.theta).all() and (fit.theta[:4] > 0).all()):
         return
     yield from _stuck(evidence, slow)
-    yield from slow_stuck_values(evidence)
     yield from _off_at_rest(evidence, slow)
 
 

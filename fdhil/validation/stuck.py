@@ -9,7 +9,7 @@ refused where one of these leaves a chance below the budget's, shared by all rea
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -20,6 +20,7 @@ from fdhil.records import Float, Reason
 from fdhil.validation.evidence import Evidence, Signal
 from fdhil.validation.plausibility import RAIL_SAMPLES
 from fdhil.validation.repeated_readings import LEAST_NOISE_ROWS, SIDE, alike, beyond_chance, wakes_with_a_jump
+from fdhil.validation.sensor_reconstruction import Bridge
 from fdhil.validation.significance import BUDGET
 
 NOISES = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}
@@ -28,10 +29,8 @@ TOLD_S = 0.010  # the shortest run that its neighbours or the other signals are 
 LONGEST_RUNS = 2  # of a signal that are judged: a sensor sticks longer than chance repeats
 LEAST_NOISE = 0.2  # steps: what hides in the resolution
 TOLD_NOISE = 0.6  # steps: below it, how readings scatter depends on where in its step the signal lies
-MOST_ROWS = 250  # to either side that may be as steady as a run
 PARTS = 4  # of a run: its first and its last one are judged alone too
 WITHIN_STEP = 0.3  # of a step: how far from its middle a constant may lie that is read there for long
-STEADY_STEPS, STEADY_DEVIATIONS = 2.0, 3.0  # of the run's reading: what lies nearer is steady
 
 
 @dataclass(frozen=True)
@@ -63,37 +62,24 @@ class Readings:
         return beyond_chance(self.steps[self.begin : self.end], start - self.begin, last - self.begin)
 
 
-def equal_runs(evidence: Evidence, signal: Signal) -> tuple[list[tuple[int, int]], float]:
-    """Return first and last rows of a signal's longest repeats in the move, and log p below which one is beyond chance.
-
-    The budget is shared by all readings at which a run might begin.
-    """
-    begin, end = evidence.moving
-    same = np.diff(signal.values[begin:end]) == 0.0
-    runs = [(begin + start, begin + last) for start, last in runs_of(same)[:LONGEST_RUNS]]
-    return runs, BUDGET["stuck"].log_chance - math.log(np.count_nonzero(~same) + 2)
-
-
-def repeats(evidence: Evidence, signal: Signal, start: int, last: int, meanwhile: str) -> Reason:
-    """Return the reason of a signal that sticks from row ``start`` to ``last``, and what else happens ``meanwhile``."""
-    lasts_ms = 1e3 * (last - start + 1) * evidence.window.dt_s
-    text = (
-        f"{signal.name} repeats {signal.values[start]:.6g} {signal.unit} for {lasts_ms:.0f} ms "
-        f"from {evidence.time_s(start):.3f} s{meanwhile}"
-    )
-    return Reason("StuckValue", text, "check the sensor or the object's mapping")
-
-
 def stuck_values(evidence: Evidence) -> Iterator[Reason]:
     """Yield a reason for each sensor that surely stuck during the move; without a fit, its own rows alone are asked."""
+    begin, end = evidence.moving
     for signal in evidence.signals:
         if signal.step == 0.0:
             continue
-        readings = Readings(signal, *evidence.moving, evidence.window.dt_s)
-        runs, limit = equal_runs(evidence, signal)
+        readings = Readings(signal, begin, end, evidence.window.dt_s)
+        same = np.diff(signal.values[begin:end]) == 0.0
+        limit = BUDGET["stuck"].log_chance - math.log(np.count_nonzero(~same) + 2)
+        runs = ((begin + start, begin + last) for start, last in runs_of(same)[:LONGEST_RUNS])
         stuck = next((run for run in runs if _is_stuck(evidence, readings, *run, limit)), None)
         if stuck is not None:
-            yield repeats(evidence, signal, *stuck, " while the axis moves")
+            lasts_ms = 1e3 * (stuck[1] - stuck[0] + 1) * evidence.window.dt_s
+            text = (
+                f"{signal.name} repeats {signal.values[stuck[0]]:.6g} {signal.unit} for {lasts_ms:.0f} ms "
+                f"from {evidence.time_s(stuck[0]):.3f} s while the axis moves"
+            )
+            yield Reason("StuckValue", text, "check the sensor or the object's mapping")
 
 
 def clipped_peaks(evidence: Evidence) -> Iterator[Reason]:
@@ -133,44 +119,32 @@ def _is_stuck(evidence: Evidence, readings: Readings, start: int, last: int, lim
         return True
     if (last - start) * readings.dt_s < TOLD_S:
         return False
-    left, right = _steady_rows(readings, start, last)
-    whole = min(last - start + 1, MOST_ROWS)
-    steady = max(left, right) >= whole
-    if steady and readings.beyond_chance(start, last):
+    if readings.beyond_chance(start, last):
         return True
-    bridge = None if at_rail else evidence.bridge
-    if at_rail or (steady and (bridge is None or min(left, right) >= whole)):
+    if at_rail:
         return False
+    bridge = evidence.bridge
     if bridge is None:
         part = readings.steps[readings.begin : readings.end]
-        return readings.beyond_chance(start, last) or wakes_with_a_jump(
-            part, start - readings.begin, last - readings.begin
-        )
+        return wakes_with_a_jump(part, start - readings.begin, last - readings.begin)
+    return _elsewhere(bridge, readings, start, last, limit)
+
+
+def _elsewhere(bridge: Bridge, readings: Readings, start: int, last: int, limit: float) -> bool:
+    """Return whether the model and the other sensors put the signal elsewhere over the run, or at either end of it.
+
+    A sensor that sticks is furthest from the truth where it wakes.
+    """
     crossing = bridge.crossing(readings.signal.name, start + 1, last + 1)
     if crossing is None:
         return False
     step = readings.signal.step
     deviation = step * math.sqrt(readings.noise**2 + 1.0 / 12.0)
-
-    def log_chance(first: int, end: int, level: float) -> float:
-        return crossing.log_chance(first, end, level, deviation)
-
-    return elsewhere(log_chance, (start + 1, last + 1), step * readings.steps[start], step, limit)
-
-
-def elsewhere(
-    log_chance: Callable[[int, int, float], float], rows: tuple[int, int], level: float, step: float, limit: float
-) -> bool:
-    """Return whether a signal was not at ``level`` over half-open ``rows``, or at either end, by log p < ``limit``.
-
-    A sensor that sticks is furthest from the truth where it wakes.
-    """
-    start, end = rows
-    part = max(1, (end - start) // PARTS)
-    levels = [level + share * step for share in (0.0, -WITHIN_STEP, WITHIN_STEP)]
-    tried = (rows, (end - part, end), (start, start + part))
-    limit -= math.log(len(tried))
-    return any(all(log_chance(*span, at) < limit for at in levels) for span in tried)
+    levels = [step * (readings.steps[start] + share) for share in (0.0, -WITHIN_STEP, WITHIN_STEP)]
+    part = (last - start) // PARTS
+    spans = ((start + 1, last + 1), (last + 1 - part, last + 1), (start + 1, start + 1 + part))
+    limit -= math.log(len(spans))
+    return any(all(crossing.log_chance(*span, level, deviation) < limit for level in levels) for span in spans)
 
 
 def _quieter_than_noise(readings: Readings, start: int, last: int, limit: float) -> bool:
@@ -194,15 +168,3 @@ def noise_steps(readings: Float) -> float:
         before, kept = power, square[square <= max(9.0 * power, 1.0)]
         power = float(kept.mean())
     return math.sqrt(max(power / 20.0 - 1.0 / 12.0, LEAST_NOISE**2))
-
-
-def _steady_rows(readings: Readings, start: int, last: int) -> tuple[int, int]:
-    """Return how many rows before and after the run stay near its reading."""
-    most = min(SIDE * (last - start + 1), MOST_ROWS)
-    first = max(0, start - most)
-    band = STEADY_STEPS + STEADY_DEVIATIONS * readings.noise
-    near = np.abs(readings.steps[first : last + 1 + most] - readings.steps[start]) <= band
-    before, after = ~near[: start - first][::-1], ~near[last + 1 - first :]
-    left = int(np.argmax(before)) if before.any() else before.size
-    right = int(np.argmax(after)) if after.any() else after.size
-    return left, right
