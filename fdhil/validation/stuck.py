@@ -114,15 +114,14 @@ def _is_stuck(evidence: Evidence, readings: Readings, start: int, last: int, lim
     """Return whether rows ``start`` to ``last``, all alike, are less likely than ``limit`` by every explanation."""
     if (last - start) < max(2, round(SHORTEST_S / readings.dt_s)):
         return False
-    at_rail = readings.steps[start] in readings.rails  # that is for saturation to explain
-    if not at_rail and _quieter_than_noise(readings, start, last, limit):
+    if readings.steps[start] in readings.rails:
+        return False  # that is for saturation to explain
+    if _quieter_than_noise(readings, start, last, limit):
         return True
     if (last - start) * readings.dt_s < TOLD_S:
         return False
     if readings.beyond_chance(start, last):
         return True
-    if at_rail:
-        return False
     bridge = evidence.bridge
     if bridge is None:
         part = readings.steps[readings.begin : readings.end]
