@@ -15,10 +15,9 @@ from fdhil import tables
 from fdhil.config import Identification
 from fdhil.daemon.kernel_warmup import nominal_rapid
 from fdhil.identification.windows import find_windows
-from fdhil.pipeline import AxisPipeline
+from fdhil.pipeline import AxisPipeline, analyse
 from fdhil.records import Window
 from fdhil.store.recording_csv import parse_recording
-from fdhil.validation import analyse
 from studies import bench
 from tests.bench import bench_config
 

@@ -18,10 +18,9 @@ import numpy as np
 from fdhil.config import Identification, MachineConfig, parse
 from fdhil.identification.trends import crossing, slope, steps
 from fdhil.identification.windows import find_windows
-from fdhil.pipeline import AxisPipeline
+from fdhil.pipeline import AxisPipeline, analyse, pool
 from fdhil.records import PARAMETERS, Notice, ParameterSet, Window, WindowOutcome
 from fdhil.store.recording_csv import parse_recording
-from fdhil.validation import analyse, pool
 from studies import bench, pages
 from studies.pages import grid, paragraph
 

@@ -12,7 +12,7 @@ from scipy.stats import beta
 
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
-from fdhil.validation import analyse, pool
+from fdhil.pipeline import analyse, pool
 from studies import faults
 from studies.pages import grid, paragraph
 

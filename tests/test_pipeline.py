@@ -17,7 +17,7 @@ from fdhil.config import MachineConfig
 from fdhil.daemon.kernel_warmup import nominal_rapid
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import AxisPipeline, Record
-from fdhil.pipeline.ring import Ring
+from fdhil.pipeline.recent_samples import RecentSamples
 from fdhil.records import (
     AxisSamples,
     Notice,
@@ -212,16 +212,25 @@ def test_one_window_that_is_off_leaves_no_trace(config: MachineConfig) -> None:
     assert abs(last.K - 0.8) < 0.008
 
 
+def beside_a_sensor(config: MachineConfig) -> RecentSamples:
+    """Return the recent samples of an axis whose voltage comes from a sensor of its own."""
+    axis = config.axis["X"]
+    section = axis.model_copy(update={"voltage": axis.voltage.model_copy(update={"source": "modbus"})})
+    return RecentSamples("X", section, 20_000, 1e-3)
+
+
 @pytest.mark.parametrize("late_s", [0.0, 0.0003, -0.0004])
 @pytest.mark.parametrize("ratio", [1, 4])
-def test_a_sensors_voltage_is_placed_by_its_count_however_late_the_host_is(ratio: int, late_s: float) -> None:
+def test_a_sensors_voltage_is_placed_by_its_count_however_late_the_host_is(
+    config: MachineConfig, ratio: int, late_s: float
+) -> None:
     period_ns, n = 1_000_000, 4000
     rng = np.random.default_rng(5)
-    ring = Ring(20_000, 1e-3)
+    recent = beside_a_sensor(config)
     tick = np.arange(100, 100 + n)
     # a host that is late by up to 5 ms, in bursts: arrivals are true only as a whole
     arrival = np.maximum.accumulate(tick * period_ns + rng.exponential(3e5, n).astype(np.int64))
-    ring.add(TickTimes(frozen_ints(tick), frozen_ints(arrival)))
+    recent.add(TickTimes(frozen_ints(tick), frozen_ints(arrival)))
     signal = np.sin(np.arange(n + 200) / 50)
     counter = np.arange(7 * ratio, (7 + n) * ratio)  # its sample 7 * ratio begins with tick 107, but for late_s
     begins = 107 + (counter - 7 * ratio) / ratio - late_s / 1e-3
@@ -229,33 +238,33 @@ def test_a_sensors_voltage_is_placed_by_its_count_however_late_the_host_is(ratio
     volts = signal[np.minimum((begins - 100).round().astype(int).clip(0), n + 199)]
     for part in np.array_split(np.arange(counter.size), 80):
         block = (frozen_ints(counter[part]), frozen_ints(t_ns[part]), frozen_ints(np.full(part.size, 9)))
-        ring.add(VoltageSamples("s", "X", *block, frozen(volts[part]), 1000.0 * ratio))
-    ring.add(samples(np.arange(100, 100 + n)))
-    stretch = ring.cut(1000, 2000, separate_voltage=True)
-    assert stretch.voltage_v is not None
+        recent.add(VoltageSamples("s", "X", *block, frozen(volts[part]), 1000.0 * ratio))
+    recent.add(samples(np.arange(100, 100 + n)))
+    recording = recent.cut(1000, 2000)
+    assert recording.voltage_v is not None
     left_over = late_s - round(late_s * 1e3 * ratio) / (1e3 * ratio)  # whole samples are placed
-    assert stretch.voltage_delay_s == pytest.approx(left_over, abs=1.2e-4 / ratio)
-    assert ring.voltage_reaches(3000)
-    assert not ring.voltage_reaches(5000)
+    assert recording.voltage_delay_s == pytest.approx(left_over, abs=1.2e-4 / ratio)
+    assert recent.voltage_reaches(3000)
+    assert not recent.voltage_reaches(5000)
     if ratio == 1 and late_s == 0.0:
-        assert np.array_equal(stretch.voltage_v, signal[900:1900])
+        assert np.array_equal(recording.voltage_v, signal[900:1900])
 
 
-def test_lost_sensor_samples_and_an_unfit_rate_stay_unknown() -> None:
-    ring = Ring(20_000, 1e-3)
+def test_lost_sensor_samples_and_an_unfit_rate_stay_unknown(config: MachineConfig) -> None:
+    recent = beside_a_sensor(config)
     tick = np.arange(2000)
-    ring.add(TickTimes(frozen_ints(tick), frozen_ints(tick * 1_000_000)))
-    ring.add(samples(tick))
+    recent.add(TickTimes(frozen_ints(tick), frozen_ints(tick * 1_000_000)))
+    recent.add(samples(tick))
     counter = np.delete(np.arange(2000), np.arange(500, 510))
     block = (frozen_ints(counter), frozen_ints(counter * 1_000_000), frozen_ints(np.ones(counter.size)))
-    ring.add(VoltageSamples("s", "X", *block, frozen(np.ones(counter.size)), 1000.0))
-    stretch = ring.cut(400, 600, separate_voltage=True)
-    assert stretch.voltage_v is not None
-    assert np.flatnonzero(np.isnan(stretch.voltage_v)).tolist() == list(range(100, 110))
-    unfit = Ring(20_000, 1e-3)
+    recent.add(VoltageSamples("s", "X", *block, frozen(np.ones(counter.size)), 1000.0))
+    recording = recent.cut(400, 600)
+    assert recording.voltage_v is not None
+    assert np.flatnonzero(np.isnan(recording.voltage_v)).tolist() == list(range(100, 110))
+    unfit = beside_a_sensor(config)
     unfit.add(TickTimes(frozen_ints(tick), frozen_ints(tick * 1_000_000)))
     unfit.add(VoltageSamples("s", "X", *block, frozen(np.ones(counter.size)), 730.0))
-    assert unfit.cut(400, 600, separate_voltage=True).voltage_v is None
+    assert unfit.cut(400, 600).voltage_v is None
 
 
 def samples(tick: np.ndarray) -> AxisSamples:
@@ -266,14 +275,14 @@ def samples(tick: np.ndarray) -> AxisSamples:
 
 
 def test_memory_is_bounded(config: MachineConfig) -> None:
-    ring = Ring(1000, 1e-3)
+    recent = RecentSamples("X", config.axis["X"], 1000, 1e-3)
     for start in range(0, 100_000, 50):
         tick = np.arange(start, start + 50)
-        ring.add(samples(tick))
-        ring.add(TickTimes(frozen_ints(tick), frozen_ints(tick * 1_000_000)))
-    assert len(ring._samples) <= 22
-    assert len(ring._times) <= 22
-    assert math.isnan(ring.cut(0, 10, separate_voltage=False).speed_rad_s[0])
+        recent.add(samples(tick))
+        recent.add(TickTimes(frozen_ints(tick), frozen_ints(tick * 1_000_000)))
+    assert len(recent._samples) <= 22
+    assert len(recent._times) <= 22
+    assert math.isnan(recent.cut(0, 10).speed_rad_s[0])
 
 
 def test_a_window_that_leaves_l_open_is_accepted_and_publishes_nothing(tmp_path: Path) -> None:

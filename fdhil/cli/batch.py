@@ -16,9 +16,9 @@ from fdhil.cli.failing import error_document
 from fdhil.config import Identification
 from fdhil.errors import FdhilError
 from fdhil.identification.windows import find_windows
+from fdhil.pipeline import analyse, pool
 from fdhil.records import Estimate, Reason, Verdict, Window, WindowOutcome
 from fdhil.store.recording_csv import read_recording
-from fdhil.validation import analyse, pool
 
 MANY_FILES = 16  # from here on further processes pay for their start
 MANY_WINDOWS = 48

@@ -15,9 +15,9 @@ from fdhil import config as machine_config
 from fdhil import tables
 from fdhil.config import MachineConfig
 from fdhil.daemon.kernel_warmup import nominal_rapid, warm
+from fdhil.pipeline import analyse
 from fdhil.records import SlowVoltage, Window, frozen
 from fdhil.sim.machine import Machine
-from fdhil.validation import analyse
 
 SLOW_ROWS = 5
 

@@ -12,7 +12,6 @@ from fdhil.correction.kernels import project
 from fdhil.identification.kalman import departure
 from fdhil.pipeline import AxisPipeline
 from fdhil.records import Float, Parameters, Stages, Trajectory, Window, frozen, frozen_ints
-from fdhil.validation.repeated_readings import log_chance
 
 
 def warm(config: MachineConfig, method: str | None = None) -> None:
@@ -34,9 +33,8 @@ def warm(config: MachineConfig, method: str | None = None) -> None:
 
 
 def _warm_what_is_rare() -> None:
-    """Call the kernels that a sound drive seldom needs: offsets at their limits, readings that stand still."""
+    """Call the kernels that a sound drive seldom needs: offsets at their limits, a sensor told by the others."""
     project(np.linspace(0.0, 2.0, 8), np.ones(3), np.zeros(2))
-    log_chance(np.arange(12.0), 4, 8, 3, 3, 2, 1.0)
     theta, rows = np.array([0.5, 0.005, 0.8, 0.075, 0.05, 5.0, 0.0]), np.ones((4, 3))
     departure(theta, 0.001, np.ones(4, dtype=np.int8), rows, rows, rows, 0)
 

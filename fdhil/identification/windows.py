@@ -13,7 +13,7 @@ from itertools import islice, pairwise
 import numpy as np
 
 from fdhil.identification.filtering import moving_mean
-from fdhil.records import Bool, Float, Recording, SlowVoltage, Stages, Window, frozen
+from fdhil.records import Bool, Float, Int, Recording, SlowVoltage, Stages, Window, read_only
 
 RUN_SHARE = 0.02
 RAPID_SHARE = 0.60
@@ -50,6 +50,12 @@ def carried(values: Float) -> Float:
         return values
     last = np.maximum.accumulate(np.where(finite, np.arange(values.size), -1))
     return np.where(last < 0, 0.0, values[np.maximum(last, 0)])
+
+
+def bridged(values: Float) -> Float:
+    """Return ``values`` with a line across each gap of non-finite rows; some row must be finite."""
+    known = np.isfinite(values)
+    return values if known.all() else np.interp(np.arange(values.size), np.flatnonzero(known), values[known])
 
 
 def noise_of(values: Float) -> float:
@@ -124,16 +130,17 @@ def _cut(recording: Recording, speed: Float, run: Run, floor: int, ceiling: int,
     b = min(max(ceiling, run.rest_end), run.rest_end + margin)
     part = slice(a, b)
     gaps = tuple((max(g, a) - a, min(h, b) - a) for g, h in recording.gaps if g < b and h > a)
+    voltage, offset = recording.voltage_v, recording.offset_mm
     return Window(
         axis=recording.axis,
-        start_tick=a,
+        start_tick=recording.start_tick + a,
         start_s=float(recording.time_s[a]),
         dt_s=recording.dt_s,
-        demand_mm=frozen(recording.demand_mm[part]),
-        position_mm=frozen(recording.position_mm[part]),
-        speed_rad_s=frozen(recording.speed_rad_s[part]),
-        current_a=frozen(recording.current_a[part]),
-        voltage_v=frozen(recording.voltage_v[part]) if recording.slow_voltage is None else None,
+        demand_mm=read_only(recording.demand_mm[part]),
+        position_mm=read_only(recording.position_mm[part]),
+        speed_rad_s=read_only(recording.speed_rad_s[part]),
+        current_a=read_only(recording.current_a[part]),
+        voltage_v=read_only(voltage[part]) if voltage is not None and recording.slow_voltage is None else None,
         voltage_sampling=recording.voltage_sampling,
         stages=_stages(speed, run, a, recording.dt_s),
         direction=run.direction,
@@ -141,6 +148,9 @@ def _cut(recording: Recording, speed: Float, run: Run, floor: int, ceiling: int,
         pitch_mm=recording.pitch_mm,
         gaps=gaps,
         temperature_c=recording.temperature_c,
+        voltage_delay_s=recording.voltage_delay_s,
+        source=recording.source,
+        offset_mm=read_only(offset[part]) if offset is not None and np.any(np.abs(offset[part]) > 0) else None,
         slow_voltage=_slow_part(recording, a, b),
     )
 
@@ -154,7 +164,7 @@ def _slow_part(recording: Recording, a: int, b: int) -> SlowVoltage | None:
     first = max(0, math.ceil((begin - slow.begin_s) / slow.period_s - 1e-9))
     end = math.floor((last - slow.begin_s) / slow.period_s + 1e-9)
     moved = slow.begin_s + first * slow.period_s - begin
-    return replace(slow, begin_s=moved, voltage_v=frozen(slow.voltage_v[first:end])) if end > first else None
+    return replace(slow, begin_s=moved, voltage_v=read_only(slow.voltage_v[first:end])) if end > first else None
 
 
 def _stages(speed: Float, run: Run, offset: int, dt: float) -> Stages:
@@ -182,16 +192,20 @@ def _plateau(moving: Float) -> float:
     return float(ordered[int(np.argmax(counts))])
 
 
-def longest(flags: Bool) -> tuple[int, int]:
-    """Return the half-open range of the longest run of True; (0, 0) when there is none."""
-    return next(iter(runs_of(flags, 1)), (0, 0))
+def spans(flags: Bool) -> Int:
+    """Return the half-open rows (k, 2) of the runs of True, in order."""
+    return np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))).reshape(-1, 2)
 
 
-def runs_of(flags: Bool, least: int) -> list[tuple[int, int]]:
+def runs_of(flags: Bool, least: int = 1) -> list[tuple[int, int]]:
     """Return the half-open rows of the runs of True that are ``least`` long or longer, the longest first."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8))).reshape(-1, 2)
-    runs = [(int(start), int(end)) for start, end in edges if end - start >= least]
+    runs = [(int(start), int(end)) for start, end in spans(flags) if end - start >= least]
     return sorted(runs, key=lambda run: run[0] - run[1])
+
+
+def longest(flags: Bool) -> tuple[int, int]:
+    """Return the half-open rows of the longest run of True; (0, 0) when there is none."""
+    return next(iter(runs_of(flags)), (0, 0))
 
 
 def moving_range(window: Window) -> tuple[int, int]:

@@ -147,15 +147,16 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """A whole recorded file of one axis before windows are cut: arrays (n,), lost samples NaN, ``gaps`` half-open.
+    """A stretch of one axis before windows are cut, a whole file or the newest samples: arrays (n,), lost samples NaN.
 
-    ``slow_voltage``, counted from row 0, stands in the place of ``voltage_v`` where a sensor is slower than the rows.
+    ``gaps`` are half-open. ``slow_voltage``, counted from row 0, stands in the place of ``voltage_v`` where a sensor is
+    slower than the rows; both are None without a source. Row 0 is ``start_tick``. The rest is as in :class:`Window`.
     """
 
     axis: str
     dt_s: float
     time_s: Float
-    voltage_v: Float
+    voltage_v: Float | None
     current_a: Float
     speed_rad_s: Float
     position_mm: Float
@@ -167,3 +168,7 @@ class Recording:
     gaps: tuple[tuple[int, int], ...] = ()
     headers: Mapping[str, str] = field(default_factory=dict)
     slow_voltage: SlowVoltage | None = None
+    start_tick: int = 0
+    voltage_delay_s: float | None = None
+    offset_mm: Float | None = None
+    source: str = ""

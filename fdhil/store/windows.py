@@ -12,7 +12,7 @@ import io
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from fdhil.errors import RecordingError, StoreError
-from fdhil.records import Float, SlowVoltage, Stages, Window, frozen
+from fdhil.records import Float, SlowVoltage, Stages, Window, read_only
 from fdhil.store.atomic import store_error, sync_folder, write_file
 from fdhil.store.parquet_pages import uncompressed_bytes
 
@@ -120,36 +120,16 @@ def _column(values: Float, candidates: Sequence[RawScale]) -> tuple[RawScale | N
 
 
 def _head(window: Window) -> dict[str, Any]:
-    """The fields of a window that are no arrays, as JSON keeps them exactly."""
-    stages, slow = window.stages, window.slow_voltage
-    sensor = {} if slow is None else {"slow_voltage": _grid(slow)}
-    return sensor | {
-        "format": FORMAT,
-        "clock": "SYNC tick",
-        "axis": window.axis,
-        "start_tick": window.start_tick,
-        "start_s": window.start_s,
-        "dt_s": window.dt_s,
-        "voltage_sampling": window.voltage_sampling,
-        "stages": {"accelerate": stages.accelerate, "cruise": stages.cruise, "brake": stages.brake},
-        "direction": window.direction,
-        "rapid_speed_rad_s": window.rapid_speed_rad_s,
-        "pitch_mm": window.pitch_mm,
-        "gaps": window.gaps,
-        "temperature_c": window.temperature_c,
-        "voltage_delay_s": window.voltage_delay_s,
-        "source": window.source,
-    }
+    """The fields of a window that are no arrays, as JSON keeps them exactly.
 
-
-def _grid(slow: SlowVoltage) -> dict[str, Any]:
-    """The grid of a slow sensor beside the rows; its samples are a column that ends earlier than the others."""
-    return {
-        "begin_s": slow.begin_s,
-        "period_s": slow.period_s,
-        "error_s": slow.error_s,
-        "samples": slow.voltage_v.size,
-    }
+    A slow sensor's samples are a column that ends earlier than the others; its grid is kept here.
+    """
+    plain = {field.name: getattr(window, field.name) for field in fields(Window) if field.name not in COLUMNS}
+    slow = plain.pop("slow_voltage")
+    if slow is not None:
+        grid = {"begin_s": slow.begin_s, "period_s": slow.period_s, "error_s": slow.error_s}
+        plain["slow_voltage"] = grid | {"samples": slow.voltage_v.size}
+    return plain | {"format": FORMAT, "clock": "SYNC tick", "stages": asdict(window.stages)}
 
 
 def _digest(window: Window) -> str:
@@ -188,9 +168,12 @@ def _decode(content: bytes) -> tuple[Window, str]:
         arrays[name] = None if described is None else _values(table.column(name), described)
     if any(arrays[name] is None for name in COLUMNS.keys() - OPTIONAL):
         raise ValueError("a column is missing")
-    grid = head.pop("slow_voltage", None)
-    slow = None if grid is None else _slow(grid, table.column("slow_voltage_v"))
-    return _window(head, arrays | {"slow_voltage": slow}), str(head["digest"])
+    grid, arrays["slow_voltage"] = head.pop("slow_voltage", None), None
+    if grid is not None:
+        samples = _values(table.column("slow_voltage_v"), {})[: int(grid["samples"])]
+        begin, period, error = (float(grid[name]) for name in ("begin_s", "period_s", "error_s"))
+        arrays["slow_voltage"] = SlowVoltage(begin, period, error, samples)
+    return _window(head, arrays), str(head["digest"])
 
 
 def _check_declared(file: pq.ParquetFile, content: bytes) -> None:
@@ -213,16 +196,11 @@ def _check_declared(file: pq.ParquetFile, content: bytes) -> None:
                 raise ValueError(f"its column {name} declares {size} bytes for {group.num_rows} rows")
 
 
-def _slow(grid: Mapping[str, Any], column: Any) -> SlowVoltage:
-    samples = np.asarray(column.to_numpy(), dtype=np.float64)[: int(grid["samples"])]
-    return SlowVoltage(float(grid["begin_s"]), float(grid["period_s"]), float(grid["error_s"]), frozen(samples))
-
-
 def _values(column: Any, described: Mapping[str, Any]) -> Float:
     values = np.asarray(column.to_numpy(), dtype=np.float64)
     if "factor" in described:
         values = RawScale(float(described["factor"]), float(described["divisor"])).decode(values)
-    return frozen(values)
+    return read_only(values)
 
 
 def _window(head: Mapping[str, Any], arrays: Mapping[str, Any]) -> Window:

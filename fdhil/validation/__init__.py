@@ -1,12 +1,11 @@
-"""Nothing is believed that was not checked: plausibility before any fit, the model's behaviour after it.
+"""Checks what was measured and what was fitted: a literal table of checks over one record of evidence.
 
-``analyse`` judges one window, ``pool`` the accepted windows of one drive together. Neither raises on any data: what
-cannot be believed is a refused :class:`~fdhil.records.Verdict` with its reasons.
+Nothing is believed that was not checked. The table never raises on any signals; what cannot be believed has a reason.
 """
 
 from __future__ import annotations
 
-from fdhil.validation.pooled import pool
-from fdhil.validation.window import analyse
+from fdhil.validation.checks import BEFORE_ANY_FIT, OF_THE_FIT, Check, Findings, ask
+from fdhil.validation.evidence import LEAST_ROWS, Evidence
 
-__all__ = ["analyse", "pool"]
+__all__ = ["BEFORE_ANY_FIT", "LEAST_ROWS", "OF_THE_FIT", "Check", "Evidence", "Findings", "ask"]

@@ -1,4 +1,4 @@
-"""Backlash: how far the motor turns before the table follows, in micrometres at the table.
+"""Measures backlash: how far the motor turns before the table follows, in micrometres at the table.
 
 While the table stands still, the integral of the motor's speed is the dead band that is being crossed. It is measured
 from the row in which the current leaves its level of standstill up to the row in which the table surely moves, less
@@ -18,8 +18,8 @@ from fdhil.identification.filtering import moving_mean
 from fdhil.identification.motion import noise_levels, resolution
 from fdhil.identification.windows import carried, moving_range
 from fdhil.records import Float, Reason, Window
+from fdhil.validation.significance import BUDGET
 
-SURE = 4.5  # standard deviations: one test a window, 3e-6 by chance
 LIKELY = 2.0  # of the first measurement, which the second may confirm
 LEAST_UM = 20.0  # a screw's wind-up before the table starts, which is no play
 WOUND_UP_UM = 60.0  # a screw's wind-up as it unwinds and winds up again from driving to braking
@@ -42,7 +42,7 @@ class DeadBand:
     @property
     def sure(self) -> bool:
         """Return whether it is beyond chance."""
-        return abs(self.um) > SURE * self.std_um
+        return abs(self.um) > BUDGET["play"].deviations * self.std_um
 
     def reason(self) -> Reason:
         """Return it as the reason of a refusal."""

@@ -1,4 +1,4 @@
-"""What the recording itself cannot tell: a sensor whose gain is wrong all along, seen against the data sheet.
+"""Names a sensor whose gain is wrong all along, which the recording cannot tell, against the data sheet.
 
 The model looks the same when one signal is multiplied by a constant: each parameter is then multiplied by a power of
 that constant (``GAINS``). Only known values tell. A gain is named where several of R, L, K and Jt lie farther from the
@@ -12,11 +12,11 @@ import math
 import numpy as np
 
 from fdhil.records import PARAMETERS, Estimate, Float, Parameters, Reason
-from fdhil.validation.pooled import GAINS
+from fdhil.validation.agreement import GAINS
+from fdhil.validation.significance import BUDGET
 
 TOLERANCE = 0.15  # of a data sheet's R (cold), L, K, and of an inertia that was computed
 COMPARED = ("R", "L", "K", "Jt")  # friction is no value of a data sheet
-SURE = 3.0  # standard deviations of the estimate
 LEAST_BEYOND = 2  # one alone is a warm winding, a saturated core, another load
 
 
@@ -28,7 +28,8 @@ def gain_error(estimate: Estimate, nominal: Parameters) -> Reason | None:
     rows = [PARAMETERS.index(name) for name in told]
     values = np.array([estimate.value(name) for name in told])
     apart = np.log(values / [getattr(nominal, name) for name in told])
-    allowed = math.log1p(TOLERANCE) + SURE * np.array([estimate.std(name) for name in told]) / values
+    sure = BUDGET["data sheet"].deviations
+    allowed = math.log1p(TOLERANCE) + sure * np.array([estimate.std(name) for name in told]) / values
     if np.count_nonzero(np.abs(apart) > allowed) < LEAST_BEYOND:
         return None
     explained = {signal: _amplitude(apart, allowed, powers[rows]) for signal, powers in GAINS.items()}

@@ -1,4 +1,4 @@
-"""Was the rapid carried out as it was ordered? One plateau, both ramps alike, and rest where the demand rests.
+"""Checks that the rapid was carried out as ordered: one plateau, both ramps alike, rest where the demand rests.
 
 Feed override and feed hold change the speed on the way; an abort brakes harder than any planned ramp or leaves the
 demand behind. Position and demand tell, so that no fault of the speed sensor can pass for one. A slower rapid at a
@@ -12,8 +12,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from fdhil.identification.filtering import moving_mean
-from fdhil.identification.windows import longest, moving_range
+from fdhil.identification.windows import bridged, longest
 from fdhil.records import Float, Reason, Window
+from fdhil.validation.evidence import Evidence
 
 CODE = "EpisodeAborted"
 ADVICE = "record a rapid without feed hold, override change or stop"
@@ -31,9 +32,10 @@ LEFT_MM = 1.0
 LEFT_SHARE = 0.01
 
 
-def interruptions(window: Window) -> Iterator[Reason]:
+def interruptions(evidence: Evidence) -> Iterator[Reason]:
     """Yield the reason why the window is no whole rapid, with the figure that shows it."""
-    a, b = (min(row, window.n) for row in moving_range(window))
+    window = evidence.window
+    a, b = (min(row, window.n) for row in evidence.moving)
     speed = _course(window.position_mm, window)
     if speed is None or b - a < 8:
         return
@@ -66,10 +68,10 @@ def _plateau(window: Window, moving: Float, speed: Float) -> float:
 
 def _course(position_mm: Float, window: Window, seconds: float = SMOOTHING_S) -> Float | None:
     """Return the speed (n,) in the window's direction, mm/s, of a position; None where there is none."""
-    known = np.flatnonzero(np.isfinite(position_mm))
-    if known.size < 2 or np.ptp(position_mm[known]) == 0.0:
+    known = position_mm[np.isfinite(position_mm)]
+    if known.size < 2 or np.ptp(known) == 0.0:
         return None
-    position = np.interp(np.arange(position_mm.size), known, position_mm[known])  # across a gap: one even speed
+    position = bridged(position_mm)  # across a gap: one even speed
     width = 2 * round(seconds / window.dt_s / 2) + 1
     if position.size < width:
         return None

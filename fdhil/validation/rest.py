@@ -1,4 +1,4 @@
-"""What standstill tells: sensors must read zero speed and u = R i, and friction must hold no more than it drags."""
+"""Checks standstill: sensors must read zero speed and u = R i, and friction must hold no more than it drags."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ import numpy as np
 from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.filtering import moving_mean
-from fdhil.identification.motion import UNKNOWN, noise_levels
+from fdhil.identification.motion import UNKNOWN, Noise
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.windows import carried, smooth
 from fdhil.records import Reason, Window
-from fdhil.validation.plausibility import at_rest
+from fdhil.validation.evidence import Evidence
+from fdhil.validation.significance import BUDGET
 
 Rows = np.ndarray[tuple[int], np.dtype[np.intp]]
 
 ROWS = 12
-SURE = 5.5
+SURE = BUDGET["standstill"].deviations
 LEAST_SPEED = 0.004  # of the rapid speed
 LEAST_CURRENT = 0.01  # of the peak current
 SETTLING_S, RISING_S = 0.010, 0.020  # at the ends of standstill, in which the current follows from or for a move
@@ -30,27 +31,27 @@ HELD_SHARE = 0.7  # of dry friction: what surely does not move the shaft
 LONGEST_BREAKAWAY_S = 0.060
 
 
-def rest_faults(window: Window, fit: Fit) -> Iterator[Reason]:
+def rest_faults(evidence: Evidence) -> Iterator[Reason]:
     """Yield what the rows at standstill contradict."""
-    rows = np.flatnonzero(at_rest(window))
+    window, fit, noise = evidence.window, evidence.on_time, evidence.noise
+    rows = np.flatnonzero(evidence.at_rest)
     if rows.size < ROWS or (window.voltage_v is None and window.slow_voltage is None):
         return
-    noise = noise_levels(window)
     speed = float(np.mean(window.speed_rad_s[rows]))
     limit = max(SURE * noise.speed_rad_s / np.sqrt(rows.size), LEAST_SPEED * window.rapid_speed_rad_s)
     if abs(speed) > limit:
         text = f"speed reads {speed:+.3g} rad/s at standstill, limit {limit:.2g}"
         yield Reason("CalibrationSuspect", text, "set the zero of the speed sensor at standstill")
-    yield from _contradiction(window, fit, rows)
+    yield from _contradiction(window, fit, noise, rows)
     yield from _holding(window, fit, rows)
     yield from breakaway(window, fit)
 
 
-def _contradiction(window: Window, fit: Fit, rows: Rows) -> Iterator[Reason]:
+def _contradiction(window: Window, fit: Fit, noise: Noise, rows: Rows) -> Iterator[Reason]:
     """At standstill u = R i + L di/dt: the zero of current or voltage is off where they contradict each other."""
     if window.voltage_v is None:
         return
-    noise, peak = noise_levels(window), float(np.nanmax(np.abs(window.current_a)))
+    peak = float(np.nanmax(np.abs(window.current_a)))
     resistance, inductance, torque_constant = fit.theta[:3]
     settled, rising = round(SETTLING_S / window.dt_s), round(RISING_S / window.dt_s)
     for part in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):

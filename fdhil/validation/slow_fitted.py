@@ -1,4 +1,4 @@
-"""What a slow voltage sensor's samples tell beside the fitted model: that they stand still, or are off at standstill.
+"""Checks a slow voltage sensor's samples beside the fitted model: that they do not stick, nor are off at standstill.
 
 The filter foretells each sample from current and speed, and says how surely. A working sensor repeats its reading where
 its noise and resolution let it, and where the voltage stays; a stuck one repeats it wherever the voltage goes.
@@ -11,68 +11,66 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.motion import resolution
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_start import sample_rows
 from fdhil.identification.slow_voltage import innovations_of
-from fdhil.records import Float, Reason, Window
-from fdhil.validation.plausibility import at_rest
+from fdhil.records import Reason, SlowVoltage
+from fdhil.validation.evidence import Evidence
 from fdhil.validation.sensor_reconstruction import log_beyond
-from fdhil.validation.slow_readings import CHANCE, LEAST_NOISE_SAMPLES, likely_same, runs
-from fdhil.validation.slow_stuck import slow_stuck_values
+from fdhil.validation.significance import BUDGET
+from fdhil.validation.slow_readings import LEAST_NOISE_SAMPLES, likely_same, runs
 
-SURE = 5.5  # standard deviations
 LEAST_OFFSET = 0.01  # of the peak of voltage or current
 LEAST_AT_REST = 12  # samples: with fewer, their own scatter is not known
 
 
-def slow_faults_beside(window: Window, fit: Fit, lowpass_hz: float) -> Iterator[Reason]:
-    """Yield what the samples of a slow voltage contradict of the model fitted to ``window``."""
-    slow = window.slow_voltage
+def slow_faults_beside(evidence: Evidence) -> Iterator[Reason]:
+    """Yield what the samples of a slow voltage contradict of the model fitted to the window."""
+    slow, fit = evidence.window.slow_voltage, evidence.judged
     if slow is None or np.count_nonzero(np.isfinite(slow.voltage_v)) < LEAST_NOISE_SAMPLES:
         return
     if not (np.isfinite(fit.theta).all() and (fit.theta[:4] > 0).all()):
         return
-    yield from _stuck(window, fit, slow.voltage_v)
-    yield from slow_stuck_values(window, fit)
-    yield from _off_at_rest(window, fit, lowpass_hz)
+    yield from _stuck(evidence, slow)
+    yield from _off_at_rest(evidence, slow)
 
 
-def _stuck(window: Window, fit: Fit, volts: Float) -> Iterator[Reason]:
+def _stuck(evidence: Evidence, slow: SlowVoltage) -> Iterator[Reason]:
     """Yield a reason for a run of equal samples that the sensor's noise and the model let happen by no chance.
 
     That noise alone leaves a constant's reading alike, and that the model is as far from it by chance, are both needed
     of a sensor that works.
     """
-    slow, motion = window.slow_voltage, fit.problem.motions[0]
-    assert slow is not None
+    fit, volts = evidence.judged, slow.voltage_v
+    motion = fit.problem.motions[0]
     noise = fit.problem.noises[0].vector() ** 2
     made = innovations_of(motion, fit.theta, noise, float(fit.theta[6]))
     errors, spread = made.values[2 * motion.n :], np.sqrt(made.variance[2 * motion.n :])
     step = resolution(volts[np.isfinite(volts)])
     beyond = np.maximum(np.abs(errors) - step / 2, 0.0) / spread  # what its step does not hide
+    limit = BUDGET["slow voltage"].log_chance
     same = math.log(max(likely_same(volts, max(step, 1e-12)), 1e-300))
     for start, end in runs(volts):
         squares = float(beyond[start + 1 : end] @ beyond[start + 1 : end])
         count = end - start - 1
-        if math.log(volts.size) + count * same + min(log_beyond(squares, count), 0.0) < math.log(CHANCE):
-            at = window.start_s + slow.begin_s + start * slow.period_s
+        if math.log(volts.size) + count * same + min(log_beyond(squares, count), 0.0) < limit:
+            at = evidence.window.start_s + slow.begin_s + start * slow.period_s
             lasts = 1e3 * (end - start) * slow.period_s
             text = f"voltage repeats {volts[start]:.6g} V for {lasts:.0f} ms from {at:.3f} s, current and speed do not"
             yield Reason("StuckValue", text, "check the sensor or the object's mapping")
             return
 
 
-def _off_at_rest(window: Window, fit: Fit, lowpass_hz: float) -> Iterator[Reason]:
+def _off_at_rest(evidence: Evidence, slow: SlowVoltage) -> Iterator[Reason]:
     """Yield a reason where u = R i does not hold at standstill: there nothing else is asked of the model.
 
     The rapid's own rows tell an offset badly, for R and K imitate most of it.
     """
-    slow, theta = window.slow_voltage, fit.theta
-    assert slow is not None
-    rows, begin = sample_rows(window, float(theta[6]), lowpass_hz)
-    time, rest = np.arange(window.n) * window.dt_s, at_rest(window).astype(np.float64)
+    window, fit = evidence.window, evidence.judged
+    theta = fit.theta
+    rows, begin = sample_rows(window, float(theta[6]), evidence.settings.lowpass_hz)
+    time, rest = np.arange(window.n) * window.dt_s, evidence.at_rest.astype(np.float64)
     lasts = slow.period_s if window.voltage_sampling == "interval_mean" else 0.0
     ends = [np.interp(at, time, rest) for at in (begin - window.dt_s, begin + lasts / 2, begin + lasts + window.dt_s)]
     still = rows[np.min(ends, axis=0) == 1.0]
@@ -81,7 +79,7 @@ def _off_at_rest(window: Window, fit: Fit, lowpass_hz: float) -> Iterator[Reason
     left = still[:, 0] - still[:, 1:] @ theta[[1, 0, 2]]
     mean_a = float(np.mean(still[:, 2]))
     of_r = float(np.sqrt(inverse_of(fit.information)[0][0, 0])) * mean_a
-    chance = SURE * math.hypot(float(np.std(left, ddof=1)) / math.sqrt(len(left)), of_r)
+    chance = BUDGET["standstill"].deviations * math.hypot(float(np.std(left, ddof=1)) / math.sqrt(len(left)), of_r)
     # a steady signal may lie half a step from what is read
     hidden = 0.5 * (resolution(rows[:, 0]) + theta[0] * resolution(window.current_a[np.isfinite(window.current_a)]))
     off = float(np.mean(left))

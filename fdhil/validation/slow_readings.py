@@ -1,4 +1,4 @@
-"""What a slow voltage sensor's own samples tell before any fit: that they stand still while the axis does not.
+"""Refuses a slow voltage sensor whose own samples, before any fit, stand still while the axis does not.
 
 A steady voltage that is read coarsely repeats itself, and that is no fault. So a run of equal samples is refused where
 the speed changes over it by more than such a reading hides, or where the sensor's noise would have changed it.
@@ -14,11 +14,12 @@ import numpy as np
 from fdhil.identification.motion import resolution
 from fdhil.identification.windows import carried, noise_of, runs_of, smooth
 from fdhil.records import Float, Reason, Window
+from fdhil.validation.evidence import Evidence
 from fdhil.validation.repeated_readings import alike
+from fdhil.validation.significance import BUDGET
 
 LEAST_SAMPLES = 3
 MOVED_SAMPLES = 4  # equal while the speed changes: shorter runs may lie where current and speed balance
-CHANCE = 1e-5  # of a false alarm of one window
 SPEED_CHANGE = 0.05  # of the rapid speed
 READ_STEPS = 4.0  # by which a voltage changes before its equal readings are strange
 MOVING = 0.05  # of the rapid speed
@@ -26,8 +27,9 @@ LEAST_NOISE = 0.2  # of a step: what hides in the resolution
 LEAST_NOISE_SAMPLES = 20
 
 
-def slow_voltage_faults(window: Window) -> Iterator[Reason]:
+def slow_voltage_faults(evidence: Evidence) -> Iterator[Reason]:
     """Yield a reason where the samples of a slow voltage sensor repeat themselves, or lie at the sensor's limit."""
+    window = evidence.window
     slow = window.slow_voltage
     if slow is None or window.n == 0 or np.count_nonzero(np.isfinite(slow.voltage_v)) < LEAST_NOISE_SAMPLES:
         return
@@ -66,7 +68,7 @@ def _strange(window: Window, volts: Float, speed: Float, run: tuple[int, int], s
     inner = speed[start + 1 : end - 1]
     if end - start >= MOVED_SAMPLES and float(np.ptp(inner)) > hidden:
         return True
-    return volts.size * same ** (end - start - 1) < CHANCE
+    return volts.size * same ** (end - start - 1) < BUDGET["slow voltage"].chance
 
 
 def likely_same(volts: Float, step: float) -> float:

@@ -1,4 +1,4 @@
-"""Is the current of a window with a slow voltage late or early against the speed? By how much likelier that makes it.
+"""Tells whether the current beside a slow voltage is late against the speed, by how much likelier that makes it.
 
 The delay of a slow voltage is one of the parameters. Current and speed come in the same rows: one that a drive or a
 recorder assigns to later ones shifts by whole rows, which a load along the ramps imitates badly.
@@ -19,8 +19,10 @@ from fdhil.identification.motion import Motion
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import innovations_of
 from fdhil.records import Float, Reason, Window
-from fdhil.validation.timing import LARGEST, SEARCH, SMOOTHING_S, SURE
+from fdhil.validation.significance import BUDGET
+from fdhil.validation.timing import LARGEST, SEARCH, SMOOTHING_S
 
+LEAST_GAIN = BUDGET["timing"].deviations ** 2
 FIRST_SHARE = 0.1  # of the gain wanted that the score, too small for a long delay, shows at first sight
 
 
@@ -31,7 +33,7 @@ def current_late(window: Window, fit: Fit, least_gain: float) -> Iterator[Reason
     """
     plain, last, rows = fit.problem.motions[0], fit, 0
     found, std = _shift(fit)
-    if not (found / std) ** 2 > max(SURE**2, FIRST_SHARE * least_gain):
+    if not (found / std) ** 2 > max(LEAST_GAIN, FIRST_SHARE * least_gain):
         return
     for _ in range(SEARCH):
         wanted = rows + _whole(found)
@@ -42,7 +44,7 @@ def current_late(window: Window, fit: Fit, least_gain: float) -> Iterator[Reason
         if not (np.isfinite(last.residuals).all() and np.isfinite(last.information).all()):
             return
         found, _ = _shift(last)
-    if abs(rows) > LARGEST and _cost(fit) - _cost(last) > max(SURE**2, least_gain):
+    if abs(rows) > LARGEST and _cost(fit) - _cost(last) > max(LEAST_GAIN, least_gain):
         late_ms = 1e3 * window.dt_s * abs(rows)
         text = (
             f"current is {late_ms:.3g} ms {'late' if rows > 0 else 'early'} against speed and voltage, "

@@ -1,4 +1,4 @@
-"""Does the model have the drive's structure? Score tests on the innovations of the fitted model.
+"""Tests whether the model has the drive's structure, by scores of the fitted model's innovations.
 
 Each alternative (a load torque for a while, a sensor gain that steps, friction that rises at low speed, an offset, a
 delay) moves the innovations in its own direction. What of that direction the six parameters cannot imitate is compared
@@ -21,10 +21,8 @@ from fdhil.identification.motion import UNKNOWN, Motion
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import innovations_of
 from fdhil.records import Float, Reason
+from fdhil.validation.significance import BUDGET
 
-BEYOND_CHANCE = (
-    4.5  # standard deviations: 7e-6 a test; some hundred tests a window, which must find enough to matter too
-)
 EDGES = 20  # instants at which a load may begin or end, or a gain may step
 LEAST_TORQUE = 0.01  # of the peak torque
 LEAST_GAIN = 0.01  # what pooled windows may differ in K
@@ -53,7 +51,7 @@ class Finding:
     @property
     def matters(self) -> bool:
         """Return whether the finding is beyond chance and large enough to matter."""
-        return abs(self.statistic) > BEYOND_CHANCE and abs(self.amplitude) > self.least
+        return abs(self.statistic) > BUDGET["structure"].deviations and abs(self.amplitude) > self.least
 
     def reason(self) -> Reason:
         """Return the finding as a reason."""

@@ -1,157 +1,158 @@
-"""Does a sensor repeat a reading longer than a living one could? Judged by its own noise, its neighbours, the others.
+"""Refuses a sensor that repeats a reading longer than a living one could: by its noise, its neighbours, the others.
 
 A steady signal that is read coarsely repeats itself for long, and that is no fault. So a run of equal readings is
-judged by how likely it was: noise would have changed a reading even in the middle of a step; or it is no part of the
-steady signal beside it; or, where it moves, the fitted model and the other two sensors say that it was elsewhere. A run
-is refused where one of these leaves a chance below ``CHANCE``, shared by all readings at which one might begin.
+judged by how likely it was: noise would have changed a reading even in the middle of a step; or the rows beside it
+change more often; or, where it moves, the fitted model and the other two sensors say that it was elsewhere. A run is
+refused where one of these leaves a chance below the budget's, shared by all readings at which one might begin.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
-from fdhil.identification.estimators.maximum_likelihood import Fit
-from fdhil.identification.motion import resolution
-from fdhil.identification.windows import moving_range, runs_of
-from fdhil.records import Float, Reason, Window
-from fdhil.validation.plausibility import RAIL_SAMPLES, beyond_chance, signals_of, wakes_with_a_jump
-from fdhil.validation.repeated_readings import alike, log_chance
+from fdhil.identification.windows import runs_of
+from fdhil.records import Float, Reason
+from fdhil.validation.evidence import Evidence, Signal
+from fdhil.validation.plausibility import RAIL_SAMPLES
+from fdhil.validation.repeated_readings import LEAST_NOISE_ROWS, SIDE, alike, beyond_chance, wakes_with_a_jump
 from fdhil.validation.sensor_reconstruction import Bridge
+from fdhil.validation.significance import BUDGET
 
-CHANCE = 2e-3  # of a false alarm of one signal in one good window, were its runs explained by what is drawn at random
 NOISES = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}
-LOG_CLIPPED = math.log(1e-6)  # at an extreme the voltage's course within a row is known least
 SHORTEST_S = 0.003
 TOLD_S = 0.010  # the shortest run that its neighbours or the other signals are asked about
 LONGEST_RUNS = 2  # of a signal that are judged: a sensor sticks longer than chance repeats
 LEAST_NOISE = 0.2  # steps: what hides in the resolution
 TOLD_NOISE = 0.6  # steps: below it, how readings scatter depends on where in its step the signal lies
-LEAST_NOISE_ROWS = 20
-SIDE, MOST_ROWS = 3, 250  # rows to either side that tell of a run: in its own lengths, and at most
-LEAST_ROWS = 6
 PARTS = 4  # of a run: its first and its last one are judged alone too
 WITHIN_STEP = 0.3  # of a step: how far from its middle a constant may lie that is read there for long
-STEADY_STEPS, STEADY_DEVIATIONS = 2.0, 3.0  # of the run's reading: what lies nearer is steady
 
 
 @dataclass(frozen=True)
-class Signal:
-    """One sensor over the window: ``readings`` (n,) in units of its ``step``, and the half-open rows of the move."""
+class Readings:
+    """One sensor over the window: ``steps`` (n,) in units of its resolution, and the half-open rows of the move."""
 
-    name: str
-    readings: Float
-    step: float
+    signal: Signal
     begin: int
     end: int
     dt_s: float
 
     @cached_property
+    def steps(self) -> Float:
+        """The readings (n,) in steps."""
+        return np.rint(self.signal.values / self.signal.step)
+
+    @cached_property
     def noise(self) -> float:
-        """Return the noise in the move, in steps."""
-        return noise_steps(self.readings[self.begin : self.end])
+        """The noise in the move, in steps."""
+        return noise_steps(self.steps[self.begin : self.end])
 
     @cached_property
     def rails(self) -> tuple[float, float]:
-        """Return the least and the largest reading."""
-        return float(np.nanmin(self.readings)), float(np.nanmax(self.readings))
+        """The least and the largest reading."""
+        return float(np.nanmin(self.steps)), float(np.nanmax(self.steps))
+
+    def beyond_chance(self, start: int, last: int) -> bool:
+        """Return whether how often the rows beside the run change leaves it no chance."""
+        return beyond_chance(self.steps[self.begin : self.end], start - self.begin, last - self.begin)
 
 
-def stuck_values(window: Window, fit: Fit | None) -> Iterator[Reason]:
-    """Yield a reason for each sensor that surely stuck during the move; ``fit`` is the window's, where there is one."""
-    bridge = cache(partial(Bridge.over, fit)) if fit is not None and _bears(fit) else None
-    begin, end = moving_range(window)
-    for name, unit, values in signals_of(window):
-        same = np.concatenate([[False], np.diff(values[begin:end]) == 0.0, [False]])
-        starts, after = np.flatnonzero(np.diff(same.astype(np.int8))).reshape(-1, 2).T
-        lengths = after - starts
-        if lengths.max(initial=0) < max(2, round(SHORTEST_S / window.dt_s)):
+def stuck_values(evidence: Evidence) -> Iterator[Reason]:
+    """Yield a reason for each sensor that surely stuck during the move; without a fit, its own rows alone are asked."""
+    begin, end = evidence.moving
+    for signal in evidence.signals:
+        if signal.step == 0.0:
             continue
-        step = resolution(values[np.isfinite(values)])
-        if step == 0.0:
-            continue
-        signal = Signal(name, np.rint(values / step), step, begin, end, window.dt_s)
-        limit = math.log(CHANCE / np.count_nonzero(~same))
-        for k in np.argsort(-lengths, kind="stable")[:LONGEST_RUNS]:
-            start, last = begin + int(starts[k]), begin + int(after[k])
-            if _is_stuck(signal, start, last, limit, bridge):
-                text = (
-                    f"{name} repeats {values[start]:.6g} {unit} for {(last - start + 1) * window.dt_s * 1e3:.0f} ms "
-                    f"from {window.start_s + start * window.dt_s:.3f} s while the axis moves"
-                )
-                yield Reason("StuckValue", text, "check the sensor or the object's mapping")
-                break
-    if bridge is not None and fit is not None:
-        yield from _clipped_peaks(window, fit, bridge)
+        readings = Readings(signal, begin, end, evidence.window.dt_s)
+        same = np.diff(signal.values[begin:end]) == 0.0
+        limit = BUDGET["stuck"].log_chance - math.log(np.count_nonzero(~same) + 2)
+        runs = ((begin + start, begin + last) for start, last in runs_of(same)[:LONGEST_RUNS])
+        stuck = next((run for run in runs if _is_stuck(evidence, readings, *run, limit)), None)
+        if stuck is not None:
+            lasts_ms = 1e3 * (stuck[1] - stuck[0] + 1) * evidence.window.dt_s
+            text = (
+                f"{signal.name} repeats {signal.values[stuck[0]]:.6g} {signal.unit} for {lasts_ms:.0f} ms "
+                f"from {evidence.time_s(stuck[0]):.3f} s while the axis moves"
+            )
+            yield Reason("StuckValue", text, "check the sensor or the object's mapping")
 
 
-def _clipped_peaks(window: Window, fit: Fit, bridge: Callable[[], Bridge]) -> Iterator[Reason]:
+def clipped_peaks(evidence: Evidence) -> Iterator[Reason]:
     """Yield a reason for each sensor whose extreme was cut off where its rows do not show it by themselves.
 
     Model and the other sensors tell where it should have been.
     """
-    for name, unit, values in signals_of(window):
-        noise = getattr(fit.problem.noises[0], NOISES[name])
+    fit, bridge = evidence.judged, evidence.bridge
+    if bridge is None:
+        return
+    for signal in evidence.signals:
+        noise, values = getattr(fit.problem.noises[0], NOISES[signal.name]), signal.values
         for rail in (np.nanmax(values), np.nanmin(values)):
             runs = runs_of(values == rail, RAIL_SAMPLES) if rail != 0.0 else []
             if runs and beyond_chance(values, runs[0][0], runs[0][1] - 1):
                 continue  # this is told without a model
             for start, end in runs:
-                crossing = bridge().crossing(name, start, end)
-                if crossing is None or crossing.log_chance(start, end, float(rail), float(noise)) >= LOG_CLIPPED:
+                crossing = bridge.crossing(signal.name, start, end)
+                if crossing is None:
+                    continue
+                if crossing.log_chance(start, end, float(rail), float(noise)) >= BUDGET["cut off"].log_chance:
                     continue
                 text = (
-                    f"{name} stays at its extreme {rail:.6g} {unit} for {end - start} samples from "
-                    f"{window.start_s + start * window.dt_s:.3f} s, where the other signals tell more"
+                    f"{signal.name} stays at its extreme {rail:.6g} {signal.unit} for {end - start} samples from "
+                    f"{evidence.time_s(start):.3f} s, where the other signals tell more"
                 )
                 yield Reason("Saturated", text, "use a larger measuring range")
                 break
 
 
-def _bears(fit: Fit) -> bool:
-    """Return whether the fit can tell what a sensor should have read."""
-    motion, theta = fit.problem.motions[0], fit.theta
-    finite = bool(np.isfinite(theta).all() and np.isfinite(fit.problem.noises[0].vector()).all())
-    return motion.slow is None and finite and bool((theta[:4] > 0).all()) and abs(theta[6]) <= motion.dt_s
-
-
-def _is_stuck(signal: Signal, start: int, last: int, limit: float, bridge: Callable[[], Bridge] | None) -> bool:
+def _is_stuck(evidence: Evidence, readings: Readings, start: int, last: int, limit: float) -> bool:
     """Return whether rows ``start`` to ``last``, all alike, are less likely than ``limit`` by every explanation."""
-    if (last - start) < max(2, round(SHORTEST_S / signal.dt_s)):
+    if (last - start) < max(2, round(SHORTEST_S / readings.dt_s)):
         return False
-    at_rail = signal.readings[start] in signal.rails  # that is for saturation to explain
-    if not at_rail and _quieter_than_noise(signal, start, last, limit):
+    if readings.steps[start] in readings.rails:
+        return False  # that is for saturation to explain
+    if _quieter_than_noise(readings, start, last, limit):
         return True
-    if (last - start) * signal.dt_s < TOLD_S:
+    if (last - start) * readings.dt_s < TOLD_S:
         return False
-    left, right = _steady_rows(signal, start, last)
-    length = last - start + 1
-    whole = min(length, MOST_ROWS)
-    steady = max(left, right) >= whole
-    if steady and _departs_from_neighbours(signal, start, last, (left, right), limit):
+    if readings.beyond_chance(start, last):
         return True
-    if at_rail or (steady and (bridge is None or min(left, right) >= whole)):
-        return False
-    if bridge is not None:
-        return _departs_from_others(signal, start, last, limit, bridge())
-    part = signal.readings[signal.begin : signal.end]
-    first, end = start - signal.begin, last - signal.begin
-    return beyond_chance(part, first, end) or wakes_with_a_jump(part, first, end)
+    bridge = evidence.bridge
+    if bridge is None:
+        part = readings.steps[readings.begin : readings.end]
+        return wakes_with_a_jump(part, start - readings.begin, last - readings.begin)
+    return _elsewhere(bridge, readings, start, last, limit)
 
 
-def _quieter_than_noise(signal: Signal, start: int, last: int, limit: float) -> bool:
+def _elsewhere(bridge: Bridge, readings: Readings, start: int, last: int, limit: float) -> bool:
+    """Return whether the model and the other sensors put the signal elsewhere over the run, or at either end of it.
+
+    A sensor that sticks is furthest from the truth where it wakes.
+    """
+    crossing = bridge.crossing(readings.signal.name, start + 1, last + 1)
+    if crossing is None:
+        return False
+    step = readings.signal.step
+    deviation = step * math.sqrt(readings.noise**2 + 1.0 / 12.0)
+    levels = [step * (readings.steps[start] + share) for share in (0.0, -WITHIN_STEP, WITHIN_STEP)]
+    part = (last - start) // PARTS
+    spans = ((start + 1, last + 1), (last + 1 - part, last + 1), (start + 1, start + 1 + part))
+    limit -= math.log(len(spans))
+    return any(all(crossing.log_chance(*span, level, deviation) < limit for level in levels) for span in spans)
+
+
+def _quieter_than_noise(readings: Readings, start: int, last: int, limit: float) -> bool:
     """Return whether noise would have changed a reading even of a constant in the middle of its step."""
-    readings, rows = signal.readings, SIDE * (last - start + 1)
-    if signal.noise < TOLD_NOISE:
+    steps, rows = readings.steps, SIDE * (last - start + 1)
+    if readings.noise < TOLD_NOISE or (last - start) * math.log(alike(readings.noise)) > limit:
         return False
-    if (last - start) * math.log(alike(signal.noise)) > limit:
-        return False
-    sides = (readings[max(0, start - rows) : start], readings[last + 1 : last + 1 + rows])
-    least = min([noise_steps(side) for side in sides if side.size >= LEAST_NOISE_ROWS], default=signal.noise)
+    sides = (steps[max(0, start - rows) : start], steps[last + 1 : last + 1 + rows])
+    least = min([noise_steps(side) for side in sides if side.size >= LEAST_NOISE_ROWS], default=readings.noise)
     return least >= TOLD_NOISE and (last - start) * math.log(alike(least)) < limit
 
 
@@ -166,52 +167,3 @@ def noise_steps(readings: Float) -> float:
         before, kept = power, square[square <= max(9.0 * power, 1.0)]
         power = float(kept.mean())
     return math.sqrt(max(power / 20.0 - 1.0 / 12.0, LEAST_NOISE**2))
-
-
-def _steady_rows(signal: Signal, start: int, last: int) -> tuple[int, int]:
-    """Return how many rows before and after the run stay near its reading."""
-    most = min(SIDE * (last - start + 1), MOST_ROWS)
-    band = STEADY_STEPS + STEADY_DEVIATIONS * signal.noise
-    near = np.abs(signal.readings[max(0, start - most) : last + 1 + most] - signal.readings[start]) <= band
-    first, end = start - max(0, start - most), last + 1 - max(0, start - most)
-    before, after = ~near[:first][::-1], ~near[end:]
-    left = int(np.argmax(before)) if before.any() else before.size
-    right = int(np.argmax(after)) if after.any() else after.size
-    return left, right
-
-
-def _departs_from_neighbours(signal: Signal, start: int, last: int, steady: tuple[int, int], limit: float) -> bool:
-    """Return whether no smooth course through the steady rows beside the run explains it, be it short or long."""
-    readings, length = signal.readings, last - start + 1
-    beside = readings[start - min(steady[0], length) : last + 1 + min(steady[1], length)]
-    equal = int(np.count_nonzero(beside == readings[start])) - length
-    # a first look: as often as its neighbours have the reading
-    if (length - 1) * math.log((equal + 1) / (beside.size - length + 2)) > limit / 2:
-        return False
-    noise = 1.25 * signal.noise
-    sides = [(min(steady[0], most), min(steady[1], most)) for most in (length, MOST_ROWS)]
-    tried = [(*rows, degree) for rows in sides for degree in (2, 3) if min(rows) >= LEAST_ROWS]
-    # where the signal was steady for less than the run's own length, it may have come to rest only as the run began
-    tried += [(0, steady[1], degree) for degree in (1, 2) if steady[0] < min(length, MOST_ROWS)]
-    tried += [(steady[0], 0, degree) for degree in (1, 2) if steady[1] < min(length, MOST_ROWS)]
-    return all(
-        log_chance(readings, start, last, before, after, degree, noise) < limit for before, after, degree in tried
-    )
-
-
-def _departs_from_others(signal: Signal, start: int, last: int, limit: float, bridge: Bridge) -> bool:
-    """Return whether the signal was elsewhere by what the model and the other sensors tell: over the run, or at an end.
-
-    A sensor that sticks is furthest from the truth where it wakes.
-    """
-    crossing = bridge.crossing(signal.name, start + 1, last + 1)
-    if crossing is None:
-        return False
-    deviation = signal.step * math.sqrt(signal.noise**2 + 1.0 / 12.0)
-    levels = [signal.step * (signal.readings[start] + share) for share in (0.0, -WITHIN_STEP, WITHIN_STEP)]
-    part = (last - start) // PARTS
-    limit -= math.log(3.0)
-    for first, end in ((start + 1, last + 1), (last + 1 - part, last + 1), (start + 1, start + 1 + part)):
-        if all(crossing.log_chance(first, end, level, deviation) < limit for level in levels):
-            return True
-    return False

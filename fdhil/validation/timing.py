@@ -1,4 +1,4 @@
-"""Do voltage and current belong to the same instants as the rest? Their delays, from the fitted window's innovations.
+"""Tells by how much voltage and current are late, from the fitted window's innovations.
 
 A delay is told by what it does to the smooth part of a signal: differences between neighbouring rows hold more noise
 than signal where rows are fine, which hides a delay of several of them. Resistance and inductance imitate most of a
@@ -17,13 +17,14 @@ from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.innovations import CURRENT, VOLTAGE, answers
 from fdhil.identification.normal import inverse_of
-from fdhil.records import Float, Reason, Window
+from fdhil.records import Float, Reason
+from fdhil.validation.evidence import Evidence
+from fdhil.validation.significance import BUDGET
 from fdhil.validation.structure import courses, expected_correlation
 
 SMOOTHING_S = 0.010  # of the jerk-limited course of a rapid nothing is lost over this time
 LARGEST = 1.0  # samples: a recorder may assign a value to the SYNC before or after it
 DOUBTFUL = 0.5  # samples: a delay that may be larger is searched for
-SURE = 4.5  # standard deviations: two tests a window
 TOLD = 2.5  # standard deviations
 STRIDE = 1.0  # samples: with other parameters fitted to none, hardly anything may be left of a delay of several
 SEARCH = 6  # fits: each takes away most of what is left
@@ -42,21 +43,30 @@ class Shift:
     @property
     def sure(self) -> bool:
         """Return whether it is beyond chance and more than a sample."""
-        return abs(self.samples) > max(LARGEST, SURE * self.std)
+        return abs(self.samples) > max(LARGEST, BUDGET["timing"].deviations * self.std)
 
 
-def timing_faults(window: Window, fit: Fit) -> Iterator[Reason]:
+def voltage_late(evidence: Evidence) -> Iterator[Reason]:
+    """Yield a reason where the fit itself needs a delay of more than a sample."""
+    late_s = evidence.late_s
+    if late_s:
+        period_s = max(evidence.window.dt_s, evidence.judged.problem.motions[0].voltage_period_s)
+        yield _reason("voltage", "current and speed", late_s, period_s)
+
+
+def timing_faults(evidence: Evidence) -> Iterator[Reason]:
     """Yield the signal that is late or early by more than a sample, with the figure."""
+    window, fit = evidence.window, evidence.on_time
     if fit.problem.motions[0].slow is not None:
         return  # there the delay is one of the parameters
     voltage, current = shifts(fit)
     if current.sure and abs(current.samples) * voltage.std > abs(voltage.samples) * current.std:
-        yield _reason("current", "voltage and speed", current.samples, window.dt_s)
+        yield _reason("current", "voltage and speed", current.samples * window.dt_s, window.dt_s)
         return
     if abs(voltage.samples) + TOLD * voltage.std > DOUBTFUL:
         samples = searched(fit, voltage)
         if samples is not None and abs(samples) > LARGEST:
-            yield _reason("voltage", "current and speed", samples, window.dt_s)
+            yield _reason("voltage", "current and speed", samples * window.dt_s, window.dt_s)
             return
     yield from _short_winding(fit)
 
@@ -70,7 +80,7 @@ def _short_winding(fit: Fit) -> Iterator[Reason]:
     motion, theta = fit.problem.motions[0], fit.theta
     if theta[1] > theta[0] * motion.dt_s:
         return
-    least = float(fit.residuals @ fit.residuals) * (1.0 + SURE**2 / fit.residuals.size)
+    least = float(fit.residuals @ fit.residuals) * (1.0 + BUDGET["timing"].deviations ** 2 / fit.residuals.size)
     for samples in LATE:
         start = np.append(theta[:6], samples * motion.dt_s)
         theta, residuals, _, _ = maximum_likelihood.descend(fit.problem, start, range(6))
@@ -84,10 +94,10 @@ def _short_winding(fit: Fit) -> Iterator[Reason]:
             return
 
 
-def _reason(name: str, others: str, samples: float, dt_s: float) -> Reason:
+def _reason(name: str, others: str, late_s: float, period_s: float) -> Reason:
     text = (
-        f"{name} is {1e3 * abs(samples) * dt_s:.2f} ms {'late' if samples > 0 else 'early'} against "
-        f"{others}, more than a sample of {1e3 * dt_s:g} ms"
+        f"{name} is {1e3 * abs(late_s):.2f} ms {'late' if late_s > 0 else 'early'} against {others}, "
+        f"more than a sample of {1e3 * period_s:.3g} ms"
     )
     return Reason("SampleTiming", text, "take voltage, current and speed from one SYNC, or enter the sensor's delay")
 
@@ -139,7 +149,7 @@ def searched(fit: Fit, first: Shift) -> float | None:
     rest = first.samples - begun
     stride = max(2.0 * abs(rest), STRIDE)  # what is left shows smaller than it is
     found = _root(left, begun, rest, -stride if rest < -TOLD * first.std else stride)
-    return found if found is not None and _deviance(fit) - _deviance(last) > SURE**2 else None
+    return found if found is not None and _deviance(fit) - _deviance(last) > BUDGET["timing"].deviations ** 2 else None
 
 
 def _deviance(fit: Fit) -> float:

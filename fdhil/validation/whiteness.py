@@ -1,4 +1,4 @@
-"""What has no name of its own: innovations that hang together over lags, and noise that no sensor has."""
+"""Refuses what has no name of its own: innovations that hang together over lags, and noise that no sensor has."""
 
 from __future__ import annotations
 
@@ -11,22 +11,24 @@ from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import left_open_v
 from fdhil.records import Float, Reason, Window
+from fdhil.validation.evidence import Evidence
+from fdhil.validation.significance import BUDGET
 from fdhil.validation.structure import LAGS, expected_correlation
 
-BEYOND_CHANCE = 5.0  # standard deviations
 PRACTICAL_CORRELATION = 0.25  # smaller ones come from the voltage's course within a sample and do no harm
 NOISE_RATIO = 1.6
 _FIELDS = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}
 
 
-def whiteness(fit: Fit) -> Iterator[Reason]:
+def whiteness(evidence: Evidence) -> Iterator[Reason]:
     """Yield a reason where an autocorrelation of the innovations is neither chance (over all lags) nor harmless."""
+    fit = evidence.on_time
     motion = fit.problem.motions[0]
     rows = (np.abs(motion.mode) == 1) & motion.observed
     e = fit.residuals[: 2 * motion.n].reshape(-1, 2)[rows]
     if e.shape[0] < 4 * LAGS:
         return
-    limit = max(BEYOND_CHANCE / np.sqrt(e.shape[0]), PRACTICAL_CORRELATION)
+    limit = max(BUDGET["whiteness"].deviations / np.sqrt(e.shape[0]), PRACTICAL_CORRELATION)
     for k, name in enumerate(("current", "speed")):
         if name == "current" and motion.slow is not None:
             continue  # a slow voltage does not foretell the current from row to row
@@ -44,11 +46,12 @@ def whiteness(fit: Fit) -> Iterator[Reason]:
             yield Reason("ValidationFailed", text, "the drive does what the model does not have: look at the residuals")
 
 
-def excess_noise(fit: Fit, window: Window) -> Iterator[Reason]:
+def excess_noise(evidence: Evidence) -> Iterator[Reason]:
     """Yield a reason where the fit needs more noise than the signal's own scatter from row to row shows.
 
     What the voltage's course within its samples may add, and the parameters do not imitate, is no reason.
     """
+    fit, window = evidence.on_time, evidence.window
     fitted = fit.problem.noises[0]
     course = fit.problem.shape_effect(fit.theta)
     course = course - fit.jacobian @ (inverse_of(fit.information)[0] @ (fit.jacobian.T @ course))

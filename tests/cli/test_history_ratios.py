@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from fdhil.config import Identification
+from fdhil.pipeline import analyse
 from fdhil.records import frozen
 from fdhil.store.history import History, Stamp
-from fdhil.validation import analyse
 from tests.daemon.machine import config_of
 from tests.daemon.shop import BENCH, fdhil
 from tests.identification.recorded import windows

@@ -12,10 +12,10 @@ from fdhil import tables
 from fdhil.config import Identification
 from fdhil.identification.estimators import Estimator, chosen, least_squares, maximum_likelihood
 from fdhil.identification.normal import inverse_of
+from fdhil.identification.pooling import weighted
 from fdhil.identification.windows import find_windows
 from fdhil.records import PARAMETERS, Estimate, Float, Result, Window, frozen
 from fdhil.store.recording_csv import parse_recording
-from fdhil.validation.pooled import weighted
 from studies import bench, instrumental_variables
 from tests.identification.recorded import signals, windows
 

@@ -7,8 +7,8 @@ import pytest
 
 from fdhil.config import Identification
 from fdhil.identification.identifiability import judge, unphysical
+from fdhil.pipeline import analyse
 from fdhil.records import PARAMETERS, Estimate, Result
-from fdhil.validation import analyse
 from studies import bench
 from tests.identification.recorded import windows
 

@@ -10,8 +10,8 @@ import pytest
 from fdhil.config import Identification
 from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.windows import find_windows
+from fdhil.pipeline import analyse
 from fdhil.records import PARAMETERS, Float, Result, VoltageSampling, frozen
-from fdhil.validation import analyse
 from studies import bench
 from studies.judging import GOOD
 from studies.slow_recordings import recording_of

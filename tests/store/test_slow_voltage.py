@@ -10,10 +10,10 @@ import pytest
 from fdhil.config import Identification
 from fdhil.daemon.outcome_json import as_document
 from fdhil.errors import RecordingError
+from fdhil.pipeline import analyse
 from fdhil.store.export import csv_lines
 from fdhil.store.recording_csv import parse_recording
 from fdhil.store.windows import decode_window, encode_window
-from fdhil.validation import analyse
 from studies.slow_sensor import slow_windows
 
 

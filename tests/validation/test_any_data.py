@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from fdhil import tables
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
+from fdhil.pipeline import analyse, pool
 from fdhil.records import Float, Window, WindowOutcome, frozen
-from fdhil.validation import analyse, pool
 from tests.identification.recorded import recording, windows
 
 FIELDS = ("voltage_v", "current_a", "speed_rad_s", "position_mm")

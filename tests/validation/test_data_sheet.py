@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from fdhil.cli.main import cli
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
+from fdhil.pipeline import analyse
 from fdhil.records import PARAMETERS, Estimate, Parameters, Result, frozen
 from fdhil.store.recording_csv import parse_recording
-from fdhil.validation import analyse
 from fdhil.validation.data_sheet import TOLERANCE, gain_error
 from studies import bench
 from tests.bench import bench_toml
@@ -51,7 +51,7 @@ def shuttle() -> str:
 
 def test_the_scales_of_the_model_are_what_an_identification_finds(shuttle: str) -> None:
     """R, L, K, Jt, ft and Cd follow the powers of a signal's gain, so that no fit can see it."""
-    from fdhil.validation.pooled import GAINS
+    from fdhil.validation.agreement import GAINS
 
     def fitted(text: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
         found = analyse(find_windows(parse_recording(text))[0], Identification()).estimate

@@ -10,8 +10,9 @@ import pytest
 
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows, moving_range
+from fdhil.pipeline import analyse
 from fdhil.records import WindowOutcome
-from fdhil.validation import analyse
+from fdhil.validation import Evidence
 from fdhil.validation.interruptions import interruptions
 from studies import drives, faults
 from studies.drives import Array, Drive, Move
@@ -107,13 +108,13 @@ def test_a_drive_that_creeps_towards_a_demanded_speed_is_not_held_there() -> Non
         rates = drives.rates(scene.move, partial(_falls, drop))
         rows = measured(np.random.default_rng(7), scene, drives.run(slow, demand_of(scene, rates), scene.dt_s))
         (window,) = find_windows(recorded(scene, rows))
-        assert [reason.code for reason in interruptions(window)] == said
+        assert [reason.code for reason in interruptions(Evidence(window, Identification()))] == said
 
 
 def test_a_slow_plateau_is_seen_through_a_coarse_scale() -> None:
     fallen = faults.KINDS["override changed"].make(np.random.default_rng([61, 2, 2888]))  # rows of 0.25 ms, slow ramps
     (window,) = find_windows(fallen.recording)
-    (reason,) = interruptions(window)
+    (reason,) = interruptions(Evidence(window, Identification()))
     assert "held at 96." in reason.text
 
 

@@ -11,8 +11,8 @@ import pytest
 from fdhil.config import Identification
 from fdhil.identification.estimators.maximum_likelihood import fit_windows
 from fdhil.identification.windows import find_windows
+from fdhil.pipeline import analyse, pool
 from fdhil.records import Window, frozen
-from fdhil.validation import analyse, pool
 from fdhil.validation.backlash import backlash, dead_band, overrun
 from fdhil.validation.structure import findings
 from studies import drives, faults

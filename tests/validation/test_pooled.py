@@ -9,7 +9,7 @@ import pytest
 
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
-from fdhil.validation import analyse, pool
+from fdhil.pipeline import analyse, pool
 from studies import drives, faults
 from studies.scenes import demand_of, measured, recorded
 from tests.identification.recorded import windows

@@ -1,4 +1,4 @@
-"""Current and speed beside a slow voltage: what sticks is told by the other signals, and what is late by its rows."""
+"""Current and speed beside a slow voltage: what is steady does not stick, and what is late is told by its rows."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from fdhil.identification.estimators.maximum_likelihood import fit_windows
+from fdhil.pipeline import analyse
 from fdhil.records import Window, frozen
-from fdhil.validation import analyse
-from fdhil.validation.slow_stuck import slow_stuck_values
+from fdhil.validation import Evidence
 from fdhil.validation.slow_timing import current_late
+from fdhil.validation.stuck import stuck_values
 from studies.slow_sensor import SETTINGS, slow_windows
 
 
@@ -28,22 +29,14 @@ def _stuck(window: Window, name: str, start: int, rows: int) -> list[str]:
     stuck = replace(window, current_a=held) if name == "current_a" else replace(window, speed_rad_s=held)
     fit = fit_windows([stuck], SETTINGS)
     assert fit is not None
-    return [reason.text.split(" ")[0] for reason in slow_stuck_values(stuck, fit)]
-
-
-def test_a_current_or_speed_that_sticks_on_a_ramp_is_told_by_the_others() -> None:
-    for period in (0.002, 0.010):
-        (window,) = slow_windows(period)
-        coarse = _coarse(window)
-        assert _stuck(coarse, "current_a", 118, 40) == ["current"]
-        assert _stuck(coarse, "speed_rad_s", 150, 25) == ["speed"]
+    return [reason.text.split(" ")[0] for reason in stuck_values(Evidence(stuck, SETTINGS, fit=fit))]
 
 
 def test_a_steady_signal_that_is_read_coarsely_does_not_stick() -> None:
     (window,) = slow_windows(0.005)
     fit = fit_windows([_coarse(window)], SETTINGS)
     assert fit is not None
-    assert list(slow_stuck_values(_coarse(window), fit)) == []
+    assert list(stuck_values(Evidence(_coarse(window), SETTINGS, fit=fit))) == []
     assert _stuck(_coarse(window), "current_a", 500, 60) == []  # at full speed the current stays
 
 

@@ -12,8 +12,9 @@ import pytest
 from fdhil.config import Identification
 from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.windows import moving_range
+from fdhil.pipeline import analyse
 from fdhil.records import Float, Reason, Window, frozen
-from fdhil.validation import analyse
+from fdhil.validation import Evidence
 from fdhil.validation.rest import rest_faults
 from tests.identification.recorded import windows
 
@@ -23,7 +24,11 @@ SETTINGS = Identification()
 def _at_rest(window: Window) -> Sequence[Reason]:
     fit = maximum_likelihood.fit_windows([window], SETTINGS)
     assert fit is not None
-    return [reason for reason in rest_faults(window, fit) if "at standstill the current" in reason.text]
+    return [
+        reason
+        for reason in rest_faults(Evidence(window, SETTINGS, fit=fit))
+        if "at standstill the current" in reason.text
+    ]
 
 
 @pytest.mark.parametrize("share", [-0.02, 0.02])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +9,9 @@ import pytest
 
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
+from fdhil.pipeline import analyse
 from fdhil.records import Window, frozen
-from fdhil.validation import analyse
-from fdhil.validation.repeated_readings import log_chance
+from fdhil.validation import Evidence
 from fdhil.validation.stuck import noise_steps, stuck_values
 from studies import drives, faults, signal_faults
 from studies.scenes import Sensor, demand_of, measured, recorded
@@ -40,21 +39,6 @@ def _stuck(window: Window, name: str, start: int, length: int) -> Window:
 
 def _codes(window: Window) -> list[str]:
     return [reason.code for reason in analyse(window, SETTINGS).verdict.reasons]
-
-
-@pytest.mark.parametrize(("level", "noise"), [(0.0, 0.5), (0.35, 0.3), (0.2, 1.0)])
-def test_the_chance_of_equal_readings_is_that_of_the_true_level_and_noise(level: float, noise: float) -> None:
-    rng = np.random.default_rng(4)
-    readings = np.round(level + noise * rng.standard_normal(440))
-    start, last = 200, 219
-    readings[start : last + 1] = 0.0
-
-    def below(x: float) -> float:
-        return 0.5 * math.erfc(-(x - level) / noise / math.sqrt(2))
-
-    exact = (last - start) * math.log(below(0.5) - below(-0.5))
-    told = log_chance(readings, start, last, 200, 200, 0, 2 * noise)
-    assert told == pytest.approx(exact, rel=0.2, abs=0.3)
 
 
 @pytest.mark.parametrize("noise", [0.7, 3.0, 40.0])
@@ -93,7 +77,7 @@ def test_a_coarse_sensor_that_sticks_is_told_by_its_neighbours() -> None:
         changes = [np.count_nonzero(np.diff(values[k : k + 60])) for k in rows]
         start = rows[int(np.argmax(changes))]
         assert max(changes) > 10
-        found = list(stuck_values(_stuck(window, "current", start, 60), None))
+        found = list(stuck_values(Evidence(_stuck(window, "current", start, 60), SETTINGS)))
         refused += any("current repeats" in reason.text for reason in found)
     assert refused == 4
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fdhil.config import Identification
+from fdhil.pipeline import analyse, pool
 from fdhil.records import Window, WindowOutcome, frozen
-from fdhil.validation import analyse, pool
 from tests.identification.recorded import windows
 
 SETTINGS = Identification()

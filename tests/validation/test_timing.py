@@ -11,8 +11,9 @@ import pytest
 from fdhil.config import Identification
 from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.windows import find_windows
+from fdhil.pipeline import analyse
 from fdhil.records import VoltageSampling, Window
-from fdhil.validation import analyse
+from fdhil.validation import Evidence
 from fdhil.validation.structure import expected_correlation
 from fdhil.validation.timing import Shift, searched, shifts, timing_faults
 from studies import drives, faults
@@ -52,7 +53,7 @@ def test_a_delay_of_which_the_other_parameters_leave_nothing_at_first_is_searche
     assert fit is not None
     assert abs(shifts(fit)[0].samples) < 0.5
     assert not analyse(window, SETTINGS).verdict.accepted
-    (reason,) = timing_faults(window, fit)
+    (reason,) = timing_faults(Evidence(window, SETTINGS, fit=fit))
     assert float(re.findall(r"is ([\d.]+) ms", reason.text)[0]) == pytest.approx(late.severity * 0.25, abs=0.2)
 
 

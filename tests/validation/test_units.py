@@ -9,9 +9,9 @@ import pytest
 
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
+from fdhil.pipeline import analyse
 from fdhil.records import Recording, Window, frozen
 from fdhil.store.recording_csv import parse_recording
-from fdhil.validation import analyse
 from fdhil.validation.plausibility import warnings_of
 from studies import bench
 from tests.identification.recorded import signals

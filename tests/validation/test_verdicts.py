@@ -11,9 +11,9 @@ import pytest
 from fdhil import tables
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
+from fdhil.pipeline import analyse, pool
 from fdhil.records import Float, Window, WindowOutcome, frozen
 from fdhil.store.recording_csv import parse_recording
-from fdhil.validation import analyse, pool
 from fdhil.validation.plausibility import warnings_of
 from studies import bench
 from tests.identification.recorded import windows

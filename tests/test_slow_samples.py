@@ -1,31 +1,35 @@
-"""A sensor slower than the SYNC keeps its own samples: the ring gives them with their times and the clock's error."""
+"""A sensor slower than the SYNC keeps its own samples: they are given with their times and the clock's error."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from fdhil.pipeline.ring import Ring
+from fdhil import config as machine_config
+from fdhil.pipeline.recent_samples import RecentSamples
 from fdhil.records import AxisSamples, Float, TickTimes, VoltageSamples, frozen, frozen_ints
+from tests.bench import bench_axis
 
 PERIOD_NS = 1_000_000
 SKEW = 1.0002  # the sensor's clock runs slower than the drive's by this factor
 
 
-def _ring(rate_hz: float, begin_ticks: float, samples: int, lost: int = -1) -> tuple[Ring, Float]:
-    """Return a ring with 2 s of a drive and of a sensor whose sample c is c V and begins ``begin_ticks`` late.
+def _recent(rate_hz: float, begin_ticks: float, samples: int, lost: int = -1) -> tuple[RecentSamples, Float]:
+    """Return a recent with 2 s of a drive and of a sensor whose sample c is c V and begins ``begin_ticks`` late.
 
     Block ``lost`` of the sensor's 20 is left out.
     """
-    ring, ticks = Ring(30_000, 1e-3), np.arange(2000)
+    axis = machine_config.parse({"machine": {"name": "bench"}, "axis": {"X": bench_axis()}}, "test").axis["X"]
+    section = axis.model_copy(update={"voltage": axis.voltage.model_copy(update={"source": "modbus"})})
+    recent, ticks = RecentSamples("X", section, 30_000, 1e-3), np.arange(2000)
     zero = frozen(np.zeros(ticks.size))
-    ring.add(TickTimes(frozen_ints(ticks), frozen_ints(ticks * PERIOD_NS)))
-    ring.add(AxisSamples("X", frozen_ints(ticks), zero, zero, zero, zero, None, zero, frozen_ints(ticks * 0)))
+    recent.add(TickTimes(frozen_ints(ticks), frozen_ints(ticks * PERIOD_NS)))
+    recent.add(AxisSamples("X", frozen_ints(ticks), zero, zero, zero, zero, None, zero, frozen_ints(ticks * 0)))
     counter = np.arange(samples)
     begins = (begin_ticks + counter * SKEW * 1e3 / rate_hz) * PERIOD_NS
     for k, part in enumerate(np.array_split(counter, 20)):
         if k == lost:
             continue
-        ring.add(
+        recent.add(
             VoltageSamples(
                 sensor="voltage sensor X",
                 axis="X",
@@ -36,14 +40,14 @@ def _ring(rate_hz: float, begin_ticks: float, samples: int, lost: int = -1) -> t
                 sample_rate_hz=rate_hz,
             )
         )
-    return ring, begins / PERIOD_NS
+    return recent, begins / PERIOD_NS
 
 
 def test_samples_keep_their_own_times() -> None:
-    ring, begins = _ring(200.0, 2.4, 390)
-    stretch = ring.cut(500, 1500, separate_voltage=True)
-    assert stretch.voltage_v is None
-    slow = stretch.slow_voltage
+    recent, begins = _recent(200.0, 2.4, 390)
+    recording = recent.cut(500, 1500)
+    assert recording.voltage_v is None
+    slow = recording.slow_voltage
     assert slow is not None
     first = int(slow.voltage_v[0])
     assert begins[first] >= 500 > begins[first - 1]
@@ -55,20 +59,20 @@ def test_samples_keep_their_own_times() -> None:
 
 
 def test_lost_samples_stay_lost() -> None:
-    ring, _ = _ring(100.0, 0.0, 196, lost=10)
-    slow = ring.cut(500, 1500, separate_voltage=True).slow_voltage
+    recent, _ = _recent(100.0, 0.0, 196, lost=10)
+    slow = recent.cut(500, 1500).slow_voltage
     assert slow is not None
     assert 5 < np.isnan(slow.voltage_v).sum() < 12
 
 
 def test_a_cut_waits_for_the_sensor() -> None:
-    ring, _ = _ring(200.0, 0.0, 300)
-    assert ring.voltage_reaches(1400)
-    assert not ring.voltage_reaches(1600)
+    recent, _ = _recent(200.0, 0.0, 300)
+    assert recent.voltage_reaches(1400)
+    assert not recent.voltage_reaches(1600)
 
 
 def test_a_sensor_as_fast_as_the_sync_is_placed_on_it() -> None:
-    ring, _ = _ring(1000.0, 0.0, 1990)
-    stretch = ring.cut(500, 1500, separate_voltage=True)
-    assert stretch.slow_voltage is None
-    assert stretch.voltage_v is not None
+    recent, _ = _recent(1000.0, 0.0, 1990)
+    recording = recent.cut(500, 1500)
+    assert recording.slow_voltage is None
+    assert recording.voltage_v is not None

@@ -1,0 +1,254 @@
+"""Carries the samples of one axis to outcomes: what is cut, held back, pooled, published, judged.
+
+:class:`AxisPipeline` keeps the recent samples, cuts a window when a rapid move is over, has it analysed,
+holds back what jumped, pools the accepted windows, publishes a parameter set when the pool is validated, and judges the
+closed-loop model by every recorded move. A replayed window takes the very same way (``feed(window)``).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+
+from fdhil.config import Identification, MachineConfig
+from fdhil.identification.drift import DriftTracker, Point
+from fdhil.identification.windows import find_windows
+from fdhil.pipeline.analysis import analyse
+from fdhil.pipeline.pooling import pool
+from fdhil.pipeline.recent_samples import RecentSamples
+from fdhil.prediction import skill
+from fdhil.records import (
+    AxisSamples,
+    Estimate,
+    MoveEvent,
+    MoveKind,
+    Notice,
+    Outcome,
+    Parameters,
+    ParameterSet,
+    Skill,
+    Temperature,
+    TickTimes,
+    Verdict,
+    VoltageSamples,
+    Window,
+    WindowOutcome,
+)
+from fdhil.validation.data_sheet import gain_error
+
+RECENT_S = 30.0  # a rapid that is longer than this is cut short, and then refused for its missing stage
+LEAD_S = 0.25  # standstill wanted before a rapid
+SETTLE_S = 0.30  # after the demand has ended: the shaft comes to rest, and stays there for the window's margin
+VOLTAGE_PATIENCE_S = 1.0  # how much later than the drive's samples a separate sensor may deliver
+POOL_WINDOWS = 4  # both directions twice: enough to tell viscous from dry friction, few enough to follow drift
+
+JUMPS = {"LoadChanged", "ParameterJump"}
+
+Record = AxisSamples | VoltageSamples | TickTimes | MoveEvent | Temperature | Window
+
+
+@dataclass(frozen=True, slots=True)
+class _Rapid:
+    """A rapid move that the NC ordered: from ``start`` to ``end`` (None while it lasts)."""
+
+    start: int
+    end: int | None
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What the history knows of an axis: its first and its newest published set, the newest windows' estimates."""
+
+    first: ParameterSet | None = None
+    newest: ParameterSet | None = None
+    points: tuple[Point, ...] = ()
+
+
+class AxisPipeline:
+    """Everything that is known of one axis, and what follows from the next record of it."""
+
+    def __init__(
+        self,
+        axis: str,
+        config: MachineConfig,
+        method: str | None = None,
+        known: Known | None = None,
+        with_skill: bool = True,
+    ) -> None:
+        """``method`` names an estimator (None: the config's choice); ``known`` is where an earlier run left off.
+
+        ``with_skill`` False leaves out what needs the axis' own section, for a recording of which none is known.
+        """
+        self.axis = axis
+        self._config = config
+        self._settings = _settings(config, method)
+        self._period_s = config.machine.sync_period_s
+        self._recent = RecentSamples(axis, config.axis[axis], self._ticks(RECENT_S), self._period_s)
+        self._rapids: deque[_Rapid] = deque()
+        self._temperature: Temperature | None = None
+        self._pool: deque[WindowOutcome] = deque(maxlen=POOL_WINDOWS)
+        self._held: list[WindowOutcome] = []
+        known = known or Known()
+        self._published = known.newest
+        self._tracker = DriftTracker(config.maintenance, axis)
+        self._tracker.resume(known.first.parameters if known.first else None, known.points)
+        self._with_skill = with_skill
+        self._gain_suspected = False
+
+    @property
+    def published(self) -> ParameterSet | None:
+        """The newest published parameter set."""
+        return self._published
+
+    def _ticks(self, seconds: float) -> int:
+        return round(seconds / self._period_s)
+
+    def feed(self, record: Record) -> list[Outcome]:
+        """Take one record and return what follows from it; a record of another axis is ignored."""
+        if isinstance(record, TickTimes):
+            self._recent.add(record)
+            return self._cut_what_is_over()
+        if record.axis != self.axis:
+            return []
+        if isinstance(record, Window):
+            return self._analyse(record)
+        if isinstance(record, MoveEvent):
+            self._note_move(record)
+        elif isinstance(record, Temperature):
+            self._temperature = record
+        else:
+            if isinstance(record, AxisSamples) and record.tick.size:
+                self._note_grid(record)
+            self._recent.add(record)
+        return self._cut_what_is_over()
+
+    def _note_grid(self, samples: AxisSamples) -> None:
+        newest = self._recent.newest_tick
+        if newest is not None and samples.tick[0] <= newest:  # the SYNC count began anew
+            self._recent.clear()
+            self._rapids.clear()
+
+    def _note_move(self, event: MoveEvent) -> None:
+        if self._rapids and self._rapids[-1].end is None:
+            self._rapids[-1] = replace(self._rapids[-1], end=event.tick)
+        if event.kind is MoveKind.RAPID:
+            self._rapids.append(_Rapid(event.tick, None, event.source))
+
+    def _cut_what_is_over(self) -> list[Outcome]:
+        outcomes: list[Outcome] = []
+        while self._rapids and self._is_over(self._rapids[0]):
+            for window in self._cut(self._rapids.popleft()):
+                outcomes += self._analyse(window)
+        return outcomes
+
+    def _is_over(self, rapid: _Rapid) -> bool:
+        newest = self._recent.newest_tick
+        if newest is None:
+            return False
+        if rapid.end is None:
+            return newest - rapid.start > self._ticks(RECENT_S)
+        last = rapid.end + self._ticks(SETTLE_S)
+        if newest < last:
+            return False
+        patient = newest < last + self._ticks(VOLTAGE_PATIENCE_S)
+        return not (self._recent.separate_voltage and patient and not self._recent.voltage_reaches(last))
+
+    def _cut(self, rapid: _Rapid) -> list[Window]:
+        """Return the window of a rapid that is over; none when the shaft never came near the rapid speed."""
+        newest = self._recent.newest_tick
+        assert newest is not None
+        end = newest if rapid.end is None else rapid.end
+        start = max(rapid.start - self._ticks(LEAD_S), newest - self._ticks(RECENT_S))
+        recording = replace(
+            self._recent.cut(start, min(newest, end + self._ticks(SETTLE_S)) + 1),
+            temperature_c=None if self._temperature is None else self._temperature.celsius,
+            source=rapid.source,
+        )
+        # the neighbours of a rapid may reach into what is cut; they have their own
+        return [w for w in find_windows(recording) if rapid.start <= w.start_tick + w.n // 2 <= end]
+
+    def _analyse(self, window: Window) -> list[Outcome]:
+        outcome = analyse(window, self._settings)
+        before = self._published
+        outcomes: list[Outcome] = [outcome]
+        # a correction needs all six: what a slow voltage leaves open keeps the older set in use
+        if outcome.verdict.accepted and outcome.estimate is not None and not outcome.estimate.missing:
+            notices = self._track(outcome)
+            outcomes += notices
+            if not self._tracker.holding:
+                outcomes += self._publish(window)
+        judged = self._judge(window, before or self._published)
+        return [*outcomes, judged] if judged else outcomes
+
+    def _track(self, outcome: WindowOutcome) -> list[Notice]:
+        """Hold a window back that jumped; once further ones agree with it they are the new pool."""
+        estimate, window = outcome.estimate, outcome.window
+        assert estimate is not None
+        tick = window.start_tick
+        notices = self._tracker.update(estimate.parameters(), estimate.covariance, tick)
+        if self._tracker.holding:
+            self._held.append(outcome)
+            return notices
+        if any(notice.code in JUMPS for notice in notices):
+            agreeing = {point.tick for point in self._tracker.points}
+            self._pool.clear()
+            self._pool.extend(held for held in self._held if held.window.start_tick in agreeing)
+        self._held.clear()
+        self._pool.append(outcome)
+        return notices
+
+    def _publish(self, newest: Window) -> list[Outcome]:
+        """Publish what the pool says; windows that no longer agree with the newest leave it, the oldest first."""
+        estimate, verdict = pool(tuple(self._pool), self._settings, refit=False)
+        while not verdict.accepted and len(self._pool) > 1:
+            self._pool.popleft()
+            estimate, verdict = pool(tuple(self._pool), self._settings, refit=False)
+        if estimate is None or not verdict.accepted:
+            text = (
+                "the newest window is not believed as a pool of its own (" + _listed(verdict) + "), the older set stays"
+            )
+            return [Notice("ValidationFailed", "minor", text, self.axis, newest.start_tick)]
+        self._published = ParameterSet(
+            axis=self.axis,
+            revision=1 if self._published is None else self._published.revision + 1,
+            parameters=estimate.parameters(),
+            covariance=estimate.covariance,
+            windows=len(self._pool),
+            tick=newest.start_tick + newest.n,
+            temperature_c=newest.temperature_c,
+            config_digest=self._config.digest,
+        )
+        return [self._published, *self._against_data_sheet(estimate, newest.start_tick)]
+
+    def _against_data_sheet(self, estimate: Estimate, tick: int) -> list[Notice]:
+        """Tell once, and again after it was gone, that only a sensor's gain explains how the set is off nominal."""
+        if not self._with_skill:  # the axis' section is made up
+            return []
+        nominal = Parameters(**self._config.axis[self.axis].nominal.model_dump())
+        reason, before = gain_error(estimate, nominal), self._gain_suspected
+        self._gain_suspected = reason is not None
+        if reason is None or before:
+            return []
+        return [Notice(reason.code, "minor", f"{reason.text}; {reason.advice}", self.axis, tick)]
+
+    def _judge(self, window: Window, published: ParameterSet | None) -> Skill | None:
+        """Compare the move with what the set that was valid before it predicts; None where that cannot be done."""
+        if published is None or not self._with_skill:
+            return None
+        axis = self._config.axis[self.axis]
+        signals = (window.demand_mm, window.position_mm)
+        try:
+            return skill(
+                self.axis, window.start_tick, *signals, published.parameters, axis, self._period_s, window.offset_mm
+            )
+        except ValueError:  # too few whole rows to compare
+            return None
+
+
+def _listed(verdict: Verdict) -> str:
+    return "; ".join(str(reason) for reason in verdict.reasons)
+
+
+def _settings(config: MachineConfig, method: str | None) -> Identification:
+    return config.identification if method is None else config.identification.model_copy(update={"method": method})

@@ -1,0 +1,43 @@
+"""Pools the accepted windows of one drive: estimated together, and refused where they disagree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from fdhil.config import Identification
+from fdhil.identification.estimators import chosen
+from fdhil.identification.identifiability import unphysical, untold
+from fdhil.identification.pooling import weighted
+from fdhil.pipeline.analysis import GAVE_UP, gave_up
+from fdhil.records import Estimate, Reason, Verdict, WindowOutcome
+from fdhil.validation.agreement import moved
+
+
+def pool(
+    outcomes: Sequence[WindowOutcome], settings: Identification, *, refit: bool = True
+) -> tuple[Estimate | None, Verdict]:
+    """Estimate from the accepted windows together; None and a refusal when there is none, or when they disagree.
+
+    With ``refit`` all samples are fitted once more. Without it the windows' own estimates are weighted by their
+    information, which is as good when each window tells all six parameters, and takes no time: for a running machine.
+    """
+    if not outcomes:
+        advice = "record moves at 60 % of the rapid speed or more"
+        return None, Verdict(False, None, (Reason("NoWindow", "the recording holds no rapid move", advice),))
+    accepted = [o for o in outcomes if o.verdict.accepted]
+    if not accepted:
+        seen = dict.fromkeys(r for o in outcomes for r in o.verdict.reasons)
+        return None, Verdict(False, None, tuple(seen))
+    fits = [o.verdict.fit_percent for o in accepted if o.verdict.fit_percent is not None]
+    if len(accepted) == 1 and accepted[0].estimate is not None:
+        return accepted[0].estimate, Verdict(True, accepted[0].verdict.fit_percent)
+    told = [(o.window, o.estimate) for o in accepted if o.estimate is not None]
+    try:
+        estimate = None if refit else weighted(told)
+        if estimate is None:
+            estimate = chosen(settings)[1]([o.window for o in accepted], settings)
+    except GAVE_UP as error:
+        return None, Verdict(False, None, (gave_up(error, "look at the windows"),))
+    slow = any(o.window.slow_voltage is not None for o in accepted)
+    reasons = untold(estimate, slow=slow) + unphysical(estimate) + moved(told)
+    return estimate, Verdict(not reasons, min(fits, default=None), tuple(reasons))

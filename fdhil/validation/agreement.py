@@ -1,0 +1,102 @@
+"""Checks that methods agree on one window, and the windows of one drive with each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+
+import numpy as np
+
+from fdhil.identification.pooling import difference_covariance
+from fdhil.records import PARAMETERS, Estimate, Float, Reason, Window
+from fdhil.validation.significance import BUDGET
+
+BEYOND_CHANCE = BUDGET["between windows"].deviations
+MODEL_SHARE = 0.003  # how well equal drives agree at any noise: the voltage's course within a sample is not known
+UNEXPLAINED = 30.0  # chi-square of 5 degrees of freedom: 2e-5 by chance
+GAINS: Mapping[str, Float] = {  # powers of R, L, K, Jt, ft, Cd
+    "voltage": np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0]),
+    "current": np.array([-1.0, -1.0, 0.0, 1.0, 1.0, 1.0]),
+    "speed": np.array([0.0, 0.0, -1.0, -2.0, -2.0, -1.0]),
+}
+LEAST_GAIN_CHANGE = 0.02
+LEAST_CHANGE: Mapping[str, float] = {"R": 0.02, "L": 0.03, "K": 0.01, "Jt": 0.02, "ft": 0.15, "Cd": 0.10}
+
+
+def values_apart(estimate: Estimate, likeliest: Float) -> Iterator[Reason]:
+    """Yield a reason for each value that its own interval puts apart from the ``likeliest`` (6,) of the same window.
+
+    The structure is tested about the likeliest values: what another method says is believed as far as it agrees.
+    """
+    for name, best in zip(PARAMETERS, likeliest, strict=True):
+        value, std = estimate.value(name), estimate.std(name)
+        if abs(value - best) > max(BEYOND_CHANCE * std, LEAST_CHANGE[name] * abs(best)):
+            text = (
+                f"{name} = {value:.4g} by {estimate.method} lies {abs(value - best) / std:.1f} of its standard "
+                f"deviations from {best:.4g}, which fits the window best"
+            )
+            yield Reason("ValidationFailed", text, "identify by maximum_likelihood")
+
+
+def moved(told: Sequence[tuple[Window, Estimate]]) -> list[Reason]:
+    """Return a reason for each parameter that differs between windows beyond chance and by enough to matter.
+
+    One sensor's gain moves several parameters at once, each in its own proportion: where that explains all of it, the
+    sensor is the reason, even where no parameter alone moves enough to tell.
+    """
+    reasons: list[Reason] = []
+    worst = (0, 0)
+    estimates = [estimate for _, estimate in told]
+    for k, name in enumerate(PARAMETERS):
+        values = np.array([e.value(name) for e in estimates])
+        if np.count_nonzero(np.isfinite(values)) < 2:
+            continue  # a slow voltage may leave R and L open
+        low, high = int(np.nanargmin(values)), int(np.nanargmax(values))
+        apart = float(values[high] - values[low])
+        chance = BEYOND_CHANCE * float(np.sqrt(difference_covariance(told[low], told[high])[k, k]))
+        if apart > max(chance, LEAST_CHANGE[name] * abs(float(np.nanmedian(values)))):
+            worst = worst if reasons else (min(low, high), max(low, high))
+            code = "LoadChanged" if name == "Jt" else "ParameterJump"
+            text = f"{name} moves from {values[low]:.4g} to {values[high]:.4g} between the windows"
+            reasons.append(Reason(code, text, "identify the windows before and after the change apart"))
+    if len(reasons) == 1:
+        return reasons
+    suspected = [(told[worst[0]], told[worst[1]])] if reasons else list(pairwise(told))
+    sensors = [reason for pair in suspected if (reason := gain_change(*pair)) is not None]
+    return sensors[:1] or reasons
+
+
+def gain_change(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) -> Reason | None:
+    """Return the reason when one sensor's gain explains all that differs between two estimates; None when none does.
+
+    With g the factor of a sensor's gain, [1] and [2] hold again for parameters times g to the powers of ``GAINS``.
+    """
+    before, after = one[1], other[1]
+    names = [name for name in PARAMETERS if before.value(name) > 0 and after.value(name) > 0]
+    if len(names) < len(PARAMETERS) - 1:  # friction may be nil
+        return None
+    rows = [PARAMETERS.index(name) for name in names]
+    moved = np.log(after.values[rows] / before.values[rows])
+    apart = difference_covariance(one, other) / np.outer(before.values, after.values)
+    spread = apart[np.ix_(rows, rows)] + np.diag(np.full(len(rows), MODEL_SHARE**2))
+    weight: Float = np.asarray(np.linalg.inv(spread), dtype=np.float64)
+    singles = np.eye(len(rows))
+    patterns = {name: powers[rows] for name, powers in GAINS.items()}
+    left = {name: _unexplained(moved, weight, pattern)[1] for name, pattern in patterns.items()}
+    sensor = min(left, key=lambda name: left[name])
+    if left[sensor] > min(UNEXPLAINED, *(_unexplained(moved, weight, single)[1] for single in singles)):
+        return None
+    amplitude = _unexplained(moved, weight, patterns[sensor])[0]
+    deviation = float(patterns[sensor] @ weight @ patterns[sensor]) ** -0.5
+    share = float(np.expm1(amplitude))
+    if abs(amplitude) < BEYOND_CHANCE * deviation or abs(share) < LEAST_GAIN_CHANGE:
+        return None
+    text = f"the gain of {sensor} changes by {share:+.2%} between the windows: that alone explains what moves"
+    return Reason("CalibrationSuspect", text, f"check the {sensor} sensor and its wiring")
+
+
+def _unexplained(moved: Float, weight: Float, pattern: Float) -> tuple[float, float]:
+    """Return the best amplitude of a pattern, and the chi-square that it leaves."""
+    amplitude = float(pattern @ weight @ moved / (pattern @ weight @ pattern))
+    rest = moved - amplitude * pattern
+    return amplitude, float(rest @ weight @ rest)

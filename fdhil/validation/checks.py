@@ -1,0 +1,170 @@
+"""Lists the checks of a window: a literal table, asked from top to bottom over one record of evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdhil.identification.identifiability import unphysical, untold
+from fdhil.records import Reason, Result
+from fdhil.validation.agreement import values_apart
+from fdhil.validation.evidence import LEAST_ROWS, Evidence
+from fdhil.validation.interruptions import interruptions
+from fdhil.validation.plausibility import clipped, gaps, missing_stages, not_finite, position_parted
+from fdhil.validation.rest import rest_faults
+from fdhil.validation.simulation import expected_fit_percent
+from fdhil.validation.slow_fitted import slow_faults_beside
+from fdhil.validation.slow_readings import slow_voltage_faults
+from fdhil.validation.slow_timing import current_late
+from fdhil.validation.stuck import clipped_peaks, stuck_values
+from fdhil.validation.timing import timing_faults, voltage_late
+from fdhil.validation.whiteness import excess_noise, whiteness
+
+Findings = dict[str, list[Reason]]
+"""What each check that was asked found, in the order of the table."""
+
+
+def _always(_: Evidence) -> bool:
+    return True
+
+
+def _enough_rows(evidence: Evidence) -> bool:
+    return evidence.window.n >= LEAST_ROWS
+
+
+def _has_voltage(evidence: Evidence) -> bool:
+    return evidence.window.voltage_v is not None or evidence.window.slow_voltage is not None
+
+
+def _fitted(evidence: Evidence) -> bool:
+    return evidence.fit is not None
+
+
+def _sound(evidence: Evidence) -> bool:
+    if evidence.fit is None:
+        return False
+    return bool(np.isfinite(evidence.on_time.residuals).all() and np.isfinite(evidence.on_time.information).all())
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One question: ``find`` is asked where the evidence has what it ``needs``.
+
+    It is passed over where a check of ``unless`` has found something: that explains what this one would find.
+    """
+
+    name: str
+    find: Callable[[Evidence], Iterable[Reason]]
+    needs: Callable[[Evidence], bool] = _always
+    unless: Sequence[str] = ()
+
+
+def _few_rows(evidence: Evidence) -> Iterator[Reason]:
+    if not _enough_rows(evidence):
+        yield Reason("LowExcitation", f"{evidence.window.n} rows are no rapid move", "record a whole rapid")
+
+
+def _play(evidence: Evidence) -> Iterator[Reason]:
+    if evidence.play is not None:
+        yield evidence.play.reason()
+
+
+def _no_voltage(evidence: Evidence) -> Iterator[Reason]:
+    if not _has_voltage(evidence):
+        yield Reason("SampleTiming", "the window has no voltage", "connect the voltage sensor")
+
+
+def _estimate_faults(evidence: Evidence) -> Iterator[Reason]:
+    """Yield why the estimate tells no drive: values left open, a fit that does not converge, unphysical values."""
+    estimate, fit = evidence.estimate, evidence.fit
+    assert estimate is not None
+    missing = untold(estimate, slow=evidence.window.slow_voltage is not None)
+    yield from missing
+    open_end = bool(estimate.missing) and not missing and fit is not None and not fit.converged
+    if open_end or estimate.result is Result.DIVERGED:
+        yield Reason("SolverFailed", "the fit does not converge", "look at the window's signals")
+    yield from unphysical(estimate)
+
+
+def _no_fit(evidence: Evidence) -> Iterator[Reason]:
+    if not _fitted(evidence):
+        yield Reason("RankDeficient", "there is no fit to check", "record a whole rapid")
+
+
+def _electrically_late(evidence: Evidence) -> Iterable[Reason]:
+    return voltage_late(evidence) if evidence.electrically_late else ()
+
+
+def _current_late(evidence: Evidence) -> Iterable[Reason]:
+    if evidence.window.slow_voltage is None:
+        return ()
+    others = max((finding.statistic**2 for finding in evidence.findings), default=0.0)
+    return current_late(evidence.window, evidence.on_time, others)
+
+
+def _structure(evidence: Evidence) -> Iterator[Reason]:
+    """Yield the finding that explains most."""
+    matters = [finding for finding in evidence.findings if finding.matters]
+    yield from (finding.reason() for finding in matters[:1])
+
+
+def _late(evidence: Evidence) -> Iterable[Reason]:
+    if evidence.late_s:
+        return voltage_late(evidence)
+    return timing_faults(evidence) if _sound(evidence) else ()
+
+
+def _simulation(evidence: Evidence) -> Iterator[Reason]:
+    """Yield a reason where the model follows the speed worse than a right one would."""
+    reached, least = evidence.fit_percent, expected_fit_percent(evidence.window, evidence.judged)
+    if reached is not None and not reached >= least:
+        text = f"the model simulated from the measured voltage follows the speed by {reached:.2f} %, not {least:.2f} %"
+        yield Reason("ValidationFailed", text, "the drive does what the model does not have")
+
+
+def _values(evidence: Evidence) -> Iterable[Reason]:
+    assert evidence.estimate is not None
+    return values_apart(evidence.estimate, evidence.judged.theta[:6])
+
+
+MODEL = ("estimate", "fit", "late voltage", "late current", "structure", "whiteness", "excess noise", "standstill")
+BEFORE_ANY_FIT: Sequence[Check] = (
+    Check("finite", not_finite),
+    Check("stages", missing_stages),
+    Check("gaps", gaps, _enough_rows, ("finite",)),
+    Check("range", clipped, _enough_rows, ("finite",)),
+    Check("position", position_parted, _enough_rows, ("finite",)),
+    # what position tells of the move's course is worth nothing where it contradicts the speed
+    Check("whole move", interruptions, _enough_rows, ("finite", "position")),
+    Check("play", _play, _enough_rows, ("finite",)),
+    Check("slow readings", slow_voltage_faults),
+    Check("voltage", _no_voltage),
+    Check("rows", _few_rows, unless=("finite", "stages", "slow readings", "voltage")),
+)
+OF_THE_FIT: Sequence[Check] = (
+    Check("stuck", stuck_values),
+    Check("cut off", clipped_peaks, _fitted),
+    Check("estimate", _estimate_faults, _has_voltage),
+    Check("fit", _no_fit, _has_voltage, ("estimate",)),
+    Check("late voltage", _electrically_late, _fitted),
+    Check("late current", _current_late, _sound, ("late voltage",)),
+    Check("structure", _structure, _sound, ("late voltage", "late current")),
+    Check("whiteness", whiteness, _sound, ("late voltage", "late current", "structure")),
+    Check("excess noise", excess_noise, _sound, ("late voltage", "late current", "structure")),
+    # a late current seems to move a shaft at rest
+    Check("standstill", rest_faults, _sound, ("late voltage", "late current")),
+    Check("delay", _late, _fitted, MODEL[2:]),
+    Check("simulation", _simulation, _fitted, (*MODEL, "delay")),
+    Check("values", _values, _fitted, (*MODEL, "delay")),
+    Check("slow sensor", slow_faults_beside, _fitted, ("range", "slow readings")),
+)
+
+
+def ask(checks: Sequence[Check], evidence: Evidence, found: Findings) -> Findings:
+    """Return what was ``found`` before, and what these checks find."""
+    for check in checks:
+        if not any(found.get(other) for other in check.unless) and check.needs(evidence):
+            found = {**found, check.name: list(check.find(evidence))}
+    return found

@@ -1,0 +1,81 @@
+"""Simulates the speed from the measured voltage, and tells how much of the measured speed that explains."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from fdhil.identification.estimators.maximum_likelihood import Fit
+from fdhil.identification.identifiability import untold
+from fdhil.identification.windows import carried
+from fdhil.model.feed_drive import discretise, simulate_plant
+from fdhil.records import Estimate, Float, Parameters, Window
+
+LEAST_FIT_PERCENT = 80.0
+EXCESS = 1.5  # of the variance that noise explains
+SHAPE_SHARE = 0.002  # of the rapid speed: what the voltage's course within a sample leaves open
+
+
+def fit_percent(window: Window, estimate: Estimate, fit: Fit | None) -> float | None:
+    """Return 100 (1 - |w - what| / |w - mean w|) of the speed simulated from voltage; None without a model.
+
+    A delay of the voltage that the estimate found, and that is no more than a sample, is taken out first. Where a slow
+    voltage leaves R or L open, the fit's own value is taken: a simulation needs all.
+    """
+    if window.voltage_v is None and window.slow_voltage is None:
+        return None
+    p = _complete(estimate, fit).parameters()
+    values = np.array(list(p.as_dict().values()))
+    if not np.isfinite(values).all() or not (values[:4] > 0).all():
+        return None
+    p = replace(p, ft=max(p.ft, 0.0), Cd=max(p.Cd, 0.0))
+    if window.slow_voltage is not None:
+        return _slow_fit_percent(window, p, estimate.delay_s or 0.0)
+    assert window.voltage_v is not None
+    known = np.isfinite(window.speed_rad_s)
+    voltage = carried(window.voltage_v)
+    if estimate.delay_s and abs(estimate.delay_s) <= window.dt_s:
+        row = np.arange(voltage.size)
+        voltage = np.interp(row + estimate.delay_s / window.dt_s, row, voltage)
+    _, speed = simulate_plant(p, voltage, window.dt_s, window.voltage_sampling)
+    return _explained_percent(window.speed_rad_s[known], speed[known])
+
+
+def _complete(estimate: Estimate, fit: Fit | None) -> Estimate:
+    if fit is None or not estimate.missing or untold(estimate, slow=fit.problem.slow):
+        return estimate
+    return replace(estimate, values=np.where(np.isnan(estimate.values), fit.theta[:6], estimate.values))
+
+
+def _slow_fit_percent(window: Window, parameters: Parameters, delay_s: float) -> float | None:
+    """Simulate on the grid of the slow sensor itself, and compare with the measured speed at its instants."""
+    slow = window.slow_voltage
+    assert slow is not None
+    begin = slow.begin_s - delay_s + slow.period_s * np.arange(slow.voltage_v.size)
+    _, speed = simulate_plant(parameters, carried(slow.voltage_v), slow.period_s, window.voltage_sampling)
+    measured = np.interp(begin, np.arange(window.n) * window.dt_s, carried(window.speed_rad_s))
+    return _explained_percent(measured, speed)
+
+
+def _explained_percent(measured: Float, speed: Float) -> float | None:
+    spread = float(np.linalg.norm(measured - measured.mean())) if measured.size else 0.0
+    if spread == 0.0 or not np.isfinite(speed).all():
+        return None
+    return 100.0 * (1.0 - float(np.linalg.norm(measured - speed)) / spread)
+
+
+def expected_fit_percent(window: Window, fit: Fit) -> float:
+    """Return the fit that a right model has at least, from the noise of speed and of the voltage that drives it."""
+    if window.slow_voltage is not None:
+        return LEAST_FIT_PERCENT  # the voltage's course within its samples is not known
+    noise = fit.problem.motions[0].noise
+    own = fit.problem.noises[0].voltage_v
+    p = Parameters(*fit.theta[:6])
+    step = discretise(p, fit.problem.motions[0].voltage_period_s)
+    push = step.mean[:, 0] / p.L * min(own, EXCESS * noise.voltage_v)
+    # the steady state of P = phi P phi' + push push'
+    spread = np.linalg.solve(np.eye(4) - np.kron(step.phi, step.phi), np.outer(push, push).ravel()).reshape(2, 2)
+    variance = EXCESS * (noise.speed_rad_s**2 + spread[1, 1]) + (SHAPE_SHARE * window.rapid_speed_rad_s) ** 2
+    deviation = float(np.nanstd(window.speed_rad_s))
+    return max(LEAST_FIT_PERCENT, 100.0 * (1.0 - float(np.sqrt(variance)) / max(deviation, 1e-300)))

@@ -1,0 +1,58 @@
+"""The table of checks and the budget behind their thresholds: what is listed holds together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil.config import Identification
+from fdhil.identification.estimators.maximum_likelihood import fit_windows
+from fdhil.pipeline import analyse
+from fdhil.records import Reason
+from fdhil.validation import BEFORE_ANY_FIT, OF_THE_FIT, Check, Evidence, ask
+from fdhil.validation.agreement import values_apart
+from fdhil.validation.significance import BUDGET
+from tests.identification.recorded import windows
+
+SETTINGS = Identification()
+
+
+def test_a_check_is_passed_over_for_one_that_comes_before_it() -> None:
+    before: list[str] = []
+    for check in (*BEFORE_ANY_FIT, *OF_THE_FIT):
+        assert set(check.unless) <= set(before)
+        assert check.name not in before
+        before.append(check.name)
+
+
+def test_what_explains_a_finding_stands_in_its_place() -> None:
+    told = Reason("Told", "first")
+    first, second = Check("first", lambda _: [told]), Check("second", lambda _: [told], unless=("first",))
+    evidence = Evidence(windows(0.002)[0], SETTINGS)
+    assert ask([first, second], evidence, {}) == {"first": [told]}
+    assert ask([second], evidence, {"first": []}) == {"first": [], "second": [told]}
+
+
+def test_the_budget_is_spent_once_and_gives_every_threshold() -> None:
+    assert sum(share.share for share in BUDGET.values()) <= 1.0
+    deviations = {"structure": 4.5, "timing": 4.5, "play": 4.5, "whiteness": 5.0, "between windows": 5.0}
+    for name, told in (deviations | {"standstill": 5.5, "position": 6.0, "data sheet": 3.0}).items():
+        assert BUDGET[name].deviations == pytest.approx(told, abs=0.02)
+    for name, chance in {"stuck": 2e-3, "saturated": 1e-4, "slow voltage": 1e-5, "cut off": 1e-6}.items():
+        assert BUDGET[name].chance == pytest.approx(chance)
+
+
+@pytest.mark.parametrize("method", ["least_squares", "partial_moments", "maximum_likelihood"])
+def test_the_values_of_a_method_are_judged_by_its_own_intervals(method: str) -> None:
+    window = windows(0.002)[0]
+    outcome, fit = analyse(window, Identification(method=method)), fit_windows([window], SETTINGS)
+    assert outcome.verdict.accepted
+    assert outcome.estimate is not None
+    assert fit is not None
+    assert list(values_apart(outcome.estimate, fit.theta[:6])) == []
+    off = replace(outcome.estimate, values=outcome.estimate.values * np.array([1.0, 1.0, 1.1, 1.0, 1.0, 1.0]))
+    (reason,) = values_apart(off, fit.theta[:6])
+    assert reason.text.startswith("K = ")
+    assert method in reason.text
