@@ -19,6 +19,13 @@ from tests.integration.conftest import PATIENCE_S, Bench, digested
 
 ROUND = "G0 X300 Y300\nG4 P0.3\nG0 X0 Y0\nG4 P0.3\n"
 TRUE = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
+SETTLED_ROWS = 500  # after the last motion: a rapid becomes a window when its axis has stood for a while
+
+
+def newest_tick(records: list[Any], axis: str) -> int:
+    """The newest tick of an axis' samples so far; 0 before there are any."""
+    blocks = (r for r in reversed(records) if isinstance(r, AxisSamples) and r.axis == axis and r.tick.size)
+    return next((int(block.tick[-1]) for block in blocks), 0)
 
 
 async def recorded(bench: Bench, program: Path) -> tuple[list[Any], dict[str, int]]:
@@ -32,7 +39,9 @@ async def recorded(bench: Bench, program: Path) -> tuple[list[Any], dict[str, in
         running = asyncio.create_task(source.run(records.append))
         async with asyncio.timeout(4 * PATIENCE_S):
             await finished
-            await asyncio.sleep(0.5)
+            settled = {axis: newest_tick(records, axis) + SETTLED_ROWS for axis in bench.config.axis}
+            while any(newest_tick(records, axis) < tick for axis, tick in settled.items()):  # noqa: ASYNC110 - records have no event
+                await asyncio.sleep(0.02)
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
         return records, source.counters()
