@@ -34,7 +34,7 @@ from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError
 from fdhil.guard.protocol import LANDING
 from fdhil.records import AxisSamples, Notice, Skill
-from fdhil.store.history import Revision
+from fdhil.store.rows import Revision
 
 STREAM_S = 0.05
 ALIVE_S = 0.1  # the guard calls us lost after 0.5 s

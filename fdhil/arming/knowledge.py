@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from fdhil.records import Notice, Outcome, ParameterSet, Skill, Temperature
-from fdhil.store.history import Revision
+from fdhil.store.rows import Revision
 
 SKILL_MOVES = 3  # FAULTS E19: the last three recorded moves
 

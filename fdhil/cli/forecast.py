@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from fdhil.prediction.forecast import Step, ZoneChange
     from fdhil.prediction.gain import Gain
     from fdhil.records import Correction, Float, Parameters, Prediction
-    from fdhil.store.history import Comparison, Revision, Stamp
+    from fdhil.store.rows import Comparison, Revision, Stamp
 
 DAY_S = 86400.0
 FAR_DAYS = 36500.0
@@ -75,7 +75,7 @@ def comparison(
     zones: Sequence[Mapping[str, Any]],
 ) -> Comparison:
     """Return this prediction as the store keeps it; ``zones`` as JSON has them."""
-    from fdhil.store.history import Comparison, UsedParameters
+    from fdhil.store.rows import Comparison, UsedParameters
 
     newest = {axis: found[-1].set.revision for axis, found in past.revisions.items() if found}
     return Comparison(
@@ -93,7 +93,8 @@ def remember(past: Past, now: Comparison, config: MachineConfig) -> None:
     if past.comparisons and _same(past.comparisons[0][1], now):
         return
     from fdhil.errors import StoreError
-    from fdhil.store.history import History, Stamp
+    from fdhil.store.history import History
+    from fdhil.store.rows import Stamp
 
     try:
         with History.open(config.store.directory) as history:

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from fdhil.config import MachineConfig
     from fdhil.identification.trends import Crossing, Step
     from fdhil.records import Float
-    from fdhil.store.history import History, StoredWindow
+    from fdhil.store.history import History
+    from fdhil.store.rows import StoredWindow
 
 NEWEST_WINDOWS = 2000
 DAY_S = 86_400.0

@@ -18,7 +18,7 @@ from fdhil.errors import RecordingError
 
 if TYPE_CHECKING:
     from fdhil.records import Outcome, Window
-    from fdhil.store.history import Revision
+    from fdhil.store.rows import Revision
 
 AS_JSON = click.option("--json", "as_json", is_flag=True, help="Write one JSON document.")
 FILE = click.Path(path_type=Path)

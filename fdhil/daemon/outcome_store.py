@@ -13,7 +13,8 @@ from fdhil.errors import StoreError
 from fdhil.identification.drift import Point
 from fdhil.pipeline import POOL_WINDOWS, Known
 from fdhil.records import PARAMETERS, Notice, Outcome, ParameterSet, Skill, WindowOutcome, frozen
-from fdhil.store.history import FILE_NAME, History, Revision, Stamp, StoredWindow
+from fdhil.store.history import FILE_NAME, History
+from fdhil.store.rows import Revision, Stamp, StoredWindow
 from fdhil.store.windows import RawScale, Scales, WindowStore
 
 WINDOWS_FOLDER = "windows"

@@ -10,101 +10,22 @@ from __future__ import annotations
 import json
 import math
 import sqlite3
-import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import numpy as np
-
 from fdhil.errors import StoreError
-from fdhil.records import PARAMETERS, Float, Notice, Parameters, ParameterSet, Skill, WindowOutcome, frozen
+from fdhil.records import Notice, Parameters, ParameterSet, Skill, WindowOutcome
 from fdhil.store import schema
+from fdhil.store.rows import DECODED, Comparison, Revision, Stamp, StoredWindow
 from fdhil.store.schema import told
 
 FILE_NAME = "history.sqlite"
 KEEP_NOTICES = 100_000
 KEEP_COMPARISONS = 10_000
-
-
-@dataclass(frozen=True, slots=True)
-class Stamp:
-    """When a row was written: wall clock (s since 1970, may be wrong), boot identifier, monotonic clock."""
-
-    wall_s: float
-    boot: str
-    monotonic_ns: int
-
-    @staticmethod
-    def now() -> Stamp:
-        """Return the stamp of this moment."""
-        return Stamp(time.time(), _boot_id(), time.monotonic_ns())
-
-    def age_s(self) -> float:
-        """Return how long ago that was; below 0 where a wall clock was set back, which is not to be believed."""
-        now = Stamp.now()
-        if now.boot and self.boot == now.boot:
-            return (now.monotonic_ns - self.monotonic_ns) * 1e-9
-        return now.wall_s - self.wall_s
-
-
-def _boot_id() -> str:
-    """Return the kernel's identifier of this boot; monotonic times compare only within one."""
-    try:
-        return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
-    except OSError:
-        return ""
-
-
-@dataclass(frozen=True, slots=True)
-class Revision:
-    """A published parameter set as stored: ``window_ids`` are the rows of the windows it was pooled from."""
-
-    number: int
-    set: ParameterSet
-    window_ids: tuple[int, ...]
-    stamp: Stamp
-
-
-@dataclass(frozen=True, slots=True)
-class StoredWindow:
-    """An analysed window as stored; ``parameters`` maps a symbol to {"value", "std"} or {"value": None, "reason"}."""
-
-    number: int
-    axis: str
-    file: str
-    start_tick: int
-    direction: int
-    accepted: bool
-    fit_percent: float | None
-    reasons: tuple[str, ...]
-    parameters: dict[str, dict[str, Any]] | None
-    temperature_c: float | None
-    stamp: Stamp
-
-
-@dataclass(frozen=True, slots=True)
-class UsedParameters:
-    """An axis' parameters as a prediction used them: ``revision`` 0 where none was published."""
-
-    revision: int
-    parameters: Parameters
-
-
-@dataclass(frozen=True, slots=True)
-class Comparison:
-    """A prediction of a program: ``program`` is its digest, ``zones`` as ``fdhil predict --json`` has them."""
-
-    program: str
-    name: str
-    config_digest: str
-    used: Mapping[str, UsedParameters]
-    rms_um: float
-    zones: tuple[Mapping[str, Any], ...]
 
 
 class History:
@@ -202,7 +123,7 @@ class History:
                     continue
                 if all(row[name] == value for name, value in only.items()):
                     try:
-                        found.append(_DECODED[table](row))
+                        found.append(DECODED[table](row))
                     except (ValueError, TypeError, LookupError, AttributeError, OverflowError, RecursionError):
                         self._damaged[table, row["id"]] = row
         return found if oldest else found[::-1]
@@ -359,56 +280,3 @@ def latest_parameters(store_directory: Path, tell: Callable[[str], object] | Non
         return {}
     with History.read(store_directory, tell) as history:
         return {revision.set.axis: revision.set.parameters for revision in history.revisions()}
-
-
-def _stamp(row: Mapping[str, Any]) -> Stamp:
-    return Stamp(row["wall_s"], row["boot"], row["monotonic_ns"])
-
-
-def _number(value: float | None) -> float:
-    return math.nan if value is None else float(value)
-
-
-def _revision(row: Mapping[str, Any]) -> Revision:
-    parameters = Parameters(*(float(row[name]) for name in PARAMETERS))
-    covariance: Float = frozen(np.array(json.loads(row["covariance"]), dtype=np.float64))
-    published = ParameterSet(
-        row["axis"], row["revision"], parameters, covariance, row["windows"], row["tick"], row["temperature_c"],
-        row["config_digest"],
-    )  # fmt: skip
-    return Revision(row["id"], published, tuple(json.loads(row["window_ids"])), _stamp(row))
-
-
-def _comparison(row: Mapping[str, Any]) -> tuple[Stamp, Comparison]:
-    used = {
-        axis: UsedParameters(int(u["revision"]), Parameters(*(float(u[name]) for name in PARAMETERS)))
-        for axis, u in json.loads(row["parameters"]).items()
-    }
-    zones = tuple(json.loads(row["zones"]))
-    return _stamp(row), Comparison(row["program"], row["name"], row["config_digest"], used, row["rms_um"], zones)
-
-
-def _skill(row: Mapping[str, Any]) -> Skill:
-    figures = ("rms_um", "max_um", "delay_ms", "measured_rms_um")
-    return Skill(row["axis"], row["tick"], *(_number(row[name]) for name in figures))
-
-
-def _notice(row: Mapping[str, Any]) -> tuple[Stamp, Notice]:
-    return _stamp(row), Notice(*(row[name] for name in ("code", "severity", "text", "axis", "tick")))
-
-
-def _stored_window(row: Mapping[str, Any]) -> StoredWindow:
-    parameters = None if row["parameters"] is None else json.loads(row["parameters"])
-    return StoredWindow(
-        row["id"], row["axis"], row["file"], row["start_tick"], row["direction"], bool(row["accepted"]),
-        row["fit_percent"], tuple(json.loads(row["reasons"])), parameters, row["temperature_c"], _stamp(row),
-    )  # fmt: skip
-
-
-_DECODED: Mapping[str, Callable[[Mapping[str, Any]], Any]] = {
-    "windows": _stored_window,
-    "revisions": _revision,
-    "skills": _skill,
-    "notices": _notice,
-    "comparisons": _comparison,
-}

@@ -27,7 +27,7 @@ from fdhil.arming.token import read_token
 from fdhil.config import MachineConfig
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.records import Notice, Reason, Skill
-from fdhil.store.history import Revision, Stamp
+from fdhil.store.rows import Revision, Stamp
 from tests.arming.mill import RESERVE_ROWS, Mill
 from tests.arming.test_preparing import known, save_records
 from tests.arming.test_program_check import HEAD, SQUARE

@@ -27,7 +27,7 @@ from fdhil.config import MachineConfig
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.program import program_digest
 from fdhil.records import Notice, Skill
-from fdhil.store.history import Revision, Stamp
+from fdhil.store.rows import Revision, Stamp
 from tests.daemon.machine import config_of
 from tests.store.made import published
 

@@ -12,7 +12,8 @@ import pytest
 
 from fdhil.program import write_demand_csv
 from fdhil.records import Skill
-from fdhil.store.history import History, Stamp
+from fdhil.store.history import History
+from fdhil.store.rows import Stamp
 from tests.cli.test_predict import _bench as _bench
 from tests.cli.test_predict import invoke, remember
 from tests.paths import bench_trajectory, smooth, trajectory

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from fdhil.records import PARAMETERS, frozen
-from fdhil.store.history import History, Stamp
+from fdhil.store.history import History
+from fdhil.store.rows import Stamp
 from tests.daemon.machine import config_of
 from tests.daemon.shop import BENCH, fdhil
 from tests.store.made import outcome, published, window

@@ -13,7 +13,8 @@ import pytest
 from fdhil.config import Identification
 from fdhil.pipeline import analyse
 from fdhil.records import frozen
-from fdhil.store.history import History, Stamp
+from fdhil.store.history import History
+from fdhil.store.rows import Stamp
 from tests.daemon.machine import config_of
 from tests.daemon.shop import BENCH, fdhil
 from tests.identification.recorded import windows

@@ -15,7 +15,8 @@ from fdhil.cli.main import cli, run_safely
 from fdhil.errors import StoreError
 from fdhil.program import write_demand_csv
 from fdhil.records import Parameters, ParameterSet, frozen
-from fdhil.store.history import History, Stamp
+from fdhil.store.history import History
+from fdhil.store.rows import Stamp
 from tests.bench import bench_toml
 from tests.paths import bench_trajectory
 

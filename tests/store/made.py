@@ -21,7 +21,7 @@ from fdhil.records import (
     WindowOutcome,
     frozen,
 )
-from fdhil.store.history import Stamp
+from fdhil.store.rows import Stamp
 
 INCREMENTS_PER_MM = 65536 / 20.0
 BENCH = Parameters(0.5, 0.005, 0.8, 0.075, 0.05, 5.0)

@@ -18,7 +18,8 @@ from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.errors import RecordingError, StoreError
 from fdhil.records import Notice, Parameters, Skill
 from fdhil.store import schema
-from fdhil.store.history import FILE_NAME, Comparison, History, UsedParameters, latest_parameters
+from fdhil.store.history import FILE_NAME, History, latest_parameters
+from fdhil.store.rows import Comparison, UsedParameters
 from fdhil.store.windows import decode_window, encode_window
 from tests.daemon.machine import config_of
 from tests.store.made import BENCH, STAMP, outcome, published, same, window

@@ -13,14 +13,8 @@ from fdhil.errors import StoreError
 from fdhil.records import Notice, Parameters, Skill
 from fdhil.store import history as history_module
 from fdhil.store import schema
-from fdhil.store.history import (
-    FILE_NAME,
-    Comparison,
-    History,
-    Stamp,
-    UsedParameters,
-    latest_parameters,
-)
+from fdhil.store.history import FILE_NAME, History, latest_parameters
+from fdhil.store.rows import Comparison, Stamp, UsedParameters
 from tests.store.made import BENCH, STAMP, outcome, published
 
 DRIFTED = Parameters(0.5, 0.005, 0.8, 0.075, 0.01 + 1e-17, 1.0 / 3.0)

@@ -1,0 +1,145 @@
+"""The rows of the history as records, and how each is read from what SQLite gives."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdhil.records import PARAMETERS, Float, Notice, Parameters, ParameterSet, Skill, frozen
+
+
+@dataclass(frozen=True, slots=True)
+class Stamp:
+    """When a row was written: wall clock (s since 1970, may be wrong), boot identifier, monotonic clock."""
+
+    wall_s: float
+    boot: str
+    monotonic_ns: int
+
+    @staticmethod
+    def now() -> Stamp:
+        """Return the stamp of this moment."""
+        return Stamp(time.time(), _boot_id(), time.monotonic_ns())
+
+    def age_s(self) -> float:
+        """Return how long ago that was; below 0 where a wall clock was set back, which is not to be believed."""
+        now = Stamp.now()
+        if now.boot and self.boot == now.boot:
+            return (now.monotonic_ns - self.monotonic_ns) * 1e-9
+        return now.wall_s - self.wall_s
+
+
+def _boot_id() -> str:
+    """Return the kernel's identifier of this boot; monotonic times compare only within one."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text("ascii").strip()
+    except OSError:
+        return ""
+
+
+@dataclass(frozen=True, slots=True)
+class Revision:
+    """A published parameter set as stored: ``window_ids`` are the rows of the windows it was pooled from."""
+
+    number: int
+    set: ParameterSet
+    window_ids: tuple[int, ...]
+    stamp: Stamp
+
+
+@dataclass(frozen=True, slots=True)
+class StoredWindow:
+    """An analysed window as stored; ``parameters`` maps a symbol to {"value", "std"} or {"value": None, "reason"}."""
+
+    number: int
+    axis: str
+    file: str
+    start_tick: int
+    direction: int
+    accepted: bool
+    fit_percent: float | None
+    reasons: tuple[str, ...]
+    parameters: dict[str, dict[str, Any]] | None
+    temperature_c: float | None
+    stamp: Stamp
+
+
+@dataclass(frozen=True, slots=True)
+class UsedParameters:
+    """An axis' parameters as a prediction used them: ``revision`` 0 where none was published."""
+
+    revision: int
+    parameters: Parameters
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """A prediction of a program: ``program`` is its digest, ``zones`` as ``fdhil predict --json`` has them."""
+
+    program: str
+    name: str
+    config_digest: str
+    used: Mapping[str, UsedParameters]
+    rms_um: float
+    zones: tuple[Mapping[str, Any], ...]
+
+
+def _stamp(row: Mapping[str, Any]) -> Stamp:
+    return Stamp(row["wall_s"], row["boot"], row["monotonic_ns"])
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)
+
+
+def _revision(row: Mapping[str, Any]) -> Revision:
+    parameters = Parameters(*(float(row[name]) for name in PARAMETERS))
+    covariance: Float = frozen(np.array(json.loads(row["covariance"]), dtype=np.float64))
+    published = ParameterSet(
+        row["axis"], row["revision"], parameters, covariance, row["windows"], row["tick"], row["temperature_c"],
+        row["config_digest"],
+    )  # fmt: skip
+    return Revision(row["id"], published, tuple(json.loads(row["window_ids"])), _stamp(row))
+
+
+def _comparison(row: Mapping[str, Any]) -> tuple[Stamp, Comparison]:
+    used = {
+        axis: UsedParameters(int(u["revision"]), Parameters(*(float(u[name]) for name in PARAMETERS)))
+        for axis, u in json.loads(row["parameters"]).items()
+    }
+    zones = tuple(json.loads(row["zones"]))
+    return _stamp(row), Comparison(row["program"], row["name"], row["config_digest"], used, row["rms_um"], zones)
+
+
+def _skill(row: Mapping[str, Any]) -> Skill:
+    figures = ("rms_um", "max_um", "delay_ms", "measured_rms_um")
+    return Skill(row["axis"], row["tick"], *(_number(row[name]) for name in figures))
+
+
+def _notice(row: Mapping[str, Any]) -> tuple[Stamp, Notice]:
+    return _stamp(row), Notice(*(row[name] for name in ("code", "severity", "text", "axis", "tick")))
+
+
+def _stored_window(row: Mapping[str, Any]) -> StoredWindow:
+    parameters = None if row["parameters"] is None else json.loads(row["parameters"])
+    return StoredWindow(
+        row["id"], row["axis"], row["file"], row["start_tick"], row["direction"], bool(row["accepted"]),
+        row["fit_percent"], tuple(json.loads(row["reasons"])), parameters, row["temperature_c"], _stamp(row),
+    )  # fmt: skip
+
+
+# table -> what makes a record of its row; a row that is none raises one of the errors that the reader knows
+DECODED: Mapping[str, Callable[[Mapping[str, Any]], Any]] = {
+    "windows": _stored_window,
+    "revisions": _revision,
+    "skills": _skill,
+    "notices": _notice,
+    "comparisons": _comparison,
+}
