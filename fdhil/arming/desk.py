@@ -253,7 +253,7 @@ class ArmingDesk:
             await self._check.attend()
 
     def _facts(self) -> Mapping[str, bool] | None:
-        """What is still vouched for while a correction runs; None while none does."""
+        """Return what is still vouched for while a correction runs; None while none does."""
         if self._armed is None:
             return None
         facts = self._armed[0].standing_facts(self._config, self.knowledge.now())

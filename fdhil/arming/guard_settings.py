@@ -118,7 +118,7 @@ def _commissioned(machine: MachineConfig, name: str, record: CommissioningRecord
 
 
 def _largest_acceleration_rad_s2(axis: Axis) -> float:
-    """What the motor can do at its current limit, or what the NC asks for where that is more."""
+    """Return what the motor can do at its current limit, or what the NC asks for where that is more."""
     of_the_motor = axis.regulators.current_limit_a * axis.nominal.K / axis.nominal.Jt
     return max(of_the_motor, axis.max_acceleration_mm_s2 * 2 * math.pi / axis.screw_pitch_mm)
 
@@ -148,7 +148,7 @@ def _feedforward(profile: DriveProfile, machine: MachineConfig, name: str, axis:
 
 
 def heartbeat_timeout_s(machine: MachineConfig, axis: str) -> float:
-    """How long the drive's heartbeat may be missing, from the 0x1017 that the axis was commissioned with.
+    """Return how long the drive's heartbeat may be missing, from the 0x1017 that the axis was commissioned with.
 
     0, never: without a record that can be read (nothing is armed then), for a drive that sends none, and where time is
     the count of SYNC, which says nothing about heartbeats of the wall clock.

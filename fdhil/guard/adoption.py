@@ -25,7 +25,7 @@ OF_THE_RECORD = frozenset({"NotCommissioned", "RecordVoid", "PdoMapping"})
 
 
 def patience(settings: Settings) -> int:
-    """How many SYNC to wait for a value to become known."""
+    """Return how many SYNC to wait for a value to become known."""
     return PERIODS_AWAITED * max([axis.read_back_every for axis in settings.axes])
 
 
@@ -142,7 +142,7 @@ def at_rest(axis: AxisState, offset: int) -> AxisState:
 
 
 def unread(state: State) -> State:
-    """What the drives hold is to be read anew."""
+    """Return the state with what the drives hold to be read anew."""
     return state._replace(
         axes=tuple([axis._replace(read_back=None, readings=0, zero_shown=False) for axis in state.axes])
     )

@@ -51,7 +51,7 @@ class Alarm:
         return CATALOGUE[self.code][2]
 
     def sentence(self, off: bool = False) -> str:
-        """What happened, what it means for the machine (``off``: nothing is applied any more), what to do next."""
+        """Return cause, effect on the machine (``off``: nothing is applied any more) and next action as a sentence."""
         effect = "the correction is off and nothing is applied" if off else EFFECT[self.reaction]
         return f"{self.cause}; {effect}; {self.action}"
 

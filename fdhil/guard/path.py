@@ -103,7 +103,7 @@ def rate_between(path: CorrectedPath, row: int, last: Sequence[int], targets: Se
 
 
 def _fraction(path: CorrectedPath, row: int, targets: Sequence[int]) -> float | None:
-    """Where on the path the targets are, in rows, within ``2 SEARCH`` before and ``SEARCH`` behind ``row``."""
+    """Return where on the path the targets are, in rows, within ``2 SEARCH`` before and ``SEARCH`` behind ``row``."""
     for k in range(row + SEARCH, row - 2 * SEARCH, -1):
         if not path.has(k) or not path.has(k + 1):
             continue

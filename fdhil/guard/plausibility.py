@@ -90,7 +90,7 @@ def _sampled(
 
 
 def _off_demand(seen: AxisInput, k: int, history: tuple[tuple[int, ...] | None, ...]) -> float:
-    """How far the read-back is from what the drive adds to its last targets, told by 0x6062 where that came with it."""
+    """Return how far the read-back is from what the drive adds to its last targets, told by 0x6062 if that came too."""
     if seen.demand is None or seen.read_back is None:
         return 0.0
     targets = [latched[k] for latched in history[1:] if latched is not None]

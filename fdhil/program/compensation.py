@@ -189,7 +189,7 @@ def _sweep(piece: Piece) -> float:
 
 
 def _crossing(before: Piece, piece: Piece, radius: float, side: int) -> complex:
-    """Where the parallels of two pieces cross at an inside corner, next to the corner."""
+    """Return where the parallels of two pieces cross at an inside corner, next to the corner."""
     corner = before.corner
     if before.centre is None and piece.centre is None:
         share = side * radius / (1.0 + _dot(before.leaving, piece.heading))
