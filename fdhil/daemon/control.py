@@ -17,7 +17,7 @@ import stat
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from fdhil.arming.answers import Answer, refusal
 from fdhil.errors import ConnectError, DeviceTimeout, FdhilError
@@ -32,6 +32,7 @@ PROGRESS_S = 0.5
 
 Handler = Callable[[Mapping[str, Any]], Awaitable[Answer]]
 Progress = Callable[[], Mapping[str, Any] | None]
+Done = TypeVar("Done")
 
 
 class ControlServer:
@@ -100,13 +101,13 @@ class ControlServer:
     async def _converse(
         self, task: asyncio.Task[None], reader: asyncio.StreamReader, writer: asyncio.StreamWriter
     ) -> None:
-        while line := await asyncio.wait_for(reader.readline(), IDLE_S):
+        while line := await _in_time(reader.readline()):
             self._busy.add(task)
             answer = await self._attended(line, reader, writer)
             self._busy.discard(task)
             self._clients[task] = self._clients.pop(task, None)
             writer.write(json.dumps(answer).encode() + b"\n")
-            await asyncio.wait_for(writer.drain(), IDLE_S)
+            await _in_time(writer.drain())
 
     async def _attended(self, line: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Answer:
         """Answer a request; tell its progress meanwhile where that is wanted."""
@@ -135,6 +136,12 @@ class ControlServer:
             return await self._handle(request)
         except FdhilError as error:
             return refusal(type(error).__name__, str(error))
+
+
+async def _in_time(doing: Awaitable[Done]) -> Done:
+    """Wait for a client no longer than it may idle; TimeoutError. A cancellation is kept, as wait_for may not."""
+    async with asyncio.timeout(IDLE_S):
+        return await doing
 
 
 def ask(

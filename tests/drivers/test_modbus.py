@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pymodbus.pdu.register_message import ReadInputRegistersResponse
 
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.tick_clock import TickClock
@@ -90,6 +91,18 @@ async def test_each_misbehaviour_is_one_error(mode: str, error: type[DeviceError
             await sensor.poll(TickClock(0.001))
         assert says in str(caught.value)
         sensor.link.close()
+
+
+async def test_a_source_that_is_stopped_just_as_the_answer_comes_ends() -> None:
+    link = ModbusLink("voltage sensor X", "127.0.0.1", 502, 1, 10.0)
+    answer = asyncio.get_running_loop().create_future()
+    asking = asyncio.create_task(link._request(asyncio.wait_for(answer, 10.0), 0))
+    for _ in range(3):
+        await asyncio.sleep(0)
+    answer.set_result(ReadInputRegistersResponse(registers=[1]))
+    asking.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await asking
 
 
 async def test_nobody_there_is_said() -> None:

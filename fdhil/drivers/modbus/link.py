@@ -124,6 +124,10 @@ class ModbusLink:
                 text = f"the connection to the Modbus sensor {self._where} is gone; check its supply and cable"
                 raise ConnectError(self.name, text) from error
             raise self._silent(address) from error
+        task = asyncio.current_task()
+        if task is not None and task.cancelling():
+            # the library waits by wait_for, which in Python 3.11 forgets a cancellation that meets the answer
+            raise asyncio.CancelledError
         if answer.isError():
             code = int(answer.exception_code)
             what = EXCEPTIONS.get(code, f"exception {code}")
