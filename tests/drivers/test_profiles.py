@@ -56,6 +56,14 @@ def test_no_pdo_is_longer_than_a_frame_or_overlaps(profile: DriveProfile) -> Non
             assert before.bit_offset + before.bits <= after.bit_offset
 
 
+def test_what_may_be_negative_is_signed(profile: DriveProfile) -> None:
+    """Read unsigned, a current of -1 count would be 65.5 times the rated one."""
+    set_points = (profile.target, profile.offset, profile.speed_offset, profile.torque_offset)
+    signals = (profile.position, profile.position_demand, profile.speed, profile.current, profile.voltage or (0, 0))
+    places = [profile.find_rpdo(key) for key in set_points] + [profile.find_tpdo(key) for key in signals]
+    assert [entry for _, entry in filter(None, places) if not entry.signed] == []
+
+
 def test_every_signal_has_its_scale(profile: DriveProfile) -> None:
     axis = machine().axis["X"]
     assert profile.speed_rad_s_per_count(axis) > 0
