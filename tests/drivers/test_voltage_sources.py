@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from fdhil import tables
@@ -40,17 +41,21 @@ def test_the_voltage_comes_from_one_place_alone(name: str) -> None:
 
 @pytest.mark.parametrize("name", SEPARATE)
 async def test_a_sensor_is_polled_and_read(name: str) -> None:
+    """The peer serves what the sensor's class names as an example, else the map of ``modbus``, sampled as time goes."""
     async with sensor_peer() as peer:
+        peer.served = getattr(tables.load(tables.VOLTAGE_SOURCES, name), "example_registers", ())
         sensor = sensors_of("X", config_of(name, peer.port))["voltage"]
         await sensor.link.connect()
         before = sensor.samples
         shown = await sensor.reading()
         assert " V at " in shown
         assert sensor.samples == before  # a reading takes nothing from a daemon that polls
-        records = await sensor.poll(TickClock(0.001))
+        records = [record for _ in range(3) for record in await sensor.poll(TickClock(0.001))]
         sensor.link.close()
     blocks = [record for record in records if isinstance(record, VoltageSamples)]
     assert blocks
+    assert all(np.isfinite(block.voltage_v).all() for block in blocks)
+    assert (np.diff(np.concatenate([block.counter for block in blocks])) > 0).all()  # no sample comes twice
     assert {(block.axis, block.sensor) for block in blocks} == {("X", sensor.name)}
     assert sensor.samples == sum(block.voltage_v.size for block in blocks)
     assert sensor.lost == 0
