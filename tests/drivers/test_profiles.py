@@ -43,7 +43,9 @@ def test_the_offset_can_be_sent_and_read_back(profile: DriveProfile) -> None:
     assert offset is not None
     assert target[0].cob_base != offset[0].cob_base
     assert (offset[1].bits, offset[1].signed) == (32, True)
-    assert profile.find_tpdo(profile.offset) is not None
+    read_back = profile.find_tpdo(profile.offset)
+    assert read_back is not None
+    assert read_back[1].bits == 32
 
 
 def test_no_pdo_is_longer_than_a_frame_or_overlaps(profile: DriveProfile) -> None:
