@@ -76,7 +76,8 @@ class Voltage(Section):
     """[axis.X.voltage]: where the motor's terminal voltage comes from."""
 
     source: Annotated[str, one_of(tables.VOLTAGE_SOURCES)] = Field(
-        tables.DRIVE_VOLTAGE, description="drive (a vendor object in a TPDO) or modbus (a separate sensor)"
+        tables.DRIVE_VOLTAGE,
+        description=f"{', '.join(tables.VOLTAGE_SOURCES)}; drive: a vendor object in a TPDO, else a separate sensor",
     )
     sampling: Literal["interval_mean", "instant"] = Field(
         "interval_mean", description="the drive's value is the mean since the last sample, or an instant"

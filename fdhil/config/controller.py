@@ -40,7 +40,9 @@ class G0(Section):
     """[g0]: how a rapid move is recognised."""
 
     source: Annotated[str, one_of(tables.EVENT_SOURCES)] = Field(
-        "inferred", description="inferred (from the demand's speed) or digital_input (the NC's signal)"
+        "inferred",
+        description=f"{', '.join(tables.EVENT_SOURCES)}; inferred: from the demand's speed,"
+        " digital_input: the NC's signal",
     )
     input_bit: int = Field(16, ge=0, le=31, description="digital_input: bit of 0x60FD that the NC raises")
 

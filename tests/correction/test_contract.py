@@ -67,6 +67,18 @@ def test_at_rest_nothing_is_asked_for(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", tables.CORRECTIONS)
+def test_a_method_keeps_the_limits_by_itself(name: str) -> None:
+    """What is planned afterwards, where a zone would get worse, must not be what makes it fit."""
+    wanted = tables.load(tables.CORRECTIONS, name)(REFERENCE, MODELS, CONFIG, predict(REFERENCE, MODELS, CONFIG))
+    assert wanted.refused == ()
+    for axis, offset in wanted.offset_um.items():
+        limits = PlanLimits.of(CONFIG.axis[axis], CONFIG.machine.sync_period_s)
+        increments = offset / limits.um_per_increment
+        assert np.allclose(increments, np.rint(increments), atol=1e-6)
+        assert check(np.rint(increments).astype(np.int64), limits) == []
+
+
+@pytest.mark.parametrize("name", tables.CORRECTIONS)
 def test_without_its_section_nothing_is_planned(name: str) -> None:
     document = copy.deepcopy(bench_document())
     for axis in document["axis"].values():

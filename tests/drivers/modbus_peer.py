@@ -6,14 +6,17 @@ import asyncio
 import contextlib
 import struct
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 
 VOLTS_PER_COUNT = 0.01
 
 
 class SensorPeer:
-    """Samples at ``rate_hz`` of its own clock, value = counter % 1000; ``mode`` says how it answers."""
+    """Samples at ``rate_hz`` of its own clock, value = counter % 1000; ``mode`` says how it answers.
+
+    ``served``: registers that it has instead, always the same, for a sensor with another map.
+    """
 
     def __init__(self, rate_hz: float = 1000.0) -> None:
         self.rate_hz = rate_hz
@@ -25,6 +28,7 @@ class SensorPeer:
         self.requests = 0
         self.frozen_at: int | None = None
         self.port = 0
+        self.served: Sequence[int] = ()
         self.connections: dict[asyncio.StreamWriter, asyncio.Event] = {}
 
     @property
@@ -59,7 +63,7 @@ class SensorPeer:
         if function == 6:
             self.latch()
             return request
-        words = self.registers()[address : address + value]
+        words = list(self.served or self.registers())[address : address + value]
         if self.mode == "short":
             words = words[:-2]
         if self.mode == "nan":

@@ -84,9 +84,9 @@ def test_contract(name: str) -> None:
     for record in (
         samples(np.zeros(0)),
         samples(np.zeros(10)),
-        samples(np.zeros(10), axis="Y"),
+        samples(move(400, 500), axis="Y"),
         InputSamples("X", frozen_ints([]), frozen_ints([])),
-        InputSamples("Y", frozen_ints([0, 10]), frozen_ints([0, 1 << 16])),
+        InputSamples("Y", frozen_ints([0, 10, 20, 30]), frozen_ints([0, *[1 << 16] * 3])),
     ):
         assert source.feed(record) == []
 

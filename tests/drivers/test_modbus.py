@@ -203,7 +203,7 @@ def test_samples_are_placed_by_way_of_the_sync_count() -> None:
     ticks.add(TickTimes(np.arange(1000), t_ns))
     last: VoltageSamples | None = None
     for k in range(50, 1000, 50):
-        block = SensorBlock(k - 1, 1000.0, 20.0, False, k - 50, np.zeros(50))
+        block = SensorBlock(k - 1, 1000.0, 20.0, False, k - 50, np.zeros(50), 0.0)
         asked = int(t_ns[k - 1]) + 999_000 if k > 501 else k * 1_000_000 + 100_000
         asked = int(np.interp(k + 0.3, np.arange(1000), t_ns))
         for record in sensor.accept(block, asked, asked + 200_000, ticks):
@@ -212,6 +212,19 @@ def test_samples_are_placed_by_way_of_the_sync_count() -> None:
     assert last is not None
     placed = np.interp(last.t_ns, t_ns, np.arange(1000))
     np.testing.assert_allclose(placed, last.counter, atol=0.6)
+
+
+def test_samples_that_come_again_are_taken_once() -> None:
+    """A sensor without a latch shows the newest samples, whether or not they were read before."""
+    sensor, ticks = ModbusVoltage("X", config(1)), TickClock(0.001)
+    taken: list[int] = []
+    for poll, newest in enumerate([39, 39, 59, 139, 9]):  # the count fell: the sensor was restarted
+        block = SensorBlock(newest, 1000.0, np.nan, False, max(0, newest - 39), np.zeros(min(40, newest + 1)), 0.0)
+        for record in sensor.accept(block, poll * 50_000_000, poll * 50_000_000 + 200_000, ticks):
+            if isinstance(record, VoltageSamples):
+                taken += record.counter.tolist()
+    assert taken == [*range(60), *range(100, 140), *range(10)]
+    assert (sensor.samples, sensor.lost) == (110, 40)
 
 
 def test_late_stamps_of_sync_do_not_move_the_samples() -> None:
@@ -229,7 +242,7 @@ def test_late_stamps_of_sync_do_not_move_the_samples() -> None:
         ticks.add(TickTimes(np.arange(k - 50, k), stamps[k - 50 : k]))
         answered_ns = int(asked_ns + rng.integers(2_000_000, 4_000_000))
         newest = (int(asked_ns) + answered_ns) // 2_000_000 - 1
-        block = SensorBlock(newest, 1000.0, 20.0, False, newest - 49, np.zeros(50))
+        block = SensorBlock(newest, 1000.0, 20.0, False, newest - 49, np.zeros(50), 0.0)
         sensor.accept(block, int(asked_ns), answered_ns, ticks)
         assert sensor.line is not None
         begins.append(sensor.line.at(0))

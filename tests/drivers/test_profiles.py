@@ -43,7 +43,9 @@ def test_the_offset_can_be_sent_and_read_back(profile: DriveProfile) -> None:
     assert offset is not None
     assert target[0].cob_base != offset[0].cob_base
     assert (offset[1].bits, offset[1].signed) == (32, True)
-    assert profile.find_tpdo(profile.offset) is not None
+    read_back = profile.find_tpdo(profile.offset)
+    assert read_back is not None
+    assert read_back[1].bits == 32
 
 
 def test_no_pdo_is_longer_than_a_frame_or_overlaps(profile: DriveProfile) -> None:
@@ -54,6 +56,14 @@ def test_no_pdo_is_longer_than_a_frame_or_overlaps(profile: DriveProfile) -> Non
         assert spec.cob_base % 0x80 == 0
         for before, after in pairwise(spec.entries):
             assert before.bit_offset + before.bits <= after.bit_offset
+
+
+def test_what_may_be_negative_is_signed(profile: DriveProfile) -> None:
+    """Read unsigned, a current of -1 count would be 65.5 times the rated one."""
+    set_points = (profile.target, profile.offset, profile.speed_offset, profile.torque_offset)
+    signals = (profile.position, profile.position_demand, profile.speed, profile.current, profile.voltage or (0, 0))
+    places = [profile.find_rpdo(key) for key in set_points] + [profile.find_tpdo(key) for key in signals]
+    assert [entry for _, entry in filter(None, places) if not entry.signed] == []
 
 
 def test_every_signal_has_its_scale(profile: DriveProfile) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from fdhil import tables
@@ -10,6 +11,7 @@ from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.cia402.drive import VoltageObject
 from fdhil.drivers.cia402.profile import load_profile
 from fdhil.drivers.machine import MachineSource
+from fdhil.drivers.modbus.voltage import ModbusVoltage
 from fdhil.drivers.sensor_source import sensors_of
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
 from fdhil.records import VoltageSamples
@@ -40,17 +42,27 @@ def test_the_voltage_comes_from_one_place_alone(name: str) -> None:
 
 @pytest.mark.parametrize("name", SEPARATE)
 async def test_a_sensor_is_polled_and_read(name: str) -> None:
+    """The peer serves what the sensor's class names as an example; to the map of ``modbus`` it samples as time goes."""
+    factory = tables.load(tables.VOLTAGE_SOURCES, name)
+    assert factory is ModbusVoltage or factory.example_registers
     async with sensor_peer() as peer:
+        peer.served = factory.example_registers
         sensor = sensors_of("X", config_of(name, peer.port))["voltage"]
         await sensor.link.connect()
         before = sensor.samples
         shown = await sensor.reading()
-        assert " V at " in shown
+        volts, _, rate = shown.partition(" V at ")
+        assert np.isfinite([float(volts), float(rate.removesuffix(" Hz"))]).all()
         assert sensor.samples == before  # a reading takes nothing from a daemon that polls
-        records = await sensor.poll(TickClock(0.001))
+        records = [record for _ in range(3) for record in await sensor.poll(TickClock(0.001))]
+        blocks = [record for record in records if isinstance(record, VoltageSamples)]
+        assert blocks
+        counter = np.concatenate([block.counter for block in blocks])
+        if peer.served and isinstance(sensor, ModbusVoltage):
+            assert counter[-1] == (await sensor.block()).newest
         sensor.link.close()
-    blocks = [record for record in records if isinstance(record, VoltageSamples)]
-    assert blocks
+    assert all(np.isfinite(block.voltage_v).all() for block in blocks)
+    assert (np.diff(counter) > 0).all()  # no sample comes twice
     assert {(block.axis, block.sensor) for block in blocks} == {("X", sensor.name)}
     assert sensor.samples == sum(block.voltage_v.size for block in blocks)
     assert sensor.lost == 0

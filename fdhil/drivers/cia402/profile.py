@@ -26,7 +26,8 @@ ObjectKey = tuple[int, int]
 class PdoSpec:
     """One PDO: its COB-ID is ``cob_base`` + node-ID; it comes with every ``every_sync``-th SYNC.
 
-    ``number`` is its place in the communication parameters (1 -> 0x1400/0x1800). ``valid`` is False when the drive's
+    ``number`` is its place in the communication parameters (1 -> 0x1400/0x1800), in a profile's file the last character
+    of its name ("RPDO1"). ``valid`` is False when the drive's
     default has bit 31 of the COB-ID set: mapped, but not exchanged.
     """
 
@@ -102,7 +103,7 @@ class DriveProfile:
 
     def current_a_per_count(self, axis: Axis) -> float:
         """Scale of the current object, the axis' sign included."""
-        per_count = axis.drive.rated_current_a / 1000 if self.current_unit == "permille_of_rated" else 1e-3
+        per_count = {"permille_of_rated": axis.drive.rated_current_a / 1000, "mA": 1e-3}[self.current_unit]
         return axis.drive.sign * per_count
 
 

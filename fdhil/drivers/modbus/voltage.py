@@ -5,6 +5,8 @@ its sample counter uint32, 4-5 sample rate Hz float32, 6-7 volts per count of th
 temperature degC float32, 10 trigger, 11 status, 12-13 counter of the block's first sample uint32, 14 samples in the
 block, 16..115 the samples int16. Writing 1 to the trigger latches the newest samples that were not latched before.
 Everything is then read with one request, so that no value is torn.
+
+A sensor with another register map is a class beneath :class:`ModbusVoltage` that reads a :class:`SensorBlock`.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ import math
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -39,7 +42,10 @@ _SETTLED_NS = 50_000_000  # a query is placed when so many later SYNCs have show
 
 @dataclass(frozen=True, slots=True)
 class SensorBlock:
-    """One reading of the whole map: ``volts`` (n,) are the samples ``first`` .. ``first`` + n - 1."""
+    """One reading of the whole map: ``volts`` (n,) are the samples ``first`` .. ``first`` + n - 1.
+
+    ``newest`` counts the newest complete sample, ``newest_v`` is for people. ``celsius`` NaN: no temperature.
+    """
 
     newest: int
     rate_hz: float
@@ -47,6 +53,7 @@ class SensorBlock:
     lost: bool
     first: int
     volts: Float
+    newest_v: float
 
 
 def parse_block(name: str, registers: Sequence[int]) -> SensorBlock:
@@ -62,11 +69,18 @@ def parse_block(name: str, registers: Sequence[int]) -> SensorBlock:
         if not ok:
             raise ProtocolError(name, f"the sensor reports {what}; compare its register map with the driver's")
     samples = np.array(registers[FIRST_SAMPLE : FIRST_SAMPLE + count], np.uint16).view(np.int16)
-    return SensorBlock(newest, rate_hz, celsius, registers[11] == STATUS_LOST, first, frozen(samples * volts_per_count))
+    volts = frozen(samples * volts_per_count)
+    return SensorBlock(newest, rate_hz, celsius, registers[11] == STATUS_LOST, first, volts, float32(registers))
 
 
 class ModbusVoltage:
-    """The voltage source ``modbus`` of one axis; ``poll`` asks once and returns what is new."""
+    """The voltage source ``modbus`` of one axis; ``poll`` asks once and returns what is new.
+
+    A class beneath it says in ``latch`` and ``block`` how its own register map is read, and in ``example_registers``
+    what a unit that answers has in its input registers from 0 on: the contract's peer serves these.
+    """
+
+    example_registers: ClassVar[Sequence[int]] = ()
 
     def __init__(self, axis: str, config: MachineConfig) -> None:
         settings = config.axis[axis].voltage
@@ -86,21 +100,28 @@ class ModbusVoltage:
 
     async def poll(self, ticks: TickClock) -> list[VoltageSamples | Temperature | Notice]:
         """Latch and read once; errors of the link pass through."""
-        await self.link.write(TRIGGER, 1)
+        await self.latch()
         asked_ns = time.monotonic_ns()
-        registers = await self.link.read_input(0, ALL_REGISTERS)
+        block = await self.block()
         answered_ns = time.monotonic_ns()
-        block = parse_block(self.name, registers)
         for _ in range(_SETTLE_STEPS):  # the SYNCs around the query must have been drained before it can be placed
             if not ticks.running or ticks.covers(answered_ns):
                 break
             await asyncio.sleep(_SETTLE_STEP_S)
         return self.accept(block, asked_ns, answered_ns, ticks)
 
+    async def latch(self) -> None:
+        """Have the newest samples put into the registers; nothing where the sensor does so by itself."""
+        await self.link.write(TRIGGER, 1)
+
+    async def block(self) -> SensorBlock:
+        """Read the registers with one request and change nothing; samples may come again, they are taken once."""
+        return parse_block(self.name, await self.link.read_input(0, ALL_REGISTERS))
+
     async def reading(self) -> str:
         """Read the map without latching anything, for people."""
-        registers = await self.link.read_input(0, ALL_REGISTERS)
-        return f"{float32(registers):.2f} V at {parse_block(self.name, registers).rate_hz:g} Hz"
+        block = await self.block()
+        return f"{block.newest_v:.2f} V at {block.rate_hz:g} Hz"
 
     def accept(
         self, block: SensorBlock, asked_ns: int, answered_ns: int, ticks: TickClock
@@ -108,6 +129,7 @@ class ModbusVoltage:
         """Place a block on the timelines. Pure but for this object's own memory."""
         out: list[VoltageSamples | Temperature | Notice] = []
         self._clocks(block, asked_ns, answered_ns, ticks)
+        block = self._unseen(block)
         out += self._continuity(block)
         if PLAUSIBLE_C[0] < block.celsius < PLAUSIBLE_C[1]:
             out.append(Temperature(self.axis, ticks.newest_tick, block.celsius, "slideway"))
@@ -133,6 +155,13 @@ class ModbusVoltage:
     def line(self) -> Line | None:
         """The sensor's samples on the SYNC count, None before that is known."""
         return self._tick_clock.line() if self._tick_clock else None
+
+    def _unseen(self, block: SensorBlock) -> SensorBlock:
+        """Leave out the samples that have come before; a count that fell is a sensor that was restarted."""
+        if self._next is None or block.newest + 1 < self._next:
+            return block
+        known = min(max(0, self._next - block.first), block.volts.size)
+        return replace(block, first=block.first + known, volts=block.volts[known:]) if known else block
 
     def _continuity(self, block: SensorBlock) -> list[Notice]:
         """Count samples that are missing between blocks, and notice a counter that stands still."""
