@@ -110,7 +110,7 @@ def _heartbeat(period_ms: int | None) -> Finding:
 def _rapid(config: MachineConfig, profile: DriveProfile, read: Callable[[], int | None]) -> Iterator[Finding]:
     """The NC's signal of a rapid move, where the config counts on it."""
     if not load_event_source(config.g0.source).needs_input:
-        yield Finding("rapid signal", config.g0.source, f"{config.g0.source} from the demand's speed")
+        yield Finding("rapid signal", config.g0.source, f"{config.g0.source} needs no input")
         return
     bit = config.g0.input_bit
     expected = f"bit {bit} of 0x60FD in a TPDO"
