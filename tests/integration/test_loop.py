@@ -14,23 +14,26 @@ import pytest
 from fdhil.commissioning.steps import commission
 from fdhil.drivers import open_machine
 from fdhil.pipeline import AxisPipeline
-from fdhil.records import AxisSamples, ParameterSet, WindowOutcome
+from fdhil.records import AxisSamples, MoveEvent, MoveKind, ParameterSet, WindowOutcome
 from tests.integration.conftest import PATIENCE_S, Bench, digested
 
 ROUND = "G0 X300 Y300\nG4 P0.3\nG0 X0 Y0\nG4 P0.3\n"
 TRUE = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
-SETTLED_ROWS = 500  # after the last motion: a rapid becomes a window when its axis has stood for a while
+SETTLED_ROWS = 500  # after the last rapid: it becomes a window when its axis has stood for a while
 
 
-def newest_tick(records: list[Any], axis: str) -> int:
-    """The newest tick of an axis' samples so far; 0 before there are any."""
+def settled(records: list[Any], axis: str, rapids: int) -> bool:
+    """Whether all rapids of an axis are over, and it has stood for a while: records come later than the NC tells."""
+    rests = [r.tick for r in records if isinstance(r, MoveEvent) and r.axis == axis and r.kind is MoveKind.REST]
     blocks = (r for r in reversed(records) if isinstance(r, AxisSamples) and r.axis == axis and r.tick.size)
-    return next((int(block.tick[-1]) for block in blocks), 0)
+    newest = next((int(block.tick[-1]) for block in blocks), 0)
+    return len(rests) == rapids and newest >= rests[-1] + SETTLED_ROWS
 
 
 async def recorded(bench: Bench, program: Path) -> tuple[list[Any], dict[str, int]]:
     """Let the NC play a program, and return all records that the drivers made of it with their counters."""
     records: list[Any] = []
+    rapids = program.read_text().count("G0 ")
     async with open_machine(bench.config) as source:
         bench.command('{"command": "nc", "on": true}')
         await asyncio.to_thread(bench.event, "nc")
@@ -39,8 +42,7 @@ async def recorded(bench: Bench, program: Path) -> tuple[list[Any], dict[str, in
         running = asyncio.create_task(source.run(records.append))
         async with asyncio.timeout(4 * PATIENCE_S):
             await finished
-            settled = {axis: newest_tick(records, axis) + SETTLED_ROWS for axis in bench.config.axis}
-            while any(newest_tick(records, axis) < tick for axis, tick in settled.items()):  # noqa: ASYNC110 - records have no event
+            while not all(settled(records, axis, rapids) for axis in bench.config.axis):  # noqa: ASYNC110 - no event
                 await asyncio.sleep(0.02)
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
