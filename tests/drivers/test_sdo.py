@@ -9,7 +9,7 @@ import pytest
 
 from fdhil.drivers.can import sdo
 from fdhil.drivers.can.sdo import SdoLink
-from fdhil.errors import DeviceTimeout
+from fdhil.errors import DeviceTimeout, ProtocolError
 
 
 class SlowNode:
@@ -49,3 +49,14 @@ def test_the_roll_back_is_not_spoilt_by_a_late_answer(monkeypatch: pytest.Monkey
     monkeypatch.setattr("fdhil.drivers.can.sdo.time.sleep", node.arrive)
     assert link.read_int(0x60B0) == 7
     assert link.read_int(0x6041) == 7
+
+
+def test_an_answer_to_what_another_program_asked_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sdo, "QUIET_S", 0.0)
+    node = SlowNode()
+    node.link = link = SdoLink("drive X", 1, node.send)
+    node.waiting = [b"\x60\x16\x10\x01" + bytes(4)]  # a download's, of a program that has ended
+    assert link.read_int(0x1018, 2) == 7
+    link = SdoLink("drive X", 1, lambda can_id, data: link.deliver(b"\x60\x16\x10\x01" + bytes(4)))
+    with pytest.raises(ProtocolError, match="answered wrongly"):
+        link.read_int(0x1018, 2)

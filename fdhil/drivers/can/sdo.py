@@ -1,8 +1,9 @@
 """Reads and writes objects of one node by the canopen library's SDO client, within bounds of size and time.
 
 The library has no limit on size or duration, and takes a late answer to an earlier request of the same object for the
-answer to the present one. So after a time-out the line is left quiet until nothing more can come, and then the object
-is read twice: two equal answers, or an error.
+answer to the present one. So after a time-out, and after an answer to something else (what another program asked for
+a moment ago), the line is left quiet until nothing more can come, and then the object is read twice: two equal answers,
+or an error.
 """
 
 from __future__ import annotations
@@ -69,7 +70,9 @@ class SdoLink:
         """Read an object; SdoAbort, DeviceTimeout or ProtocolError."""
         try:
             return self._upload(index, sub)
-        except DeviceTimeout:
+        except (DeviceTimeout, ProtocolError):
+            if not self._late:
+                raise
             first, second = self._upload(index, sub), self._upload(index, sub)
             if first != second:
                 text = f"{_name(index, sub)} gave two answers after a time-out; check that one master asks"
@@ -91,7 +94,9 @@ class SdoLink:
         data = (number & (1 << 8 * length) - 1).to_bytes(length, "little")
         try:
             self._guarded(index, sub, lambda: self._client.download(index, sub, data))
-        except DeviceTimeout:
+        except (DeviceTimeout, ProtocolError):
+            if not self._late:
+                raise
             if self._upload(index, sub) == data == self._upload(index, sub):
                 return
             self._guarded(index, sub, lambda: self._client.download(index, sub, data))
@@ -140,5 +145,6 @@ class SdoLink:
                 self._late = True
                 text = f"{_name(index, sub)} was not answered; check the drive's supply and its node-ID"
                 raise DeviceTimeout(self.device, text) from None
+            self._late = True
             text = f"{_name(index, sub)} was answered wrongly ({error}); check that one master asks"
             raise ProtocolError(self.device, text) from None
