@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
-KERNELS := $(shell grep -rl --include='*.py' njit fdhil)
+KERNELS := $(shell grep -rlE --include='*.py' 'njit|^@(compiled|inlined)' fdhil)
 VCAN   := bash tests/integration/vcan-vm.sh -t 900
 
 # a child process need not translate fdhil anew

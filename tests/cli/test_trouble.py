@@ -208,9 +208,11 @@ def test_a_bus_that_is_not_there_is_3(command: str, capsys: Any) -> None:
 
 @pytest.mark.parametrize("command", ["status", "arm", "disarm"])
 def test_a_daemon_that_does_not_run_is_3(command: str, capsys: Any) -> None:
-    told(capsys, TROUBLE, command, *(text.format(config="bench.toml") for text in WITH_CONFIG[command]))
+    said = told(capsys, TROUBLE, command, *(text.format(config="bench.toml") for text in WITH_CONFIG[command]))
+    assert "fdhil run" in said
 
 
 def test_no_history_is_3(capsys: Any) -> None:
     for command in ("history", "report"):
-        told(capsys, TROUBLE, command, *(text.format(config="bench.toml") for text in WITH_CONFIG[command]))
+        said = told(capsys, TROUBLE, command, *(text.format(config="bench.toml") for text in WITH_CONFIG[command]))
+        assert "history" in said

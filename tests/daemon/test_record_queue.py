@@ -28,6 +28,9 @@ async def test_it_is_joined_once_all_is_digested() -> None:
     queue.put(reading(1))
     queue.put(reading(2))
     joined = asyncio.create_task(queue.join())
-    queue.digested(len(await queue.batch()))
+    batch = await queue.batch()
+    await asyncio.sleep(0)
+    assert not joined.done()
+    queue.digested(len(batch))
     async with asyncio.timeout(60):
         await joined
