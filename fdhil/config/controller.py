@@ -56,3 +56,14 @@ class Identification(Section):
     lowpass_hz: Positive = Field(
         40.0, ge=0.01, le=1e5, description="least_squares: corner of the zero-phase low-pass on every signal"
     )
+    tolerance_um: Positive | None = Field(
+        None,
+        le=1e4,
+        description="RMS at the table that a model may leave of a rapid; left out: 5 % of its following error",
+    )
+    speed_source: Literal["auto", "sensor", "difference", "filtered"] = Field(
+        "auto", description="the recorded speed is an instant, a difference of positions, or filtered; auto: it shows"
+    )
+    voltage_source: Literal["auto", "terminals", "command"] = Field(
+        "auto", description="the recorded voltage is measured at the motor, or what the drive asked for; auto: it shows"
+    )

@@ -38,7 +38,10 @@ class Regulators(Section):
         0.0, le=1.0, description="time constant of a filter on the set-point; 0: none"
     )
     setpoint_filter_order: Literal[1, 2] = Field(1, description="first-order, or two equal ones behind each other")
-    current_delay_cycles: int = Field(0, ge=0, le=4, description="current cycles until a computed voltage acts")
+    speed_filter_s: NotNegative = Field(
+        0.0, le=0.1, description="time constant of a first-order filter on the speed feedback; 0: none"
+    )
+    current_delay_cycles: int = Field(0, ge=0, le=32, description="current cycles until a computed voltage acts")
 
     @model_validator(mode="after")
     def _integrals(self) -> Regulators:

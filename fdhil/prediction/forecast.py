@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -120,7 +120,7 @@ def step_costs(
         for what in moved(earlier[axis], now[axis]):
             names = GROUPS[what]
             old = {name: float(getattr(earlier[axis].parameters, name)) for name in names}
-            without = contour_um(reference, {**models, axis: replace(models[axis], **old)}, config)
+            without = contour_um(reference, {**models, axis: models[axis].changed(**old)}, config)
             change = prediction.contour_um - without
             row = int(np.argmax(np.abs(change)))
             if abs(change[row]) < COMMON_UM:
@@ -157,7 +157,7 @@ def zone_changes(
     reference = prediction.reference
     then = predict(reference, {**models, **earlier}, config)
     without = {
-        (axis, name): contour_um(reference, {**models, axis: replace(models[axis], **{name: old})}, config)
+        (axis, name): contour_um(reference, {**models, axis: models[axis].changed(**{name: old})}, config)
         for axis in earlier
         for name, old in earlier[axis].as_dict().items()
         if old != getattr(models[axis], name)

@@ -69,7 +69,7 @@ def _parameters(axis: str, values: Any, faults: list[ConfigFault]) -> Parameters
         faults.append(ConfigFault(f"{axis}.{name[:SHOWN_CHARS]}", "is no parameter", hint))
     if len(faults) > before:
         return None
-    return Parameters(**{name: float(values[name]) for name in PARAMETERS})
+    return Parameters.of({name: values[name] for name in PARAMETERS})
 
 
 def _fault(name: str, value: Any) -> str | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -21,7 +20,7 @@ def _changed(parameters: Parameters, name: str) -> tuple[Parameters, float]:
     """Return the parameters with one of them a little larger, and by how much."""
     value = float(getattr(parameters, name))
     step = max(abs(value) * STEP, SMALLEST.get(name, 0.0) * STEP)
-    return replace(parameters, **{name: value + step}), step
+    return parameters.changed(**{name: value + step}), step
 
 
 def _positions(

@@ -33,8 +33,9 @@ from fdhil.records.values import (
     frozen_ints,
     read_only,
     rms,
+    unit_of,
 )
-from fdhil.records.verdicts import Estimate, Notice, ParameterSet, Reason, Result, Verdict, WindowOutcome
+from fdhil.records.verdicts import Estimate, LoopEstimate, Notice, ParameterSet, Reason, Result, Verdict, WindowOutcome
 
 Outcome = WindowOutcome | ParameterSet | Skill | Notice
 
@@ -49,6 +50,7 @@ __all__ = [
     "Estimate",
     "Float",
     "Int",
+    "LoopEstimate",
     "MoveEvent",
     "MoveKind",
     "Notice",
@@ -75,4 +77,5 @@ __all__ = [
     "frozen_ints",
     "read_only",
     "rms",
+    "unit_of",
 ]

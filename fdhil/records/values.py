@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -27,6 +28,28 @@ UNITS: Mapping[str, str] = {
     "ft/K": "A.s/rad",
     "Cd/K": "A",
 }
+
+# what may join the six; of a ripple's name the number is its periods in a turn of the motor
+_TERMS: Mapping[str, str] = {
+    r"load": "N.m",
+    r"coulomb_(positive|negative)": "N.m",
+    r"viscous_(positive|negative)": "N.m.s",
+    r"stribeck": "N.m",
+    r"stribeck_speed": "rad/s",
+    r"ripple_(screw|motor)_[1-9][0-9]?": "N.m",
+    r"ripple_(screw|motor)_[1-9][0-9]?_phase": "rad",
+    r"dead_time": "V",
+    r"speed_delay": "s",
+    r"resonance": "Hz",
+    r"resonance_damping": "1",
+}
+
+
+def unit_of(name: str) -> str | None:
+    """Return the unit of a parameter, a ratio or a term; None for a name that is none."""
+    if name in UNITS:
+        return UNITS[name]
+    return next((unit for pattern, unit in _TERMS.items() if re.fullmatch(pattern, name)), None)
 
 
 def frozen(values: npt.ArrayLike) -> Float:
@@ -57,7 +80,16 @@ def rms(values: Float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """The six physical parameters of equations [1] and [2]: ohm, H, N.m/A, kg.m2, N.m.s, N.m."""
+    """The six physical parameters of equations [1] and [2] (ohm, H, N.m/A, kg.m2, N.m.s, N.m), and ``terms``.
+
+    The torque against the positive direction of a shaft that turns at w, at the angle a = 2 pi x / pitch of its place
+    x, is that of [2] with what has joined it, side = sign(w):
+
+        load + side (C + stribeck exp(-(w / stribeck_speed)^2)) + f w + sum of ripple_k sin(k a + ripple_k_phase)
+
+    C is ``coulomb_positive`` or ``coulomb_negative`` where there are such, else Cd; f the same with ``viscous_...`` and
+    ft. The shaft sticks while |K i - load - ripples| <= C + stribeck. ``terms`` are pairs of name and value.
+    """
 
     R: float
     L: float
@@ -65,7 +97,22 @@ class Parameters:
     Jt: float
     ft: float
     Cd: float
+    terms: tuple[tuple[str, float], ...] = ()
+
+    @classmethod
+    def of(cls, values: Mapping[str, float]) -> Parameters:
+        """Return the parameters whose names and values these are, the six and perhaps terms; KeyError for fewer."""
+        six = [float(values[name]) for name in PARAMETERS]
+        return cls(*six, terms=tuple((name, float(v)) for name, v in values.items() if name not in PARAMETERS))
+
+    def changed(self, **values: float) -> Parameters:
+        """Return the parameters with some values, of terms too, changed or added."""
+        return Parameters.of({**self.as_dict(), **dict(self.terms), **values})
 
     def as_dict(self) -> dict[str, float]:
-        """Return the parameters by symbol, in the order of ``PARAMETERS``."""
+        """Return the six by symbol, in the order of ``PARAMETERS``."""
         return {name: float(getattr(self, name)) for name in PARAMETERS}
+
+    def term(self, name: str, default: float = 0.0) -> float:
+        """Return the value of a term, ``default`` where it has not joined."""
+        return dict(self.terms).get(name, default)

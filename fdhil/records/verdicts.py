@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from fdhil.records.signals import Window
-from fdhil.records.values import PARAMETERS, Float, Parameters
+from fdhil.records.values import PARAMETERS, RATIOS, Float, Parameters
 
 
 class Result(Enum):
@@ -44,7 +44,8 @@ class Estimate:
     method is maximum likelihood. ``missing`` maps the names that are NaN to the reason. ``delay_s`` is the voltage
     delay that the data show, None when not estimated, and ``delay_std_s`` its standard deviation. ``systematic`` (k, q)
     is that part of the covariance, one standard deviation a column, which is the same in every window of a drive, None
-    when not told.
+    when not told. ``names`` are ``PARAMETERS``, then the terms that joined; what is ``given`` was not estimated: the
+    data sheet or the recording tells it.
     """
 
     method: str
@@ -57,6 +58,7 @@ class Estimate:
     delay_s: float | None = None
     delay_std_s: float | None = None
     systematic: Float | None = None
+    given: tuple[str, ...] = ()
 
     def value(self, name: str) -> float:
         """Return one parameter's value (NaN when the data cannot tell it)."""
@@ -68,17 +70,29 @@ class Estimate:
         return float(np.sqrt(self.covariance[k, k]))
 
     def parameters(self) -> Parameters:
-        """Return the six parameters; NaN stays NaN."""
-        return Parameters(*(self.value(name) for name in PARAMETERS))
+        """Return the six parameters and the terms that joined; NaN stays NaN."""
+        return Parameters.of({name: self.value(name) for name in (*PARAMETERS, *self.terms)})
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """The names of the terms that joined the six."""
+        return tuple(name for name in self.names if name not in PARAMETERS and name not in RATIOS)
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The validation's answer for one window or pool."""
+    """The validation's answer for one window or pool.
+
+    ``reasons`` refuse; ``warnings`` name what the model does not have, what that costs, and what to do.
+    ``unexplained_um`` is the RMS at the table, through the closed loop, of what is left unexplained of the rapid's
+    following error; None where the regulators are not known.
+    """
 
     accepted: bool
     fit_percent: float | None
     reasons: tuple[Reason, ...] = ()
+    unexplained_um: float | None = None
+    warnings: tuple[Reason, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +116,22 @@ class ParameterSet:
     tick: int
     temperature_c: float | None
     config_digest: str
+
+
+@dataclass(frozen=True, slots=True)
+class LoopEstimate:
+    """The drive's own loops as rapids show them: ``values`` (k,) and ``covariance`` (k, k) of ``names``.
+
+    ``names`` are keys of ``[axis.X.regulators]``, and ``structure`` is the one of the table that fits best. What the
+    loops leave of the following error is the ``unexplained_um`` of the verdict.
+    """
+
+    axis: str
+    structure: str
+    names: tuple[str, ...]
+    values: Float
+    covariance: Float
+    verdict: Verdict
 
 
 @dataclass(frozen=True, slots=True)

@@ -100,7 +100,7 @@ def _number(value: float | None) -> float:
 
 
 def _revision(row: Mapping[str, Any]) -> Revision:
-    parameters = Parameters(*(float(row[name]) for name in PARAMETERS))
+    parameters = Parameters.of({name: row[name] for name in PARAMETERS})
     covariance: Float = frozen(np.array(json.loads(row["covariance"]), dtype=np.float64))
     published = ParameterSet(
         row["axis"], row["revision"], parameters, covariance, row["windows"], row["tick"], row["temperature_c"],
@@ -111,7 +111,7 @@ def _revision(row: Mapping[str, Any]) -> Revision:
 
 def _comparison(row: Mapping[str, Any]) -> tuple[Stamp, Comparison]:
     used = {
-        axis: UsedParameters(int(u["revision"]), Parameters(*(float(u[name]) for name in PARAMETERS)))
+        axis: UsedParameters(int(u["revision"]), Parameters.of({name: u[name] for name in PARAMETERS}))
         for axis, u in json.loads(row["parameters"]).items()
     }
     zones = tuple(json.loads(row["zones"]))

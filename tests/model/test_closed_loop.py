@@ -9,7 +9,7 @@ import pytest
 
 from fdhil.config import parse
 from fdhil.model import closed_loop, loops
-from fdhil.records import Float, Parameters
+from fdhil.records import PARAMETERS, Float, Parameters
 from tests.bench import bench_config, bench_document
 from tests.model.slow_drive import SlowDrive
 from tests.paths import smooth
@@ -33,7 +33,7 @@ def test_agrees_with_independent_physics(seed: int) -> None:
     """Within 0.6 um of a drive that quantises (dry friction keeps what rounding left), 0.02 um of one that does not."""
     random = np.random.default_rng(100 + seed)
     scaled = [v * random.uniform(0.85, 1.15) for v in NOMINAL.as_dict().values()]
-    parameters = Parameters(*scaled)
+    parameters = Parameters.of(dict(zip(PARAMETERS, scaled, strict=True)))
     demand = random_demand(seed)
     response = closed_loop.simulate(parameters, AXIS, PERIOD, demand)
     assert response.limited_s == 0.0

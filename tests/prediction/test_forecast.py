@@ -21,7 +21,7 @@ STD = np.array([0.003 * value for value in NOMINAL.as_dict().values()])
 
 def published(axis: str, revision: int, **changed: float) -> ParameterSet:
     """A set with some values other than nominal, known to 0.3 %."""
-    values = replace(NOMINAL, **changed)
+    values = NOMINAL.changed(**changed)
     return ParameterSet(axis, revision, values, frozen(np.diag(STD**2)), 3, 0, None, "digest")
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -62,7 +60,7 @@ def test_drifts_change_the_path(
     """Figures 14 and 15: a drift on one axis alone moves the path, near E by little (friction) or much (inertia)."""
     reference = bench_trajectory(10)
     healthy = predict(reference, MODELS, CONFIG)
-    drifted = predict(reference, MODELS | {"X": replace(MODELS["X"], **drift)}, CONFIG)
+    drifted = predict(reference, MODELS | {"X": MODELS["X"].changed(**drift)}, CONFIG)
     moved = np.abs(healthy.predicted_mm["X"] - drifted.predicted_mm["X"]) * 1e3
     x, y = reference.position_mm["X"], reference.position_mm["Y"]
     near_e = np.hypot(x - 200, y - 55) < 5

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -233,7 +233,7 @@ def _predicted(loop: Loop) -> Section:
 def _drift(parameters: Parameters, change: Mapping[str, float]) -> Parameters:
     """Apply a drift of the paper: friction as its absolute value, inertia as a factor."""
     values = {name: value * parameters.Jt if name == "Jt" else value for name, value in change.items()}
-    return replace(parameters, **values)
+    return parameters.changed(**values)
 
 
 def _corrected(loop: Loop) -> Section:

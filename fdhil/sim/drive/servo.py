@@ -316,7 +316,7 @@ class Drive:
 
         TypeError for another name, ValueError for a value that no plant has.
         """
-        changed = replace(self._parameters, **values)
+        changed = self._parameters.changed(**values)
         for name, value in changed.as_dict().items():
             if not (math.isfinite(value) and value >= 0 and (value > 0 or name in ("ft", "Cd"))):
                 raise ValueError(f"{name} = {value} is no value of a feed drive; it must be finite and above 0")
