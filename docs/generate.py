@@ -36,7 +36,8 @@ EXAMPLES: Mapping[str, Any] = {  # of keys without a default: the bench machine
     "R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0,
     "position_gain_per_s": 50.0, "speed_kp": 23.562, "speed_ki": 1184.35, "current_limit_a": 200.0,
     "current_kp": 12.566, "current_ki": 1256.64, "voltage_limit_v": 300.0,
-    "node_id": 1, "speed_limit_mm_s": 500.0, "method": "maximum_likelihood", "tolerance_um": 2.0, "run_directory": "/run/fdhil",
+    "node_id": 1, "speed_limit_mm_s": 500.0, "method": "maximum_likelihood", "tolerance_um": 2.0,
+    "run_directory": "/run/fdhil",
     "guard.run_directory": "/run/fdhil-guard", "daemon_user": "fdhil",
     "commissioning_key": "/etc/fdhil/commissioning.key",
 }  # fmt: skip
