@@ -102,8 +102,8 @@ class Parameters:
     @classmethod
     def of(cls, values: Mapping[str, float]) -> Parameters:
         """Return the parameters whose names and values these are, the six and perhaps terms; KeyError for fewer."""
-        six = [float(values[name]) for name in PARAMETERS]
-        return cls(*six, terms=tuple((name, float(v)) for name, v in values.items() if name not in PARAMETERS))
+        R, L, K, Jt, ft, Cd = (float(values[name]) for name in PARAMETERS)
+        return cls(R, L, K, Jt, ft, Cd, tuple((n, float(v)) for n, v in values.items() if n not in PARAMETERS))
 
     def changed(self, **values: float) -> Parameters:
         """Return the parameters with some values, of terms too, changed or added."""
