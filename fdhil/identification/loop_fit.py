@@ -17,7 +17,7 @@ import numpy as np
 from fdhil.config import Axis
 from fdhil.identification.covariance import SUMMED_LAGS
 from fdhil.identification.loop_replay import Rapid, replay, with_regulators
-from fdhil.records import Float, Parameters, rms
+from fdhil.records import Float, Parameters
 
 DELAY = "current_delay_cycles"
 ROUNDS = 4
@@ -25,6 +25,7 @@ STEPS = 12
 CONVERGED = 1e-4  # of the squares' sum
 INERTIA_DOUBT = 0.03  # one standard deviation, relative: a sensor's gain moves K and Jt alike
 FRICTION_DOUBT = 0.3
+SYSTEMATIC = 0.005  # of a gain: what rounding of the demand and a start that is not quite at rest do to all rapids
 LEAST_POSITION_MM, LEAST_CURRENT_A = 1e-5, 1e-4
 
 
@@ -134,10 +135,7 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """The bottom that was found: coordinates, what is left (2, n) of each window, in mm and A, and its scale (2,).
-
-    ``cost`` is minus twice the logarithm of the likelihood at that scale, but for what all fits share.
-    """
+    """The bottom that was found: coordinates, what is left (2, n) of each window, in mm and A, and its scale (2,)."""
 
     problem: Problem
     coordinates: Float
@@ -147,12 +145,15 @@ class Fit:
     @property
     def unexplained_um(self) -> float:
         """RMS of what is left of the position."""
-        return rms(np.concatenate([r[0, one.known] for r, one in zip(self.left, self.problem.rapids, strict=True)])) * 1e3
+        return (
+            rms(np.concatenate([r[0, one.known] for r, one in zip(self.left, self.problem.rapids, strict=True)])) * 1e3
+        )
 
     @property
-    def rows(self) -> int:
-        """Number of rows that were compared."""
-        return int(sum(np.count_nonzero(one.known) for one in self.problem.rapids))
+    def values(self) -> dict[str, float]:
+        """The keys that moved, in their units."""
+        pairs = zip(self.problem.names, self.coordinates, strict=False)
+        return {name: KEYS[name].value(float(c)) for name, c in pairs}
 
     def axis(self) -> Axis:
         """Return the axis with the regulators found; a delay is whole only where it was not sought."""
@@ -171,10 +172,15 @@ def left_of(problem: Problem, coordinates: Float) -> tuple[tuple[Float, ...], li
     return tuple(m - a for m, a in zip(measured, answers, strict=True)), answers
 
 
-def scale_of(problem: Problem, left: Sequence[Float]) -> Float:
-    """Return the RMS (2,) of what is left."""
+def spread_of(problem: Problem, left: Sequence[Float]) -> Float:
+    """Return the RMS (2,) of what is left, in mm and A."""
     whole = np.concatenate([r[:, one.known] for r, one in zip(left, problem.rapids, strict=True)], axis=1)
-    return np.maximum(np.sqrt((whole**2).mean(axis=1)), (LEAST_POSITION_MM, LEAST_CURRENT_A))
+    return np.asarray(np.sqrt((whole**2).mean(axis=1)))
+
+
+def scale_of(problem: Problem, left: Sequence[Float]) -> Float:
+    """Return the scale (2,) at which what is left is weighed: its RMS, as far as that is not rounding."""
+    return np.maximum(spread_of(problem, left), (LEAST_POSITION_MM, LEAST_CURRENT_A))
 
 
 def fit(problem: Problem, start: Float | None = None, rounds: int = ROUNDS) -> Fit:
@@ -239,7 +245,8 @@ def normal(made: Fit) -> tuple[Float, Float, Float]:
     problem = made.problem
     size = problem.k + 1 + len(problem.rapids)
     information, score, meat = np.zeros((size, size)), np.zeros(size), np.zeros((size, size))
-    answers = [np.stack((r.position_mm, r.current_a)) - l for r, l in zip(problem.rapids, made.left, strict=True)]
+    pairs = zip(problem.rapids, made.left, strict=True)
+    answers = [np.stack((rapid.position_mm, rapid.current_a)) - left for rapid, left in pairs]
     for j, slope in enumerate(problem.slopes(made.coordinates, answers)):
         known = problem.rapids[j].known
         columns = np.array([*range(problem.k + 1), problem.k + 1 + j])
@@ -267,4 +274,5 @@ def covariance_of(made: Fit) -> Float:
     sandwich = inverse @ meat @ inverse
     k = made.problem.k
     wider = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(inverse), 1.0))
-    return np.asarray((inverse * np.outer(wider, wider))[:k, :k])
+    floor = np.diag([(SYSTEMATIC if KEYS[name].scale == 0.0 else 0.0) ** 2 for name in made.problem.names])
+    return np.asarray((inverse * np.outer(wider, wider))[:k, :k] + floor)
