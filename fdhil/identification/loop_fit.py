@@ -145,9 +145,7 @@ class Fit:
     @property
     def unexplained_um(self) -> float:
         """RMS of what is left of the position."""
-        return (
-            rms(np.concatenate([r[0, one.known] for r, one in zip(self.left, self.problem.rapids, strict=True)])) * 1e3
-        )
+        return float(spread_of(self.problem, self.left)[0]) * 1e3
 
     @property
     def values(self) -> dict[str, float]:
