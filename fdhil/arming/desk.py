@@ -15,6 +15,7 @@ from fdhil.arming.background_check import BackgroundCheck
 from fdhil.arming.checked_program import CheckedProgram
 from fdhil.arming.guard_link import GuardLink
 from fdhil.arming.knowledge import Knowledge
+from fdhil.arming.lessons import taught
 from fdhil.arming.passes import Passes
 from fdhil.arming.preparing import (
     Armament,
@@ -163,9 +164,12 @@ class ArmingDesk:
         checked = await self._checked(request, whole)
         if isinstance(checked, Refused):
             return _refused(checked)
-        armament = await asyncio.to_thread(prepare_armament, request, checked, self._config, self.knowledge.now())
+        if (broken := self._passes.broken(request.program_digest, request.models)) is not None:
+            return _refused(Refused((broken,)))
+        rows, pupil = await asyncio.to_thread(taught, checked, request, self._config)
+        armament = await asyncio.to_thread(prepare_armament, request, rows, self._config, self.knowledge.now())
         summary = armament.summary()
-        self._passes.begin(armament.begin.demand, armament.rows)
+        self._passes.begin(armament.begin.demand, armament.rows, request.models, pupil)
         answer = await self._hand_over(self.guard.arm, armament, summary, token)
         if not answer["ok"]:
             self._passes.forget()
