@@ -217,7 +217,7 @@ def cut(machine: Machine, reference: Trajectory, offset_um: Mapping[str, Array] 
 
 
 def contour(machine: Machine, model: Parameters) -> tuple[float, float, float, tuple[float, ...]]:
-    """Return RMS um at the table without and with the correction, the most that any point gets worse, what passes leave.
+    """Return RMS um at the table without and with the correction, the most that a point gets worse, what passes leave.
 
     In these the machine learns from what its motors' encoders measure.
     """
