@@ -13,7 +13,6 @@ from fdhil.arming.checked_program import Block, CheckedProgram
 from fdhil.arming.knowledge import AxisKnowledge
 from fdhil.arming.preparing import ArmRequest, Refused
 from fdhil.arming.program_check import encoded
-from fdhil.config import MachineConfig
 from fdhil.errors import StoreError
 from fdhil.prediction.gain import gain
 from fdhil.program import load_trajectory
@@ -22,13 +21,12 @@ from fdhil.records import Correction, Float, Reason, rms
 BLOCK_S = 2.0
 
 
-def plan_whole(
-    request: ArmRequest, config: MachineConfig, known: Mapping[str, AxisKnowledge]
-) -> CheckedProgram | Refused:
+def plan_whole(request: ArmRequest, known: Mapping[str, AxisKnowledge]) -> CheckedProgram | Refused:
     """Return the rows of the planned correction, or why there is none.
 
     ProgramError, RecordingError or ConfigError when the program cannot be used; StoreError when memory is short.
     """
+    config = request.config
     reference = load_trajectory(request.program, config)
     planned = correction.plan(reference, request.models, config, request.method)
     if planned.refused:
@@ -44,7 +42,7 @@ def plan_whole(
     for first in range(0, total, block_rows):
         end = min(total, first + block_rows)
         checked.take(Block(end, hashlib.sha256(rows[size * first : size * end]).hexdigest(), end == total), errors)
-    _conclude(checked, planned, request, config, known)
+    _conclude(checked, planned, request, known)
     return checked
 
 
@@ -52,12 +50,11 @@ def _conclude(
     checked: CheckedProgram,
     planned: Correction,
     request: ArmRequest,
-    config: MachineConfig,
     known: Mapping[str, AxisKnowledge],
 ) -> None:
     covariances = {axis: found.published.covariance for axis, found in known.items() if found.published is not None}
     skills = {axis: found.skills for axis, found in known.items()}
-    checked.half_um = gain(planned, request.models, config, covariances, skills).half_um
+    checked.half_um = gain(planned, request.models, request.config, covariances, skills).half_um
     checked.method, checked.warnings = planned.method, planned.warnings
     largest_um = max(float(np.abs(offset).max()) for offset in planned.offset_um.values())
     checked.conclude({**checked.errors, "largest_um": largest_um})
