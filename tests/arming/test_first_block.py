@@ -54,7 +54,7 @@ def cut(program: Path, piece: Piece, amperes: dict[str, float], config: MachineC
         drive.i = drive.speed_sum = amperes[axis]
         drive.current_sum = MODELS[axis].R * amperes[axis]
         offset_mm = np.array(piece.offset[axis]) / config.axis[axis].scaling.increments_per_mm
-        positions.append(drive.run(path + config.axis[axis].drive.sign * offset_mm))
+        positions.append(drive.run((path + config.axis[axis].drive.sign * offset_mm).tolist()))
     return contour_error_um(reference.path_mm, np.column_stack(positions), 0.001)
 
 
