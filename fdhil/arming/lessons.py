@@ -58,15 +58,16 @@ class Pupil:
         return lesson
 
 
-def taught(checked: CheckedProgram, request: ArmRequest, config: MachineConfig) -> tuple[CheckedProgram, Pupil | None]:
+def taught(checked: CheckedProgram, request: ArmRequest, machine: str) -> tuple[CheckedProgram, Pupil | None]:
     """Return the program with what was learned added, within the limits, and who learns from its pass.
 
-    StoreError when its rows cannot be read.
+    ``machine`` is the digest of the configuration that lessons are kept for. StoreError when rows cannot be read.
     """
+    config = request.config
     if not config.correction.learning or not checked.whole or checked.rows > MOST_ROWS:
         return checked, None
     demand_mm, offset_um = _rows(checked, config)
-    path = lesson_path(config.store.directory / "lessons", request.program_digest, config.digest)
+    path = lesson_path(config.store.directory / "lessons", request.program_digest, machine)
     known = read_lesson(path)
     if known is None or any(known.offset_um.get(axis, np.empty(0)).size != checked.rows for axis in demand_mm):
         known = Lesson(dict.fromkeys(demand_mm, np.zeros(checked.rows)))

@@ -13,7 +13,6 @@ from fdhil.arming.checked_program import Block, CheckedProgram
 from fdhil.arming.knowledge import AxisKnowledge
 from fdhil.arming.preparing import ArmRequest, Refused
 from fdhil.arming.program_check import encoded
-from fdhil.config import MachineConfig
 from fdhil.errors import StoreError
 from fdhil.prediction.gain import gain
 from fdhil.program import load_trajectory
@@ -22,13 +21,12 @@ from fdhil.records import Correction, Float, Reason, rms
 BLOCK_S = 2.0
 
 
-def plan_whole(
-    request: ArmRequest, config: MachineConfig, known: Mapping[str, AxisKnowledge]
-) -> CheckedProgram | Refused:
+def plan_whole(request: ArmRequest, known: Mapping[str, AxisKnowledge]) -> CheckedProgram | Refused:
     """Return the rows of the planned correction, or why there is none.
 
     ProgramError, RecordingError or ConfigError when the program cannot be used; StoreError when memory is short.
     """
+    config = request.config
     reference = load_trajectory(request.program, config)
     planned = correction.plan(reference, request.models, config, request.method)
     if planned.refused:
@@ -38,7 +36,7 @@ def plan_whole(
         return Refused((Reason("HarmPredicted", text, "use inverse or mirror; flatness is armed without a program"),))
     errors = {"before": _errors(planned.before.contour_um), "after": _errors(planned.after.contour_um)}
     checked = in_memory(encoded(reference.position_mm, planned.offset_um, config), config, errors)
-    _conclude(checked, planned, request, config, known)
+    _conclude(checked, planned, request, known)
     return checked
 
 
@@ -57,12 +55,11 @@ def _conclude(
     checked: CheckedProgram,
     planned: Correction,
     request: ArmRequest,
-    config: MachineConfig,
     known: Mapping[str, AxisKnowledge],
 ) -> None:
     covariances = {axis: found.published.covariance for axis, found in known.items() if found.published is not None}
     skills = {axis: found.skills for axis, found in known.items()}
-    checked.half_um = gain(planned, request.models, config, covariances, skills).half_um
+    checked.half_um = gain(planned, request.models, request.config, covariances, skills).half_um
     checked.method, checked.warnings = planned.method, planned.warnings
     largest_um = max(float(np.abs(offset).max()) for offset in planned.offset_um.values())
     checked.conclude({**checked.errors, "largest_um": largest_um})

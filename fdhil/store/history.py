@@ -187,7 +187,10 @@ class History:
 
     def add_comparison(self, found: Comparison, stamp: Stamp) -> int:
         """Store what was predicted of a program; the oldest beyond ``KEEP_COMPARISONS`` go."""
-        used = {axis: {"revision": u.revision, **u.parameters.as_dict()} for axis, u in found.used.items()}
+        used = {
+            axis: {"revision": u.revision, **u.parameters.as_dict(), **dict(u.parameters.terms)}
+            for axis, u in found.used.items()
+        }
         row = {
             "program": found.program,
             "name": found.name,
