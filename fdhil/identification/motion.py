@@ -37,6 +37,18 @@ class Noise:
 
 
 @dataclass(frozen=True, slots=True)
+class Course:
+    """What one unit of a term is over each interval of a window, ``values`` (n,), in which all is linear.
+
+    Its ``kind`` is the signal that it adds to, as :mod:`fdhil.identification.courses` has them.
+    """
+
+    name: str
+    kind: int
+    values: Float
+
+
+@dataclass(frozen=True, slots=True)
 class Motion:
     """One window on its grid: ``mode`` (n,) says what is known of the interval that begins at each row.
 
@@ -45,7 +57,8 @@ class Motion:
     are instants, ``observed`` (n,) marks the rows that were measured. ``speed_walk`` is the standard deviation of the
     speed's change over an interval of unknown friction. Where the voltage is ``slow``, ``voltage_mean`` (m,) are its
     samples, and ``slope_walk`` (n,) is the variance that the current's slope gains per second, (A/s)^2/s,
-    and ``shape_variance`` (m,), V^2, what the voltage's course within a row adds to its noise.
+    and ``shape_variance`` (m,), V^2, what the voltage's course within a row adds to its noise. ``courses`` are those of
+    the terms that joined, in the order of the last entries of theta.
     """
 
     dt_s: float
@@ -61,6 +74,7 @@ class Motion:
     slow: SlowVoltage | None = None
     slope_walk: Float = field(default_factory=lambda: np.zeros(0))
     shape_variance: Float = field(default_factory=lambda: np.zeros(0))
+    courses: tuple[Course, ...] = ()
 
     @property
     def n(self) -> int:
