@@ -7,14 +7,14 @@ voltage in which the innovations are linear, for a term that joined the six.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fdhil.identification.courses import FIRST_COURSE
 from fdhil.identification.identifiability import admissible
 from fdhil.identification.innovations import Gains, answers, gains_of, innovations, whiten
-from fdhil.identification.kalman import CD, DELAY, FT, LOAD, VOLTAGE, K
+from fdhil.identification.kalman import CD, DELAY, FT, LOAD, SPEED, VOLTAGE, K
 from fdhil.identification.motion import Course, Motion, Noise
 from fdhil.identification.noise import fit_noise
 from fdhil.identification.normal import inverse_of
@@ -150,17 +150,22 @@ def _answered(motion: Motion, theta: Float, noise: Noise, courses: Sequence[Cour
     if motion.slow is not None:
         variances = noise.vector() ** 2
         base = innovations_of(motion, theta, variances).whitened
-        loads = [innovations_of(motion, theta, variances, more_nm=course.values).whitened for course in courses]
-        return np.column_stack(loads) - base[:, None]
+        return np.column_stack([_slow_answered(motion, theta, variances, course) - base for course in courses])
     gains = gains_of(motion, theta, noise)
     changes = np.empty((2 * motion.n, len(courses)))
-    for kind in (LOAD, VOLTAGE):
+    for kind in (LOAD, VOLTAGE, SPEED):
         of_kind = [k for k, course in enumerate(courses) if course.kind == kind]
         if of_kind:
             values = np.stack([courses[k].values for k in of_kind])
             rises = np.zeros_like(values) if kind == VOLTAGE else None
             changes[:, of_kind] = answers(motion, theta, gains, kind, values, rises)
     return changes
+
+
+def _slow_answered(motion: Motion, theta: Float, variances: Float, course: Course) -> Float:
+    if course.kind == SPEED:
+        return innovations_of(replace(motion, speed=motion.speed + course.values), theta, variances).whitened
+    return innovations_of(motion, theta, variances, more_nm=course.values).whitened
 
 
 def typical(theta: Float, motions: Sequence[Motion]) -> Float:
@@ -218,9 +223,9 @@ def _slopes(problem: Problem, theta: Float, residuals: Float, free: Sequence[int
     return j, inverse_of(gram)[0], np.sqrt(np.diag(gram))
 
 
-def fit(motions: Sequence[Motion], start: Float, free: Sequence[int]) -> Fit:
-    """Alternate between the parameters and the noise levels, from ``start`` (k,)."""
-    theta, noises = start.copy(), [m.noise for m in motions]
+def fit(motions: Sequence[Motion], start: Float, free: Sequence[int], noises: Sequence[Noise] | None = None) -> Fit:
+    """Alternate between the parameters and the noise levels, from ``start`` (k,) and those that the signals show."""
+    theta, noises = start.copy(), [m.noise for m in motions] if noises is None else noises
     for turn in range(RENEWALS):
         problem = Problem(tuple(motions), tuple(noises), ())
         before = theta

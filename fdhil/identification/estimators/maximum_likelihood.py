@@ -23,9 +23,12 @@ from fdhil.identification.identifiability import admissible, judge
 from fdhil.identification.kalman import DELAY, JT, K, L, R
 from fdhil.identification.motion import UNKNOWN, Motion, prepare
 from fdhil.identification.normal import inverse_of, solve
+from fdhil.identification.selection import joined
+from fdhil.identification.signals import mended
 from fdhil.identification.slow_descent import Likelihood, likelier_delay
 from fdhil.identification.slow_start import slow_least_squares, slow_start, with_course
 from fdhil.identification.slow_voltage import in_order
+from fdhil.identification.term_estimates import told_terms
 from fdhil.records import PARAMETERS, Estimate, Float, Result, Window
 
 __all__ = ["Fit", "descend", "estimate", "fit", "fit_windows", "jacobian", "pose", "typical"]
@@ -53,6 +56,7 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
     A delay between voltage and the other signals is fitted too when the data surely show one, or when the voltage has
     a clock of its own.
     """
+    windows = [mended(w, settings.speed_source) for w in windows]
     slow = [w for w in windows if w.slow_voltage is not None]
     if slow:
         return _fit_slow(slow, settings)
@@ -63,10 +67,11 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
         return None
     motions = [prepare(w) for w in usable]
     delays = [coarse_delay(s, w.dt_s) for s, w in zip(signals, usable, strict=True)]
+    command = settings.voltage_source != "terminals"
     if any(w.voltage_delay_s is not None for w in usable):
-        return _fit_separate(motions, start, delays)
+        return joined(_fit_separate(motions, start, delays), command, _untold)
     start[DELAY] = float(np.median(delays))
-    return _fit_together(motions, start)
+    return _with_terms(_fit_together(motions, start), command, searched=start[DELAY] == 0.0)
 
 
 def _fit_together(motions: Sequence[Motion], start: Float) -> Fit:
@@ -75,15 +80,40 @@ def _fit_together(motions: Sequence[Motion], start: Float) -> Fit:
     Regulators act several times within a sample, which looks like a delay of a few per cent of it, but moves L
     otherwise. So a small delay is not taken out: what it would change is a doubt, and so it is about a larger one.
     """
-    least = LEAST_DELAY * min(m.dt_s for m in motions)
     if start[DELAY] == 0.0:
-        plain = fit(motions, start, range(6))
-        delay, std = delay_score(plain)
-        if abs(delay) < max(SURE * std, least):
-            beyond = np.sqrt(max(0.0, delay**2 - (CHANCE * std) ** 2))
-            return replace(plain, delay_doubt_s=float(beyond))
-        start = with_delay(plain.theta, delay)
-    return replace(fit(motions, start, range(7)), delay_doubt_s=least / 2)
+        return _delay_told(fit(motions, start, range(6)))
+    return replace(fit(motions, start, range(7)), delay_doubt_s=_least_delay_s(motions) / 2)
+
+
+def _least_delay_s(motions: Sequence[Motion]) -> float:
+    return LEAST_DELAY * min(m.dt_s for m in motions)
+
+
+def _delay_told(plain: Fit) -> Fit:
+    """Return a fit without delay with its doubt about one, or the fit with the delay that the data surely show."""
+    motions = plain.problem.motions
+    least = _least_delay_s(motions)
+    delay, std = delay_score(plain)
+    if abs(delay) < max(SURE * std, least):
+        beyond = np.sqrt(max(0.0, delay**2 - (CHANCE * std) ** 2))
+        return replace(plain, delay_doubt_s=float(beyond))
+    free = sorted({*plain.free, DELAY})
+    return replace(fit(motions, with_delay(plain.theta, delay), free), delay_doubt_s=least / 2)
+
+
+def _with_terms(base: Fit, command: bool, searched: bool) -> Fit:
+    """Return the fit with the terms that join it; a delay that was ``searched`` for is told anew, they look alike."""
+    result = joined(base, command, _untold)
+    if result is base or not searched:
+        return result
+    if DELAY in result.free:
+        motions, free = result.problem.motions, but_delay(result.free)
+        result = fit(motions, with_delay(result.theta, 0.0), free, result.problem.noises)
+    return _delay_told(result)
+
+
+def _untold(result: Fit) -> frozenset[str]:
+    return frozenset(finish(result).missing)
 
 
 def _fit_separate(motions: Sequence[Motion], start: Float, delays: Sequence[float]) -> Fit:
@@ -206,23 +236,31 @@ def robust_inverse(result: Fit, inverse: Float) -> Float:
 def finish(result: Fit) -> Estimate:
     """Return the fit as an estimate with its covariance."""
     inverse, condition = inverse_of(result.information)
-    k = len(PARAMETERS)
+    kept = [k for k, j in enumerate(result.free) if j != DELAY]
+    told = [j for j in result.free if j != DELAY]
     first = result.problem.motions[0]
-    alias = aliasing(first.voltage_sampling, first.voltage_period_s)
+    alias = np.zeros(len(told))
+    alias[: len(PARAMETERS)] = aliasing(first.voltage_sampling, first.voltage_period_s)
     systematic = doubts(result, inverse)
     held = robust_inverse(result, inverse)
     late = DELAY in result.free
+    at = result.free.index(DELAY) if late else 0
+    chance, beyond = (part[np.ix_(kept, kept)] for part in (inverse, held - inverse))
+    own = systematic[told]
+    values = result.theta[told]
     answer = Estimate(
         method=NAME,
         names=PARAMETERS,
-        values=result.theta[:k],
-        covariance=inverse[:k, :k] + systematic[:k] @ systematic[:k].T + np.diag(np.square(alias * result.theta[:k])),
+        values=values[: len(PARAMETERS)],
+        covariance=chance + own @ own.T + np.diag(np.square(alias * values)),
         residuals=result.by_equation(),
         result=Result.OK if result.converged else Result.DIVERGED,
         delay_s=float(result.theta[DELAY]) if late else None,
-        delay_std_s=float(np.sqrt(held[DELAY, DELAY] + systematic[DELAY] @ systematic[DELAY])) if late else None,
-        systematic=systematic[:k],
+        delay_std_s=float(np.sqrt(held[at, at] + systematic[DELAY] @ systematic[DELAY])) if late else None,
+        systematic=own,
     )
+    if first.courses or first.speed_late is not None:
+        answer, beyond = told_terms(answer, result, values, beyond)
     # what the data can tell is the information's to say; that residuals are coloured is no lack of excitation
     judged = judge(answer, condition, max(float(np.abs(m.speed).max()) for m in result.problem.motions))
-    return replace(judged, covariance=judged.covariance + (held - inverse)[:k, :k])
+    return replace(judged, covariance=judged.covariance + beyond)
