@@ -10,6 +10,7 @@ from fdhil.config import Identification
 from fdhil.identification.estimators import chosen, maximum_likelihood
 from fdhil.identification.identifiability import empty_estimate
 from fdhil.identification.ratios import estimate_ratios
+from fdhil.identification.signals import mended
 from fdhil.records import Estimate, Reason, Result, Verdict, Window, WindowOutcome
 from fdhil.validation import BEFORE_ANY_FIT, LEAST_ROWS, OF_THE_FIT, Evidence, Findings, ask
 
@@ -18,7 +19,14 @@ UNFIT = "NotFinite"
 
 
 def analyse(window: Window, settings: Identification) -> WindowOutcome:
-    """Return what one window says of the drive, and whether it is believed; never raises, whatever the data."""
+    """Return what one window says of the drive, and whether it is believed; never raises, whatever the data.
+
+    The speed is brought to the instants of its rows first; the outcome's window is as it was recorded.
+    """
+    return replace(_analysed(mended(window, settings.speed_source), settings), window=window)
+
+
+def _analysed(window: Window, settings: Identification) -> WindowOutcome:
     signals = Evidence(window, settings)
     found = ask(BEFORE_ANY_FIT, signals, {})
     reasons = _listed(found)

@@ -10,8 +10,8 @@ import numpy as np
 
 from fdhil.config import Identification
 from fdhil.identification.delay import coarse_delay
-from fdhil.identification.estimators import least_squares, maximum_likelihood
-from fdhil.identification.estimators.maximum_likelihood import Fit
+from fdhil.identification.estimators import least_squares
+from fdhil.identification.fit import Fit, but_delay, fit, with_delay
 from fdhil.identification.motion import Noise, noise_levels, resolution
 from fdhil.identification.windows import carried, moving_range, smooth
 from fdhil.records import Bool, Estimate, Float, Window
@@ -113,7 +113,8 @@ class Evidence:
         """The fit, without a delay of more than a sample: what else is wrong moves it too, and has its own name."""
         if not self.late_s:
             return self.judged
-        return maximum_likelihood.fit(self.judged.problem.motions, np.append(self.judged.theta[:6], 0.0), range(6))
+        judged = self.judged
+        return fit(judged.problem.motions, with_delay(judged.theta, 0.0), but_delay(judged.free))
 
     @cached_property
     def fit_percent(self) -> float | None:
