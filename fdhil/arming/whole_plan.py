@@ -13,6 +13,7 @@ from fdhil.arming.checked_program import Block, CheckedProgram
 from fdhil.arming.knowledge import AxisKnowledge
 from fdhil.arming.preparing import ArmRequest, Refused
 from fdhil.arming.program_check import encoded
+from fdhil.config import MachineConfig
 from fdhil.errors import StoreError
 from fdhil.prediction.gain import gain
 from fdhil.program import load_trajectory
