@@ -31,6 +31,11 @@ def voltage_v(motion: Motion, theta: Float) -> Float:
     return _added(motion.delayed(float(theta[DELAY])), motion, theta, VOLTAGE)
 
 
+def voltage_terms_v(motion: Motion, theta: Float) -> Float:
+    """Return what the terms add to the voltage (n,) over each interval."""
+    return _added(np.zeros(motion.n), motion, theta, VOLTAGE)
+
+
 def _added(values: Float, motion: Motion, theta: Float, kind: int) -> Float:
     for course, amplitude in zip(motion.courses, theta[FIRST_COURSE:], strict=False):
         if course.kind == kind:

@@ -223,9 +223,9 @@ def _slopes(problem: Problem, theta: Float, residuals: Float, free: Sequence[int
     return j, inverse_of(gram)[0], np.sqrt(np.diag(gram))
 
 
-def fit(motions: Sequence[Motion], start: Float, free: Sequence[int], noises: Sequence[Noise] | None = None) -> Fit:
-    """Alternate between the parameters and the noise levels, from ``start`` (k,) and those that the signals show."""
-    theta, noises = start.copy(), [m.noise for m in motions] if noises is None else noises
+def fit(motions: Sequence[Motion], start: Float, free: Sequence[int]) -> Fit:
+    """Alternate between the parameters and the noise levels, from ``start`` (k,)."""
+    theta, noises = start.copy(), [m.noise for m in motions]
     for turn in range(RENEWALS):
         problem = Problem(tuple(motions), tuple(noises), ())
         before = theta

@@ -69,7 +69,7 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
     delays = [coarse_delay(s, w.dt_s) for s, w in zip(signals, usable, strict=True)]
     command = settings.voltage_source != "terminals"
     if any(w.voltage_delay_s is not None for w in usable):
-        return joined(_fit_separate(motions, start, delays), command, _untold)
+        return joined(_fit_separate(motions, start, delays), command, finish)
     start[DELAY] = float(np.median(delays))
     return _with_terms(_fit_together(motions, start), command, searched=start[DELAY] == 0.0)
 
@@ -94,26 +94,27 @@ def _delay_told(plain: Fit) -> Fit:
     motions = plain.problem.motions
     least = _least_delay_s(motions)
     delay, std = delay_score(plain)
-    if abs(delay) < max(SURE * std, least):
-        beyond = np.sqrt(max(0.0, delay**2 - (CHANCE * std) ** 2))
-        return replace(plain, delay_doubt_s=float(beyond))
-    free = sorted({*plain.free, DELAY})
-    return replace(fit(motions, with_delay(plain.theta, delay), free), delay_doubt_s=least / 2)
+    if abs(delay) >= max(SURE * std, least):
+        free = sorted({*plain.free, DELAY})
+        late = replace(fit(motions, with_delay(plain.theta, delay), free), delay_doubt_s=least / 2)
+        if not motions[0].courses:
+            return late
+        told = finish(late)  # with as much colour as is left beside terms
+        if told.delay_s is None or told.delay_std_s is None or abs(told.delay_s) >= SURE * told.delay_std_s:
+            return late
+    beyond = np.sqrt(max(0.0, delay**2 - (CHANCE * std) ** 2))
+    return replace(plain, delay_doubt_s=float(beyond))
 
 
 def _with_terms(base: Fit, command: bool, searched: bool) -> Fit:
     """Return the fit with the terms that join it; a delay that was ``searched`` for is told anew, they look alike."""
-    result = joined(base, command, _untold)
+    result = joined(base, command, finish)
     if result is base or not searched:
         return result
     if DELAY in result.free:
         motions, free = result.problem.motions, but_delay(result.free)
-        result = fit(motions, with_delay(result.theta, 0.0), free, result.problem.noises)
+        result = fit(motions, with_delay(result.theta, 0.0), free)
     return _delay_told(result)
-
-
-def _untold(result: Fit) -> frozenset[str]:
-    return frozenset(finish(result).missing)
 
 
 def _fit_separate(motions: Sequence[Motion], start: Float, delays: Sequence[float]) -> Fit:
