@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdhil.config import Identification
+from fdhil.config import Axis, Identification
 from fdhil.identification.estimators import chosen, maximum_likelihood
 from fdhil.identification.identifiability import empty_estimate
-from fdhil.identification.ratios import estimate_ratios
+from fdhil.identification.without_voltage import told
 from fdhil.records import Estimate, Reason, Result, Verdict, Window, WindowOutcome
 from fdhil.validation import BEFORE_ANY_FIT, LEAST_ROWS, OF_THE_FIT, Evidence, Findings, ask
 
@@ -17,9 +17,12 @@ GAVE_UP = (np.linalg.LinAlgError, FloatingPointError, ZeroDivisionError, Overflo
 UNFIT = "NotFinite"
 
 
-def analyse(window: Window, settings: Identification) -> WindowOutcome:
-    """Return what one window says of the drive, and whether it is believed; never raises, whatever the data."""
-    signals = Evidence(window, settings)
+def analyse(window: Window, settings: Identification, axis: Axis | None = None) -> WindowOutcome:
+    """Return what one window says of the drive, and whether it is believed; never raises, whatever the data.
+
+    ``axis`` is the axis' section where it is known.
+    """
+    signals = Evidence(window, settings, axis=axis)
     found = ask(BEFORE_ANY_FIT, signals, {})
     reasons = _listed(found)
     if window.n < LEAST_ROWS or any(reason.code == UNFIT for reason in reasons):
@@ -38,11 +41,13 @@ def analyse(window: Window, settings: Identification) -> WindowOutcome:
 def estimated(signals: Evidence) -> Evidence:
     """Return the evidence with the estimate by the method asked for, and the fit that is judged.
 
-    Current and speed alone tell Jt/K, ft/K and Cd/K: without a voltage there is no fit.
+    Without a voltage [2] alone is fitted, with the torque constant of the recording or of the axis: there is no fit
+    of both equations.
     """
-    window, settings = signals.window, signals.settings
+    window, settings, axis = signals.window, signals.settings, signals.axis
     if window.voltage_v is None and window.slow_voltage is None:
-        return replace(signals, estimate=estimate_ratios([window], settings))
+        known = {} if axis is None else {"R": axis.nominal.R, "L": axis.nominal.L, "K": axis.nominal.K}
+        return replace(signals, estimate=told([window], signals.torque, known))
     name, estimator = chosen(settings)
     fit = maximum_likelihood.fit_windows([window], settings)
     if name == maximum_likelihood.NAME and fit is not None:

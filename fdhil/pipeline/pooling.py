@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from fdhil.config import Identification
 from fdhil.identification.estimators import chosen
 from fdhil.identification.identifiability import unphysical, untold
 from fdhil.identification.pooling import weighted
+from fdhil.identification.without_voltage import pooled
 from fdhil.pipeline.analysis import GAVE_UP, gave_up
-from fdhil.records import Estimate, Reason, Verdict, WindowOutcome
+from fdhil.records import Estimate, Reason, Verdict, Window, WindowOutcome
 from fdhil.validation.agreement import moved
 
 
@@ -32,12 +34,22 @@ def pool(
     if len(accepted) == 1 and accepted[0].estimate is not None:
         return accepted[0].estimate, Verdict(True, accepted[0].verdict.fit_percent)
     told = [(o.window, o.estimate) for o in accepted if o.estimate is not None]
+    deaf = not any(w.voltage_v is not None or w.slow_voltage is not None for w, _ in told)
     try:
-        estimate = None if refit else weighted(told)
+        estimate = pooled(told, settings) if deaf else None if refit else weighted(told)
         if estimate is None:
             estimate = chosen(settings)[1]([o.window for o in accepted], settings)
     except GAVE_UP as error:
         return None, Verdict(False, None, (gave_up(error, "look at the windows"),))
     slow = any(o.window.slow_voltage is not None for o in accepted)
-    reasons = untold(estimate, slow=slow) + unphysical(estimate) + moved(told)
+    reasons = untold(estimate, slow=slow or deaf) + unphysical(estimate) + _moved(told, deaf)
     return estimate, Verdict(not reasons, min(fits, default=None), tuple(reasons))
+
+
+def _moved(told: Sequence[tuple[Window, Estimate]], deaf: bool) -> list[Reason]:
+    """Return what differs between windows; without a voltage a constant load makes friction differ by direction."""
+    if not deaf:
+        return moved(told)
+    six = [(w, replace(e, values=e.values[:6], covariance=e.covariance[:6, :6])) for w, e in told]
+    ways = ([pair for pair in six if pair[0].direction == side] for side in (1, -1))
+    return [reason for way in ways if len(way) > 1 for reason in moved(way)]

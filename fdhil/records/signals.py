@@ -115,7 +115,8 @@ class Window:
     value at t_k; ``voltage_delay_s`` (what is left after alignment by counters, None when not known) has not been
     taken out. ``slow_voltage`` stands in its place where a sensor samples more slowly than the drive.
     ``start_s`` is the time of row 0 in its recording or since the first tick. ``offset_mm`` is the position
-    offset in force, None where it was 0 throughout or is not known. Two windows are equal when they are the same one.
+    offset in force, None where it was 0 throughout or is not known. ``torque_constant_nm_per_a`` is the K that the
+    recording itself tells. Two windows are equal when they are the same one.
     """
 
     axis: str
@@ -138,6 +139,7 @@ class Window:
     source: str = ""
     offset_mm: Float | None = None
     slow_voltage: SlowVoltage | None = None
+    torque_constant_nm_per_a: float | None = None
 
     @property
     def n(self) -> int:
@@ -172,3 +174,4 @@ class Recording:
     voltage_delay_s: float | None = None
     offset_mm: Float | None = None
     source: str = ""
+    torque_constant_nm_per_a: float | None = None

@@ -8,12 +8,14 @@ from functools import cached_property
 
 import numpy as np
 
-from fdhil.config import Identification
+from fdhil.config import Axis, Identification
 from fdhil.identification.delay import coarse_delay
 from fdhil.identification.estimators import least_squares, maximum_likelihood
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.motion import Noise, noise_levels, resolution
 from fdhil.identification.windows import carried, moving_range, smooth
+from fdhil.identification.without_voltage import TorqueFit
+from fdhil.identification.without_voltage import fit as fit_torque
 from fdhil.records import Bool, Estimate, Float, Window
 from fdhil.validation.backlash import DeadBand, backlash
 from fdhil.validation.sensor_reconstruction import Bridge
@@ -47,12 +49,16 @@ def signals_of(window: Window) -> tuple[Signal, ...]:
 
 @dataclass(frozen=True)
 class Evidence:
-    """A window before any fit, or with its ``estimate`` and the ``fit`` of the same method (None: there is none)."""
+    """A window before any fit, or with its ``estimate`` and the ``fit`` of the same method (None: there is none).
+
+    ``axis`` is the axis' section where it is known. Without a voltage the fit is ``torque``, of [2] alone.
+    """
 
     window: Window
     settings: Identification
     estimate: Estimate | None = None
     fit: Fit | None = None
+    axis: Axis | None = None
 
     @cached_property
     def signals(self) -> Sequence[Signal]:
@@ -86,6 +92,11 @@ class Evidence:
     def play(self) -> DeadBand | None:
         """The backlash that the window shows."""
         return backlash(self.window)
+
+    @cached_property
+    def torque(self) -> TorqueFit | None:
+        """The fit of [2] alone; None where hardly any row surely moves."""
+        return fit_torque([self.window], self.settings)
 
     @property
     def judged(self) -> Fit:
