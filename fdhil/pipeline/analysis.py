@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from fdhil.config import Axis, Identification
+from fdhil.identification import without_voltage
 from fdhil.identification.estimators import chosen, maximum_likelihood
 from fdhil.identification.identifiability import empty_estimate
-from fdhil.identification.ratios import estimate_ratios
 from fdhil.identification.signals import mended
 from fdhil.records import Estimate, Reason, Result, Verdict, Window, WindowOutcome
 from fdhil.validation import BEFORE_ANY_FIT, LEAST_ROWS, OF_THE_FIT, WEIGHED, Evidence, Findings, ask
@@ -63,11 +63,13 @@ def own(window: Window, axis: Axis | None) -> Axis | None:
 def estimated(signals: Evidence) -> Evidence:
     """Return the evidence with the estimate by the method asked for, and the fit that is judged.
 
-    Current and speed alone tell Jt/K, ft/K and Cd/K: without a voltage there is no fit.
+    Without a voltage [2] alone is fitted, with the torque constant of the recording or of the axis: there is no fit
+    of both equations.
     """
-    window, settings = signals.window, signals.settings
+    window, settings, axis = signals.window, signals.settings, signals.axis
     if window.voltage_v is None and window.slow_voltage is None:
-        return replace(signals, estimate=estimate_ratios([window], settings))
+        known = {} if axis is None else {"R": axis.nominal.R, "L": axis.nominal.L, "K": axis.nominal.K}
+        return replace(signals, estimate=without_voltage.told([window], signals.torque, known))
     name, estimator = chosen(settings)
     fit = maximum_likelihood.fit_windows([window], settings)
     if name == maximum_likelihood.NAME and fit is not None:

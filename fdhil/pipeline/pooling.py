@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 from fdhil.config import Identification
+from fdhil.identification import without_voltage
 from fdhil.identification.between import ALIKE, Between, Member, between
 from fdhil.identification.estimators import chosen
 from fdhil.identification.identifiability import unphysical, untold
@@ -65,13 +66,27 @@ def together(
     reasons = list(one_sided(outcomes))
     estimate: Estimate | None = told[0][1]
     if len(told) > 1:
+        deaf = not any(window.voltage_v is not None or window.slow_voltage is not None for window, _ in told)
         try:
-            estimate = _estimated(told, members, between(history), settings, refit=refit)
+            estimate = (
+                without_voltage.pooled(told, settings)
+                if deaf
+                else _estimated(told, members, between(history), settings, refit=refit)
+            )
         except GAVE_UP as error:
             return None, Verdict(False, None, (gave_up(error, "look at the windows"),))
         slow = any(window.slow_voltage is not None for window, _ in told)
-        reasons += untold(estimate, slow=slow) + unphysical(estimate) + moved(told)
+        reasons += untold(estimate, slow=slow or deaf) + unphysical(estimate) + _moved(told, deaf)
     return estimate, _verdict([o.verdict for o in accepted], reasons)
+
+
+def _moved(told: Told, deaf: bool) -> list[Reason]:
+    """Return what differs between windows; without a voltage a constant load makes friction differ by direction."""
+    if not deaf:
+        return moved(told)
+    six = [(w, replace(e, values=e.values[:6], covariance=e.covariance[:6, :6])) for w, e in told]
+    ways = ([pair for pair in six if pair[0].direction == side] for side in (1, -1))
+    return [reason for way in ways if len(way) > 1 for reason in moved(way)]
 
 
 def _estimated(

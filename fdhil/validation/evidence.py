@@ -15,6 +15,8 @@ from fdhil.identification.estimators import least_squares
 from fdhil.identification.fit import Fit, but_delay, fit, with_delay
 from fdhil.identification.motion import Noise, noise_levels, resolution
 from fdhil.identification.windows import carried, moving_range, smooth
+from fdhil.identification.without_voltage import TorqueFit
+from fdhil.identification.without_voltage import fit as fit_torque
 from fdhil.records import PARAMETERS, Bool, Estimate, Float, Parameters, Reason, Window, rms
 from fdhil.validation.backlash import DeadBand, backlash
 from fdhil.validation.selection import Lacking, lacking
@@ -55,6 +57,7 @@ class Evidence:
     """A window before any fit, or with its ``estimate`` and the ``fit`` of the same method (None: there is none).
 
     ``axis`` is the axis' section where it is known, and ``sync_period_s`` that of its set-points (None: a row's).
+    Without a voltage the fit is ``torque``, of [2] alone.
     """
 
     window: Window
@@ -164,6 +167,11 @@ class Evidence:
         if self.weight is None:
             return reason
         return replace(reason, text=f"{reason.text}; at the table {self.weight.told(self.cost_um(lack))}")
+
+    @cached_property
+    def torque(self) -> TorqueFit | None:
+        """The fit of [2] alone; None where hardly any row surely moves."""
+        return fit_torque([self.window], self.settings)
 
     @property
     def judged(self) -> Fit:
