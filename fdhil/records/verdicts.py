@@ -106,7 +106,10 @@ class WindowOutcome:
 
 @dataclass(frozen=True, slots=True)
 class ParameterSet:
-    """A published revision of one axis' parameters: pooled from ``windows`` accepted windows."""
+    """A published revision of one axis' parameters: pooled from ``windows`` accepted windows.
+
+    ``window_ticks`` are where they start, where that is known. ``unexplained_um`` and ``warnings`` are the verdict's.
+    """
 
     axis: str
     revision: int
@@ -116,6 +119,9 @@ class ParameterSet:
     tick: int
     temperature_c: float | None
     config_digest: str
+    window_ticks: tuple[int, ...] = ()
+    unexplained_um: float | None = None
+    warnings: tuple[Reason, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
