@@ -14,23 +14,18 @@ from typing import Literal
 import numpy as np
 
 from fdhil.config import Axis, Identification
+from fdhil.config.controller import TOLERANCE_SHARE
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.windows import carried
 from fdhil.records import PARAMETERS, Bool, Float, Parameters, Reason, Window, rms
 from fdhil.validation.replay import Replay, replay_window
 from fdhil.validation.table_error import TableError
 
-TOLERANCE_SHARE = 0.05  # of the following error: on two machines with 90 real effects it parts what gains from what not
 NEXT_SPEED = 0.3  # of the rapid speed: that of a program that is cut
 SCATTER = 3.0  # deviations by which the power of noise may lie above what is expected
 BEGINNING_S = 0.060  # before the drive surely moves
 SMOOTHING_S = 0.002  # of the current, whose noise would push a shaft at rest
 NOISE_ROWS = 25.0e-3  # s: over which noise behind a position loop hangs together
-
-
-def tolerance_um(settings: Identification, following_um: float) -> float:
-    """Return the RMS at the table that a model may leave of a rapid with this following error."""
-    return settings.tolerance_um or TOLERANCE_SHARE * following_um
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,9 +170,9 @@ def weigh(
     left = _beyond_noise(left, loop, parameters, move, noise)
     told = _replayed(window, parameters, axis, sync_period_s)
     if told is None:
-        limit = tolerance_um(settings, whole) if axis is not None else TOLERANCE_SHARE * whole
+        limit = settings.tolerance_for(whole) if axis is not None else TOLERANCE_SHARE * whole
         return Weight(left, limit, whole, left, "own loop" if axis is not None else "ordinary loop")
-    return Weight(told.unexplained_um, tolerance_um(settings, told.measured_um), told.measured_um, left, "replay")
+    return Weight(told.unexplained_um, settings.tolerance_for(told.measured_um), told.measured_um, left, "replay")
 
 
 def _runs(parameters: Parameters) -> bool:

@@ -1,0 +1,55 @@
+"""Seeks a drive's own loops where the configured ones do not explain its rapids, for the analysis to go on with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from fdhil.config import Axis, Identification
+from fdhil.identification.loops import better_loops, identify_loops, with_loops
+from fdhil.pipeline.analysis import own
+from fdhil.records import LoopEstimate, Parameters, WindowOutcome
+
+# of a motor whose data sheet is not known: fast enough to be no part of what is sought
+UNKNOWN_R, UNKNOWN_L = 1.0, 5e-3
+
+
+def loops_of(
+    outcomes: Sequence[WindowOutcome],
+    axis: Axis | None,
+    settings: Identification,
+    sync_period_s: float | None = None,
+) -> LoopEstimate | None:
+    """Return the loops of a drive as the windows show them that were analysed; None where they show none.
+
+    What the axis' section or a window's own estimate does not tell of the winding is made up: the current loop hides
+    it. Windows that are believed go before the others, and a section that is another machine's is none.
+    """
+    axis = own(outcomes[0].window, axis) if outcomes else None
+    told = [(o, mechanics_of(o, axis)) for o in outcomes]
+    known = [(o, plant) for o, plant in told if plant is not None]
+    believed = [(o, plant) for o, plant in known if o.verdict.accepted]
+    chosen = believed or known
+    return identify_loops([o.window for o, _ in chosen], [p for _, p in chosen], axis, settings, sync_period_s)
+
+
+def mechanics_of(outcome: WindowOutcome, axis: Axis | None) -> Parameters | None:
+    """Return the parameters of a window's estimate, its winding filled up; None where K, Jt, ft or Cd is not told."""
+    if outcome.estimate is None:
+        return None
+    found = outcome.estimate.parameters()
+    values = found.as_dict()
+    winding = {"R": UNKNOWN_R, "L": UNKNOWN_L} if axis is None else {"R": axis.nominal.R, "L": axis.nominal.L}
+    filled = {name: winding.get(name, value) if value != value else value for name, value in values.items()}
+    if any(value != value for value in filled.values()) or filled["Jt"] <= 0.0 or filled["K"] <= 0.0:
+        return None
+    return found.changed(**filled)
+
+
+def suspected(outcomes: Sequence[WindowOutcome]) -> bool:
+    """Return whether some window is refused though its rapid was replayed: perhaps through loops that are not its."""
+    return any(not o.verdict.accepted and o.verdict.unexplained_um is not None for o in outcomes)
+
+
+def better_axis(axis: Axis | None, found: LoopEstimate | None) -> Axis | None:
+    """Return the axis with the loops that were found, where they explain what the configured ones do not; else None."""
+    return with_loops(axis, found) if axis is not None and found is not None and better_loops(found) else None
