@@ -108,7 +108,7 @@ def robust(information: Float, scores: Sequence[Float], rows: Sequence[tuple[Flo
         foretold += _coloured(slopes @ root, _spectrum(innovations, quick_size(2 * len(slopes))))
     share = SUMMED_LAGS / sum(len(own) for own in scores)
     power *= (1.0 + 2.9694 / 1.96 * min(share, 1.0)) ** 2
-    sandwich: Float = root @ _larger(foretold, _larger(power, np.eye(len(power)))) @ root.T
+    sandwich: Float = root @ larger(foretold, larger(power, np.eye(len(power)))) @ root.T
     return sandwich
 
 
@@ -144,7 +144,7 @@ def _coloured(slopes: Float, spectrum: Float) -> Float:
     return variance
 
 
-def _larger(one: Float, other: Float) -> Float:
+def larger(one: Float, other: Float) -> Float:
     """Return the variance that is, in every direction, the larger of ``one`` and ``other`` (positive), both (k, k)."""
     lower = np.linalg.cholesky(other)
     inverse = np.linalg.inv(lower)

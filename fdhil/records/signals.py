@@ -116,7 +116,8 @@ class Window:
     taken out. ``slow_voltage`` stands in its place where a sensor samples more slowly than the drive.
     ``speed_late_s`` is how late the recorded speed was, which has been taken out (None: nothing was), with its standard
     deviation. ``start_s`` is the time of row 0 in its recording or since the first tick. ``offset_mm`` is the position
-    offset in force, None where it was 0 throughout or is not known. Two windows are equal when they are the same one.
+    offset in force, None where it was 0 throughout or is not known. ``torque_constant_nm_per_a`` is the K that the
+    recording itself tells. Two windows are equal when they are the same one.
     """
 
     axis: str
@@ -141,6 +142,7 @@ class Window:
     slow_voltage: SlowVoltage | None = None
     speed_late_s: float | None = None
     speed_late_std_s: float = 0.0
+    torque_constant_nm_per_a: float | None = None
 
     @property
     def n(self) -> int:
@@ -175,3 +177,4 @@ class Recording:
     voltage_delay_s: float | None = None
     offset_mm: Float | None = None
     source: str = ""
+    torque_constant_nm_per_a: float | None = None
