@@ -8,7 +8,7 @@ through an ordinary loop, and weighed against what all torque of the move makes 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -137,25 +137,23 @@ class Move:
         """Return the momentum (n,) of all torque that the model has."""
         return self.integral(self.friction) + p.Jt * self.turned(self.speed)
 
+    def slower(self, p: Parameters, share: float) -> Move:
+        """Return the move at a share of its speed, by the same model: what is cut."""
+        speed = share * self.speed
+        friction = p.Cd * self.side + p.ft * speed
+        current = (p.Jt * np.gradient(speed, self.dt_s) + friction) / p.K
+        return replace(self, speed=speed, friction=friction, current=np.where(self.side != 0, current, self.current))
+
     def of_shift(self, p: Parameters, shift: Float) -> Float:
-        """Return the momentum (2, 2 n) that parameters off by ``shift`` (6,) make: on this rapid, and on what is cut.
-
-        Of the second the speed is lower, and it comes back at once: dry and viscous friction no longer hide each other.
-        """
+        """Return the momentum (n,) that parameters off by ``shift`` (6,) make."""
         _, _, of_k, of_jt, of_ft, of_cd = shift
-        made = []
-        for share in (1.0, NEXT_SPEED):
-            speed = share * self.speed
-            current = self.current + (share - 1.0) * (self.integral_free(p) / p.K)
-            torque = of_ft * speed + of_cd * self.side - of_k * current
-            there = self.integral(torque) + of_jt * self.turned(speed)
-            made.append(np.concatenate([there, there[-1] - there]))
-        return np.array(made)
+        torque = of_ft * self.speed + of_cd * self.side - of_k * self.current
+        return self.integral(torque) + of_jt * self.turned(self.speed)
 
-    def integral_free(self, p: Parameters) -> Float:
-        """Return the torque (n,) of the model that goes with the speed: inertia and viscous friction."""
-        torque: Float = p.Jt * np.gradient(self.speed, self.dt_s) + p.ft * self.speed
-        return torque
+
+def to_and_fro(momentum: Float) -> Float:
+    """Return the momentum (2 n,) of a move and its way back at once: dry and viscous friction do not hide each other."""
+    return np.concatenate([momentum, momentum[-1] - momentum])
 
 
 def weigh(
