@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from fdhil.config import Axis, Identification
+from fdhil.identification import without_voltage
 from fdhil.identification.estimators import chosen, maximum_likelihood
 from fdhil.identification.identifiability import empty_estimate
-from fdhil.identification.ratios import estimate_ratios
+from fdhil.identification.signals import mended
 from fdhil.records import Estimate, Reason, Result, Verdict, Window, WindowOutcome
 from fdhil.validation import BEFORE_ANY_FIT, LEAST_ROWS, OF_THE_FIT, WEIGHED, Evidence, Findings, ask
 
@@ -24,10 +25,18 @@ def analyse(
 ) -> WindowOutcome:
     """Return what one window says of the drive, and whether it is believed; never raises, whatever the data.
 
-    With the ``axis``' section the rapid is replayed through the closed loop, whose set-points come every
-    ``sync_period_s`` (left out: with every row).
+    The speed is brought to the instants of its rows first; the outcome's window is as it was recorded. With the
+    ``axis``' section the rapid is replayed through the closed loop, whose set-points come every ``sync_period_s``
+    (left out: with every row).
     """
-    signals = Evidence(window, settings, axis=own(window, axis), sync_period_s=sync_period_s)
+    signals = Evidence(
+        mended(window, settings.speed_source), settings, axis=own(window, axis), sync_period_s=sync_period_s
+    )
+    return replace(_analysed(signals), window=window)
+
+
+def _analysed(signals: Evidence) -> WindowOutcome:
+    window, settings = signals.window, signals.settings
     found = ask(BEFORE_ANY_FIT, signals, {})
     reasons = _listed(found)
     if window.n < LEAST_ROWS or any(reason.code == UNFIT for reason in reasons):
@@ -54,11 +63,13 @@ def own(window: Window, axis: Axis | None) -> Axis | None:
 def estimated(signals: Evidence) -> Evidence:
     """Return the evidence with the estimate by the method asked for, and the fit that is judged.
 
-    Current and speed alone tell Jt/K, ft/K and Cd/K: without a voltage there is no fit.
+    Without a voltage [2] alone is fitted, with the torque constant of the recording or of the axis: there is no fit
+    of both equations.
     """
-    window, settings = signals.window, signals.settings
+    window, settings, axis = signals.window, signals.settings, signals.axis
     if window.voltage_v is None and window.slow_voltage is None:
-        return replace(signals, estimate=estimate_ratios([window], settings))
+        known = {} if axis is None else {"R": axis.nominal.R, "L": axis.nominal.L, "K": axis.nominal.K}
+        return replace(signals, estimate=without_voltage.told([window], signals.torque, known))
     name, estimator = chosen(settings)
     fit = maximum_likelihood.fit_windows([window], settings)
     if name == maximum_likelihood.NAME and fit is not None:

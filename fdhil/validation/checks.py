@@ -19,6 +19,7 @@ from fdhil.validation.slow_timing import current_late
 from fdhil.validation.stuck import clipped_peaks, stuck_values
 from fdhil.validation.timing import timing_faults, voltage_late
 from fdhil.validation.whiteness import excess_noise, whiteness
+from fdhil.validation.without_voltage import load_comes_and_goes, torque_late, torque_unexplained
 
 Findings = dict[str, list[Reason]]
 """What each check that was asked found, in the order of the table."""
@@ -70,8 +71,14 @@ def _play(evidence: Evidence) -> Iterator[Reason]:
         yield evidence.play.reason()
 
 
+def _without_voltage(evidence: Evidence) -> bool:
+    return not _has_voltage(evidence)
+
+
 def _no_voltage(evidence: Evidence) -> Iterator[Reason]:
-    if not _has_voltage(evidence):
+    """Yield a reason where a sensor should have told the voltage: what it tells of K is no data sheet's to replace."""
+    sensed = evidence.axis is not None and evidence.axis.voltage.separate
+    if sensed and not _has_voltage(evidence) and evidence.window.torque_constant_nm_per_a is None:
         yield Reason("SampleTiming", "the window has no voltage", "connect the voltage sensor")
 
 
@@ -79,7 +86,7 @@ def _estimate_faults(evidence: Evidence) -> Iterator[Reason]:
     """Yield why the estimate tells no drive: values left open, a fit that does not converge, unphysical values."""
     estimate, fit = evidence.estimate, evidence.fit
     assert estimate is not None
-    missing = untold(estimate, slow=evidence.window.slow_voltage is not None)
+    missing = untold(estimate, slow=evidence.window.slow_voltage is not None or not _has_voltage(evidence))
     yield from missing
     open_end = bool(estimate.missing) and not missing and fit is not None and not fit.converged
     if open_end or estimate.result is Result.DIVERGED:
@@ -154,7 +161,10 @@ BEFORE_ANY_FIT: Sequence[Check] = (
 OF_THE_FIT: Sequence[Check] = (
     Check("stuck", stuck_values),
     Check("cut off", clipped_peaks, _fitted),
-    Check("estimate", _estimate_faults, _has_voltage),
+    Check("estimate", _estimate_faults),
+    Check("late torque", torque_late, _without_voltage, ("estimate",)),
+    Check("load", load_comes_and_goes, _without_voltage, ("estimate", "late torque")),
+    Check("torque", torque_unexplained, _without_voltage, ("estimate", "late torque", "load")),
     Check("fit", _no_fit, _has_voltage, ("estimate",)),
     Check("late voltage", _electrically_late, _fitted),
     Check("late current", _current_late, _sound, ("late voltage",)),

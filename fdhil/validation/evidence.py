@@ -11,10 +11,12 @@ import numpy as np
 
 from fdhil.config import Axis, Identification
 from fdhil.identification.delay import coarse_delay
-from fdhil.identification.estimators import least_squares, maximum_likelihood
-from fdhil.identification.estimators.maximum_likelihood import Fit
+from fdhil.identification.estimators import least_squares
+from fdhil.identification.fit import Fit, but_delay, fit, with_delay
 from fdhil.identification.motion import Noise, noise_levels, resolution
 from fdhil.identification.windows import carried, moving_range, smooth
+from fdhil.identification.without_voltage import TorqueFit
+from fdhil.identification.without_voltage import fit as fit_torque
 from fdhil.records import PARAMETERS, Bool, Estimate, Float, Parameters, Reason, Window, rms
 from fdhil.validation.backlash import DeadBand, backlash
 from fdhil.validation.selection import Lacking, lacking
@@ -56,6 +58,7 @@ class Evidence:
     """A window before any fit, or with its ``estimate`` and the ``fit`` of the same method (None: there is none).
 
     ``axis`` is the axis' section where it is known, and ``sync_period_s`` that of its set-points (None: a row's).
+    Without a voltage the fit is ``torque``, of [2] alone.
     """
 
     window: Window
@@ -180,6 +183,11 @@ class Evidence:
             return reason
         return replace(reason, text=f"{reason.text}; at the table {self.weight.told(self.cost_um(lack))}")
 
+    @cached_property
+    def torque(self) -> TorqueFit | None:
+        """The fit of [2] alone; None where hardly any row surely moves."""
+        return fit_torque([self.window], self.settings)
+
     @property
     def judged(self) -> Fit:
         """The fit; only for checks that need one."""
@@ -206,7 +214,8 @@ class Evidence:
         """The fit, without a delay of more than a sample: what else is wrong moves it too, and has its own name."""
         if not self.late_s:
             return self.judged
-        return maximum_likelihood.fit(self.judged.problem.motions, np.append(self.judged.theta[:6], 0.0), range(6))
+        judged = self.judged
+        return fit(judged.problem.motions, with_delay(judged.theta, 0.0), but_delay(judged.free))
 
     @cached_property
     def fit_percent(self) -> float | None:
