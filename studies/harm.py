@@ -1,11 +1,9 @@
-"""Tells whether a model that was believed does harm: a parameter beyond its interval, or a path beyond the tolerance."""
+"""Tells whether a believed model does harm: a parameter beyond its interval, or a path beyond the tolerance."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-
-import numpy as np
 
 from fdhil.config import Axis, Identification
 from fdhil.config.axis import Nominal

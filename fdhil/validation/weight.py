@@ -148,11 +148,12 @@ class Move:
         """Return the momentum (n,) that parameters off by ``shift`` (6,) make."""
         _, _, of_k, of_jt, of_ft, of_cd = shift
         torque = of_ft * self.speed + of_cd * self.side - of_k * self.current
-        return self.integral(torque) + of_jt * self.turned(self.speed)
+        made: Float = self.integral(torque) + of_jt * self.turned(self.speed)
+        return made
 
 
 def to_and_fro(momentum: Float) -> Float:
-    """Return the momentum (2 n,) of a move and its way back at once: dry and viscous friction do not hide each other."""
+    """Return the momentum (2 n,) of a move and its way back at once, where dry and viscous friction differ."""
     return np.concatenate([momentum, momentum[-1] - momentum])
 
 
