@@ -13,12 +13,12 @@ from typing import Any
 
 from fdhil.cli.compiling import forewarn
 from fdhil.cli.failing import error_document
-from fdhil.config import Identification
+from fdhil.config import Axis, Identification
 from fdhil.errors import FdhilError
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
-from fdhil.records import Estimate, Reason, Verdict, Window, WindowOutcome
-from fdhil.store.recording_csv import read_recording
+from fdhil.records import Estimate, Reason, Recording, Verdict, Window, WindowOutcome
+from fdhil.store.recording_csv import SOURCES, read_recording
 
 MANY_FILES = 16  # from here on further processes pay for their start
 MANY_WINDOWS = 48
@@ -45,20 +45,21 @@ def unseen(share: float) -> None:
 def analyse_files(
     paths: Sequence[Path],
     settings: Identification,
-    rapid_speeds_rad_s: dict[str, float],
+    axes: Mapping[str, Axis],
     progress: Progress = unseen,
 ) -> Iterator[FileResult]:
     """Yield the result of each recording in order, also of those that cannot be read.
 
-    ``rapid_speeds_rad_s`` maps an axis to the machine's rapid speed, for recordings that do not say theirs.
-    ``progress`` is told the share of a file that each step was: a window of it, or the whole.
+    ``axes`` are the sections of the axes that are known: their rapid speed is that of recordings that do not say
+    theirs, and their nominal values tell what a recording without voltage cannot. ``progress`` is told the share of a
+    file that each step was: a window of it, or the whole.
     """
     if len(paths) < MANY_FILES or _cores() < 2:
         for path in paths:
-            yield analyse_file(path, settings, rapid_speeds_rad_s, progress)
+            yield analyse_file(path, settings, axes, progress)
         return
     forewarn("identify")
-    work = partial(analyse_file, settings=settings, rapid_speeds_rad_s=rapid_speeds_rad_s)
+    work = partial(analyse_file, settings=settings, axes=axes)
     with _processes() as executor:
         for result in executor.map(work, paths, chunksize=CHUNK):
             progress(1.0)
@@ -66,7 +67,7 @@ def analyse_files(
 
 
 def analyse_file(
-    path: Path, settings: Identification, rapid_speeds_rad_s: dict[str, float], progress: Progress = unseen
+    path: Path, settings: Identification, axes: Mapping[str, Axis], progress: Progress = unseen
 ) -> FileResult:
     """Return the windows of one recording analysed, and their pool, or why it cannot be read."""
     try:
@@ -78,8 +79,10 @@ def analyse_file(
     if multiprocessing.parent_process() is None:
         forewarn("identify")
     outcomes = []
-    windows = find_windows(recording, rapid_speeds_rad_s.get(recording.axis))
-    for outcome in _outcomes(windows, settings):
+    axis = axes.get(recording.axis)
+    settings = told_by(recording, settings)
+    windows = find_windows(recording, None if axis is None else axis.rapid_speed_rad_s)
+    for outcome in _outcomes(windows, settings, axis):
         outcomes.append(outcome)
         progress(1.0 / (len(windows) + 1))
     estimate, verdict = pool(outcomes, settings)
@@ -87,8 +90,14 @@ def analyse_file(
     return FileResult(str(path), recording.axis, tuple(outcomes), estimate, verdict)
 
 
-def _outcomes(windows: Sequence[Window], settings: Identification) -> Iterator[WindowOutcome]:
-    work = partial(analyse, settings=settings)
+def told_by(recording: Recording, settings: Identification) -> Identification:
+    """Return the settings with what a recording itself says of where its speed and its voltage come from."""
+    told = {key: recording.headers[key] for key in SOURCES if key in recording.headers}
+    return settings.model_copy(update=told) if told else settings
+
+
+def _outcomes(windows: Sequence[Window], settings: Identification, axis: Axis | None) -> Iterator[WindowOutcome]:
+    work = partial(analyse, settings=settings, axis=axis)
     if len(windows) < MANY_WINDOWS or _cores() < 2 or multiprocessing.parent_process() is not None:
         yield from map(work, windows)
         return

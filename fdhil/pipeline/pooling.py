@@ -6,7 +6,10 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from fdhil.config import Identification
+from fdhil.identification import without_voltage
 from fdhil.identification.between import ALIKE, Between, Member, between
 from fdhil.identification.estimators import chosen
 from fdhil.identification.identifiability import unphysical, untold
@@ -80,20 +83,22 @@ def together(
 def _estimated(
     told: Told, members: Sequence[Member], apart: Between, settings: Identification, *, refit: bool
 ) -> Estimate:
-    """Return the estimate: of the samples once more where the windows are alike, else the mixed model's.
-
-    Without a voltage there is no more in the samples than in the windows' estimates.
-    """
+    """Return the estimate: of the samples once more where the windows are alike, else the mixed model's."""
     first = told[0][1]
-    hearing = all(window.voltage_v is not None or window.slow_voltage is not None for window, _ in told)
     quick = pooled(members, first, apart)
     whole = all(set(PARAMETERS) <= set(m.names) for m in members)
-    if not hearing or quick.terms or apart.surely or (whole and not refit):
+    if any(window.voltage_v is not None or window.slow_voltage is not None for window, _ in told):
+        if quick.terms or apart.surely or (whole and not refit):
+            return quick
+        again = chosen(settings)[1]([window for window, _ in told], settings)
+    elif apart.surely or not refit:
         return quick
-    again = chosen(settings)[1]([window for window, _ in told], settings)
-    if not whole or again.names != quick.names:
+    else:
+        again = without_voltage.pooled(told, settings)
+    alike = pooled(members, first, ALIKE)
+    if not again.names == alike.names == quick.names:
         return again
-    wider = quick.covariance - pooled(members, first, ALIKE, joining=False).covariance
+    wider = np.nan_to_num(quick.covariance - alike.covariance)  # nothing where a slow voltage leaves R or L open
     return replace(again, covariance=frozen(again.covariance + wider))
 
 

@@ -129,7 +129,8 @@ class LoopEstimate:
     """The drive's own loops as rapids show them: ``values`` (k,) and ``covariance`` (k, k) of ``names``.
 
     ``names`` are keys of ``[axis.X.regulators]``, and ``structure`` is the one of the table that fits best. What the
-    loops leave of the following error is the ``unexplained_um`` of the verdict.
+    loops leave of the following error is the ``unexplained_um`` of the verdict; ``configured_um`` is what the
+    configured ones leave, None where there are none.
     """
 
     axis: str
@@ -138,6 +139,7 @@ class LoopEstimate:
     values: Float
     covariance: Float
     verdict: Verdict
+    configured_um: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

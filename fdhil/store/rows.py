@@ -131,7 +131,7 @@ def _revision(row: Mapping[str, Any]) -> Revision:
 
 def _comparison(row: Mapping[str, Any]) -> tuple[Stamp, Comparison]:
     used = {
-        axis: UsedParameters(int(u["revision"]), Parameters.of({k: v for k, v in u.items() if k != "revision"}))
+        axis: UsedParameters(int(u["revision"]), Parameters.of({n: v for n, v in u.items() if n != "revision"}))
         for axis, u in json.loads(row["parameters"]).items()
     }
     zones = tuple(json.loads(row["zones"]))
