@@ -302,7 +302,7 @@ def feeder_of(checked: CheckedProgram, mill: Mill, folder: Path) -> tuple[Stream
     link.look()
     stream = RowStream(checked, "digest", 0.001)
     armed = Armament("long.ngc", stream, Piece(0, {}, {}, False), {}, 29.0)
-    return StreamFeeder(armed, link), link
+    return StreamFeeder(armed, link, Standstill(mill.config)), link
 
 
 def test_what_is_refused_before_it_begins_is_disarmed(config: MachineConfig, mill: Mill, tmp_path: Path) -> None:
