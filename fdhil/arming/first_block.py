@@ -3,7 +3,8 @@
 A check of a program knows nothing of the current at which an axis will stand when it starts: that is somewhere in the
 band of its dry friction, wherever the last move has left it, and up to the first corner it is most of the error that
 the check's own rows leave. Once the axes stand at the start it is heard on the bus. The rows that are found from it go
-over into the checked ones, and take their place only where the model says that they are better.
+over into the checked ones, and take their place only where the model says that they are better. Until the axes stand
+there, what the way to the start will leave is expected.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from fdhil.correction.limits import check
 from fdhil.model import closed_loop, kernels
 from fdhil.model.closed_loop import State
 from fdhil.prediction.contour import contour_error_um
-from fdhil.prediction.model_terms import band
+from fdhil.prediction.model_terms import Band, band
 from fdhil.records import Float, Parameters, rms
 
 ALONE_S, JOINED_S = 0.9, 1.4  # from where on rows go over into the checked ones, and where they are those
@@ -83,14 +84,32 @@ class FirstBlock:
         self.begin = self.begin._replace(offset={axis: offset[axis] + behind[axis] for axis in axes})
         return Piece(0, {axis: values[:rows] for axis, values in self.begin.demand.items()}, offset, self.begin.final)
 
+    def expect(self, rest: Mapping[str, AtRest]) -> Piece | None:
+        """Return rows for a machine that is taken to the start from where its axes ``rest``, as :meth:`renew` does.
+
+        Each axis that has a way to go will stop with its regulators' integral at the edge of the dry friction's band,
+        on the side of its last motion: creeping to its target it has nothing else to push against.
+        """
+        return self.renew({axis: self._arrived(axis, there) for axis, there in rest.items() if axis in self._walks})
+
+    def _arrived(self, axis: str, rest: AtRest) -> AtRest:
+        if self._stands(axis, rest):
+            return rest
+        start_mm = float(self._path[axis][0])
+        held, model = self._band(axis, start_mm), self._models[axis]
+        torque_nm = held.high if start_mm > rest.demand_mm else held.low
+        return AtRest(start_mm, start_mm, torque_nm / model.K)
+
+    def _band(self, axis: str, position_mm: float) -> Band:
+        return band(self._models[axis], position_mm * 2 * np.pi / self._config.axis[axis].screw_pitch_mm)
+
     def _stands(self, axis: str, rest: AtRest | None) -> bool:
         room_mm = AT_START_INCREMENTS / self._config.axis[axis].scaling.increments_per_mm
         return rest is not None and abs(rest.demand_mm - self._path[axis][0]) <= room_mm
 
     def _differs(self, axis: str, rest: AtRest) -> bool:
-        model = self._models[axis]
-        held = band(model, rest.position_mm * 2 * np.pi / self._config.axis[axis].screw_pitch_mm)
-        return abs(rest.current_a - self._used_a[axis]) * model.K > CHANGED_SHARE * 0.5 * (held.high - held.low)
+        held, change_a = self._band(axis, rest.position_mm), rest.current_a - self._used_a[axis]
+        return abs(change_a) * self._models[axis].K > CHANGED_SHARE * 0.5 * (held.high - held.low)
 
     def _solved(self, name: str, rest: AtRest) -> _Found:
         """Find the offsets of one axis' first rows."""

@@ -188,7 +188,7 @@ def prepare_armament(
     begin, first = stream.take(FIRST_S), None
     if checked.method == "inverse":
         first = FirstBlock(begin, request.program, request.models, request.config)
-        first.renew(rest or {})
+        first.expect(rest or {})
         begin = first.begin
     return Armament(str(request.program), stream, begin, facts, gain_um, half_um, first)
 

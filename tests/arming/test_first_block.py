@@ -91,6 +91,17 @@ def test_rows_that_are_right_already_stay(tmp_path: Path) -> None:
     assert first.renew(resting({"X": 0.0, "Y": 0.0})) is not None  # it has moved since
 
 
+def test_what_the_way_to_the_start_leaves_is_expected(tmp_path: Path) -> None:
+    """X comes from the positive side, Y stands there: independent drives that do so are corrected from their start."""
+    program, begin = checked(tmp_path, LONG, MODELS, CONFIG)
+    first = FirstBlock(begin, program, MODELS, CONFIG)
+    assert first.expect({"X": AtRest(250.0, 250.0, 3.0), "Y": AtRest(0.0, 0.0, 5.0)}) is not None
+    amperes = {"X": -6.0, "Y": 5.0}
+    before, after = (cut(program, piece, amperes, CONFIG) for piece in (begin, first.begin))
+    assert rms(after[:600]) < 0.3 * rms(before[:600])
+    assert first.renew(resting(amperes)) is None  # as it was expected
+
+
 @pytest.mark.parametrize("rest", [{}, {"X": AtRest(0, 0, 3)}, {"X": AtRest(0, 0, 3), "Y": AtRest(5, 5, 3)}])
 def test_an_axis_that_does_not_stand_at_the_start_leaves_the_rows(rest: dict[str, AtRest], tmp_path: Path) -> None:
     """What it holds when the program starts is not known yet."""
