@@ -70,11 +70,12 @@ def measure() -> dict[str, float]:
     plant = plant_step(model, axis.screw_pitch_mm, axis.regulators.current_period_s)
     gains, n = loop_gains(axis, 0.001), reference.size
     whole = leap(plant, gains[kernels.CURRENT_KP], gains[kernels.CURRENT_KI], N_CURRENT)
-    empty = np.empty(0)
+    empty, one_mass = np.empty(0), np.empty((0, 5, 8))
     shape = (kernels.CASCADE, kernels.POSITION_INTEGRAL, N_SPEED, N_CURRENT, 0, 0)
 
     def numba(leaps: Float = whole) -> Float:
-        return kernels.run(reference, empty, empty, 0, n, plant, leaps, gains, shape, np.zeros(kernels.STATES))
+        state = np.zeros(kernels.STATES)
+        return kernels.run(reference, empty, empty, 0, n, plant, leaps, one_mass, gains, empty, shape, state)
 
     with tempfile.TemporaryDirectory() as folder:
         library = compiled(Path(folder))

@@ -41,7 +41,7 @@ _TERMS: Mapping[str, str] = {
     r"dead_time": "V",
     r"speed_delay": "s",
     r"resonance": "Hz",
-    r"resonance_damping": "1",
+    r"resonance_(damping|share)": "1",
 }
 
 
