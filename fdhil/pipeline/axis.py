@@ -16,7 +16,7 @@ from fdhil.identification.between import HISTORY, Member
 from fdhil.identification.drift import LEAST_JUMP, DriftTracker, Point
 from fdhil.identification.pooling import member
 from fdhil.identification.windows import find_windows
-from fdhil.pipeline.analysis import analyse
+from fdhil.pipeline.own_loops import OwnLoops
 from fdhil.pipeline.pooling import one_sided, refuses_the_model, together
 from fdhil.pipeline.recent_samples import RecentSamples
 from fdhil.prediction import skill
@@ -119,6 +119,8 @@ class AxisPipeline:
         self._tracker.resume(known.first, known.points)
         self._history: deque[Member] = deque(_since_jump(known), maxlen=HISTORY)
         self._with_skill = with_skill
+        # else the axis' section is made up
+        self._loops = OwnLoops(config.axis[axis] if with_skill else None, self._settings, self._period_s)
         self._gain_suspected = False
         self._place = self._history[-1].place if self._history else 0
         self._withheld = ""
@@ -196,9 +198,9 @@ class AxisPipeline:
         return [w for w in find_windows(recording) if rapid.start <= w.start_tick + w.n // 2 <= end]
 
     def _analyse(self, window: Window) -> list[Outcome]:
-        outcome = analyse(window, self._settings)
+        outcome, loops = self._loops.analyse(window)
         before = self._published
-        outcomes: list[Outcome] = [outcome]
+        outcomes: list[Outcome] = [outcome] if loops is None else [outcome, loops]
         if refuses_the_model(outcome):
             self._refused[window.direction] = outcome
         # a correction needs all six: what a slow voltage leaves open keeps the older set in use
@@ -281,7 +283,7 @@ class AxisPipeline:
         """Compare the move with what the set that was valid before it predicts; None where that cannot be done."""
         if published is None or not self._with_skill:
             return None
-        axis = self._config.axis[self.axis]
+        axis = self._loops.axis or self._config.axis[self.axis]
         signals = (window.demand_mm, window.position_mm)
         try:
             return skill(

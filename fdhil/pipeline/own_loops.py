@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 
 from fdhil.config import Axis, Identification
 from fdhil.identification.loops import better_loops, identify_loops, with_loops
-from fdhil.pipeline.analysis import own
-from fdhil.records import LoopEstimate, Parameters, WindowOutcome
+from fdhil.pipeline.analysis import analyse, own
+from fdhil.records import LoopEstimate, Parameters, Window, WindowOutcome
 
+ENOUGH = 4  # windows, both directions twice
+KEPT = 6
 # of a motor whose data sheet is not known: fast enough to be no part of what is sought
 UNKNOWN_R, UNKNOWN_L = 1.0, 5e-3
 
@@ -53,3 +56,41 @@ def suspected(outcomes: Sequence[WindowOutcome]) -> bool:
 def better_axis(axis: Axis | None, found: LoopEstimate | None) -> Axis | None:
     """Return the axis with the loops that were found, where they explain what the configured ones do not; else None."""
     return with_loops(axis, found) if axis is not None and found is not None and better_loops(found) else None
+
+
+class OwnLoops:
+    """An axis' own loops as its rapids come one by one: each is analysed through the best that are known.
+
+    They are sought once after the first ``ENOUGH`` rapids, so that they are told, and where a rapid is refused that was
+    replayed: at once, and each time after twice as many refused rapids as before, since it takes long.
+    """
+
+    def __init__(self, axis: Axis | None, settings: Identification, sync_period_s: float) -> None:
+        """``axis`` is the machine's section, None where none is known: then no loops are sought."""
+        self._configured = axis
+        self._settings = settings
+        self._period_s = sync_period_s
+        self._outcomes: deque[WindowOutcome] = deque(maxlen=KEPT)
+        self._seen = self._refused = 0
+        self._due = 1
+        self.axis = axis
+
+    def analyse(self, window: Window) -> tuple[WindowOutcome, LoopEstimate | None]:
+        """Return what a window says of the drive, and its loops where they were sought again."""
+        outcome = analyse(window, self._settings, self.axis, self._period_s)
+        if self._configured is None:
+            return outcome, None
+        self._outcomes.append(outcome)
+        self._seen += 1
+        self._refused += suspected([outcome])
+        wanted = self._refused >= self._due
+        if wanted:
+            self._refused, self._due = 0, 2 * self._due
+        elif self._seen != ENOUGH:
+            return outcome, None
+        found = loops_of(tuple(self._outcomes), self._configured, self._settings, self._period_s)
+        better = better_axis(self._configured, found)
+        if better is not None:
+            self.axis = better
+            outcome = analyse(window, self._settings, better, self._period_s) if wanted else outcome
+        return outcome, found
