@@ -29,6 +29,11 @@ SMOOTHING_S = 0.002  # of the current, whose noise would push a shaft at rest
 NOISE_ROWS = 25.0e-3  # s: over which noise behind a position loop hangs together
 
 
+def tolerance_um(settings: Identification, following_um: float) -> float:
+    """Return the RMS at the table that a model may leave of a rapid with this following error."""
+    return settings.tolerance_for(following_um)
+
+
 @dataclass(frozen=True, slots=True)
 class Weight:
     """What a model leaves of a rapid at the table, RMS um, and how much it may: ``limit_um`` of ``whole_um``.
@@ -175,9 +180,9 @@ def weigh(
     left = _beyond_noise(left, loop, parameters, move, noise)
     told = _replayed(window, parameters, axis, sync_period_s)
     if told is None:
-        limit = settings.tolerance_for(whole) if axis is not None else TOLERANCE_SHARE * whole
+        limit = tolerance_um(settings, whole) if axis is not None else TOLERANCE_SHARE * whole
         return Weight(left, limit, whole, left, "own loop" if axis is not None else "ordinary loop")
-    return Weight(told.unexplained_um, settings.tolerance_for(told.measured_um), told.measured_um, left, "replay")
+    return Weight(told.unexplained_um, tolerance_um(settings, told.measured_um), told.measured_um, left, "replay")
 
 
 def _runs(parameters: Parameters) -> bool:
