@@ -118,7 +118,7 @@ def _analyse(paths: Sequence[Path], settings: Identification, axes: Mapping[str,
 
 
 def _file_document(result: FileResult, axes: Mapping[str, Axis], with_loops: bool) -> dict[str, Any]:
-    from fdhil.cli.loops_view import loops_document
+    from fdhil.cli.loops_view import compared
 
     document = {
         "file": result.file,
@@ -133,7 +133,7 @@ def _file_document(result: FileResult, axes: Mapping[str, Axis], with_loops: boo
         },
     }
     if with_loops or result.loops is not None:
-        document["loops"] = loops_document(result.loops, axes.get(result.axis or ""))
+        document["loops"] = compared(result.loops, axes.get(result.axis or ""))
     return document if result.error is None else document | {"error": result.error}
 
 

@@ -36,24 +36,29 @@ def with_all_loops(
     return [r if r.loops else replace(r, loops=loops_of(r.outcomes, axes.get(r.axis or ""), settings)) for r in results]
 
 
-def loops_document(found: LoopEstimate | None, axis: Axis | None) -> dict[str, Any] | None:
-    """Return the loops as JSON has them; None where the recording shows none."""
+def compared(found: LoopEstimate | None, axis: Axis | None) -> dict[str, Any] | None:
+    """Return the loops as JSON has them, beside the configured ones; None where the recording shows none."""
+    from fdhil.daemon.outcome_json import loops_document
+
     if found is None:
         return None
     regulators = None if axis is None else axis.regulators
+    document = loops_document(found)
+    gains = document["gains"].items()
     return {
         "structure": found.structure,
         "configured_structure": None if regulators is None else regulators.structure,
-        "gains": {
-            name: {"value": value, "std": std, "unit": UNITS[name], "configured": _configured(regulators, name)}
-            for name, value, std in _each(found)
-        },
-        "validated": found.verdict.accepted,
-        "unexplained_um": found.verdict.unexplained_um,
-        "configured_um": found.configured_um,
-        "reasons": [str(reason) for reason in found.verdict.reasons],
-        "warnings": [str(warning) for warning in found.verdict.warnings],
+        "gains": {n: {**told, "unit": UNITS[n], "configured": _configured(regulators, n)} for n, told in gains},
+        **{key: document[key] for key in ("validated", "unexplained_um", "configured_um", "reasons", "warnings")},
     }
+
+
+def loops_line(told: Mapping[str, Any]) -> str:
+    """Return what the status tells of an axis' loops, for people; nothing where they are as configured."""
+    if told["validated"] and not told["warnings"]:
+        return ""
+    gains = ", ".join(f"{name} {figures['value']:.4g}" for name, figures in told["gains"].items())
+    return f"loops {told['structure']}, {gains}; {'; '.join((*told['reasons'], *told['warnings']))}"
 
 
 def _each(found: LoopEstimate) -> list[tuple[str, float, float]]:
