@@ -63,14 +63,18 @@ def identify_loops(
     pairs = [
         (w, own) for w, own in zip(windows, mechanics, strict=True) if np.isfinite([*own.as_dict().values()]).all()
     ]
-    told = [rapid for w, own in pairs if (rapid := rapid_of(w, own, sync_period_s)) is not None]
-    rapids = tuple(told[-MOST_WINDOWS:])
-    if not rapids:
+    told = [(rapid, own) for w, own in pairs if (rapid := rapid_of(w, own, sync_period_s)) is not None][-MOST_WINDOWS:]
+    if not told:
         return None
+    rapids = tuple(rapid for rapid, _ in told)
     following = rms(np.concatenate([one.lag_mm[one.known] for one in rapids])) * 1e3
     tolerance = settings.tolerance_for(following)
     problem = _problem(rapids, axis, windows[0])
-    found = _whole_delay(_best(problem, tolerance, axis is not None))
+    found = _best(problem, tolerance, axis is not None)
+    # where the model has all that is there, it is better without what noise makes of the rest
+    modelled = tuple(replace(rapid, plant=own, load_nm=np.zeros_like(rapid.load_nm)) for rapid, own in told)
+    plain = loop_fit.fit(replace(found.problem, rapids=modelled), found.coordinates)
+    found = _whole_delay(min(found, plain, key=lambda fit: fit.deviance))
     configured = None if axis is None else _left_um(problem)
     verdict = _verdict(found, tolerance, following, configured)
     return _told(windows[0].axis, found, verdict, configured)
