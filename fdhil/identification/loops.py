@@ -25,7 +25,7 @@ from fdhil.records import INTERVAL_95, LoopEstimate, Parameters, Reason, Verdict
 
 WORTH, WORTH_LEFT = 0.1, 0.25  # of the tolerance, or of what is left: what a key must explain to join
 LEAST_UM = 0.05
-WELL = 0.25  # of the tolerance: with less left no other structure is tried
+WELL, NOTHING_UM = 0.25, 0.5  # of the tolerance, and in um: with less left nothing is missing
 MOST_WINDOWS = 6
 DIFFER = "LoopsDiffer"
 LOOSE = 0.25  # relative standard deviation above which a gain is not known
@@ -72,14 +72,27 @@ def identify_loops(
     following = rms(np.concatenate([one.lag_mm[one.known] for one in rapids])) * 1e3
     tolerance = settings.tolerance_for(following)
     problem = _problem(rapids, axis, windows[0])
-    found = _best(problem, tolerance, axis is not None)
     # where the model has all that is there, it is better without what noise makes of the rest
     modelled = tuple(replace(rapid, plant=own, load_nm=np.zeros_like(rapid.load_nm)) for rapid, own in told)
-    plain = loop_fit.fit(replace(found.problem, rapids=modelled), found.coordinates)
-    found = _whole_delay(min(found, plain, key=lambda fit: fit.deviance))
-    configured = None if axis is None else _left_um(problem)
+    configured = None if axis is None else min(_left_um(replace(problem, rapids=r)) for r in (rapids, modelled))
+    if configured is not None and configured < enough_um(tolerance):
+        found = min((loop_fit.fit(replace(problem, rapids=r)) for r in (rapids, modelled)), key=lambda f: f.deviance)
+    else:
+        found = _of_either(problem, modelled, tolerance, axis is not None)
+    found = _whole_delay(found)
     verdict = _verdict(found, tolerance, following, configured)
     return _told(windows[0].axis, found, verdict, configured)
+
+
+def _of_either(problem: Problem, modelled: tuple[Rapid, ...], tolerance_um: float, configured: bool) -> Fit:
+    """Return the best fit with what the model lacks as a load, or without: sought again where the other is better."""
+    begun = [loop_fit.fit(replace(problem, rapids=rapids)) for rapids in (problem.rapids, modelled)]
+    begun.sort(key=lambda fit: fit.deviance)
+    found = _best(begun[0].problem, tolerance_um, configured)
+    other = loop_fit.fit(replace(found.problem, rapids=begun[1].problem.rapids), found.coordinates)
+    if found.deviance <= other.deviance:
+        return found
+    return _best(replace(other.problem, axis=other.axis()), tolerance_um, configured)
 
 
 def _left_um(problem: Problem) -> float:
@@ -108,8 +121,8 @@ def _best(problem: Problem, tolerance_um: float, configured: bool) -> Fit:
     best = _grown(loop_fit.fit(problem), tolerance_um)
     if configured and best.unexplained_um > tolerance_um:  # the configuration may have led astray
         best = min(best, _grown(loop_fit.fit(begun_anew(problem)), tolerance_um), key=lambda f: f.unexplained_um)
-    if best.problem.names == CASCADE and best.unexplained_um < WELL * tolerance_um:
-        return best  # nothing is missing
+    if best.problem.names == CASCADE and best.unexplained_um < enough_um(tolerance_um):
+        return best
     other = _other_structure(best)
     if other is not None:
         rival = _grown(loop_fit.fit(other), tolerance_um)
@@ -120,7 +133,7 @@ def _best(problem: Problem, tolerance_um: float, configured: bool) -> Fit:
 
 def _grown(made: Fit, tolerance_um: float) -> Fit:
     """Let keys join, the best of all first, as long as it is worth it; two at once where that is worth more."""
-    while True:
+    while made.unexplained_um > enough_um(tolerance_um):
         best = made
         for options in (SINGLE_KEYS, FILTERS):
             free = [option for option in options if not {*option} & {*made.problem.names}]
@@ -128,8 +141,14 @@ def _grown(made: Fit, tolerance_um: float) -> Fit:
             if best.unexplained_um - grown.unexplained_um > worth_um(best, tolerance_um):
                 best = grown
         if best is made:
-            return made
+            break
         made = best
+    return made
+
+
+def enough_um(tolerance_um: float) -> float:
+    """Return how little may be left for nothing to be missing."""
+    return min(NOTHING_UM, WELL * tolerance_um)
 
 
 def worth_um(made: Fit, tolerance_um: float) -> float:
