@@ -541,7 +541,7 @@ def run(
     leap: Float,
     masses: Float,
     gains: Float,
-    terms: Float,
+    terms: Float | None,
     shape: tuple[int, int, int, int, int, int],
     state: Float,
 ) -> Float:
@@ -549,7 +549,7 @@ def run(
 
     ``reference`` (n,) mm is held beyond its end; ``speed_offset`` rad/s and ``current_offset`` A are (n,) or empty.
     ``plant`` (16,), ``leap`` (LEAP_ROWS, LEAP_COLUMNS) or empty, and ``gains`` (GAINS,): see :mod:`fdhil.model.loops`.
-    ``terms``, empty for a plain drive, and ``masses``: see :mod:`fdhil.model.terms`. ``shape``: law, states kept of
+    ``terms``, None for a plain drive, and ``masses``: see :mod:`fdhil.model.terms`. ``shape``: law, states kept of
     each row, speed cycles per SYNC cycle, current cycles per speed cycle, order of the set-point filter, current cycles
     of delay. ``state`` (STATES,) is written.
     """
@@ -557,10 +557,10 @@ def run(
     last = reference.size - 1
     out = np.empty((ROW_STATE + kept, rows))
     if law == CASCADE and leap.size > 0 and speed_offset.size + current_offset.size == 0:
-        if terms.size > 0:
-            _run_leaping_with_terms(reference, first, plant, leap, masses, gains, terms, shape, state, out)
-        else:
+        if terms is None:
             _run_leaping(reference, first, plant, leap, gains, shape, state, out)
+        else:
+            _run_leaping_with_terms(reference, first, plant, leap, masses, gains, terms, shape, state, out)
         return out
     kff, period, current_max, filtered = gains[KFF], gains[PERIOD], gains[CURRENT_MAX], gains[SPEED_DECAY] > 0.0
     for row in range(rows):
@@ -593,9 +593,9 @@ def run(
                 state[SPEED_INTEGRAL], state[POSITION_INTEGRAL] = speed_integral, position_integral
             state[CURRENT_DEMAND] = demand_a
             clipped = demand_a != raw
-            if terms.size > 0:
-                limited += _cycles_with_terms(demand_a, clipped, plant, masses, gains, terms, n_current, delay, state)
-            else:
+            if terms is None:
                 limited += _current_cycles(demand_a, clipped, plant, gains, n_current, state)
+            else:
+                limited += _cycles_with_terms(demand_a, clipped, plant, masses, gains, terms, n_current, delay, state)
         out[ROW_LIMITED, row] = limited
     return out

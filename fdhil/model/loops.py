@@ -21,7 +21,6 @@ from fdhil.model.terms import exponential
 from fdhil.records import Float, Parameters, read_only
 
 _NO_LEAP = read_only(np.empty((0, kernels.LEAP_COLUMNS)))
-_NO_TERMS = read_only(np.empty(0))
 
 
 @lru_cache(maxsize=64)
@@ -81,7 +80,7 @@ class Drive:
     leap: Float
     masses: Float
     gains: Float
-    terms: Float
+    terms: Float | None
     shape: tuple[int, int, int, int, int, int]
     sync_period_s: float
     nominal_k: float
@@ -125,7 +124,7 @@ def prepare(law: int, places: int, parameters: Parameters, axis: Axis, sync_peri
         through,
         terms.masses(parameters, axis.screw_pitch_mm, g.current_period_s),
         values,
-        terms.packed(parameters) if more else _NO_TERMS,
+        terms.packed(parameters) if more else None,
         (law, _kept(places, parameters, axis), n_speed, n_current, order, g.current_delay_cycles),
         sync_period_s,
         axis.nominal.K,
