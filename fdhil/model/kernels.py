@@ -338,10 +338,10 @@ def _mean_torque(
 
 @inlined
 def _leapt(
-    i: float, w: float, integral: float, demand_a: float, side: float, leap: Float
+    i: float, w: float, integral: float, demand_a: float, side: float, held: bool, leap: Float
 ) -> tuple[float, float, float]:
     """Return current, speed and integral of the current loop after a speed cycle."""
-    if side == 0.0:
+    if held:
         return (
             _mapped(leap, HELD_CURRENT, i, w, integral, demand_a, side),
             0.0,
@@ -361,12 +361,14 @@ def _run_leaping(
     plant: Float,
     leap: Float,
     gains: Float,
+    terms: Float | None,
     shape: tuple[int, int, int, int, int, int],
     state: Float,
     out: Float,
 ) -> None:
     """Run a cascade without delay and offsets as :func:`run` does, each speed cycle in one leap where it is linear.
 
+    With terms a leap takes the mean of their torque; a constant voltage that is lost comes to a change of the integral.
     ``out`` (1 + kept, rows) is written. All that a cycle changes is in plain variables: memory would take most of it.
     """
     kept, n_speed, n_current, order, last = shape[1], shape[2], shape[3], shape[4], reference.size - 1
@@ -381,6 +383,10 @@ def _run_leaping(
     decay, seen = gains[SPEED_DECAY], state[SPEED_FILTERED]
     i, w, x, demand_a = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_DEMAND]
     speeds, currents, places = state[SPEED_INTEGRAL], state[CURRENT_INTEGRAL], state[POSITION_INTEGRAL]
+    if terms is not None:
+        rad_per_mm, load, dead_v, full_a = gains[RAD_PER_MM], terms[LOAD], terms[DEAD_TIME], gains[FULL_DEAD_TIME_A]
+        positive, negative, slow = terms[DRY_POSITIVE], terms[DRY_NEGATIVE], terms[STRIBECK]
+        half_mm, faster = gains[HALF_STEP_MM] * n_current, plant[10] * (0.5 * n_current)
     for row in range(out.shape[1]):
         k = first + row
         r0, r1, r2 = reference[min(k, last)], reference[min(k + 1, last)], reference[min(k + 2, last)]
@@ -412,122 +418,36 @@ def _run_leaping(
             demand_a = min(max(raw, -current_max), current_max)
             if demand_a == raw:
                 speeds, places = candidate, place
-            may, side = _leapable(i, w, currents, demand_a, plant, leap)
-            if may <= voltage_max:
-                limited += n_current if demand_a != raw else 0
-                if side != 0.0:
-                    x += _mapped(leap, LEAP_WAY, i, w, currents, demand_a, side)
-                i, w, currents = _leapt(i, w, currents, demand_a, side, leap)
+            lost_v = 0.0
+            if terms is None:
+                may, side = _leapable(i, w, currents, demand_a, plant, leap)
+                held = side == 0.0
             else:
-                state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL] = i, w, x, currents
-                limited += _current_cycles(demand_a, demand_a != raw, plant, gains, n_current, 0, state)
-                i, w, x, currents = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL]
-        out[ROW_LIMITED, row] = limited
-    state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_DEMAND] = i, w, x, demand_a
-    state[SPEED_INTEGRAL], state[CURRENT_INTEGRAL], state[POSITION_INTEGRAL] = speeds, currents, places
-    state[SPEED_FILTERED] = seen if decay > 0.0 else 0.0
-
-
-@compiled
-def _run_leaping_with_terms(
-    reference: Float,
-    first: int,
-    plant: Float,
-    leap: Float,
-    masses: Float | None,
-    gains: Float,
-    terms: Float,
-    shape: tuple[int, int, int, int, int, int],
-    state: Float,
-    out: Float,
-) -> None:
-    """Run as :func:`_run_leaping` does, with what has joined the plain drive but a spring.
-
-    Within a leap the torque is its mean: what bends in between is not seen at the table.
-    """
-    kept, n_speed, n_current, order, last = shape[1], shape[2], shape[3], shape[4], reference.size - 1
-    kv, kff, speed_kp, speed_ki, position_ki = (
-        gains[KV],
-        gains[KFF],
-        gains[SPEED_KP],
-        gains[SPEED_KI],
-        gains[POSITION_KI],
-    )
-    period, current_max, voltage_max = gains[PERIOD], gains[CURRENT_MAX], gains[VOLTAGE_MAX]
-    decay, seen = gains[SPEED_DECAY], state[SPEED_FILTERED]
-    i, w, x, demand_a = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_DEMAND]
-    speeds, currents, places = state[SPEED_INTEGRAL], state[CURRENT_INTEGRAL], state[POSITION_INTEGRAL]
-    torque_constant, rad_per_mm, load, slow = plant[14], gains[RAD_PER_MM], terms[LOAD], terms[STRIBECK]
-    positive, negative, dead_v, full_a = (
-        terms[DRY_POSITIVE],
-        terms[DRY_NEGATIVE],
-        terms[DEAD_TIME],
-        gains[FULL_DEAD_TIME_A],
-    )
-    half_mm, faster = gains[HALF_STEP_MM] * n_current, plant[10] * (0.5 * n_current)
-    for row in range(out.shape[1]):
-        k = first + row
-        r0, r1, r2 = reference[min(k, last)], reference[min(k + 1, last)], reference[min(k + 2, last)]
-        slope = (r1 - r0) / period
-        bend = (r2 - r1) / period - slope
-        forward = gains[ACCELERATION] * (bend / period)
-        out[ROW_STATE + CURRENT, row], out[ROW_STATE + SPEED, row], out[ROW_STATE + POSITION, row] = i, w, x
-        out[ROW_STATE + SPEED_INTEGRAL, row], out[ROW_STATE + CURRENT_INTEGRAL, row] = speeds, currents
-        out[ROW_STATE + CURRENT_DEMAND, row] = demand_a
-        if kept > POSITION_INTEGRAL:
-            out[ROW_STATE + POSITION_INTEGRAL, row] = places
-            state[SPEED_FILTERED] = seen
-            for n in range(SET_POINT_BEFORE, kept):
-                out[ROW_STATE + n, row] = state[n]
-        limited = 0
-        for m in range(n_speed):
-            part = m / n_speed
-            wanted, rate = r0 + (r1 - r0) * part, slope + bend * part
-            if order > 0:
-                _filter(wanted, rate, bend / period, order, gains[DECAY], state)
-                at = FILTERED + 3 * (order - 1)
-                wanted, rate, forward = state[at], state[at + 1], gains[ACCELERATION] * state[at + 2]
-            lag = wanted - x
-            place = places + position_ki * lag
-            seen = decay * seen + (1.0 - decay) * w
-            error = kv * lag + place + kff * rate - seen
-            candidate = speeds + speed_ki * error
-            raw = speed_kp * error + candidate + forward
-            demand_a = min(max(raw, -current_max), current_max)
-            if demand_a == raw:
-                speeds, places = candidate, place
-            shift = dead_v if i > 0.0 else -dead_v
-            left = currents - shift  # a constant voltage is taken from the integral, which comes to the same
-            if w == 0.0:
-                torque = 0.0
-                against = load + _ripple(rad_per_mm * x, terms)
-                push = torque_constant * i - against
-                room = min(positive - push, negative + push) + slow
-                may = _may_hold(i, left, demand_a, room, plant, leap)
-            else:
-                torque = _mean_torque(i, w, x, half_mm, faster, plant, rad_per_mm, terms)
-                may = _may_move(i, w, left, demand_a, torque, abs(torque), plant, leap)
-                if not w * _mapped(leap, LEAP_SPEED, i, w, left, demand_a, torque) > 0.0:
-                    may = np.inf
-            if dead_v != 0.0 and (min(abs(i), abs(demand_a)) < full_a or i * demand_a < 0.0):
-                may = np.inf
-            if may <= voltage_max - abs(dead_v):
-                limited += n_current if demand_a != raw else 0
-                if w == 0.0:
-                    i, _, currents = _leapt(i, w, left, demand_a, 0.0, leap)
+                lost_v, held = dead_v if i > 0.0 else -dead_v, w == 0.0
+                left, side, may = currents - lost_v, 0.0, np.inf
+                if dead_v != 0.0 and (min(abs(i), abs(demand_a)) < full_a or i * demand_a < 0.0):
+                    pass  # the dead time's effect changes on the way
+                elif held:
+                    push = plant[14] * i - load - _ripple(rad_per_mm * x, terms)
+                    room = min(positive - push, negative + push) + slow
+                    may = _may_hold(i, left, demand_a, room, plant, leap)
                 else:
-                    x += _mapped(leap, LEAP_WAY, i, w, left, demand_a, torque)
-                    i, w, currents = (
-                        _mapped(leap, LEAP_CURRENT, i, w, left, demand_a, torque),
-                        _mapped(leap, LEAP_SPEED, i, w, left, demand_a, torque),
-                        _mapped(leap, LEAP_INTEGRAL, i, w, left, demand_a, torque),
-                    )
-                currents += shift
+                    side = _mean_torque(i, w, x, half_mm, faster, plant, rad_per_mm, terms)
+                    if w * _mapped(leap, LEAP_SPEED, i, w, left, demand_a, side) > 0.0:
+                        may = _may_move(i, w, left, demand_a, side, abs(side), plant, leap)
+            if may <= voltage_max - abs(lost_v):
+                limited += n_current if demand_a != raw else 0
+                if not held:
+                    x += _mapped(leap, LEAP_WAY, i, w, currents - lost_v, demand_a, side)
+                i, w, currents = _leapt(i, w, currents - lost_v, demand_a, side, held, leap)
+                currents += lost_v
             else:
                 state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL] = i, w, x, currents
-                limited += _cycles_with_terms(
-                    demand_a, demand_a != raw, plant, masses, gains, terms, n_current, 0, state
-                )
+                clipped = demand_a != raw
+                if terms is None:
+                    limited += _current_cycles(demand_a, clipped, plant, gains, n_current, 0, state)
+                else:
+                    limited += _cycles_with_terms(demand_a, clipped, plant, None, gains, terms, n_current, 0, state)
                 i, w, x, currents = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL]
         out[ROW_LIMITED, row] = limited
     state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_DEMAND] = i, w, x, demand_a
@@ -562,10 +482,7 @@ def run(
     last = reference.size - 1
     out = np.empty((ROW_STATE + kept, rows))
     if law == CASCADE and leap.size > 0 and speed_offset.size + current_offset.size == 0:
-        if terms is None:
-            _run_leaping(reference, first, plant, leap, gains, shape, state, out)
-        else:
-            _run_leaping_with_terms(reference, first, plant, leap, masses, gains, terms, shape, state, out)
+        _run_leaping(reference, first, plant, leap, gains, terms, shape, state, out)
         return out
     kff, period, current_max, filtered = gains[KFF], gains[PERIOD], gains[CURRENT_MAX], gains[SPEED_DECAY] > 0.0
     for row in range(rows):
