@@ -94,17 +94,18 @@ def untold(estimate: Estimate, *, slow: bool) -> list[Reason]:
     return list({r.text: r for r in estimate.missing.values()}.values())
 
 
-def unphysical(estimate: Estimate, *, one_direction: bool = False) -> list[Reason]:
+def unphysical(estimate: Estimate, *, one_way: bool = False) -> list[Reason]:
     """Return a reason for each parameter outside the box of what a feed drive can be; a NaN has its own reason.
 
-    What moves in ``one_direction`` alone may have a weight that helps it by more than friction takes.
+    Of moves ``one_way`` a constant load is part of Cd, and may be more than all friction.
     """
     reasons = []
     for name, (low, high) in PHYSICAL.items():
+        if one_way and name == "Cd":
+            low = -high
         value = estimate.value(name)
         # friction may be nil, so only a significantly negative one is unphysical
-        floor = -3 * estimate.std(name) if name in ("ft", "Cd") else low
-        floor = -high if name == "Cd" and one_direction else floor
+        floor = -3 * estimate.std(name) if name in ("ft", "Cd") and not np.isfinite(low) else low
         if np.isfinite(value) and not floor <= value <= high:
             text = f"{name} = {value:.4g} lies outside {max(low, 0):.3g} to {high:.3g}"
             reasons.append(Reason("Unphysical", text, "check the scale, sign and order of the signals"))

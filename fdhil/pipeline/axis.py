@@ -125,7 +125,7 @@ class AxisPipeline:
         self._with_skill = with_skill
         self._gain_suspected = False
         self._place = self._history[-1].place if self._history else 0
-        self._withheld = ""
+        self._withheld: tuple[str, ...] = ()  # why the newest pool was not published: told once
 
     @property
     def published(self) -> ParameterSet | None:
@@ -252,9 +252,10 @@ class AxisPipeline:
             estimate, verdict = self._pooled()
         if estimate is None or not verdict.accepted:
             text = "the pool of the newest windows is not believed (" + _listed(verdict) + "), the older set stays"
-            again, self._withheld = self._withheld == text, text
+            codes = tuple(reason.code for reason in verdict.reasons)
+            again, self._withheld = self._withheld == codes, codes
             return [] if again else [Notice("ValidationFailed", "minor", text, self.axis, window.start_tick)]
-        self._withheld = ""
+        self._withheld = ()
         self._published = ParameterSet(
             axis=self.axis,
             revision=1 if self._published is None else self._published.revision + 1,
