@@ -58,7 +58,8 @@ class Evidence:
     """A window before any fit, or with its ``estimate`` and the ``fit`` of the same method (None: there is none).
 
     ``axis`` is the axis' section where it is known, and ``sync_period_s`` that of its set-points (None: a row's).
-    Without a voltage the fit is ``torque``, of [2] alone.
+    Without a voltage the fit is ``torque``, of [2] alone. ``recorded`` is the window as it was before its speed was
+    mended (None: it was not): whether a sensor repeats itself is asked of its own readings.
     """
 
     window: Window
@@ -67,11 +68,12 @@ class Evidence:
     fit: Fit | None = None
     axis: Axis | None = None
     sync_period_s: float | None = None
+    recorded: Window | None = None
 
     @cached_property
     def signals(self) -> Sequence[Signal]:
-        """The sensors, each with its resolution."""
-        return signals_of(self.window)
+        """The sensors as they were read, each with its resolution."""
+        return signals_of(self.recorded or self.window)
 
     @cached_property
     def noise(self) -> Noise:
