@@ -118,9 +118,11 @@ def prepare(law: int, places: int, parameters: Parameters, axis: Axis, sync_peri
     more = terms.more_than_plain(parameters, axis)
     plant, values = plant_step(parameters, axis.screw_pitch_mm, g.current_period_s), gains(axis, sync_period_s)
     kp, ki = values[kernels.CURRENT_KP], values[kernels.CURRENT_KI]
+    steps_only = g.current_delay_cycles > 0 or terms.has_spring(parameters)
+    through = _NO_LEAP if steps_only else leap(_per_newton_metre(plant) if more else plant, kp, ki, n_current)
     return Drive(
         plant,
-        _NO_LEAP if more else leap(plant, kp, ki, n_current),
+        through,
         terms.masses(parameters, axis.screw_pitch_mm, g.current_period_s),
         values,
         terms.packed(parameters) if more else _NO_TERMS,
@@ -128,6 +130,11 @@ def prepare(law: int, places: int, parameters: Parameters, axis: Axis, sync_peri
         sync_period_s,
         axis.nominal.K,
     )
+
+
+def _per_newton_metre(plant: Float) -> Float:
+    """Return the plant with a dry friction of 1 N.m, so that a leap takes any torque."""
+    return np.append(plant[:-1], 1.0)
 
 
 def _kept(places: int, parameters: Parameters, axis: Axis) -> int:
