@@ -30,7 +30,7 @@ LEAST_ROWS = 32
 BASE = ("Jt", "delay", "ft", "Cd")
 STRIBECK_SHARES = (0.02, 0.03, 0.05, 0.08, 0.12, 0.18, 0.27)  # of the top speed
 SCREW_ORDERS = (1, 2)
-WORTH = 0.01  # of the torque's RMS: what a term must explain
+WORTH = 0.005  # of the torque's RMS: what a term must explain, a tenth of what may be left
 SUMMED_SHARE = 0.1  # of a window's rows: over which its residuals may hang together
 WIDENED = 2.9694 / 1.96  # per share, of the 95 % interval: Kiefer and Vogelsang 2005, Bartlett's weights
 OPEN_SHARE = 3e-4  # of Jt: what the current's course between two rows leaves open
@@ -59,7 +59,8 @@ class Term:
 class TorqueFit:
     """[2] in amperes, fitted to the rows of some windows together: ``design`` (m, k) and what it leaves, (m,).
 
-    ``theta`` (k,) are the columns' amplitudes: those of ``BASE``, then of each of ``terms``.
+    ``theta`` (k,) are the columns' amplitudes: those of ``BASE``, then of each of ``terms``. Each of ``shifts`` (k,)
+    is by how much they would move with a term that is there and was not worth joining.
     """
 
     parts: tuple[TorqueRows, ...]
@@ -67,6 +68,7 @@ class TorqueFit:
     current: Float
     theta: Float
     terms: tuple[Term, ...]
+    shifts: tuple[Float, ...] = ()
 
     @property
     def residual(self) -> Float:
@@ -100,27 +102,40 @@ def _fitted(parts: tuple[TorqueRows, ...], terms: tuple[Term, ...]) -> TorqueFit
 
 
 def _joined(fitted: TorqueFit) -> TorqueFit:
-    """Let the best candidate join, as long as one is wanted and worth it."""
-    rows = effective_rows(fitted)
+    """Let the best term join as long as one is wanted and worth it; what is wanted only puts the others in doubt."""
+    rows = effective_rows(fitted.residual)
     while True:
-        power = float(fitted.residual @ fitted.residual)
-        best, gained = None, 0.0
-        for term in candidates(fitted):
-            tried = _fitted(fitted.parts, (*fitted.terms, term))
-            left = float(tried.residual @ tried.residual)
-            values = len(term.names)
-            gain = rows * np.log(power / max(left, 1e-300)) - values * np.log(rows)
-            worth = rms(tried.design @ tried.theta - fitted.design @ fitted.theta)
-            if gain > gained and worth > WORTH * rms(fitted.current):
-                best, gained = tried, gain
-        if best is None:
-            return fitted
-        fitted = best
+        wanted = _wanted(fitted, rows)
+        worth = [other for other in wanted if _explained(other, fitted) > WORTH * rms(fitted.current)]
+        if not worth:
+            shifts = [other.theta[: fitted.theta.size] - fitted.theta for other in wanted]
+            return replace(fitted, shifts=tuple(shifts))
+        fitted = worth[0]
 
 
-def effective_rows(fitted: TorqueFit) -> float:
-    """Return how many rows tell something new: n / (1 + 2 sum rho), rho summed up to where it is nil."""
-    e = fitted.residual
+def _wanted(fitted: TorqueFit, rows: float) -> list[TorqueFit]:
+    """Return the fits with one term more that the criterion prefers, the best first, one for each kind of term."""
+    power, found = float(np.square(fitted.residual).sum()), []
+    for term in candidates(fitted):
+        tried = _fitted(fitted.parts, (*fitted.terms, term))
+        left = float(np.square(tried.residual).sum())
+        gain = rows * np.log(power / max(left, 1e-300)) - len(term.names) * np.log(rows)
+        if gain > 0.0:
+            found.append((gain, tried))
+    found.sort(key=lambda pair: -pair[0])
+    best: dict[tuple[str, ...], TorqueFit] = {}
+    for _, tried in found:
+        best.setdefault(tried.terms[-1].names, tried)
+    return list(best.values())
+
+
+def _explained(other: TorqueFit, fitted: TorqueFit) -> float:
+    """Return the RMS of the torque by which two fits differ, A."""
+    return rms(other.design @ other.theta - fitted.design @ fitted.theta)
+
+
+def effective_rows(e: Float) -> float:
+    """Return how many rows of residuals (n,) tell something new: n / (1 + 2 sum rho), rho up to where it is nil."""
     size = 1 << (2 * e.size).bit_length()
     correlation = np.fft.irfft(np.abs(np.fft.rfft(e, size)) ** 2, size)[: e.size]
     if correlation[0] <= 0.0:
@@ -193,7 +208,7 @@ def _covariance(fitted: TorqueFit) -> Float:
     """Return the covariance (k + s, k + s) of the amplitudes and of the values that enter in no linear way.
 
     In every direction the larger of two counts: by the scores, and by what as many residuals would be that hang
-    together as these do; a lucky sample is not precision.
+    together as these do; a lucky sample is not precision. On top comes what terms that did not join would move.
     """
     slopes = [t.slope * fitted.theta[_first(fitted, t)] for t in fitted.terms if t.slope is not None]
     design = np.column_stack([fitted.design, *slopes])
@@ -205,10 +220,12 @@ def _covariance(fitted: TorqueFit) -> Float:
         start += part.rows
     meat *= (1.0 + WIDENED * SUMMED_SHARE) ** 2
     power = max(float(np.square(fitted.residual).sum()), 1e-12 * float(np.square(fitted.current).sum()))
-    alike = design.T @ design * power / max(effective_rows(fitted) - design.shape[1], 1.0)
+    alike = design.T @ design * power / max(effective_rows(fitted.residual) - design.shape[1], 1.0)
     scale = np.sqrt(np.diag(alike))
     scaled = np.outer(scale, scale)
     covariance: Float = inverse @ (larger(meat / scaled, alike / scaled) * scaled) @ inverse.T
+    for shift in fitted.shifts:
+        covariance[: shift.size, : shift.size] += np.outer(shift, shift)
     return covariance
 
 

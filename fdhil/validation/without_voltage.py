@@ -50,7 +50,8 @@ def load_comes_and_goes(evidence: Evidence) -> Iterator[Reason]:
     seen = power > IMITATED * np.square(blocks).sum(axis=0)
     amplitude = np.where(seen, beyond.T @ left / np.where(seen, power, 1.0), 0.0)
     k = int(np.argmax(np.abs(amplitude) * np.sqrt(power)))
-    chance = rms(left) * np.sqrt(left.size / effective_rows(fitted) / max(power[k], 1e-300))
+    rest = left - amplitude[k] * beyond[:, k]
+    chance = rms(rest) * np.sqrt(rest.size / effective_rows(rest) / max(power[k], 1e-300))
     least = LEAST_LOAD * float(np.abs(fitted.current).max())
     if abs(amplitude[k]) > max(least, BUDGET["structure"].deviations * chance):
         rows = np.flatnonzero(fitted.parts[0].usable)
