@@ -211,7 +211,7 @@ def _report(
 def inputs(
     program: Path, config_path: Path, model_path: Path | None, from_history: bool
 ) -> tuple[Trajectory, dict[str, Parameters], MachineConfig]:
-    """Read configuration, model and reference, in this order."""
+    """Read configuration, model and reference, in this order; loops of the model are in the configuration."""
     if model_path is not None and from_history:
         raise click.UsageError("--model and --from-history exclude each other: give one of them")
     from fdhil import config as configuration
@@ -221,7 +221,9 @@ def inputs(
     config = configuration.load(config_path)
     given, source = model_files.nominal_models(config), str(config_path)
     if model_path is not None:
-        given, source = model_files.load_models(model_path), str(model_path)
+        source = str(model_path)
+        given, loops = model_files.load_model_file(model_path)
+        config = model_files.with_loops(config, loops, source)
     elif from_history:
         from fdhil.store.history import latest_parameters
 
@@ -232,7 +234,7 @@ def inputs(
 
 
 def _covariances(reference: Trajectory, past: Past) -> dict[str, Float]:
-    """Return the newest published covariance (6, 6) of each axis; zeros for an axis without one (it stands still)."""
+    """Return the newest published covariance of each axis; zeros for an axis without one (it stands still)."""
     import numpy as np
 
     known = {axis: found[-1].set.covariance for axis, found in past.revisions.items() if found}

@@ -116,6 +116,14 @@ class Axis(Section):
         le=1e9,
         description="largest jerk of profile jerk_limited; left out: the acceleration is reached in 25 ms",
     )
+    resonance_hz: Positive | None = Field(
+        None,
+        ge=5.0,
+        le=2000.0,
+        description="first resonance between motor and table, measured at the table; left out: the table is where the "
+        "motor's encoder is, which cannot see it",
+    )
+    resonance_damping: NotNegative = Field(0.03, le=0.7, description="damping ratio of that resonance")
     nominal: Nominal
     regulators: Regulators
     correction: CorrectionLimits | None = None

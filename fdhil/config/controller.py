@@ -47,6 +47,14 @@ class G0(Section):
     input_bit: int = Field(16, ge=0, le=31, description="digital_input: bit of 0x60FD that the NC raises")
 
 
+class Correction(Section):
+    """[correction]: what is done beyond the plan of a correction."""
+
+    learning: bool = Field(
+        False, description="learn from the measured error of each pass what no model holds, for the next pass"
+    )
+
+
 class Identification(Section):
     """[identification]"""
 

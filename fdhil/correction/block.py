@@ -199,9 +199,10 @@ def _run(
 
 def _stuck(loop: AxisLoop, response: Response, target_mm: Float, first: int) -> int | None:
     """Return the first row from ``first`` on at which dry friction holds the table near its target."""
+    band = loop.resting.band_at(float(target_mm[first]))
     near: Bool = (
         (response.speed_rad_s == 0.0)
-        & (loop.parameters.K * np.abs(response.current_a) <= BAND * loop.parameters.Cd)
+        & band.holds(loop.parameters.K * response.current_a, BAND)
         & (np.abs(response.position_mm - target_mm) <= STUCK_UM * 1e-3)
     )
     rows = np.flatnonzero(near[first:])

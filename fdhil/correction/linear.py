@@ -7,13 +7,14 @@ gives no answer, and it is applied to a recorded or planned error, so it may loo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from fdhil.config import Axis
 from fdhil.model import closed_loop
+from fdhil.prediction import model_terms
 from fdhil.records import Float, Parameters
 
 BANDWIDTH_HZ = 120.0
@@ -43,9 +44,9 @@ class Inverse:
 
 
 def unlimited(parameters: Parameters, axis: Axis, dry_nm: float = 0.0) -> tuple[Parameters, Axis]:
-    """Return the same loop without limits, and with another dry friction: without any it is linear."""
+    """Return what of the loop is linear, without limits, and with another dry friction: without any it is linear."""
     free = axis.regulators.model_copy(update={"current_limit_a": 1e9, "voltage_limit_v": 1e9})
-    return replace(parameters, Cd=dry_nm), axis.model_copy(update={"regulators": free})
+    return model_terms.linear(parameters, dry_nm), axis.model_copy(update={"regulators": free})
 
 
 def delay_s(parameters: Parameters, axis: Axis, sync_period_s: float) -> float:

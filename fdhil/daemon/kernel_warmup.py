@@ -36,7 +36,7 @@ def _warm_what_is_rare() -> None:
     """Call the kernels that a sound drive seldom needs: offsets at their limits, a sensor told by the others."""
     project(np.linspace(0.0, 2.0, 8), np.ones(3), np.zeros(2))
     theta, rows = np.array([0.5, 0.005, 0.8, 0.075, 0.05, 5.0, 0.0]), np.ones((4, 3))
-    departure(theta, 0.001, np.ones(4, dtype=np.int8), rows, rows, rows, 0)
+    departure(theta, 0.001, np.ones(4, dtype=np.int8), np.ones(4), rows, rows, rows, 0)
 
 
 def nominal_rapid(name: str, axis: Axis, dt_s: float, direction: int = 1, seed: int = 1) -> Window:

@@ -103,7 +103,7 @@ def robust(information: Float, scores: Sequence[Float], rows: Sequence[tuple[Flo
     root = root_of(information)
     power, foretold = np.zeros((2, root.shape[1], root.shape[1]))
     for own in scores:
-        power += _summed(own @ root)
+        power += summed(own @ root)
     for slopes, innovations in rows:
         foretold += _coloured(slopes @ root, _spectrum(innovations, quick_size(2 * len(slopes))))
     share = SUMMED_LAGS / sum(len(own) for own in scores)
@@ -112,7 +112,7 @@ def robust(information: Float, scores: Sequence[Float], rows: Sequence[tuple[Flo
     return sandwich
 
 
-def _summed(scores: Float) -> Float:
+def summed(scores: Float) -> Float:
     """Return the variance (k, k) of the sum of ``scores`` (n, k) that hang together, with Bartlett's weights."""
     meat = scores.T @ scores
     for lag in range(1, min(SUMMED_LAGS, len(scores) // 4) + 1):

@@ -1,9 +1,10 @@
 """Fits [2] alone where there is no voltage: Jt, ft and Cd from current and position, with the K that is given.
 
-Least squares on K i = Jt dw/dt + ft w + Cd sign(w), all filtered alike, and on what joins it: a constant load where
-both directions are there, friction at low speed, a ripple with the screw's turn. A term joins where the Bayesian
-information criterion (Schwarz 1978) wants it at the number of rows that tell something new, and where it is worth it.
-The current may be late: -tau (Jt dj/dt + ft dw/dt) is always fitted, so that it biases nothing.
+Least squares on K i = Jt dw/dt + ft w + Cd sign(w), all filtered alike, and on what joins it: friction at low speed, a
+ripple with the screw's turn. A term joins where the Bayesian information criterion (Schwarz 1978) wants it at the
+number of rows that tell something new, and where it is worth it. The current may be late: the torque's own slope
+-tau (Jt dj/dt + ft dw/dt) is always fitted, so that it biases nothing. A constant load is part of the friction of its
+direction; windows of both directions tell it.
 
 What is left is friction that no model has, much more than noise, and coloured. So the intervals stand around the
 variance of the scores (Newey and West 1987), widened for what that variance itself scatters (Kiefer and Vogelsang
@@ -57,13 +58,13 @@ class Term:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TorqueFit:
-    """[2] in amperes, fitted to the rows of some windows together: ``design`` (m, k) and what it leaves, (m,).
+    """[2] in amperes, fitted to the rows of a window: ``design`` (m, k) and ``current`` (m,).
 
     ``theta`` (k,) are the columns' amplitudes: those of ``BASE``, then of each of ``terms``. Each of ``shifts`` (k,)
     is by how much they would move with a term that is there and was not worth joining.
     """
 
-    parts: tuple[TorqueRows, ...]
+    rows: TorqueRows
     design: Float
     current: Float
     theta: Float
@@ -82,30 +83,29 @@ class TorqueFit:
         return rms(self.residual) / max(rms(self.current), 1e-300)
 
 
-def fit(windows: Sequence[Window], settings: Identification) -> TorqueFit | None:
-    """Fit [2] and the terms that join it to the windows together; None where hardly any row surely moves."""
-    parts = [p for p in (torque_rows(w, settings) for w in windows) if p is not None and p.rows]
-    if sum(p.rows for p in parts) < LEAST_ROWS:
+def fit(window: Window, settings: Identification) -> TorqueFit | None:
+    """Fit [2] and the terms that join it to a window; None where hardly any row surely moves."""
+    rows = torque_rows(window, settings)
+    if rows is None or rows.count < LEAST_ROWS:
         return None
-    fitted = _fitted(tuple(parts), ())
+    fitted = _fitted(rows, ())
     if not (np.isfinite(fitted.design).all() and np.isfinite(fitted.current).all()):
         return None
     return _joined(fitted)
 
 
-def _fitted(parts: tuple[TorqueRows, ...], terms: tuple[Term, ...]) -> TorqueFit:
-    base = np.vstack([np.column_stack([p.acceleration, p.jerk, p.speed])[p.usable] for p in parts])
-    side = np.vstack([p.through(p.side[None]) for p in parts])
-    design = np.column_stack([base, side, *(t.columns for t in terms)])
-    current = np.concatenate([p.current[p.usable] for p in parts])
-    return TorqueFit(parts, design, current, solve(design, current)[0], terms)
+def _fitted(rows: TorqueRows, terms: tuple[Term, ...]) -> TorqueFit:
+    base = np.column_stack([rows.acceleration, rows.jerk, rows.speed])[rows.usable]
+    design = np.column_stack([base, rows.through(rows.side[None]), *(t.columns for t in terms)])
+    current = rows.current[rows.usable]
+    return TorqueFit(rows, design, current, solve(design, current)[0], terms)
 
 
 def _joined(fitted: TorqueFit) -> TorqueFit:
     """Let the best term join as long as one is wanted and worth it; what is wanted only puts the others in doubt."""
-    rows = effective_rows(fitted.residual)
+    news = effective_rows(fitted.residual)
     while True:
-        wanted = _wanted(fitted, rows)
+        wanted = _wanted(fitted, news)
         worth = [other for other in wanted if _explained(other, fitted) > WORTH * rms(fitted.current)]
         if not worth:
             shifts = [other.theta[: fitted.theta.size] - fitted.theta for other in wanted]
@@ -113,13 +113,13 @@ def _joined(fitted: TorqueFit) -> TorqueFit:
         fitted = worth[0]
 
 
-def _wanted(fitted: TorqueFit, rows: float) -> list[TorqueFit]:
+def _wanted(fitted: TorqueFit, news: float) -> list[TorqueFit]:
     """Return the fits with one term more that the criterion prefers, the best first, one for each kind of term."""
     power, found = float(np.square(fitted.residual).sum()), []
     for term in candidates(fitted):
-        tried = _fitted(fitted.parts, (*fitted.terms, term))
+        tried = _fitted(fitted.rows, (*fitted.terms, term))
         left = float(np.square(tried.residual).sum())
-        gain = rows * np.log(power / max(left, 1e-300)) - len(term.names) * np.log(rows)
+        gain = news * np.log(power / max(left, 1e-300)) - len(term.names) * np.log(news)
         if gain > 0.0:
             found.append((gain, tried))
     found.sort(key=lambda pair: -pair[0])
@@ -147,35 +147,28 @@ def effective_rows(e: Float) -> float:
 
 def candidates(fitted: TorqueFit) -> list[Term]:
     """Return the terms that have not joined and that these rows could tell."""
-    parts, joined = fitted.parts, {name for term in fitted.terms for name in term.names}
+    rows, joined = fitted.rows, {name for term in fitted.terms for name in term.names}
     found = []
-    sides = {int(s) for p in parts for s in np.unique(p.side[p.usable])}
-    if "load" not in joined and {1, -1} <= sides:
-        found.append(Term(("load",), np.ones((fitted.current.size, 1))))
     if "stribeck" not in joined:
-        top = max(float(np.abs(p.speed).max()) for p in parts)
-        found += [_stribeck(parts, share * top) for share in STRIBECK_SHARES]
+        top = float(np.abs(rows.speed).max())
+        found += [_stribeck(rows, share * top) for share in STRIBECK_SHARES]
     for order in SCREW_ORDERS:
         name = f"ripple_screw_{order}"
         if name not in joined:
-            both = [p.through(np.stack([np.sin(order * p.angle), np.cos(order * p.angle)])) for p in parts]
-            found.append(Term((name, f"{name}_phase"), np.vstack(both)))
+            both = rows.through(np.stack([np.sin(order * rows.angle), np.cos(order * rows.angle)]))
+            found.append(Term((name, f"{name}_phase"), both))
     return found
 
 
-def _stribeck(parts: Sequence[TorqueRows], speed_rad_s: float) -> Term:
-    columns, slopes = [], []
-    for p in parts:
-        share = p.speed / speed_rad_s
-        course = p.side * np.exp(-np.square(share))
-        both = p.through(np.stack([course, course * 2.0 * share**2 / speed_rad_s]))
-        columns.append(both[:, :1])
-        slopes.append(both[:, 1])
-    return Term(("stribeck", "stribeck_speed"), np.vstack(columns), speed_rad_s, np.concatenate(slopes))
+def _stribeck(rows: TorqueRows, speed_rad_s: float) -> Term:
+    share = rows.speed / speed_rad_s
+    course = rows.side * np.exp(-np.square(share))
+    both = rows.through(np.stack([course, course * 2.0 * share**2 / speed_rad_s]))
+    return Term(("stribeck", "stribeck_speed"), both[:, :1], speed_rad_s, both[:, 1])
 
 
-def told(windows: Sequence[Window], fitted: TorqueFit | None, known: Mapping[str, float]) -> Estimate:
-    """Return what the fit of some windows tells, with the K of the recording itself, else the one ``known``.
+def told(window: Window, fitted: TorqueFit | None, known: Mapping[str, float]) -> Estimate:
+    """Return what the fit of a window tells, with the K of the recording itself, else the one ``known``.
 
     ``known`` may hold K, R and L of the data sheet: they are ``given`` in the estimate. R and L that are not known are
     missing. Without any K all six are, and ``RATIOS`` follow them.
@@ -184,15 +177,9 @@ def told(windows: Sequence[Window], fitted: TorqueFit | None, known: Mapping[str
         text = "hardly any row lies beyond the low-pass's reach from standstill"
         reason = Reason("LowExcitation", text, "record a longer rapid or raise lowpass_hz")
         return empty_estimate(METHOD, Result.UNDER_EXCITED, reason)
-    own = {w.torque_constant_nm_per_a for w in windows} - {None}
-    given = {**known, **({"K": constant} if len(own) == 1 and (constant := own.pop()) is not None else {})}
+    own = window.torque_constant_nm_per_a
+    given = dict(known) if own is None else {**known, "K": own}
     return _with_constant(fitted, given) if "K" in given else _ratios(fitted)
-
-
-def pooled(estimates: Sequence[tuple[Window, Estimate]], settings: Identification) -> Estimate:
-    """Return what windows without a voltage tell together, with what their own estimates were given."""
-    windows, first = [window for window, _ in estimates], estimates[0][1]
-    return told(windows, fit(windows, settings), {name: first.value(name) for name in first.given})
 
 
 def late_s(fitted: TorqueFit) -> tuple[float, float]:
@@ -213,11 +200,7 @@ def _covariance(fitted: TorqueFit) -> Float:
     slopes = [t.slope * fitted.theta[_first(fitted, t)] for t in fitted.terms if t.slope is not None]
     design = np.column_stack([fitted.design, *slopes])
     inverse, _ = inverse_gram(design)
-    scores = design * fitted.residual[:, None]
-    meat, start = np.zeros((design.shape[1], design.shape[1])), 0
-    for part in fitted.parts:
-        meat += _summed(scores[start : start + part.rows], round(SUMMED_SHARE * part.rows))
-        start += part.rows
+    meat = _summed(design * fitted.residual[:, None], round(SUMMED_SHARE * len(design)))
     meat *= (1.0 + WIDENED * SUMMED_SHARE) ** 2
     power = max(float(np.square(fitted.residual).sum()), 1e-12 * float(np.square(fitted.current).sum()))
     alike = design.T @ design * power / max(effective_rows(fitted.residual) - design.shape[1], 1.0)
@@ -264,8 +247,7 @@ def _with_constant(fitted: TorqueFit, given: Mapping[str, float]) -> Estimate:
         result=Result.OK,
         given=tuple(name for name in TOLD_BY_SHEET if name in given),
     )
-    top = max(float(np.abs(p.speed).max()) for p in fitted.parts)
-    judged = judge(answer, inverse_gram(fitted.design)[1], top)
+    judged = judge(answer, inverse_gram(fitted.design)[1], float(np.abs(fitted.rows.speed).max()))
     return _without(judged, [name for name in TOLD_BY_SHEET if name not in given])
 
 
@@ -308,20 +290,17 @@ def _values(fitted: TorqueFit) -> tuple[dict[str, float], Float]:
         if term.at is not None:
             told |= dict(zip(term.names, (float(fitted.theta[k]), term.at), strict=True))
             rates += [unit[k], unit[size]]  # of such terms there is one
-        elif term.columns.shape[1] == 2:  # sine and cosine
-            sine, cosine = fitted.theta[k : k + 2]
-            size_nm = float(np.hypot(sine, cosine))
-            told |= dict(zip(term.names, (size_nm, float(np.arctan2(cosine, sine))), strict=True))
-            rates.append((sine * unit[k] + cosine * unit[k + 1]) / size_nm)
-            rates.append((sine * unit[k + 1] - cosine * unit[k]) / size_nm**2)
-        else:
-            told[term.names[0]] = float(fitted.theta[k])
-            rates.append(unit[k])
+            continue
+        sine, cosine = fitted.theta[k : k + 2]
+        whole = float(np.hypot(sine, cosine))
+        told |= dict(zip(term.names, (whole, float(np.arctan2(cosine, sine))), strict=True))
+        rates.append((sine * unit[k] + cosine * unit[k + 1]) / whole)
+        rates.append((sine * unit[k + 1] - cosine * unit[k]) / whole**2)
     return told, np.array(rates)
 
 
 def _doubts(fitted: TorqueFit) -> Float:
     """Return what is in doubt of Jt, ft and Cd (3,), per N.m/A, beyond chance: noise on a regressor takes from it."""
     power = float(np.mean(np.square(fitted.design[:, 0])))
-    noise = float(np.mean([np.square(p.error_rad_s2) for p in fitted.parts]))
+    noise = fitted.rows.error_rad_s2**2
     return np.array([abs(fitted.theta[0]) * np.hypot(OPEN_SHARE, noise / max(power, 1e-300)), 0.0, 0.0])

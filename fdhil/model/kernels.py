@@ -13,15 +13,15 @@ from fdhil.records import Float
 
 # places in the state vector: what every drive has, then what structures and options add
 CURRENT, SPEED, POSITION, SPEED_INTEGRAL, CURRENT_INTEGRAL, CURRENT_DEMAND = range(6)
-POSITION_INTEGRAL, SET_POINT_BEFORE, POSITION_BEFORE, FILTERED, WAITING = 6, 7, 8, 9, 15
-MOST_WAITING = 4
+POSITION_INTEGRAL, SET_POINT_BEFORE, POSITION_BEFORE, FILTERED, SPEED_FILTERED, NEXT, WAITING = 6, 7, 8, 9, 15, 16, 17
+MOST_WAITING = 32
 STATES = WAITING + MOST_WAITING
 # what a run records at each SYNC instant: how many of the cycle's steps have a limit acting, the state
 ROW_LIMITED, ROW_STATE = range(2)
 # places in the gains, see fdhil.model.loops.gains
 KV, KFF, SPEED_KP, SPEED_KI, CURRENT_MAX, CURRENT_KP, CURRENT_KI, VOLTAGE_MAX, PERIOD, HALF_STEP_MM = range(10)
-POSITION_KI, ACCELERATION, DECAY, RAD_PER_MM, SPEED_CYCLES_PER_S = range(10, 15)
-GAINS = 15
+POSITION_KI, ACCELERATION, DECAY, RAD_PER_MM, SPEED_CYCLES_PER_S, SPEED_DECAY = range(10, 16)
+GAINS = 16
 # the laws from set-point to current demand
 CASCADE, PID = range(2)
 # rows of the leap, see fdhil.model.leap: what a whole speed cycle does to a table that moves or is held, and its bounds
@@ -31,14 +31,23 @@ LEAP_ROWS, LEAP_COLUMNS = 11, 5
 
 
 @compiled
-def _cascade(place: float, rate: float, state: Float, gains: Float) -> tuple[float, float, float]:
+def _seen(speed: float, state: Float, gains: Float) -> float:
+    """Return the speed that the regulators see behind the filter on its feedback, whose memory is in the state."""
+    if gains[SPEED_DECAY] > 0.0:
+        speed = gains[SPEED_DECAY] * state[SPEED_FILTERED] + (1.0 - gains[SPEED_DECAY]) * speed
+        state[SPEED_FILTERED] = speed
+    return speed
+
+
+@compiled
+def _cascade(place: float, rate: float, speed: float, state: Float, gains: Float) -> tuple[float, float, float]:
     """P or PI on position, PI on speed: return the current demand and both integrals if no limit acts.
 
-    ``place`` mm and ``rate`` rad/s are the set-point and the speed that is fed forward.
+    ``place`` mm and ``rate`` rad/s are the set-point and the speed that is fed forward, ``speed`` rad/s what is seen.
     """
     lag = place - state[POSITION]
     integral = state[POSITION_INTEGRAL] + gains[POSITION_KI] * lag
-    error = gains[KV] * lag + integral + rate - state[SPEED]
+    error = gains[KV] * lag + integral + rate - speed
     candidate = state[SPEED_INTEGRAL] + gains[SPEED_KI] * error
     return gains[SPEED_KP] * error + candidate, candidate, integral
 
@@ -48,12 +57,12 @@ def _pid(place: float, rate: float, state: Float, gains: Float) -> tuple[float, 
     """PID on position: return the current demand, the speed integral it does not have, and its own integral.
 
     The derivative is the difference of Kff times set-point less position over one cycle; ``rate`` rad/s adds to it.
+    The filter on the speed feedback acts on the position's part of it.
     """
     lag = place - state[POSITION]
     integral = state[POSITION_INTEGRAL] + gains[POSITION_KI] * lag
-    moved = gains[KFF] * (place - state[SET_POINT_BEFORE]) - gains[RAD_PER_MM] * (
-        state[POSITION] - state[POSITION_BEFORE]
-    )
+    turned = _seen(gains[RAD_PER_MM] * (state[POSITION] - state[POSITION_BEFORE]), state, gains)
+    moved = gains[KFF] * (place - state[SET_POINT_BEFORE]) - turned
     state[SET_POINT_BEFORE] = place
     state[POSITION_BEFORE] = state[POSITION]
     speed = gains[KV] * lag + integral + gains[SPEED_CYCLES_PER_S] * moved + rate
@@ -72,12 +81,10 @@ def _filter(place: float, rate: float, bend: float, order: int, decay: float, st
 
 
 @compiled
-def _current_cycles(
-    demand_a: float, limited: bool, plant: Float, gains: Float, n_current: int, delay: int, state: Float
-) -> int:
+def _current_cycles(demand_a: float, limited: bool, plant: Float, gains: Float, n_current: int, state: Float) -> int:
     """Run the current loop and the plant for one speed cycle, step by step: return the steps with a limit acting.
 
-    ``limited``: the current demand is at its limit. The voltage acts ``delay`` steps after it was computed.
+    ``limited``: the current demand is at its limit. This is the plain drive: what it has not would cost it a tenth.
     """
     phi_ii, phi_iw, phi_wi, phi_ww, phi_xi, phi_xw = plant[0], plant[1], plant[2], plant[3], plant[4], plant[5]
     i_u, w_u, x_u, i_t, w_t, x_t = plant[6], plant[7], plant[8], plant[9], plant[10], plant[11]
@@ -96,8 +103,6 @@ def _current_cycles(
                 steps += 1
         else:
             steps += 1
-        for d in range(delay):
-            u, state[WAITING + d] = state[WAITING + d], u
         torque = torque_constant * i
         if w == 0.0 and abs(torque) <= dry:
             i = still * i + still_u * u
@@ -117,6 +122,56 @@ def _current_cycles(
             i = phi_ii * i + phi_iw * w + i_u * u + i_t * friction
             w = w_next
     state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL] = i, w, x, integral
+    return steps
+
+
+@compiled
+def _delayed_cycles(
+    demand_a: float, limited: bool, plant: Float, gains: Float, n_current: int, delay: int, state: Float
+) -> int:
+    """Run a speed cycle as :func:`_current_cycles` does, of a drive whose voltage acts late.
+
+    The voltage acts ``delay`` steps after it was computed.
+    """
+    phi_ii, phi_iw, phi_wi, phi_ww, phi_xi, phi_xw = plant[0], plant[1], plant[2], plant[3], plant[4], plant[5]
+    i_u, w_u, x_u, i_t, w_t, x_t = plant[6], plant[7], plant[8], plant[9], plant[10], plant[11]
+    still, still_u, torque_constant, dry = plant[12], plant[13], plant[14], plant[15]
+    kp, ki, voltage_max, half_step_mm = gains[CURRENT_KP], gains[CURRENT_KI], gains[VOLTAGE_MAX], gains[HALF_STEP_MM]
+    i, w, x, integral = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL]
+    steps, at = 0, int(state[NEXT])
+    for _ in range(n_current):
+        error = demand_a - i
+        candidate = integral + ki * error
+        raw = kp * error + candidate
+        u = min(max(raw, -voltage_max), voltage_max)
+        if u == raw:
+            integral = candidate
+            if limited:
+                steps += 1
+        else:
+            steps += 1
+        u, state[WAITING + at] = state[WAITING + at], u
+        at = at + 1 if at + 1 < delay else 0
+        torque = torque_constant * i
+        if w == 0.0 and abs(torque) <= dry:
+            i = still * i + still_u * u
+            continue
+        # one friction sign per step: that of the motion, or where the torque will start it
+        if w > 0.0 or (w == 0.0 and torque > 0.0):
+            friction = -dry
+        else:
+            friction = dry
+        w_next = phi_wi * i + phi_ww * w + w_u * u + w_t * friction
+        if w_next * friction > 0.0:  # the sign changed: the table stops for this step
+            x += half_step_mm * w
+            i = phi_ii * i + phi_iw * w + i_u * u + i_t * friction
+            w = 0.0
+        else:
+            x += phi_xi * i + phi_xw * w + x_u * u + x_t * friction
+            i = phi_ii * i + phi_iw * w + i_u * u + i_t * friction
+            w = w_next
+    state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL] = i, w, x, integral
+    state[NEXT] = at
     return steps
 
 
@@ -193,11 +248,11 @@ def _run_leaping(
     state: Float,
     out: Float,
 ) -> None:
-    """Run a cascade without filter and delay as :func:`run` does, each speed cycle in one leap where it is linear.
+    """Run a cascade without delay and offsets as :func:`run` does, each speed cycle in one leap where it is linear.
 
     ``out`` (1 + kept, rows) is written. All that a cycle changes is in plain variables: memory would take most of it.
     """
-    kept, n_speed, n_current, last = shape[1], shape[2], shape[3], reference.size - 1
+    kept, n_speed, n_current, order, last = shape[1], shape[2], shape[3], shape[4], reference.size - 1
     kv, kff, speed_kp, speed_ki, position_ki = (
         gains[KV],
         gains[KFF],
@@ -206,6 +261,7 @@ def _run_leaping(
         gains[POSITION_KI],
     )
     period, current_max, voltage_max = gains[PERIOD], gains[CURRENT_MAX], gains[VOLTAGE_MAX]
+    decay, seen = gains[SPEED_DECAY], state[SPEED_FILTERED]
     i, w, x, demand_a = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_DEMAND]
     speeds, currents, places = state[SPEED_INTEGRAL], state[CURRENT_INTEGRAL], state[POSITION_INTEGRAL]
     for row in range(out.shape[1]):
@@ -219,12 +275,21 @@ def _run_leaping(
         out[ROW_STATE + CURRENT_DEMAND, row] = demand_a
         if kept > POSITION_INTEGRAL:
             out[ROW_STATE + POSITION_INTEGRAL, row] = places
+            state[SPEED_FILTERED] = seen
+            for n in range(SET_POINT_BEFORE, kept):
+                out[ROW_STATE + n, row] = state[n]
         limited = 0
         for m in range(n_speed):
             part = m / n_speed
-            lag = r0 + (r1 - r0) * part - x
+            wanted, rate = r0 + (r1 - r0) * part, slope + bend * part
+            if order > 0:
+                _filter(wanted, rate, bend / period, order, gains[DECAY], state)
+                at = FILTERED + 3 * (order - 1)
+                wanted, rate, forward = state[at], state[at + 1], gains[ACCELERATION] * state[at + 2]
+            lag = wanted - x
             place = places + position_ki * lag
-            error = kv * lag + place + kff * (slope + bend * part) - w
+            seen = decay * seen + (1.0 - decay) * w
+            error = kv * lag + place + kff * rate - seen
             candidate = speeds + speed_ki * error
             raw = speed_kp * error + candidate + forward
             demand_a = min(max(raw, -current_max), current_max)
@@ -238,11 +303,12 @@ def _run_leaping(
                 i, w, currents = _leapt(i, w, currents, demand_a, side, leap)
             else:
                 state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL] = i, w, x, currents
-                limited += _current_cycles(demand_a, demand_a != raw, plant, gains, n_current, 0, state)
+                limited += _current_cycles(demand_a, demand_a != raw, plant, gains, n_current, state)
                 i, w, x, currents = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL]
         out[ROW_LIMITED, row] = limited
     state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_DEMAND] = i, w, x, demand_a
     state[SPEED_INTEGRAL], state[CURRENT_INTEGRAL], state[POSITION_INTEGRAL] = speeds, currents, places
+    state[SPEED_FILTERED] = seen if decay > 0.0 else 0.0
 
 
 @compiled
@@ -268,10 +334,10 @@ def run(
     law, kept, n_speed, n_current, order, delay = shape
     last = reference.size - 1
     out = np.empty((ROW_STATE + kept, rows))
-    if law == CASCADE and order + delay + leap.size + speed_offset.size + current_offset.size == leap.size > 0:
+    if law == CASCADE and leap.size > 0 and delay + speed_offset.size + current_offset.size == 0:
         _run_leaping(reference, first, plant, leap, gains, shape, state, out)
         return out
-    kff, period, current_max = gains[KFF], gains[PERIOD], gains[CURRENT_MAX]
+    kff, period, current_max, filtered = gains[KFF], gains[PERIOD], gains[CURRENT_MAX], gains[SPEED_DECAY] > 0.0
     for row in range(rows):
         k = first + row
         r0, r1, r2 = reference[min(k, last)], reference[min(k + 1, last)], reference[min(k + 2, last)]
@@ -290,7 +356,8 @@ def run(
                 place, rate, acceleration = state[at], state[at + 1], state[at + 2]
             more = _between(speed_offset, k, part) if speed_offset.size > 0 else 0.0
             if law == CASCADE:
-                raw, speed_integral, position_integral = _cascade(place, kff * rate + more, state, gains)
+                speed = _seen(state[SPEED], state, gains) if filtered else state[SPEED]
+                raw, speed_integral, position_integral = _cascade(place, kff * rate + more, speed, state, gains)
             else:
                 raw, speed_integral, position_integral = _pid(place, more, state, gains)
             raw += gains[ACCELERATION] * acceleration
@@ -300,6 +367,9 @@ def run(
             if demand_a == raw:  # all integrals stand while the limit acts
                 state[SPEED_INTEGRAL], state[POSITION_INTEGRAL] = speed_integral, position_integral
             state[CURRENT_DEMAND] = demand_a
-            limited += _current_cycles(demand_a, demand_a != raw, plant, gains, n_current, delay, state)
+            if delay > 0:
+                limited += _delayed_cycles(demand_a, demand_a != raw, plant, gains, n_current, delay, state)
+            else:
+                limited += _current_cycles(demand_a, demand_a != raw, plant, gains, n_current, state)
         out[ROW_LIMITED, row] = limited
     return out

@@ -1,8 +1,8 @@
 """Prepares what every regulator structure shares: the plant's exact step, the kernel's gains, a drive ready to run.
 
 Each PI integrates first: candidate = integral + ki h e, output = clip(kp e + candidate); where the clip acts, the old
-integral is kept. Three options go with every structure: acceleration fed forward as current, a filter on the
-set-point (with the speed and acceleration that are fed forward), and a delay of the current loop.
+integral is kept. Four options go with every structure: acceleration fed forward as current, a filter on the set-point
+(with the speed and acceleration that are fed forward), one on the speed feedback, and a delay of the current loop.
 """
 
 from __future__ import annotations
@@ -77,6 +77,7 @@ def gains(axis: Axis, sync_period_s: float) -> Float:
     values[kernels.DECAY] = math.exp(-g.speed_period_s / g.setpoint_filter_s) if g.setpoint_filter_s > 0 else 0.0
     values[kernels.RAD_PER_MM] = rad_per_mm
     values[kernels.SPEED_CYCLES_PER_S] = 1.0 / g.speed_period_s
+    values[kernels.SPEED_DECAY] = math.exp(-g.speed_period_s / g.speed_filter_s) if g.speed_filter_s > 0 else 0.0
     return values
 
 
@@ -119,7 +120,9 @@ def prepare(law: int, places: int, parameters: Parameters, axis: Axis, sync_peri
     n_current = round(g.speed_period_s / g.current_period_s)
     order = g.setpoint_filter_order if g.setpoint_filter_s > 0 else 0
     if order:
-        places = kernels.WAITING
+        places = kernels.SPEED_FILTERED
+    if g.speed_filter_s > 0:
+        places = kernels.NEXT
     if g.current_delay_cycles:
         places = kernels.WAITING + g.current_delay_cycles
     plant, values = plant_step(parameters, axis.screw_pitch_mm, g.current_period_s), gains(axis, sync_period_s)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault
 from fdhil.model.closed_loop import Response, simulate_axes
 from fdhil.prediction.contour import contour_error_um
+from fdhil.prediction.model_terms import without_dry_friction
 from fdhil.prediction.zones import find_zones
 from fdhil.records import Float, Parameters, Prediction, Trajectory, frozen
 
@@ -38,7 +38,7 @@ def predict(
 
     Zones are what stands out, or with ``zones_above_um`` all that is above it.
     """
-    smooth = {axis: replace(model, Cd=0.0) for axis, model in models.items()}
+    smooth = {axis: without_dry_friction(model) for axis, model in models.items()}
     responses = _responses(reference, models, config)
     return _assemble(reference, responses, config, zones_above_um, lambda: contour_um(reference, smooth, config))
 

@@ -39,6 +39,7 @@ _TERMS: Mapping[str, str] = {
     r"ripple_(screw|motor)_[1-9][0-9]?": "N.m",
     r"ripple_(screw|motor)_[1-9][0-9]?_phase": "rad",
     r"dead_time": "V",
+    r"bus_sag": "1/W",
     r"speed_delay": "s",
     r"resonance": "Hz",
     r"resonance_damping": "1",

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from fdhil.identification.identifiability import unphysical, untold
 from fdhil.records import Reason, Result
 from fdhil.validation.agreement import values_apart
@@ -36,7 +34,7 @@ def _enough_rows(evidence: Evidence) -> bool:
 
 
 def _has_voltage(evidence: Evidence) -> bool:
-    return evidence.window.voltage_v is not None or evidence.window.slow_voltage is not None
+    return evidence.has_voltage
 
 
 def _fitted(evidence: Evidence) -> bool:
@@ -44,22 +42,23 @@ def _fitted(evidence: Evidence) -> bool:
 
 
 def _sound(evidence: Evidence) -> bool:
-    if evidence.fit is None:
-        return False
-    return bool(np.isfinite(evidence.on_time.residuals).all() and np.isfinite(evidence.on_time.information).all())
+    return evidence.sound
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
     """One question: ``find`` is asked where the evidence has what it ``needs``.
 
-    It is passed over where a check of ``unless`` has found something: that explains what this one would find.
+    It is passed over where a check of ``unless`` has found something: that explains what this one would find. What it
+    finds refuses the window, or, where it is ``weighed``, does so only if the model does not explain the rapid at the
+    table, and is a warning else.
     """
 
     name: str
     find: Callable[[Evidence], Iterable[Reason]]
     needs: Callable[[Evidence], bool] = _always
     unless: Sequence[str] = ()
+    weighed: bool = False
 
 
 def _few_rows(evidence: Evidence) -> Iterator[Reason]:
@@ -92,7 +91,7 @@ def _estimate_faults(evidence: Evidence) -> Iterator[Reason]:
     open_end = bool(estimate.missing) and not missing and fit is not None and not fit.converged
     if open_end or estimate.result is Result.DIVERGED:
         yield Reason("SolverFailed", "the fit does not converge", "look at the window's signals")
-    yield from unphysical(estimate)
+    yield from unphysical(evidence.told or estimate)
 
 
 def _no_fit(evidence: Evidence) -> Iterator[Reason]:
@@ -112,9 +111,8 @@ def _current_late(evidence: Evidence) -> Iterable[Reason]:
 
 
 def _structure(evidence: Evidence) -> Iterator[Reason]:
-    """Yield the finding that explains most."""
-    matters = [finding for finding in evidence.findings if finding.matters]
-    yield from (finding.reason() for finding in matters[:1])
+    """Yield what the model lacks, each with its cost."""
+    yield from (evidence.priced(lack) for lack in evidence.lacks if lack.finding.matters)
 
 
 def _late(evidence: Evidence) -> Iterable[Reason]:
@@ -145,7 +143,7 @@ BEFORE_ANY_FIT: Sequence[Check] = (
     Check("position", position_parted, _enough_rows, ("finite",)),
     # what position tells of the move's course is worth nothing where it contradicts the speed
     Check("whole move", interruptions, _enough_rows, ("finite", "position")),
-    Check("play", _play, _enough_rows, ("finite",)),
+    Check("play", _play, _enough_rows, ("finite",), weighed=True),
     Check("slow readings", slow_voltage_faults),
     Check("voltage", _no_voltage),
     Check("rows", _few_rows, unless=("finite", "stages", "slow readings", "voltage")),
@@ -160,16 +158,19 @@ OF_THE_FIT: Sequence[Check] = (
     Check("fit", _no_fit, _has_voltage, ("estimate",)),
     Check("late voltage", _electrically_late, _fitted),
     Check("late current", _current_late, _sound, ("late voltage",)),
-    Check("structure", _structure, _sound, ("late voltage", "late current")),
-    Check("whiteness", whiteness, _sound, ("late voltage", "late current", "structure")),
-    Check("excess noise", excess_noise, _sound, ("late voltage", "late current", "structure")),
+    Check("structure", _structure, _sound, ("late voltage", "late current"), weighed=True),
+    Check("whiteness", whiteness, _sound, ("late voltage", "late current", "structure"), weighed=True),
+    Check("excess noise", excess_noise, _sound, ("late voltage", "late current", "structure"), weighed=True),
     # a late current seems to move a shaft at rest
-    Check("standstill", rest_faults, _sound, ("late voltage", "late current")),
+    Check("standstill", rest_faults, _sound, ("late voltage", "late current"), weighed=True),
     Check("delay", _late, _fitted, MODEL[2:]),
-    Check("simulation", _simulation, _fitted, (*MODEL, "delay")),
+    Check("simulation", _simulation, _fitted, (*MODEL, "delay"), weighed=True),
     Check("values", _values, _fitted, (*MODEL, "delay")),
     Check("slow sensor", slow_faults_beside, _fitted, ("range", "slow readings")),
 )
+
+
+WEIGHED = frozenset(check.name for check in (*BEFORE_ANY_FIT, *OF_THE_FIT) if check.weighed)
 
 
 def ask(checks: Sequence[Check], evidence: Evidence, found: Findings) -> Findings:

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from fdhil.config import Axis, Identification
 from fdhil.identification.delay import coarse_delay
-from fdhil.identification.estimators import least_squares, maximum_likelihood
-from fdhil.identification.estimators.maximum_likelihood import Fit
+from fdhil.identification.estimators import least_squares
+from fdhil.identification.fit import Fit, but_delay, fit, with_delay
 from fdhil.identification.motion import Noise, noise_levels, resolution
 from fdhil.identification.windows import carried, moving_range, smooth
 from fdhil.identification.without_voltage import TorqueFit
 from fdhil.identification.without_voltage import fit as fit_torque
-from fdhil.records import Bool, Estimate, Float, Window
+from fdhil.records import PARAMETERS, Bool, Estimate, Float, Parameters, Reason, Window, rms
 from fdhil.validation.backlash import DeadBand, backlash
+from fdhil.validation.selection import Lacking, lacking
 from fdhil.validation.sensor_reconstruction import Bridge
 from fdhil.validation.simulation import fit_percent
 from fdhil.validation.structure import Finding, findings
+from fdhil.validation.table_error import TableError
+from fdhil.validation.weight import Move, Weight, completed, weigh
+from fdhil.validation.widening import widened
 
 STILL_MM = 0.004  # of the table at rest
 STILL_S, STILL_SHARE = 0.010, 0.02  # of the rapid speed
@@ -51,7 +56,7 @@ def signals_of(window: Window) -> tuple[Signal, ...]:
 class Evidence:
     """A window before any fit, or with its ``estimate`` and the ``fit`` of the same method (None: there is none).
 
-    ``axis`` is the axis' section where it is known. Without a voltage the fit is ``torque``, of [2] alone.
+    ``axis`` is the axis' section where it is known, and ``sync_period_s`` that of its set-points (None: a row's).
     """
 
     window: Window
@@ -59,6 +64,7 @@ class Evidence:
     estimate: Estimate | None = None
     fit: Fit | None = None
     axis: Axis | None = None
+    sync_period_s: float | None = None
 
     @cached_property
     def signals(self) -> Sequence[Signal]:
@@ -95,8 +101,86 @@ class Evidence:
 
     @cached_property
     def torque(self) -> TorqueFit | None:
-        """The fit of [2] alone; None where hardly any row surely moves."""
-        return fit_torque([self.window], self.settings)
+        """The fit of [2] alone, for a window without a voltage; None where hardly any row surely moves."""
+        return None if self.has_voltage else fit_torque(self.window, self.settings)
+
+    @property
+    def has_voltage(self) -> bool:
+        """Whether the window has a voltage, of the drive or of a slow sensor."""
+        return self.window.voltage_v is not None or self.window.slow_voltage is not None
+
+    @cached_property
+    def parameters(self) -> Parameters | None:
+        """The estimate as a drive that can be run; what a voltage would tell of it, and did not, is the fit's own."""
+        if self.estimate is None or not set(PARAMETERS) <= set(self.estimate.names):
+            return None
+        told = self.estimate.parameters()
+        if self.fit is not None:
+            told = completed(told, Parameters(*self.fit.theta[:6]))
+        if self.axis is not None:
+            return completed(told, Parameters(**self.axis.nominal.model_dump()))
+        # through an ordinary loop R and L, which only a voltage tells, do nothing
+        return told if self.has_voltage else told.changed(R=1.0, L=1.0)
+
+    @cached_property
+    def move(self) -> Move | None:
+        """The rows in which the drive surely moves, with the friction of the estimate."""
+        if self.parameters is None or not math.isfinite(sum(self.parameters.as_dict().values())):
+            return None
+        moving = np.zeros(self.window.n)
+        moving[slice(*self.moving)] = self.window.direction
+        if self.torque is not None:
+            moving = self.torque.rows.side
+        mode = moving if self.fit is None else self.fit.problem.motions[0].mode
+        return Move.of(self.window, self.parameters, np.where(np.abs(mode) == 1, mode, 0.0))
+
+    @cached_property
+    def weight(self) -> Weight | None:
+        """What the estimate leaves of the rapid at the table; None where there is no drive to run."""
+        if self.parameters is None or self.move is None:
+            return None
+        noise = self.noise.current_a, self.noise.speed_rad_s
+        period = self.sync_period_s or self.window.dt_s
+        return weigh(self.window, self.settings, self.parameters, self.move, noise, self.axis, period)
+
+    def cost_um(self, lack: Lacking) -> float:
+        """Return what the model's lack makes at the table: a torque on this rapid, a bias here and in a program cut."""
+        if self.parameters is None or self.move is None:
+            return math.inf
+        loop = TableError.of(self.parameters, self.window.pitch_mm, self.axis)
+        courses = list(self.move.of_shift(self.parameters, lack.shift[: len(PARAMETERS)]))
+        if lack.load_nm is not None:
+            one_way = self.move.integral(lack.load_nm)
+            courses.append(np.append(one_way, np.full(one_way.size, one_way[-1])))
+        return max(rms(row) for row in loop.um(np.array(courses), self.window.dt_s))
+
+    @cached_property
+    def told(self) -> Estimate | None:
+        """The estimate with the intervals that hold although the model lacks what was found."""
+        if self.estimate is None or not self.lacks:
+            return self.estimate
+        return widened(self.estimate, self.on_time, self.lacks)
+
+    @cached_property
+    def sound(self) -> bool:
+        """Whether there is a fit that can be asked what it lacks."""
+        if self.fit is None:
+            return False
+        return bool(np.isfinite(self.on_time.residuals).all() and np.isfinite(self.on_time.information).all())
+
+    @cached_property
+    def harmless(self) -> bool:
+        """Whether the model explains the rapid at the table, and nothing it surely lacks makes a next one worse."""
+        if self.weight is None or not self.weight.believed:
+            return False
+        return all(self.weight.allows(self.cost_um(lack)) for lack in self.lacks)
+
+    def priced(self, lack: Lacking) -> Reason:
+        """Return what the model lacks as a reason, with what that costs."""
+        reason = lack.finding.reason()
+        if self.weight is None:
+            return reason
+        return replace(reason, text=f"{reason.text}; at the table {self.weight.told(self.cost_um(lack))}")
 
     @property
     def judged(self) -> Fit:
@@ -124,7 +208,8 @@ class Evidence:
         """The fit, without a delay of more than a sample: what else is wrong moves it too, and has its own name."""
         if not self.late_s:
             return self.judged
-        return maximum_likelihood.fit(self.judged.problem.motions, np.append(self.judged.theta[:6], 0.0), range(6))
+        judged = self.judged
+        return fit(judged.problem.motions, with_delay(judged.theta, 0.0), but_delay(judged.free))
 
     @cached_property
     def fit_percent(self) -> float | None:
@@ -145,6 +230,11 @@ class Evidence:
     def findings(self) -> list[Finding]:
         """What the fit shows beyond the model, the most significant first."""
         return findings(self.on_time)
+
+    @cached_property
+    def lacks(self) -> list[Lacking]:
+        """What of that surely is there, each beside those before it."""
+        return lacking(self.on_time, self.findings) if self.sound else []
 
     def time_s(self, row: int) -> float:
         """Return the time of a row as its recording counts it."""

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from fdhil.identification.courses import voltage_terms_v
 from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.filtering import moving_mean
@@ -53,6 +54,7 @@ def _contradiction(window: Window, fit: Fit, noise: Noise, rows: Rows) -> Iterat
         return
     peak = float(np.nanmax(np.abs(window.current_a)))
     resistance, inductance, torque_constant = fit.theta[:3]
+    voltage = window.voltage_v + voltage_terms_v(fit.problem.motions[0], fit.theta)
     settled, rising = round(SETTLING_S / window.dt_s), round(RISING_S / window.dt_s)
     for part in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
         still = part[settled:-rising]
@@ -61,7 +63,7 @@ def _contradiction(window: Window, fit: Fit, noise: Noise, rows: Rows) -> Iterat
         current, quarter = window.current_a[still], still.size // 4
         lasted_s = (still.size - quarter) * window.dt_s
         rise = (current[-quarter:].mean() - current[:quarter].mean()) / lasted_s
-        excess = float(current.mean() - (window.voltage_v[still].mean() - inductance * rise) / resistance)
+        excess = float(current.mean() - (voltage[still].mean() - inductance * rise) / resistance)
         crept = float(np.ptp(window.position_mm[still[[0, -1]]])) / window.pitch_mm * 2 * np.pi
         doubts = (
             np.hypot(noise.current_a, noise.voltage_v / resistance) / np.sqrt(still.size),

@@ -54,7 +54,7 @@ def load_comes_and_goes(evidence: Evidence) -> Iterator[Reason]:
     chance = rms(rest) * np.sqrt(rest.size / effective_rows(rest) / max(power[k], 1e-300))
     least = LEAST_LOAD * float(np.abs(fitted.current).max())
     if abs(amplitude[k]) > max(least, BUDGET["structure"].deviations * chance):
-        rows = np.flatnonzero(fitted.parts[0].usable)
+        rows = np.flatnonzero(fitted.rows.usable)
         a, b = (evidence.time_s(int(rows[min(edge, rows.size - 1)])) for edge in edges[[starts[k], ends[k]]])
         text = f"a torque as of {amplitude[k]:+.3g} A that is no friction acts from {a:.3f} to {b:.3f} s"
         yield Reason("LoadDetected", text, "identify from moves without cutting, clamping or collision")

@@ -89,7 +89,7 @@ def whole(program: Path, config: MachineConfig, method: str | None = None, **cha
     request = prepare(program, method, config, known(config, **changes))
     assert isinstance(request, ArmRequest)
     assert not request.ahead
-    checked = plan_whole(request, config, known(config, **changes))
+    checked = plan_whole(request, known(config, **changes))
     if isinstance(checked, Refused):
         return checked
     return prepare_armament(request, checked, config, known(config, **changes))

@@ -205,7 +205,7 @@ async def test_a_subroutine_beside_the_program_belongs_to_it(config: MachineConf
     beside.write_text(BESIDE)
     program = written(tmp_path, CALLS)
     digest, models = program_digest(program), nominal_models(config)
-    folder, key = config.store.directory / FOLDER, BackgroundCheck(config)._key(digest, models)
+    folder, key = config.store.directory / FOLDER, BackgroundCheck(config)._key(digest, models, config)
     header = keep(folder, key, lambda body: check(program, digest, models, config, body, lambda _told: None))
     assert header["files"] == {"square.ngc": program_digest(beside)}
     first = await BackgroundCheck(config).run(program, digest, models, whole)

@@ -14,7 +14,7 @@ from fdhil.cli.main import cli
 from fdhil.prediction.models import load_models
 from studies import bench
 from tests.bench import bench_toml
-from tests.identification.deaf import SCREW, screw_csv
+from tests.identification.deaf import SCREW, SECTION, screw_csv
 from tests.identification.recorded import signals
 
 
@@ -28,7 +28,7 @@ def deaf(tmp_path: Path) -> Path:
 @pytest.fixture
 def machine(tmp_path: Path) -> Path:
     path = tmp_path / "machine.toml"
-    path.write_text(bench_toml("X", screw_pitch_mm=10.0, rapid_speed_mm_s=150.0))
+    path.write_text(bench_toml("X", **SECTION))
     return path
 
 
@@ -70,9 +70,9 @@ def test_the_config_gives_what_the_recording_does_not(deaf: Path, machine: Path)
     assert alone.return_value == 1
     assert "torque_constant_nm_per_a" in _invoke(deaf).stdout
     told = _document(_invoke(deaf, "--json", "--config", machine))["files"][0]["pooled"]["parameters"]
-    assert told["K"]["value"] == 0.8
+    assert told["K"]["value"] == 0.33
     assert told["R"]["value"] is None
-    assert told["Jt"]["value"] == pytest.approx(SCREW.Jt * 0.8 / SCREW.K, rel=0.01)
+    assert told["Jt"]["value"] == pytest.approx(SCREW.Jt * 0.33 / SCREW.K, rel=0.01)
 
 
 def test_a_model_file_is_written_that_predict_reads(deaf: Path, machine: Path, tmp_path: Path) -> None:
@@ -83,7 +83,7 @@ def test_a_model_file_is_written_that_predict_reads(deaf: Path, machine: Path, t
     assert not out.exists()
     assert _invoke(deaf, "--config", machine, "--write-model", out).return_value == 0
     written = json.loads(out.read_text())["X"]
-    assert (written["R"], written["L"], written["K"]) == (0.5, 0.005, SCREW.K)
+    assert (written["R"], written["L"], written["K"]) == (0.6, 0.003, SCREW.K)
     assert written["Cd"] == pytest.approx(SCREW.Cd, rel=0.06)
     assert set(written["terms"]) >= {"load"}
 

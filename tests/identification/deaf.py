@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -39,6 +40,26 @@ LOOPS = real_plant.Loops(
     current_ki=2 * np.pi * 400 * SCREW.R,
 )
 SENSORS = real_plant.Sensors(noise=1e-4, speed="middle", encoder_bits=16)
+
+
+# [axis.X] of that machine, whose data sheet has another winding and K
+SECTION: Mapping[str, Any] = {
+    "screw_pitch_mm": 10.0,
+    "rapid_speed_mm_s": 150.0,
+    "nominal": {"R": 0.6, "L": 0.003, "K": 0.33, "Jt": 2e-4, "ft": 5e-4, "Cd": 0.03},
+    "regulators": {
+        "position_gain_per_s": LOOPS.position_gain_per_s,
+        "speed_feedforward": 0.0,
+        "speed_kp": LOOPS.speed_kp,
+        "speed_ki": 0.0,
+        "speed_period_s": 0.00025,
+        "current_limit_a": LOOPS.current_limit_a,
+        "current_kp": LOOPS.current_kp,
+        "current_ki": LOOPS.current_ki,
+        "current_period_s": 3.125e-5,
+        "voltage_limit_v": LOOPS.voltage_limit_v,
+    },
+}
 
 
 def to_and_fro(moves: int, distance_m: float = 0.2, speed_m_s: float = RAPID_M_S, rate_m_s2: float = 1.0) -> Array:

@@ -26,6 +26,7 @@ class SlowDrive:
         self.i = self.w = self.theta = 0.0
         self.speed_sum = self.current_sum = self.position_sum = 0.0
         self.before: tuple[float, float] | None = None
+        self.seen = 0.0
         self.pipeline = [0.0] * axis.regulators.current_delay_cycles
         self.memory: list[list[float]] = []
 
@@ -83,6 +84,13 @@ class SlowDrive:
                 signals = list(stage)
         return signals
 
+    def _slowed(self, speed: float) -> float:
+        """The speed behind the filter on its feedback."""
+        if self.g.speed_filter_s > 0:
+            self.seen += -math.expm1(-self.g.speed_period_s / self.g.speed_filter_s) * (speed - self.seen)
+            return self.seen
+        return speed
+
     def _cycle(self, place: float, rate: float, acceleration: float, encoder: float) -> None:
         """One speed cycle, angles in radians."""
         g, h = self.g, self.g.speed_period_s
@@ -92,11 +100,11 @@ class SlowDrive:
         speed_sum = self.speed_sum
         if g.structure == "pid":
             before = self.before or (place, encoder)
-            difference = g.speed_feedforward * (place - before[0]) - (encoder - before[1])
+            difference = g.speed_feedforward * (place - before[0]) - h * self._slowed((encoder - before[1]) / h)
             self.before = place, encoder
             wanted = g.speed_kp * (outer + difference / h)
         else:
-            error = outer + g.speed_feedforward * rate - self.w
+            error = outer + g.speed_feedforward * rate - self._slowed(self.w)
             speed_sum += g.speed_ki * h * error
             wanted = g.speed_kp * error + speed_sum
         wanted += g.torque_feedforward * acceleration * self.nominal.Jt / self.nominal.K

@@ -103,6 +103,9 @@ def test_leaps_give_what_steps_give(structure: str, seed: int) -> None:
     document["axis"]["X"]["regulators"] |= {
         "structure": structure,
         "position_ki_per_s2": 200.0 * (structure == "double_pi"),
+        "speed_filter_s": 0.0005 * (seed in (1, 4, 5)),
+        "setpoint_filter_s": 0.001 * (seed in (2, 4, 6)),
+        "torque_feedforward": 0.5 * (seed in (2, 3, 4)),
     }
     axis = parse(document).axis["X"]
     model = replace(NOMINAL, Cd=0.0 if seed == 7 else NOMINAL.Cd, Jt=NOMINAL.Jt * random.uniform(0.7, 1.4))

@@ -31,12 +31,15 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "torque": {"torque_feedforward": 0.9},
     "filter": {"setpoint_filter_s": 0.002},
     "second order": {"setpoint_filter_s": 0.001, "setpoint_filter_order": 2},
+    "speed filter": {"speed_filter_s": 0.0005},
     "delay": {"current_delay_cycles": 2},
+    "long delay": {"current_delay_cycles": 32, "current_kp": 1.5, "current_ki": 150.0},
     "all": {
         "speed_feedforward": 0.95,
         "torque_feedforward": 0.5,
         "setpoint_filter_s": 0.001,
         "setpoint_filter_order": 2,
+        "speed_filter_s": 0.0003,
         "current_delay_cycles": 1,
     },
 }

@@ -56,15 +56,16 @@ class Feedback:
 
     @property
     def true_position(self) -> int:
-        """The table's encoder, increments: what the position loop closes on."""
-        return round(self._physics.table_rad * self._inc_per_rad)
+        """What the position loop closes on, increments."""
+        return round(self._physics.seen.position_rad * self._inc_per_rad)
 
     def sample(self, tick: int) -> int:
         """Sample all objects now; the voltage is the mean of the cycle that ended. Returns the following error."""
         physics, numbers = self._physics, self._numbers
         true_position = self.true_position
+        seen = physics.seen
         position, speed, current, voltage = self._sensors.read(
-            true_position, physics.speed_rad_s, physics.current_a, physics.voltage_mean_v
+            true_position, seen.speed_rad_s, seen.current_a, seen.voltage_v
         )
         demand = clip(self._motion.demand, INT32)
         shown = clip(position, INT32)

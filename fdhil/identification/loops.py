@@ -1,0 +1,257 @@
+"""Identifies a drive's own loops from its rapids: gains, feed-forward, filters, computing delay, structure.
+
+The four gains every cascade has are fitted first. What else a drive may have joins one key at a time, the one that a
+score test finds likeliest, as long as the test is sure and the key explains a tenth of the tolerance at the table. The
+other structures of the table are tried against the cascade by the same measure. With full feed-forward and no filter, a
+cascade answers the same when position_gain_per_s and speed_ki / speed_kp change places: of the two the one nearer to
+where the fit began is told.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fdhil.config import Axis, Identification, Regulators
+from fdhil.identification import loop_fit
+from fdhil.identification.loop_fit import DELAY, KEYS, Fit, Problem
+from fdhil.identification.loop_replay import Rapid, fitting_periods, rapid_of, with_regulators
+from fdhil.identification.loop_start import CASCADE, begun_anew, made_up_axis
+from fdhil.records import INTERVAL_95, LoopEstimate, Parameters, Reason, Verdict, Window, frozen, rms
+
+EXPLAINED_SHARE = 0.05  # of the following error, where the config has no tolerance
+WORTH = 0.1  # of the tolerance: what a key must explain to join
+WELL = 0.25  # of the tolerance: with less left no other structure is tried
+SURE = 10.83  # chi square of one degree: one key in a thousand joins by chance
+MOST_WINDOWS = 6
+DIFFER = "LoopsDiffer"
+LOOSE = 0.25  # relative standard deviation above which a gain is not known
+PID = ("position_gain_per_s", "speed_feedforward", "speed_kp", "position_ki_per_s2")
+OPTIONS = ("speed_filter_s", "setpoint_filter_s", DELAY, "torque_feedforward", "position_ki_per_s2")
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One key of the regulators as configured and as found; ``apart`` where chance does not explain the difference."""
+
+    key: str
+    configured: float
+    found: float
+    std: float
+
+    @property
+    def apart(self) -> bool:
+        """Whether the configured value lies outside the 95 % interval of what was found."""
+        return abs(self.found - self.configured) > INTERVAL_95 * self.std
+
+
+def identify_loops(
+    windows: Sequence[Window],
+    mechanics: Sequence[Parameters],
+    axis: Axis | None,
+    settings: Identification,
+    sync_period_s: float | None = None,
+) -> LoopEstimate | None:
+    """Return the loops of the drive whose rapids these are; None where no window tells demand, position and current.
+
+    ``mechanics`` are what each window's estimate says of the motor and what it moves, ``axis`` the machine's section:
+    without it the search begins from the demand alone. Set-points come every ``sync_period_s`` (left out: each row).
+    """
+    pairs = [(rapid_of(w, sync_period_s), own) for w, own in zip(windows, mechanics, strict=True)]
+    told = [(rapid, own) for rapid, own in pairs if rapid is not None and np.isfinite([*own.as_dict().values()]).all()]
+    if not told:
+        return None
+    rapids, plants = zip(*told[-MOST_WINDOWS:], strict=True)
+    following = rms(np.concatenate([one.lag_mm[one.known] for one in rapids])) * 1e3
+    tolerance = settings.tolerance_um or EXPLAINED_SHARE * following
+    problem = _problem(rapids, plants, axis, windows[0])
+    found = _whole_delay(_best(problem, tolerance, axis is not None))
+    configured = None if axis is None else _left_um(problem)
+    verdict = _verdict(found, tolerance, following, configured)
+    return _told(windows[0].axis, found, verdict, configured)
+
+
+def _left_um(problem: Problem) -> float:
+    """Return what the configured regulators leave of the position, the dry friction of each window found anew."""
+    return loop_fit.fit(replace(problem, names=())).unexplained_um
+
+
+def _problem(rapids: tuple[Rapid, ...], plants: tuple[Parameters, ...], axis: Axis | None, window: Window) -> Problem:
+    """Return where the search begins: at the configured regulators, or at what the demand alone says."""
+    if axis is None:
+        made_up = made_up_axis(window, plants[-1], rapids[-1].dt_s)
+        return begun_anew(Problem(rapids, plants, made_up, CASCADE))
+    axis = with_regulators(axis, **fitting_periods(axis.regulators, rapids[0].dt_s))
+    return Problem(rapids, plants, axis, _names(axis.regulators))
+
+
+def _names(regulators: Regulators) -> tuple[str, ...]:
+    """Return the keys that a structure has, and the options that are configured."""
+    base: tuple[str, ...] = PID if regulators.structure == "pid" else CASCADE
+    if base == CASCADE and regulators.speed_ki == 0.0:
+        base = CASCADE[:3]
+    return (*base, *(n for n in OPTIONS if n not in base and getattr(regulators, n) > 0))
+
+
+def _best(problem: Problem, tolerance_um: float, configured: bool) -> Fit:
+    """Return the best fit of all structures; another structure than that of the start must be worth it."""
+    best = _grown(loop_fit.fit(problem), tolerance_um)
+    if configured and best.unexplained_um > tolerance_um:  # the configuration may have led astray
+        best = min(best, _grown(loop_fit.fit(begun_anew(problem)), tolerance_um), key=lambda f: f.unexplained_um)
+    if best.unexplained_um < WELL * tolerance_um:
+        return best
+    other = _other_structure(best)
+    if other is not None:
+        rival = _grown(loop_fit.fit(other), tolerance_um)
+        if best.unexplained_um - rival.unexplained_um > WORTH * tolerance_um:
+            return rival
+    return best
+
+
+def _grown(made: Fit, tolerance_um: float) -> Fit:
+    """Let keys join as long as one is sure and worth it."""
+    while True:
+        name = _likeliest(made)
+        if name is None:
+            return made
+        problem = made.problem
+        wider = replace(problem, names=(*problem.names, name))
+        k = problem.k
+        start = np.concatenate([made.coordinates[:k], [KEYS[name].step], made.coordinates[k:]])
+        grown = loop_fit.fit(wider, start)
+        if made.unexplained_um - grown.unexplained_um < WORTH * tolerance_um:
+            return made
+        made = grown
+
+
+def _likeliest(made: Fit) -> str | None:
+    """Return the key whose absence the residuals show most surely; None where none is sure.
+
+    Rao's score test, with the score's covariance of residuals that hang together.
+    """
+    problem = made.problem
+    options = tuple(n for n in OPTIONS if n not in problem.names)
+    if not options:
+        return None
+    k, m = problem.k, len(options)
+    wider = replace(problem, names=(*problem.names, *options))
+    at = np.concatenate([made.coordinates[:k], np.zeros(m), made.coordinates[k:]])
+    information, score, meat = loop_fit.normal(replace(made, problem=wider, coordinates=at))
+    information = information + np.diag(1.0 / wider.doubt() ** 2)
+    own = np.array([j for j in range(at.size) if not k <= j < k + m])
+    best, most = None, SURE
+    for j, name in enumerate(options):
+        away = np.zeros(at.size)
+        away[k + j] = 1.0
+        away[own] = -np.linalg.solve(information[np.ix_(own, own)], information[own, k + j])
+        push, variance = float(away @ score), float(away @ meat @ away)
+        sure = push * push / variance if variance > 0 else 0.0
+        if push > 0 and sure > most:
+            best, most = name, sure
+    return best
+
+
+def _other_structure(made: Fit) -> Problem | None:
+    """Return the other law of the table, begun where it is nearest to this one: a cascade is a PID but for a filter."""
+    problem = made.problem
+    found = made.axis()
+    g = found.regulators
+    keep = tuple(n for n in problem.names if n in OPTIONS and n not in ("speed_filter_s", "position_ki_per_s2"))
+    if g.structure == "pid":
+        half = g.position_gain_per_s / 2
+        rest = max(half * half - g.position_ki_per_s2, 0.0)
+        outer = half - math.sqrt(rest)
+        axis = with_regulators(
+            found,
+            structure="p_pi_pi",
+            position_gain_per_s=outer,
+            speed_ki=g.speed_kp * (half + math.sqrt(rest)),
+            position_ki_per_s2=0.0,
+        )
+        return replace(problem, axis=axis, names=(*CASCADE, *keep))
+    slow = g.speed_ki / g.speed_kp
+    axis = with_regulators(
+        found,
+        structure="pid",
+        position_gain_per_s=g.position_gain_per_s + slow,
+        position_ki_per_s2=g.position_gain_per_s * slow,
+        speed_ki=0.0,
+        speed_filter_s=0.0,
+    )
+    return replace(problem, axis=axis, names=(*PID, *keep))
+
+
+def _whole_delay(made: Fit) -> Fit:
+    """Return the fit with a whole number of cycles as delay, the rest found anew."""
+    problem = made.problem
+    if DELAY not in problem.names:
+        return made
+    place = problem.names.index(DELAY)
+    cycles = round(made.coordinates[place])
+    axis = with_regulators(problem.axis, **{DELAY: cycles})
+    fewer = replace(problem, axis=axis, names=tuple(n for n in problem.names if n != DELAY))
+    again = loop_fit.fit(fewer, np.delete(made.coordinates, place))
+    return replace(again, problem=replace(problem, axis=axis), coordinates=np.insert(again.coordinates, place, cycles))
+
+
+def _told(name: str, made: Fit, verdict: Verdict, configured_um: float | None) -> LoopEstimate:
+    """Return the answer in the units of the keys."""
+    names = made.problem.names
+    values = made.values
+    slope = [KEYS[n].scale or v for n, v in values.items()]
+    covariance = loop_fit.covariance_of(made) * np.outer(slope, slope)
+    structure = made.problem.axis.regulators.structure
+    if structure != "pid":
+        structure = "double_pi" if values.get("position_ki_per_s2", 0.0) > 0.0 else "p_pi_pi"
+    return LoopEstimate(name, structure, names, frozen([*values.values()]), frozen(covariance), verdict, configured_um)
+
+
+def _verdict(made: Fit, tolerance_um: float, following_um: float, configured_um: float | None) -> Verdict:
+    """Return whether the loops explain the rapids, and what the configured ones leave beyond that."""
+    left = made.unexplained_um
+    reasons, warnings = [], []
+    if not left <= tolerance_um:
+        text = f"the best loops leave {left:.3g} um of a following error of {following_um:.3g} um"
+        advice = "the drive has a structure or a filter that is not known; identification.tolerance_um may be raised"
+        reasons.append(Reason("LoopsUnexplained", f"{text}, more than {tolerance_um:.3g} um", advice))
+    elif configured_um is not None and configured_um - left > WORTH * tolerance_um:
+        text = f"the configured regulators leave {configured_um:.3g} um of a following error of {following_um:.3g} um"
+        advice = "put what was found into [axis.X.regulators]"
+        warnings.append(Reason(DIFFER, f"{text}, those found {left:.3g} um", advice))
+    doubts = np.sqrt(np.diag(loop_fit.covariance_of(made)))
+    for n, doubt in zip(made.problem.names, doubts, strict=True):
+        if KEYS[n].scale == 0.0 and doubt > LOOSE:
+            text = f"{n} is known to {100 * doubt:.0f} % only"
+            warnings.append(Reason("LoopsUndetermined", text, "let the axis accelerate harder"))
+    return Verdict(not reasons, None, tuple(reasons), left, tuple(warnings))
+
+
+def better_loops(loops: LoopEstimate) -> bool:
+    """Return whether loops are believed and explain more than the configured ones, so that they are used instead."""
+    differ = loops.configured_um is None or any(warning.code == DIFFER for warning in loops.verdict.warnings)
+    return loops.verdict.accepted and differ
+
+
+def with_loops(axis: Axis, loops: LoopEstimate) -> Axis:
+    """Return the axis with the regulators that were identified in the place of the configured ones."""
+    values: dict[str, object] = axis.regulators.model_dump()
+    values |= {"structure": loops.structure} | dict(zip(loops.names, loops.values.tolist(), strict=True))
+    if DELAY in loops.names:
+        values[DELAY] = round(float(loops.values[loops.names.index(DELAY)]))
+    if loops.structure == "pid":
+        values |= {"speed_ki": 0.0, "speed_filter_s": 0.0}
+    elif loops.structure == "p_pi_pi":
+        values["position_ki_per_s2"] = 0.0
+    return axis.model_copy(update={"regulators": Regulators.model_validate(values)})
+
+
+def differences(axis: Axis, loops: LoopEstimate) -> list[Difference]:
+    """Return every key that was identified beside its configured value."""
+    spread = np.sqrt(np.diag(loops.covariance))
+    return [
+        Difference(name, float(getattr(axis.regulators, name)), float(value), float(std))
+        for name, value, std in zip(loops.names, loops.values, spread, strict=True)
+    ]
