@@ -34,7 +34,7 @@ class Key:
     """A key of the regulators as the fit moves it: by ``scale``, or by its logarithm (0), between ``low`` and ``high``.
 
     ``doubt`` is how far off it may be to begin with, one standard deviation in that coordinate: it holds what the data
-    cannot tell. ``step`` is what its derivative is taken over.
+    cannot tell. ``step`` is what its derivative is taken over, ``usual`` where the search for an option begins.
     """
 
     scale: float
@@ -42,6 +42,7 @@ class Key:
     high: float
     doubt: float
     step: float
+    usual: float = 0.0
 
     def coordinate(self, value: float) -> float:
         """Return the coordinate of a value."""
@@ -58,11 +59,11 @@ KEYS: dict[str, Key] = {
     "speed_feedforward": Key(1.0, 0.0, 1.5, 0.5, 1e-3),
     "speed_kp": _GAIN,
     "speed_ki": _GAIN,
-    "position_ki_per_s2": Key(100.0, 0.0, 1e4, 10.0, 1e-2),
-    "torque_feedforward": Key(1.0, 0.0, 1.5, 0.5, 2e-3),
-    "speed_filter_s": Key(1e-3, 0.0, 100.0, 3.0, 1e-2),
-    "setpoint_filter_s": Key(1e-3, 0.0, 100.0, 3.0, 1e-2),
-    DELAY: Key(1.0, 0.0, 32.0, 16.0, 0.5),
+    "position_ki_per_s2": Key(100.0, 0.0, 1e4, 10.0, 1e-2, 1.0),
+    "torque_feedforward": Key(1.0, 0.0, 1.5, 0.5, 2e-3, 0.5),
+    "speed_filter_s": Key(1e-3, 0.0, 100.0, 3.0, 1e-2, 1.0),
+    "setpoint_filter_s": Key(1e-3, 0.0, 100.0, 3.0, 1e-2, 1.0),
+    DELAY: Key(1.0, 0.0, 32.0, 16.0, 0.5, 4.0),
 }
 
 
@@ -146,6 +147,11 @@ class Fit:
     def unexplained_um(self) -> float:
         """RMS of what is left of the position."""
         return float(spread_of(self.problem, self.left)[0]) * 1e3
+
+    @property
+    def deviance(self) -> float:
+        """Minus twice the logarithm of the likelihood for each row, but for what all fits of the rapids share."""
+        return float(2.0 * np.log(scale_of(self.problem, self.left)).sum())
 
     @property
     def values(self) -> dict[str, float]:

@@ -14,9 +14,10 @@ from fdhil.model import closed_loop, kernels
 from fdhil.records import Bool, Float, Parameters, Window, read_only, rms
 
 LEAST_ROWS = 50
-REST_ROWS = 20
+REST_ROWS = 30
 LEAD_ROWS = 5
-BEGUN = 1e-5  # of the way
+BEGUN = 1e-6  # of the way
+CREEP = 1e-5
 EDGE_ROWS = 3  # at either end, where the demand may be cut
 NIL_MM = 1e-9
 PENALISED = 3  # order of the differences
@@ -69,10 +70,11 @@ def rapid_of(window: Window, sync_period_s: float | None = None) -> Rapid | None
     offset = 0.0 if window.offset_mm is None else np.nan_to_num(window.offset_mm)
     demand = smoothed(demand) + offset
     begun = int(np.argmax(np.abs(demand - demand[0]) > BEGUN * way))
-    cut = slice(max(0, begun - LEAD_ROWS), None)
-    still = slice(max(0, begun - REST_ROWS), max(begun - 1, 1))
+    first = max(0, begun - LEAD_ROWS)
+    cut = slice(first, None)
+    still = slice(max(0, first - REST_ROWS), first + 1)
     current = bridged(window.current_a)
-    creep = _creep(position[still], window.dt_s, BEGUN * way)
+    creep = _creep(position[still], window.dt_s, CREEP * way)
     return Rapid(
         window.dt_s,
         read_only(demand[cut].copy()),
@@ -80,9 +82,15 @@ def rapid_of(window: Window, sync_period_s: float | None = None) -> Rapid | None
         current[cut],
         known[cut],
         float(position[cut][0]) if creep else float(position[still].mean()),
-        float(current[still].mean()),
+        _held(current[still], first - still.start),
         creep,
     )
+
+
+def _held(current_a: Float, row: int) -> float:
+    """Return the current that is held at a row: while dry friction holds an axis beside its place, it rises steadily."""
+    rows = np.arange(current_a.size)
+    return float(np.polyval(np.polyfit(rows, current_a, 1), row)) if rows.size > LEAD_ROWS else float(current_a.mean())
 
 
 def _on_the_grid(window: Window, sync_period_s: float | None) -> Window:
@@ -167,13 +175,15 @@ def standing(rapid: Rapid, parameters: Parameters, axis: Axis) -> closed_loop.St
     held = rapid.standstill_a - g.speed_kp * (g.position_gain_per_s * lag - speed)
     state = closed_loop.start(rapid.standstill_mm)
     state[[kernels.CURRENT, kernels.CURRENT_DEMAND]] = rapid.standstill_a
-    state[kernels.SPEED] = speed
+    state[[kernels.SPEED, kernels.SPEED_FILTERED]] = speed
     if g.structure == "pid":
         state[kernels.POSITION_INTEGRAL] = held / g.speed_kp
         state[kernels.POSITION_BEFORE] -= rapid.creep_mm_s * g.speed_period_s
     else:
         state[kernels.SPEED_INTEGRAL] = held
-    state[kernels.CURRENT_INTEGRAL] = parameters.R * rapid.standstill_a + parameters.K * speed
+    voltage = parameters.R * rapid.standstill_a + parameters.K * speed
+    state[kernels.CURRENT_INTEGRAL] = voltage
+    state[kernels.WAITING : kernels.WAITING + g.current_delay_cycles] = voltage
     return state
 
 

@@ -1,8 +1,8 @@
 """Identifies a drive's own loops from its rapids: gains, feed-forward, filters, computing delay, structure.
 
-The four gains every cascade has are fitted first. What else a drive may have joins one key at a time, the one that a
-score test finds likeliest, as long as the test is sure and the key explains a tenth of the tolerance at the table. The
-other structures of the table are tried against the cascade by the same measure. With full feed-forward and no filter, a
+The four gains every cascade has are fitted first. What else a drive may have joins one key at a time, the likeliest of
+all first, as long as it explains a tenth of the tolerance at the table, or a quarter of what is left: over hundreds of
+rows no chance does either. The other structures of the table are tried against the cascade by the same measure. With full feed-forward and no filter, a
 cascade answers the same when position_gain_per_s and speed_ki / speed_kp change places: of the two the one nearer to
 where the fit began is told.
 """
@@ -23,9 +23,9 @@ from fdhil.identification.loop_start import CASCADE, begun_anew, made_up_axis
 from fdhil.records import INTERVAL_95, LoopEstimate, Parameters, Reason, Verdict, Window, frozen, rms
 
 EXPLAINED_SHARE = 0.05  # of the following error, where the config has no tolerance
-WORTH = 0.1  # of the tolerance: what a key must explain to join
+WORTH, WORTH_LEFT = 0.1, 0.25  # of the tolerance, or of what is left: what a key must explain to join
+LEAST_UM = 0.1
 WELL = 0.25  # of the tolerance: with less left no other structure is tried
-SURE = 10.83  # chi square of one degree: one key in a thousand joins by chance
 MOST_WINDOWS = 6
 DIFFER = "LoopsDiffer"
 LOOSE = 0.25  # relative standard deviation above which a gain is not known
@@ -106,52 +106,33 @@ def _best(problem: Problem, tolerance_um: float, configured: bool) -> Fit:
     other = _other_structure(best)
     if other is not None:
         rival = _grown(loop_fit.fit(other), tolerance_um)
-        if best.unexplained_um - rival.unexplained_um > WORTH * tolerance_um:
+        if best.unexplained_um - rival.unexplained_um > worth_um(best, tolerance_um):
             return rival
     return best
 
 
 def _grown(made: Fit, tolerance_um: float) -> Fit:
-    """Let keys join as long as one is sure and worth it."""
-    while True:
-        name = _likeliest(made)
-        if name is None:
-            return made
-        problem = made.problem
-        wider = replace(problem, names=(*problem.names, name))
-        k = problem.k
-        start = np.concatenate([made.coordinates[:k], [KEYS[name].step], made.coordinates[k:]])
-        grown = loop_fit.fit(wider, start)
-        if made.unexplained_um - grown.unexplained_um < WORTH * tolerance_um:
-            return made
+    """Let keys join, the best of all first, as long as it is worth it."""
+    while options := [n for n in OPTIONS if n not in made.problem.names]:
+        grown = min((_with(made, name) for name in options), key=lambda fit: fit.deviance)
+        if made.unexplained_um - grown.unexplained_um < worth_um(made, tolerance_um):
+            break
         made = grown
+    return made
 
 
-def _likeliest(made: Fit) -> str | None:
-    """Return the key whose absence the residuals show most surely; None where none is sure.
+def worth_um(made: Fit, tolerance_um: float) -> float:
+    """Return by how much another key, or another structure, must explain more than this fit does."""
+    return max(LEAST_UM, min(WORTH * tolerance_um, WORTH_LEFT * made.unexplained_um))
 
-    Rao's score test, with the score's covariance of residuals that hang together.
-    """
-    problem = made.problem
-    options = tuple(n for n in OPTIONS if n not in problem.names)
-    if not options:
-        return None
-    k, m = problem.k, len(options)
-    wider = replace(problem, names=(*problem.names, *options))
-    at = np.concatenate([made.coordinates[:k], np.zeros(m), made.coordinates[k:]])
-    information, score, meat = loop_fit.normal(replace(made, problem=wider, coordinates=at))
-    information = information + np.diag(1.0 / wider.doubt() ** 2)
-    own = np.array([j for j in range(at.size) if not k <= j < k + m])
-    best, most = None, SURE
-    for j, name in enumerate(options):
-        away = np.zeros(at.size)
-        away[k + j] = 1.0
-        away[own] = -np.linalg.solve(information[np.ix_(own, own)], information[own, k + j])
-        push, variance = float(away @ score), float(away @ meat @ away)
-        sure = push * push / variance if variance > 0 else 0.0
-        if push > 0 and sure > most:
-            best, most = name, sure
-    return best
+
+def _with(made: Fit, name: str) -> Fit:
+    """Return the fit with one key more, begun where it was without, and where all began: its lack bends the others."""
+    k = made.problem.k
+    wider = replace(made.problem, names=(*made.problem.names, name))
+    starts = [np.insert(made.coordinates, k, KEYS[name].step), wider.start()]
+    starts[1][k] = KEYS[name].usual
+    return min((loop_fit.fit(wider, start) for start in starts), key=lambda fit: fit.deviance)
 
 
 def _other_structure(made: Fit) -> Problem | None:

@@ -104,7 +104,7 @@ def gain_change(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) ->
         names = [name for name in names if name not in FRICTION]
     rows = [PARAMETERS.index(name) for name in names]
     moved = np.log(after.values[rows] / before.values[rows])
-    apart = difference_covariance(one, other) / np.outer(before.values, after.values)
+    apart = difference_covariance(one, other) / np.outer(before.values[:6], after.values[:6])
     spread = apart[np.ix_(rows, rows)] + np.diag(np.full(len(rows), MODEL_SHARE**2))
     weight: Float = np.asarray(np.linalg.inv(spread), dtype=np.float64)
     singles = np.eye(len(rows))

@@ -57,6 +57,7 @@ class Evidence:
     """A window before any fit, or with its ``estimate`` and the ``fit`` of the same method (None: there is none).
 
     ``axis`` is the axis' section where it is known, and ``sync_period_s`` that of its set-points (None: a row's).
+    Without a voltage the fit is ``torque``, of [2] alone.
     """
 
     window: Window
