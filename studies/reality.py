@@ -197,7 +197,10 @@ def outcomes_of(machine: Machine, seed: int) -> tuple[list[WindowOutcome], float
         demand = shuttle(0.4, share * rapid_m_s, acceleration_m_s2, RAPIDS)
         moved = run(machine.mechanics, demand, machine.loops)
         told = recording(moved, machine.mechanics, machine.sensors, rapid_m_s, 1000 * seed + k)
-        outcomes += [analyse(w, config.identification, config.axis["X"], config.machine.sync_period_s) for w in find_windows(told)]
+        outcomes += [
+            analyse(w, config.identification, config.axis["X"], config.machine.sync_period_s)
+            for w in find_windows(told)
+        ]
         following.append(rms((moved.motor_m - moved.demand) * 1e6))
     return outcomes, float(np.mean(following))
 
