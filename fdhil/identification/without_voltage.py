@@ -14,7 +14,7 @@ variance of the scores (Newey and West 1987), widened for what that variance its
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -31,6 +31,7 @@ LEAST_ROWS = 32
 BASE = ("Jt", "delay", "ft", "Cd")
 STRIBECK_SHARES = (0.02, 0.03, 0.05, 0.08, 0.12, 0.18, 0.27)  # of the top speed
 SCREW_ORDERS = (1, 2)
+TERMS = ("stribeck", *(f"ripple_screw_{order}" for order in SCREW_ORDERS))
 WORTH = 0.005  # of the torque's RMS: what a term must explain, a tenth of what may be left
 SUMMED_SHARE = 0.1  # of a window's rows: over which its residuals may hang together
 WIDENED = 2.9694 / 1.96  # per share, of the 95 % interval: Kiefer and Vogelsang 2005, Bartlett's weights
@@ -60,8 +61,8 @@ class Term:
 class TorqueFit:
     """[2] in amperes, fitted to the rows of a window: ``design`` (m, k) and ``current`` (m,).
 
-    ``theta`` (k,) are the columns' amplitudes: those of ``BASE``, then of each of ``terms``. Each of ``shifts`` (k,)
-    is by how much they would move with a term that is there and was not worth joining.
+    ``theta`` (k,) are the columns' amplitudes: those of ``BASE``, then of each of ``terms``. ``shifts`` (k,) are
+    by how much they would move with a term that is there and was not worth joining, by its name.
     """
 
     rows: TorqueRows
@@ -69,7 +70,7 @@ class TorqueFit:
     current: Float
     theta: Float
     terms: tuple[Term, ...]
-    shifts: tuple[Float, ...] = ()
+    shifts: Mapping[str, Float] = field(default_factory=dict)
 
     @property
     def residual(self) -> Float:
@@ -108,8 +109,9 @@ def _joined(fitted: TorqueFit) -> TorqueFit:
         wanted = _wanted(fitted, news)
         worth = [other for other in wanted if _explained(other, fitted) > WORTH * rms(fitted.current)]
         if not worth:
-            shifts = [other.theta[: fitted.theta.size] - fitted.theta for other in wanted]
-            return replace(fitted, shifts=tuple(shifts))
+            size = fitted.theta.size
+            shifts = {other.terms[-1].names[0]: other.theta[:size] - fitted.theta for other in wanted}
+            return replace(fitted, shifts=shifts)
         fitted = worth[0]
 
 
@@ -195,7 +197,7 @@ def _covariance(fitted: TorqueFit) -> Float:
     """Return the covariance (k + s, k + s) of the amplitudes and of the values that enter in no linear way.
 
     In every direction the larger of two counts: by the scores, and by what as many residuals would be that hang
-    together as these do; a lucky sample is not precision. On top comes what terms that did not join would move.
+    together as these do; a lucky sample is not precision.
     """
     slopes = [t.slope * fitted.theta[_first(fitted, t)] for t in fitted.terms if t.slope is not None]
     design = np.column_stack([fitted.design, *slopes])
@@ -207,8 +209,6 @@ def _covariance(fitted: TorqueFit) -> Float:
     scale = np.sqrt(np.diag(alike))
     scaled = np.outer(scale, scale)
     covariance: Float = inverse @ (larger(meat / scaled, alike / scaled) * scaled) @ inverse.T
-    for shift in fitted.shifts:
-        covariance[: shift.size, : shift.size] += np.outer(shift, shift)
     return covariance
 
 
@@ -230,9 +230,8 @@ def _first(fitted: TorqueFit, term: Term) -> int:
 def _with_constant(fitted: TorqueFit, given: Mapping[str, float]) -> Estimate:
     """Return the parameters and terms with the torque constant that is ``given``, N.m/A, and R and L if they are."""
     values, rates = _values(fitted)
-    covariance = rates @ _covariance(fitted) @ rates.T
-    doubts = _doubts(fitted)
-    covariance[: len(doubts), : len(doubts)] += np.diag(doubts**2)
+    doubts = _doubts(fitted, rates)
+    covariance = rates @ _covariance(fitted) @ rates.T + doubts @ doubts.T
     units = np.array([1.0 if name.endswith(("_speed", "_phase")) else given["K"] for name in values])
     whole = np.zeros((len(TOLD_BY_SHEET) + len(values),) * 2)
     whole[len(TOLD_BY_SHEET) :, len(TOLD_BY_SHEET) :] = covariance * np.outer(units, units)
@@ -246,6 +245,7 @@ def _with_constant(fitted: TorqueFit, given: Mapping[str, float]) -> Estimate:
         residuals={"mechanical": fitted.residual},
         result=Result.OK,
         given=tuple(name for name in TOLD_BY_SHEET if name in given),
+        systematic=np.vstack([np.zeros((len(TOLD_BY_SHEET), doubts.shape[1])), units[:, None] * doubts]),
     )
     judged = judge(answer, inverse_gram(fitted.design)[1], float(np.abs(fitted.rows.speed).max()))
     return _without(judged, [name for name in TOLD_BY_SHEET if name not in given])
@@ -267,7 +267,8 @@ def _ratios(fitted: TorqueFit) -> Estimate:
     values, rates = _values(fitted)
     known, k = len(RATIOS), len(PARAMETERS)
     whole = np.full((k + known, k + known), np.nan)
-    whole[k:, k:] = (rates @ _covariance(fitted) @ rates.T)[:known, :known] + np.diag(_doubts(fitted) ** 2)
+    doubts = _doubts(fitted, rates)
+    whole[k:, k:] = (rates @ _covariance(fitted) @ rates.T + doubts @ doubts.T)[:known, :known]
     return Estimate(
         method=METHOD,
         names=(*PARAMETERS, *RATIOS),
@@ -299,8 +300,14 @@ def _values(fitted: TorqueFit) -> tuple[dict[str, float], Float]:
     return told, np.array(rates)
 
 
-def _doubts(fitted: TorqueFit) -> Float:
-    """Return what is in doubt of Jt, ft and Cd (3,), per N.m/A, beyond chance: noise on a regressor takes from it."""
+def _doubts(fitted: TorqueFit, rates: Float) -> Float:
+    """Return what is in doubt of each value (v, q), the same in all windows of a drive: one deviation a column.
+
+    Noise on the acceleration takes from Jt; and each term that is there and did not join would move them all.
+    """
     power = float(np.mean(np.square(fitted.design[:, 0])))
-    noise = fitted.rows.error_rad_s2**2
-    return np.array([abs(fitted.theta[0]) * np.hypot(OPEN_SHARE, noise / max(power, 1e-300)), 0.0, 0.0])
+    noise = fitted.rows.error_rad_s2**2 / max(power, 1e-300)
+    inertia = np.eye(len(rates))[0] * abs(fitted.theta[0]) * np.hypot(OPEN_SHARE, noise)
+    none = np.zeros(fitted.theta.size)
+    shifts = [rates[:, : none.size] @ fitted.shifts.get(name, none) for name in TERMS]
+    return np.column_stack([inertia, *shifts])

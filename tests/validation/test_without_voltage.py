@@ -144,3 +144,14 @@ def test_a_triangular_move_is_listed_with_its_parameters_and_not_believed() -> N
     assert outcome.estimate is not None
     assert outcome.estimate.value("Jt") == pytest.approx(SCREW.Jt, rel=0.01)
     assert [reason.code for reason in outcome.verdict.reasons] == ["MissingStage(cruise)"]
+
+
+def test_a_drive_without_feed_forward_is_weighed_by_its_following_error() -> None:
+    """A torque that would be too much of what the torque makes is nothing beside what the loop itself leaves."""
+    window = screw_windows()[0]
+    rng = np.random.default_rng(3)
+    waves = 0.04 * np.abs(window.current_a).max() * np.sin(np.arange(window.n) / 15.0 + rng.uniform(0, 6))
+    rough = replace(window, current_a=frozen(window.current_a + waves))
+    assert analyse(rough, SETTINGS).verdict.accepted
+    unled = replace(rough, demand_mm=frozen(np.zeros(window.n)))
+    assert "ValidationFailed" in [reason.code for reason in analyse(unled, SETTINGS).verdict.reasons]
