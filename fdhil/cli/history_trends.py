@@ -72,6 +72,7 @@ def of_axis(
     from fdhil.identification.trends import slope, steps
 
     values, stds = (_columns(windows, key, symbols) for key in ("value", "std"))
+    values[stds == 0.0] = np.nan  # given, not estimated: a data sheet's value has no course
     time_s = np.array([window.stamp.wall_s for window in windows])
     celsius = np.array([np.nan if w.temperature_c is None else w.temperature_c for w in windows], dtype=np.float64)
     known = bool(np.isfinite(celsius).all())
