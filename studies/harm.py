@@ -71,6 +71,5 @@ def beside_the_path(models: Sequence[Parameters], scene: Scene) -> list[str]:
 
 
 def _missed(model: Parameters, axis: Axis, demand_mm: Float, position_mm: Float) -> tuple[float, float]:
-    runnable = model.changed(ft=max(model.ft, 0.0), Cd=max(model.Cd, 0.0))
-    told = closed_loop.simulate(runnable, axis, drives.CYCLE_S, demand_mm).position_mm
+    told = closed_loop.simulate(model, axis, drives.CYCLE_S, demand_mm).position_mm
     return 1e3 * rms(position_mm - told), 1e3 * rms(position_mm - demand_mm)

@@ -92,7 +92,7 @@ def judge(
         codes=tuple(sorted({reason.code for reason in reasons})),
         texts=tuple(dict.fromkeys(str(reason) for reason in reasons)),
         left_open=tuple(" and ".join(estimate.missing) for estimate in told if estimate.missing),
-        harm=() if scene is None or kind in faults.BETWEEN else _harm(outcomes, scene),
+        harm=() if scene is None or kind in faults.BETWEEN else _harm(outcomes, spoilt.scene or scene),
         warned=tuple(sorted({warning.code for o in outcomes for warning in o.verdict.warnings})),
     )
 

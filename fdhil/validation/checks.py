@@ -91,7 +91,7 @@ def _estimate_faults(evidence: Evidence) -> Iterator[Reason]:
     open_end = bool(estimate.missing) and not missing and fit is not None and not fit.converged
     if open_end or estimate.result is Result.DIVERGED:
         yield Reason("SolverFailed", "the fit does not converge", "look at the window's signals")
-    yield from unphysical(evidence.told or estimate)
+    yield from unphysical(evidence.told or estimate, one_way=True)
 
 
 def _no_fit(evidence: Evidence) -> Iterator[Reason]:

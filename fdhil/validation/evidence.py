@@ -22,14 +22,14 @@ from fdhil.validation.backlash import DeadBand, backlash
 from fdhil.validation.selection import Lacking, lacking
 from fdhil.validation.sensor_reconstruction import Bridge
 from fdhil.validation.simulation import fit_percent
-from fdhil.validation.structure import DEAD_TIME, Finding, findings
+from fdhil.validation.structure import DEAD_TIME, OFFSET_CURRENT, Finding, findings
 from fdhil.validation.table_error import TableError
 from fdhil.validation.weight import NEXT_SPEED, Move, Weight, completed, to_and_fro, weigh
 from fdhil.validation.widening import widened
 
 STILL_MM = 0.004  # of the table at rest
 STILL_S, STILL_SHARE = 0.010, 0.02  # of the rapid speed
-KNOWN = 0.5  # of what a lack makes at the table: it resembles what is tried, and is not known to more
+SENSOR_KNOWN = 0.5  # of what a sensor's fault makes at the table: it resembles what is tried, and does not show there
 LEAST_ROWS = 32  # of a window that may hold a rapid move
 
 
@@ -156,7 +156,9 @@ class Evidence:
         if p is None or move is None:
             return math.inf
         loop, dt_s = TableError.of(p, self.window.pitch_mm, self.axis), self.window.dt_s
-        cut, shift = move.slower(p, NEXT_SPEED), lack.shift[: len(PARAMETERS)]
+        cut, shift = move.slower(p, NEXT_SPEED), lack.shift[: len(PARAMETERS)].copy()
+        if lack.finding.name == OFFSET_CURRENT:  # to the loop it is a load, which is part of one direction's friction
+            shift[PARAMETERS.index("Cd")] = 0.0
         torques = [move.whole(p), move.of_shift(p, shift), cut.whole(p), cut.of_shift(p, shift)]
         if lack.load_nm is not None:
             torques.append(move.integral(lack.load_nm))
@@ -191,7 +193,7 @@ class Evidence:
         """Whether the model explains the rapid at the table, and nothing it surely lacks makes a next one worse."""
         if self.weight is None or not self.weight.believed:
             return False
-        return all(self.weight.allows(self.cost_um(lack) / KNOWN) for lack in self.lacks)
+        return all(self.weight.allows(self.cost_um(lack) / _known(lack)) for lack in self.lacks)
 
     def priced(self, lack: Lacking) -> Reason:
         """Return what the model lacks as a reason, with what that costs."""
@@ -257,3 +259,8 @@ class Evidence:
     def time_s(self, row: int) -> float:
         """Return the time of a row as its recording counts it."""
         return self.window.start_s + row * self.window.dt_s
+
+
+def _known(lack: Lacking) -> float:
+    """Return what share of a lack's error is known: a replay shows a torque, and no sensor."""
+    return 1.0 if lack.load_nm is not None else SENSOR_KNOWN

@@ -27,6 +27,7 @@ NEXT_SPEED = 0.3  # of the rapid speed: that of a program that is cut
 SCATTER = 3.0  # deviations by which the power of noise may lie above what is expected
 BEGINNING_S = 0.060  # before the drive surely moves
 SMOOTHING_S = 0.002  # of the current, whose noise would push a shaft at rest
+LOOPS_DIFFER = "LoopsDiffer"  # code of what the torque explains, and the closed loop does not
 NOISE_ROWS = 25.0e-3  # s: over which noise behind a position loop hangs together
 
 
@@ -75,6 +76,7 @@ class Weight:
         )
         if self.allows(self.torque_um):
             advice = "the torque is explained, so the drive's loops are not as configured: fdhil identify --loops"
+            return Reason(LOOPS_DIFFER, text, advice)
         return Reason("ValidationFailed", text, advice)
 
     def told(self, um: float) -> str:
