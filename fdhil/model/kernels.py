@@ -58,15 +58,14 @@ def _cascade(place: float, rate: float, speed: float, state: Float, gains: Float
 
 
 @compiled
-def _pid(place: float, rate: float, state: Float, gains: Float) -> tuple[float, float, float]:
+def _pid(place: float, rate: float, turned: float, state: Float, gains: Float) -> tuple[float, float, float]:
     """PID on position: return the current demand, the speed integral it does not have, and its own integral.
 
     The derivative is the difference of Kff times set-point less position over one cycle; ``rate`` rad/s adds to it.
-    The filter on the speed feedback acts on the position's part of it.
+    ``turned`` rad is the position's part of it, as the filter on the speed feedback lets it through.
     """
     lag = place - state[POSITION]
     integral = state[POSITION_INTEGRAL] + gains[POSITION_KI] * lag
-    turned = _seen(gains[RAD_PER_MM] * (state[POSITION] - state[POSITION_BEFORE]), state, gains)
     moved = gains[KFF] * (place - state[SET_POINT_BEFORE]) - turned
     state[SET_POINT_BEFORE] = place
     state[POSITION_BEFORE] = state[POSITION]
@@ -86,17 +85,19 @@ def _filter(place: float, rate: float, bend: float, order: int, decay: float, st
 
 
 @compiled
-def _current_cycles(demand_a: float, limited: bool, plant: Float, gains: Float, n_current: int, state: Float) -> int:
+def _current_cycles(
+    demand_a: float, limited: bool, plant: Float, gains: Float, n_current: int, delay: int, state: Float
+) -> int:
     """Run the current loop and the plant for one speed cycle, step by step: return the steps with a limit acting.
 
-    ``limited``: the current demand is at its limit. This is the plain drive: what it has not would cost it a tenth.
+    ``limited``: the current demand is at its limit. The voltage acts ``delay`` steps after it was computed.
     """
     phi_ii, phi_iw, phi_wi, phi_ww, phi_xi, phi_xw = plant[0], plant[1], plant[2], plant[3], plant[4], plant[5]
     i_u, w_u, x_u, i_t, w_t, x_t = plant[6], plant[7], plant[8], plant[9], plant[10], plant[11]
     still, still_u, torque_constant, dry = plant[12], plant[13], plant[14], plant[15]
     kp, ki, voltage_max, half_step_mm = gains[CURRENT_KP], gains[CURRENT_KI], gains[VOLTAGE_MAX], gains[HALF_STEP_MM]
     i, w, x, integral = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL]
-    steps = 0
+    steps, at = 0, int(state[NEXT])
     for _ in range(n_current):
         error = demand_a - i
         candidate = integral + ki * error
@@ -108,6 +109,9 @@ def _current_cycles(demand_a: float, limited: bool, plant: Float, gains: Float, 
                 steps += 1
         else:
             steps += 1
+        if delay > 0:
+            u, state[WAITING + at] = state[WAITING + at], u
+            at = at + 1 if at + 1 < delay else 0
         torque = torque_constant * i
         if w == 0.0 and abs(torque) <= dry:
             i = still * i + still_u * u
@@ -127,6 +131,7 @@ def _current_cycles(demand_a: float, limited: bool, plant: Float, gains: Float, 
             i = phi_ii * i + phi_iw * w + i_u * u + i_t * friction
             w = w_next
     state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL] = i, w, x, integral
+    state[NEXT] = at
     return steps
 
 
@@ -165,7 +170,7 @@ def _cycles_with_terms(
     demand_a: float,
     limited: bool,
     plant: Float,
-    masses: Float,
+    masses: Float | None,
     gains: Float,
     terms: Float,
     n_current: int,
@@ -175,7 +180,7 @@ def _cycles_with_terms(
     """Run a speed cycle as :func:`_current_cycles` does, with what may join the plain drive.
 
     A voltage acts ``delay`` steps after it was computed, less the inverter's dead time. Ripples are those of the middle
-    of each step. ``masses`` (2, 5, 8), or empty where motor and table are one, is the exact step of motor and table,
+    of each step. ``masses`` (2, 5, 8), or None where motor and table are one, is the exact step of motor and table,
     free and with the table held; dry friction acts on the table then, all else on the motor.
     """
     phi_ii, phi_iw, phi_wi, phi_ww, phi_xi, phi_xw = plant[0], plant[1], plant[2], plant[3], plant[4], plant[5]
@@ -190,7 +195,7 @@ def _cycles_with_terms(
         terms[STRIBECK_SPEED],
     )
     more_positive, more_negative = terms[VISCOUS_POSITIVE] - terms[VISCOUS], terms[VISCOUS_NEGATIVE] - terms[VISCOUS]
-    spring, damper, two = terms[SPRING] * rad_per_mm, terms[DAMPER], masses.size > 0
+    spring, damper = terms[SPRING] * rad_per_mm, terms[DAMPER]
     i, w, x, integral = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL]
     table_w, table = state[TABLE_SPEED], state[TABLE]
     steps, at = 0, int(state[NEXT])
@@ -214,13 +219,13 @@ def _cycles_with_terms(
         if terms.size > RIPPLES:
             against += _ripple(rad_per_mm * (x + half_step_mm * w), terms)
         rubbing, push = w, torque_constant * i - against
-        if two:
+        if masses is not None:
             rubbing, push = table_w, spring * (x - table) + damper * w
         # one side per step: that of the motion, or where the torque will start it
         side = 1.0 if rubbing > 0.0 or (rubbing == 0.0 and push > 0.0) else -1.0
         dry = (positive if side > 0.0 else negative) + _low_speed(rubbing, slow, slow_speed)
         held = rubbing == 0.0 and abs(push) <= dry
-        if two:
+        if masses is not None:
             m = masses[1 if held else 0]
             dry, apart = side * dry, x - table
             x = table + m[2, 0] * i + m[2, 1] * w + m[2, 2] * apart + m[2, 3] * table_w
@@ -415,7 +420,7 @@ def _run_leaping(
                 i, w, currents = _leapt(i, w, currents, demand_a, side, leap)
             else:
                 state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL] = i, w, x, currents
-                limited += _current_cycles(demand_a, demand_a != raw, plant, gains, n_current, state)
+                limited += _current_cycles(demand_a, demand_a != raw, plant, gains, n_current, 0, state)
                 i, w, x, currents = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL]
         out[ROW_LIMITED, row] = limited
     state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_DEMAND] = i, w, x, demand_a
@@ -429,7 +434,7 @@ def _run_leaping_with_terms(
     first: int,
     plant: Float,
     leap: Float,
-    masses: Float,
+    masses: Float | None,
     gains: Float,
     terms: Float,
     shape: tuple[int, int, int, int, int, int],
@@ -539,9 +544,9 @@ def run(
     rows: int,
     plant: Float,
     leap: Float,
-    masses: Float,
+    masses: Float | None,
     gains: Float,
-    terms: Float,
+    terms: Float | None,
     shape: tuple[int, int, int, int, int, int],
     state: Float,
 ) -> Float:
@@ -549,7 +554,7 @@ def run(
 
     ``reference`` (n,) mm is held beyond its end; ``speed_offset`` rad/s and ``current_offset`` A are (n,) or empty.
     ``plant`` (16,), ``leap`` (LEAP_ROWS, LEAP_COLUMNS) or empty, and ``gains`` (GAINS,): see :mod:`fdhil.model.loops`.
-    ``terms``, empty for a plain drive, and ``masses``: see :mod:`fdhil.model.terms`. ``shape``: law, states kept of
+    ``terms``, None for a plain drive, and ``masses``: see :mod:`fdhil.model.terms`. ``shape``: law, states kept of
     each row, speed cycles per SYNC cycle, current cycles per speed cycle, order of the set-point filter, current cycles
     of delay. ``state`` (STATES,) is written.
     """
@@ -557,10 +562,10 @@ def run(
     last = reference.size - 1
     out = np.empty((ROW_STATE + kept, rows))
     if law == CASCADE and leap.size > 0 and speed_offset.size + current_offset.size == 0:
-        if terms.size > 0:
-            _run_leaping_with_terms(reference, first, plant, leap, masses, gains, terms, shape, state, out)
-        else:
+        if terms is None:
             _run_leaping(reference, first, plant, leap, gains, shape, state, out)
+        else:
+            _run_leaping_with_terms(reference, first, plant, leap, masses, gains, terms, shape, state, out)
         return out
     kff, period, current_max, filtered = gains[KFF], gains[PERIOD], gains[CURRENT_MAX], gains[SPEED_DECAY] > 0.0
     for row in range(rows):
@@ -584,7 +589,9 @@ def run(
                 speed = _seen(state[SPEED], state, gains) if filtered else state[SPEED]
                 raw, speed_integral, position_integral = _cascade(place, kff * rate + more, speed, state, gains)
             else:
-                raw, speed_integral, position_integral = _pid(place, more, state, gains)
+                turned = gains[RAD_PER_MM] * (state[POSITION] - state[POSITION_BEFORE])
+                turned = _seen(turned, state, gains) if filtered else turned
+                raw, speed_integral, position_integral = _pid(place, more, turned, state, gains)
             raw += gains[ACCELERATION] * acceleration
             if current_offset.size > 0:
                 raw += _between(current_offset, k, part)
@@ -593,9 +600,9 @@ def run(
                 state[SPEED_INTEGRAL], state[POSITION_INTEGRAL] = speed_integral, position_integral
             state[CURRENT_DEMAND] = demand_a
             clipped = demand_a != raw
-            if terms.size > 0:
-                limited += _cycles_with_terms(demand_a, clipped, plant, masses, gains, terms, n_current, delay, state)
+            if terms is None:
+                limited += _current_cycles(demand_a, clipped, plant, gains, n_current, delay, state)
             else:
-                limited += _current_cycles(demand_a, clipped, plant, gains, n_current, state)
+                limited += _cycles_with_terms(demand_a, clipped, plant, masses, gains, terms, n_current, delay, state)
         out[ROW_LIMITED, row] = limited
     return out
