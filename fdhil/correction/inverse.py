@@ -97,7 +97,7 @@ class AxisInverse:
             linear.inverse(parameters, drive, period, sum(block_rows(period))),
             Resting(parameters, drive, period, limits.um_per_increment * 1e-3),
         )
-        return AxisInverse(loop, Carry(closed_loop.start(start_mm), np.zeros(2), np.empty(0)))
+        return AxisInverse(loop, Carry(closed_loop.standing(parameters, drive, start_mm), np.zeros(2), np.empty(0)))
 
     def block(self, reference_mm: Float, target_mm: Float, rows: int, ends: bool) -> Solution:
         """Solve the next ``rows``, with what is known of the rows behind them, and go on to those.
