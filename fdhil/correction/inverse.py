@@ -43,7 +43,7 @@ def common_delay_s(
         return 0.0, ()
     tau = 0.5 * (min(delays.values()) + max(delays.values()))
     needed_um = {axis: abs(delay - tau) * speeds_mm_s[axis] * 1e3 for axis, delay in delays.items()}
-    return tau, too_large(needed_um, config)
+    return tau, too_large(needed_um, models, config)
 
 
 def delayed(path: Float, delay_rows: float) -> Float:
@@ -72,7 +72,7 @@ def plan(reference: Trajectory, models: Mapping[str, Parameters], config: Machin
         return walk.whole(path, delayed(path, tau / reference.dt_s))
 
     found = closed_loop.each_axis(one, reference.axes)
-    refused = too_large({axis: needed for axis, (_, needed) in found.items()}, config)
+    refused = too_large({axis: needed for axis, (_, needed) in found.items()}, models, config)
     return Plan(nothing if refused else {axis: offset for axis, (offset, _) in found.items()}, tau, refused)
 
 

@@ -151,8 +151,7 @@ def _refused(name: str, loop: AxisLoop, solution: Solution, free: Response, rows
         reason = Reason("DemandTooHigh", text, "lower the feed, or smooth more")
         refused.append(_Refusal(int(np.argmax(free.limited > 0.0)), reason))
     elif solution.needed_um > loop.limits.offset * um:
-        feedforward = loop.axis.regulators.speed_feedforward
-        reason = lag_reason(name, solution.needed_um, loop.limits.offset * um, feedforward)
+        reason = lag_reason(name, solution.needed_um, loop.limits.offset * um, loop.parameters, loop.axis)
         refused.append(_Refusal(solution.needed_at, reason))
     before = float(solution.offset[1]), float(solution.offset[0])
     broken = check(solution.offset[2:rows].astype(np.int64), loop.limits, before)
