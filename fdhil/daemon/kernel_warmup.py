@@ -10,6 +10,7 @@ from fdhil import correction
 from fdhil.config import Axis, MachineConfig
 from fdhil.correction.kernels import project
 from fdhil.identification.kalman import departure
+from fdhil.model import closed_loop
 from fdhil.pipeline import AxisPipeline
 from fdhil.records import Float, Parameters, Stages, Trajectory, Window, frozen, frozen_ints
 
@@ -29,6 +30,8 @@ def warm(config: MachineConfig, method: str | None = None) -> None:
     reference = Trajectory(dt_s, frozen(np.arange(rows) * dt_s), demand, still.astype(np.bool_), frozen_ints(still))
     models = {name: Parameters(**axis.nominal.model_dump()) for name, axis in config.axis.items()}
     correction.plan(reference, models, config)
+    for name, model in models.items():
+        closed_loop.simulate(model.changed(load=0.0), config.axis[name], dt_s, demand[name][:8])
     _warm_what_is_rare()
 
 
