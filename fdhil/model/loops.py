@@ -21,7 +21,6 @@ from fdhil.model.terms import exponential
 from fdhil.records import Float, Parameters, read_only
 
 _NO_LEAP = read_only(np.empty((0, kernels.LEAP_COLUMNS)))
-_NO_TERMS = read_only(np.empty(0))
 
 
 @lru_cache(maxsize=64)
@@ -81,7 +80,7 @@ class Drive:
     leap: Float
     masses: Float
     gains: Float
-    terms: Float
+    terms: Float | None
     shape: tuple[int, int, int, int, int, int]
     sync_period_s: float
     nominal_k: float
@@ -118,16 +117,23 @@ def prepare(law: int, places: int, parameters: Parameters, axis: Axis, sync_peri
     more = terms.more_than_plain(parameters, axis)
     plant, values = plant_step(parameters, axis.screw_pitch_mm, g.current_period_s), gains(axis, sync_period_s)
     kp, ki = values[kernels.CURRENT_KP], values[kernels.CURRENT_KI]
+    steps_only = g.current_delay_cycles > 0 or terms.has_spring(parameters)
+    through = _NO_LEAP if steps_only else leap(_per_newton_metre(plant) if more else plant, kp, ki, n_current)
     return Drive(
         plant,
-        _NO_LEAP if more else leap(plant, kp, ki, n_current),
+        through,
         terms.masses(parameters, axis.screw_pitch_mm, g.current_period_s),
         values,
-        terms.packed(parameters) if more else _NO_TERMS,
+        terms.packed(parameters) if more else None,
         (law, _kept(places, parameters, axis), n_speed, n_current, order, g.current_delay_cycles),
         sync_period_s,
         axis.nominal.K,
     )
+
+
+def _per_newton_metre(plant: Float) -> Float:
+    """Return the plant with a dry friction of 1 N.m, so that a leap takes any torque."""
+    return np.append(plant[:-1], 1.0)
 
 
 def _kept(places: int, parameters: Parameters, axis: Axis) -> int:
