@@ -92,10 +92,10 @@ def analyse_file(
     for outcome in _outcomes(windows, work):
         outcomes.append(outcome)
         progress(1.0 / (len(windows) + 1))
-    loops = loops_of(outcomes, axis, settings) if suspected(outcomes) else None
+    loops = loops_of(outcomes, axis, settings, period_s) if suspected(outcomes) else None
     own_axis = better_axis(axis, loops)
     if own_axis is not None:
-        outcomes = list(_outcomes(windows, settings, own_axis))
+        outcomes = list(_outcomes(windows, partial(work, axis=own_axis)))
     estimate, verdict = pool(outcomes, settings)
     progress(1.0 / (len(windows) + 1))
     return FileResult(str(path), recording.axis, tuple(outcomes), estimate, verdict, loops=loops)
