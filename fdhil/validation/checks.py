@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from fdhil.identification.identifiability import unphysical, untold
 from fdhil.records import Reason, Result
 from fdhil.validation.agreement import values_apart
@@ -95,7 +97,7 @@ def _estimate_faults(evidence: Evidence) -> Iterator[Reason]:
 
 
 def _slips(evidence: Evidence) -> Iterator[Reason]:
-    """Yield a reason where friction falls so much with speed that the axis sticks and slips: no model is steady there."""
+    """Yield a reason where friction falls so much with speed that the axis sticks and slips."""
     if evidence.estimate is None or "stribeck" not in evidence.estimate.terms:
         return
     more, dry = evidence.estimate.value("stribeck"), abs(evidence.estimate.value("Cd"))
