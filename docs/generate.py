@@ -33,10 +33,12 @@ ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES: Mapping[str, Any] = {  # of keys without a default: the bench machine
     "machine.name": "my machine",
     "screw_pitch_mm": 20.0, "rapid_speed_mm_s": 500.0, "max_acceleration_mm_s2": 4000.0, "max_jerk_mm_s3": 160000.0,
+    "resonance_hz": 80.0,
     "R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0,
     "position_gain_per_s": 50.0, "speed_kp": 23.562, "speed_ki": 1184.35, "current_limit_a": 200.0,
     "current_kp": 12.566, "current_ki": 1256.64, "voltage_limit_v": 300.0,
     "node_id": 1, "speed_limit_mm_s": 500.0, "method": "maximum_likelihood", "tolerance_um": 2.0,
+    "speed_feedforward": 0.98, "setpoint_filter_s": 0.002, "speed_filter_s": 0.0005, "current_delay_cycles": 2,
     "run_directory": "/run/fdhil",
     "guard.run_directory": "/run/fdhil-guard", "daemon_user": "fdhil",
     "commissioning_key": "/etc/fdhil/commissioning.key",

@@ -78,14 +78,16 @@ def test_each_section_of_the_template_may_be_uncommented_and_shows_its_defaults(
         assert loaded(tmp_path, uncommented(text, section)).digest, section
 
 
-@pytest.mark.parametrize("model", [config.Thermometer, config.FeedforwardLimits, config.CanBus, config.SimAxis])
+@pytest.mark.parametrize(
+    "model", [config.Thermometer, config.FeedforwardLimits, config.CanBus, config.SimAxis, config.Reality]
+)
 def test_comments_stand_right_above_what_they_explain(model: type[config.Section]) -> None:
     text = TEMPLATE.read_text("utf-8")
     header, _, words = (model.__doc__ or "").partition(": ")
     name = header.replace("NAME", "can0")
     assert f"\n\n# {words[0].upper()}{words[1:]}\n{name}\n" in text.replace(f"#{name}", name)
     block = text.split(f"{name}\n")[1].split("\n\n")[0]
-    keys = [f"# {field.description}\n#{key} = " for key, field in model.model_fields.items()]
+    keys = [f"# {field.description}\n#{key} = " for key, field in model.model_fields.items() if field.description]
     assert [key for key in keys if key not in block] == []
 
 

@@ -17,6 +17,7 @@ from fdhil.arming.checked_program import Block, CheckedProgram
 from fdhil.arming.code_digest import MAKER
 from fdhil.arming.program_check import SCHEMA, part_file
 from fdhil.config import MachineConfig
+from fdhil.prediction.model_terms import values_of
 from fdhil.records import Parameters, Reason
 from fdhil.store.atomic import store_error
 
@@ -40,21 +41,28 @@ class BackgroundCheck:
         return None if self._going is None or self._going.ended else self._going.progress
 
     async def run(
-        self, program: Path, program_digest: str, models: Mapping[str, Parameters], enough: Enough
+        self,
+        program: Path,
+        program_digest: str,
+        models: Mapping[str, Parameters],
+        enough: Enough,
+        config: MachineConfig | None = None,
     ) -> CheckedProgram | tuple[Reason, ...]:
         """Return the program as soon as ``enough`` of it or all has passed, or why it is refused: every place.
 
+        ``config`` is that of the machine with its regulators as they were identified; left out: as configured.
         What was checked before is not checked again; a check that still goes on is taken up, one of another program is
         ended. StoreError when no rows can be written.
         """
-        key = self._key(program_digest, models)
+        config = config or self._config
+        key = self._key(program_digest, models, config)
         known = await asyncio.to_thread(CheckedProgram.find, self._folder, key, program.parent)
         if known is not None:
             return known
         going = self._going
         if going is None or going.ended or going.key != key:
             await self.close()
-            request = self._request(program, program_digest, models, key)
+            request = self._request(program, program_digest, models, key, config)
             going = self._going = _RunningCheck(request, await asyncio.to_thread(self._opened, key))
         with contextlib.ExitStack() as left:  # who waits for it was cancelled, or cannot judge it
             left.callback(self.abandon)
@@ -62,8 +70,8 @@ class BackgroundCheck:
             left.pop_all()
         return found
 
-    def _key(self, program_digest: str, models: Mapping[str, Parameters]) -> str:
-        of = [SCHEMA, program_digest, self._config.digest, {axis: m.as_dict() for axis, m in models.items()}]
+    def _key(self, program_digest: str, models: Mapping[str, Parameters], config: MachineConfig) -> str:
+        of = [SCHEMA, program_digest, config.digest, {axis: values_of(m) for axis, m in models.items()}]
         return hashlib.sha256(json.dumps(of).encode()).hexdigest()[:32]
 
     def _opened(self, key: str) -> CheckedProgram:
@@ -77,12 +85,14 @@ class BackgroundCheck:
         except OSError as error:
             raise store_error(part, error) from None
 
-    def _request(self, program: Path, digest: str, models: Mapping[str, Parameters], key: str) -> Mapping[str, Any]:
+    def _request(
+        self, program: Path, digest: str, models: Mapping[str, Parameters], key: str, config: MachineConfig
+    ) -> Mapping[str, Any]:
         return {
             "program": str(program),
             "program_digest": digest,
-            "config": self._config.model_dump(mode="json"),
-            "models": {axis: model.as_dict() for axis, model in models.items()},
+            "config": config.model_dump(mode="json"),
+            "models": {axis: values_of(model) for axis, model in models.items()},
             "folder": str(self._folder),
             "key": key,
         }

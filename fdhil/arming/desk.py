@@ -15,6 +15,7 @@ from fdhil.arming.background_check import BackgroundCheck
 from fdhil.arming.checked_program import CheckedProgram
 from fdhil.arming.guard_link import GuardLink
 from fdhil.arming.knowledge import Knowledge
+from fdhil.arming.lessons import taught
 from fdhil.arming.passes import Passes
 from fdhil.arming.preparing import (
     Armament,
@@ -27,6 +28,7 @@ from fdhil.arming.preparing import (
     prepare_feeding,
 )
 from fdhil.arming.standing import ADOPT, GONE, REST, START_AND_ADOPT, Standing, landed, verdict
+from fdhil.arming.standstill import Standstill
 from fdhil.arming.stream_feeder import StreamFeeder
 from fdhil.arming.token import ensure_token
 from fdhil.arming.whole_plan import plan_whole
@@ -65,6 +67,7 @@ class ArmingDesk:
         self._armed: tuple[Armament | Feeding, Mapping[str, Any]] | None = None
         self._check = BackgroundCheck(config)
         self._passes = Passes(config)
+        self._standstill = Standstill(config)
         self._feeder: StreamFeeder | None = None
         self._given_up = False
         self._disarming: asyncio.Future[Answer] | None = None
@@ -78,6 +81,7 @@ class ArmingDesk:
     def hear(self, samples: AxisSamples) -> None:
         """Take samples: those of a pass of the armed program are compared with what was predicted."""
         self._passes.take(samples)
+        self._standstill.take(samples)
 
     @property
     def passes(self) -> list[Mapping[str, Any]]:
@@ -163,14 +167,18 @@ class ArmingDesk:
         checked = await self._checked(request, whole)
         if isinstance(checked, Refused):
             return _refused(checked)
-        armament = await asyncio.to_thread(prepare_armament, request, checked, self._config, self.knowledge.now())
+        if (broken := self._passes.broken(request.program_digest, request.models)) is not None:
+            return _refused(Refused((broken,)))
+        rows, pupil = await asyncio.to_thread(taught, checked, request, self._config.digest)
+        known, rest = self.knowledge.now(), self._standstill.now()
+        armament = await asyncio.to_thread(prepare_armament, request, rows, self._config, known, rest)
         summary = armament.summary()
-        self._passes.begin(armament.begin.demand, armament.rows)
+        self._passes.begin(armament.begin.demand, armament.rows, request.models, pupil)
         answer = await self._hand_over(self.guard.arm, armament, summary, token)
         if not answer["ok"]:
             self._passes.forget()
             return answer
-        self._feeder = StreamFeeder(armament, self.guard)
+        self._feeder = StreamFeeder(armament, self.guard, self._standstill)
         text = f"armed {program.name} by {summary['method']}: {summary['promise']}"
         if not summary["check"]["whole"]:
             text += f" in its first {summary['check']['checked_s']:.0f} s; the check of the rest goes on ahead of it"
@@ -180,12 +188,13 @@ class ArmingDesk:
     async def _checked(self, request: ArmRequest, whole: bool) -> CheckedProgram | Refused:
         """Have a program checked: at once, or ahead of the motion as far as arming asks, or as a ``whole``."""
         if not request.ahead:
-            return await asyncio.to_thread(plan_whole, request, self._config, self.knowledge.now())
+            return await asyncio.to_thread(plan_whole, request, self.knowledge.now())
 
         def enough(checked: CheckedProgram) -> bool:
             return not whole and may_begin(checked, self._config, self.knowledge.now())
 
-        checked = await self._check.run(request.program, request.program_digest, request.models, enough)
+        of = (request.program, request.program_digest, request.models)
+        checked = await self._check.run(*of, enough, request.config)
         return Refused(checked) if isinstance(checked, tuple) else checked
 
     @property

@@ -7,7 +7,8 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from fdhil.records import Notice, Outcome, ParameterSet, Skill, Temperature
+from fdhil.identification.loops import better_loops
+from fdhil.records import LoopEstimate, Notice, Outcome, ParameterSet, Skill, Temperature
 from fdhil.store.rows import Revision
 
 SKILL_MOVES = 3  # FAULTS E19: the last three recorded moves
@@ -15,13 +16,17 @@ SKILL_MOVES = 3  # FAULTS E19: the last three recorded moves
 
 @dataclass(frozen=True, slots=True)
 class AxisKnowledge:
-    """An axis when it is armed, as the daemon knows it: newest published set with its age, last moves' skills."""
+    """An axis when it is armed, as the daemon knows it: newest published set with its age, last moves' skills.
+
+    ``loops`` are the newest that were identified, where they explain what the configured ones do not.
+    """
 
     published: ParameterSet | None
     age_s: float
     temperature_c: float | None
     skills: tuple[Skill, ...]
     load_changed: bool = False
+    loops: LoopEstimate | None = None
 
 
 @dataclass(slots=True)
@@ -31,6 +36,7 @@ class _Axis:
     temperature_c: float | None = None
     skills: deque[Skill] = field(default_factory=lambda: deque(maxlen=SKILL_MOVES))
     load_changed: bool = False
+    loops: LoopEstimate | None = None
 
 
 class Knowledge:
@@ -46,7 +52,7 @@ class Knowledge:
             axis.published, axis.published_s = revision.set, time.monotonic() - revision.stamp.age_s()
         self.note(skills)
 
-    def note(self, outcomes: Sequence[Outcome]) -> None:
+    def note(self, outcomes: Sequence[Outcome | LoopEstimate]) -> None:
         """Take what the pipelines say."""
         for outcome in outcomes:
             if isinstance(outcome, ParameterSet):
@@ -54,6 +60,8 @@ class Knowledge:
                 axis.published, axis.published_s, axis.load_changed = outcome, time.monotonic(), False
             elif isinstance(outcome, Skill):
                 self._axes[outcome.axis].skills.append(outcome)
+            elif isinstance(outcome, LoopEstimate):
+                self._axes[outcome.axis].loops = outcome if better_loops(outcome) else None
             elif isinstance(outcome, Notice) and outcome.code == "LoadChanged" and outcome.severity == "MAJOR":
                 self._axes[outcome.axis].load_changed = True
 
@@ -71,7 +79,12 @@ class Knowledge:
         now_s = time.monotonic()
         return {
             name: AxisKnowledge(
-                axis.published, now_s - axis.published_s, axis.temperature_c, tuple(axis.skills), axis.load_changed
+                axis.published,
+                now_s - axis.published_s,
+                axis.temperature_c,
+                tuple(axis.skills),
+                axis.load_changed,
+                axis.loops,
             )
             for name, axis in self._axes.items()
         }

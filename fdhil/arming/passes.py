@@ -16,11 +16,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fdhil.arming.lessons import Pupil
 from fdhil.config import MachineConfig
+from fdhil.correction import gate
+from fdhil.correction.learning import Lesson
+from fdhil.errors import StoreError
 from fdhil.prediction import contour_error_um
 from fdhil.prediction.contour import WINDOW_S
 from fdhil.prediction.gain import plus_minus
-from fdhil.records import AxisSamples, Float, Int, Notice
+from fdhil.records import AxisSamples, Float, Int, Notice, Parameters, Reason
 
 Rows = tuple[Int, Float, Float]
 """Tick, demand and position (n,) of an axis."""
@@ -31,12 +35,15 @@ MOST_BLOCKS = 1000
 MOST_LEAD_S = 10.0
 TOLERANCE_INCREMENTS = 2.5
 WORSE = 1.05  # times the error predicted without a correction
+SHOWN_CURVE = 8  # passes
+FINISHED = "Finished"  # the guard's word for a program that ran to its end
 
 
 class _Ended(NamedTuple):
     """A pass that the guard has ended; its last samples may come until ``due_s``."""
 
     running: Pass
+    models: Mapping[str, Parameters]
     due_s: float
     cause: str
     summary: Mapping[str, Any]
@@ -49,13 +56,27 @@ class Passes:
         self._config = config
         self._count = Counter[str]()
         self._running: Pass | None = None
+        self._models: Mapping[str, Parameters] = {}
+        self._broken: dict[str, tuple[Mapping[str, Parameters], Reason]] = {}
         self._ended: deque[_Ended] = deque()
         self._taken: deque[AxisSamples] = deque()
         self.told: deque[Mapping[str, Any]] = deque(maxlen=KEPT)
 
-    def begin(self, demand: Mapping[str, Sequence[int]], rows: int | None) -> None:
-        """A program is about to be armed: the first rows of its table in increments, and how many there are."""
-        self._running = Pass(self._config, demand, rows)
+    def begin(
+        self,
+        demand: Mapping[str, Sequence[int]],
+        rows: int | None,
+        models: Mapping[str, Parameters],
+        pupil: Pupil | None = None,
+    ) -> None:
+        """A program is about to be armed: the first rows of its table in increments, how many there are, who learns."""
+        self._running = Pass(self._config, demand, rows, pupil)
+        self._models = models
+
+    def broken(self, program_digest: str, models: Mapping[str, Parameters]) -> Reason | None:
+        """Return why a program is not corrected again by the same models: its last pass was not what they promised."""
+        found = self._broken.get(program_digest)
+        return None if found is None or found[0] != models else found[1]
 
     def forget(self) -> None:
         """It was not armed."""
@@ -69,7 +90,7 @@ class Passes:
     def end(self, cause: str, summary: Mapping[str, Any]) -> None:
         """The guard has ended the correction."""
         if self._running is not None:
-            self._ended.append(_Ended(self._running, time.monotonic() + LATE_S, cause, summary))
+            self._ended.append(_Ended(self._running, self._models, time.monotonic() + LATE_S, cause, summary))
             self._running = None
 
     def digest(self) -> list[Notice]:
@@ -85,10 +106,10 @@ class Passes:
         while self._ended and time.monotonic() >= self._ended[0].due_s:
             ended = self._ended.popleft()
             measured = ended.running.measured()
-            notices += [] if measured is None else [self._tell(ended, measured)]
+            notices += [] if measured is None else self._tell(ended, measured)
         return notices
 
-    def _tell(self, ended: _Ended, measured: Mapping[str, Any]) -> Notice:
+    def _tell(self, ended: _Ended, measured: Mapping[str, Any]) -> list[Notice]:
         summary = ended.summary
         digest = str(summary["program_digest"])
         self._count[digest] += 1
@@ -101,15 +122,33 @@ class Passes:
             "predicted": {key: summary["after"].get(key) for key in ("rms_um", "uncertainty_um")},
             "predicted_without": {"rms_um": summary["before"]["rms_um"]},
         }
-        text = _text(told)
-        self.told.append({**told, "text": text})
-        return _notice(told, text)
+        lesson, notices = _learned(ended)
+        text = _text(told) + ("" if lesson is None else _lesson_text(lesson))
+        learned = {} if lesson is None else {"learned": {"passes": len(lesson.curve_um), "curve_um": lesson.curve_um}}
+        self.told.append({**told, "text": text, **learned})
+        self._keep_or_break(ended, told, text)
+        return [_notice(told, text), *notices]
+
+    def _keep_or_break(self, ended: _Ended, told: Mapping[str, Any], text: str) -> None:
+        """Note a promise that a whole pass did not keep: the program is not corrected again by the same models."""
+        digest = told["program_digest"]
+        self._broken.pop(digest, None)
+        if (
+            ended.cause == FINISHED
+            and told["measured"]["rms_um"] * gate.LEAST_GAIN > told["predicted_without"]["rms_um"]
+        ):
+            advice = "let the machine make a few rapids, which identify it again, then arm"
+            self._broken[digest] = (ended.models, Reason("PromiseBroken", f"{text}: it was withdrawn", advice))
 
 
 class Pass:
     """One pass: rows of all axes of the table, joined by their ticks; ``rows`` None: to the program's end."""
 
-    def __init__(self, config: MachineConfig, demand: Mapping[str, Sequence[int]], rows: int | None) -> None:
+    def __init__(
+        self, config: MachineConfig, demand: Mapping[str, Sequence[int]], rows: int | None, pupil: Pupil | None = None
+    ) -> None:
+        self._pupil = pupil
+        self._heard: list[tuple[Float, Float]] = []
         self._left = rows if rows is not None else sys.maxsize
         self._axes = tuple(demand)
         self._dt_s = config.machine.sync_period_s
@@ -182,6 +221,8 @@ class Pass:
             self._squares += float(error @ error)
             self._max_um = max(self._max_um, float(error.max()))
             self._following += np.sum((position - self._demand[self._first : end]) ** 2, axis=0) * 1e6
+            if self._pupil is not None:
+                self._heard.append((self._demand[self._first : end].copy(), position.copy()))
         drop = max(0, end - self._margin) if self._left else len(self._demand)
         self._demand, self._position, self._first = self._demand[drop:], self._position[drop:], max(0, end - drop)
 
@@ -197,6 +238,23 @@ class Pass:
             "measured": {"rms_um": math.sqrt(self._squares / self._rows), "max_um": self._max_um},
             "following_rms_um": dict(zip(self._axes, following.tolist(), strict=True)),
         }
+
+    def learn(self) -> Lesson | None:
+        """Return what the pass, which is over, has taught; None where nobody learns or it was not the plan's."""
+        if self._pupil is None or not self._heard:
+            return None
+        demand, position = (np.concatenate([rows[k] for rows in self._heard]) for k in range(2))
+        return self._pupil.learn(demand, position)
+
+
+def _learned(ended: _Ended) -> tuple[Lesson | None, list[Notice]]:
+    """Let a program learn from its pass; return what it knows then, and a notice where that could not be kept."""
+    if ended.cause != FINISHED:
+        return None, []
+    try:
+        return ended.running.learn(), []
+    except StoreError as error:
+        return None, [Notice(error.code or "StoreFault", "minor", f"what the pass taught is lost: {error}")]
 
 
 def _joined(blocks: Sequence[Rows]) -> Rows:
@@ -223,7 +281,13 @@ def _text(told: Mapping[str, Any]) -> str:
     text = f"pass {told['pass']} of {name}: contour error measured {measured['rms_um']:.2f} um RMS,"
     text += f" {measured['max_um']:.1f} at most (predicted {told['predicted']['rms_um']:.2f}{spread};"
     text += f" without correction {told['predicted_without']['rms_um']:.1f} predicted)"
-    return text if told["ended_by"] == "Finished" else f"{text}; it was ended by {told['ended_by']}"
+    return text if told["ended_by"] == FINISHED else f"{text}; it was ended by {told['ended_by']}"
+
+
+def _lesson_text(lesson: Lesson) -> str:
+    """Return the curve of what the passes left, as the end of a line."""
+    newest = " ".join(f"{left_um:.2f}" for left_um in lesson.curve_um[-SHOWN_CURVE:])
+    return f"; learning from {len(lesson.curve_um)} passes, the last left {newest} um"
 
 
 def _notice(told: Mapping[str, Any], text: str) -> Notice:

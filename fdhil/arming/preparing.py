@@ -12,14 +12,19 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.arming.checked_program import FIRST_S, CheckedProgram, Piece, RowStream
+from fdhil.arming.first_block import FirstBlock
 from fdhil.arming.knowledge import SKILL_MOVES, AxisKnowledge
 from fdhil.arming.program_check import reference_blocks
+from fdhil.arming.standstill import AtRest
 from fdhil.commissioning.feedforward import feedforward_object
 from fdhil.commissioning.record import CommissioningRecord, holds, load_record
 from fdhil.config import MachineConfig
 from fdhil.correction import gate, online
 from fdhil.drivers.cia402.profile import load_profile
+from fdhil.identification.loops import regulators_of
 from fdhil.prediction.gain import Gain, skill_of
+from fdhil.prediction.model_terms import with_resonance
+from fdhil.prediction.models import with_loops
 from fdhil.program import program_digest
 from fdhil.records import Parameters, Reason, Skill
 
@@ -32,11 +37,15 @@ UNGUARDED_UM = 20.0  # the largest offset that may stay in a drive whose watchdo
 
 @dataclass(frozen=True, slots=True)
 class ArmRequest:
-    """A program that may be corrected, and by which models; ``ahead``: its rows are checked ahead of the motion."""
+    """A program that may be corrected, and by which models; ``ahead``: its rows are checked ahead of the motion.
+
+    ``config`` is the machine's, with the regulators as they were identified.
+    """
 
     program: Path
     program_digest: str
     models: Mapping[str, Parameters]
+    config: MachineConfig
     method: str | None = None
     ahead: bool = False
 
@@ -46,7 +55,7 @@ class Armament:
     """A correction ready for the guard: its first rows, the stream of all that passed and will pass, and the facts.
 
     ``begun_um`` is what the rows promised that were checked when it was armed, ``half_um`` half the 95 % interval of
-    the error that is left, None: not known.
+    the error that is left, None: not known. ``first`` finds the first rows anew where the axes stand otherwise.
     """
 
     program: str
@@ -55,6 +64,7 @@ class Armament:
     facts: dict[str, bool]
     begun_um: float
     half_um: float | None = None
+    first: FirstBlock | None = None
 
     @property
     def rows(self) -> int | None:
@@ -113,12 +123,18 @@ def prepare(
         published = known[axis].published
         if published is None:
             return _not_validated(axis)
-        models[axis] = published.parameters
+        models[axis] = with_resonance(published.parameters, config.axis[axis])
     digest = program_digest(program)
     ahead = method in (None, "inverse") and _longer_than_ring(program, config)
     if ahead and (off := gate.writing_off(list(config.axis), config)):
         return Refused(off)
-    return ArmRequest(program, digest, models, method, ahead)
+    return ArmRequest(program, digest, models, with_identified_loops(config, known), method, ahead)
+
+
+def with_identified_loops(config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> MachineConfig:
+    """Return the configuration with those regulators that were identified and are believed."""
+    loops = {name: regulators_of(axis.loops) for name, axis in known.items() if axis.loops is not None}
+    return with_loops(config, loops, "the identified loops")
 
 
 def _not_validated(axis: str) -> Refused:
@@ -150,16 +166,28 @@ def may_begin(checked: CheckedProgram, config: MachineConfig, known: Mapping[str
 
 
 def prepare_armament(
-    request: ArmRequest, checked: CheckedProgram, config: MachineConfig, known: Mapping[str, AxisKnowledge]
+    request: ArmRequest,
+    checked: CheckedProgram,
+    config: MachineConfig,
+    known: Mapping[str, AxisKnowledge],
+    rest: Mapping[str, AtRest] | None = None,
 ) -> Armament:
-    """Make a checked program ready with the rows that it is armed with. StoreError when its rows cannot be read."""
+    """Make a checked program ready with the rows that it is armed with; the first of them begin where axes ``rest``.
+
+    StoreError when its rows cannot be read.
+    """
     stream, gain_um = RowStream(checked, request.program_digest, config.machine.sync_period_s), checked.gain_um
     facts = standing_facts(stream.axes, config, known, gain_um)
     facts |= _commissioned(stream.axes, checked.largest_um, config)
     half_um = checked.half_um
     if half_um is None:
         half_um = skill_of({axis: found.skills for axis, found in known.items()}, stream.axes)
-    return Armament(str(request.program), stream, stream.take(FIRST_S), facts, gain_um, half_um)
+    begin, first = stream.take(FIRST_S), None
+    if checked.method == "inverse":
+        first = FirstBlock(begin, request.program, request.models, request.config)
+        first.expect(rest or {})
+        begin = first.begin
+    return Armament(str(request.program), stream, begin, facts, gain_um, half_um, first)
 
 
 @dataclass(frozen=True, slots=True)

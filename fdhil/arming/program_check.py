@@ -288,7 +288,7 @@ def main() -> None:
         sys.stdout.flush()
 
     config = MachineConfig.model_validate(request["config"])
-    models = {axis: Parameters(**values) for axis, values in request["models"].items()}
+    models = {axis: Parameters.of(values) for axis, values in request["models"].items()}
 
     def run(body: BinaryIO) -> dict[str, Any]:
         return check(Path(request["program"]), request["program_digest"], models, config, body, say)

@@ -22,13 +22,12 @@ from fdhil.records import Correction, Float, Reason, rms
 BLOCK_S = 2.0
 
 
-def plan_whole(
-    request: ArmRequest, config: MachineConfig, known: Mapping[str, AxisKnowledge]
-) -> CheckedProgram | Refused:
+def plan_whole(request: ArmRequest, known: Mapping[str, AxisKnowledge]) -> CheckedProgram | Refused:
     """Return the rows of the planned correction, or why there is none.
 
     ProgramError, RecordingError or ConfigError when the program cannot be used; StoreError when memory is short.
     """
+    config = request.config
     reference = load_trajectory(request.program, config)
     planned = correction.plan(reference, request.models, config, request.method)
     if planned.refused:
@@ -36,15 +35,20 @@ def plan_whole(
     if not any(np.any(offset) for offset in planned.offset_um.values()):
         text = f"the method {planned.method} plans no position offset"
         return Refused((Reason("HarmPredicted", text, "use inverse or mirror; flatness is armed without a program"),))
-    rows = encoded(reference.position_mm, planned.offset_um, config)
-    checked = CheckedProgram(_in_memory(rows), tuple(config.axis))
     errors = {"before": _errors(planned.before.contour_um), "after": _errors(planned.after.contour_um)}
-    size, total = 8 * len(config.axis), reference.time_s.size
-    block_rows = round(BLOCK_S / config.machine.sync_period_s)
+    checked = in_memory(encoded(reference.position_mm, planned.offset_um, config), config, errors)
+    _conclude(checked, planned, request, known)
+    return checked
+
+
+def in_memory(rows: bytes, config: MachineConfig, errors: Mapping[str, Mapping[str, float]]) -> CheckedProgram:
+    """Return encoded rows that passed as a checked program; ``errors`` without and with their offsets."""
+    checked = CheckedProgram(_in_memory(rows), tuple(config.axis))
+    size = 8 * len(config.axis)
+    total, block_rows = len(rows) // size, round(BLOCK_S / config.machine.sync_period_s)
     for first in range(0, total, block_rows):
         end = min(total, first + block_rows)
         checked.take(Block(end, hashlib.sha256(rows[size * first : size * end]).hexdigest(), end == total), errors)
-    _conclude(checked, planned, request, config, known)
     return checked
 
 
@@ -52,12 +56,11 @@ def _conclude(
     checked: CheckedProgram,
     planned: Correction,
     request: ArmRequest,
-    config: MachineConfig,
     known: Mapping[str, AxisKnowledge],
 ) -> None:
     covariances = {axis: found.published.covariance for axis, found in known.items() if found.published is not None}
     skills = {axis: found.skills for axis, found in known.items()}
-    checked.half_um = gain(planned, request.models, config, covariances, skills).half_um
+    checked.half_um = gain(planned, request.models, request.config, covariances, skills).half_um
     checked.method, checked.warnings = planned.method, planned.warnings
     largest_um = max(float(np.abs(offset).max()) for offset in planned.offset_um.values())
     checked.conclude({**checked.errors, "largest_um": largest_um})

@@ -138,6 +138,9 @@ def compared(
 def _change_entry(
     change: ZoneChange, earlier: Mapping[str, Parameters], models: Mapping[str, Parameters]
 ) -> dict[str, Any]:
+    from fdhil.prediction.model_terms import values_of
+
+    old, new = ({axis: values_of(p) for axis, p in models.items()} for models in (earlier, models))
     return {
         "line": change.line,
         "where": change.where,
@@ -150,8 +153,8 @@ def _change_entry(
             {
                 "axis": axis,
                 "parameter": name,
-                "before": getattr(earlier[axis], name),
-                "now": getattr(models[axis], name),
+                "before": old[axis].get(name, 0.0),
+                "now": new[axis].get(name, 0.0),
                 "um": um,
             }
             for axis, name, um in change.by

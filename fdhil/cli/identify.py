@@ -13,73 +13,96 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fdhil import tables
+from fdhil.cli.options import OutputFile, Writing
 from fdhil.cli.parameter_view import MEANING, cell, head
-from fdhil.records import INTERVAL_95
+from fdhil.records import INTERVAL_95, unit_of
 
 if TYPE_CHECKING:
     from fdhil.cli.batch import FileResult
-    from fdhil.config import Identification
-    from fdhil.records import Estimate, Parameters, Verdict, WindowOutcome
+    from fdhil.config import Axis, Identification, MachineConfig
+    from fdhil.records import Estimate, Verdict, WindowOutcome
 
 SCHEMA = "fdhil-identify-1"
 UNREADABLE = 3
 
 
-@click.command()
+@click.command(cls=Writing)
 @click.argument("recordings", nargs=-1, required=True, type=click.Path(path_type=Path), metavar="RECORDING...")
 @click.option("--config", "config_path", type=click.Path(path_type=Path), help="Machine configuration (TOML).")
 @click.option("--method", type=click.Choice(list(tables.ESTIMATORS)), help="Estimator; left out: the best there is.")
+@click.option(
+    "--write-model",
+    "model",
+    type=OutputFile(".json"),
+    help="Write the validated pools as a model file, which --model of predict and correct reads.",
+)
+@click.option("--loops", "with_loops", is_flag=True, help="Identify the drive's own loops, too.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
-def identify(recordings: tuple[Path, ...], config_path: Path | None, method: str | None, as_json: bool) -> int:
+def identify(
+    recordings: tuple[Path, ...],
+    config_path: Path | None,
+    method: str | None,
+    model: Path | None,
+    with_loops: bool,
+    as_json: bool,
+) -> int:
     """Identify a drive from the rapid moves in each RECORDING (CSV).
 
     Each rapid is a window: it is checked, the six parameters are estimated from it, and the model is validated. The
     accepted windows of a file together give its pooled parameters. With --config they are also compared with the axis'
-    nominal values: a sensor whose gain is wrong all along shows in no other way. Exit codes: 0 every file's pool is
-    validated, 1 some pool is not, 2 wrong option or configuration, 3 a recording cannot be read (the others are
-    identified all the same).
+    nominal values: a sensor whose gain is wrong all along shows in no other way. A recording may have no voltage: then
+    K is the one in its header torque_constant_nm_per_a, else the nominal one of --config. Where the configured
+    regulators do not explain the rapids, and with --loops always, the drive's own are identified; those that explain
+    more are used. Exit codes: 0 every file's
+    pool is validated, 1 some pool is not, 2 wrong option or configuration, 3 a recording cannot be read (the others
+    are identified all the same).
     """
-    settings, rapid_speeds, nominal = _settings(config_path, method)
-    results = [_against_data_sheet(r, nominal) for r in _analyse(recordings, settings, rapid_speeds)]
+    settings, machine = _settings(config_path, method)
+    axes = machine.axis if machine is not None else {}
+    results = [_against_data_sheet(r, axes) for r in _analyse(recordings, settings, machine)]
+    if model is not None:
+        from fdhil.cli.model_file import write_model
+
+        write_model(results, axes, model)
+    if with_loops:
+        from fdhil.cli.loops_view import with_all_loops
+
+        results = with_all_loops(results, settings, axes)
     if as_json:
-        document = {"schema": SCHEMA, "files": [_file_document(r) for r in results]}
+        document = {"schema": SCHEMA, "files": [_file_document(r, axes, with_loops) for r in results]}
         click.echo(json.dumps(document, allow_nan=False))
     else:
-        _show(results)
+        _show(results, axes, with_loops)
     if any(result.error for result in results):
         return UNREADABLE
     return 0 if all(r.verdict.accepted for r in results) else 1
 
 
-def _settings(
-    path: Path | None, method: str | None
-) -> tuple[Identification, dict[str, float], Mapping[str, Parameters]]:
+def _settings(path: Path | None, method: str | None) -> tuple[Identification, MachineConfig | None]:
     from fdhil import config
-    from fdhil.records import Parameters
 
     machine = config.load(path) if path is not None else None
     settings = machine.identification if machine is not None else config.Identification()
-    speeds = {name: axis.rapid_speed_rad_s for name, axis in machine.axis.items()} if machine is not None else {}
-    nominal = {n: Parameters(**a.nominal.model_dump()) for n, a in machine.axis.items()} if machine is not None else {}
-    return (settings.model_copy(update={"method": method}) if method else settings), speeds, nominal
+    return (settings.model_copy(update={"method": method}) if method else settings), machine
 
 
-def _against_data_sheet(result: FileResult, nominal: Mapping[str, Parameters]) -> FileResult:
+def _against_data_sheet(result: FileResult, axes: Mapping[str, Axis]) -> FileResult:
     """Refuse a pool that only a sensor's gain takes to the axis' nominal values."""
     from dataclasses import replace
 
+    from fdhil.records import Parameters
     from fdhil.validation.data_sheet import gain_error
 
-    sheet = nominal.get(result.axis or "")
-    if sheet is None or result.pooled is None or not result.verdict.accepted:
+    axis = axes.get(result.axis or "")
+    if axis is None or result.pooled is None or not result.verdict.accepted:
         return result
-    reason = gain_error(result.pooled, sheet)
+    reason = gain_error(result.pooled, Parameters(**axis.nominal.model_dump()))
     if reason is None:
         return result
     return replace(result, verdict=replace(result.verdict, accepted=False, reasons=(reason,)))
 
 
-def _analyse(paths: Sequence[Path], settings: Identification, speeds: dict[str, float]) -> list[FileResult]:
+def _analyse(paths: Sequence[Path], settings: Identification, machine: MachineConfig | None) -> list[FileResult]:
     """Analyse the files, with a progress bar on stderr when that is a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -87,25 +110,30 @@ def _analyse(paths: Sequence[Path], settings: Identification, speeds: dict[str, 
     from fdhil.cli.batch import analyse_files
 
     if not sys.stderr.isatty():
-        return list(analyse_files(paths, settings, speeds))
+        return list(analyse_files(paths, settings, machine))
     columns = (TextColumn("identifying"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("identifying", total=len(paths))
-        return list(analyse_files(paths, settings, speeds, partial(progress.advance, task)))
+        return list(analyse_files(paths, settings, machine, partial(progress.advance, task)))
 
 
-def _file_document(result: FileResult) -> dict[str, Any]:
+def _file_document(result: FileResult, axes: Mapping[str, Axis], with_loops: bool) -> dict[str, Any]:
+    from fdhil.cli.loops_view import compared
+
     document = {
         "file": result.file,
         "axis": result.axis,
         "windows": [_window_document(outcome) for outcome in result.outcomes],
         "pooled": {
             "parameters": _parameters(result.pooled, result.verdict),
+            "terms": _terms(result.pooled),
             "validated": result.verdict.accepted,
             "windows_used": _used(result),
-            "reasons": [str(reason) for reason in result.verdict.reasons],
+            **_verdict(result.verdict),
         },
     }
+    if with_loops or result.loops is not None:
+        document["loops"] = compared(result.loops, axes.get(result.axis or ""))
     return document if result.error is None else document | {"error": result.error}
 
 
@@ -126,10 +154,26 @@ def _window_document(outcome: WindowOutcome) -> dict[str, Any]:
         "end_s": round(window.start_s + last * window.dt_s, 6),
         "direction": window.direction,
         "parameters": _parameters(outcome.estimate, outcome.verdict),
+        "terms": _terms(outcome.estimate),
         "validated": outcome.verdict.accepted,
         "fit_percent": outcome.verdict.fit_percent,
-        "reasons": [str(reason) for reason in outcome.verdict.reasons],
+        **_verdict(outcome.verdict),
     } | ({"delay_s": delay} if delay is not None else {})
+
+
+def _verdict(verdict: Verdict) -> dict[str, Any]:
+    return {
+        "unexplained_um": verdict.unexplained_um,
+        "reasons": [str(reason) for reason in verdict.reasons],
+        "warnings": [str(reason) for reason in verdict.warnings],
+    }
+
+
+def _terms(estimate: Estimate | None) -> dict[str, Any]:
+    """Return value, std and unit of each term that joined the six."""
+    if estimate is None:
+        return {}
+    return {n: {"value": estimate.value(n), "std": estimate.std(n), "unit": unit_of(n)} for n in estimate.terms}
 
 
 def _delay(estimate: Estimate | None) -> dict[str, Any] | None:
@@ -142,11 +186,19 @@ def _delay(estimate: Estimate | None) -> dict[str, Any] | None:
 
 
 def _parameters(estimate: Estimate | None, verdict: Verdict) -> dict[str, Any]:
-    """Return value, std and unit of each parameter, or null and the reason."""
+    """Return value, std and unit of each parameter, or null and the reason.
+
+    K may be given; R and L that the data sheet gives are none that this recording tells.
+    """
+    from fdhil.identification.without_voltage import NO_VOLTAGE
     from fdhil.records import PARAMETERS, UNITS
 
     answer: dict[str, Any] = {}
     for name in PARAMETERS:
+        if estimate is not None and name in estimate.given:
+            told = {"value": estimate.value(name), "std": 0.0, "unit": UNITS[name]}
+            answer[name] = {**told, "given": True} if name == "K" else {"value": None, "reason": str(NO_VOLTAGE)}
+            continue
         if estimate is not None and math.isfinite(estimate.value(name)) and math.isfinite(estimate.std(name)):
             answer[name] = {"value": estimate.value(name), "std": estimate.std(name), "unit": UNITS[name]}
             continue
@@ -156,12 +208,13 @@ def _parameters(estimate: Estimate | None, verdict: Verdict) -> dict[str, Any]:
     return answer
 
 
-def _show(results: Sequence[FileResult]) -> None:
-    """Write a table per file for people: every window, then the pool."""
+def _show(results: Sequence[FileResult], axes: Mapping[str, Axis], with_loops: bool) -> None:
+    """Write a table per file for people: every window, then the pool, then the loops."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
+    from fdhil.cli.loops_view import show_loops
     from fdhil.identification.windows import moving_range
     from fdhil.records import PARAMETERS
 
@@ -179,33 +232,56 @@ def _show(results: Sequence[FileResult]) -> None:
         for name in PARAMETERS:
             table.add_column(head(name), justify="right", no_wrap=True)
         table.add_column("fit\n%", justify="right", no_wrap=True)
+        weighed = any(outcome.verdict.unexplained_um is not None for outcome in result.outcomes)
+        if weighed:  # micrometres at the table that the model leaves of the rapid
+            table.add_column("left\num", justify="right", no_wrap=True)
         table.add_column("valid", no_wrap=True)
         for outcome in result.outcomes:
             window = outcome.window
             first, last = moving_range(window)
             span = f"{window.start_s + first * window.dt_s:.2f}-{window.start_s + last * window.dt_s:.2f}"
-            table.add_row(span, *_cells(outcome.estimate, outcome.verdict))
+            table.add_row(span, *_cells(outcome.estimate, outcome.verdict, weighed))
         table.add_section()
-        table.add_row(f"all {_used(result)}", *_cells(result.pooled, result.verdict), style="bold")
+        table.add_row(f"all {_used(result)}", *_cells(result.pooled, result.verdict, weighed), style="bold")
         console.print(table)
+        _show_terms(console, result)
         _show_reasons(console, result)
+        if with_loops or result.loops is not None:
+            show_loops(result, axes.get(result.axis or ""), console)
 
 
-def _cells(estimate: Estimate | None, verdict: Verdict) -> list[str]:
+def _cells(estimate: Estimate | None, verdict: Verdict, weighed: bool) -> list[str]:
     from fdhil.records import PARAMETERS
 
     cells = ["-"] * len(PARAMETERS)
     if estimate is not None:
-        cells = [cell(name, estimate.value(name), INTERVAL_95 * estimate.std(name)) for name in PARAMETERS]
+        cells = [_cell(estimate, name) for name in PARAMETERS]
     fit = "-" if verdict.fit_percent is None else f"{verdict.fit_percent:.2f}"
-    return [*cells, fit, "yes" if verdict.accepted else "no"]
+    left = "-" if verdict.unexplained_um is None else f"{verdict.unexplained_um:.3g}"
+    return [*cells, fit, *([left] if weighed else []), "yes" if verdict.accepted else "no"]
+
+
+def _cell(estimate: Estimate, name: str) -> str:
+    value, half = estimate.value(name), INTERVAL_95 * estimate.std(name)
+    return cell(name, value, None).replace("(no ±)", "(given)") if name in estimate.given else cell(name, value, half)
+
+
+def _show_terms(console: Any, result: FileResult) -> None:
+    """Write what joined the six: of the pool, else of each window."""
+    each = ((f"{o.window.start_s:.2f} s", o.estimate) for o in result.outcomes)
+    for who, estimate in each if result.pooled is None else (("all", result.pooled),):
+        if estimate is not None and estimate.terms:
+            told = (cell(n, estimate.value(n), INTERVAL_95 * estimate.std(n), " ") for n in estimate.terms)
+            named = (f"{n} {value} {unit_of(n)}" for n, value in zip(estimate.terms, told, strict=True))
+            console.print(f"  terms of {who}: {', '.join(named)}", highlight=False, markup=False)
 
 
 def _show_reasons(console: Any, result: FileResult) -> None:
     """Write each reason, and what only widens the intervals, once and with what to do."""
     from fdhil.validation.plausibility import warnings_of
 
-    told = [r for outcome in result.outcomes for r in outcome.verdict.reasons] + list(result.verdict.reasons)
+    verdicts = [*(outcome.verdict for outcome in result.outcomes), result.verdict]
+    told = [r for verdict in verdicts for r in (*verdict.reasons, *verdict.warnings)]
     told += [r for outcome in result.outcomes for r in warnings_of(outcome.window)]
     for outcome in result.outcomes:
         delay = _delay(outcome.estimate) if outcome.window.slow_voltage is not None else None

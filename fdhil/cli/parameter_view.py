@@ -34,10 +34,11 @@ def cell(name: str, value: float | None, half: float | None, between: str = "\n"
     """Return a value and half of its interval in the parameter's unit, both to the place where the half begins."""
     if value is None or not math.isfinite(value):
         return "-"
-    shown = value * DISPLAY[name][1]
+    factor = DISPLAY[name][1] if name in DISPLAY else 1.0  # terms are shown in SI units
+    shown = value * factor
     if half is None or not math.isfinite(half):
         return f"{shown:.4g}{between}(no ±)"
-    width = half * DISPLAY[name][1]
+    width = half * factor
     if width <= 0.0:
         return f"{shown:.6g}{between}±0"
     digits = -math.floor(math.log10(width))

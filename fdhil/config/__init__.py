@@ -20,6 +20,7 @@ from fdhil.config.controller import Identification, Nc
 from fdhil.config.machine import MachineConfig
 from fdhil.config.offset_bounds import VARIATION_MM, OffsetBounds, share_fault
 from fdhil.config.reading import load, parse, toml_document, unlikely
+from fdhil.config.reality import Reality
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import Section
 from fdhil.config.service import CanBus, Maintenance
@@ -41,6 +42,7 @@ __all__ = [
     "Noise",
     "Nominal",
     "OffsetBounds",
+    "Reality",
     "Regulators",
     "Section",
     "SimAxis",

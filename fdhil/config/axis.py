@@ -116,6 +116,14 @@ class Axis(Section):
         le=1e9,
         description="largest jerk of profile jerk_limited; left out: the acceleration is reached in 25 ms",
     )
+    resonance_hz: Positive | None = Field(
+        None,
+        ge=5.0,
+        le=2000.0,
+        description="resonance of motor and table against each other, the motor free to turn, as the drive's frequency "
+        "response has it; the motor's encoder cannot see what the table does then: left out, the table is where it is",
+    )
+    resonance_damping: NotNegative = Field(0.03, le=0.7, description="damping ratio of that resonance")
     nominal: Nominal
     regulators: Regulators
     correction: CorrectionLimits | None = None

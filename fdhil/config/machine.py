@@ -9,7 +9,7 @@ from pathlib import Path
 from pydantic import Field, ValidationInfo, model_validator
 
 from fdhil.config.axis import Axis
-from fdhil.config.controller import G0, Identification, Nc
+from fdhil.config.controller import G0, Correction, Identification, Nc
 from fdhil.config.offset_bounds import limit_faults
 from fdhil.config.plausible import doubts
 from fdhil.config.regulators import period_faults
@@ -33,6 +33,7 @@ class MachineConfig(Section):
     nc: Nc = Nc()
     g0: G0 = G0()
     identification: Identification = Identification()
+    correction: Correction = Correction()
     bus: Mapping[str, CanBus] = Field(default_factory=lambda: {"can0": CanBus()})
     store: Store = Store()
     guard: Guard = Guard()

@@ -7,6 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from fdhil.config.reality import Reality
 from fdhil.config.section import AxisName, Finite, NotNegative, Positive, Section
 
 
@@ -32,6 +33,7 @@ class SimAxis(Section):
     backlash_um: NotNegative = Field(0.0, description="lost motion between screw and table")
     start_mm: Finite = Field(0.0, description="position at power-on")
     offset_in_feedforward: bool = Field(True, description="whether 0x60B0 is seen by the speed feed-forward")
+    reality: Reality = Reality()
 
 
 class Thermal(Section):

@@ -1,9 +1,9 @@
 """Plans an on-line feed-forward: the drive is flat, its position tells speed and torque ([ROT 99] as [DES] proposes).
 
-With w = r' 2 pi / pitch, equation [2] gives the torque Jt w' + ft w + Cd sign(w) that follows the path; sent as torque
-offset (0x60B2), the speed loop has only the model's error left to do. What the drive's own feed-forward leaves out of
-the speed, or feeds forward half a cycle too early, is the speed offset (0x60B1). The position offset (0x60B0) stays 0.
-Each row needs two rows of look-ahead.
+With w = r' 2 pi / pitch, equation [2] gives the torque Jt w' + ft w + Cd sign(w) that follows the path, with what the
+model has of terms; sent as torque offset (0x60B2), the speed loop has only the model's error left to do. What the
+drive's own feed-forward leaves out of the speed, or feeds forward half a cycle too early, is the speed offset (0x60B1).
+The position offset (0x60B0) stays 0. Each row needs two rows of look-ahead.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 
 from fdhil.config import Axis, MachineConfig
 from fdhil.correction.method import Plan
+from fdhil.prediction.model_terms import resisting
 from fdhil.records import Float, Parameters, Prediction, Trajectory
 
 STILL_RAD_S = 1e-6
@@ -39,8 +40,10 @@ def offsets(reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: float
     lead = lead_s(parameters, axis)
     demanded = np.gradient(reference_mm, dt_s) * 2 * np.pi / axis.screw_pitch_mm
     acceleration = np.gradient(demanded, dt_s)
-    sign = np.where(np.abs(demanded) > STILL_RAD_S, np.sign(demanded), 0.0)
-    current = (p.Jt * acceleration + p.ft * demanded + p.Cd * sign) / p.K
+    turning = np.where(np.abs(demanded) > STILL_RAD_S, demanded, 0.0)
+    smooth, dry = resisting(p, turning, reference_mm * 2 * np.pi / axis.screw_pitch_mm)
+    # a load acts at rest too: what stands still while the axis does, the speed loop's integral holds by itself
+    current = (p.Jt * acceleration + smooth + dry - p.term("load")) / p.K
     times = np.arange(reference_mm.size) * dt_s
     early = np.interp(times + lead, times, current)
     # what the drive feeds forward itself is the acceleration of the next row, held: half a cycle ahead as well

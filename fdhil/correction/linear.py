@@ -7,17 +7,19 @@ gives no answer, and it is applied to a recorded or planned error, so it may loo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from fdhil.config import Axis
 from fdhil.model import closed_loop
+from fdhil.prediction import model_terms
 from fdhil.records import Float, Parameters
 
 BANDWIDTH_HZ = 120.0
 REGULARISATION = 1e-3
+RESONANCE_SHARE = 0.5  # of a resonance's frequency: near it a little error of the model turns the answer's sign
 IMPULSE_S = 1.0
 AHEAD_S = 0.064  # of the impulse's answer that may come before it: the feed-forward looks ahead
 PAD_S = 0.5
@@ -43,9 +45,9 @@ class Inverse:
 
 
 def unlimited(parameters: Parameters, axis: Axis, dry_nm: float = 0.0) -> tuple[Parameters, Axis]:
-    """Return the same loop without limits, and with another dry friction: without any it is linear."""
+    """Return what of the loop is linear, without limits, and with another dry friction: without any it is linear."""
     free = axis.regulators.model_copy(update={"current_limit_a": 1e9, "voltage_limit_v": 1e9})
-    return replace(parameters, Cd=dry_nm), axis.model_copy(update={"regulators": free})
+    return model_terms.linear(parameters, dry_nm), axis.model_copy(update={"regulators": free})
 
 
 def delay_s(parameters: Parameters, axis: Axis, sync_period_s: float) -> float:
@@ -63,7 +65,7 @@ def inverse(parameters: Parameters, axis: Axis, sync_period_s: float, rows: int)
     ahead = round(AHEAD_S / sync_period_s)
     impulse = np.zeros(ahead + round(IMPULSE_S / sync_period_s))
     impulse[ahead] = 1.0
-    answer = closed_loop.simulate(linear, free, sync_period_s, impulse).position_mm
+    answer = closed_loop.simulate(linear, free, sync_period_s, impulse).table_mm
     pad = round(PAD_S / sync_period_s)
     size = int(2 ** np.ceil(np.log2(rows + 2 * pad)))
     around = np.zeros(size)
@@ -71,7 +73,8 @@ def inverse(parameters: Parameters, axis: Axis, sync_period_s: float, rows: int)
     around = np.roll(around, -ahead)
     spectrum = np.fft.rfft(around)
     frequency = np.fft.rfftfreq(size, sync_period_s)
-    roll_off = 1 / (1 + (frequency / min(BANDWIDTH_HZ, 0.2 / sync_period_s)) ** 4)
+    bandwidth = min(BANDWIDTH_HZ, 0.2 / sync_period_s, RESONANCE_SHARE * parameters.term("resonance", np.inf))
+    roll_off = 1 / (1 + (frequency / bandwidth) ** 4)
     gain = roll_off / (np.abs(spectrum) ** 2 + REGULARISATION)
     factor = np.asarray(np.conj(spectrum) * gain, dtype=np.complex128)
     return Inverse(factor, size, pad)

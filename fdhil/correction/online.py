@@ -15,6 +15,7 @@ import numpy as np
 
 from fdhil.config import Axis
 from fdhil.correction.flatness import PER_MILLE, lead_s
+from fdhil.prediction.model_terms import mean_friction
 from fdhil.records import Float, Parameters
 
 ONE = 1 << 24  # the weights' scale
@@ -39,8 +40,9 @@ def law(parameters: Parameters, axis: Axis, sync_period_s: float) -> Mapping[str
     """Return the law of one axis as the guard takes it: ``speed``, ``torque``, ``pace`` weights and ``dry``.
 
     In the drive's counts: increments/s, 0.1 % of the rated torque. What the drive feeds forward itself is left to it.
+    Friction is the mean of both directions; a load is held by the drive's own integral.
     """
-    p, g, period = parameters, axis.regulators, sync_period_s
+    p, g, period = mean_friction(parameters), axis.regulators, sync_period_s
     later = AHEAD_CYCLES + lead_s(p, axis) / period
     speed_now = derivative_weights(SPEED_ROWS, SPEED_ORDER, AHEAD_CYCLES, 1) / period
     speed_later = derivative_weights(SPEED_ROWS, SPEED_ORDER, later, 1) / period

@@ -17,9 +17,10 @@ from scipy.linalg.lapack import dposv
 from fdhil.config import Axis
 from fdhil.correction import kernels
 from fdhil.correction.linear import unlimited
-from fdhil.model import closed_loop
+from fdhil.model import closed_loop, terms
 from fdhil.model.closed_loop import Commands, Ready, Response, State
-from fdhil.model.kernels import CURRENT_DEMAND, POSITION
+from fdhil.model.kernels import CURRENT_DEMAND, POSITION, TABLE
+from fdhil.prediction.model_terms import Band, band
 from fdhil.records import Float, Parameters
 
 FREE_S = 0.3  # in which the current is led away
@@ -40,6 +41,8 @@ class Resting:
 
     def __init__(self, parameters: Parameters, axis: Axis, sync_period_s: float, increment_mm: float) -> None:
         self._held = closed_loop.prepare(*unlimited(parameters, axis, HELD_NM), sync_period_s)
+        self._parameters, self._rad_per_mm = parameters, terms.rad_per_mm(axis)
+        self._place = TABLE if terms.has_spring(parameters) else POSITION
         self._period_s, self._increment_mm = sync_period_s, increment_mm
         self._free, self._again = round(FREE_S / sync_period_s), round(AGAIN_S / sync_period_s)
         impulse = np.zeros(round((FREE_S + WATCHED_S) / sync_period_s))
@@ -47,12 +50,18 @@ class Resting:
         self._answer_a = _demand(self._held.run(Commands(impulse), closed_loop.start(0.0)))
         self._lead = _Lead(self._answer_a, self._free)
 
+    def band_at(self, position_mm: float) -> Band:
+        """Return the torques that hold the table at a place."""
+        return band(self._parameters, position_mm * self._rad_per_mm)
+
     def quiet(self, reference_mm: Float, fixed: Float, state: State) -> Float:
         """Return the offset (n,) in whole increments for a rest (n,) of ``reference_mm`` that begins in ``state``.
 
         ``fixed`` (2,): the offsets of its first two rows, which are already used.
         """
-        silent = float(state[POSITION] - reference_mm[0]) / self._increment_mm
+        stands_mm = float(state[self._place])
+        silent = (stands_mm - float(reference_mm[0])) / self._increment_mm
+        middle_a = self.band_at(stands_mm).middle / self._parameters.K
         offset = np.full(reference_mm.size, silent)
         offset[:2] = fixed
         for first in range(0, reference_mm.size - 2, self._again):  # what rounding left is led away as well
@@ -62,7 +71,7 @@ class Resting:
             rows = min(self._answer_a.size, rest.size)
             free = min(rows - 2, self._free)
             base_a = _demand(self._simulate(rest, exact, state, rows))
-            exact[2 : 2 + free] += self._lead.away(base_a, exact[:2] - silent)
+            exact[2 : 2 + free] += self._lead.away(base_a - middle_a, exact[:2] - silent)
             offset[first:] = kernels.rounded(exact, 2 + free, UNEVEN)
             state = self._simulate(rest, offset[first:], state, min(self._again, rest.size)).end
         return offset

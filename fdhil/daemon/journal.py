@@ -11,7 +11,17 @@ from contextlib import contextmanager
 from datetime import datetime
 from typing import Literal
 
-from fdhil.records import PARAMETERS, UNITS, Notice, Outcome, ParameterSet, Skill, WindowOutcome
+from fdhil.records import (
+    PARAMETERS,
+    UNITS,
+    LoopEstimate,
+    Notice,
+    Outcome,
+    ParameterSet,
+    Skill,
+    WindowOutcome,
+    unit_of,
+)
 
 Severity = Literal["info", "minor", "MAJOR"]
 # syslog priorities, see sd-daemon(3)
@@ -61,6 +71,8 @@ def line_of(outcome: Outcome) -> tuple[str, Severity]:
         return _window_line(outcome), "info"
     if isinstance(outcome, ParameterSet):
         return _set_line(outcome), "info"
+    if isinstance(outcome, LoopEstimate):
+        return _loops_line(outcome), "info"
     return _skill_line(outcome), "info"
 
 
@@ -69,14 +81,24 @@ def _window_line(outcome: WindowOutcome) -> str:
     head = f"{window.axis}: G0 {'+' if window.direction > 0 else '-'} at {window.start_s:.2f} s ({window.n} samples)"
     fit = "" if verdict.fit_percent is None else f", fit {verdict.fit_percent:.2f} %"
     if verdict.accepted:
-        return f"{head} accepted{fit}"
+        warned = "; ".join(str(warning) for warning in verdict.warnings)
+        return f"{head} accepted{fit}" + (f", but {warned}" if warned else "")
     return f"{head} refused{fit}: " + ("; ".join(str(reason) for reason in verdict.reasons) or "no reason given")
 
 
 def _set_line(published: ParameterSet) -> str:
     values = (f"{name} {getattr(published.parameters, name):.5g} {UNITS[name]}" for name in PARAMETERS)
     windows = f"{published.windows} window" + ("" if published.windows == 1 else "s")
-    return f"{published.axis}: parameters, revision {published.revision} from {windows}: " + ", ".join(values)
+    terms = (f"{name} {value:.5g} {unit_of(name)}" for name, value in published.parameters.terms)
+    told = ", ".join((*values, *terms))
+    return f"{published.axis}: parameters, revision {published.revision} from {windows}: {told}"
+
+
+def _loops_line(found: LoopEstimate) -> str:
+    gains = ", ".join(f"{name} {value:.5g}" for name, value in zip(found.names, found.values, strict=True))
+    verdict = found.verdict
+    told = "believed" if verdict.accepted else "not believed: " + "; ".join(str(reason) for reason in verdict.reasons)
+    return f"{found.axis}: loops of structure {found.structure}, {gains}; {told}"
 
 
 def _skill_line(skill: Skill) -> str:

@@ -9,27 +9,50 @@ from typing import Any
 
 import numpy as np
 
-from fdhil.records import INTERVAL_95, PARAMETERS, UNITS, Notice, Outcome, ParameterSet, Skill, WindowOutcome
-from fdhil.store.history import described
+from fdhil.records import (
+    INTERVAL_95,
+    PARAMETERS,
+    LoopEstimate,
+    Notice,
+    Outcome,
+    ParameterSet,
+    Skill,
+    WindowOutcome,
+    unit_of,
+)
+from fdhil.store.history import described, friction_of
 
 
 def parameters_status(published: ParameterSet) -> Mapping[str, Mapping[str, Any]]:
     """Return each parameter with its standard deviation and 95 % interval; nothing is told without its interval."""
-    told = {}
+    values, deviations = published.parameters.as_dict(), _deviations(published)
+    return {name: _figures(name, value, deviations[k]) for k, (name, value) in enumerate(values.items())}
+
+
+def terms_status(published: ParameterSet) -> Mapping[str, Mapping[str, Any]]:
+    """Return each term that joined the six parameters in the same way."""
+    deviations = _deviations(published)
+    pairs = enumerate(published.parameters.terms, start=len(PARAMETERS))
+    return {name: _figures(name, value, deviations[k]) for k, (name, value) in pairs}
+
+
+def _deviations(published: ParameterSet) -> list[float]:
+    """Return the standard deviations of the six parameters and the terms, NaN where none is known."""
     variances = np.diag(published.covariance)
-    deviations = np.sqrt(np.where(variances >= 0, variances, np.nan))
-    for k, name in enumerate(PARAMETERS):
-        value, std = float(getattr(published.parameters, name)), float(deviations[k])
-        half = INTERVAL_95 * std
-        known = math.isfinite(half)
-        told[name] = {
-            "value": value,
-            "std": std if known else None,
-            "low": value - half if known else None,
-            "high": value + half if known else None,
-            "unit": UNITS[name],
-        }
-    return told
+    known = np.sqrt(np.where(variances >= 0, variances, np.nan)).tolist()
+    return [*known, *[math.nan] * (len(PARAMETERS) + len(published.parameters.terms) - len(known))]
+
+
+def _figures(name: str, value: float, std: float) -> Mapping[str, Any]:
+    half = INTERVAL_95 * std
+    known = math.isfinite(half)
+    return {
+        "value": value,
+        "std": std if known else None,
+        "low": value - half if known else None,
+        "high": value + half if known else None,
+        "unit": unit_of(name),
+    }
 
 
 def set_document(published: ParameterSet) -> dict[str, Any]:
@@ -41,21 +64,45 @@ def set_document(published: ParameterSet) -> dict[str, Any]:
         "tick": published.tick,
         "temperature_c": published.temperature_c,
         "parameters": parameters_status(published),
+        "terms": terms_status(published),
+        "unexplained_um": published.unexplained_um,
+        "warnings": [str(warning) for warning in published.warnings],
     }
 
 
 def as_document(outcome: Outcome) -> dict[str, Any]:
-    """Return an outcome as JSON has it; ``kind`` is window, parameters, skill or notice."""
+    """Return an outcome as JSON has it; ``kind`` is window, parameters, skill, notice or loops."""
     if isinstance(outcome, WindowOutcome):
         return _window(outcome)
     if isinstance(outcome, ParameterSet):
         return {"kind": "parameters", **set_document(outcome)}
+    if isinstance(outcome, LoopEstimate):
+        return loops_document(outcome)
     assert isinstance(outcome, Skill | Notice)
     return {"kind": "skill" if isinstance(outcome, Skill) else "notice", **asdict(outcome)}
 
 
+def loops_document(found: LoopEstimate) -> dict[str, Any]:
+    """Return what rapids show of the drive's own loops as JSON has it."""
+    stds = np.sqrt(np.diag(found.covariance)).tolist()
+    gains = zip(found.names, found.values.tolist(), stds, strict=True)
+    return {
+        "kind": "loops",
+        "axis": found.axis,
+        "structure": found.structure,
+        "gains": {name: {"value": value, "std": std if math.isfinite(std) else None} for name, value, std in gains},
+        "validated": found.verdict.accepted,
+        "unexplained_um": found.verdict.unexplained_um,
+        "configured_um": found.configured_um,
+        "reasons": [str(reason) for reason in found.verdict.reasons],
+        "warnings": [str(warning) for warning in found.verdict.warnings],
+    }
+
+
 def _window(outcome: WindowOutcome) -> dict[str, Any]:
     window, verdict = outcome.window, outcome.verdict
+    told = {name: figures | {"unit": unit_of(name)} for name, figures in described(outcome).items()}
+    terms = outcome.estimate.terms if outcome.estimate else ()
     return {
         "kind": "window",
         "axis": window.axis,
@@ -67,7 +114,11 @@ def _window(outcome: WindowOutcome) -> dict[str, Any]:
         "fit_percent": verdict.fit_percent,
         "reasons": [str(reason) for reason in verdict.reasons],
         "method": outcome.estimate and outcome.estimate.method,
-        "parameters": {name: told | {"unit": UNITS[name]} for name, told in described(outcome).items()},
+        "unexplained_um": verdict.unexplained_um,
+        "warnings": [str(warning) for warning in verdict.warnings],
+        "parameters": {name: figures for name, figures in told.items() if name not in terms},
+        "terms": {name: figures for name, figures in told.items() if name in terms},
+        "friction_at_rapid": friction_of(outcome),
         "delay_s": _delay(outcome),
     }
 

@@ -10,9 +10,21 @@ from collections.abc import Sequence
 from fdhil.config import MachineConfig
 from fdhil.drivers.cia402.profile import load_profile
 from fdhil.errors import StoreError
+from fdhil.identification.between import HISTORY, Member
 from fdhil.identification.drift import Point
 from fdhil.pipeline import POOL_WINDOWS, Known
-from fdhil.records import PARAMETERS, Notice, Outcome, ParameterSet, Skill, WindowOutcome, frozen
+from fdhil.records import (
+    PARAMETERS,
+    Float,
+    LoopEstimate,
+    Notice,
+    Outcome,
+    Parameters,
+    ParameterSet,
+    Skill,
+    WindowOutcome,
+    frozen,
+)
 from fdhil.store.history import FILE_NAME, History
 from fdhil.store.rows import Revision, Stamp, StoredWindow
 from fdhil.store.windows import RawScale, Scales, WindowStore
@@ -38,12 +50,24 @@ def raw_scales(config: MachineConfig, axis: str) -> Scales:
 
 def _point(window: StoredWindow) -> Point:
     """Return a stored window's estimate as the drift tracker has it."""
+    values, stds = (_numbers(window, key) for key in ("value", "std"))
+    return Point(values, stds, window.start_tick, window.direction)
+
+
+def _numbers(window: StoredWindow, key: str) -> Float:
+    """Return a figure (6,) of each parameter of a stored window, NaN where there is none."""
     told = window.parameters or {}
-    values, stds = (
-        frozen([math.nan if (number := told.get(name, {}).get(key)) is None else number for name in PARAMETERS])
-        for key in ("value", "std")
-    )
-    return Point(values, stds, window.start_tick)
+    return frozen([math.nan if (number := told.get(name, {}).get(key)) is None else number for name in PARAMETERS])
+
+
+def _members(windows: Sequence[StoredWindow]) -> tuple[Member, ...]:
+    """Return what stored windows, given in order, tell a pool."""
+    members = []
+    for place, window in enumerate(windows, start=1 - len(windows)):
+        if (told := window.told) is not None:
+            values, own, shared = (frozen(told[key]) for key in ("values", "own", "shared"))
+            members.append(Member(tuple(told["names"]), values, own, shared, place, window.direction))
+    return tuple(members)
 
 
 class OutcomeStore:
@@ -60,7 +84,7 @@ class OutcomeStore:
         self._scales = {axis: raw_scales(config, axis) for axis in config.axis}
         self._history: History | None = None
         self._windows: WindowStore | None = None
-        self._pool_ids = {axis: deque[int](maxlen=POOL_WINDOWS) for axis in config.axis}
+        self._accepted = {axis: deque[tuple[int, int]](maxlen=HISTORY) for axis in config.axis}  # start tick and row
         self.fault: str | None = None
         self.strays: tuple[str, ...] = ()
 
@@ -136,13 +160,17 @@ class OutcomeStore:
         return [skill for axis in self._config.axis for skill in self._history.skills(axis, limit=SKILLS)]
 
     def known(self, axis: str) -> Known:
-        """Return where an earlier run left off: first and newest set, and the newest accepted windows' estimates."""
+        """Return where an earlier run left off: first values, newest set, the newest accepted windows' estimates."""
         if self._history is None:
             return Known()
         newest = self._history.revisions(axis, limit=1)
-        first = self._history.first_revision(axis)
-        windows = [window for window in self._history.windows(axis, limit=4 * POOL_WINDOWS) if window.accepted]
-        return Known(first.set if first else None, newest[0].set if newest else None, tuple(map(_point, windows)))
+        first = {
+            direction: Parameters.of(dict(zip(PARAMETERS, _numbers(window, "value"), strict=True)))
+            for direction, window in self._history.first_windows(axis).items()
+        }
+        windows = [window for window in self._history.windows(axis, limit=2 * HISTORY) if window.accepted][-HISTORY:]
+        points = tuple(map(_point, windows[-4 * POOL_WINDOWS :]))
+        return Known(first, newest[0].set if newest else None, points, _members(windows))
 
     def counts(self, axis: str) -> tuple[int, int]:
         """Return how many windows of an axis were ever accepted and refused."""
@@ -174,12 +202,14 @@ class OutcomeStore:
             file = self._windows.append(outcome.window, self._scales[axis], last)
             number = self._history.add_window(outcome, file.path.name, stamp)
             if outcome.verdict.accepted:
-                self._pool_ids[axis].append(number)
+                self._accepted[axis].append((outcome.window.start_tick, number))
         elif isinstance(outcome, ParameterSet):
-            ids = list(self._pool_ids[outcome.axis])[-outcome.windows :]
+            ids = [number for tick, number in self._accepted[outcome.axis] if tick in outcome.window_ticks]
             self._history.add_revision(outcome, ids, stamp)
         elif isinstance(outcome, Notice):
             self._history.add_notice(outcome, stamp)
+        elif isinstance(outcome, LoopEstimate):
+            self._history.add_loops(outcome, stamp)
         else:
             self._history.add_skill(outcome, stamp)
 

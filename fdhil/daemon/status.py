@@ -8,8 +8,8 @@ from typing import Any
 
 from fdhil.config import MachineConfig
 from fdhil.daemon.hearing import Hearing, Trouble
-from fdhil.daemon.outcome_json import parameters_status
-from fdhil.records import Notice, Outcome, ParameterSet, Skill, WindowOutcome
+from fdhil.daemon.outcome_json import loops_document, parameters_status, terms_status
+from fdhil.records import LoopEstimate, Notice, Outcome, ParameterSet, Skill, WindowOutcome
 
 SCHEMA = "fdhil-status-1"
 NOTICES = 20
@@ -25,6 +25,7 @@ class _AxisWatch:
     refused_by: Counter[str] = field(default_factory=Counter)
     last: WindowOutcome | None = None
     skill: Skill | None = None
+    loops: LoopEstimate | None = None
 
 
 class Watch:
@@ -58,6 +59,8 @@ class Watch:
                 watch.refused_by.update(reason.code for reason in outcome.verdict.reasons[:1])
         elif isinstance(outcome, ParameterSet):
             self._axes[outcome.axis].published = outcome
+        elif isinstance(outcome, LoopEstimate):
+            self._axes[outcome.axis].loops = outcome
         else:
             self._axes[outcome.axis].skill = outcome
 
@@ -98,8 +101,12 @@ class Watch:
             "tick": published and published.tick,
             "temperature_c": published and published.temperature_c,
             "parameters": parameters_status(published) if published else None,
+            "terms": terms_status(published) if published else None,
+            "unexplained_um": published and published.unexplained_um,
+            "warnings": [str(warning) for warning in published.warnings] if published else [],
             "last_window": _window_status(last) if last else None,
             "skill": asdict(watch.skill) if watch.skill else None,
+            "loops": loops_document(watch.loops) if watch.loops else None,
             "samples_s_ago": self.hearing.samples_s_ago(axis, now_s),
             "moves": self.hearing.moves[axis].status(),
         }
@@ -112,4 +119,6 @@ def _window_status(outcome: WindowOutcome) -> dict[str, Any]:
         "accepted": outcome.verdict.accepted,
         "fit_percent": outcome.verdict.fit_percent,
         "reasons": [str(reason) for reason in outcome.verdict.reasons],
+        "unexplained_um": outcome.verdict.unexplained_um,
+        "warnings": [str(warning) for warning in outcome.verdict.warnings],
     }

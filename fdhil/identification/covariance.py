@@ -103,16 +103,16 @@ def robust(information: Float, scores: Sequence[Float], rows: Sequence[tuple[Flo
     root = root_of(information)
     power, foretold = np.zeros((2, root.shape[1], root.shape[1]))
     for own in scores:
-        power += _summed(own @ root)
+        power += summed(own @ root)
     for slopes, innovations in rows:
         foretold += _coloured(slopes @ root, _spectrum(innovations, quick_size(2 * len(slopes))))
     share = SUMMED_LAGS / sum(len(own) for own in scores)
     power *= (1.0 + 2.9694 / 1.96 * min(share, 1.0)) ** 2
-    sandwich: Float = root @ _larger(foretold, _larger(power, np.eye(len(power)))) @ root.T
+    sandwich: Float = root @ larger(foretold, larger(power, np.eye(len(power)))) @ root.T
     return sandwich
 
 
-def _summed(scores: Float) -> Float:
+def summed(scores: Float) -> Float:
     """Return the variance (k, k) of the sum of ``scores`` (n, k) that hang together, with Bartlett's weights."""
     meat = scores.T @ scores
     for lag in range(1, min(SUMMED_LAGS, len(scores) // 4) + 1):
@@ -144,7 +144,7 @@ def _coloured(slopes: Float, spectrum: Float) -> Float:
     return variance
 
 
-def _larger(one: Float, other: Float) -> Float:
+def larger(one: Float, other: Float) -> Float:
     """Return the variance that is, in every direction, the larger of ``one`` and ``other`` (positive), both (k, k)."""
     lower = np.linalg.cholesky(other)
     inverse = np.linalg.inv(lower)

@@ -1,5 +1,8 @@
 """Follows the parameters from rapid to rapid: jumps held back, a changed load, maintenance alarms.
 
+One rapid tells the friction of its own direction, with a constant load in it: friction is compared in either direction
+by itself.
+
 Pure: the same estimates in the same order give the same notices. Nothing here reads a clock.
 """
 
@@ -15,6 +18,7 @@ from fdhil.config import Maintenance
 from fdhil.records import PARAMETERS, UNITS, Float, Notice, Parameters
 
 HISTORY = 32
+RECENT = 8
 LEAST_HISTORY = 3
 BEYOND_CHANCE = 5.0
 HELD_EPISODES = 2
@@ -22,6 +26,7 @@ AGREEING = 2
 SURELY = 2.0  # standard deviations by which a change must be beyond its limit
 RELEASE = 0.8  # an alarm is released when the change has fallen to this share of its limit
 RELEASING = 4  # estimates whose mean releases an alarm
+FRICTION = ("ft", "Cd")
 # changes smaller than these are drift, not a jump, however sure the estimates are
 LEAST_JUMP: Mapping[str, float] = {"R": 0.05, "L": 0.08, "K": 0.03, "Jt": 0.03, "ft": 0.40, "Cd": 0.25}
 
@@ -33,6 +38,7 @@ class Point:
     values: Float
     stds: Float
     tick: int
+    direction: int = 1
 
 
 @dataclass(slots=True)
@@ -42,20 +48,19 @@ class DriftTracker:
     maintenance: Maintenance
     axis: str = ""
     points: deque[Point] = field(default_factory=lambda: deque(maxlen=HISTORY))
-    reference: Parameters | None = None
+    references: dict[int, Parameters] = field(default_factory=dict)
     alarms: set[str] = field(default_factory=set)
     _held: list[Point] = field(default_factory=list)
 
-    def update(self, values: Parameters, covariance: Float, tick: int = 0) -> list[Notice]:
-        """Take a validated estimate with its covariance (6, 6); return what is to be said about it.
+    def update(self, values: Parameters, covariance: Float, tick: int = 0, direction: int = 1) -> list[Notice]:
+        """Take a validated estimate of a move in a ``direction``, with its covariance; return what is to be said.
 
         ``ParameterJump`` holds the estimate back for ``HELD_EPISODES`` further ones; a step of Jt alone is
         ``LoadChanged``: the correction must be withdrawn at once, and the new Jt is used from the second agreeing one.
         """
-        stds = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-        point = Point(np.array(list(values.as_dict().values())), stds, tick)
-        if self.reference is None:
-            self.reference = values
+        stds = np.sqrt(np.clip(np.diag(covariance)[: len(PARAMETERS)], 0.0, None))
+        point = Point(np.array(list(values.as_dict().values())), stds, tick, direction)
+        self.references.setdefault(direction, values)
         moved = self._moved(point)
         if not moved:
             self._held.clear()
@@ -63,12 +68,15 @@ class DriftTracker:
             return self._alarms(point)
         return self._hold(point, moved)
 
-    def resume(self, first: Parameters | None, points: Iterable[Point]) -> None:
-        """Go on where an earlier run left off: an alarm that its ``points`` raised is not raised again."""
-        self.reference = first
+    def resume(self, first: Mapping[int, Parameters], points: Iterable[Point]) -> None:
+        """Go on where an earlier run left off: an alarm that its ``points`` raised is not raised again.
+
+        ``first`` are the first values in either direction, against which changes count.
+        """
+        self.references = dict(first)
         for point in points:
             self.points.append(point)
-            if first is not None:
+            if point.direction in self.references:
                 self._alarms(point)
 
     @property
@@ -76,21 +84,29 @@ class DriftTracker:
         """Return whether the newest estimate is held back: it must not be used yet."""
         return bool(self._held)
 
+    def _recent(self, direction: int) -> list[list[Point]]:
+        """Return for each parameter the points that a new one is compared with: of friction those of its direction."""
+        points = list(self.points)
+        same = [point for point in points if point.direction == direction][-RECENT:]
+        return [same if name in FRICTION else points[-RECENT:] for name in PARAMETERS]
+
     def _moved(self, point: Point) -> list[str]:
         """Return the parameters that lie beyond chance and drift from the recent history (median and MAD)."""
-        if len(self.points) < LEAST_HISTORY:
-            return []
-        recent = np.array([p.values for p in list(self.points)[-8:]])
-        spread = np.array([p.stds for p in list(self.points)[-8:]])
-        middle = np.median(recent, axis=0)
-        scatter = 1.4826 * np.median(np.abs(recent - middle), axis=0)
-        chance = BEYOND_CHANCE * np.sqrt(scatter**2 + point.stds**2 + np.median(spread, axis=0) ** 2)
-        least = np.array([LEAST_JUMP[name] for name in PARAMETERS]) * np.abs(middle)
-        apart = np.abs(point.values - middle)
-        return [name for k, name in enumerate(PARAMETERS) if apart[k] > max(chance[k], least[k])]
+        moved = []
+        for k, (name, recent) in enumerate(zip(PARAMETERS, self._recent(point.direction), strict=True)):
+            if len(recent) < LEAST_HISTORY:
+                continue
+            values = np.array([p.values[k] for p in recent])
+            middle = float(np.median(values))
+            scatter = 1.4826 * np.median(np.abs(values - middle))
+            spread = np.median([p.stds[k] for p in recent])
+            chance = BEYOND_CHANCE * np.sqrt(scatter**2 + point.stds[k] ** 2 + spread**2)
+            if abs(point.values[k] - middle) > max(chance, LEAST_JUMP[name] * abs(middle)):
+                moved.append(name)
+        return moved
 
     def _hold(self, point: Point, moved: Sequence[str]) -> list[Notice]:
-        before = np.median(np.array([p.values for p in list(self.points)[-8:]]), axis=0)
+        before = [np.median([p.values[k] for p in at]) for k, at in enumerate(self._recent(point.direction))]
         self._held = [p for p in self._held if self._agree(p, point)]
         self._held.append(point)
         load = list(moved) == ["Jt"]
@@ -112,18 +128,19 @@ class DriftTracker:
 
     @staticmethod
     def _agree(one: Point, other: Point) -> bool:
+        alike = one.direction == other.direction
+        rows = [k for k, name in enumerate(PARAMETERS) if alike or name not in FRICTION]
         chance = BEYOND_CHANCE * np.sqrt(one.stds**2 + other.stds**2)
         least = np.array([LEAST_JUMP[name] for name in PARAMETERS]) * np.abs(one.values)
-        return bool((np.abs(one.values - other.values) <= np.maximum(chance, least)).all())
+        return bool((np.abs(one.values - other.values) <= np.maximum(chance, least))[rows].all())
 
     def _alarms(self, point: Point) -> list[Notice]:
         """Return maintenance alarms that begin or end: relative change from the first value, with hysteresis.
 
         One sure window begins an alarm; it takes the mean of the newest, surely below ``RELEASE``, to end it.
         """
-        assert self.reference is not None
         notices = []
-        for k, (name, first) in enumerate(self.reference.as_dict().items()):
+        for k, (name, first) in enumerate(self.references[point.direction].as_dict().items()):
             if not (first and np.isfinite(point.values[k])):
                 continue
             limit = float(getattr(self.maintenance, name))
@@ -133,16 +150,23 @@ class DriftTracker:
                 moved = f"{name} has moved by {100 * change:.0f} % to {point.values[k]:.4g} {UNITS[name]}"
                 text = f"{moved}, limit {100 * limit:.0f} %"
                 notices.append(Notice("MaintenanceDue", "minor", text, self.axis, point.tick))
-            elif name in self.alarms and self._released(k, first, limit):
+            elif name in self.alarms and self._released(k, limit):
                 self.alarms.discard(name)
                 text = f"{name} is back at {point.values[k]:.4g} {UNITS[name]}"
                 notices.append(Notice("MaintenanceDue", "info", text, self.axis, point.tick))
         return notices
 
-    def _released(self, k: int, first: float, limit: float) -> bool:
+    def _released(self, k: int, limit: float) -> bool:
         newest = [p for p in list(self.points)[-RELEASING:] if np.isfinite(p.values[k]) and np.isfinite(p.stds[k])]
-        if not newest:
+        firsts = [list(self.references[p.direction].as_dict().values())[k] for p in newest if self._measured(p, k)]
+        if not firsts or len(firsts) < len(newest):
             return False
-        change = abs(float(np.mean([p.values[k] for p in newest])) / first - 1)
-        doubt = SURELY * float(np.sqrt(np.mean([p.stds[k] ** 2 for p in newest]) / len(newest))) / abs(first)
-        return change + doubt < RELEASE * limit
+        shares = np.array([p.values[k] / first for p, first in zip(newest, firsts, strict=True)])
+        doubts = np.array([p.stds[k] / first for p, first in zip(newest, firsts, strict=True)])
+        doubt = SURELY * float(np.sqrt(np.mean(doubts**2) / len(newest)))
+        return abs(float(np.mean(shares)) - 1) + doubt < RELEASE * limit
+
+    def _measured(self, point: Point, k: int) -> bool:
+        """Return whether a point's parameter has a first value that it may be measured against."""
+        first = self.references.get(point.direction)
+        return first is not None and bool(list(first.as_dict().values())[k])

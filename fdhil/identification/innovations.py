@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fdhil.identification import kalman
-from fdhil.identification.kalman import CD, CURRENT, DELAY, LOAD, SPEED, VOLTAGE, Readings
+from fdhil.identification.courses import any_voltage, load_nm, voltage_v
+from fdhil.identification.kalman import CURRENT, DELAY, LOAD, SPEED, VOLTAGE, Readings
 from fdhil.identification.motion import Motion, Noise
 from fdhil.identification.slow_voltage import innovations_of
 from fdhil.records import Float
@@ -39,7 +40,7 @@ class Gains:
 
 
 def gains_of(motion: Motion, theta: Float, noise: Noise) -> Gains:
-    """Return the filter's gains for ``theta`` (7,) = [R, L, K, Jt, ft, Cd, delay]."""
+    """Return the filter's gains for ``theta`` (k,) = [R, L, K, Jt, ft, Cd, delay, terms]."""
     variances = noise.vector() ** 2
     if motion.slow is not None:
         return Gains(NOTHING, innovations_of(motion, theta, variances).logdet, variances)
@@ -48,7 +49,7 @@ def gains_of(motion: Motion, theta: Float, noise: Noise) -> Gains:
 
 
 def whiten(motion: Motion, thetas: Float, variances: Float) -> tuple[Float, Float]:
-    """Return the whitened innovations (m, q) for the rows of ``thetas`` (q, 7), each by the filter made for it.
+    """Return the whitened innovations (m, q) for the rows of ``thetas`` (q, k), each by the filter made for it.
 
     Those of current and speed come row by row, those of the samples of a slow voltage (m,) after them. All are white,
     of unit variance, in a right model. ``variances`` (q, 3) are those of voltage, current and speed; with the
@@ -63,26 +64,27 @@ def whiten(motion: Motion, thetas: Float, variances: Float) -> tuple[Float, Floa
 
 
 def _whitened(motion: Motion, thetas: Float, variances: Float, gains: Float) -> tuple[Float, Float]:
-    delays = thetas[:, DELAY]
-    together = bool((delays == delays[0]).all())
-    voltages = [motion.delayed(float(d)) for d in (delays[:1] if together else delays)]
-    return kalman.whiten(thetas, variances, Readings.of(motion), np.array(voltages), gains)
+    told = thetas[:, DELAY:] if any_voltage(motion) else thetas[:, DELAY, None]
+    together = bool((told == told[0]).all())
+    voltages = np.array([voltage_v(motion, theta) for theta in (thetas[:1] if together else thetas)])
+    loads = np.array([load_nm(motion, theta) for theta in thetas])
+    return kalman.whiten(thetas, variances, Readings.of(motion), voltages, loads, gains)
 
 
 def innovations(
-    motion: Motion, theta: Float, gains: Gains, load_nm: Float | None = None, emf_share: float = 1.0
+    motion: Motion, theta: Float, gains: Gains, more_nm: Float | None = None, emf_share: float = 1.0
 ) -> Float:
     """Return the whitened innovations (m,) by a filter that was made before, in the order of :func:`whiten`.
 
-    ``load_nm`` (n,) is a torque against the positive direction over each interval (none when left out); ``emf_share``
+    ``more_nm`` (n,) is one more torque against the positive direction over each interval; ``emf_share``
     of the back-EMF's ramp within a voltage sample is taken.
     """
     if motion.slow is not None:
-        return innovations_of(motion, theta, gains.variances, load_nm=load_nm).whitened
-    load = theta[CD] * motion.mode
+        return innovations_of(motion, theta, gains.variances, more_nm=more_nm).whitened
+    load = load_nm(motion, theta)
     readings = Readings.of(motion, emf_share)
-    signals = np.stack([load, motion.delayed(float(theta[DELAY])), motion.current, motion.speed])
-    loads = (load if load_nm is None else load + load_nm)[None]
+    signals = np.stack([load, voltage_v(motion, theta), motion.current, motion.speed])
+    loads = (load if more_nm is None else load + more_nm)[None]
     white = kalman.respond(theta, readings, signals, LOAD, loads, readings.rise_v[None], gains.gains)
     return white.ravel()
 

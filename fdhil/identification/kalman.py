@@ -145,7 +145,9 @@ def _spread(
 
 
 @compiled
-def _whiten_one(theta: Float, variances: Float, readings: Readings, mean_v: Float, white: Float, gains: Float) -> float:
+def _whiten_one(
+    theta: Float, variances: Float, readings: Readings, mean_v: Float, load: Float, white: Float, gains: Float
+) -> float:
     """Fill ``white`` (n, 2), and ``gains`` (n, 7) unless it has no rows; return the innovations' log determinant."""
     steps = interval_steps(theta, readings.dt_s, readings.emf_share)
     mode, observed, rise_v = readings.mode, readings.observed, readings.rise_v
@@ -185,23 +187,26 @@ def _whiten_one(theta: Float, variances: Float, readings: Readings, mean_v: Floa
         known = 0 if mode[k] == UNKNOWN else 1
         p11, p12, p22 = _spread(steps, known, p11, p12, p22, vu, 0.0 if known else readings.walk)
         rise = rise_v[k] if rise_v.size else 0.0
-        i, w = _moved(steps, known, i, w, mean_v[k], theta[CD] * mode[k], rise)
+        i, w = _moved(steps, known, i, w, mean_v[k], load[k], rise)
     return float(logdet + np.log(product) - counted * np.log(unit))
 
 
 @compiled
-def whiten(thetas: Float, variances: Float, readings: Readings, mean_v: Float, gains: Float) -> tuple[Float, Float]:
+def whiten(
+    thetas: Float, variances: Float, readings: Readings, mean_v: Float, loads: Float, gains: Float
+) -> tuple[Float, Float]:
     """Return whitened innovations (q, n, 2) and log determinants (q,) for the rows of ``thetas`` (q, 7).
 
-    ``variances`` (q, 3) are those of voltage, current and speed; ``mean_v`` is (q, n) or, when all share it, (1, n).
-    ``gains`` (n, 7), or of no rows, takes those of the last filter.
+    ``variances`` (q, 3) are those of voltage, current and speed; ``mean_v`` is (q, n) or, when all share it, (1, n),
+    and so are the ``loads``: friction, and what comes on top, against the positive direction. ``gains`` (n, 7), or of
+    no rows, takes those of the last filter.
     """
     q = thetas.shape[0]
     white = np.empty((q, readings.mode.size, 2))
     logdet = np.zeros(q)
     for c in range(q):
-        mean = mean_v[min(c, mean_v.shape[0] - 1)]
-        logdet[c] = _whiten_one(thetas[c], variances[c], readings, mean, white[c], gains)
+        mean, load = mean_v[min(c, mean_v.shape[0] - 1)], loads[min(c, loads.shape[0] - 1)]
+        logdet[c] = _whiten_one(thetas[c], variances[c], readings, mean, load, white[c], gains)
     return white, logdet
 
 
@@ -354,12 +359,13 @@ def slow_innovations(
 
 @compiled
 def departure(
-    theta: Float, dt: float, mode: Modes, y: Float, variance: Float, walks: Float, signal: int
+    theta: Float, dt: float, mode: Modes, load: Float, y: Float, variance: Float, walks: Float, signal: int
 ) -> tuple[float, float]:
     """Return the sum of squares by which readings ``y`` (n, 3) depart from the best course, in units of ``variance``.
 
     And how many of the readings of ``signal`` were news: the sum of their shares of variance that were not their own.
-    Readings are of current, speed and voltage; their variance (n, 3) is infinite where there is none.
+    Readings are of current, speed and voltage; their variance (n, 3) is infinite where there is none. ``load`` (n,) is
+    friction, and what comes on top, against the positive direction.
 
     ``walks`` (n, 3) are the variances that speed (where friction is unknown) and voltage gain over each interval, and
     of the voltage's rise within it.
@@ -392,5 +398,5 @@ def departure(
         for a in range(2):
             for b in range(2):
                 p[a, b] += walks[k, 2] * rises[a] * rises[b]
-        x[STATE_I], x[STATE_W] = _moved(steps, known, x[STATE_I], x[STATE_W], x[STATE_U], theta[CD] * mode[k], 0.0)
+        x[STATE_I], x[STATE_W] = _moved(steps, known, x[STATE_I], x[STATE_W], x[STATE_U], load[k], 0.0)
     return total, news

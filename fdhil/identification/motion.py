@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from fdhil.identification.filtering import all_about, moving_mean
-from fdhil.identification.windows import RUN_SHARE, carried, noise_of, runs_of
+from fdhil.identification.windows import RUN_SHARE, bridged, carried, noise_of, runs_of
 from fdhil.model.feed_drive import interval_shape
 from fdhil.records import Bool, Float, SlowVoltage, VoltageSampling, Window
 
@@ -37,6 +37,20 @@ class Noise:
 
 
 @dataclass(frozen=True, slots=True)
+class Course:
+    """What one unit of a term is over each interval of a window, ``values`` (n,), in which all is linear.
+
+    Its ``kind`` is the signal that it adds to, as :mod:`fdhil.identification.courses` has them.
+    Friction at low speed falls off with ``speed_rad_s``.
+    """
+
+    name: str
+    kind: int
+    values: Float
+    speed_rad_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Motion:
     """One window on its grid: ``mode`` (n,) says what is known of the interval that begins at each row.
 
@@ -45,7 +59,10 @@ class Motion:
     are instants, ``observed`` (n,) marks the rows that were measured. ``speed_walk`` is the standard deviation of the
     speed's change over an interval of unknown friction. Where the voltage is ``slow``, ``voltage_mean`` (m,) are its
     samples, and ``slope_walk`` (n,) is the variance that the current's slope gains per second, (A/s)^2/s,
-    and ``shape_variance`` (m,), V^2, what the voltage's course within a row adds to its noise.
+    and ``shape_variance`` (m,), V^2, what the voltage's course within a row adds to its noise. ``courses`` are those of
+    the terms that joined, in the order of the last entries of theta;
+    ``angle_rad`` (n,) is the shaft's as its place tells, or has no rows;
+    ``speed_late`` is by how many seconds the recorded speed was late, and the standard deviation of that.
     """
 
     dt_s: float
@@ -61,6 +78,9 @@ class Motion:
     slow: SlowVoltage | None = None
     slope_walk: Float = field(default_factory=lambda: np.zeros(0))
     shape_variance: Float = field(default_factory=lambda: np.zeros(0))
+    courses: tuple[Course, ...] = ()
+    angle_rad: Float = field(default_factory=lambda: np.zeros(0))
+    speed_late: tuple[float, float] | None = None
 
     @property
     def n(self) -> int:
@@ -145,7 +165,16 @@ def prepare(window: Window) -> Motion:
         speed_walk=_largest_step(speed, window.dt_s),
         voltage_sampling=window.voltage_sampling,
         slow=slow,
+        angle_rad=_angle(window),
+        speed_late=None if window.speed_late_s is None else (window.speed_late_s, window.speed_late_std_s),
     )
+
+
+def _angle(window: Window) -> Float:
+    if not np.isfinite(window.position_mm).any():
+        return np.zeros(0)
+    angle: Float = bridged(window.position_mm) * (2 * math.pi / window.pitch_mm)
+    return angle
 
 
 def _majority(side: Modes, sure: Bool) -> Modes:

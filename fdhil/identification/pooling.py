@@ -1,18 +1,39 @@
-"""Combines the estimates of several windows of one drive, and tells how far two of them may lie apart by chance."""
+"""Combines the estimates of several windows of one drive, and tells how far two of them may lie apart by chance.
+
+A small mixed model: what is common to all windows is estimated by generalised least squares, with what differs between
+them (:mod:`fdhil.identification.between`) in the covariance. Moves in both directions tell a constant load from dry
+friction, and viscous friction by direction.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fdhil.identification.between import ALIKE, Between, Member
 from fdhil.identification.covariance import aliasing
+from fdhil.identification.ripple_parts import as_amplitude, as_parts
 from fdhil.records import PARAMETERS, Estimate, Float, Window, frozen
 
 # of a doubt that windows of one drive share, what may still differ between them: its size depends on the regulators,
 # which are the same, and a little on the move
 UNSHARED = 0.2
+JOINS = 3.3  # standard deviations: of a thousand pools of a drive without a load, one is given one
+LEAST_SHARE = 1e-6  # of a parameter's size: what is not told more narrowly than rounding
+BY_DIRECTION = {"load": "Cd", "viscous": "ft"}  # what the direction changes, and of which parameter
+
+
+def member(window: Window, estimate: Estimate, place: int = 0) -> Member:
+    """Return what a window tells, ready to be pooled: its own chance apart from the doubts that all windows share."""
+    own, systematic, alias = _parts(window, estimate)
+    told = np.isfinite(estimate.values) & np.isfinite(np.diag(estimate.covariance))
+    kept = [k for k, name in enumerate(estimate.names) if told[k] and name not in estimate.given]
+    doubts = np.column_stack([np.diag(alias)[:, : len(PARAMETERS)], systematic])
+    names = tuple(estimate.names[k] for k in kept)
+    values, own, doubts = as_parts(names, estimate.values[kept], own[np.ix_(kept, kept)], doubts[kept])
+    return Member(names, values, own, doubts, place, window.direction)
 
 
 def weighted(told: Sequence[tuple[Window, Estimate]]) -> Estimate | None:
@@ -21,30 +42,160 @@ def weighted(told: Sequence[tuple[Window, Estimate]]) -> Estimate | None:
     What windows share (the systematic part, and what instants of the voltage miss) does not average away: it goes
     through the same weights.
     """
-    first = told[0][1]
-    scale = np.where(first.values != 0.0, np.abs(first.values), 1.0)  # the parameters differ by orders of magnitude
-    information = np.zeros((len(PARAMETERS), len(PARAMETERS)))
-    pull = np.zeros(len(PARAMETERS))
-    shared = np.zeros((len(PARAMETERS), 2 + len(PARAMETERS)))
-    for window, estimate in told:
-        if not (np.isfinite(estimate.values).all() and np.isfinite(estimate.covariance).all()):
-            return None
-        own, systematic, alias = _parts(window, estimate)
-        weight = np.linalg.inv(own / np.outer(scale, scale))
-        information += weight
-        pull += weight @ (estimate.values / scale)
-        shared += weight @ (np.column_stack([systematic, np.diag(alias)]) / scale[:, None])
-    covariance = np.linalg.inv(information)
-    doubts = (covariance @ shared) * scale[:, None]
+    members = [member(window, estimate, k) for k, (window, estimate) in enumerate(told)]
+    if any(not set(PARAMETERS) <= set(m.names) for m in members):
+        return None
+    return pooled(members, told[0][1], ALIKE, joining=False)
+
+
+def pooled(members: Sequence[Member], first: Estimate, apart: Between, *, joining: bool = True) -> Estimate:
+    """Return what windows, given in order, tell together of the drive as it is at the newest of them.
+
+    ``apart`` is what differs between them. With ``joining`` a load, and viscous friction by direction, join where the
+    windows surely tell them. Method, and what no window tells, are those of ``first``.
+    """
+    names = _common(members)
+    joined: list[str] = []
+    answer = _solved(members, names, joined, apart)
+    while joining:
+        trials = {term: _solved(members, names, [*joined, term], apart) for term in _open(members, names, joined)}
+        surest = max(trials, key=lambda term: trials[term].surety(), default=None)
+        if surest is None or trials[surest].surety() < JOINS:
+            break
+        joined.append(surest)
+        answer = trials[surest]
+    return _estimate(answer, names, joined, first)
+
+
+def _common(members: Sequence[Member]) -> tuple[str, ...]:
+    """Return the parameters that any window tells, and the terms that at least half of the windows have."""
+    seen = dict.fromkeys(name for m in members for name in m.names)
+    known = [name for name in PARAMETERS if name in seen]
+    terms = [name for name in seen if name not in PARAMETERS and 2 * sum(name in m.names for m in members)
+             >= len(members)]  # fmt: skip
+    return (*known, *terms)
+
+
+def _open(members: Sequence[Member], names: Sequence[str], joined: Sequence[str]) -> list[str]:
+    """Return the terms by direction that may still join: there must be moves in both."""
+    both = len({m.direction for m in members}) == 2
+    return [term for term, of in BY_DIRECTION.items() if both and of in names and term not in joined]
+
+
+@dataclass(frozen=True, slots=True)
+class _Solution:
+    """Common ``values`` (k,) with their chance (k, k) and the doubts (k, q) that the windows share."""
+
+    values: Float
+    chance: Float
+    doubts: Float
+
+    def surety(self) -> float:
+        """Return how many standard deviations the last value lies from 0."""
+        return abs(float(self.values[-1])) / float(np.sqrt(self.chance[-1, -1]))
+
+
+def _solved(members: Sequence[Member], names: Sequence[str], joined: Sequence[str], apart: Between) -> _Solution:
+    """Return the generalised least squares of what the windows tell, by ``names`` and then the terms ``joined``."""
+    rows = [(j, name) for j, m in enumerate(members) for name in m.names if name in names]
+    values = np.array([members[j].values[members[j].names.index(name)] for j, name in rows])
+    scale = {name: max((abs(v) for v, (_, n) in zip(values, rows, strict=True) if n == name), default=0.0) or 1.0
+             for name in names}  # fmt: skip
+    scales = np.array([scale[name] for _, name in rows])
+    levels = _columns(members, rows, names, joined)
+    weight = np.linalg.inv(_covariance(members, rows, apart) / np.outer(scales, scales))
+    unit = np.array([scale[BY_DIRECTION.get(name, name)] for name in (*names, *joined)])
+    phi = levels * unit / scales[:, None]
+    chance = np.linalg.inv(phi.T @ weight @ phi)
+    gain = chance @ phi.T @ weight / scales
+    shared = np.zeros((len(rows), max(m.shared.shape[1] for m in members)))
+    for row, (j, name) in zip(shared, rows, strict=True):
+        row[: members[j].shared.shape[1]] = members[j].shared[members[j].names.index(name)]
+    return _Solution(gain @ values * unit, chance * np.outer(unit, unit), (gain @ shared) * unit[:, None])
+
+
+def _columns(
+    members: Sequence[Member], rows: Sequence[tuple[int, str]], names: Sequence[str], joined: Sequence[str]
+) -> Float:
+    """Return (m, k): which common value each row is, and what the direction adds to it."""
+    columns = [[float(name == of) for _, name in rows] for of in names]
+    columns += [[members[j].direction * float(name == BY_DIRECTION[term]) for j, name in rows] for term in joined]
+    return np.array(columns, dtype=np.float64).T
+
+
+def _covariance(members: Sequence[Member], rows: Sequence[tuple[int, str]], apart: Between) -> Float:
+    """Return the covariance (m, m) of the rows about what the drive is at the newest window."""
+    window = np.array([j for j, _ in rows])
+    alike = np.equal.outer([name for _, name in rows], [name for _, name in rows])
+    places = np.array([members[j].place for j, _ in rows], dtype=np.float64)
+    back = places.max() - places
+    squares = {name: size**2 for name, size in apart.sizes.items()}
+    walk = np.array([apart.walk.get(name, 0.0) * squares.get(name, 0.0) for _, name in rows])
+    scatter = np.array([apart.scatter.get(name, 0.0) * squares.get(name, 0.0) for _, name in rows])
+    # two windows share the way from the newer of them to the newest
+    total = np.where(alike, walk * np.minimum.outer(back, back), 0.0) + np.diag(scatter)
+    for j, one in enumerate(members):
+        at = np.flatnonzero(window == j)
+        own = [one.names.index(rows[int(k)][1]) for k in at]
+        total[np.ix_(at, at)] += one.own[np.ix_(own, own)]
+        total[at, at] += (LEAST_SHARE * one.values[own]) ** 2
+    return total
+
+
+def _estimate(found: _Solution, names: Sequence[str], joined: Sequence[str], first: Estimate) -> Estimate:
+    """Return the solution as an estimate: parameters that no window tells stay open, given ones stay as given."""
+    listed = (*PARAMETERS, *(name for name in names if name not in PARAMETERS), *_told_terms(joined))
+    values, total, doubts = as_amplitude((*names, *joined), found.values, found.chance, found.doubts)
+    known = {name: k for k, name in enumerate((*names, *joined))}
+    root = np.zeros((len(listed), len(known)))
+    for row, name in enumerate(listed):
+        for of, share in _made_of(name).items():
+            if of in known:
+                root[row, known[of]] = share
+    answer, covariance = root @ values, root @ total @ root.T
+    systematic = root @ doubts
+    covariance += systematic @ systematic.T
+    for row, name in enumerate(PARAMETERS):
+        if name not in known:
+            answer[row] = first.value(name)
+            covariance[row, :] = covariance[:, row] = 0.0 if name in first.given else np.nan
     return replace(
         first,
-        values=frozen(covariance @ pull * scale),
-        covariance=frozen(covariance * np.outer(scale, scale) + doubts @ doubts.T),
+        names=listed,
+        values=frozen(answer),
+        covariance=frozen(covariance),
         residuals={},
         delay_s=None,
         delay_std_s=None,
-        systematic=frozen(doubts[:, :2]),
+        systematic=frozen(systematic[:, len(PARAMETERS) :]),
     )
+
+
+def _told_terms(joined: Sequence[str]) -> tuple[str, ...]:
+    """Return the names under which terms by direction are told."""
+    sides = ("viscous_positive", "viscous_negative") if "viscous" in joined else ()
+    return (*(("load",) if "load" in joined else ()), *sides)
+
+
+def _made_of(name: str) -> dict[str, float]:
+    """Return of what solved values, and by which shares, a told value is made."""
+    sides = {"viscous_positive": 1.0, "viscous_negative": -1.0}
+    return {"ft": 1.0, "viscous": sides[name]} if name in sides else {name: 1.0}
+
+
+def friction_at(estimate: Estimate, speed_rad_s: float) -> tuple[float, float] | None:
+    """Return the friction torque Cd + ft w at a speed, and its standard deviation (N.m); None where it is not known.
+
+    At one speed ft and Cd trade, each with a wide interval: this sum is what is known, and what trends follow. Of a
+    single window it holds the load of its direction.
+    """
+    if not {"ft", "Cd"} <= set(estimate.names):
+        return None
+    rows = [estimate.names.index(name) for name in ("ft", "Cd")]
+    lever = np.array([speed_rad_s, 1.0])
+    value = float(lever @ estimate.values[rows])
+    variance = float(lever @ estimate.covariance[np.ix_(rows, rows)] @ lever)
+    return (value, variance**0.5) if np.isfinite(value) and variance >= 0.0 else None
 
 
 def difference_covariance(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) -> Float:
@@ -53,18 +204,29 @@ def difference_covariance(one: tuple[Window, Estimate], other: tuple[Window, Est
     What is not known of the voltage's course within its samples is the regulators' doing and the same in both: with s
     and t what it does to either estimate, it moves their difference by s - t only, and hides no change of the drive.
     """
-    (own, systematic, alias), (its_own, its_systematic, its_alias) = _parts(*one), _parts(*other)
+    (own, systematic, alias), (its_own, its_systematic, its_alias) = (_of_six(*_parts(*pair)) for pair in (one, other))
+    wide = max(systematic.shape[1], its_systematic.shape[1])
+    systematic, its_systematic = (np.pad(s, ((0, 0), (0, wide - s.shape[1]))) for s in (systematic, its_systematic))
     apart = systematic - its_systematic
     unshared = systematic @ systematic.T + its_systematic @ its_systematic.T + np.diag(alias**2 + its_alias**2)
     covariance: Float = own + its_own + apart @ apart.T + np.diag((alias - its_alias) ** 2) + UNSHARED**2 * unshared
     return covariance
 
 
+def _of_six(own: Float, systematic: Float, alias: Float) -> tuple[Float, Float, Float]:
+    six = len(PARAMETERS)
+    return own[:six, :six], systematic[:six], alias[:six]
+
+
 def _parts(window: Window, estimate: Estimate) -> tuple[Float, Float, Float]:
-    """Return the covariance (6, 6) of a window's own chance, and the doubts (6, 2) and (6,) that it shares."""
-    size = len(PARAMETERS)
-    systematic = np.zeros((size, 2)) if estimate.systematic is None else estimate.systematic
+    """Return the covariance (k, k) of a window's own chance, and the doubts (k, q) and (k,) that it shares."""
+    size = len(estimate.names)
+    systematic = np.zeros((size, 0))
+    if estimate.systematic is not None:  # told of the first names
+        systematic = np.pad(estimate.systematic, ((0, size - len(estimate.systematic)), (0, 0)))
     slow = window.slow_voltage
     period = window.dt_s if slow is None else slow.period_s
-    alias = aliasing(window.voltage_sampling, period) * np.abs(estimate.values)
+    alias = np.zeros(size)
+    six = len(PARAMETERS)
+    alias[:six] = aliasing(window.voltage_sampling, period) * np.abs(estimate.values[:six])
     return estimate.covariance - systematic @ systematic.T - np.diag(alias**2), systematic, alias

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fdhil.identification.courses import terms_nm
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.kalman import DELAY, JT, NO_SAMPLE, K, Marks, Readings, SlowSensor, slow_innovations
 from fdhil.identification.motion import Motion
@@ -96,13 +97,13 @@ def innovations_of(
     theta: Float,
     variances: Float,
     ordered_for_s: float | None = None,
-    load_nm: Float | None = None,
+    more_nm: Float | None = None,
     spread: Float | None = None,
 ) -> Innovations:
     """Return the innovations by the filter that is right for ``theta`` (7,) = [R, L, K, Jt, ft, Cd, delay].
 
     ``variances`` (3,) are those of voltage, current and speed; ``ordered_for_s`` as in :func:`marks_of`, the delay
-    itself when left out; ``load_nm`` (n,) is a torque against the positive direction over each row's interval;
+    itself when left out; ``more_nm`` (n,) is one more torque against the positive direction over each row's interval;
     ``spread`` (n, 2) stands in the place of what :func:`spread_of` gives.
     """
     assert motion.slow is not None
@@ -112,7 +113,8 @@ def innovations_of(
     voltage = read_only(motion.voltage_mean)
     sensor = SlowSensor(voltage, instant, motion.slow.period_s, motion.shape_variance, marks)
     spread = spread_of(motion, variances) if spread is None else spread
-    load = np.zeros(0) if load_nm is None else load_nm
+    more = np.zeros(0) if more_nm is None else more_nm
+    load = terms_nm(motion, theta) + (more if more.size else 0.0) if motion.courses else more
     readings = Readings.of(motion)
     return Innovations(*slow_innovations(theta, readings, sensor, variances, spread, load, motion.slope_walk))
 

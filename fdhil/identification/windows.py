@@ -152,6 +152,7 @@ def _cut(recording: Recording, speed: Float, run: Run, floor: int, ceiling: int,
         source=recording.source,
         offset_mm=read_only(offset[part]) if offset is not None and np.any(np.abs(offset[part]) > 0) else None,
         slow_voltage=_slow_part(recording, a, b),
+        torque_constant_nm_per_a=recording.torque_constant_nm_per_a,
     )
 
 

@@ -6,20 +6,36 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdhil.config import Identification
+from fdhil.config import Axis, Identification
 from fdhil.identification.estimators import chosen, maximum_likelihood
 from fdhil.identification.identifiability import empty_estimate
-from fdhil.identification.ratios import estimate_ratios
+from fdhil.identification.signals import mended
+from fdhil.identification.without_voltage import told
 from fdhil.records import Estimate, Reason, Result, Verdict, Window, WindowOutcome
-from fdhil.validation import BEFORE_ANY_FIT, LEAST_ROWS, OF_THE_FIT, Evidence, Findings, ask
+from fdhil.validation import BEFORE_ANY_FIT, LEAST_ROWS, OF_THE_FIT, WEIGHED, Evidence, Findings, ask
 
 GAVE_UP = (np.linalg.LinAlgError, FloatingPointError, ZeroDivisionError, OverflowError)
+SAME_PITCH = 0.01  # to which a recording and the section of its axis agree
+OVERRIDE = 2.0  # by which their rapid speeds may differ: an override slows what is recorded
 UNFIT = "NotFinite"
 
 
-def analyse(window: Window, settings: Identification) -> WindowOutcome:
-    """Return what one window says of the drive, and whether it is believed; never raises, whatever the data."""
-    signals = Evidence(window, settings)
+def analyse(
+    window: Window, settings: Identification, axis: Axis | None = None, sync_period_s: float | None = None
+) -> WindowOutcome:
+    """Return what one window says of the drive, and whether it is believed; never raises, whatever the data.
+
+    The speed is brought to the instants of its rows first; the outcome's window is as it was recorded. With the
+    ``axis``' section the rapid is replayed through the closed loop, whose set-points come every ``sync_period_s``
+    (left out: with every row).
+    """
+    at_instants = mended(window, settings.speed_source)
+    signals = Evidence(at_instants, settings, axis=own(window, axis), sync_period_s=sync_period_s, recorded=window)
+    return replace(_analysed(signals), window=window)
+
+
+def _analysed(signals: Evidence) -> WindowOutcome:
+    window, settings = signals.window, signals.settings
     found = ask(BEFORE_ANY_FIT, signals, {})
     reasons = _listed(found)
     if window.n < LEAST_ROWS or any(reason.code == UNFIT for reason in reasons):
@@ -35,14 +51,24 @@ def analyse(window: Window, settings: Identification) -> WindowOutcome:
         return _outcome(replace(signals, estimate=_none(settings, Result.DIVERGED, reason)), found)
 
 
+def own(window: Window, axis: Axis | None) -> Axis | None:
+    """Return the axis' section if it may be that of the window: of another machine's regulators nothing is known."""
+    if axis is None:
+        return None
+    pitch, rapid = window.pitch_mm / axis.screw_pitch_mm, window.rapid_speed_rad_s / axis.rapid_speed_rad_s
+    return axis if abs(pitch - 1.0) < SAME_PITCH and 1.0 / OVERRIDE <= rapid <= OVERRIDE else None
+
+
 def estimated(signals: Evidence) -> Evidence:
     """Return the evidence with the estimate by the method asked for, and the fit that is judged.
 
-    Current and speed alone tell Jt/K, ft/K and Cd/K: without a voltage there is no fit.
+    Without a voltage [2] alone is fitted, with the torque constant of the recording or of the axis: there is no fit of
+    both equations.
     """
-    window, settings = signals.window, signals.settings
+    window, settings, axis = signals.window, signals.settings, signals.axis
     if window.voltage_v is None and window.slow_voltage is None:
-        return replace(signals, estimate=estimate_ratios([window], settings))
+        known = {} if axis is None else {"R": axis.nominal.R, "L": axis.nominal.L, "K": axis.nominal.K}
+        return replace(signals, estimate=told(window, signals.torque, known))
     name, estimator = chosen(settings)
     fit = maximum_likelihood.fit_windows([window], settings)
     if name == maximum_likelihood.NAME and fit is not None:
@@ -64,5 +90,14 @@ def _listed(found: Findings) -> tuple[Reason, ...]:
 
 
 def _outcome(evidence: Evidence, found: Findings) -> WindowOutcome:
-    reasons = _listed(found)
-    return WindowOutcome(evidence.window, evidence.estimate, Verdict(not reasons, evidence.fit_percent, reasons))
+    """Return the verdict: what is weighed refuses only where it does harm at the table, and warns else."""
+    weight, weighed = evidence.weight, [r for name, told in found.items() if name in WEIGHED for r in told]
+    reasons = [r for name, told in found.items() if name not in WEIGHED for r in told]
+    # through ordinary loops only a share is known: what has a name says more
+    if weight is not None and not weight.believed and (weight.in_um or not (reasons or weighed)):
+        reasons.append(weight.reason())
+    if not evidence.harmless:
+        reasons, weighed = [*reasons, *weighed], []
+    unexplained = weight.unexplained_um if weight is not None and weight.in_um else None
+    verdict = Verdict(not reasons, evidence.fit_percent, tuple(reasons), unexplained, tuple(weighed))
+    return WindowOutcome(evidence.window, evidence.told, verdict)

@@ -8,18 +8,22 @@ closed-loop model by every recorded move. A replayed window takes the very same 
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 from fdhil.config import Identification, MachineConfig
-from fdhil.identification.drift import DriftTracker, Point
+from fdhil.identification.between import HISTORY, Member
+from fdhil.identification.drift import LEAST_JUMP, DriftTracker, Point
+from fdhil.identification.pooling import member
 from fdhil.identification.windows import find_windows
-from fdhil.pipeline.analysis import analyse
-from fdhil.pipeline.pooling import pool
+from fdhil.pipeline.own_loops import OwnLoops
+from fdhil.pipeline.pooling import one_sided, refuses_the_model, together
 from fdhil.pipeline.recent_samples import RecentSamples
 from fdhil.prediction import skill
 from fdhil.records import (
     AxisSamples,
     Estimate,
+    LoopEstimate,
     MoveEvent,
     MoveKind,
     Notice,
@@ -58,11 +62,32 @@ class _Rapid:
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What the history knows of an axis: its first and its newest published set, the newest windows' estimates."""
+    """What the history knows of an axis: the first values in either direction, the newest published set, and the
+    newest accepted windows' estimates, for the tracker and for the pool, and the newest identified loops.
+    """
 
-    first: ParameterSet | None = None
+    first: Mapping[int, Parameters] = field(default_factory=dict)
     newest: ParameterSet | None = None
     points: tuple[Point, ...] = ()
+    members: tuple[Member, ...] = ()
+    loops: LoopEstimate | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Pooled:
+    """An accepted window, and what it tells a pool."""
+
+    outcome: WindowOutcome
+    member: Member
+
+
+def newest(found: Sequence[_Pooled]) -> list[_Pooled]:
+    """Return the newest windows, and so many older ones that either direction is there twice where it can be."""
+    kept = set(range(max(0, len(found) - POOL_WINDOWS), len(found)))
+    for direction in (1, -1):
+        its = [k for k, each in enumerate(found) if each.outcome.window.direction == direction]
+        kept.update(its[-POOL_WINDOWS // 2 :])
+    return [found[k] for k in sorted(kept)]
 
 
 class AxisPipeline:
@@ -84,17 +109,23 @@ class AxisPipeline:
         self._config = config
         self._settings = _settings(config, method)
         self._period_s = config.machine.sync_period_s
+        known = known or Known()
         self._recent = RecentSamples(axis, config.axis[axis], self._ticks(RECENT_S), self._period_s)
         self._rapids: deque[_Rapid] = deque()
         self._temperature: Temperature | None = None
-        self._pool: deque[WindowOutcome] = deque(maxlen=POOL_WINDOWS)
-        self._held: list[WindowOutcome] = []
-        known = known or Known()
+        self._pool: list[_Pooled] = []
+        self._held: list[_Pooled] = []
+        self._refused: dict[int, WindowOutcome] = {}  # the newest window of a direction, where its model was refused
         self._published = known.newest
         self._tracker = DriftTracker(config.maintenance, axis)
-        self._tracker.resume(known.first.parameters if known.first else None, known.points)
+        self._tracker.resume(known.first, known.points)
+        self._history: deque[Member] = deque(_since_jump(known), maxlen=HISTORY)
         self._with_skill = with_skill
+        # else the axis' section is made up
+        self._loops = OwnLoops(config.axis[axis] if with_skill else None, self._settings, self._period_s, known.loops)
         self._gain_suspected = False
+        self._place = self._history[-1].place if self._history else 0
+        self._withheld: tuple[str, ...] = ()  # why the newest pool was not published: told once
 
     @property
     def published(self) -> ParameterSet | None:
@@ -169,57 +200,76 @@ class AxisPipeline:
         return [w for w in find_windows(recording) if rapid.start <= w.start_tick + w.n // 2 <= end]
 
     def _analyse(self, window: Window) -> list[Outcome]:
-        outcome = analyse(window, self._settings)
+        outcome, loops = self._loops.analyse(window)
         before = self._published
-        outcomes: list[Outcome] = [outcome]
+        outcomes: list[Outcome] = [outcome] if loops is None else [outcome, loops]
+        if refuses_the_model(outcome):
+            self._refused[window.direction] = outcome
         # a correction needs all six: what a slow voltage leaves open keeps the older set in use
         if outcome.verdict.accepted and outcome.estimate is not None and not outcome.estimate.missing:
-            notices = self._track(outcome)
+            self._refused.pop(window.direction, None)
+            notices = self._track(outcome, outcome.estimate)
             outcomes += notices
             if not self._tracker.holding:
                 outcomes += self._publish(window)
         judged = self._judge(window, before or self._published)
         return [*outcomes, judged] if judged else outcomes
 
-    def _track(self, outcome: WindowOutcome) -> list[Notice]:
+    def _track(self, outcome: WindowOutcome, estimate: Estimate) -> list[Notice]:
         """Hold a window back that jumped; once further ones agree with it they are the new pool."""
-        estimate, window = outcome.estimate, outcome.window
-        assert estimate is not None
-        tick = window.start_tick
-        notices = self._tracker.update(estimate.parameters(), estimate.covariance, tick)
+        window = outcome.window
+        self._place += 1
+        found = _Pooled(outcome, member(window, estimate, self._place))
+        notices = self._tracker.update(estimate.parameters(), estimate.covariance, window.start_tick, window.direction)
         if self._tracker.holding:
-            self._held.append(outcome)
+            self._held.append(found)
             return notices
         if any(notice.code in JUMPS for notice in notices):
             agreeing = {point.tick for point in self._tracker.points}
-            self._pool.clear()
-            self._pool.extend(held for held in self._held if held.window.start_tick in agreeing)
+            self._pool = [held for held in self._held if held.outcome.window.start_tick in agreeing]
+            self._history.clear()
+            self._history.extend(held.member for held in self._pool)
         self._held.clear()
-        self._pool.append(outcome)
+        self._pool = newest([*self._pool, found])
+        self._history.append(found.member)
         return notices
 
-    def _publish(self, newest: Window) -> list[Outcome]:
+    def _publish(self, window: Window) -> list[Outcome]:
         """Publish what the pool says; windows that no longer agree with the newest leave it, the oldest first."""
-        estimate, verdict = pool(tuple(self._pool), self._settings, refit=False)
-        while not verdict.accepted and len(self._pool) > 1:
-            self._pool.popleft()
-            estimate, verdict = pool(tuple(self._pool), self._settings, refit=False)
+        estimate, verdict = self._pooled()
+        while not verdict.accepted and len(self._pool) > 1 and not one_sided(self._judged()):
+            self._pool.pop(0)
+            while self._history[0].place < self._pool[0].member.place:
+                self._history.popleft()
+            estimate, verdict = self._pooled()
         if estimate is None or not verdict.accepted:
-            text = (
-                "the newest window is not believed as a pool of its own (" + _listed(verdict) + "), the older set stays"
-            )
-            return [Notice("ValidationFailed", "minor", text, self.axis, newest.start_tick)]
+            text = "the pool of the newest windows is not believed (" + _listed(verdict) + "), the older set stays"
+            codes = tuple(reason.code for reason in verdict.reasons)
+            again, self._withheld = self._withheld == codes, codes
+            return [] if again else [Notice("ValidationFailed", "minor", text, self.axis, window.start_tick)]
+        self._withheld = ()
         self._published = ParameterSet(
             axis=self.axis,
             revision=1 if self._published is None else self._published.revision + 1,
             parameters=estimate.parameters(),
             covariance=estimate.covariance,
             windows=len(self._pool),
-            tick=newest.start_tick + newest.n,
-            temperature_c=newest.temperature_c,
+            tick=window.start_tick + window.n,
+            temperature_c=window.temperature_c,
             config_digest=self._config.digest,
+            window_ticks=tuple(found.outcome.window.start_tick for found in self._pool),
+            unexplained_um=verdict.unexplained_um,
+            warnings=verdict.warnings,
         )
-        return [self._published, *self._against_data_sheet(estimate, newest.start_tick)]
+        return [self._published, *self._against_data_sheet(estimate, window.start_tick)]
+
+    def _judged(self) -> list[WindowOutcome]:
+        """Return the windows that the pool is judged by: its own, and one of a direction whose moves are refused."""
+        return [*(found.outcome for found in self._pool), *self._refused.values()]
+
+    def _pooled(self) -> tuple[Estimate | None, Verdict]:
+        members = [found.member for found in self._pool]
+        return together(self._judged(), members, tuple(self._history), self._settings)
 
     def _against_data_sheet(self, estimate: Estimate, tick: int) -> list[Notice]:
         """Tell once, and again after it was gone, that only a sensor's gain explains how the set is off nominal."""
@@ -236,7 +286,7 @@ class AxisPipeline:
         """Compare the move with what the set that was valid before it predicts; None where that cannot be done."""
         if published is None or not self._with_skill:
             return None
-        axis = self._config.axis[self.axis]
+        axis = self._loops.axis or self._config.axis[self.axis]
         signals = (window.demand_mm, window.position_mm)
         try:
             return skill(
@@ -244,6 +294,18 @@ class AxisPipeline:
             )
         except ValueError:  # too few whole rows to compare
             return None
+
+
+def _since_jump(known: Known) -> Sequence[Member]:
+    """Return what the newest windows tell, from the last on that does not agree with the newest published set."""
+    if known.newest is None:
+        return known.members
+    now = known.newest.parameters.as_dict()
+    for k, told in reversed(list(enumerate(known.members))):
+        values = dict(zip(told.names, told.values.tolist(), strict=True))
+        if any(abs(values[n] - now[n]) > LEAST_JUMP[n] * abs(now[n]) for n in ("R", "L", "K", "Jt") if n in values):
+            return known.members[k + 1 :]
+    return known.members
 
 
 def _listed(verdict: Verdict) -> str:

@@ -2,15 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
 
 from fdhil.config import Identification
+from fdhil.identification.between import ALIKE, Between, Member, between
 from fdhil.identification.estimators import chosen
 from fdhil.identification.identifiability import unphysical, untold
-from fdhil.identification.pooling import weighted
+from fdhil.identification.pooling import member, pooled
 from fdhil.pipeline.analysis import GAVE_UP, gave_up
-from fdhil.records import Estimate, Reason, Verdict, WindowOutcome
+from fdhil.records import PARAMETERS, Estimate, Reason, Verdict, Window, WindowOutcome, frozen
 from fdhil.validation.agreement import moved
+
+# what a window is refused for that says nothing of the direction: its samples, or how the move went
+OF_THE_MOVE = (
+    "Missing",
+    "Episode",
+    "Stale",
+    "Stuck",
+    "Saturated",
+    "Implausible",
+    "NotFinite",
+    "LoadDetected",
+    "Timing",
+)
+_FIGURES = re.compile(r"[-+]?[0-9][-+.0-9e]*")  # in which warnings of one kind differ
+
+Told = list[tuple[Window, Estimate]]
 
 
 def pool(
@@ -18,26 +39,97 @@ def pool(
 ) -> tuple[Estimate | None, Verdict]:
     """Estimate from the accepted windows together; None and a refusal when there is none, or when they disagree.
 
-    With ``refit`` all samples are fitted once more. Without it the windows' own estimates are weighted by their
-    information, which is as good when each window tells all six parameters, and takes no time: for a running machine.
+    With ``refit`` all samples are fitted once more, where the windows tell one and the same six parameters. Without it
+    the windows' own estimates are pooled, which is as good when each window tells all six, and takes no time.
     """
     if not outcomes:
         advice = "record moves at 60 % of the rapid speed or more"
         return None, Verdict(False, None, (Reason("NoWindow", "the recording holds no rapid move", advice),))
-    accepted = [o for o in outcomes if o.verdict.accepted]
+    members = [member(o.window, o.estimate, k) for k, o in enumerate(outcomes) if o.verdict.accepted and o.estimate]
+    return together(outcomes, members, members, settings, refit=refit)
+
+
+def together(
+    outcomes: Sequence[WindowOutcome],
+    members: Sequence[Member],
+    history: Sequence[Member],
+    settings: Identification,
+    *,
+    refit: bool = False,
+) -> tuple[Estimate | None, Verdict]:
+    """Return what ``members``, the accepted among the ``outcomes``, tell together, and whether that is believed.
+
+    ``history`` are all windows from which it follows by how much windows of this drive differ.
+    """
+    accepted = [o for o in outcomes if o.verdict.accepted and o.estimate is not None]
     if not accepted:
         seen = dict.fromkeys(r for o in outcomes for r in o.verdict.reasons)
         return None, Verdict(False, None, tuple(seen))
-    fits = [o.verdict.fit_percent for o in accepted if o.verdict.fit_percent is not None]
-    if len(accepted) == 1 and accepted[0].estimate is not None:
-        return accepted[0].estimate, Verdict(True, accepted[0].verdict.fit_percent)
-    told = [(o.window, o.estimate) for o in accepted if o.estimate is not None]
-    try:
-        estimate = None if refit else weighted(told)
-        if estimate is None:
-            estimate = chosen(settings)[1]([o.window for o in accepted], settings)
-    except GAVE_UP as error:
-        return None, Verdict(False, None, (gave_up(error, "look at the windows"),))
-    slow = any(o.window.slow_voltage is not None for o in accepted)
-    reasons = untold(estimate, slow=slow) + unphysical(estimate) + moved(told)
-    return estimate, Verdict(not reasons, min(fits, default=None), tuple(reasons))
+    told: Told = [(o.window, o.estimate) for o in accepted if o.estimate is not None]
+    reasons = list(one_sided(outcomes))
+    estimate: Estimate | None = told[0][1]
+    if len(told) > 1:
+        try:
+            estimate = _estimated(told, members, between(history), settings, refit=refit)
+        except GAVE_UP as error:
+            return None, Verdict(False, None, (gave_up(error, "look at the windows"),))
+        # where the voltage is slow, or there is none, R and L may stay open
+        slow = any(window.slow_voltage is not None or window.voltage_v is None for window, _ in told)
+        reasons += untold(estimate, slow=slow) + unphysical(estimate) + moved(told)
+    return estimate, _verdict(accepted, reasons)
+
+
+def _estimated(
+    told: Told, members: Sequence[Member], apart: Between, settings: Identification, *, refit: bool
+) -> Estimate:
+    """Return the estimate: of the samples once more where the windows are alike, else the mixed model's."""
+    first = told[0][1]
+    quick = pooled(members, first, apart)
+    whole = all(set(PARAMETERS) <= set(m.names) for m in members)
+    deaf = all(window.voltage_v is None and window.slow_voltage is None for window, _ in told)
+    if deaf or quick.terms or apart.surely or (whole and not refit):
+        return quick
+    again = chosen(settings)[1]([window for window, _ in told], settings)
+    alike = pooled(members, first, ALIKE)
+    if not again.names == alike.names == quick.names:
+        return again
+    wider = np.nan_to_num(quick.covariance - alike.covariance)  # nothing where a slow voltage leaves R or L open
+    return replace(again, covariance=frozen(again.covariance + wider))
+
+
+def one_sided(outcomes: Iterable[WindowOutcome]) -> list[Reason]:
+    """Return the reason when one direction alone is believed while the model was refused in the other.
+
+    A load that acts one way is part of dry friction then, and nothing tells how much of it.
+    """
+    listed = list(outcomes)
+    believed = {o.window.direction for o in listed if o.verdict.accepted}
+    refused = [o for o in listed if o.window.direction not in believed and refuses_the_model(o)]
+    if len(believed) != 1 or not refused:
+        return []
+    way = "positive" if refused[0].window.direction > 0 else "negative"
+    cause = refused[0].verdict.reasons[0]
+    text = (
+        f"no move in the {way} direction is believed ({cause.code}), and one direction tells no friction of the other"
+    )
+    return [Reason("OneDirection", text, cause.advice or "see why the other moves are refused")]
+
+
+def refuses_the_model(outcome: WindowOutcome) -> bool:
+    """Return whether a window was refused for what its drive does, not for its samples or an aborted move."""
+    codes = [reason.code for reason in outcome.verdict.reasons]
+    return not outcome.verdict.accepted and not any(part in code for code in codes for part in OF_THE_MOVE)
+
+
+def _verdict(accepted: Sequence[WindowOutcome], reasons: Sequence[Reason]) -> Verdict:
+    """Return the pool's verdict: its own reasons, the worst of the windows' figures, each of their warnings once."""
+    verdicts = [o.verdict for o in accepted]
+    fits = [v.fit_percent for v in verdicts if v.fit_percent is not None]
+    unexplained = [v.unexplained_um for v in verdicts if v.unexplained_um is not None]
+    warnings = {_FIGURES.sub("", str(warning)): warning for v in verdicts for warning in v.warnings}
+    told = list(warnings.values())
+    if len({o.window.direction for o in accepted}) == 1 and not reasons:
+        text = "all moves go one way: a constant load is part of Cd, as nothing tells it apart"
+        told.append(Reason("OneDirection", text, "record rapids in both directions"))
+    figure = max(unexplained, default=None)
+    return Verdict(not reasons, min(fits, default=None), tuple(reasons), figure, tuple(told))

@@ -10,6 +10,7 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.identification import trends
 from fdhil.identification.trends import LEAST_STEP, Slope, reach_days, slope
+from fdhil.prediction.model_terms import all_names, families, put_back
 from fdhil.prediction.predict import contour_um, predict
 from fdhil.records import PARAMETERS, Float, Parameters, ParameterSet, Prediction, Zone, rms
 
@@ -156,12 +157,12 @@ def zone_changes(
     """
     reference = prediction.reference
     then = predict(reference, {**models, **earlier}, config)
-    without = {
-        (axis, name): contour_um(reference, {**models, axis: models[axis].changed(**{name: old})}, config)
-        for axis in earlier
-        for name, old in earlier[axis].as_dict().items()
-        if old != getattr(models[axis], name)
-    }
+    without = {}
+    for axis, old in earlier.items():
+        for main, names in families(all_names(models[axis], old)).items():
+            alone = put_back(models[axis], old, names)
+            if alone != put_back(models[axis], models[axis], names):
+                without[axis, main] = contour_um(reference, {**models, axis: alone}, config)
     gone = [zone for zone in then.zones if not any(_meet(zone, other) for other in prediction.zones)]
     changes = []
     for zone in sorted((*prediction.zones, *gone), key=lambda zone: zone.start_s):

@@ -8,6 +8,7 @@ import numpy as np
 
 from fdhil.config import Axis, MachineConfig
 from fdhil.model import closed_loop
+from fdhil.prediction.model_terms import resisting
 from fdhil.records import Float, Parameters, Trajectory
 
 SHARE_STEP = 2e-3  # to which the feed that can be held is found
@@ -19,9 +20,11 @@ def required(reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: floa
     speed = np.gradient(reference_mm, dt_s) * 2 * np.pi / axis.screw_pitch_mm
     acceleration = np.gradient(speed, dt_s)
     moving = np.abs(speed) > 1e-9 * max(1.0, float(np.abs(speed).max()))
-    current = (p.Jt * acceleration + p.ft * speed + p.Cd * np.where(moving, np.sign(speed), 0.0)) / p.K
+    angle = reference_mm * 2 * np.pi / axis.screw_pitch_mm
+    smooth, dry = resisting(p, np.where(moving, speed, 0.0), angle)
+    current = (p.Jt * acceleration + smooth + dry) / p.K
     # dry friction's steps are left out of di/dt: the current loop takes them in a fraction of a cycle
-    slope = np.gradient((p.Jt * acceleration + p.ft * speed) / p.K, dt_s)
+    slope = np.gradient((p.Jt * acceleration + smooth) / p.K, dt_s)
     voltage = p.L * slope + p.R * current + p.K * speed
     return (
         np.asarray(np.abs(current) / axis.regulators.current_limit_a),

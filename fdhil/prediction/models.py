@@ -1,4 +1,8 @@
-"""Reads model files: the six parameters of each axis as JSON, ``{"X": {"R", "L", "K", "Jt", "ft", "Cd"}, ...}``."""
+"""Reads model files: the parameters of each axis as JSON, ``{"X": {"R", "L", "K", "Jt", "ft", "Cd"}, ...}``.
+
+An axis may have two tables more: ``terms``, the value of each term that has joined the six, and ``loops``, keys of
+``[axis.X.regulators]`` that were identified and take the place of the configuration's.
+"""
 
 from __future__ import annotations
 
@@ -7,19 +11,38 @@ import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from fdhil import config as configuration
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault
-from fdhil.records import PARAMETERS, UNITS, Parameters, Trajectory
+from fdhil.prediction.model_terms import families, with_resonance
+from fdhil.records import PARAMETERS, UNITS, Parameters, Trajectory, unit_of
 
 MAX_BYTES = 64 * 1024
 SHOWN_CHARS = 40
 MOST_FAULTS = 50
 LARGEST, SMALLEST = 1e12, 1e-12
-_MAY_BE_ZERO = ("ft", "Cd")
+_MAY_BE_ZERO = ("ft", "Cd", "coulomb_positive", "coulomb_negative", "viscous_positive", "viscous_negative",
+                "resonance_damping")  # fmt: skip
+_ABOVE_ZERO = ("R", "L", "K", "Jt", "stribeck_speed", "resonance")
+_TABLES = ("terms", "loops")
+TERMS = ("load", "coulomb_positive", "coulomb_negative", "viscous_positive", "viscous_negative", "stribeck",
+         "stribeck_speed", "ripple_screw_1", "ripple_screw_1_phase", "ripple_motor_1", "ripple_motor_1_phase",
+         "dead_time", "speed_delay", "resonance", "resonance_damping", "resonance_share")  # fmt: skip
+"""The terms' names, of the ripples the first ones."""
+
+Loops = Mapping[str, Mapping[str, float | str]]
+"""Per axis keys of its regulators."""
+
+
+class ModelFile(NamedTuple):
+    """What a model file says of each axis."""
+
+    parameters: dict[str, Parameters]
+    loops: Loops
 
 
 def nominal_models(config: MachineConfig) -> dict[str, Parameters]:
@@ -28,6 +51,11 @@ def nominal_models(config: MachineConfig) -> dict[str, Parameters]:
 
 
 def load_models(path: Path) -> dict[str, Parameters]:
+    """Read the parameters of a model file; ConfigError with all its faults."""
+    return load_model_file(path).parameters
+
+
+def load_model_file(path: Path) -> ModelFile:
     """Read a model file; ConfigError with all its faults: missing or unknown keys, no numbers, negative values."""
     try:
         with path.open("rb") as file:
@@ -44,9 +72,22 @@ def load_models(path: Path) -> dict[str, Parameters]:
         raise _cannot(path, "holds no axis", 'write {"X": {"R": .., "L": .., "K": .., "Jt": .., "ft": .., "Cd": ..}}')
     faults: list[ConfigFault] = []
     models = {axis: _parameters(axis[:SHOWN_CHARS], values, faults) for axis, values in document.items()}
+    loops = {axis: _table(axis[:SHOWN_CHARS], "loops", values, faults) for axis, values in document.items()}
     if faults:
         raise ConfigError(str(path), faults[:MOST_FAULTS])
-    return {axis: model for axis, model in models.items() if model is not None}
+    known = {axis: model for axis, model in models.items() if model is not None}
+    return ModelFile(known, {axis: values for axis, values in loops.items() if values})
+
+
+def with_loops(config: MachineConfig, loops: Loops, source: str) -> MachineConfig:
+    """Return the configuration with keys of the regulators changed; ConfigError with what is wrong with them."""
+    known = {axis: values for axis, values in loops.items() if axis in config.axis}
+    if not known:
+        return config
+    document = config.model_dump(mode="json")
+    for axis, values in known.items():
+        document["axis"][axis]["regulators"] |= values
+    return configuration.parse(document, source, made_up=True)
 
 
 def _cannot(path: Path, what: str, suggestion: str) -> ConfigError:
@@ -63,13 +104,50 @@ def _parameters(axis: str, values: Any, faults: list[ConfigFault]) -> Parameters
             faults.append(ConfigFault(f"{axis}.{name}", "is missing", f"in {UNITS[name]}"))
         elif fault := _fault(name, values[name]):
             faults.append(ConfigFault(f"{axis}.{name}", fault, f"in {UNITS[name]}"))
-    for name in set(values) - set(PARAMETERS):
-        near = difflib.get_close_matches(name, PARAMETERS, n=1, cutoff=0.4)
-        hint = f"did you mean {near[0]!r}?" if near else f"the parameters are {', '.join(PARAMETERS)}"
-        faults.append(ConfigFault(f"{axis}.{name[:SHOWN_CHARS]}", "is no parameter", hint))
+    known = (*PARAMETERS, *_TABLES)
+    faults += [_unknown(axis, name, known, "the parameters are") for name in sorted(set(values) - {*known})]
+    terms = _table(axis, "terms", values, faults)
+    faults += _term_faults(axis, terms, values.get("Cd"))
     if len(faults) > before:
         return None
-    return Parameters.of({name: values[name] for name in PARAMETERS})
+    return Parameters.of({**{name: values[name] for name in PARAMETERS}, **terms})
+
+
+def _table(axis: str, name: str, values: Any, faults: list[ConfigFault]) -> dict[str, Any]:
+    """Return one of an axis' two tables, empty where it is left out."""
+    table = values.get(name, {}) if isinstance(values, dict) else {}
+    if not isinstance(table, dict):
+        faults.append(ConfigFault(f"{axis}.{name}", f"must be a table of names, not {_shown(table)}"))
+        return {}
+    return table
+
+
+def _unknown(axis: str, name: str, known: tuple[str, ...], listed: str) -> ConfigFault:
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+    hint = f"did you mean {near[0]!r}?" if near else f"{listed} {', '.join(known)}"
+    return ConfigFault(f"{axis}.{name[:SHOWN_CHARS]}", "is no parameter", hint)
+
+
+def _term_faults(axis: str, terms: Mapping[str, Any], dry_nm: Any) -> list[ConfigFault]:
+    """Say what is wrong with the terms: names, values, and what means nothing without another."""
+    place, faults = f"{axis}.terms", []
+    for name, value in terms.items():
+        if name in PARAMETERS or unit_of(name) is None:
+            faults.append(_unknown(place, name, TERMS, "terms are"))
+        elif fault := _fault(name, value):
+            faults.append(ConfigFault(f"{place}.{name}", fault, f"in {unit_of(name)}"))
+    for main, (name, *_) in families(tuple(terms)).items():
+        if main not in terms:
+            text = f"means nothing without {main[:SHOWN_CHARS]}"
+            faults.append(ConfigFault(f"{place}.{name[:SHOWN_CHARS]}", text))
+    if "stribeck" in terms and "stribeck_speed" not in terms:
+        faults.append(ConfigFault(f"{place}.stribeck", "needs stribeck_speed beside it", "in rad/s"))
+    if not faults and "stribeck" in terms:
+        sides = [terms.get(f"coulomb_{side}", dry_nm) for side in ("positive", "negative")]
+        if any(_fault("Cd", side) is None and side + terms["stribeck"] < 0 for side in sides):
+            text = "takes more from the dry friction than there is: at standstill it would be below 0"
+            faults.append(ConfigFault(f"{place}.stribeck", text, "in N.m"))
+    return faults
 
 
 def _fault(name: str, value: Any) -> str | None:
@@ -78,8 +156,10 @@ def _fault(name: str, value: Any) -> str | None:
         return f"must be a number, not {_shown(value)}"
     if abs(value) > LARGEST or not math.isfinite(value) or 0 < abs(value) < SMALLEST:
         return f"must be a finite number of this physical quantity, not {_shown(value)}"
-    if value < 0 or (value == 0 and name not in _MAY_BE_ZERO):
-        return f"must be {'at least 0' if name in _MAY_BE_ZERO else 'above 0'}, not {_shown(value)}"
+    if name in _ABOVE_ZERO and value <= 0:
+        return f"must be above 0, not {_shown(value)}"
+    if name in _MAY_BE_ZERO and value < 0:
+        return f"must be at least 0, not {_shown(value)}"
     return None
 
 
@@ -93,7 +173,8 @@ def models_for(
 ) -> dict[str, Parameters]:
     """Return a model for every axis of the reference; an axis that stands still may lack one and gets the nominal.
 
-    ConfigError where an axis that moves has none.
+    Where the configuration knows of a resonance that the model does not have, the model gets it. ConfigError where an
+    axis that moves has none.
     """
     nominal = nominal_models(config)
     faults = [
@@ -103,4 +184,4 @@ def models_for(
     ]
     if faults:
         raise ConfigError(source, faults)
-    return {axis: given.get(axis, nominal[axis]) for axis in reference.axes}
+    return {axis: with_resonance(given.get(axis, nominal[axis]), config.axis[axis]) for axis in reference.axes}

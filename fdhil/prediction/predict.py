@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault
 from fdhil.model.closed_loop import Response, simulate_axes
 from fdhil.prediction.contour import contour_error_um
+from fdhil.prediction.model_terms import without_dry_friction
 from fdhil.prediction.zones import find_zones
 from fdhil.records import Float, Parameters, Prediction, Trajectory, frozen
 
@@ -38,7 +38,7 @@ def predict(
 
     Zones are what stands out, or with ``zones_above_um`` all that is above it.
     """
-    smooth = {axis: replace(model, Cd=0.0) for axis, model in models.items()}
+    smooth = {axis: without_dry_friction(model) for axis, model in models.items()}
     responses = _responses(reference, models, config)
     return _assemble(reference, responses, config, zones_above_um, lambda: contour_um(reference, smooth, config))
 
@@ -76,7 +76,7 @@ def _responses(
 
 
 def _contour(reference: Trajectory, responses: Mapping[str, Response]) -> Float:
-    actual = np.column_stack([responses[axis].position_mm for axis in reference.axes])
+    actual = np.column_stack([responses[axis].table_mm for axis in reference.axes])
     return contour_error_um(reference.path_mm, actual, reference.dt_s)
 
 
@@ -94,8 +94,8 @@ def _assemble(
     limited = np.max([responses[axis].limited for axis in axes], axis=0)
     return Prediction(
         reference=reference,
-        predicted_mm={axis: frozen(responses[axis].position_mm) for axis in axes},
-        error_um={axis: frozen((responses[axis].position_mm - reference.position_mm[axis]) * 1e3) for axis in axes},
+        predicted_mm={axis: frozen(responses[axis].table_mm) for axis in axes},
+        error_um={axis: frozen((responses[axis].table_mm - reference.position_mm[axis]) * 1e3) for axis in axes},
         contour_um=contour,
         current_a={axis: frozen(responses[axis].current_a) for axis in axes},
         limited_s={axis: responses[axis].limited_s for axis in axes},

@@ -9,17 +9,19 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.model import closed_loop
 from fdhil.prediction.contour import contour_error_um
+from fdhil.prediction.model_terms import main_name, values_of
 from fdhil.prediction.predict import check_axes
-from fdhil.records import PARAMETERS, Float, Parameters, Prediction, Trajectory
+from fdhil.records import Float, Parameters, Prediction, Trajectory, unit_of
 
 STEP = 0.005  # relative change of a parameter for its derivative
-SMALLEST = {"ft": 1e-4, "Cd": 1e-2}  # a friction may be 0: its step is not relative then
+# a friction may be 0: its step is not relative then; a phase is relative to a radian
+SMALLEST = {"N.m.s": 1e-4, "N.m": 1e-2, "rad": 1.0}
 
 
 def _changed(parameters: Parameters, name: str) -> tuple[Parameters, float]:
-    """Return the parameters with one of them a little larger, and by how much."""
-    value = float(getattr(parameters, name))
-    step = max(abs(value) * STEP, SMALLEST.get(name, 0.0) * STEP)
+    """Return the parameters with one of them, or of the terms, a little larger, and by how much."""
+    value = values_of(parameters)[name]
+    step = max(abs(value) * STEP, SMALLEST.get(unit_of(name) or "", 0.0) * STEP)
     return parameters.changed(**{name: value + step}), step
 
 
@@ -29,15 +31,16 @@ def _positions(
     config: MachineConfig,
     offset_um: Mapping[str, Float] | None,
 ) -> dict[str, tuple[Float, Float, Float]]:
-    """Return of each axis (6, n) positions with each parameter changed in turn, the steps (6,), and (n,) with none."""
+    """Return of each axis (k, n) positions with each of the six and the terms changed in turn, the steps (k,), and
+    (n,) with none."""
     check_axes(reference, models, config)
 
     def one(axis: str) -> tuple[Float, Float, Float]:
         offset_mm = None if offset_um is None else offset_um[axis] * 1e-3
         path = reference.position_mm[axis]
-        changed, steps = zip(*(_changed(models[axis], name) for name in PARAMETERS), strict=True)
+        changed, steps = zip(*(_changed(models[axis], name) for name in values_of(models[axis])), strict=True)
         here, *moved = (
-            closed_loop.simulate(model, config.axis[axis], reference.dt_s, path, offset_mm).position_mm
+            closed_loop.simulate(model, config.axis[axis], reference.dt_s, path, offset_mm).table_mm
             for model in (models[axis], *changed)
         )
         return np.array(moved), np.array(steps), here
@@ -54,15 +57,16 @@ def contour_std_um(
 ) -> Float:
     """Return (n,) one standard deviation of the table's distance from the path, propagated from the parameters'.
 
-    ``covariances`` (6, 6) per axis, in the order of ``PARAMETERS``; NaN rows count as known exactly. First order: the
-    position's derivative by each parameter, of which only what is across the path counts; at rest all of it does.
+    ``covariances`` (k, k) per axis, of the six and the first terms of its model; what it does not cover, and NaN,
+    counts as known exactly. First order: the position's derivative by each parameter, of which only what is across the
+    path counts; at rest all of it does.
     """
     found = _positions(reference, models, config, offset_um)
     variances = []
     for axis in reference.axes:
         moved, steps, here = found[axis]
-        derivative = (moved - here) / steps[:, None]
         covariance = np.nan_to_num(covariances[axis])
+        derivative = ((moved - here) / steps[:, None])[: len(covariance)]
         variances.append(np.einsum("in,ij,jn->n", derivative, covariance, derivative))
     across = _across(reference)
     # axes are identified apart from each other, so that their errors are independent
@@ -90,7 +94,8 @@ def sensitivity_um(
 ) -> tuple[Mapping[str, Mapping[str, float]], ...]:
     """Return per zone of ``prediction`` how much its largest contour error rises per 1 % of each parameter, um.
 
-    A mapping axis -> parameter -> um, in the order of the zones: it names the parameter that drives a zone's error.
+    A mapping axis -> parameter or term -> um, in the order of the zones: it names what drives a zone's error. What is
+    only a part of a term, a phase or the speed of its course, is not listed.
     """
     reference = prediction.reference
     found = _positions(reference, models, config, offset_um)
@@ -100,12 +105,13 @@ def sensitivity_um(
     result: list[dict[str, dict[str, float]]] = [{axis: {} for axis in reference.axes} for _ in prediction.zones]
     for a, axis in enumerate(reference.axes):
         moved, steps, _ = found[axis]
-        for k, name in enumerate(PARAMETERS):
+        for k, (name, value) in enumerate(values_of(models[axis]).items()):
+            if main_name(name) != name:
+                continue
             other = here.copy()
             other[:, a] = moved[k]
             contour = contour_error_um(path, other, reference.dt_s)
-            value = abs(float(getattr(models[axis], name)))
-            per_percent = 0.01 * value / steps[k]
+            per_percent = 0.01 * abs(value) / steps[k]
             for zone, per_axis in zip(prediction.zones, result, strict=True):
                 rows = prediction.rows(zone)
                 per_axis[axis][name] = float(contour[rows].max() - base[rows].max()) * per_percent

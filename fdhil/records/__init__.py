@@ -37,7 +37,7 @@ from fdhil.records.values import (
 )
 from fdhil.records.verdicts import Estimate, LoopEstimate, Notice, ParameterSet, Reason, Result, Verdict, WindowOutcome
 
-Outcome = WindowOutcome | ParameterSet | Skill | Notice
+Outcome = WindowOutcome | ParameterSet | Skill | Notice | LoopEstimate
 
 __all__ = [
     "INTERVAL_95",

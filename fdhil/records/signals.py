@@ -114,8 +114,10 @@ class Window:
     ``voltage_v`` of row k is the mean over [t_k, t_k + dt) when ``voltage_sampling`` is ``interval_mean``, else the
     value at t_k; ``voltage_delay_s`` (what is left after alignment by counters, None when not known) has not been
     taken out. ``slow_voltage`` stands in its place where a sensor samples more slowly than the drive.
-    ``start_s`` is the time of row 0 in its recording or since the first tick. ``offset_mm`` is the position
-    offset in force, None where it was 0 throughout or is not known. Two windows are equal when they are the same one.
+    ``speed_late_s`` is how late the recorded speed was, which has been taken out (None: nothing was), with its standard
+    deviation. ``start_s`` is the time of row 0 in its recording or since the first tick. ``offset_mm`` is the position
+    offset in force, None where it was 0 throughout or is not known. ``torque_constant_nm_per_a`` is the K that the
+    recording itself tells. Two windows are equal when they are the same one.
     """
 
     axis: str
@@ -138,6 +140,9 @@ class Window:
     source: str = ""
     offset_mm: Float | None = None
     slow_voltage: SlowVoltage | None = None
+    speed_late_s: float | None = None
+    speed_late_std_s: float = 0.0
+    torque_constant_nm_per_a: float | None = None
 
     @property
     def n(self) -> int:
@@ -172,3 +177,4 @@ class Recording:
     voltage_delay_s: float | None = None
     offset_mm: Float | None = None
     source: str = ""
+    torque_constant_nm_per_a: float | None = None

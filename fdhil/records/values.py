@@ -27,6 +27,7 @@ UNITS: Mapping[str, str] = {
     "Jt/K": "A.s2/rad",
     "ft/K": "A.s/rad",
     "Cd/K": "A",
+    "friction_at_rapid": "N.m",  # Cd + ft w at the rapid speed
 }
 
 # what may join the six; of a ripple's name the number is its periods in a turn of the motor
@@ -39,6 +40,7 @@ _TERMS: Mapping[str, str] = {
     r"ripple_(screw|motor)_[1-9][0-9]?": "N.m",
     r"ripple_(screw|motor)_[1-9][0-9]?_phase": "rad",
     r"dead_time": "V",
+    r"bus_sag": "1/W",
     r"speed_delay": "s",
     r"resonance": "Hz",
     r"resonance_(damping|share)": "1",

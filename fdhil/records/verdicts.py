@@ -106,7 +106,10 @@ class WindowOutcome:
 
 @dataclass(frozen=True, slots=True)
 class ParameterSet:
-    """A published revision of one axis' parameters: pooled from ``windows`` accepted windows."""
+    """A published revision of one axis' parameters: pooled from ``windows`` accepted windows.
+
+    ``window_ticks`` are where they start, where that is known. ``unexplained_um`` and ``warnings`` are the verdict's.
+    """
 
     axis: str
     revision: int
@@ -116,6 +119,9 @@ class ParameterSet:
     tick: int
     temperature_c: float | None
     config_digest: str
+    window_ticks: tuple[int, ...] = ()
+    unexplained_um: float | None = None
+    warnings: tuple[Reason, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +129,8 @@ class LoopEstimate:
     """The drive's own loops as rapids show them: ``values`` (k,) and ``covariance`` (k, k) of ``names``.
 
     ``names`` are keys of ``[axis.X.regulators]``, and ``structure`` is the one of the table that fits best. What the
-    loops leave of the following error is the ``unexplained_um`` of the verdict.
+    loops leave of the following error is the ``unexplained_um`` of the verdict; ``configured_um`` is what the
+    configured ones leave, None where there are none.
     """
 
     axis: str
@@ -132,6 +139,7 @@ class LoopEstimate:
     values: Float
     covariance: Float
     verdict: Verdict
+    configured_um: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

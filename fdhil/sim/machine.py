@@ -100,8 +100,8 @@ class Machine:
 
     def power_on(self) -> list[BusFrame]:
         """Switch the drives on; they boot into pre-operational, and no SYNC will find anything still to be compiled."""
-        next(iter(self.units.values())).drive.physics.rehearse()
         for unit in self.units.values():
+            unit.drive.physics.rehearse()
             unit.power(True)
         return self._take_outbox()
 

@@ -12,19 +12,17 @@ from fdhil.errors import RecordingError
 from fdhil.records import Float, SlowVoltage, Window
 from fdhil.store.output import open_output
 
-COLUMNS = "time_s,voltage_V,current_A,speed_rad_per_s,position_m,demand_m"
+TIME, VOLTAGE, OTHERS = "time_s", "voltage_V", "current_A,speed_rad_per_s,position_m,demand_m"
 
 
 def csv_lines(window: Window) -> Iterator[str]:
     """Yield the lines of a recording without line ends; a lost sample is a missing row, which readers see as a gap.
 
     The samples of a voltage sensor slower than the rows stand in headers, on their own grid and to the last bit; their
-    column holds the sample under way, for programs that know no other. RecordingError when there is no voltage.
+    column holds the sample under way, for programs that know no other. Without a voltage there is no such column.
     """
     slow = window.slow_voltage
     voltage = _held(window, slow) if slow is not None else window.voltage_v
-    if voltage is None:
-        raise RecordingError("this window has no voltage, which a recording needs; see why the sensor gave none")
     rapid_m_s = window.rapid_speed_rad_s / (2 * math.pi) * window.pitch_mm / 1000
     headers = {
         "format": "fdhil-recording-1",
@@ -33,17 +31,24 @@ def csv_lines(window: Window) -> Iterator[str]:
         "axis": window.axis,
         "pitch_m_per_rev": f"{window.pitch_mm / 1000:.12g}",
         "rapid_speed_m_per_s": f"{rapid_m_s:.12g}",
-        "temperature_C": None if window.temperature_c is None else f"{window.temperature_c:.12g}",
+        "temperature_C": _number(window.temperature_c),
         "voltage_delay_s": None if window.voltage_delay_s is None else repr(window.voltage_delay_s),
+        "torque_constant_nm_per_a": _number(window.torque_constant_nm_per_a),
         "start_tick": str(window.start_tick),
         "source": window.source or None,
     } | (_samples(slow) if slow is not None else {})
-    yield from (f"# {key}: {value}" for key, value in headers.items() if value is not None)
-    yield COLUMNS
+    left_out = () if voltage is not None else ("voltage_sampling", "voltage_delay_s")
+    yield from (f"# {key}: {value}" for key, value in headers.items() if value is not None and key not in left_out)
+    yield ",".join((TIME, OTHERS) if voltage is None else (TIME, VOLTAGE, OTHERS))
     path_m = (window.position_mm / 1000, window.demand_mm / 1000)
-    rows = np.column_stack((voltage, window.current_a, window.speed_rad_s, *path_m))
+    signals = (window.current_a, window.speed_rad_s, *path_m)
+    rows = np.column_stack(signals if voltage is None else (voltage, *signals))
     for k in np.flatnonzero(np.isfinite(rows).all(axis=1)):
         yield f"{k * window.dt_s:.9g}," + ",".join(repr(float(value)) for value in rows[k])
+
+
+def _number(value: float | None) -> str | None:
+    return None if value is None else f"{value:.12g}"
 
 
 def _samples(slow: SlowVoltage) -> dict[str, str]:

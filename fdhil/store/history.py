@@ -18,7 +18,8 @@ from types import TracebackType
 from typing import Any
 
 from fdhil.errors import StoreError
-from fdhil.records import Notice, Parameters, ParameterSet, Skill, WindowOutcome
+from fdhil.identification.pooling import friction_at, member
+from fdhil.records import LoopEstimate, Notice, Parameters, ParameterSet, Reason, Skill, WindowOutcome
 from fdhil.store import schema
 from fdhil.store.rows import DECODED, Comparison, Revision, Stamp, StoredWindow
 from fdhil.store.schema import told
@@ -154,6 +155,10 @@ class History:
             "result": estimate and estimate.result.value,
             "parameters": json.dumps(described(outcome)) if estimate else None,
             "temperature_c": window.temperature_c,
+            "unexplained_um": verdict.unexplained_um,
+            "warnings": _dumped(verdict.warnings),
+            "friction": json.dumps(friction_of(outcome)),
+            "told": _told(outcome),
         }
         return self._insert("windows", row, stamp)
 
@@ -168,8 +173,32 @@ class History:
             "config_digest": published.config_digest,
             "tick": published.tick,
             "temperature_c": published.temperature_c,
+            "terms": json.dumps(dict(published.parameters.terms)),
+            "unexplained_um": published.unexplained_um,
+            "warnings": _dumped(published.warnings),
         }
         return self._insert("revisions", row, stamp)
+
+    def add_loops(self, found: LoopEstimate, stamp: Stamp) -> int:
+        """Store what rapids showed of the drive's own loops."""
+        verdict = found.verdict
+        row = {
+            "axis": found.axis,
+            "structure": found.structure,
+            "accepted": int(verdict.accepted),
+            "gains": json.dumps(dict(zip(found.names, found.values.tolist(), strict=True))),
+            "covariance": json.dumps(found.covariance.tolist()),
+            "unexplained_um": verdict.unexplained_um,
+            "reasons": _dumped(verdict.reasons),
+            "warnings": _dumped(verdict.warnings),
+        }
+        return self._insert("loops", row, stamp)
+
+    def loops(self, axis: str | None = None, limit: int | None = None) -> list[tuple[Stamp, LoopEstimate]]:
+        """Return what was found of the drives' own loops, oldest first."""
+        if self._version < schema.WITH_TERMS:
+            return []
+        return self._read("loops", _of(axis), limit)
 
     def add_skill(self, skill: Skill, stamp: Stamp) -> int:
         """Store how well a move was predicted."""
@@ -187,7 +216,10 @@ class History:
 
     def add_comparison(self, found: Comparison, stamp: Stamp) -> int:
         """Store what was predicted of a program; the oldest beyond ``KEEP_COMPARISONS`` go."""
-        used = {axis: {"revision": u.revision, **u.parameters.as_dict()} for axis, u in found.used.items()}
+        used = {
+            axis: {"revision": u.revision, **u.parameters.as_dict(), **dict(u.parameters.terms)}
+            for axis, u in found.used.items()
+        }
         row = {
             "program": found.program,
             "name": found.name,
@@ -210,6 +242,16 @@ class History:
     def revisions(self, axis: str | None = None, limit: int | None = None) -> list[Revision]:
         """Return the published parameter sets, oldest first; with ``limit`` the newest so many."""
         return self._read("revisions", _of(axis), limit)
+
+    def first_windows(self, axis: str) -> dict[int, StoredWindow]:
+        """Return the first window of an axis that was ever accepted in either direction, by direction."""
+        found = {}
+        for direction in (1, -1):
+            only = {"axis": axis, "direction": direction, "accepted": 1}
+            first = self._read("windows", only, 1, oldest=True)
+            if first:
+                found[direction] = first[0]
+        return found
 
     def first_revision(self, axis: str) -> Revision | None:
         """Return the first parameter set that was ever published of an axis."""
@@ -254,6 +296,26 @@ def named(rows: Mapping[tuple[str, int], Any]) -> str:
         for table, numbers in tables.items()
     ]
     return " and ".join(parts)
+
+
+def _dumped(reasons: Sequence[Reason]) -> str:
+    return json.dumps([[reason.code, reason.text, reason.advice] for reason in reasons])
+
+
+def _told(outcome: WindowOutcome) -> str | None:
+    """Return what an accepted window tells a pool, as its row has it."""
+    if not outcome.verdict.accepted or outcome.estimate is None:
+        return None
+    told = member(outcome.window, outcome.estimate)
+    arrays = {"values": told.values.tolist(), "own": told.own.tolist(), "shared": told.shared.tolist()}
+    return json.dumps({"names": told.names, **arrays})
+
+
+def friction_of(outcome: WindowOutcome) -> dict[str, float] | None:
+    """Return a window's friction torque at the rapid speed as JSON has it; None where it is not known."""
+    speed = outcome.window.rapid_speed_rad_s
+    known = friction_at(outcome.estimate, speed) if outcome.estimate is not None else None
+    return None if known is None else {"value": known[0], "std": known[1], "speed_rad_s": speed}
 
 
 def described(outcome: WindowOutcome) -> dict[str, dict[str, Any]]:

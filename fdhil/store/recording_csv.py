@@ -1,8 +1,12 @@
-"""Recordings as CSV: header lines ``# key: value``, then columns; a step of time off by more than 1 % is a gap."""
+"""Recordings as CSV: header lines ``# key: value``, then columns; a step of time off by more than 1 % is a gap.
+
+A recording may have no voltage: then it may tell the motor's torque constant.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +16,21 @@ from fdhil.errors import RecordingError
 from fdhil.records import Float, Recording, SlowVoltage, VoltageSampling, frozen
 
 FORMAT = "fdhil-recording-1"
-COLUMNS = ("time_s", "voltage_V", "current_A", "speed_rad_per_s", "position_m", "demand_m")
-REQUIRED = ("format", "sample_rate_hz", "voltage_sampling", "axis", "pitch_m_per_rev")
+COLUMNS = ("time_s", "current_A", "speed_rad_per_s", "position_m", "demand_m")
+VOLTAGE = "voltage_V"
+REQUIRED = ("format", "sample_rate_hz", "axis", "pitch_m_per_rev")
+SAMPLING = "voltage_sampling"  # required where there is a voltage
+SOURCES: Mapping[str, tuple[str, ...]] = {
+    "speed_source": ("sensor", "difference", "filtered"),
+    "voltage_source": ("terminals", "command"),
+}
 STEP_TOLERANCE = 0.01
 MIN_ROWS = 16
 MAX_SAMPLES_CHARS = 16 * 1024 * 1024
 PITCH_M = (1e-5, 0.8)
 RATE_HZ = (1.0, 1e6)
 RAPID_M_S = (1e-4, 20.0)
+CONSTANT_NM_A = (1e-3, 100.0)
 
 
 def read_recording(path: Path) -> Recording:
@@ -40,18 +51,20 @@ def parse_recording(text: str, source: str = "recording") -> Recording:
     table = _numbers(lines, first_row, source)
     rows, gaps = _place(table[:, 0], dt, source)
     columns = _spread(table, rows)
-    sampling = _sampling(headers, source)
+    has_voltage = columns.shape[1] > len(COLUMNS)
+    sampling = _sampling(headers, source) if SAMPLING in headers else "interval_mean"
+    _check_sources(headers, source)
     pitch_m = _within(headers, "pitch_m_per_rev", PITCH_M, source)
     rapid_m_s = _within(headers, "rapid_speed_m_per_s", RAPID_M_S, source) if "rapid_speed_m_per_s" in headers else None
     return Recording(
         axis=headers["axis"],
         dt_s=dt,
         time_s=frozen(table[0, 0] + dt * np.arange(columns.shape[0])),
-        voltage_v=frozen(columns[:, 1]),
-        current_a=frozen(columns[:, 2]),
-        speed_rad_s=frozen(columns[:, 3]),
-        position_mm=frozen(columns[:, 4] * 1e3),
-        demand_mm=frozen(columns[:, 5] * 1e3),
+        voltage_v=frozen(columns[:, len(COLUMNS)]) if has_voltage else None,
+        current_a=frozen(columns[:, 1]),
+        speed_rad_s=frozen(columns[:, 2]),
+        position_mm=frozen(columns[:, 3] * 1e3),
+        demand_mm=frozen(columns[:, 4] * 1e3),
         voltage_sampling=sampling,
         pitch_mm=pitch_m * 1e3,
         rapid_speed_rad_s=None if rapid_m_s is None else rapid_m_s / pitch_m * 2 * math.pi,
@@ -59,6 +72,7 @@ def parse_recording(text: str, source: str = "recording") -> Recording:
         gaps=gaps,
         headers=headers,
         slow_voltage=_slow_voltage(headers, float(table[0, 0]), dt, source),
+        torque_constant_nm_per_a=_torque_constant(headers, source),
     )
 
 
@@ -102,14 +116,15 @@ def _split(text: str, source: str) -> tuple[dict[str, str], int, list[str]]:
     if k == len(lines):
         raise RecordingError(f"{source} is truncated: it has headers but no columns; record it again")
     check_lengths(lines[k:], k + 1, source)
-    missing = [key for key in REQUIRED if not headers.get(key)]
+    names = tuple(name.strip() for name in lines[k].split(","))
+    required = (*REQUIRED, SAMPLING) if VOLTAGE in names else REQUIRED
+    missing = [key for key in required if not headers.get(key)]
     if missing:
         raise RecordingError(f"{source} has no header {', '.join(missing)}: add a line such as '# {missing[0]}: ...'")
     if headers["format"] != FORMAT:
         raise RecordingError(
             f"{source} has format {shown(headers['format'])}, which is not {FORMAT!r}: convert it first"
         )
-    names = tuple(name.strip() for name in lines[k].split(","))
     absent = [name for name in COLUMNS if name not in names]
     if absent:
         raise RecordingError(f"{source} has no column {', '.join(absent)}: it needs {','.join(COLUMNS)}")
@@ -117,7 +132,7 @@ def _split(text: str, source: str) -> tuple[dict[str, str], int, list[str]]:
 
 
 def _numbers(lines: list[str], first_row: int, source: str) -> Float:
-    """Return the rows as (n, 6) in the order of ``COLUMNS``; all of them finite."""
+    """Return the rows (n, 5) in the order of ``COLUMNS``, or (n, 6) with the voltage last; all of them finite."""
     names = [name.strip() for name in lines[first_row - 1].split(",")]
     rows = [line for line in lines[first_row:] if line.strip()]
     if len(rows) < MIN_ROWS:
@@ -128,7 +143,8 @@ def _numbers(lines: list[str], first_row: int, source: str) -> Float:
         raise _bad_row(lines, first_row, len(names), source) from None
     if table.shape[1] != len(names) or not np.isfinite(table).all():
         raise _bad_row(lines, first_row, len(names), source)
-    return table[:, [names.index(name) for name in COLUMNS]]
+    wanted = (*COLUMNS, VOLTAGE) if VOLTAGE in names else COLUMNS
+    return table[:, [names.index(name) for name in wanted]]
 
 
 def _bad_row(lines: list[str], first_row: int, width: int, source: str) -> RecordingError:
@@ -193,6 +209,18 @@ def _sampling(headers: dict[str, str], source: str) -> VoltageSampling:
     raise RecordingError(f"{source} has voltage_sampling {shown(value)}: it must be interval_mean or instant")
 
 
+def _check_sources(headers: dict[str, str], source: str) -> None:
+    """Refuse a word for where speed or voltage come from that is none."""
+    for key, words in SOURCES.items():
+        if key in headers and headers[key] not in words:
+            raise RecordingError(f"{source} has {key} {shown(headers[key])}: it must be {' or '.join(words)}")
+
+
+def _torque_constant(headers: dict[str, str], source: str) -> float | None:
+    key = "torque_constant_nm_per_a"
+    return _within(headers, key, CONSTANT_NM_A, source) if key in headers else None
+
+
 def _positive(headers: dict[str, str], key: str, source: str) -> float:
     value = _optional(headers, key, source)
     if value is None or not value > 0:
@@ -205,7 +233,8 @@ def _within(headers: dict[str, str], key: str, bounds: tuple[float, float], sour
     value, (low, high) = _positive(headers, key, source), bounds
     if low <= value <= high:
         return value
-    guess = f" (is {value:g} in mm? then write {value / 1e3:g})" if key != "sample_rate_hz" and value > high else ""
+    length = key in ("pitch_m_per_rev", "rapid_speed_m_per_s")
+    guess = f" (is {value:g} in mm? then write {value / 1e3:g})" if length and value > high else ""
     text = f"{source} has header {key} = {value:g}, machines have {low:g} to {high:g}: correct it{guess}"
     raise RecordingError(text)
 

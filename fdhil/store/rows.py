@@ -12,7 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from fdhil.records import PARAMETERS, Float, Notice, Parameters, ParameterSet, Skill, frozen
+from fdhil.records import (
+    PARAMETERS,
+    Float,
+    LoopEstimate,
+    Notice,
+    Parameters,
+    ParameterSet,
+    Reason,
+    Skill,
+    Verdict,
+    frozen,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +67,12 @@ class Revision:
 
 @dataclass(frozen=True, slots=True)
 class StoredWindow:
-    """An analysed window as stored; ``parameters`` maps a symbol to {"value", "std"} or {"value": None, "reason"}."""
+    """An analysed window as stored; ``parameters`` maps a symbol to {"value", "std"} or {"value": None, "reason"}.
+
+    ``friction`` is {"value", "std", "speed_rad_s"}: the friction torque at the rapid speed (N.m), load included.
+    ``told`` is what an accepted window tells a pool: "names" and "values" (k,), the covariance (k, k) of its "own"
+    chance, and the doubts (k, q) "shared" by all windows of the drive.
+    """
 
     number: int
     axis: str
@@ -69,6 +85,10 @@ class StoredWindow:
     parameters: dict[str, dict[str, Any]] | None
     temperature_c: float | None
     stamp: Stamp
+    unexplained_um: float | None = None
+    warnings: tuple[str, ...] = ()
+    friction: dict[str, float] | None = None
+    told: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,18 +120,18 @@ def _number(value: float | None) -> float:
 
 
 def _revision(row: Mapping[str, Any]) -> Revision:
-    parameters = Parameters.of({name: row[name] for name in PARAMETERS})
+    parameters = Parameters.of({name: row[name] for name in PARAMETERS} | json.loads(row.get("terms") or "{}"))
     covariance: Float = frozen(np.array(json.loads(row["covariance"]), dtype=np.float64))
     published = ParameterSet(
         row["axis"], row["revision"], parameters, covariance, row["windows"], row["tick"], row["temperature_c"],
-        row["config_digest"],
+        row["config_digest"], (), row.get("unexplained_um"), _warnings(row),
     )  # fmt: skip
     return Revision(row["id"], published, tuple(json.loads(row["window_ids"])), _stamp(row))
 
 
 def _comparison(row: Mapping[str, Any]) -> tuple[Stamp, Comparison]:
     used = {
-        axis: UsedParameters(int(u["revision"]), Parameters.of({name: u[name] for name in PARAMETERS}))
+        axis: UsedParameters(int(u["revision"]), Parameters.of({n: v for n, v in u.items() if n != "revision"}))
         for axis, u in json.loads(row["parameters"]).items()
     }
     zones = tuple(json.loads(row["zones"]))
@@ -132,7 +152,22 @@ def _stored_window(row: Mapping[str, Any]) -> StoredWindow:
     return StoredWindow(
         row["id"], row["axis"], row["file"], row["start_tick"], row["direction"], bool(row["accepted"]),
         row["fit_percent"], tuple(json.loads(row["reasons"])), parameters, row["temperature_c"], _stamp(row),
+        row.get("unexplained_um"), tuple(str(warning) for warning in _warnings(row)),
+        json.loads(row.get("friction") or "null"), json.loads(row.get("told") or "null"),
     )  # fmt: skip
+
+
+def _warnings(row: Mapping[str, Any]) -> tuple[Reason, ...]:
+    return tuple(Reason(*parts) for parts in json.loads(row.get("warnings") or "[]"))
+
+
+def _loops(row: Mapping[str, Any]) -> tuple[Stamp, LoopEstimate]:
+    gains = json.loads(row["gains"])
+    reasons = tuple(Reason(*parts) for parts in json.loads(row["reasons"]))
+    verdict = Verdict(bool(row["accepted"]), None, reasons, row["unexplained_um"], _warnings(row))
+    covariance = frozen(np.array(json.loads(row["covariance"]), dtype=np.float64))
+    found = LoopEstimate(row["axis"], row["structure"], tuple(gains), frozen([*gains.values()]), covariance, verdict)
+    return _stamp(row), found
 
 
 # table -> what makes a record of its row; a row that is none raises one of the errors that the reader knows
@@ -142,4 +177,5 @@ DECODED: Mapping[str, Callable[[Mapping[str, Any]], Any]] = {
     "skills": _skill,
     "notices": _notice,
     "comparisons": _comparison,
+    "loops": _loops,
 }

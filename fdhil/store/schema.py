@@ -42,19 +42,30 @@ CREATE TABLE comparisons (id INTEGER PRIMARY KEY AUTOINCREMENT, program TEXT NOT
   config_digest TEXT NOT NULL, parameters TEXT NOT NULL, rms_um REAL NOT NULL, zones TEXT NOT NULL, {_STAMP});
 CREATE INDEX comparisons_program ON comparisons (program, id);
 """
-TABLES = ("windows", "revisions", "skills", "notices", "comparisons")
+_WITH_DIGESTS = ("windows", "revisions", "skills", "notices", "comparisons")
 # a revision whose row was damaged is numbered again, so no two axis and revision need differ
 _DIGESTS = (
     "DROP INDEX windows_axis; DROP INDEX revisions_axis; DROP INDEX comparisons_program;"
     f"CREATE TABLE renewed {_REVISION}); INSERT INTO renewed SELECT * FROM revisions;"
     "DROP TABLE revisions; ALTER TABLE renewed RENAME TO revisions;"
-    + "".join(f"ALTER TABLE {table} ADD COLUMN digest TEXT NOT NULL DEFAULT '';" for table in TABLES)
+    + "".join(f"ALTER TABLE {table} ADD COLUMN digest TEXT NOT NULL DEFAULT '';" for table in _WITH_DIGESTS)
     + "CREATE TABLE quarantine (id INTEGER PRIMARY KEY, of TEXT NOT NULL, row INTEGER NOT NULL, content TEXT NOT NULL);"
 )
+# ``told`` is what a window tells a pool; a history before that has none
+_TERMS = f"""
+ALTER TABLE windows ADD COLUMN unexplained_um REAL; ALTER TABLE windows ADD COLUMN warnings TEXT;
+ALTER TABLE windows ADD COLUMN friction TEXT; ALTER TABLE windows ADD COLUMN told TEXT;
+ALTER TABLE revisions ADD COLUMN terms TEXT; ALTER TABLE revisions ADD COLUMN unexplained_um REAL;
+ALTER TABLE revisions ADD COLUMN warnings TEXT;
+CREATE TABLE loops (id INTEGER PRIMARY KEY AUTOINCREMENT, axis TEXT NOT NULL, structure TEXT NOT NULL,
+  accepted INTEGER NOT NULL, gains TEXT NOT NULL, covariance TEXT NOT NULL, unexplained_um REAL, reasons TEXT NOT NULL,
+  warnings TEXT NOT NULL, {_STAMP}, digest TEXT NOT NULL DEFAULT '')
+"""
+TABLES = (*_WITH_DIGESTS, "loops")
 # what leads from each schema to the next, in order: a new one is added at the end, an old one never changes
-_STEPS = (_FIRST, _COMPARISONS, _DIGESTS)
+_STEPS = (_FIRST, _COMPARISONS, _DIGESTS, _TERMS)
 SCHEMA_VERSION = len(_STEPS)
-WITH_COMPARISONS, WITH_DIGESTS = 2, 3
+WITH_COMPARISONS, WITH_DIGESTS, WITH_TERMS = 2, 3, 4
 # what the check of the structure says of single values; their row's digest tells the same and no more than the row
 _OF_ONE_ROW = (" value in ", "CHECK constraint failed")
 
@@ -124,10 +135,11 @@ def bring_up(db: sqlite3.Connection, path: Path) -> None:
         db.execute("BEGIN IMMEDIATE")
         try:
             if version_of(db) == version:  # else another process made the same step in between
+                sound = _sound_rows(db) if version >= WITH_DIGESTS else None
                 for statement in _STEPS[version].split(";"):
                     db.execute(statement)
-                if version + 1 == WITH_DIGESTS:
-                    _sign_all(db)
+                if version + 1 >= WITH_DIGESTS:
+                    _sign(db, sound)
                 db.execute(f"PRAGMA user_version = {version + 1}")
             db.execute("COMMIT")
         except sqlite3.Error:
@@ -146,12 +158,27 @@ def _keep_copy(db: sqlite3.Connection, path: Path) -> None:
         raise store_error(path, error) from None
 
 
-def _sign_all(db: sqlite3.Connection) -> None:
-    """Give the rows of an older schema their digest, from what can be read of them now."""
-    for table in TABLES:
-        cursor = db.execute(f"SELECT * FROM {table}")
-        names = [column[0] for column in cursor.description]
-        signed = [(digest_of(table, dict(zip(names, row, strict=True))), row[0]) for row in cursor]
+def _rows_of(db: sqlite3.Connection, table: str) -> Iterator[dict[str, Any]]:
+    cursor = db.execute(f"SELECT * FROM {table}")
+    names = [column[0] for column in cursor.description]
+    return (dict(zip(names, row, strict=True)) for row in cursor)
+
+
+def _sound_rows(db: sqlite3.Connection) -> set[tuple[str, int]]:
+    """Return table and number of the rows that are what was written."""
+    return {
+        (table, row["id"])
+        for table in _WITH_DIGESTS
+        for row in _rows_of(db, table)
+        if row["digest"] == digest_of(table, row)
+    }
+
+
+def _sign(db: sqlite3.Connection, sound: set[tuple[str, int]] | None) -> None:
+    """Give rows of an older schema the digest of what can be read of them now; all, or those that were ``sound``."""
+    for table in _WITH_DIGESTS:
+        rows = [row for row in _rows_of(db, table) if sound is None or (table, row["id"]) in sound]
+        signed = [(digest_of(table, row), row["id"]) for row in rows]
         db.executemany(f"UPDATE {table} SET digest = ? WHERE id = ?", signed)
 
 

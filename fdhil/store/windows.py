@@ -126,6 +126,8 @@ def _head(window: Window) -> dict[str, Any]:
     """
     plain = {field.name: getattr(window, field.name) for field in fields(Window) if field.name not in COLUMNS}
     slow = plain.pop("slow_voltage")
+    if plain["torque_constant_nm_per_a"] is None:  # as in windows of before there was one: their digest stays
+        del plain["torque_constant_nm_per_a"]
     if slow is not None:
         grid = {"begin_s": slow.begin_s, "period_s": slow.period_s, "error_s": slow.error_s}
         plain["slow_voltage"] = grid | {"samples": slow.voltage_v.size}

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 
+from fdhil.identification.drift import FRICTION, LEAST_JUMP
 from fdhil.identification.pooling import difference_covariance
 from fdhil.records import PARAMETERS, Estimate, Float, Reason, Window
 from fdhil.validation.significance import BUDGET
@@ -20,7 +21,10 @@ GAINS: Mapping[str, Float] = {  # powers of R, L, K, Jt, ft, Cd
     "speed": np.array([0.0, 0.0, -1.0, -2.0, -2.0, -1.0]),
 }
 LEAST_GAIN_CHANGE = 0.02
+WARMING = ("R", *FRICTION)
 LEAST_CHANGE: Mapping[str, float] = {"R": 0.02, "L": 0.03, "K": 0.01, "Jt": 0.02, "ft": 0.15, "Cd": 0.10}
+
+Pair = tuple[tuple[Window, Estimate], tuple[Window, Estimate]]
 
 
 def values_apart(estimate: Estimate, likeliest: Float) -> Iterator[Reason]:
@@ -41,29 +45,51 @@ def values_apart(estimate: Estimate, likeliest: Float) -> Iterator[Reason]:
 def moved(told: Sequence[tuple[Window, Estimate]]) -> list[Reason]:
     """Return a reason for each parameter that differs between windows beyond chance and by enough to matter.
 
-    One sensor's gain moves several parameters at once, each in its own proportion: where that explains all of it, the
-    sensor is the reason, even where no parameter alone moves enough to tell.
+    L, K and Jt are the same in all windows, given in order. What warms drifts from window to window and is no jump: R
+    is compared with the window before, friction with that before in the same direction, as a load and the screw make
+    it another in the other. One sensor's gain moves several parameters at once, each in its own proportion: where that
+    explains all of it, the sensor is the reason, even where no parameter alone moves enough to tell.
     """
     reasons: list[Reason] = []
-    worst = (0, 0)
-    estimates = [estimate for _, estimate in told]
-    for k, name in enumerate(PARAMETERS):
-        values = np.array([e.value(name) for e in estimates])
-        if np.count_nonzero(np.isfinite(values)) < 2:
-            continue  # a slow voltage may leave R and L open
-        low, high = int(np.nanargmin(values)), int(np.nanargmax(values))
-        apart = float(values[high] - values[low])
-        chance = BEYOND_CHANCE * float(np.sqrt(difference_covariance(told[low], told[high])[k, k]))
-        if apart > max(chance, LEAST_CHANGE[name] * abs(float(np.nanmedian(values)))):
-            worst = worst if reasons else (min(low, high), max(low, high))
-            code = "LoadChanged" if name == "Jt" else "ParameterJump"
-            text = f"{name} moves from {values[low]:.4g} to {values[high]:.4g} between the windows"
-            reasons.append(Reason(code, text, "identify the windows before and after the change apart"))
+    worst: Pair | None = None
+    for name in PARAMETERS:
+        pair = _farthest(told, name)
+        if pair is None:
+            continue
+        worst = worst or pair
+        code = "LoadChanged" if name == "Jt" else "ParameterJump"
+        before, after = (estimate.value(name) for _, estimate in pair)
+        text = f"{name} moves from {before:.4g} to {after:.4g} between the windows"
+        reasons.append(Reason(code, text, "identify the windows before and after the change apart"))
     if len(reasons) == 1:
         return reasons
-    suspected = [(told[worst[0]], told[worst[1]])] if reasons else list(pairwise(told))
+    suspected = [worst] if worst is not None else [*pairwise(told), *_by_direction(told)]
     sensors = [reason for pair in suspected if (reason := gain_change(*pair)) is not None]
     return sensors[:1] or reasons
+
+
+def _farthest(told: Sequence[tuple[Window, Estimate]], name: str) -> Pair | None:
+    """Return the two windows, in order, between which a parameter moves most, where that is a jump; else None."""
+    known = [(w, e) for w, e in told if np.isfinite(e.value(name))]  # a slow voltage may leave R and L open
+    if len(known) < 2:
+        return None
+    pairs = list(combinations(known, 2)) if name not in WARMING else list(pairwise(known))
+    if name in FRICTION:
+        pairs = list(_by_direction(known))
+    if not pairs:
+        return None
+    one, other = max(pairs, key=lambda pair: abs(pair[1][1].value(name) - pair[0][1].value(name)))
+    k = PARAMETERS.index(name)
+    chance = BEYOND_CHANCE * float(np.sqrt(difference_covariance(one, other)[k, k]))
+    share = LEAST_JUMP[name] if name in WARMING else LEAST_CHANGE[name]
+    least = share * abs(float(np.median([e.value(name) for _, e in known])))
+    return (one, other) if abs(other[1].value(name) - one[1].value(name)) > max(chance, least) else None
+
+
+def _by_direction(told: Sequence[tuple[Window, Estimate]]) -> Iterator[Pair]:
+    """Yield each window with the one before it in its direction."""
+    for direction in (1, -1):
+        yield from pairwise([(w, e) for w, e in told if w.direction == direction])
 
 
 def gain_change(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) -> Reason | None:
@@ -75,9 +101,11 @@ def gain_change(one: tuple[Window, Estimate], other: tuple[Window, Estimate]) ->
     names = [name for name in PARAMETERS if before.value(name) > 0 and after.value(name) > 0]
     if len(names) < len(PARAMETERS) - 1:  # friction may be nil
         return None
+    if one[0].direction != other[0].direction:  # what a load and the screw make of friction is no gain's doing
+        names = [name for name in names if name not in FRICTION]
     rows = [PARAMETERS.index(name) for name in names]
     moved = np.log(after.values[rows] / before.values[rows])
-    apart = difference_covariance(one, other) / np.outer(before.values, after.values)
+    apart = difference_covariance(one, other) / np.outer(before.values[:6], after.values[:6])
     spread = apart[np.ix_(rows, rows)] + np.diag(np.full(len(rows), MODEL_SHARE**2))
     weight: Float = np.asarray(np.linalg.inv(spread), dtype=np.float64)
     singles = np.eye(len(rows))

@@ -13,7 +13,7 @@ from fdhil.validation.agreement import values_apart
 from fdhil.validation.evidence import LEAST_ROWS, Evidence
 from fdhil.validation.interruptions import interruptions
 from fdhil.validation.plausibility import clipped, gaps, missing_stages, not_finite, position_parted
-from fdhil.validation.rest import rest_faults
+from fdhil.validation.rest import friction_at_rest, rest_faults
 from fdhil.validation.simulation import expected_fit_percent
 from fdhil.validation.slow_fitted import slow_faults_beside
 from fdhil.validation.slow_readings import slow_voltage_faults
@@ -21,6 +21,7 @@ from fdhil.validation.slow_timing import current_late
 from fdhil.validation.stuck import clipped_peaks, stuck_values
 from fdhil.validation.timing import timing_faults, voltage_late
 from fdhil.validation.whiteness import excess_noise, whiteness
+from fdhil.validation.without_voltage import load_comes_and_goes, torque_late, torque_unexplained
 
 Findings = dict[str, list[Reason]]
 """What each check that was asked found, in the order of the table."""
@@ -35,7 +36,7 @@ def _enough_rows(evidence: Evidence) -> bool:
 
 
 def _has_voltage(evidence: Evidence) -> bool:
-    return evidence.window.voltage_v is not None or evidence.window.slow_voltage is not None
+    return evidence.has_voltage
 
 
 def _fitted(evidence: Evidence) -> bool:
@@ -43,22 +44,23 @@ def _fitted(evidence: Evidence) -> bool:
 
 
 def _sound(evidence: Evidence) -> bool:
-    if evidence.fit is None:
-        return False
-    return bool(np.isfinite(evidence.on_time.residuals).all() and np.isfinite(evidence.on_time.information).all())
+    return evidence.sound
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
     """One question: ``find`` is asked where the evidence has what it ``needs``.
 
-    It is passed over where a check of ``unless`` has found something: that explains what this one would find.
+    It is passed over where a check of ``unless`` has found something: that explains what this one would find. What it
+    finds refuses the window, or, where it is ``weighed``, does so only if the model does not explain the rapid at the
+    table, and is a warning else.
     """
 
     name: str
     find: Callable[[Evidence], Iterable[Reason]]
     needs: Callable[[Evidence], bool] = _always
     unless: Sequence[str] = ()
+    weighed: bool = False
 
 
 def _few_rows(evidence: Evidence) -> Iterator[Reason]:
@@ -71,8 +73,14 @@ def _play(evidence: Evidence) -> Iterator[Reason]:
         yield evidence.play.reason()
 
 
+def _without_voltage(evidence: Evidence) -> bool:
+    return not _has_voltage(evidence)
+
+
 def _no_voltage(evidence: Evidence) -> Iterator[Reason]:
-    if not _has_voltage(evidence):
+    """Yield a reason where a sensor should have told the voltage: what it tells of K is no data sheet's to replace."""
+    sensed = evidence.axis is not None and evidence.axis.voltage.separate
+    if sensed and not _has_voltage(evidence) and evidence.window.torque_constant_nm_per_a is None:
         yield Reason("SampleTiming", "the window has no voltage", "connect the voltage sensor")
 
 
@@ -80,12 +88,23 @@ def _estimate_faults(evidence: Evidence) -> Iterator[Reason]:
     """Yield why the estimate tells no drive: values left open, a fit that does not converge, unphysical values."""
     estimate, fit = evidence.estimate, evidence.fit
     assert estimate is not None
-    missing = untold(estimate, slow=evidence.window.slow_voltage is not None)
+    missing = untold(estimate, slow=evidence.window.slow_voltage is not None or not _has_voltage(evidence))
     yield from missing
     open_end = bool(estimate.missing) and not missing and fit is not None and not fit.converged
     if open_end or estimate.result is Result.DIVERGED:
         yield Reason("SolverFailed", "the fit does not converge", "look at the window's signals")
-    yield from unphysical(estimate)
+    yield from unphysical(evidence.told or estimate, one_way=True)
+
+
+def _slips(evidence: Evidence) -> Iterator[Reason]:
+    """Yield a reason where friction falls so much with speed that the axis sticks and slips."""
+    if evidence.estimate is None or "stribeck" not in evidence.estimate.terms:
+        return
+    more, dry = evidence.estimate.value("stribeck"), abs(evidence.estimate.value("Cd"))
+    torque_nm = evidence.estimate.value("K") * float(np.nanmax(np.abs(evidence.window.current_a)))
+    if more > max(dry, SLIPPING_SHARE * torque_nm):
+        text = f"friction at low speed is {more:.3g} N.m higher than the dry friction of {dry:.3g} N.m: the axis slips"
+        yield Reason("ValidationFailed", text, "lubricate the slide-way, and look at its guides, before anything else")
 
 
 def _no_fit(evidence: Evidence) -> Iterator[Reason]:
@@ -105,9 +124,8 @@ def _current_late(evidence: Evidence) -> Iterable[Reason]:
 
 
 def _structure(evidence: Evidence) -> Iterator[Reason]:
-    """Yield the finding that explains most."""
-    matters = [finding for finding in evidence.findings if finding.matters]
-    yield from (finding.reason() for finding in matters[:1])
+    """Yield what the model lacks, each with its cost."""
+    yield from (evidence.priced(lack) for lack in evidence.lacks if lack.finding.matters)
 
 
 def _late(evidence: Evidence) -> Iterable[Reason]:
@@ -129,7 +147,18 @@ def _values(evidence: Evidence) -> Iterable[Reason]:
     return values_apart(evidence.estimate, evidence.judged.theta[:6])
 
 
-MODEL = ("estimate", "fit", "late voltage", "late current", "structure", "whiteness", "excess noise", "standstill")
+SLIPPING_SHARE = 0.1  # of the largest torque of the move: less than this more friction at low speed does little
+MODEL = (
+    "estimate",
+    "fit",
+    "late voltage",
+    "late current",
+    "structure",
+    "whiteness",
+    "excess noise",
+    "standstill",
+    "friction at rest",
+)
 BEFORE_ANY_FIT: Sequence[Check] = (
     Check("finite", not_finite),
     Check("stages", missing_stages),
@@ -138,7 +167,7 @@ BEFORE_ANY_FIT: Sequence[Check] = (
     Check("position", position_parted, _enough_rows, ("finite",)),
     # what position tells of the move's course is worth nothing where it contradicts the speed
     Check("whole move", interruptions, _enough_rows, ("finite", "position")),
-    Check("play", _play, _enough_rows, ("finite",)),
+    Check("play", _play, _enough_rows, ("finite",), weighed=True),
     Check("slow readings", slow_voltage_faults),
     Check("voltage", _no_voltage),
     Check("rows", _few_rows, unless=("finite", "stages", "slow readings", "voltage")),
@@ -146,20 +175,28 @@ BEFORE_ANY_FIT: Sequence[Check] = (
 OF_THE_FIT: Sequence[Check] = (
     Check("stuck", stuck_values),
     Check("cut off", clipped_peaks, _fitted),
-    Check("estimate", _estimate_faults, _has_voltage),
+    Check("late torque", torque_late, _without_voltage),
+    Check("load", load_comes_and_goes, _without_voltage, ("late torque",)),
+    Check("torque", torque_unexplained, _without_voltage, ("late torque", "load")),
+    Check("estimate", _estimate_faults, unless=("late torque", "load", "torque")),
+    Check("slips", _slips),
     Check("fit", _no_fit, _has_voltage, ("estimate",)),
     Check("late voltage", _electrically_late, _fitted),
     Check("late current", _current_late, _sound, ("late voltage",)),
-    Check("structure", _structure, _sound, ("late voltage", "late current")),
-    Check("whiteness", whiteness, _sound, ("late voltage", "late current", "structure")),
-    Check("excess noise", excess_noise, _sound, ("late voltage", "late current", "structure")),
+    Check("structure", _structure, _sound, ("late voltage", "late current"), weighed=True),
+    Check("whiteness", whiteness, _sound, ("late voltage", "late current", "structure"), weighed=True),
+    Check("excess noise", excess_noise, _sound, ("late voltage", "late current", "structure"), weighed=True),
     # a late current seems to move a shaft at rest
     Check("standstill", rest_faults, _sound, ("late voltage", "late current")),
+    Check("friction at rest", friction_at_rest, _sound, ("late voltage", "late current"), weighed=True),
     Check("delay", _late, _fitted, MODEL[2:]),
-    Check("simulation", _simulation, _fitted, (*MODEL, "delay")),
+    Check("simulation", _simulation, _fitted, (*MODEL, "delay"), weighed=True),
     Check("values", _values, _fitted, (*MODEL, "delay")),
     Check("slow sensor", slow_faults_beside, _fitted, ("range", "slow readings")),
 )
+
+
+WEIGHED = frozenset(check.name for check in (*BEFORE_ANY_FIT, *OF_THE_FIT) if check.weighed)
 
 
 def ask(checks: Sequence[Check], evidence: Evidence, found: Findings) -> Findings:

@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from fdhil.config import Identification
+from fdhil.config import Axis, Identification
 from fdhil.identification.delay import coarse_delay
-from fdhil.identification.estimators import least_squares, maximum_likelihood
-from fdhil.identification.estimators.maximum_likelihood import Fit
+from fdhil.identification.estimators import least_squares
+from fdhil.identification.fit import Fit, but_delay, fit, with_delay
 from fdhil.identification.motion import Noise, noise_levels, resolution
 from fdhil.identification.windows import carried, moving_range, smooth
-from fdhil.records import Bool, Estimate, Float, Window
+from fdhil.identification.without_voltage import TorqueFit
+from fdhil.identification.without_voltage import fit as fit_torque
+from fdhil.records import PARAMETERS, Bool, Estimate, Float, Parameters, Reason, Window, rms
 from fdhil.validation.backlash import DeadBand, backlash
+from fdhil.validation.selection import Lacking, lacking
 from fdhil.validation.sensor_reconstruction import Bridge
 from fdhil.validation.simulation import fit_percent
-from fdhil.validation.structure import Finding, findings
+from fdhil.validation.structure import DEAD_TIME, OFFSET_CURRENT, Finding, findings
+from fdhil.validation.table_error import TableError
+from fdhil.validation.weight import NEXT_SPEED, Move, Weight, completed, to_and_fro, weigh
+from fdhil.validation.widening import widened
 
 STILL_MM = 0.004  # of the table at rest
 STILL_S, STILL_SHARE = 0.010, 0.02  # of the rapid speed
+SENSOR_KNOWN = 0.5  # of what a sensor's fault makes at the table: it resembles what is tried, and does not show there
 LEAST_ROWS = 32  # of a window that may hold a rapid move
 
 
@@ -47,17 +55,25 @@ def signals_of(window: Window) -> tuple[Signal, ...]:
 
 @dataclass(frozen=True)
 class Evidence:
-    """A window before any fit, or with its ``estimate`` and the ``fit`` of the same method (None: there is none)."""
+    """A window before any fit, or with its ``estimate`` and the ``fit`` of the same method (None: there is none).
+
+    ``axis`` is the axis' section where it is known, and ``sync_period_s`` that of its set-points (None: a row's).
+    Without a voltage the fit is ``torque``, of [2] alone. ``recorded`` is the window as it was before its speed was
+    mended (None: it was not): whether a sensor repeats itself is asked of its own readings.
+    """
 
     window: Window
     settings: Identification
     estimate: Estimate | None = None
     fit: Fit | None = None
+    axis: Axis | None = None
+    sync_period_s: float | None = None
+    recorded: Window | None = None
 
     @cached_property
     def signals(self) -> Sequence[Signal]:
-        """The sensors, each with its resolution."""
-        return signals_of(self.window)
+        """The sensors as they were read, each with its resolution."""
+        return signals_of(self.recorded or self.window)
 
     @cached_property
     def noise(self) -> Noise:
@@ -87,6 +103,105 @@ class Evidence:
         """The backlash that the window shows."""
         return backlash(self.window)
 
+    @cached_property
+    def torque(self) -> TorqueFit | None:
+        """The fit of [2] alone, for a window without a voltage; None where hardly any row surely moves."""
+        return None if self.has_voltage else fit_torque(self.window, self.settings)
+
+    @property
+    def has_voltage(self) -> bool:
+        """Whether the window has a voltage, of the drive or of a slow sensor."""
+        return self.window.voltage_v is not None or self.window.slow_voltage is not None
+
+    @cached_property
+    def parameters(self) -> Parameters | None:
+        """The estimate as a drive that can be run; what a voltage would tell of it, and did not, is the fit's own."""
+        if self.estimate is None or not set(PARAMETERS) <= set(self.estimate.names):
+            return None
+        told = self.estimate.parameters()
+        if self.fit is not None:
+            told = completed(told, Parameters(*self.fit.theta[:6]))
+        if self.axis is not None:
+            return completed(told, Parameters(**self.axis.nominal.model_dump()))
+        # through an ordinary loop R and L, which only a voltage tells, do nothing
+        return told if self.has_voltage else told.changed(R=1.0, L=1.0)
+
+    @cached_property
+    def move(self) -> Move | None:
+        """The rows in which the drive surely moves, with the friction of the estimate."""
+        if self.parameters is None or not math.isfinite(sum(self.parameters.as_dict().values())):
+            return None
+        moving = np.zeros(self.window.n)
+        moving[slice(*self.moving)] = self.window.direction
+        if self.torque is not None:
+            moving = self.torque.rows.side
+        mode = moving if self.fit is None else self.fit.problem.motions[0].mode
+        return Move.of(self.window, self.parameters, np.where(np.abs(mode) == 1, mode, 0.0))
+
+    @cached_property
+    def weight(self) -> Weight | None:
+        """What the estimate leaves of the rapid at the table; None where there is no drive to run."""
+        if self.parameters is None or self.move is None:
+            return None
+        noise = self.noise.current_a, self.noise.speed_rad_s
+        period = self.sync_period_s or self.window.dt_s
+        return weigh(self.window, self.settings, self.parameters, self.move, noise, self.axis, period)
+
+    def cost_um(self, lack: Lacking) -> float:
+        """Return what the model's lack makes at the table: its torque on this rapid, its bias here and in what is cut.
+
+        Of what is cut less torque is asked than of a rapid: its error counts as the same share of a rapid's.
+        """
+        p, move = self.parameters, self.move
+        if p is None or move is None:
+            return math.inf
+        loop, dt_s = TableError.of(p, self.window.pitch_mm, self.axis), self.window.dt_s
+        cut, shift = move.slower(p, NEXT_SPEED), lack.shift[: len(PARAMETERS)].copy()
+        if lack.finding.name == OFFSET_CURRENT:  # to the loop it is a load, which is part of one direction's friction
+            shift[PARAMETERS.index("Cd")] = 0.0
+        torques = [move.whole(p), move.of_shift(p, shift), cut.whole(p), cut.of_shift(p, shift)]
+        if lack.load_nm is not None:
+            torques.append(move.integral(lack.load_nm))
+        whole, here, all_cut, there, *load = (
+            rms(row) for row in loop.um(np.array([to_and_fro(row) for row in torques]), dt_s)
+        )
+        return max(here, there * whole / max(all_cut, 1e-300), *load)
+
+    @cached_property
+    def told(self) -> Estimate | None:
+        """The estimate with the intervals that hold although the model lacks what was found."""
+        if self.estimate is None or not self.lacks:
+            return self.estimate
+        return widened(self.estimate, self.on_time, self.lacks)
+
+    @cached_property
+    def sound(self) -> bool:
+        """Whether there is a fit that can be asked what it lacks."""
+        if self.fit is None:
+            return False
+        return bool(np.isfinite(self.on_time.residuals).all() and np.isfinite(self.on_time.information).all())
+
+    @cached_property
+    def lost_v(self) -> float:
+        """What of the recorded voltage does not reach the motor: a term of the estimate, or found beside it."""
+        found = [abs(lack.finding.amplitude) for lack in self.lacks if lack.finding.name == DEAD_TIME]
+        term = self.parameters.term("dead_time") if self.parameters is not None else 0.0
+        return abs(term) + sum(found)
+
+    @cached_property
+    def harmless(self) -> bool:
+        """Whether the model explains the rapid at the table, and nothing it surely lacks makes a next one worse."""
+        if self.weight is None or not self.weight.believed:
+            return False
+        return all(self.weight.allows(self.cost_um(lack) / _known(lack)) for lack in self.lacks)
+
+    def priced(self, lack: Lacking) -> Reason:
+        """Return what the model lacks as a reason, with what that costs."""
+        reason = lack.finding.reason()
+        if self.weight is None:
+            return reason
+        return replace(reason, text=f"{reason.text}; at the table {self.weight.told(self.cost_um(lack))}")
+
     @property
     def judged(self) -> Fit:
         """The fit; only for checks that need one."""
@@ -113,7 +228,8 @@ class Evidence:
         """The fit, without a delay of more than a sample: what else is wrong moves it too, and has its own name."""
         if not self.late_s:
             return self.judged
-        return maximum_likelihood.fit(self.judged.problem.motions, np.append(self.judged.theta[:6], 0.0), range(6))
+        judged = self.judged
+        return fit(judged.problem.motions, with_delay(judged.theta, 0.0), but_delay(judged.free))
 
     @cached_property
     def fit_percent(self) -> float | None:
@@ -135,6 +251,16 @@ class Evidence:
         """What the fit shows beyond the model, the most significant first."""
         return findings(self.on_time)
 
+    @cached_property
+    def lacks(self) -> list[Lacking]:
+        """What of that surely is there, each beside those before it."""
+        return lacking(self.on_time, self.findings) if self.sound else []
+
     def time_s(self, row: int) -> float:
         """Return the time of a row as its recording counts it."""
         return self.window.start_s + row * self.window.dt_s
+
+
+def _known(lack: Lacking) -> float:
+    """Return what share of a lack's error is known: a replay shows a torque, and no sensor."""
+    return 1.0 if lack.load_nm is not None else SENSOR_KNOWN

@@ -12,6 +12,7 @@ from functools import cached_property
 
 import numpy as np
 
+from fdhil.identification.courses import load_nm, voltage_v
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.kalman import DELAY, departure
@@ -39,7 +40,7 @@ class Bridge:
         """Return the bridge of a fit's window."""
         motion, theta = fit.problem.motions[0], fit.theta
         noise = np.maximum(fit.problem.noises[0].vector(), motion.noise.vector())[[1, 2, 0]]
-        voltage = motion.delayed(theta[DELAY])
+        voltage = voltage_v(motion, theta)
         width = 2 * round(SMOOTHING_S / motion.dt_s / 2) + 1
         course = moving_mean(voltage, width)
         change = np.diff(course, append=course[-1]) ** 2
@@ -72,6 +73,7 @@ class Bridge:
             theta,
             motion.dt_s,
             motion.mode[part],
+            load_nm(motion, theta)[part],
             self.readings[part],
             variances,
             self.walks[part],
@@ -91,6 +93,7 @@ class Crossing:
     theta: Float
     dt_s: float
     mode: Modes
+    load_nm: Float
     readings: Float
     variances: Float
     walks: Float
@@ -118,7 +121,7 @@ class Crossing:
         return log_beyond(forced - free, max(news - other_news, 1.0))
 
     def _squares(self, readings: Float, variances: Float) -> tuple[float, float]:
-        return departure(self.theta, self.dt_s, self.mode, readings, variances, self.walks, self.signal)
+        return departure(self.theta, self.dt_s, self.mode, self.load_nm, readings, variances, self.walks, self.signal)
 
 
 def log_beyond(square: float, freedom: float) -> float:

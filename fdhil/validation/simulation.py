@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from fdhil.identification.courses import voltage_terms_v
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.identifiability import untold
 from fdhil.identification.windows import carried
@@ -35,6 +36,8 @@ def fit_percent(window: Window, estimate: Estimate, fit: Fit | None) -> float | 
     assert window.voltage_v is not None
     known = np.isfinite(window.speed_rad_s)
     voltage = carried(window.voltage_v)
+    if fit is not None:
+        voltage = voltage + voltage_terms_v(fit.problem.motions[0], fit.theta)
     if estimate.delay_s and abs(estimate.delay_s) <= window.dt_s:
         row = np.arange(voltage.size)
         voltage = np.interp(row + estimate.delay_s / window.dt_s, row, voltage)

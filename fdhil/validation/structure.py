@@ -20,6 +20,7 @@ from fdhil.identification.innovations import CURRENT, LOAD, SPEED, VOLTAGE, answ
 from fdhil.identification.motion import UNKNOWN, Motion
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import innovations_of
+from fdhil.identification.windows import carried
 from fdhil.records import Float, Reason
 from fdhil.validation.significance import BUDGET
 
@@ -31,14 +32,17 @@ IMITATED = 1e-6  # share of a direction below which only rounding is left of it
 LAGS = 25
 SLOPE_S = 0.005  # over which the acceleration is taken
 _KINDS = {"current": CURRENT, "speed": SPEED}
-STRIBECK_SPEEDS = (0.01, 0.03, 0.06, 0.12)  # of the rapid speed
+STRIBECK_SPEEDS = (0.01, 0.03, 0.06, 0.12, 0.25)  # of the rapid speed
+DEAD_TIME, OFFSET_CURRENT = "dead_time", "current offset"
+SATURATED = 0.02  # of the peak current, at which an inverter's dead time has its whole effect
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
     """What one alternative shows: its class, how it reads, its statistic (standard deviations) and amplitude.
 
-    ``least`` is the smallest amplitude that matters, in the amplitude's own unit.
+    ``least`` is the smallest amplitude that matters, in the amplitude's own unit. ``direction`` (m,) is how it moves
+    the innovations, a unit of it, and ``load_nm`` (n,) the unit's torque, where it is one.
     """
 
     code: str
@@ -47,11 +51,19 @@ class Finding:
     least: float
     statistic: float
     amplitude: float
+    direction: Float
+    load_nm: Float | None = None
+    name: str = ""
+
+    @property
+    def sure(self) -> bool:
+        """Return whether the finding is beyond chance."""
+        return abs(self.statistic) > BUDGET["structure"].deviations
 
     @property
     def matters(self) -> bool:
         """Return whether the finding is beyond chance and large enough to matter."""
-        return abs(self.statistic) > BUDGET["structure"].deviations and abs(self.amplitude) > self.least
+        return self.sure and abs(self.amplitude) > self.least
 
     def reason(self) -> Reason:
         """Return the finding as a reason."""
@@ -170,14 +182,14 @@ class Bench:
         beyond = beyond - self.imitated.T @ shared
         return beyond[0], beyond[1:].T, shared
 
-    def best(self, matrix: Float) -> tuple[int, float, float]:
-        """Return index, statistic and amplitude of the column of ``matrix`` (m, q) with the largest statistic."""
+    def best(self, matrix: Float) -> tuple[int, float, float, Float]:
+        """Return index, statistic, amplitude and (m,) of the column of ``matrix`` (m, q) with the largest statistic."""
         score, course, shared = self.scores(matrix)
         whole = np.einsum("mq,mq->q", matrix, matrix)
         weight = whole - np.einsum("kq,kq->q", shared, self.inverse @ shared)
         statistic, amplitude = self.tested(score, weight, whole, course)
         k = int(np.argmax(np.abs(statistic)))
-        return k, float(statistic[k]), float(amplitude[k])
+        return k, float(statistic[k]), float(amplitude[k]), matrix[:, k]
 
     def tested(self, score: Float, weight: Float, whole: Float, course: Float) -> tuple[Float, Float]:
         """Return statistics and amplitudes; 0 where the parameters imitate all but rounding of ``whole``.
@@ -243,7 +255,7 @@ def findings(fit: Fit) -> list[Finding]:
         return []
     edges = np.unique(np.linspace(rows[0], rows[-1] + 1, EDGES + 1).astype(int))
     drift = np.clip((np.arange(bench.motion.n) - edges[0]) / max(1, edges[-1] - edges[0]), 0.0, 1.0)
-    found = [_load(bench, edges, drift), _low_speed_friction(bench)]
+    found = [_load(bench, edges, drift), _low_speed_friction(bench), *_of_the_voltage(bench, drift)]
     for name, unit in (("voltage", "V"), ("current", "A"), ("speed", "rad/s")):
         found += [_gain(bench, name, edges[2:-2:2], drift), _offset(bench, name, unit, drift)]
     return sorted(found, key=lambda f: -abs(f.statistic))
@@ -271,14 +283,19 @@ def _load(bench: Bench, edges: npt.NDArray[np.int_], drift: Float) -> Finding:
     a, b = np.unravel_index(int(np.argmax(np.abs(np.triu(statistic, 1)))), statistic.shape)
     span = f"acts from {edges[a] * motion.dt_s:.3f} to {edges[b] * motion.dt_s:.3f} s of the window"
     found = (float(statistic[a, b]), float(amplitude[a, b]))
+    rows, direction = np.arange(motion.n), matrix[:, a] - (matrix[:, b] if b < edges.size - 1 else 0.0)
+    torque = ((rows >= edges[a]) & (rows < edges[b])).astype(np.float64)
     if abs(rising[0][0]) > abs(found[0]):
         span, found = "rises over the move", (float(rising[0][0]), float(rising[1][0]))
+        torque, direction = drift, matrix[:, -1]
     return Finding(
         "LoadDetected",
         f"a torque of {{:+.3g}} N.m that is no friction {span}",
         "identify from moves without cutting, clamping or collision",
         LEAST_TORQUE * bench.peak_torque,
         *found,
+        direction,
+        torque,
     )
 
 
@@ -291,13 +308,19 @@ def _apart(gram: Float) -> Float:
 
 def _gain(bench: Bench, name: str, edges: npt.NDArray[np.int_], drift: Float) -> Finding:
     """Try a gain that steps at one of ``edges`` and stays, and one that drifts."""
-    k, statistic, amplitude = bench.best(bench.gain_answers(name, _steps_and_drift(edges, drift)))
+    k, statistic, amplitude, direction = bench.best(bench.gain_answers(name, _steps_and_drift(edges, drift)))
     drifts = k == edges.size
     at = "over the move" if drifts else f"at {edges[k] * bench.motion.dt_s:.3f} s of the window"
     text = f"the gain of {name} {'drifts' if drifts else 'changes'} by {{:+.2%}} {at}"
     # what is tried is the correction of the signal, so the sensor's own change has the other sign
     return Finding(
-        "CalibrationSuspect", text, f"check the {name} sensor and its wiring", LEAST_GAIN, statistic, -amplitude
+        "CalibrationSuspect",
+        text,
+        f"check the {name} sensor and its wiring",
+        LEAST_GAIN,
+        statistic,
+        -amplitude,
+        direction,
     )
 
 
@@ -305,10 +328,58 @@ def _offset(bench: Bench, name: str, unit: str, drift: Float) -> Finding:
     """Try an offset that is there throughout, and one that drifts from nothing on over the move."""
     motion = bench.motion
     peak = float(np.abs(motion.voltage_mean if name == "voltage" else getattr(motion, name)).max())
-    k, statistic, amplitude = bench.best(bench.offset_answers(name, np.vstack([np.ones(motion.n), drift])))
+    k, statistic, amplitude, direction = bench.best(bench.offset_answers(name, np.vstack([np.ones(motion.n), drift])))
     text = f"{name} has an offset of {{:+.3g}} {unit}" if k == 0 else f"the zero of {name} drifts by {{:+.3g}} {unit}"
     advice = f"set the zero of the {name} sensor at standstill"
-    return Finding("CalibrationSuspect", text, advice, LEAST_OFFSET * peak, statistic, -amplitude)
+    kind = OFFSET_CURRENT if name == "current" and k == 0 else ""
+    return Finding("CalibrationSuspect", text, advice, LEAST_OFFSET * peak, statistic, -amplitude, direction, name=kind)
+
+
+def _of_the_voltage(bench: Bench, drift: Float) -> list[Finding]:
+    """Try what else is between the recorded voltage and the winding: dead time, a bus that sags, a winding that warms.
+
+    Of these voltages only a part reaches the motor, or is needed there: each is tried as what is missing.
+    """
+    motion = bench.motion
+    current, volts = carried(motion.current), np.interp(*_places(motion), carried(motion.voltage_mean))
+    peak, most = float(np.abs(current).max()), float(np.abs(volts).max())
+    power = np.maximum(volts * current, 0.0)
+    tried = (
+        (
+            DEAD_TIME,
+            np.clip(current / (SATURATED * peak), -1.0, 1.0),
+            ("CalibrationSuspect", "{:+.3g} V are lost before the motor, whatever its current (dead time)"),
+            "set voltage_source = 'command' where the voltage is what the drive asks for",
+            LEAST_OFFSET * most,
+        ),
+        (
+            "bus_sag",
+            volts * power / float(power.max()),
+            ("CalibrationSuspect", "{:+.2%} of the voltage are lost at the largest power (the bus sags)"),
+            "record the voltage at the motor, or map the bus voltage",
+            LEAST_GAIN,
+        ),
+        (
+            "warming",
+            drift * current,
+            ("ParameterJump", "the resistance changes by {:+.3g} ohm over the move (the winding warms)"),
+            "let the motor reach its temperature before identifying",
+            LEAST_GAIN * float(bench.fit.theta[0]),
+        ),
+    )
+    joined = {course.name for course in motion.courses}
+    found = []
+    for name, course, (code, text), advice, least in tried:
+        if name not in joined:
+            _, statistic, amplitude, direction = bench.best(bench.offset_answers("voltage", course[None]))
+            found.append(Finding(code, text, advice, least, statistic, -amplitude, direction, name=name))
+    return found
+
+
+def _places(motion: Motion) -> tuple[Float, Float]:
+    """Return the rows (n,), and those at which the samples (m,) of the voltage lie."""
+    rows = np.arange(motion.n, dtype=np.float64)
+    return rows, motion.at_voltage(rows) if motion.slow is not None else rows
 
 
 def _low_speed_friction(bench: Bench) -> Finding:
@@ -317,7 +388,7 @@ def _low_speed_friction(bench: Bench) -> Finding:
     top = float(np.abs(motion.speed).max())
     moving = np.where(np.abs(motion.mode) == 1, motion.mode, 0)
     loads = np.exp(-np.square(motion.speed / (top * np.array(STRIBECK_SPEEDS)[:, None]))) * moving
-    k, statistic, amplitude = bench.best(bench.load_answers(loads))
+    k, statistic, amplitude, direction = bench.best(bench.load_answers(loads))
     return Finding(
         "ValidationFailed",
         f"friction is {{:+.3g}} N.m higher below {STRIBECK_SPEEDS[k] * top:.3g} rad/s than above (Stribeck)",
@@ -325,4 +396,6 @@ def _low_speed_friction(bench: Bench) -> Finding:
         LEAST_TORQUE * bench.peak_torque,
         statistic,
         amplitude,
+        direction,
+        loads[k],
     )

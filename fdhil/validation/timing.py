@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdhil.identification.estimators import maximum_likelihood
-from fdhil.identification.estimators.maximum_likelihood import Fit
+from fdhil.identification.courses import voltage_v
 from fdhil.identification.filtering import moving_mean
+from fdhil.identification.fit import Fit, but_delay, descend, with_delay
+from fdhil.identification.fit import fit as fitted
 from fdhil.identification.innovations import CURRENT, VOLTAGE, answers
 from fdhil.identification.normal import inverse_of
 from fdhil.records import Float, Reason
@@ -82,8 +83,8 @@ def _short_winding(fit: Fit) -> Iterator[Reason]:
         return
     least = float(fit.residuals @ fit.residuals) * (1.0 + BUDGET["timing"].deviations ** 2 / fit.residuals.size)
     for samples in LATE:
-        start = np.append(theta[:6], samples * motion.dt_s)
-        theta, residuals, _, _ = maximum_likelihood.descend(fit.problem, start, range(6))
+        start = with_delay(theta, samples * motion.dt_s)
+        theta, residuals, _, _ = descend(fit.problem, start, but_delay(fit.free))
         if float(residuals @ residuals) < least:
             short_ms, long_ms = (1e3 * t[1] / t[0] for t in (fit.theta, theta))
             text = (
@@ -107,12 +108,12 @@ def shifts(fit: Fit) -> tuple[Shift, Shift]:
     motion, gains = fit.problem.motions[0], fit.problem.filters[0]
     width = 2 * round(SMOOTHING_S / 2 / motion.dt_s) + 1
     found = []
-    jacobian = fit.jacobian[:, :6]
+    jacobian = fit.but_delay
     inverse, e = inverse_of(jacobian.T @ jacobian)[0], fit.residuals
     coloured = 1.0 + 2.0 * max(0.0, float(expected_correlation(fit)[0]))
     whole = np.column_stack([e, courses(fit)])
     whole = whole - jacobian @ (inverse @ (jacobian.T @ whole))
-    for kind, values in ((VOLTAGE, motion.delayed(float(fit.theta[6]))), (CURRENT, motion.current)):
+    for kind, values in ((VOLTAGE, voltage_v(motion, fit.theta)), (CURRENT, motion.current)):
         slope = np.gradient(moving_mean(values, width))
         answer = answers(motion, fit.theta, gains, kind, [slope], _no_rise(kind, motion.n))[:, 0]
         rest = answer - jacobian @ (inverse @ (jacobian.T @ answer))
@@ -141,7 +142,7 @@ def searched(fit: Fit, first: Shift) -> float | None:
 
     def left(delay: float) -> float:
         nonlocal last
-        last = maximum_likelihood.fit([motion], np.append(last.theta[:6], delay * motion.dt_s), range(6))
+        last = fitted([motion], with_delay(last.theta, delay * motion.dt_s), but_delay(last.free))
         if not (np.isfinite(last.residuals).all() and np.isfinite(last.information).all()):
             return float("nan")
         return shifts(last)[0].samples - delay

@@ -134,8 +134,8 @@ async def test_each_pass_is_told_beside_what_was_predicted(
     worse = {axis: 3 * planned.before.predicted_mm[axis] - 2 * reference[axis] for axis in reference}
     cases = [
         (planned.after.predicted_mm, "Finished", "info"),
-        (planned.before.predicted_mm, "Finished", "minor"),
         (worse, "StaleData", "MAJOR"),
+        (planned.before.predicted_mm, "Finished", "minor"),
     ]
     async with opened(config, mill) as shop:
         for number, (is_at, cause, severity) in enumerate(cases, 1):
@@ -152,7 +152,9 @@ async def test_each_pass_is_told_beside_what_was_predicted(
             notice = next(notice for notice in reversed(shop.told) if notice.code == "PassMeasured")
             assert (notice.severity, notice.text.startswith(told["text"])) == (severity, True)
             assert (told["pass"], told["ended_by"]) == (number, cause)
-    first, second, third = shop.desk.passes
+        refused = await shop.arm(program)
+    assert (refused["ok"], refused["code"]) == (False, "PromiseBroken"), refused
+    first, third, second = shop.desk.passes
     assert first["measured"]["rms_um"] == pytest.approx(first["predicted"]["rms_um"], rel=1e-3)
     assert second["measured"]["rms_um"] == pytest.approx(second["predicted_without"]["rms_um"], rel=1e-3)
     assert "pass 1 of gentle.ngc: contour error measured" in first["text"]

@@ -48,7 +48,8 @@ def test_json_holds_every_window_and_the_pool(shuttle: Path) -> None:
         assert window["reasons"] == []
         assert 98 < window["fit_percent"] < 100
         assert set(window) == {
-            "start_s", "end_s", "direction", "parameters", "validated", "fit_percent", "reasons",
+            "start_s", "end_s", "direction", "parameters", "terms", "validated", "fit_percent", "unexplained_um",
+            "reasons", "warnings",
         }  # fmt: skip
     pooled = told["pooled"]
     assert pooled["windows_used"] == 2

@@ -98,7 +98,7 @@ def test_an_alarm_is_not_raised_again_after_a_restart() -> None:
     stds = np.sqrt(np.diag(COVARIANCE))
     worn = np.array([*list(BENCH.as_dict().values())[:5], 10.5])
     tracker = DriftTracker(Maintenance(), "X")
-    tracker.resume(BENCH, [Point(worn, stds, k) for k in range(4)])
+    tracker.resume({1: BENCH}, [Point(worn, stds, k) for k in range(4)])
     assert tracker.alarms == {"Cd"}
     assert tracker.update(replace(BENCH, Cd=10.5), COVARIANCE, 9) == []
     back = [notice for k in range(6) for notice in tracker.update(BENCH, COVARIANCE, 10 + k)]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fdhil.errors import ConfigError
-from fdhil.prediction.models import load_models, models_for, nominal_models
+from fdhil.prediction.models import load_model_file, load_models, models_for, nominal_models, with_loops
 from tests.bench import bench_config
 from tests.paths import trajectory
 
@@ -42,6 +42,18 @@ def test_reads_what_it_should(tmp_path: Path) -> None:
         ({"Jt": None}, "X.Jt: must be a number, not None"),
         ({"ft": True}, "X.ft: must be a number"),
         ({"J": 0.07}, "did you mean 'Jt'"),
+        ({"terms": {"laod": 1.0}}, "X.terms.laod: is no parameter (did you mean 'load'?)"),
+        ({"terms": {"Cd": 1.0}}, "X.terms.Cd: is no parameter"),
+        ({"terms": {"load": "2"}}, "X.terms.load: must be a number, not '2' (in N.m)"),
+        ({"terms": {"viscous_positive": -0.1}}, "X.terms.viscous_positive: must be at least 0"),
+        ({"terms": {"stribeck": 1.0}}, "X.terms.stribeck: needs stribeck_speed beside it"),
+        ({"terms": {"stribeck": 1.0, "stribeck_speed": 0}}, "X.terms.stribeck_speed: must be above 0"),
+        ({"terms": {"stribeck": -6.0, "stribeck_speed": 5}}, "X.terms.stribeck: takes more from the dry friction"),
+        ({"terms": {"stribeck_speed": 5}}, "X.terms.stribeck_speed: means nothing without stribeck"),
+        ({"terms": {"ripple_motor_24_phase": 1}}, "means nothing without ripple_motor_24"),
+        ({"terms": {"ripple_motor_0": 1}}, "X.terms.ripple_motor_0: is no parameter"),
+        ({"terms": [1]}, "X.terms: must be a table of names, not [1]"),
+        ({"loops": 3}, "X.loops: must be a table of names, not 3"),
     ],
 )
 def test_names_the_fault(tmp_path: Path, change: dict[str, Any], message: str) -> None:
@@ -49,6 +61,50 @@ def test_names_the_fault(tmp_path: Path, change: dict[str, Any], message: str) -
     with pytest.raises(ConfigError) as caught:
         load_models(write(tmp_path, json.dumps({"X": GOOD | change})))
     assert message in str(caught.value)
+
+
+def test_terms_and_loops_are_read(tmp_path: Path) -> None:
+    """Terms join the parameters in their order; keys of the regulators take the place of the configuration's."""
+    terms = {"load": -2.5, "stribeck": -1.0, "stribeck_speed": 12.0, "ripple_screw_1": 0.2, "ripple_screw_1_phase": -1}
+    found = load_model_file(
+        write(tmp_path, json.dumps({"X": GOOD | {"terms": terms, "loops": {"speed_kp": 21.0, "speed_filter_s": 5e-4}}}))
+    )
+    assert dict(found.parameters["X"].terms) == terms
+    config = bench_config()
+    changed = with_loops(config, found.loops, "m.json")
+    assert changed.axis["X"].regulators.speed_kp == 21.0
+    assert changed.axis["X"].regulators.speed_filter_s == 5e-4
+    assert changed.axis["Y"] == config.axis["Y"]
+    assert changed.store == config.store
+
+
+@pytest.mark.parametrize(
+    ("loops", "message"),
+    [
+        ({"speed_k": 21.0}, "axis.X.regulators.speed_k: is no key of this section (did you mean 'speed_kp'?)"),
+        ({"speed_kp": "fast"}, "axis.X.regulators.speed_kp"),
+        ({"structure": "double_pi"}, "double_pi needs position_ki_per_s2"),
+    ],
+)
+def test_loops_that_no_drive_has_are_refused(loops: dict[str, Any], message: str) -> None:
+    """In the words of the configuration, whose keys they are."""
+    with pytest.raises(ConfigError) as caught:
+        with_loops(bench_config(), {"X": loops}, "m.json")
+    assert message in str(caught.value)
+
+
+def test_a_configured_resonance_is_in_the_model() -> None:
+    """Unless the model has its own."""
+    config = bench_config()
+    axis = config.axis["X"].model_copy(update={"resonance_hz": 80.0, "resonance_damping": 0.05})
+    config = config.model_copy(update={"axis": {**config.axis, "X": axis}})
+    path = trajectory(np.column_stack([np.linspace(0, 1, 10), np.zeros(10)]))
+    nominal = nominal_models(config)
+    found = models_for(path, nominal, config, "m.json")
+    assert dict(found["X"].terms) == {"resonance": 80.0, "resonance_damping": 0.05}
+    assert found["Y"].terms == ()
+    own = nominal["X"].changed(resonance=60.0)
+    assert models_for(path, nominal | {"X": own}, config, "m.json")["X"] == own
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"X": 3}', "no json", '{"X": {"R": 1}}', "[" * 100_000])

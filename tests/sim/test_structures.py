@@ -14,10 +14,10 @@ from tests.bench import bench_document
 def test_other_regulators_are_refused() -> None:
     """They would be simulated as p_pi_pi silently."""
     document = bench_document("X")
-    document["axis"]["X"]["regulators"] |= {"structure": "pid", "speed_ki": 0.0, "current_delay_cycles": 1}
+    document["axis"]["X"]["regulators"] |= {"structure": "pid", "speed_ki": 0.0, "torque_feedforward": 1.0}
     with pytest.raises(ConfigError) as caught:
         Drive("X", config.parse(document), np.random.default_rng(0))
     assert [fault.path for fault in caught.value.faults] == [
         "axis.X.regulators.structure",
-        "axis.X.regulators.current_delay_cycles",
+        "axis.X.regulators.torque_feedforward",
     ]

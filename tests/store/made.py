@@ -94,4 +94,5 @@ def published(revision: int = 1, axis: str = "X", parameters: Parameters = BENCH
     """Return a parameter set with a covariance of its own."""
     root = np.random.default_rng(revision).normal(0, 1e-3, (6, 6))
     covariance = frozen(root @ root.T)
-    return ParameterSet(axis, revision, parameters, covariance, 3, 12_345 + revision, 21.5, "0123456789abcdef")
+    digest, ticks = "0123456789abcdef", (12_345,)
+    return ParameterSet(axis, revision, parameters, covariance, 3, 12_345 + revision, 21.5, digest, ticks)

@@ -106,10 +106,11 @@ def first_schema(folder: Path) -> None:
     with History.open(folder) as history:
         history.add_revision(published(), [4], STAMP)
         (row,) = history._db.execute("SELECT * FROM revisions").fetchall()
+        row = row[: -len(("digest", "terms", "unexplained_um", "warnings"))]
     (folder / FILE_NAME).unlink()
     db = sqlite3.connect(folder / FILE_NAME)
     db.executescript(schema._FIRST + "PRAGMA user_version = 1;")
-    db.execute(f"INSERT INTO revisions VALUES ({', '.join('?' * (len(row) - 1))})", row[:-1])
+    db.execute(f"INSERT INTO revisions VALUES ({', '.join('?' * len(row))})", row)
     db.commit()
     db.close()
 

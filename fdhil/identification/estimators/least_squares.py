@@ -19,6 +19,7 @@ from fdhil.identification.filtering import all_about, impulse_response, reach, z
 from fdhil.identification.identifiability import empty_estimate, judge
 from fdhil.identification.motion import noise_levels, surely_moving
 from fdhil.identification.normal import solve
+from fdhil.identification.signals import mended
 from fdhil.identification.windows import carried
 from fdhil.records import PARAMETERS, Bool, Estimate, Float, Reason, Result, Window
 
@@ -84,6 +85,7 @@ def regressors(signals: Signals, dt_s: float, operator: Operator = ZERO_FORCING_
 
 def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
     """Fit [5] and [6] to the windows together."""
+    windows = [mended(w, settings.speed_source) for w in windows]
     parts = [regressors(align(w, settings), w.dt_s) for w in windows if w.voltage_v is not None]
     parts = [p for p in parts if p[0].shape[0] > 0]
     rows = sum(p[0].shape[0] for p in parts)

@@ -10,7 +10,7 @@ information matrix is what remains of the steps.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,189 +18,27 @@ from fdhil.config import Identification
 from fdhil.identification.covariance import TESTED_LAGS, aliasing, robust, suspicious
 from fdhil.identification.delay import coarse_delay
 from fdhil.identification.estimators import least_squares
+from fdhil.identification.fit import Fit, but_delay, descend, fit, jacobian, pose, typical, with_delay
 from fdhil.identification.identifiability import admissible, judge
-from fdhil.identification.innovations import Gains, gains_of, innovations, whiten
-from fdhil.identification.kalman import CD, DELAY, FT, JT, K, L, R
-from fdhil.identification.motion import UNKNOWN, Motion, Noise, prepare
-from fdhil.identification.noise import fit_noise
+from fdhil.identification.kalman import DELAY, JT, K, L, R
+from fdhil.identification.motion import UNKNOWN, Motion, prepare
 from fdhil.identification.normal import inverse_of, solve
-from fdhil.identification.slow_descent import Likelihood, ascend, likelier_delay
+from fdhil.identification.selection import joined
+from fdhil.identification.signals import mended
+from fdhil.identification.slow_descent import Likelihood, likelier_delay
 from fdhil.identification.slow_start import slow_least_squares, slow_start, with_course
-from fdhil.identification.slow_voltage import course_effect, in_order
+from fdhil.identification.slow_voltage import in_order
+from fdhil.identification.term_estimates import told_terms
 from fdhil.records import PARAMETERS, Estimate, Float, Result, Window
 
+__all__ = ["Fit", "descend", "estimate", "fit", "fit_windows", "jacobian", "pose", "typical"]
 NAME = "maximum_likelihood"
-RENEWALS = 3
-STEPS = 16
-CONVERGED = 1e-3  # of a standard deviation
-ROUGH = 0.3  # of a standard deviation: near enough to tell the noise levels
-KEPT = 0.2  # of the step before: as long as steps shorten by more, their jacobian is good enough
-SLACK = 1e-6  # of the squares' sum, by which a step may miss the bottom
-DIFFERENCE = 1e-5
-DELAY_DIFFERENCE_S = 1e-5
 SURE = 5.0  # standard deviations beyond which a delay is believed
-SHAPE_DOUBT = 1.5  # of the back-EMF's ramp within a sample: one standard deviation of the voltage's course
 LEAST_DELAY = 0.05  # of a sample; smaller ones cannot be told from the voltage's course within a sample
 CHANCE = 2.0  # standard deviations of a delay that are chance, not doubt
-SETTLED = 0.25  # squared standard deviations moved: for less, no noise level changes by a thousandth
 INSTANT_DELAY = 0.5  # of a row
 FLOORS = np.array([1e-4, 1e-4, 1e-9])  # of R, K and Jt
 LEAST_TIME_CONSTANT_S = 1e-4  # of the winding: noise may drive the starting L below 0
-
-
-@dataclass(frozen=True, slots=True)
-class Problem:
-    """Windows ready to be fitted: each with its noise levels and, for the parameters they were made for, its filter."""
-
-    motions: tuple[Motion, ...]
-    noises: tuple[Noise, ...]
-    filters: tuple[Gains, ...]
-
-    def residuals(self, theta: Float) -> Float:
-        """Return the whitened innovations (m,) of all windows, each by the filter that is right for ``theta`` (7,).
-
-        ``theta`` is [R, L, K, Jt, ft, Cd, delay].
-        """
-        column: Float = self.columns(theta[None])[:, 0]
-        return column
-
-    @property
-    def slow(self) -> bool:
-        """Whether the voltage comes more slowly than the drive's rows."""
-        return any(m.slow is not None for m in self.motions)
-
-    def columns(self, thetas: Float) -> Float:
-        """Return the whitened innovations (m, q) for each row of ``thetas`` (q, 7)."""
-        pairs = zip(self.motions, self.noises, strict=True)
-        return np.concatenate([whiten(m, thetas, np.tile(s.vector() ** 2, (len(thetas), 1)))[0] for m, s in pairs])
-
-    def shape_effect(self, theta: Float) -> Float:
-        """Return how the innovations (m,) change with what is not known of the voltage's course within its samples."""
-        if self.slow:
-            pairs = zip(self.motions, self.noises, strict=True)
-            return np.concatenate([course_effect(m, theta, s.vector() ** 2) for m, s in pairs])
-        return self._all(theta, 1.0 + SHAPE_DOUBT) - self._all(theta, 1.0)
-
-    def _all(self, theta: Float, emf_share: float) -> Float:
-        pairs = zip(self.motions, self.filters, strict=True)
-        return np.concatenate([innovations(m, theta, f, emf_share=emf_share) for m, f in pairs])
-
-
-@dataclass(frozen=True, slots=True)
-class Fit:
-    """The end of a fit: ``theta`` (7,), information (k, k) of the ``free`` entries, innovations (m,), noises.
-
-    ``delay_doubt_s`` is how much of a delay may be the voltage's course within its samples, or the other way round.
-    """
-
-    theta: Float
-    information: Float
-    free: tuple[int, ...]
-    residuals: Float
-    jacobian: Float
-    problem: Problem
-    converged: bool
-    delay_doubt_s: float = 0.0
-
-    def by_window(self, values: Float) -> list[Float]:
-        """Return ``values`` (m, ...) of all innovations in parts, one for each window."""
-        return np.split(values, np.cumsum([2 * m.n + m.samples for m in self.problem.motions])[:-1])
-
-    def by_equation(self) -> dict[str, Float]:
-        """Return the innovations of [5], of the current or the samples of a slow voltage, and of [6], the speed's."""
-        pairs = list(zip(self.problem.motions, self.by_window(self.residuals), strict=True))
-        return {
-            "electrical": np.concatenate([e[2 * m.n :] if m.slow is not None else e[0::2] for m, e in pairs]),
-            "mechanical": np.concatenate([e[1 : 2 * m.n : 2] for m, e in pairs]),
-        }
-
-
-def pose(motions: Sequence[Motion], theta: Float, noises: Sequence[Noise]) -> Problem:
-    """Return the problem with the filters made for ``theta``."""
-    filters = tuple(gains_of(m, theta, s) for m, s in zip(motions, noises, strict=True))
-    return Problem(tuple(motions), tuple(noises), filters)
-
-
-def jacobian(problem: Problem, theta: Float, base: Float, free: Sequence[int], scales: Float) -> Float:
-    """Return minus the derivative (m, k) of the innovations by the ``free`` entries of theta, filter included."""
-    steps = np.array([DELAY_DIFFERENCE_S if j == DELAY else DIFFERENCE * scales[j] for j in free])
-    moved = np.tile(theta, (len(free), 1))
-    moved[np.arange(len(free)), list(free)] += steps
-    changes: Float = (base[:, None] - problem.columns(moved)) / steps
-    return changes
-
-
-def typical(theta: Float, motions: Sequence[Motion]) -> Float:
-    """Return the typical size (7,) of each entry: friction is measured against the torque and speed there are."""
-    torque = abs(theta[K]) * max(float(np.abs(m.current).max()) for m in motions)
-    speed = max(float(np.abs(m.speed).max()) for m in motions)
-    sizes = np.abs(theta)
-    sizes[FT] = max(sizes[FT], 1e-3 * torque / speed)
-    sizes[CD] = max(sizes[CD], 1e-3 * torque)
-    return sizes
-
-
-def descend(
-    problem: Problem, theta: Float, free: Sequence[int], enough: float = CONVERGED
-) -> tuple[Float, Float, Float, bool]:
-    """Take Gauss-Newton steps until one is below ``enough`` standard deviations.
-
-    Return theta, innovations (m,), jacobian (m, k), and success. The jacobian hardly changes near the bottom, and costs
-    as much as all else: it is kept while each step is much shorter than the one before.
-    """
-    residuals = problem.residuals(theta)
-    last, j, inverse, norms = 0.0, *_slopes(problem, theta, residuals, free)
-    for _ in range(STEPS):
-        step = inverse @ (j.T @ residuals)
-        size = float(np.abs(step * norms).max())
-        if last and size > KEPT * last:
-            j, inverse, norms = _slopes(problem, theta, residuals, free)
-            step = inverse @ (j.T @ residuals)
-            size = float(np.abs(step * norms).max())
-        if not np.isfinite(norms).all() or (norms == 0).any():
-            return theta, residuals, j, False
-        share, ceiling = 1.0, float(residuals @ residuals) * (1 + SLACK)
-        while share > 1e-3:
-            trial = theta.copy()
-            trial[list(free)] += share * step
-            if admissible(trial):
-                moved = problem.residuals(trial)
-                if np.isfinite(moved).all() and float(moved @ moved) <= ceiling:
-                    theta, residuals = trial, moved
-                    break
-            share *= 0.5
-        else:
-            return theta, residuals, j, True  # nothing lower along the step: this is the bottom, to rounding
-        if size < enough:
-            return theta, residuals, j, True
-        last = size
-    return theta, residuals, j, False
-
-
-def _slopes(problem: Problem, theta: Float, residuals: Float, free: Sequence[int]) -> tuple[Float, Float, Float]:
-    """Return the jacobian (m, k), the inverse (k, k) of its Gram matrix, and the lengths (k,) of its columns."""
-    j = jacobian(problem, theta, residuals, free, typical(theta, problem.motions))
-    gram = j.T @ j
-    return j, inverse_of(gram)[0], np.sqrt(np.diag(gram))
-
-
-def fit(motions: Sequence[Motion], start: Float, free: Sequence[int]) -> Fit:
-    """Alternate between the parameters and the noise levels, from ``start`` (7,)."""
-    theta, noises = start.copy(), [m.noise for m in motions]
-    for turn in range(RENEWALS):
-        problem = Problem(tuple(motions), tuple(noises), ())
-        before = theta
-        if problem.slow:
-            likelihood = Likelihood(problem.motions, problem.noises)
-            theta, residuals, j, converged = ascend(likelihood, theta, free, typical(theta, motions))
-        else:
-            theta, residuals, j, converged = descend(problem, theta, free, CONVERGED if turn else ROUGH)
-        information = j.T @ j
-        moved = theta[list(free)] - before[list(free)]
-        if turn and float(moved @ information @ moved) < SETTLED:
-            break
-        noises = [fit_noise(m, theta, s) for m, s in zip(motions, noises, strict=True)]
-    return Fit(theta, information, tuple(free), residuals, j, pose(motions, theta, problem.noises), converged)
 
 
 def starting_point(first: Float | None) -> Float | None:
@@ -218,6 +56,7 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
     A delay between voltage and the other signals is fitted too when the data surely show one, or when the voltage has
     a clock of its own.
     """
+    windows = [mended(w, settings.speed_source) for w in windows]
     slow = [w for w in windows if w.slow_voltage is not None]
     if slow:
         return _fit_slow(slow, settings)
@@ -228,10 +67,11 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
         return None
     motions = [prepare(w) for w in usable]
     delays = [coarse_delay(s, w.dt_s) for s, w in zip(signals, usable, strict=True)]
+    command = settings.voltage_source != "terminals"
     if any(w.voltage_delay_s is not None for w in usable):
-        return _fit_separate(motions, start, delays)
+        return joined(_fit_separate(motions, start, delays), command, finish)
     start[DELAY] = float(np.median(delays))
-    return _fit_together(motions, start)
+    return _with_terms(_fit_together(motions, start), command, searched=start[DELAY] == 0.0)
 
 
 def _fit_together(motions: Sequence[Motion], start: Float) -> Fit:
@@ -240,15 +80,41 @@ def _fit_together(motions: Sequence[Motion], start: Float) -> Fit:
     Regulators act several times within a sample, which looks like a delay of a few per cent of it, but moves L
     otherwise. So a small delay is not taken out: what it would change is a doubt, and so it is about a larger one.
     """
-    least = LEAST_DELAY * min(m.dt_s for m in motions)
     if start[DELAY] == 0.0:
-        plain = fit(motions, start, range(6))
-        delay, std = delay_score(plain)
-        if abs(delay) < max(SURE * std, least):
-            beyond = np.sqrt(max(0.0, delay**2 - (CHANCE * std) ** 2))
-            return replace(plain, delay_doubt_s=float(beyond))
-        start = np.append(plain.theta[:6], delay)
-    return replace(fit(motions, start, range(7)), delay_doubt_s=least / 2)
+        return _delay_told(fit(motions, start, range(6)))
+    return replace(fit(motions, start, range(7)), delay_doubt_s=_least_delay_s(motions) / 2)
+
+
+def _least_delay_s(motions: Sequence[Motion]) -> float:
+    return LEAST_DELAY * min(m.dt_s for m in motions)
+
+
+def _delay_told(plain: Fit) -> Fit:
+    """Return a fit without delay with its doubt about one, or the fit with the delay that the data surely show."""
+    motions = plain.problem.motions
+    least = _least_delay_s(motions)
+    delay, std = delay_score(plain)
+    if abs(delay) >= max(SURE * std, least):
+        free = sorted({*plain.free, DELAY})
+        late = replace(fit(motions, with_delay(plain.theta, delay), free), delay_doubt_s=least / 2)
+        if not motions[0].courses:
+            return late
+        told = finish(late)  # with as much colour as is left beside terms
+        if told.delay_s is None or told.delay_std_s is None or abs(told.delay_s) >= SURE * told.delay_std_s:
+            return late
+    beyond = np.sqrt(max(0.0, delay**2 - (CHANCE * std) ** 2))
+    return replace(plain, delay_doubt_s=float(beyond))
+
+
+def _with_terms(base: Fit, command: bool, searched: bool) -> Fit:
+    """Return the fit with the terms that join it; a delay that was ``searched`` for is told anew, they look alike."""
+    result = joined(base, command, finish)
+    if result is base or not searched:
+        return result
+    if DELAY in result.free:
+        motions, free = result.problem.motions, but_delay(result.free)
+        result = fit(motions, with_delay(result.theta, 0.0), free)
+    return _delay_told(result)
 
 
 def _fit_separate(motions: Sequence[Motion], start: Float, delays: Sequence[float]) -> Fit:
@@ -304,7 +170,7 @@ def _fit_slow(windows: Sequence[Window], settings: Identification) -> Fit | None
 def delay_score(plain: Fit) -> tuple[float, float]:
     """Return the delay (s) that one Newton step from a fit without delay would add, and its standard deviation."""
     d = delay_direction(plain)
-    rest = d - plain.jacobian @ solve(plain.jacobian, d)[0]
+    rest = d - plain.but_delay @ solve(plain.but_delay, d)[0]
     weight = float(rest @ rest)
     return (float(rest @ plain.residuals) / weight, weight**-0.5) if weight > 0 else (0.0, np.inf)
 
@@ -318,18 +184,18 @@ def delay_direction(result: Fit) -> Float:
 
 
 def doubts(result: Fit, inverse: Float) -> Float:
-    """Return what noise cannot explain: one standard deviation (7, 2) of the six parameters and the delay.
+    """Return what noise cannot explain: one standard deviation (k, 2) of the entries of theta.
 
     An interval mean leaves the voltage's course within the sample open: its largest part, the back-EMF's ramp, is
     known but for the regulators' answer to it (first column); what looks like a delay is the second. Either is the
     same in all windows of a drive, so that more windows do not lessen it.
     """
-    columns = np.zeros((7, 2))
+    columns = np.zeros((result.theta.size, 2))
     free = list(result.free)
     columns[free, 0] = inverse @ (result.jacobian.T @ result.problem.shape_effect(result.theta))
     if result.delay_doubt_s > 0.0:
-        six = result.jacobian[:, :6]
-        columns[:6, 1] = -result.delay_doubt_s * solve(six, delay_direction(result))[0]
+        others = but_delay(free)
+        columns[others, 1] = -result.delay_doubt_s * solve(result.but_delay, delay_direction(result))[0]
         columns[DELAY, 1] = result.delay_doubt_s
     return columns
 
@@ -371,23 +237,34 @@ def robust_inverse(result: Fit, inverse: Float) -> Float:
 def finish(result: Fit) -> Estimate:
     """Return the fit as an estimate with its covariance."""
     inverse, condition = inverse_of(result.information)
-    k = len(PARAMETERS)
+    kept = [k for k, j in enumerate(result.free) if j != DELAY]
+    told = [j for j in result.free if j != DELAY]
     first = result.problem.motions[0]
-    alias = aliasing(first.voltage_sampling, first.voltage_period_s)
+    alias = np.zeros(len(told))
+    alias[: len(PARAMETERS)] = aliasing(first.voltage_sampling, first.voltage_period_s)
     systematic = doubts(result, inverse)
     held = robust_inverse(result, inverse)
     late = DELAY in result.free
+    at = result.free.index(DELAY) if late else 0
+    chance, beyond = (part[np.ix_(kept, kept)] for part in (inverse, held - inverse))
+    own = systematic[told]
+    values = result.theta[told]
     answer = Estimate(
         method=NAME,
         names=PARAMETERS,
-        values=result.theta[:k],
-        covariance=inverse[:k, :k] + systematic[:k] @ systematic[:k].T + np.diag(np.square(alias * result.theta[:k])),
+        values=values[: len(PARAMETERS)],
+        covariance=chance + own @ own.T + np.diag(np.square(alias * values)),
         residuals=result.by_equation(),
         result=Result.OK if result.converged else Result.DIVERGED,
         delay_s=float(result.theta[DELAY]) if late else None,
-        delay_std_s=float(np.sqrt(held[DELAY, DELAY] + systematic[DELAY] @ systematic[DELAY])) if late else None,
-        systematic=systematic[:k],
+        delay_std_s=float(np.sqrt(held[at, at] + systematic[DELAY] @ systematic[DELAY])) if late else None,
+        systematic=own,
     )
+    if first.courses or first.speed_late is not None:
+        answer, beyond = told_terms(answer, result, values, beyond)
     # what the data can tell is the information's to say; that residuals are coloured is no lack of excitation
-    judged = judge(answer, condition, max(float(np.abs(m.speed).max()) for m in result.problem.motions))
-    return replace(judged, covariance=judged.covariance + (held - inverse)[:k, :k])
+    top_rad_s, top_a = (
+        max(float(np.abs(getattr(m, n)).max()) for m in result.problem.motions) for n in ("speed", "current")
+    )
+    judged = judge(answer, condition, top_rad_s, abs(float(result.theta[K])) * top_a)
+    return replace(judged, covariance=judged.covariance + beyond)

@@ -18,6 +18,7 @@ from fdhil.config import Identification
 from fdhil.identification.covariance import aliasing
 from fdhil.identification.estimators.least_squares import fit_two_steps, too_short
 from fdhil.identification.motion import noise_levels, surely_moving
+from fdhil.identification.signals import mended
 from fdhil.identification.windows import carried
 from fdhil.records import Estimate, Float, VoltageSampling, Window
 
@@ -27,7 +28,7 @@ LEAST_STEPS = 8
 
 def estimate(windows: Sequence[Window], settings: Identification) -> Estimate:
     """Fit [1], then [2] with its K, by partial moments over a horizon of one period of the low-pass's corner."""
-    usable = [w for w in windows if w.voltage_v is not None]
+    usable = [mended(w, settings.speed_source) for w in windows if w.voltage_v is not None]
     parts = [moments(w, horizon_steps(settings, w.dt_s)) for w in usable]
     if sum(p[0].shape[0] for p in parts) < 8:
         return too_short(NAME, sum(p[0].shape[0] for p in parts))

@@ -51,20 +51,22 @@ class Feedback:
         self._inc_per_rad = ratings.increments_per_rev / (2 * math.pi)
         self._counts_per_a = 1e3 / ratings.rated_current_a
         self._kv, self._kff = regulators.position_gain_per_s, regulators.speed_feedforward
+        self._bus_mv = regulators.voltage_limit_v * 1e3
         self.following_error = False
         self.digital_inputs = 0
 
     @property
     def true_position(self) -> int:
-        """The table's encoder, increments: what the position loop closes on."""
-        return round(self._physics.table_rad * self._inc_per_rad)
+        """What the position loop closes on, increments."""
+        return round(self._physics.seen.position_rad * self._inc_per_rad)
 
     def sample(self, tick: int) -> int:
         """Sample all objects now; the voltage is the mean of the cycle that ended. Returns the following error."""
         physics, numbers = self._physics, self._numbers
         true_position = self.true_position
+        seen = physics.seen
         position, speed, current, voltage = self._sensors.read(
-            true_position, physics.speed_rad_s, physics.current_a, physics.voltage_mean_v
+            true_position, seen.speed_rad_s, seen.current_a, seen.voltage_v
         )
         demand = clip(self._motion.demand, INT32)
         shown = clip(position, INT32)
@@ -77,6 +79,7 @@ class Feedback:
         numbers[0x606B00] = self._speed_demand(true_position)
         numbers[0x606C00] = speed_counts
         numbers[0x607700] = numbers[0x607800] = current_counts
+        numbers[0x607900] = round(seen.bus * self._bus_mv)
         numbers[0x210100] = voltage_counts
         numbers[0x60F400] = clip(demand - true_position, INT32)
         numbers[0x60FD00] = self.digital_inputs

@@ -13,6 +13,7 @@ direction; position is the shaft's angle, the table follows it through the backl
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
@@ -24,7 +25,7 @@ from fdhil.records import PARAMETERS, Float, Parameters
 Command = tuple[float, float, float, float, float, float, float, float]
 
 # what regulators other than these would need, this drive does not have
-_PLAIN = {"structure": "p_pi_pi", "torque_feedforward": 0.0, "setpoint_filter_s": 0.0, "current_delay_cycles": 0}
+_PLAIN = {"structure": "p_pi_pi", "torque_feedforward": 0.0}
 # places in the state vector
 CURRENT, SPEED, ANGLE, TABLE, SPEED_INTEGRAL, CURRENT_INTEGRAL = range(6)
 # places in the loops vector
@@ -163,10 +164,24 @@ def run_cycle(
     return total / index, limits
 
 
+class Seen(NamedTuple):
+    """What the drive's own sensors see at a SYNC, without their noise; the position is that of the position loop.
+
+    ``bus`` is the DC bus' voltage as a share of what it has without load.
+    """
+
+    position_rad: float
+    speed_rad_s: float
+    current_a: float
+    voltage_v: float
+    bus: float = 1.0
+
+
 class Physics:
     """One axis' mechanics and loops. Angles in rad, in the drive's own direction.
 
-    ``voltage_v`` (n,) holds the terminal voltage of each current step of the last cycle, ``voltage_mean_v`` their mean.
+    ``voltage_v`` (n,) holds the terminal voltage of each current step of the last cycle, ``voltage_mean_v`` their mean;
+    ``seen`` is what the drive knows of all that.
     """
 
     def __init__(
@@ -233,6 +248,7 @@ class Physics:
 
     def _unpack(self) -> None:
         self.current_a, self.speed_rad_s, self.angle_rad, self.table_rad, _, _ = self._state.tolist()
+        self.seen = Seen(self.table_rad, self.speed_rad_s, self.current_a, self.voltage_mean_v)
 
 
 def true_parameters(nominal: Nominal, twin: SimAxis) -> Parameters:

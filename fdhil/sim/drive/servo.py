@@ -12,7 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdhil.config import MachineConfig, SimAxis
+from fdhil.config import MachineConfig, Noise, SimAxis
+from fdhil.records import PARAMETERS, Parameters
 from fdhil.sim.drive.dictionary import Dictionary
 from fdhil.sim.drive.emergency_and_heartbeat import (
     FOLLOWING_ERROR,
@@ -31,12 +32,33 @@ from fdhil.sim.drive.objects import NO_WINDOW, Ratings, drive_objects
 from fdhil.sim.drive.pdo import PdoEngine
 from fdhil.sim.drive.physics import Physics, check_structure, true_parameters
 from fdhil.sim.drive.power import PowerStage, State
+from fdhil.sim.drive.reality import RealPhysics, is_plain, real_loops
 from fdhil.sim.drive.sdo import SdoServer
 from fdhil.sim.drive.sensors import DriveFaults, Sensors
 from fdhil.sim.drive.setpoints import CyclicSetpoints
 from fdhil.sim.frame import Frame
 
 OFF, STOPPED, OPERATIONAL, PRE_OPERATIONAL = -1, 0x04, 0x05, 0x7F
+
+
+def _physics(parameters: Parameters, config: MachineConfig, axis: str, twin: SimAxis, rad_per_mm: float) -> Physics:
+    """Make the axis' mechanics and loops: the paper's, or a real machine's where the configuration names any of it."""
+    section = config.axis[axis]
+    increments, period_s = section.drive.increments_per_rev, config.machine.sync_period_s
+    start_rad, backlash_rad = twin.start_mm * rad_per_mm, abs(twin.backlash_um * 1e-3 * rad_per_mm)
+    loops = section.regulators
+    if is_plain(twin.reality, loops):
+        return Physics(parameters, loops, period_s, increments, angle_rad=start_rad, backlash_rad=backlash_rad)
+    return RealPhysics(
+        parameters, loops, period_s, increments, twin.reality,
+        rad_per_mm=rad_per_mm, angle_rad=start_rad, backlash_rad=backlash_rad,
+    )  # fmt: skip
+
+
+def _noise(config: MachineConfig, twin: SimAxis) -> Noise:
+    """Return the sensors' white noise: a speed that is made of encoder positions has none of its own."""
+    white = twin.reality.speed_object == "shaft"
+    return config.sim.noise if white else config.sim.noise.model_copy(update={"speed_rad_s": 0.0})
 
 
 class Drive:
@@ -56,17 +78,11 @@ class Drive:
         self.node_id = self.ratings.node_id
         self.faults = DriveFaults()
         self._mm_per_rad = self.ratings.sign * section.screw_pitch_mm / (2 * math.pi)
+        real = real_loops(twin.reality, section.regulators)
         self._reference_c = self._celsius = config.sim.thermal.ambient_c
         self._per_kelvin = (twin.ft_per_kelvin, twin.Cd_per_kelvin)
         self._parameters = true_parameters(section.nominal, twin)
-        self.physics = Physics(
-            self._parameters,
-            section.regulators,
-            config.machine.sync_period_s,
-            self.ratings.increments_per_rev,
-            angle_rad=twin.start_mm / self._mm_per_rad,
-            backlash_rad=abs(twin.backlash_um * 1e-3 / self._mm_per_rad),
-        )
+        self.physics = _physics(self._parameters, config, axis, twin, 1 / self._mm_per_rad)
         self.dictionary = Dictionary(drive_objects(config, axis))
         self.power = PowerStage(self.dictionary.number)
         self.motion = Motion(
@@ -81,11 +97,11 @@ class Drive:
         self.feedback = Feedback(
             self.dictionary,
             self.ratings,
-            section.regulators,
+            real,
             self.physics,
             self.power,
             self.motion,
-            Sensors(config.sim.noise, self.faults, rng),
+            Sensors(_noise(config, twin), self.faults, rng),
         )
         self._attach()
 
@@ -316,6 +332,9 @@ class Drive:
 
         TypeError for another name, ValueError for a value that no plant has.
         """
+        unknown = [name for name in values if name not in PARAMETERS]
+        if unknown:
+            raise TypeError(f"{', '.join(unknown)} is no parameter of a drive")
         changed = self._parameters.changed(**values)
         for name, value in changed.as_dict().items():
             if not (math.isfinite(value) and value >= 0 and (value > 0 or name in ("ft", "Cd"))):

@@ -1,0 +1,106 @@
+"""Adds to a checked program what earlier passes of it have taught, and learns from the pass that follows.
+
+Off unless ``[correction] learning`` is set. Only whole programs are learned, and only from passes in which the NC
+ordered every row as planned, at its own time: an override, a feed hold or a pass that was ended teaches nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from fdhil.arming.checked_program import CheckedProgram
+from fdhil.arming.preparing import ArmRequest
+from fdhil.arming.program_check import encoded
+from fdhil.arming.whole_plan import in_memory
+from fdhil.config import MachineConfig
+from fdhil.correction.inverse import common_delay_s, delayed
+from fdhil.correction.learning import Lesson, learn
+from fdhil.correction.limits import fit_all
+from fdhil.prediction import contour_error_um
+from fdhil.records import Float, Parameters, Reason, rms
+from fdhil.store.lessons import lesson_path, read_lesson, write_lesson
+
+MOST_ROWS = 1_000_000
+TOLERANCE_INCREMENTS = 2.5
+
+
+@dataclass(frozen=True, slots=True)
+class Pupil:
+    """A program that learns: its planned demand (n,) per axis in mm, what it has learned, and its models."""
+
+    path: Path
+    demand_mm: Mapping[str, Float]
+    models: Mapping[str, Parameters]
+    config: MachineConfig
+    lesson: Lesson
+
+    def learn(self, demand_mm: Float, position_mm: Float) -> Lesson | None:
+        """Learn from the rows (n, axes) of a whole pass; None where it was not the plan's. StoreError when not kept."""
+        planned = np.column_stack(list(self.demand_mm.values()))
+        axes = [self.config.axis[axis] for axis in self.demand_mm]
+        tolerance_mm = np.array([TOLERANCE_INCREMENTS / axis.scaling.increments_per_mm for axis in axes])
+        if demand_mm.shape != planned.shape or np.any(np.abs(demand_mm - planned) > tolerance_mm):
+            return None
+        period_s = self.config.machine.sync_period_s
+        fastest = {axis: float(np.abs(np.diff(path)).max()) / period_s for axis, path in self.demand_mm.items()}
+        tau_s, _ = common_delay_s(fastest, self.models, self.config)
+        error_um = {
+            axis: (delayed(path, tau_s / period_s) - position_mm[:, k]) * 1e3
+            for k, (axis, path) in enumerate(self.demand_mm.items())
+        }
+        left_um = rms(contour_error_um(planned, position_mm, period_s))
+        lesson = learn(self.lesson, error_um, left_um, self.models, self.config)
+        write_lesson(self.path, lesson)
+        return lesson
+
+
+def taught(checked: CheckedProgram, request: ArmRequest, machine: str) -> tuple[CheckedProgram, Pupil | None]:
+    """Return the program with what was learned added, within the limits, and who learns from its pass.
+
+    ``machine`` is the digest of the configuration that lessons are kept for. StoreError when rows cannot be read.
+    """
+    config = request.config
+    if not config.correction.learning or not checked.whole or checked.rows > MOST_ROWS:
+        return checked, None
+    demand_mm, offset_um = _rows(checked, config)
+    path = lesson_path(config.store.directory / "lessons", request.program_digest, machine)
+    known = read_lesson(path)
+    if known is None or any(known.offset_um.get(axis, np.empty(0)).size != checked.rows for axis in demand_mm):
+        known = Lesson(dict.fromkeys(demand_mm, np.zeros(checked.rows)))
+    pupil = Pupil(path, demand_mm, request.models, config, known)
+    if not any(np.any(offset) for offset in known.offset_um.values()):
+        return checked, pupil
+    total = {axis: offset + known.offset_um[axis] for axis, offset in offset_um.items()}
+    fitting = fit_all(total, config.axis, config.machine.sync_period_s)
+    return _with_offsets(checked, demand_mm, fitting, known, config), pupil
+
+
+def _rows(checked: CheckedProgram, config: MachineConfig) -> tuple[dict[str, Float], dict[str, Float]]:
+    """Return demand in mm and offset in um, (n,) per axis."""
+    content = b"".join(checked.content(k) for k in range(len(checked.blocks)))
+    columns = np.frombuffer(content, "<i4").reshape(checked.rows, -1).T.astype(np.float64)
+    scale = {a: config.axis[a].scaling.sign * config.axis[a].scaling.increments_per_mm for a in checked.axes}
+    demand = {axis: columns[k] / scale[axis] for k, axis in enumerate(checked.axes)}
+    offset = {axis: columns[len(scale) + k] / scale[axis] * 1e3 for k, axis in enumerate(checked.axes)}
+    return demand, offset
+
+
+def _with_offsets(
+    checked: CheckedProgram,
+    demand_mm: Mapping[str, Float],
+    offset_um: Mapping[str, Float],
+    known: Lesson,
+    config: MachineConfig,
+) -> CheckedProgram:
+    """Return the program with other offsets, and with what the check found of it."""
+    other = in_memory(encoded(demand_mm, offset_um, config), config, checked.errors)
+    text = f"what {len(known.curve_um)} passes taught is added; the last one left {known.curve_um[-1]:.2f} um RMS"
+    other.method, other.half_um = checked.method, checked.half_um
+    other.warnings = (*checked.warnings, Reason("Learned", text, "fdhil status shows each pass"))
+    largest_um = max(float(np.abs(offset).max(initial=0.0)) for offset in offset_um.values())
+    other.conclude({**(checked.header or {}), "largest_um": largest_um})
+    return other

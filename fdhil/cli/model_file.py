@@ -1,0 +1,44 @@
+"""Writes what recordings tell as a model file, which ``--model`` of predict and correct reads."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from fdhil.cli.batch import FileResult
+from fdhil.config import Axis
+from fdhil.records import PARAMETERS, Estimate
+from fdhil.store.output import open_output
+
+
+def write_model(results: Sequence[FileResult], axes: Mapping[str, Axis], path: Path) -> None:
+    """Write the validated pools by axis, of several files of one axis the last one's.
+
+    What has to be given is the ``axes``' nominal value; click.UsageError where a value stays unknown. Without a
+    validated pool nothing is written, which is told on stderr.
+    """
+    told = {r.axis: r.pooled for r in results if r.axis is not None and r.pooled is not None and r.verdict.accepted}
+    if not told:
+        click.echo(f"fdhil: {path} is not written: no recording gives a validated model", err=True)
+        return
+    document = {name: _model(name, estimate, axes.get(name)) for name, estimate in told.items()}
+    with open_output(path) as file:
+        file.write((json.dumps(document, indent=2, allow_nan=False) + "\n").encode())
+
+
+def _model(name: str, estimate: Estimate, axis: Axis | None) -> dict[str, Any]:
+    values = {key: estimate.value(key) for key in PARAMETERS}
+    values |= {key: max(values[key], 0.0) for key in ("ft", "Cd")}  # friction may be nil, and no model has less
+    unknown = [key for key, value in values.items() if not math.isfinite(value)]
+    if unknown and axis is None:
+        text = f"{' and '.join(unknown)} of axis {name} cannot be told without a voltage"
+        raise click.UsageError(f"{text}: give its nominal values with --config to have a whole model written")
+    if axis is not None:
+        values |= {key: float(getattr(axis.nominal, key)) for key in unknown}
+    terms = {key: estimate.value(key) for key in estimate.terms}
+    return {**values, "terms": terms} if terms else values

@@ -1,0 +1,87 @@
+"""Learns from each pass of a program what no model holds: the next pass of the same program is corrected by it.
+
+Iterative learning [Bristow, Tharayil, Alleyne 2006]: u' = Q (u + g L e), with e the error that the drive's own
+encoder measured on the SYNC grid, L the zero-phase inverse of the identified loop, and Q a zero-phase low-pass above
+which no model of a drive is trusted. What is learned stays small beside what an offset may be. After a pass that is
+worse than the one before less is learned, and a pass worse than the first ends all that was. What a motor's encoder
+cannot see, the screw's wind-up and its pitch, is not learned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import butter, sosfiltfilt
+
+from fdhil.config import MachineConfig
+from fdhil.correction import linear
+from fdhil.correction.mirror import allowed_um
+from fdhil.records import Float, Parameters, Trajectory
+
+CORNER_HZ = 60.0  # of Q
+GAIN = 0.7  # g: two passes take nine tenths of what repeats, and the noise of one counts for little
+KEPT = 0.98  # of what was learned, from pass to pass: what is no longer confirmed fades
+MOST_SHARE = 0.2  # of the largest offset that an axis may have
+WORSE = 1.1  # times the pass before: by more than this no two good passes differ
+CAUTION, TRUST = 0.5, 1.25  # factors on the gain after a pass that was worse, and after one that was not
+PADDING_S = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class Lesson:
+    """What the passes of one program have taught: ``offset_um`` (n,) per axis is added to the plan's in the next pass.
+
+    ``gain`` is what the next error counts. ``curve_um`` is the RMS of the contour error that each pass so far measured,
+    ``without_um`` that of the last pass in which nothing learned was in force.
+    """
+
+    offset_um: Mapping[str, Float]
+    without_um: float = 0.0
+    gain: float = GAIN
+    curve_um: tuple[float, ...] = ()
+
+    @staticmethod
+    def none(reference: Trajectory) -> Lesson:
+        """Return that of a program which was never cut."""
+        return Lesson(dict.fromkeys(reference.axes, np.zeros(reference.time_s.size)))
+
+
+def learn(
+    lesson: Lesson,
+    error_um: Mapping[str, Float],
+    rms_um: float,
+    models: Mapping[str, Parameters],
+    config: MachineConfig,
+) -> Lesson:
+    """Return the lesson after a whole, undisturbed pass with ``lesson.offset_um`` in force.
+
+    ``error_um`` (n,) per axis is target less measured position in each row of the program, ``rms_um`` the RMS of the
+    pass' contour error. A pass worse than the last without all that was learned ends it.
+    """
+    curve = (*lesson.curve_um, rms_um)
+    learned = any(np.any(offset) for offset in lesson.offset_um.values())
+    without_um = lesson.without_um if learned else rms_um
+    if rms_um > WORSE * without_um:
+        forgotten = {axis: np.zeros_like(u) for axis, u in lesson.offset_um.items()}
+        return Lesson(forgotten, rms_um, CAUTION * lesson.gain, curve)
+    worse = len(curve) > 1 and rms_um > WORSE * curve[-2]
+    gain = CAUTION * lesson.gain if worse else min(GAIN, TRUST * lesson.gain)
+    period_s = config.machine.sync_period_s
+    taught = {}
+    for axis, error in error_um.items():
+        inverse = linear.inverse(models[axis], config.axis[axis], period_s, error.size)
+        wanted = _low_passed(KEPT * lesson.offset_um[axis] + gain * inverse.apply(error), period_s)
+        bound = MOST_SHARE * allowed_um(config, axis)
+        taught[axis] = np.clip(wanted, -bound, bound)
+    return Lesson(taught, without_um, gain, curve)
+
+
+def _low_passed(values: Float, period_s: float) -> Float:
+    """Return the values (n,) without what lies above the corner, without delay, and at rest at both ends."""
+    sections = butter(2, min(CORNER_HZ, 0.2 / period_s), fs=1 / period_s, output="sos")
+    pad = round(PADDING_S / period_s)
+    smooth: Float = sosfiltfilt(sections, np.pad(values, pad), padtype=None)[pad:-pad]
+    ends = np.clip(np.minimum(np.arange(values.size), np.arange(values.size)[::-1]) / (pad / 5), 0.0, 1.0)
+    return np.asarray(smooth * ends)

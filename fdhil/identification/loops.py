@@ -1,0 +1,236 @@
+"""Identifies a drive's own loops from its rapids: gains, feed-forward, filters, computing delay, structure.
+
+The four gains every cascade has are fitted first. What else a drive may have joins one key at a time, the likeliest of
+all first, as long as it explains a tenth of the tolerance at the table, or a quarter of what is left: over hundreds of
+rows no chance does either. The other structures of the table are tried against the cascade by the same measure. With
+full feed-forward and no filter, a cascade answers the same when position_gain_per_s and speed_ki / speed_kp change
+places: of the two the one nearer to where the fit began is told.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fdhil.config import Axis, Identification, Regulators
+from fdhil.identification import loop_fit
+from fdhil.identification.loop_fit import DELAY, KEYS, Fit, Problem
+from fdhil.identification.loop_replay import Rapid, fitting_periods, rapid_of, with_regulators
+from fdhil.identification.loop_start import CASCADE, begun_anew, made_up_axis
+from fdhil.records import INTERVAL_95, LoopEstimate, Parameters, Reason, Verdict, Window, frozen, rms
+
+WORTH, WORTH_LEFT = 0.1, 0.25  # of the tolerance, or of what is left: what a key must explain to join
+LEAST_UM = 0.1
+WELL = 0.25  # of the tolerance: with less left no other structure is tried
+MOST_WINDOWS = 6
+DIFFER = "LoopsDiffer"
+LOOSE = 0.25  # relative standard deviation above which a gain is not known
+PID = ("position_gain_per_s", "speed_feedforward", "speed_kp", "position_ki_per_s2")
+OPTIONS = ("speed_filter_s", "setpoint_filter_s", DELAY, "torque_feedforward", "position_ki_per_s2")
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """One key of the regulators as configured and as found; ``apart`` where chance does not explain the difference."""
+
+    key: str
+    configured: float
+    found: float
+    std: float
+
+    @property
+    def apart(self) -> bool:
+        """Whether the configured value lies outside the 95 % interval of what was found."""
+        return abs(self.found - self.configured) > INTERVAL_95 * self.std
+
+
+def identify_loops(
+    windows: Sequence[Window],
+    mechanics: Sequence[Parameters],
+    axis: Axis | None,
+    settings: Identification,
+    sync_period_s: float | None = None,
+) -> LoopEstimate | None:
+    """Return the loops of the drive whose rapids these are; None where no window tells demand, position and current.
+
+    ``mechanics`` are what each window's estimate says of the motor and what it moves, ``axis`` the machine's section:
+    without it the search begins from the demand alone. Set-points come every ``sync_period_s`` (left out: each row).
+    """
+    pairs = [
+        (w, own) for w, own in zip(windows, mechanics, strict=True) if np.isfinite([*own.as_dict().values()]).all()
+    ]
+    told = [rapid for w, own in pairs if (rapid := rapid_of(w, own, sync_period_s)) is not None]
+    rapids = tuple(told[-MOST_WINDOWS:])
+    if not rapids:
+        return None
+    following = rms(np.concatenate([one.lag_mm[one.known] for one in rapids])) * 1e3
+    tolerance = settings.tolerance_for(following)
+    problem = _problem(rapids, axis, windows[0])
+    found = _whole_delay(_best(problem, tolerance, axis is not None))
+    configured = None if axis is None else _left_um(problem)
+    verdict = _verdict(found, tolerance, following, configured)
+    return _told(windows[0].axis, found, verdict, configured)
+
+
+def _left_um(problem: Problem) -> float:
+    """Return what the regulators that the search begins with leave of the position."""
+    return float(loop_fit.spread_of(problem, loop_fit.left_of(problem, problem.start())[0])[0]) * 1e3
+
+
+def _problem(rapids: tuple[Rapid, ...], axis: Axis | None, window: Window) -> Problem:
+    """Return where the search begins: at the configured regulators, or at what the demand alone says."""
+    if axis is None:
+        return begun_anew(Problem(rapids, made_up_axis(window, rapids[-1]), CASCADE))
+    axis = with_regulators(axis, **fitting_periods(axis.regulators, rapids[0].dt_s))
+    return Problem(rapids, axis, _names(axis.regulators))
+
+
+def _names(regulators: Regulators) -> tuple[str, ...]:
+    """Return the keys that a structure has, and the options that are configured."""
+    base: tuple[str, ...] = PID if regulators.structure == "pid" else CASCADE
+    if base == CASCADE and regulators.speed_ki == 0.0:
+        base = CASCADE[:3]
+    return (*base, *(n for n in OPTIONS if n not in base and getattr(regulators, n) > 0))
+
+
+def _best(problem: Problem, tolerance_um: float, configured: bool) -> Fit:
+    """Return the best fit of all structures; another structure than that of the start must be worth it."""
+    best = _grown(loop_fit.fit(problem), tolerance_um)
+    if configured and best.unexplained_um > tolerance_um:  # the configuration may have led astray
+        best = min(best, _grown(loop_fit.fit(begun_anew(problem)), tolerance_um), key=lambda f: f.unexplained_um)
+    if best.unexplained_um < WELL * tolerance_um:
+        return best
+    other = _other_structure(best)
+    if other is not None:
+        rival = _grown(loop_fit.fit(other), tolerance_um)
+        if best.unexplained_um - rival.unexplained_um > worth_um(best, tolerance_um):
+            return rival
+    return best
+
+
+def _grown(made: Fit, tolerance_um: float) -> Fit:
+    """Let keys join, the best of all first, as long as it is worth it."""
+    while options := [n for n in OPTIONS if n not in made.problem.names]:
+        grown = min((_with(made, name) for name in options), key=lambda fit: fit.deviance)
+        if made.unexplained_um - grown.unexplained_um < worth_um(made, tolerance_um):
+            break
+        made = grown
+    return made
+
+
+def worth_um(made: Fit, tolerance_um: float) -> float:
+    """Return by how much another key, or another structure, must explain more than this fit does."""
+    return max(LEAST_UM, min(WORTH * tolerance_um, WORTH_LEFT * made.unexplained_um))
+
+
+def _with(made: Fit, name: str) -> Fit:
+    """Return the fit with one key more, begun where it was without, and where all began: its lack bends the others."""
+    wider = replace(made.problem, names=(*made.problem.names, name))
+    starts = [np.append(made.coordinates, KEYS[name].step), np.append(made.problem.start(), KEYS[name].usual)]
+    return min((loop_fit.fit(wider, start) for start in starts), key=lambda fit: fit.deviance)
+
+
+def _other_structure(made: Fit) -> Problem | None:
+    """Return the other law of the table, begun where it is nearest to this one: a cascade is a PID but for a filter."""
+    problem = made.problem
+    found = made.axis()
+    g = found.regulators
+    keep = tuple(n for n in problem.names if n in OPTIONS and n not in ("speed_filter_s", "position_ki_per_s2"))
+    if g.structure == "pid":
+        half = g.position_gain_per_s / 2
+        rest = max(half * half - g.position_ki_per_s2, 0.0)
+        outer = half - math.sqrt(rest)
+        axis = with_regulators(
+            found,
+            structure="p_pi_pi",
+            position_gain_per_s=outer,
+            speed_ki=g.speed_kp * (half + math.sqrt(rest)),
+            position_ki_per_s2=0.0,
+        )
+        return replace(problem, axis=axis, names=(*CASCADE, *keep))
+    slow = g.speed_ki / g.speed_kp
+    axis = with_regulators(
+        found,
+        structure="pid",
+        position_gain_per_s=g.position_gain_per_s + slow,
+        position_ki_per_s2=g.position_gain_per_s * slow,
+        speed_ki=0.0,
+        speed_filter_s=0.0,
+    )
+    return replace(problem, axis=axis, names=(*PID, *keep))
+
+
+def _whole_delay(made: Fit) -> Fit:
+    """Return the fit with a whole number of cycles as delay, the rest found anew."""
+    problem = made.problem
+    if DELAY not in problem.names:
+        return made
+    place = problem.names.index(DELAY)
+    cycles = round(made.coordinates[place])
+    axis = with_regulators(problem.axis, **{DELAY: cycles})
+    fewer = replace(problem, axis=axis, names=tuple(n for n in problem.names if n != DELAY))
+    again = loop_fit.fit(fewer, np.delete(made.coordinates, place))
+    return replace(again, problem=replace(problem, axis=axis), coordinates=np.insert(again.coordinates, place, cycles))
+
+
+def _told(name: str, made: Fit, verdict: Verdict, configured_um: float | None) -> LoopEstimate:
+    """Return the answer in the units of the keys."""
+    names = made.problem.names
+    values = made.values
+    slope = [KEYS[n].scale or v for n, v in values.items()]
+    covariance = loop_fit.covariance_of(made) * np.outer(slope, slope)
+    structure = made.problem.axis.regulators.structure
+    if structure != "pid":
+        structure = "double_pi" if values.get("position_ki_per_s2", 0.0) > 0.0 else "p_pi_pi"
+    return LoopEstimate(name, structure, names, frozen([*values.values()]), frozen(covariance), verdict, configured_um)
+
+
+def _verdict(made: Fit, tolerance_um: float, following_um: float, configured_um: float | None) -> Verdict:
+    """Return whether the loops explain the rapids, and what the configured ones leave beyond that."""
+    left = made.unexplained_um
+    reasons, warnings = [], []
+    if not left <= tolerance_um:
+        text = f"the best loops leave {left:.3g} um of a following error of {following_um:.3g} um"
+        advice = "the drive has a structure or a filter that is not known; identification.tolerance_um may be raised"
+        reasons.append(Reason("LoopsUnexplained", f"{text}, more than {tolerance_um:.3g} um", advice))
+    elif configured_um is not None and configured_um - left > WORTH * tolerance_um:
+        text = f"the configured regulators leave {configured_um:.3g} um of a following error of {following_um:.3g} um"
+        advice = "put what was found into [axis.X.regulators]"
+        warnings.append(Reason(DIFFER, f"{text}, those found {left:.3g} um", advice))
+    doubts = np.sqrt(np.diag(loop_fit.covariance_of(made)))
+    for n, doubt in zip(made.problem.names, doubts, strict=True):
+        if KEYS[n].scale == 0.0 and doubt > LOOSE:
+            text = f"{n} is known to {100 * doubt:.0f} % only"
+            warnings.append(Reason("LoopsUndetermined", text, "let the axis accelerate harder"))
+    return Verdict(not reasons, None, tuple(reasons), left, tuple(warnings))
+
+
+def better_loops(loops: LoopEstimate) -> bool:
+    """Return whether loops are believed and explain more than the configured ones, so that they are used instead."""
+    return loops.verdict.accepted and any(warning.code == DIFFER for warning in loops.verdict.warnings)
+
+
+def with_loops(axis: Axis, loops: LoopEstimate) -> Axis:
+    """Return the axis with the regulators that were identified in the place of the configured ones."""
+    values = {**axis.regulators.model_dump(), **regulators_of(loops)}
+    return axis.model_copy(update={"regulators": Regulators.model_validate(values)})
+
+
+def regulators_of(loops: LoopEstimate) -> dict[str, Any]:
+    """Return keys of ``[axis.X.regulators]`` as they were found; what a structure does not have is 0."""
+    lacks = {"pid": ("speed_ki", "speed_filter_s"), "p_pi_pi": ("position_ki_per_s2",)}.get(loops.structure, ())
+    found = dict(zip(loops.names, loops.values.tolist(), strict=True))
+    return {"structure": loops.structure, **found, **dict.fromkeys(lacks, 0.0)}
+
+
+def differences(axis: Axis, loops: LoopEstimate) -> list[Difference]:
+    """Return every key that was identified beside its configured value."""
+    spread = np.sqrt(np.diag(loops.covariance))
+    return [
+        Difference(name, float(getattr(axis.regulators, name)), float(value), float(std))
+        for name, value, std in zip(loops.names, loops.values, spread, strict=True)
+    ]

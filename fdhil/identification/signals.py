@@ -1,0 +1,223 @@
+"""Brings a recorded speed that is late to the instants of its rows: what drives call speed is often no reading.
+
+A difference of encoder positions is the mean of the row before, so half a row late; a filter behind it, or about a
+reading, adds its own lag. The recorded position has none, and tells how late the speed is. The lag is then undone on
+the speed itself, which is finer than the position as a rule: a filter by its inverse, a mean by a stencil.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+
+from fdhil.identification.covariance import summed
+from fdhil.identification.filtering import moving_mean
+from fdhil.identification.motion import resolution, surely_moving
+from fdhil.identification.normal import inverse_gram
+from fdhil.identification.windows import bridged, noise_of
+from fdhil.records import Bool, Float, Window, read_only
+
+SpeedSource = Literal["auto", "sensor", "difference", "filtered"]
+
+SURE = 5.0  # standard deviations beyond which a lag is believed
+LEAST = 0.05  # of a row: a smaller lag is less than the regulators' doing within a row
+LARGEST_S = 0.020  # no drive shows a speed that is older
+SMOOTHING_S = 0.005  # over which the acceleration is taken
+EXPLAINED = 2.0  # of its own scatter from row to row: what may be left between speed and position
+FLOOR = 1e-3  # of the top speed, of the same
+SURELY_LESS = 0.5  # of the squares that the most usual lag leaves: by less, another is not told from it
+FINER = 0.5  # noise of the position's derivative, of that of the mended speed, for it to take its place
+LEAST_ROWS = 32
+NIL = 1e-6  # of a filter's answer: what is left out of it
+REACH = 3  # rows about a lost one that cannot be mended
+
+
+@dataclass(frozen=True, slots=True)
+class Lag:
+    """By how much a speed is late, with its standard deviation; of what it is the lag, and ``share`` of a filter.
+
+    The speed is a ``mean`` of the row before, or the instants; of it a first-order filter keeps ``share`` of a row
+    before. ``moved_s`` is a plain delay.
+    """
+
+    late_s: float
+    std_s: float
+    mean: bool = False
+    share: float = 0.0
+    moved_s: float = 0.0
+
+    def seen(self, angle: Float, dt_s: float) -> Float:
+        """Return the speed (n,) that a drive with this lag tells of ``angle`` (n,), rad."""
+        speed = np.diff(angle, prepend=angle[0]) / dt_s if self.mean else of_position(angle, dt_s)
+        if self.moved_s:
+            return shifted(speed, -self.moved_s / dt_s)
+        return filtered(speed, self.share) if self.share else speed
+
+    def undone(self, speed: Float, dt_s: float) -> Float:
+        """Return the speed (n,) at the instants of the rows."""
+        if self.moved_s:
+            return shifted(speed, self.moved_s / dt_s)
+        if self.share:
+            speed = (speed - self.share * np.concatenate([speed[:1], speed[:-1]])) / (1.0 - self.share)
+        return between_means(speed) if self.mean else speed
+
+
+def mended(window: Window, source: SpeedSource = "auto") -> Window:
+    """Return the window with its speed at the instants of its rows; itself where the speed is not surely late.
+
+    ``source`` is ``[identification] speed_source``.
+    """
+    known = np.isfinite(window.speed_rad_s)
+    if window.speed_late_s is not None or source == "sensor" or np.count_nonzero(known) < LEAST_ROWS:
+        return window
+    return _mended(window, source)
+
+
+@lru_cache(maxsize=8)
+def _mended(window: Window, source: SpeedSource) -> Window:
+    with np.errstate(over="ignore", invalid="ignore"):  # a signal that no drive has tells no lag
+        found = lag_of(window, source)
+    if found is None:
+        return window
+    angle, dt = _angle(window), window.dt_s
+    speed = found.undone(bridged(window.speed_rad_s), dt)
+    direct = of_position(angle, dt)
+    if noise_of(direct) < FINER * noise_of(speed) and _agree(direct, speed, _moving(window)):
+        speed = direct
+    lost = np.convolve(~np.isfinite(window.speed_rad_s), np.ones(2 * REACH + 1), "same") > 0.5
+    speed = np.where(lost, np.nan, speed)
+    return replace(
+        window, speed_rad_s=read_only(speed), speed_late_s=found.late_s, speed_late_std_s=max(found.std_s, 1e-9)
+    )
+
+
+def lag_of(window: Window, source: SpeedSource = "auto") -> Lag | None:
+    """Return the lag of a window's speed; None where there surely is none, or position and speed do not tell."""
+    dt = window.dt_s
+    told = _lateness(window)
+    if source == "difference":
+        std = told[1] if told is not None else 0.0
+        return Lag(0.5 * dt, min(std, 0.1 * dt), mean=True)
+    if told is None:
+        return None
+    late, std = told
+    if source == "auto" and late < max(SURE * std, LEAST * dt):
+        return None
+    if not 0.0 < late < LARGEST_S:
+        return None
+    angle, speed, rows = _angle(window), bridged(window.speed_rad_s), _moving(window)
+    possible = _possible(late, std, dt)
+    left = [_left(speed, lag.seen(angle, dt), rows) for lag in possible]
+    # from row to row there is the position's own noise, of which a filter passes less
+    powers = [float(np.square(moving_mean(e, 2 * round(SMOOTHING_S / dt) + 1)).sum()) for e in left]
+    best = int(np.argmin(powers))
+    best = best if powers[best] < SURELY_LESS * powers[0] else 0
+    return possible[best] if _explained(left[best], window, rows) else None
+
+
+def _possible(late: float, std: float, dt: float) -> list[Lag]:
+    """Return what may make a speed late by ``late``, the most usual first."""
+    unsure = max(SURE * std, LEAST * dt)
+    possible = [Lag(late, std, share=late / (dt + late)), Lag(late, std, moved_s=late)]
+    rest = late - 0.5 * dt
+    if rest > -unsure:
+        possible.insert(0, Lag(late, std, mean=True, share=rest / (dt + rest) if rest > unsure else 0.0))
+    return possible
+
+
+def _lateness(window: Window) -> tuple[float, float] | None:
+    """Return by how much (s) the speed is late against the position, and the standard deviation; None if not told.
+
+    The speed is a scale times that of the position, a constant, and minus the acceleration times the lag.
+    """
+    rows = _moving(window)
+    if np.count_nonzero(rows) < LEAST_ROWS or not np.isfinite(window.position_mm).any():
+        return None
+    direct, dt = of_position(_angle(window), window.dt_s), window.dt_s
+    width = 2 * round(SMOOTHING_S / dt / 2) + 1
+    rate = np.gradient(moving_mean(direct, width), dt)
+    columns = np.column_stack([rate, direct, np.ones(window.n)])[rows]
+    speed = bridged(window.speed_rad_s)[rows]
+    if not np.ptp(columns[:, 1]) > 0.0:
+        return None
+    inverse, condition = inverse_gram(columns)
+    weights = inverse @ (columns.T @ speed)
+    left = speed - columns @ weights
+    scores = (columns @ inverse[:, :1]) * left[:, None]
+    variance = float(summed(scores)[0, 0])  # noise of either may hang together over rows
+    if not (math.isfinite(condition) and 0.0 <= variance < np.inf and weights[1] != 0.0):
+        return None
+    deviation = math.sqrt(variance)
+    return -float(weights[0] / weights[1]), deviation / abs(float(weights[1]))
+
+
+def _moving(window: Window) -> Bool:
+    """Return the rows (n,) in which the shaft surely turns and nothing about them is lost."""
+    known = np.isfinite(window.speed_rad_s) & np.isfinite(window.position_mm)
+    whole = np.convolve(known, np.ones(2 * REACH + 1), "same") > 2 * REACH + 0.5
+    sure: Bool = whole & surely_moving(window.speed_rad_s, window.rapid_speed_rad_s)
+    return sure
+
+
+def _angle(window: Window) -> Float:
+    turned: Float = bridged(window.position_mm) * (2 * math.pi / window.pitch_mm)
+    return turned
+
+
+def _left(speed: Float, seen: Float, rows: Bool) -> Float:
+    """Return what of the speed (m,) a scale and a constant do not make of what a drive would have ``seen``."""
+    columns = np.column_stack([seen, np.ones(seen.size)])[rows]
+    inverse, _ = inverse_gram(columns)
+    rest: Float = speed[rows] - columns @ (inverse @ (columns.T @ speed[rows]))
+    return rest
+
+
+def _explained(left: Float, window: Window, rows: Bool) -> bool:
+    """Return whether no more is left between speed and position than noise, and the position's steps, explain."""
+    top = float(np.abs(window.speed_rad_s[rows]).max())
+    step = resolution(_angle(window)) / window.dt_s / math.sqrt(6.0)  # of the difference of two positions
+    allowed = EXPLAINED * math.hypot(noise_of(left), step) + FLOOR * top
+    return math.sqrt(float(left @ left) / left.size) <= allowed
+
+
+def _agree(direct: Float, speed: Float, rows: Bool) -> bool:
+    apart = (direct - speed)[rows]
+    return math.sqrt(float(apart @ apart) / apart.size) <= EXPLAINED * noise_of(apart)
+
+
+def of_position(angle: Float, dt_s: float) -> Float:
+    """Return the speed (n,) at the instants of ``angle`` (n,), exact for quartics; plain differences at the ends."""
+    speed = np.gradient(angle, dt_s)
+    speed[2:-2] = (angle[:-4] - 8.0 * angle[1:-3] + 8.0 * angle[3:-1] - angle[4:]) / (12.0 * dt_s)
+    return speed
+
+
+def between_means(means: Float) -> Float:
+    """Return a signal (n,) at the instants of its rows from its means over the row before each, exact for cubics."""
+    instants = means.copy()
+    instants[1:-2] = (-means[:-3] + 7.0 * means[1:-2] + 7.0 * means[2:-1] - means[3:]) / 12.0
+    instants[[0, -2]] = (means[[0, -2]] + means[[1, -1]]) / 2.0
+    return instants
+
+
+def filtered(values: Float, share: float) -> Float:
+    """Return ``values`` (n,) behind a first-order filter that keeps ``share`` of what it gave a row before."""
+    weights = (1.0 - share) * share ** np.arange(math.ceil(math.log(NIL) / math.log(share)))
+    padded = np.concatenate([np.full(weights.size - 1, values[0]), values])
+    return np.convolve(padded, weights, "valid")
+
+
+def shifted(values: Float, rows: float) -> Float:
+    """Return ``values`` (n,) as they are ``rows`` later, by cubics through four rows; the ends are held."""
+    whole = math.floor(rows)
+    x = rows - whole
+    at = np.clip(np.arange(values.size)[:, None] + whole + np.arange(-1, 3), 0, values.size - 1)
+    weights = np.array(
+        [-x * (x - 1) * (x - 2) / 6, (x * x - 1) * (x - 2) / 2, -x * (x + 1) * (x - 2) / 2, x * (x * x - 1) / 6]
+    )
+    moved: Float = values[at] @ weights
+    return moved

@@ -1,0 +1,98 @@
+"""Makes a window ready for [2] alone: current, acceleration, jerk and speed, all filtered alike, rows that surely move.
+
+The position is the better signal where its own noise makes less of an acceleration than the speed's does: a drive's
+speed may be a difference of positions, late by half a row, or filtered. Its second difference over a row is exactly the
+acceleration's mean weighted by a triangle two rows wide, so the current is taken through the same triangle.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdhil.config import Identification
+from fdhil.identification.filtering import all_about, impulse_response, reach, zero_phase
+from fdhil.identification.motion import resolution, surely_moving
+from fdhil.identification.windows import bridged, noise_of
+from fdhil.records import Bool, Float, Window
+
+
+@dataclass(frozen=True, slots=True)
+class TorqueRows:
+    """A window's signals (n,), filtered alike; ``usable`` marks the rows to fit, which surely move.
+
+    ``side`` is the direction of motion (0 at rest) and not filtered, nor is ``angle`` = 2 pi x / pitch, rad.
+    ``error_rad_s2`` is the standard deviation of the noise on the acceleration.
+    """
+
+    dt_s: float
+    lowpass_hz: float
+    current: Float
+    acceleration: Float
+    jerk: Float
+    speed: Float
+    side: Float
+    angle: Float
+    usable: Bool
+    error_rad_s2: float
+
+    @property
+    def count(self) -> int:
+        """Number of rows to fit."""
+        return int(np.count_nonzero(self.usable))
+
+    def through(self, courses: Float) -> Float:
+        """Return ``courses`` (q, n) of a torque through the same low-pass, at the rows to fit (m, q)."""
+        filtered: Float = zero_phase(courses, self.lowpass_hz, self.dt_s)[:, self.usable].T
+        return filtered
+
+
+def torque_rows(window: Window, settings: Identification) -> TorqueRows | None:
+    """Return the rows of a window, its acceleration from position or speed; None where hardly anything was read."""
+    dt, corner = window.dt_s, settings.lowpass_hz
+    broken = ~(np.isfinite(window.current_a) & np.isfinite(window.speed_rad_s) & np.isfinite(window.position_mm))
+    if window.n - np.count_nonzero(broken) < 8:
+        return None
+    angle = bridged(window.position_mm) / window.pitch_mm * 2 * math.pi
+    speed, acceleration, error = _motion(angle, bridged(window.speed_rad_s), corner, dt)
+    raw = np.stack([_over_rows(bridged(window.current_a), (1 / 6, 2 / 3, 1 / 6)), acceleration, speed])
+    current, acceleration, speed = zero_phase(raw, corner, dt)
+    moving = surely_moving(speed, window.rapid_speed_rad_s)
+    return TorqueRows(
+        dt_s=dt,
+        lowpass_hz=corner,
+        current=current,
+        acceleration=acceleration,
+        jerk=_over_rows(acceleration, (-0.5, 0.0, 0.5)) / dt,
+        speed=speed,
+        side=np.where(moving, np.sign(speed), 0.0),
+        angle=angle,
+        usable=all_about(moving & ~broken, 2 * reach(corner, dt) + 1, beyond=False),
+        error_rad_s2=error,
+    )
+
+
+def _motion(angle: Float, speed: Float, lowpass_hz: float, dt: float) -> tuple[Float, Float, float]:
+    """Return speed and acceleration (n,) from the signal whose noise disturbs the acceleration less, and that noise."""
+    second, slope = np.array([1.0, -2.0, 1.0]) / dt**2, np.array([-0.5, 0.0, 0.5]) / dt
+    of_angle = _left(second, lowpass_hz, dt) * max(noise_of(angle), resolution(angle) / math.sqrt(12.0))
+    of_speed = _left(slope, lowpass_hz, dt) * max(noise_of(speed), resolution(speed) / math.sqrt(12.0))
+    if np.ptp(angle) > 0.0 and of_angle <= of_speed:
+        return _over_rows(angle, tuple(slope)), _over_rows(angle, tuple(second)), of_angle
+    return speed, _over_rows(speed, tuple(slope)), of_speed
+
+
+def _left(stencil: Float, lowpass_hz: float, dt: float) -> float:
+    """Return the standard deviation of what stencil and low-pass leave of white noise of 1."""
+    return float(np.linalg.norm(np.convolve(impulse_response(lowpass_hz, dt), stencil)))
+
+
+def _over_rows(values: Float, weights: tuple[float, ...]) -> Float:
+    """Return the weighted sum (n,) over three rows about each; the ends are those of their neighbours."""
+    summed = np.empty_like(values)
+    before, at, after = weights
+    summed[1:-1] = before * values[:-2] + at * values[1:-1] + after * values[2:]
+    summed[0], summed[-1] = summed[1], summed[-2]
+    return summed

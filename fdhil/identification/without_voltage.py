@@ -1,0 +1,313 @@
+"""Fits [2] alone where there is no voltage: Jt, ft and Cd from current and position, with the K that is given.
+
+Least squares on K i = Jt dw/dt + ft w + Cd sign(w), all filtered alike, and on what joins it: friction at low speed, a
+ripple with the screw's turn. A term joins where the Bayesian information criterion (Schwarz 1978) wants it at the
+number of rows that tell something new, and where it is worth it. The current may be late: the torque's own slope
+-tau (Jt dj/dt + ft dw/dt) is always fitted, so that it biases nothing. A constant load is part of the friction of its
+direction; windows of both directions tell it.
+
+What is left is friction that no model has, much more than noise, and coloured. So the intervals stand around the
+variance of the scores (Newey and West 1987), widened for what that variance itself scatters (Kiefer and Vogelsang
+2005). Without K, its ratios are told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from fdhil.config import Identification
+from fdhil.identification.covariance import larger
+from fdhil.identification.identifiability import empty_estimate, judge
+from fdhil.identification.normal import inverse_gram, solve
+from fdhil.identification.torque_rows import TorqueRows, torque_rows
+from fdhil.records import PARAMETERS, RATIOS, Estimate, Float, Reason, Result, Window, rms
+
+METHOD = "least_squares"
+TOLD_BY_SHEET = ("R", "L", "K")
+LEAST_ROWS = 32
+BASE = ("Jt", "delay", "ft", "Cd")
+STRIBECK_SHARES = (0.02, 0.03, 0.05, 0.08, 0.12, 0.18, 0.27)  # of the top speed
+SCREW_ORDERS = (1, 2)
+TERMS = ("stribeck", *(f"ripple_screw_{order}" for order in SCREW_ORDERS))
+WORTH = 0.005  # of the torque's RMS: what a term must explain, a tenth of what may be left
+SUMMED_SHARE = 0.1  # of a window's rows: over which its residuals may hang together
+WIDENED = 2.9694 / 1.96  # per share, of the 95 % interval: Kiefer and Vogelsang 2005, Bartlett's weights
+OPEN_SHARE = 3e-4  # of Jt: what the current's course between two rows leaves open
+NO_VOLTAGE = Reason("LowExcitation", "there is no voltage, so [1] gives no R and L", "connect the voltage sensor")
+NO_K = Reason(
+    "LowExcitation",
+    "there is no voltage, so [1] gives no R, L and K, and without K the rest is known in amperes only",
+    "give the header torque_constant_nm_per_a, or the axis' nominal values with --config",
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Term:
+    """What may join: its ``names``, and one column (m,) for each value that is fitted linearly.
+
+    ``slope`` (m,) is how the torque of one unit answers a value that is not, such as the Stribeck speed ``at``.
+    """
+
+    names: tuple[str, ...]
+    columns: Float
+    at: float | None = None
+    slope: Float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TorqueFit:
+    """[2] in amperes, fitted to the rows of a window: ``design`` (m, k) and ``current`` (m,).
+
+    ``theta`` (k,) are the columns' amplitudes: those of ``BASE``, then of each of ``terms``. ``shifts`` (k,) are
+    by how much they would move with a term that is there and was not worth joining, by its name.
+    """
+
+    rows: TorqueRows
+    design: Float
+    current: Float
+    theta: Float
+    terms: tuple[Term, ...]
+    shifts: Mapping[str, Float] = field(default_factory=dict)
+
+    @property
+    def residual(self) -> Float:
+        """What is left of the current (m,), A."""
+        left: Float = self.current - self.design @ self.theta
+        return left
+
+    @property
+    def unexplained(self) -> float:
+        """RMS of what is left as a share of the current's."""
+        return rms(self.residual) / max(rms(self.current), 1e-300)
+
+
+def fit(window: Window, settings: Identification) -> TorqueFit | None:
+    """Fit [2] and the terms that join it to a window; None where hardly any row surely moves."""
+    rows = torque_rows(window, settings)
+    if rows is None or rows.count < LEAST_ROWS:
+        return None
+    fitted = _fitted(rows, ())
+    if not (np.isfinite(fitted.design).all() and np.isfinite(fitted.current).all()):
+        return None
+    return _joined(fitted)
+
+
+def _fitted(rows: TorqueRows, terms: tuple[Term, ...]) -> TorqueFit:
+    base = np.column_stack([rows.acceleration, rows.jerk, rows.speed])[rows.usable]
+    design = np.column_stack([base, rows.through(rows.side[None]), *(t.columns for t in terms)])
+    current = rows.current[rows.usable]
+    return TorqueFit(rows, design, current, solve(design, current)[0], terms)
+
+
+def _joined(fitted: TorqueFit) -> TorqueFit:
+    """Let the best term join as long as one is wanted and worth it; what is wanted only puts the others in doubt."""
+    news = effective_rows(fitted.residual)
+    while True:
+        wanted = _wanted(fitted, news)
+        worth = [other for other in wanted if _explained(other, fitted) > WORTH * rms(fitted.current)]
+        if not worth:
+            size = fitted.theta.size
+            shifts = {other.terms[-1].names[0]: other.theta[:size] - fitted.theta for other in wanted}
+            return replace(fitted, shifts=shifts)
+        fitted = worth[0]
+
+
+def _wanted(fitted: TorqueFit, news: float) -> list[TorqueFit]:
+    """Return the fits with one term more that the criterion prefers, the best first, one for each kind of term."""
+    power, found = float(np.square(fitted.residual).sum()), []
+    for term in candidates(fitted):
+        tried = _fitted(fitted.rows, (*fitted.terms, term))
+        left = float(np.square(tried.residual).sum())
+        gain = news * np.log(power / max(left, 1e-300)) - len(term.names) * np.log(news)
+        if gain > 0.0:
+            found.append((gain, tried))
+    found.sort(key=lambda pair: -pair[0])
+    best: dict[tuple[str, ...], TorqueFit] = {}
+    for _, tried in found:
+        best.setdefault(tried.terms[-1].names, tried)
+    return list(best.values())
+
+
+def _explained(other: TorqueFit, fitted: TorqueFit) -> float:
+    """Return the RMS of the torque by which two fits differ, A."""
+    return rms(other.design @ other.theta - fitted.design @ fitted.theta)
+
+
+def effective_rows(e: Float) -> float:
+    """Return how many rows of residuals (n,) tell something new: n / (1 + 2 sum rho), rho up to where it is nil."""
+    size = 1 << (2 * e.size).bit_length()
+    correlation = np.fft.irfft(np.abs(np.fft.rfft(e, size)) ** 2, size)[: e.size]
+    if correlation[0] <= 0.0:
+        return float(e.size)
+    rho = correlation / correlation[0]
+    end = int(np.argmax(rho <= 0.0)) or e.size
+    return max(float(e.size / (1.0 + 2.0 * rho[1:end].sum())), 8.0)
+
+
+def candidates(fitted: TorqueFit) -> list[Term]:
+    """Return the terms that have not joined and that these rows could tell."""
+    rows, joined = fitted.rows, {name for term in fitted.terms for name in term.names}
+    found = []
+    if "stribeck" not in joined:
+        top = float(np.abs(rows.speed).max())
+        found += [_stribeck(rows, share * top) for share in STRIBECK_SHARES]
+    for order in SCREW_ORDERS:
+        name = f"ripple_screw_{order}"
+        if name not in joined:
+            both = rows.through(np.stack([np.sin(order * rows.angle), np.cos(order * rows.angle)]))
+            found.append(Term((name, f"{name}_phase"), both))
+    return found
+
+
+def _stribeck(rows: TorqueRows, speed_rad_s: float) -> Term:
+    share = rows.speed / speed_rad_s
+    course = rows.side * np.exp(-np.square(share))
+    both = rows.through(np.stack([course, course * 2.0 * share**2 / speed_rad_s]))
+    return Term(("stribeck", "stribeck_speed"), both[:, :1], speed_rad_s, both[:, 1])
+
+
+def told(window: Window, fitted: TorqueFit | None, known: Mapping[str, float]) -> Estimate:
+    """Return what the fit of a window tells, with the K of the recording itself, else the one ``known``.
+
+    ``known`` may hold K, R and L of the data sheet: they are ``given`` in the estimate. R and L that are not known are
+    missing. Without any K all six are, and ``RATIOS`` follow them.
+    """
+    if fitted is None:
+        text = "hardly any row lies beyond the low-pass's reach from standstill"
+        reason = Reason("LowExcitation", text, "record a longer rapid or raise lowpass_hz")
+        return empty_estimate(METHOD, Result.UNDER_EXCITED, reason)
+    own = window.torque_constant_nm_per_a
+    given = dict(known) if own is None else {**known, "K": own}
+    return _with_constant(fitted, given) if "K" in given else _ratios(fitted)
+
+
+def late_s(fitted: TorqueFit) -> tuple[float, float]:
+    """Return by how much the current is late against the motion (early: negative), and the standard deviation."""
+    inertia, lag = float(fitted.theta[0]), float(fitted.theta[1])
+    if not inertia > 0.0:
+        return 0.0, np.inf
+    covariance = _covariance(fitted)
+    return -lag / inertia, float(np.sqrt(covariance[1, 1])) / inertia
+
+
+def _covariance(fitted: TorqueFit) -> Float:
+    """Return the covariance (k + s, k + s) of the amplitudes and of the values that enter in no linear way.
+
+    In every direction the larger of two counts: by the scores, and by what as many residuals would be that hang
+    together as these do; a lucky sample is not precision.
+    """
+    slopes = [t.slope * fitted.theta[_first(fitted, t)] for t in fitted.terms if t.slope is not None]
+    design = np.column_stack([fitted.design, *slopes])
+    inverse, _ = inverse_gram(design)
+    meat = _summed(design * fitted.residual[:, None], round(SUMMED_SHARE * len(design)))
+    meat *= (1.0 + WIDENED * SUMMED_SHARE) ** 2
+    power = max(float(np.square(fitted.residual).sum()), 1e-12 * float(np.square(fitted.current).sum()))
+    alike = design.T @ design * power / max(effective_rows(fitted.residual) - design.shape[1], 1.0)
+    scale = np.sqrt(np.diag(alike))
+    scaled = np.outer(scale, scale)
+    covariance: Float = inverse @ (larger(meat / scaled, alike / scaled) * scaled) @ inverse.T
+    return covariance
+
+
+def _summed(scores: Float, lags: int) -> Float:
+    """Return the variance (k, k) of the sum of ``scores`` (n, k) that hang together, with Bartlett's weights."""
+    meat = scores.T @ scores
+    for lag in range(1, lags + 1):
+        shifted = scores[lag:].T @ scores[:-lag]
+        meat += (1.0 - lag / (lags + 1)) * (shifted + shifted.T)
+    return meat
+
+
+def _first(fitted: TorqueFit, term: Term) -> int:
+    """Return the column of a term's first amplitude."""
+    at = next(k for k, other in enumerate(fitted.terms) if other is term)
+    return len(BASE) + sum(int(t.columns.shape[1]) for t in fitted.terms[:at])
+
+
+def _with_constant(fitted: TorqueFit, given: Mapping[str, float]) -> Estimate:
+    """Return the parameters and terms with the torque constant that is ``given``, N.m/A, and R and L if they are."""
+    values, rates = _values(fitted)
+    doubts = _doubts(fitted, rates)
+    covariance = rates @ _covariance(fitted) @ rates.T + doubts @ doubts.T
+    units = np.array([1.0 if name.endswith(("_speed", "_phase")) else given["K"] for name in values])
+    whole = np.zeros((len(TOLD_BY_SHEET) + len(values),) * 2)
+    whole[len(TOLD_BY_SHEET) :, len(TOLD_BY_SHEET) :] = covariance * np.outer(units, units)
+    # whether the data tell enough is asked of what was fitted: what is given, or missing, has no interval
+    sheet = [given.get(name, 1.0) for name in TOLD_BY_SHEET]
+    answer = Estimate(
+        method=METHOD,
+        names=(*TOLD_BY_SHEET, *values),
+        values=np.concatenate([sheet, units * np.array(list(values.values()))]),
+        covariance=whole,
+        residuals={"mechanical": fitted.residual},
+        result=Result.OK,
+        given=tuple(name for name in TOLD_BY_SHEET if name in given),
+        systematic=np.vstack([np.zeros((len(TOLD_BY_SHEET), doubts.shape[1])), units[:, None] * doubts]),
+    )
+    judged = judge(answer, inverse_gram(fitted.design)[1], float(np.abs(fitted.rows.speed).max()))
+    return _without(judged, [name for name in TOLD_BY_SHEET if name not in given])
+
+
+def _without(estimate: Estimate, names: Sequence[str]) -> Estimate:
+    """Return the estimate with some parameters missing because there is no voltage."""
+    values, covariance = estimate.values.copy(), estimate.covariance.copy()
+    for name in names:
+        k = estimate.names.index(name)
+        values[k] = covariance[k, :] = covariance[:, k] = np.nan
+    missing = {**dict.fromkeys(names, NO_VOLTAGE), **estimate.missing}
+    result = Result.UNDER_EXCITED if names and estimate.result is Result.OK else estimate.result
+    return replace(estimate, values=values, covariance=covariance, missing=missing, result=result)
+
+
+def _ratios(fitted: TorqueFit) -> Estimate:
+    """Return the estimate whose six parameters are missing, and whose ``RATIOS`` are known with their covariance."""
+    values, rates = _values(fitted)
+    known, k = len(RATIOS), len(PARAMETERS)
+    whole = np.full((k + known, k + known), np.nan)
+    doubts = _doubts(fitted, rates)
+    whole[k:, k:] = (rates @ _covariance(fitted) @ rates.T + doubts @ doubts.T)[:known, :known]
+    return Estimate(
+        method=METHOD,
+        names=(*PARAMETERS, *RATIOS),
+        values=np.concatenate([np.full(k, np.nan), list(values.values())[:known]]),
+        covariance=whole,
+        residuals={"mechanical": fitted.residual},
+        result=Result.UNDER_EXCITED,
+        missing=dict.fromkeys(PARAMETERS, NO_K),
+    )
+
+
+def _values(fitted: TorqueFit) -> tuple[dict[str, float], Float]:
+    """Return Jt, ft, Cd and the terms' values by name, per N.m/A, and how they follow from what was fitted."""
+    inertia, lag, viscous, dry = fitted.theta[: len(BASE)]
+    told = {"Jt": float(inertia - lag / inertia * viscous), "ft": float(viscous), "Cd": float(dry)}
+    size, others = fitted.theta.size, sum(t.slope is not None for t in fitted.terms)
+    rates = [np.eye(size + others)[k] for k in (0, 2, 3)]
+    for term in fitted.terms:
+        k, unit = _first(fitted, term), np.eye(size + others)
+        if term.at is not None:
+            told |= dict(zip(term.names, (float(fitted.theta[k]), term.at), strict=True))
+            rates += [unit[k], unit[size]]  # of such terms there is one
+            continue
+        sine, cosine = fitted.theta[k : k + 2]
+        whole = float(np.hypot(sine, cosine))
+        told |= dict(zip(term.names, (whole, float(np.arctan2(cosine, sine))), strict=True))
+        rates.append((sine * unit[k] + cosine * unit[k + 1]) / whole)
+        rates.append((sine * unit[k + 1] - cosine * unit[k]) / whole**2)
+    return told, np.array(rates)
+
+
+def _doubts(fitted: TorqueFit, rates: Float) -> Float:
+    """Return what is in doubt of each value (v, q), the same in all windows of a drive: one deviation a column.
+
+    Noise on the acceleration takes from Jt; and each term that is there and did not join would move them all.
+    """
+    power = float(np.mean(np.square(fitted.design[:, 0])))
+    noise = fitted.rows.error_rad_s2**2 / max(power, 1e-300)
+    inertia = np.eye(len(rates))[0] * abs(fitted.theta[0]) * np.hypot(OPEN_SHARE, noise)
+    none = np.zeros(fitted.theta.size)
+    shifts = [rates[:, : none.size] @ fitted.shifts.get(name, none) for name in TERMS]
+    return np.column_stack([inertia, *shifts])

@@ -1,0 +1,118 @@
+"""Takes a model's terms apart: what is left of it without dry friction, as a linear system, or with a resonance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from fdhil.config import Axis
+from fdhil.model import terms
+from fdhil.records import PARAMETERS, Bool, Float, Parameters
+
+DRY = ("coulomb_positive", "coulomb_negative", "stribeck", "stribeck_speed")
+LINEAR = ("resonance", "resonance_damping", "resonance_share")
+# what a term's second and third value are called: they mean nothing alone
+_PARTS = ("_phase", "_speed", "_damping", "_share")
+
+
+def values_of(parameters: Parameters) -> dict[str, float]:
+    """Return the six and the terms by name, in the order of a covariance."""
+    return {**parameters.as_dict(), **dict(parameters.terms)}
+
+
+def without_dry_friction(parameters: Parameters) -> Parameters:
+    """Return the model of the same drive without any dry friction."""
+    return replace(parameters, Cd=0.0, terms=tuple(pair for pair in parameters.terms if pair[0] not in DRY))
+
+
+def linear(parameters: Parameters, dry_nm: float = 0.0) -> Parameters:
+    """Return what of a model is linear, with another dry friction: without any it is a linear system.
+
+    A load, ripples and a dead time move where the system works, not how it answers an offset.
+    """
+    mean = mean_friction(parameters)
+    return replace(mean, Cd=dry_nm, terms=tuple(pair for pair in mean.terms if pair[0] in LINEAR))
+
+
+def mean_friction(parameters: Parameters) -> Parameters:
+    """Return the six with friction that is the mean of both directions, and the terms that are none of friction."""
+    p = parameters
+    viscous = 0.5 * (p.term("viscous_positive", p.ft) + p.term("viscous_negative", p.ft))
+    dry = 0.5 * (p.term("coulomb_positive", p.Cd) + p.term("coulomb_negative", p.Cd))
+    left = tuple(pair for pair in p.terms if pair[0] not in (*DRY, "viscous_positive", "viscous_negative"))
+    return replace(p, ft=viscous, Cd=dry, terms=left)
+
+
+def with_resonance(parameters: Parameters, axis: Axis) -> Parameters:
+    """Return the model with the resonance of the axis' section, unless it has its own."""
+    if axis.resonance_hz is None or "resonance" in dict(parameters.terms):
+        return parameters
+    return parameters.changed(resonance=axis.resonance_hz, resonance_damping=axis.resonance_damping)
+
+
+class Band(NamedTuple):
+    """The torques of a motor, N.m, between which dry friction holds the shaft."""
+
+    low: float
+    high: float
+
+    @property
+    def middle(self) -> float:
+        """The torque at which it is held best."""
+        return 0.5 * (self.low + self.high)
+
+    def holds(self, torque_nm: Float, share: float) -> Bool:
+        """Return (n,) whether torques lie in the inner ``share`` of the band."""
+        return np.asarray(np.abs(torque_nm - self.middle) <= share * 0.5 * (self.high - self.low))
+
+
+def band(parameters: Parameters, angle_rad: float) -> Band:
+    """Return the band of a shaft that rests at an angle."""
+    p = parameters
+    pull = float(terms.torque(p, np.zeros(1), np.array([angle_rad]))[0])
+    low, high = (p.term(f"coulomb_{side}", p.Cd) + p.term("stribeck") for side in ("negative", "positive"))
+    return Band(pull - low, pull + high)
+
+
+def resisting(parameters: Parameters, speed_rad_s: Float, angle_rad: Float) -> tuple[Float, Float]:
+    """Return the torque (n,) against the positive direction of a shaft that turns: its smooth and its dry part."""
+    dry = replace(parameters, ft=0.0, terms=tuple(pair for pair in parameters.terms if pair[0] in DRY))
+    models = without_dry_friction(parameters), dry
+    smooth_nm, dry_nm = (terms.torque(model, speed_rad_s, angle_rad) for model in models)
+    return smooth_nm, dry_nm
+
+
+def main_name(name: str) -> str:
+    """Return the term that a name belongs to: a ripple's phase to the ripple.
+
+    >>> main_name("ripple_screw_1_phase"), main_name("stribeck_speed"), main_name("Jt")
+    ('ripple_screw_1', 'stribeck', 'Jt')
+    """
+    return next((name.removesuffix(part) for part in _PARTS if name.endswith(part)), name)
+
+
+def families(names: Sequence[str]) -> Mapping[str, tuple[str, ...]]:
+    """Return the names that belong together by the one that stands for them."""
+    found: dict[str, tuple[str, ...]] = {}
+    for name in names:
+        main = main_name(name)
+        found[main] = (*found.get(main, ()), name)
+    return found
+
+
+def put_back(now: Parameters, earlier: Parameters, names: Sequence[str]) -> Parameters:
+    """Return the model of now with what some names had earlier; a term that one of them lacks is nil there."""
+    before, present = values_of(earlier), values_of(now)
+    changed = {}
+    for name in names:
+        part = main_name(name) != name
+        changed[name] = before.get(name, present.get(name, 0.0) if part else 0.0)
+    return now.changed(**changed)
+
+
+def all_names(*models: Parameters) -> tuple[str, ...]:
+    """Return the six and every term that any of the models has."""
+    return tuple(dict.fromkeys((*PARAMETERS, *(name for model in models for name, _ in model.terms))))

@@ -1,0 +1,275 @@
+"""Integrates an axis as real machines have it, one SYNC cycle at a time; the compiled part of :mod:`.reality`.
+
+Two masses, motor with screw and table, or one where the screw is stiff (x: speeds w and angles a, SI units):
+
+    L di/dt    = u acting - R i - K w
+    Jm dw/dt   = K i - spring - ripples - friction       spring = k d + c (w - wt), d = a - at beyond the backlash
+    Jt' dwt/dt = spring - load - friction
+
+Dry friction sticks, or hangs on bristles z (LuGre: Canudas de Wit, Olsson, Astrom, Lischinsky 1995):
+
+    level   = C (1 +- asymmetry) (1 + ripple sin a) (1 + static exp(-(w/ws)^2))
+    F       = level sign(w)      or      s0 z + s1 dz/dt,   dz/dt = w - s0 |w| z / level
+
+Every current cycle is one step of the midpoint rule with the sign of sticking friction held: some 1e-5 of what moves in
+it, far below an increment. The bristles, which are stiff at speed, take half a step before and after it in closed form.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from fdhil.records import Float
+from fdhil.sim.drive.physics import CURRENT_LIMIT, VOLTAGE_LIMIT, Command
+
+MOST_DELAY = 32
+# places in the state
+(
+    CURRENT, SPEED, ANGLE, TABLE_SPEED, TABLE, BRISTLE, TABLE_BRISTLE, SPEED_INTEGRAL, CURRENT_INTEGRAL, SEEN_SPEED,
+    ENCODER, BUS, PLACE, RATE, PLACE_2, RATE_2, WAITING,
+) = range(17)  # fmt: skip
+STATES = WAITING + MOST_DELAY
+# places in the plant: R to K, then inertia, viscous and dry friction of the motor and of the table behind the screw
+(
+    R, L, K, JM, JT, FM, FT, CM, CT, STATIC, STATIC_SPEED, ASYMMETRY, VISCOUS_ASYMMETRY, WAVE, SIGN, BRISTLES,
+    BRISTLE_DAMPING, BRAKE, SCREW, SCREW_ORDER, SCREW_PHASE, MOTOR, MOTOR_ORDER, MOTOR_PHASE, STIFFNESS, DAMPER,
+    HALF_BACKLASH, DEAD, DEAD_CURRENT, SAG, BUS_PART, PITCH, PITCH_RATE, PLANT,
+) = range(34)  # fmt: skip
+# places in the loops
+(
+    KV, KFF, KPS, KIS, I_MAX, KPC, KIC, U_MAX, INC_PER_RAD, N_SPEED, N_CURRENT, FILTER_PART, FILTER_ORDER,
+    SPEED_PART, DELAY, ENCODER_STEP, ON_TABLE, OF_ENCODER, CURRENT_GAIN, CURRENT_OFFSET, LOOPS,
+) = range(21)  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def _level(p: Float, share: float, w: float, a: float, side: float) -> float:
+    """Return the dry friction (N.m) of a body with ``share`` of it that moves to ``side`` with ``w``."""
+    fades = p[STATIC] * math.exp(-((w / p[STATIC_SPEED]) ** 2)) if p[STATIC] != 0.0 else 0.0
+    wave = p[WAVE] * math.sin(p[SIGN] * a) if p[WAVE] != 0.0 else 0.0
+    return float(share * (1.0 + side * p[ASYMMETRY]) * (1.0 + wave) * (1.0 + fades))
+
+
+@numba.njit(cache=True, nogil=True)
+def _viscous(p: Float, share: float, w: float) -> float:
+    side = 1.0 if w > 0.0 else -1.0
+    return float(share * w * (1.0 + side * p[VISCOUS_ASYMMETRY]))
+
+
+@numba.njit(cache=True, nogil=True)
+def _hanging(p: Float, share: float, w: float, a: float, z: float, inertia: float) -> float:
+    """Return the friction (N.m) of bristles bent by ``z`` rad; zero where friction sticks instead."""
+    if p[BRISTLES] == 0.0 or share == 0.0:
+        return 0.0
+    s0 = p[BRISTLES] * share
+    slip = w - s0 * abs(w) * z / _level(p, share, w, a, 1.0 if w >= 0.0 else -1.0)
+    return float(s0 * z + p[BRISTLE_DAMPING] * math.sqrt(s0 * inertia) * slip)
+
+
+@numba.njit(cache=True, nogil=True)
+def _bent(p: Float, share: float, w: float, a: float, z: float, time_s: float) -> float:
+    """Return the bending of the bristles after ``time_s`` at this speed."""
+    if p[BRISTLES] == 0.0 or share == 0.0 or w == 0.0:
+        return z
+    end = _level(p, share, w, a, 1.0 if w > 0.0 else -1.0) / (p[BRISTLES] * share)
+    goal = end if w > 0.0 else -end
+    return float(goal + (z - goal) * math.exp(-abs(w) * time_s / end))
+
+
+@numba.njit(cache=True, nogil=True)
+def _spring(p: Float, x: Float) -> float:
+    """Return the torque (N.m) that the screw hands from the motor to the table."""
+    if p[STIFFNESS] == 0.0:
+        return 0.0
+    bend = x[ANGLE] - x[TABLE]
+    half = p[HALF_BACKLASH]
+    if abs(bend) < half:
+        return 0.0
+    return float(p[STIFFNESS] * (bend - math.copysign(half, bend)) + p[DAMPER] * (x[SPEED] - x[TABLE_SPEED]))
+
+
+@numba.njit(cache=True, nogil=True)
+def _pushes(p: Float, x: Float, current: float, load: float) -> tuple[float, float]:
+    """Return what drives motor and table (N.m), all but friction that sticks."""
+    w, a, spring = x[SPEED], x[ANGLE], _spring(p, x)
+    ripples = p[SCREW] * math.sin(p[SCREW_ORDER] * a + p[SCREW_PHASE]) if p[SCREW] != 0.0 else 0.0
+    if p[MOTOR] != 0.0:
+        ripples += p[MOTOR] * math.sin(p[MOTOR_ORDER] * a + p[MOTOR_PHASE])
+    motor = p[K] * current - spring - ripples - _viscous(p, p[FM], w)
+    motor -= _hanging(p, p[CM], w, a, x[BRISTLE], p[JM])
+    if p[STIFFNESS] == 0.0:
+        return motor - load, 0.0
+    wt = x[TABLE_SPEED]
+    table = spring - load - _viscous(p, p[FT], wt)
+    return motor, table - _hanging(p, p[CT], wt, x[TABLE], x[TABLE_BRISTLE], p[JT])
+
+
+@numba.njit(cache=True, nogil=True)
+def _held(p: Float, share: float, w: float, a: float, side: float, brake: float) -> float:
+    """Return the friction that sticks (N.m): dry friction without bristles, and a shut brake."""
+    return brake if p[BRISTLES] != 0.0 else brake + _level(p, share, w, a, side)
+
+
+@numba.njit(cache=True, nogil=True)
+def _side(p: Float, share: float, w: float, a: float, push: float, brake: float) -> float:
+    """Return to which side a body moves or is about to move; 0 where it sticks."""
+    if w != 0.0:
+        return 1.0 if w > 0.0 else -1.0
+    side = 1.0 if push > 0.0 else -1.0
+    return side if abs(push) > _held(p, share, 0.0, a, side, brake) else 0.0
+
+
+@numba.njit(cache=True, nogil=True)
+def _acting(p: Float, u: float, current: float) -> float:
+    """Return the voltage at the motor when the inverter is asked for ``u`` (of its bus as it is)."""
+    return float(u - p[DEAD] * min(max(current / p[DEAD_CURRENT], -1.0), 1.0))
+
+
+@numba.njit(cache=True, nogil=True)
+def _slopes(
+    p: Float, x: Float, u: float, load: float, brake: float, side: float, table_side: float, off: bool, out: Float
+) -> None:
+    """Fill ``out`` (5,) with the slopes of current, motor speed and angle, table speed and angle."""
+    current = 0.0 if off else x[CURRENT]
+    push, table_push = _pushes(p, x, current, load)
+    out[CURRENT] = 0.0 if off else (_acting(p, u, current) - p[R] * current - p[K] * x[SPEED]) / p[L]
+    out[SPEED] = 0.0
+    if side != 0.0:
+        out[SPEED] = (push - side * _held(p, p[CM], x[SPEED], x[ANGLE], side, brake)) / p[JM]
+    out[ANGLE], out[TABLE] = x[SPEED], x[TABLE_SPEED]
+    out[TABLE_SPEED] = 0.0
+    if p[STIFFNESS] != 0.0 and table_side != 0.0:
+        held = _held(p, p[CT], x[TABLE_SPEED], x[TABLE], table_side, 0.0)
+        out[TABLE_SPEED] = (table_push - table_side * held) / p[JT]
+
+
+@numba.njit(cache=True, nogil=True)
+def _bend(p: Float, x: Float, time_s: float) -> None:
+    x[BRISTLE] = _bent(p, p[CM], x[SPEED], x[ANGLE], x[BRISTLE], time_s)
+    x[TABLE_BRISTLE] = _bent(p, p[CT], x[TABLE_SPEED], x[TABLE], x[TABLE_BRISTLE], time_s)
+
+
+@numba.njit(cache=True, nogil=True)
+def _step(p: Float, x: Float, u: float, load: float, off: bool, h: float, trial: Float, slope: Float) -> None:
+    """Advance the first seven states by one step under the voltage ``u``; ``trial`` (7,), ``slope`` (5,) are room."""
+    brake = p[BRAKE] if off else 0.0
+    _bend(p, x, 0.5 * h)
+    if off:
+        x[CURRENT] = 0.0
+    push, table_push = _pushes(p, x, x[CURRENT], load)
+    side = _side(p, p[CM], x[SPEED], x[ANGLE], push, brake)
+    table_side = _side(p, p[CT], x[TABLE_SPEED], x[TABLE], table_push, 0.0)
+    w, wt, a, at = x[SPEED], x[TABLE_SPEED], x[ANGLE], x[TABLE]
+    for n in range(7):
+        trial[n] = x[n]
+    _slopes(p, trial, u, load, brake, side, table_side, off, slope)
+    for n in range(5):
+        trial[n] += 0.5 * h * slope[n]
+    _slopes(p, trial, u, load, brake, side, table_side, off, slope)
+    for n in range(5):
+        x[n] += h * slope[n]
+    if x[SPEED] * side < 0.0 and _held(p, p[CM], 0.0, a, side, brake) > 0.0:
+        x[SPEED], x[ANGLE] = 0.0, a + 0.5 * w * h
+    if p[STIFFNESS] == 0.0:
+        half = p[HALF_BACKLASH]
+        x[TABLE_SPEED], x[TABLE] = x[SPEED], min(max(at, x[ANGLE] - half), x[ANGLE] + half)
+    elif x[TABLE_SPEED] * table_side < 0.0 and _held(p, p[CT], 0.0, at, table_side, 0.0) > 0.0:
+        x[TABLE_SPEED], x[TABLE] = 0.0, at + 0.5 * wt * h
+    _bend(p, x, 0.5 * h)
+
+
+@numba.njit(cache=True, nogil=True)
+def table_angle(p: Float, x: Float) -> float:
+    """Return where the table is, as an angle of the shaft: the screw's own error counts."""
+    a = x[TABLE]
+    return float(a + p[PITCH] * math.sin(a) + p[PITCH_RATE] * a)
+
+
+@numba.njit(cache=True, nogil=True)
+def encoder_angle(p: Float, g: Float, x: Float, on_table: bool) -> float:
+    """Return what the encoder at the table or at the motor tells, rad."""
+    angle = table_angle(p, x) if on_table else x[ANGLE]
+    step = float(g[ENCODER_STEP])
+    return angle if step == 0.0 else float(step * np.rint(angle / step))
+
+
+@numba.njit(cache=True, nogil=True)
+def _current_demand(p: Float, g: Float, x: Float, place: float, rate: float, more: float, current: float) -> float:
+    """Run position and speed loop once; return the current they ask for (A) before its limit acts."""
+    for n in range(int(g[FILTER_ORDER])):
+        at = PLACE + 2 * n
+        x[at] += g[FILTER_PART] * (place - x[at])
+        x[at + 1] += g[FILTER_PART] * (rate - x[at + 1])
+        place, rate = x[at], x[at + 1]
+    position = np.rint(encoder_angle(p, g, x, g[ON_TABLE] != 0.0) * g[INC_PER_RAD])
+    speed = x[SPEED]
+    if g[OF_ENCODER] != 0.0:
+        encoder = encoder_angle(p, g, x, False)
+        speed = (encoder - x[ENCODER]) * g[OF_ENCODER]
+        x[ENCODER] = encoder
+    x[SEEN_SPEED] += g[SPEED_PART] * (speed - x[SEEN_SPEED])
+    error = (g[KV] * (place - position) + g[KFF] * rate) / g[INC_PER_RAD] + more - x[SEEN_SPEED]
+    candidate = x[SPEED_INTEGRAL] + g[KIS] * error
+    raw = g[KPS] * error + candidate + current
+    if abs(raw) <= g[I_MAX]:
+        x[SPEED_INTEGRAL] = candidate
+    return float(raw)
+
+
+@numba.njit(cache=True, nogil=True)
+def _voltage_demand(g: Float, x: Float, wanted: float) -> float:
+    """Run the current loop once; return the voltage it asks for (V) before its limit acts."""
+    error = wanted - (g[CURRENT_GAIN] * x[CURRENT] + g[CURRENT_OFFSET])
+    candidate = x[CURRENT_INTEGRAL] + g[KIC] * error
+    raw = g[KPC] * error + candidate
+    if abs(raw) <= g[U_MAX]:
+        x[CURRENT_INTEGRAL] = candidate
+    return float(raw)
+
+
+@numba.njit(cache=True, nogil=True)
+def run_real_cycle(
+    x: Float, g: Float, p: Float, voltage: Float, enabled: bool, command: Command, load: float, h: float
+) -> tuple[float, float, int]:
+    """Run one SYNC cycle; return the mean voltage at the motor, the mean that was asked for, and the limits that acted.
+
+    ``x`` (STATES,) and ``voltage`` (n,), the voltage at the motor in each current step, are written. ``g`` (LOOPS,) and
+    ``p`` (PLANT,) are made by :class:`fdhil.sim.drive.reality.RealPhysics`; ``command`` is that of
+    :func:`fdhil.sim.drive.physics.run_cycle`, whose loops these are.
+    """
+    p0, p1, f0, f1, v0, v1, c0, c1 = command
+    n_speed, n_current, delay = int(g[N_SPEED]), int(g[N_CURRENT]), int(g[DELAY])
+    trial, slope = np.zeros(7), np.zeros(5)
+    asked_total, total, limits, wanted = 0.0, 0.0, 0, 0.0
+    for m in range(n_speed):
+        if enabled:
+            part = m / n_speed
+            place, rate = p0 + (p1 - p0) * part, f0 + (f1 - f0) * part
+            raw = _current_demand(p, g, x, place, rate, v0 + (v1 - v0) * part, c0 + (c1 - c0) * part)
+            wanted = min(max(raw, -g[I_MAX]), g[I_MAX])
+            limits |= CURRENT_LIMIT if wanted != raw else 0
+        for c in range(n_current):
+            asked = p[K] * x[SPEED]  # an open motor shows its back-EMF
+            first = asked
+            if enabled:
+                raw = _voltage_demand(g, x, wanted)
+                asked = min(max(raw, -g[U_MAX]), g[U_MAX])
+                limits |= VOLTAGE_LIMIT if asked != raw else 0
+            u = asked
+            for d in range(delay):
+                u, x[WAITING + d] = x[WAITING + d], u
+            u *= x[BUS]
+            if enabled:
+                first = _acting(p, u, x[CURRENT])
+            _step(p, x, u, load, not enabled, h, trial, slope)
+            acting = 0.5 * (first + (_acting(p, u, x[CURRENT]) if enabled else p[K] * x[SPEED]))
+            power = max(0.0, acting * x[CURRENT])
+            x[BUS] += p[BUS_PART] * (1.0 - p[SAG] * power - x[BUS])
+            voltage[m * n_current + c] = acting
+            total += acting
+            asked_total += asked
+    count = n_speed * n_current
+    return total / count, asked_total / count, limits

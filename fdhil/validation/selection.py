@@ -1,0 +1,70 @@
+"""Takes the findings of one window one after the other: what each shows that those before it do not explain.
+
+Many alternatives resemble each other, so that one thing that the model lacks shows as several. The most significant is
+taken, the others are judged anew beside it, and so on while one is beyond chance. Together with the parameters they are
+then one fit, whose amplitudes tell by how much the parameters were off without them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fdhil.identification.estimators.maximum_likelihood import Fit
+from fdhil.identification.normal import inverse_gram, solve
+from fdhil.records import Float
+from fdhil.validation.structure import Bench, Finding
+
+
+@dataclass(frozen=True, slots=True)
+class Lacking:
+    """What a model lacks: a finding, by how much it moves the parameters (k,), and its torque (n,), N.m, or none.
+
+    The parameters are those of the fit's jacobian, in its order.
+    """
+
+    finding: Finding
+    shift: Float
+    load_nm: Float | None
+
+
+def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
+    """Return what surely is there beside the model, the most significant first; nothing where all may be chance."""
+    if not any(finding.sure for finding in findings):
+        return []
+    bench = Bench.of(fit)
+    jacobian, directions = fit.jacobian, np.column_stack([finding.direction for finding in findings])
+    shared = bench.inverse @ (jacobian.T @ directions)
+    beyond = directions - jacobian @ shared  # what the parameters do not imitate
+    others = np.column_stack([fit.residuals, bench.basis[:, jacobian.shape[1] + 1 :]])
+    others = others - jacobian @ (bench.inverse @ (jacobian.T @ others))
+    whole = np.einsum("mq,mq->q", directions, directions)
+    taken: list[int] = []
+    while len(taken) < len(findings):
+        rest = _beside(beyond[:, taken], beyond)
+        seen = rest.T @ others
+        statistic, _ = bench.tested(seen[:, 0], np.einsum("mq,mq->q", rest, rest), whole, seen[:, 1:])
+        statistic[taken] = 0.0
+        best = int(np.argmax(np.abs(statistic)))
+        if not replace(findings[best], statistic=float(statistic[best])).sure:
+            break
+        taken.append(best)
+    amplitudes, _ = solve(beyond[:, taken], others[:, 0])
+    return [_lacking(findings[k], float(a), shared[:, k]) for k, a in zip(taken, amplitudes, strict=True)]
+
+
+def _beside(basis: Float, directions: Float) -> Float:
+    """Return what of ``directions`` (m, q) the columns of ``basis`` (m, b) do not hold."""
+    if not basis.size:
+        return directions
+    rest: Float = directions - basis @ (inverse_gram(basis)[0] @ (basis.T @ directions))
+    return rest
+
+
+def _lacking(finding: Finding, amplitude: float, shared: Float) -> Lacking:
+    """Return a finding with its amplitude beside the others; a sensor's own change has the other sign."""
+    load = None if finding.load_nm is None else amplitude * finding.load_nm
+    told = amplitude if load is not None else -amplitude
+    return Lacking(replace(finding, amplitude=told), amplitude * shared, load)

@@ -1,0 +1,225 @@
+"""Weighs a window's model in micrometres at the table: what it leaves unexplained, and what its bias would make.
+
+Where the axis' regulators are known, the rapid is replayed through the closed loop with the model, and what that leaves
+of the measured positions is weighed against the tolerance. Where they are not, the torque that the model leaves is sent
+through an ordinary loop, and weighed against what all torque of the move makes there (the share hardly depends on the
+loop), or against the following error that was recorded where that is larger: a drive without feed-forward.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from fdhil.config import Axis, Identification
+from fdhil.config.controller import TOLERANCE_SHARE
+from fdhil.identification.filtering import moving_mean
+from fdhil.identification.windows import carried
+from fdhil.model.terms import torque
+from fdhil.records import PARAMETERS, Bool, Float, Parameters, Reason, Window, rms
+from fdhil.validation.replay import Replay, replay_window
+from fdhil.validation.table_error import TableError
+
+NEXT_SPEED = 0.3  # of the rapid speed: that of a program that is cut
+SCATTER = 3.0  # deviations by which the power of noise may lie above what is expected
+BEGINNING_S = 0.060  # before the drive surely moves
+SMOOTHING_S = 0.002  # of the current, whose noise would push a shaft at rest
+LOOPS_DIFFER = "LoopsDiffer"  # code of what the torque explains, and the closed loop does not
+NOISE_ROWS = 25.0e-3  # s: over which noise behind a position loop hangs together
+
+
+def tolerance_um(settings: Identification, following_um: float) -> float:
+    """Return the RMS at the table that a model may leave of a rapid with this following error."""
+    return settings.tolerance_for(following_um)
+
+
+@dataclass(frozen=True, slots=True)
+class Weight:
+    """What a model leaves of a rapid at the table, RMS um, and how much it may: ``limit_um`` of ``whole_um``.
+
+    ``torque_um`` is what the torque that it leaves makes. ``through`` says what all is told by: a replay of the rapid,
+    the axis' own loop without one, or an ordinary loop, where only the share is worth something.
+    """
+
+    unexplained_um: float
+    limit_um: float
+    whole_um: float
+    torque_um: float
+    through: Literal["replay", "own loop", "ordinary loop"]
+
+    def allows(self, um: float) -> bool:
+        """Return whether that much at the table does no harm."""
+        return um <= self.limit_um
+
+    @property
+    def in_um(self) -> bool:
+        """Return whether all is in micrometres at the axis' own table."""
+        return self.through != "ordinary loop"
+
+    @property
+    def believed(self) -> bool:
+        """Return whether the model explains the rapid."""
+        return self.allows(self.unexplained_um)
+
+    def reason(self) -> Reason:
+        """Return why the model is not believed."""
+        advice = "the drive does what the model does not have"
+        if self.through != "replay":
+            text = f"the torque that the model leaves unexplained makes {self.told(self.unexplained_um)} at the table"
+            return Reason("ValidationFailed", f"{text}, limit {self.told(self.limit_um)}", advice)
+        text = (
+            f"the closed loop with this model leaves {self.unexplained_um:.3g} um RMS of a following error of "
+            f"{self.whole_um:.3g} um unexplained, limit {self.limit_um:.3g} um"
+        )
+        if self.allows(self.torque_um):
+            advice = "the torque is explained, so the drive's loops are not as configured: fdhil identify --loops"
+            return Reason(LOOPS_DIFFER, text, advice)
+        return Reason("ValidationFailed", text, advice)
+
+    def told(self, um: float) -> str:
+        """Return an error at the table for people: in um, or as a share where the loops are not known."""
+        return f"{um:.2g} um" if self.in_um else f"{um / self.whole_um:.1%} of what all torque makes"
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """The rows of a window in which the drive surely moves to ``side`` (n,), +1 or -1, else 0; current and speed (n,).
+
+    ``friction`` (n,) is the model's torque of friction and loads against the positive direction, N.m. ``begins`` (n,)
+    marks the rows before those, in which the drive may begin to move.
+    """
+
+    current: Float
+    speed: Float
+    side: Float
+    friction: Float
+    begins: Bool
+    dt_s: float
+
+    @classmethod
+    def of(cls, window: Window, parameters: Parameters, side: Float) -> Move:
+        """Return the move of a window, with the friction of a model."""
+        speed = carried(window.speed_rad_s)
+        angle = 2 * math.pi / window.pitch_mm * carried(window.position_mm)
+        friction = np.where(side != 0, torque(parameters, np.abs(speed) * side, angle), 0.0)
+        moving = np.flatnonzero(side)
+        first = int(moving[0]) if moving.size else 0
+        begins = np.zeros(side.size, dtype=np.bool_)
+        begins[max(0, first - round(BEGINNING_S / window.dt_s)) : first] = True
+        return cls(carried(window.current_a), speed, side, friction, begins, window.dt_s)
+
+    def integral(self, torque_nm: Float) -> Float:
+        """Return the integral (n,) of a torque (n,) over the rows in which the drive surely moves."""
+        over = np.where(self.side[:-1] != 0, (torque_nm[1:] + torque_nm[:-1]) / 2, 0.0) * self.dt_s
+        return np.concatenate([[0.0], np.cumsum(over)])
+
+    def turned(self, speed: Float) -> Float:
+        """Return the speed (n,) gained in those rows."""
+        return np.concatenate([[0.0], np.cumsum(np.where(self.side[:-1] != 0, np.diff(speed), 0.0))])
+
+    def left(self, p: Parameters) -> Float:
+        """Return the momentum (n,) that the model leaves unexplained, N.m.s."""
+        return (
+            self.integral(p.K * self.current - self.friction)
+            - p.Jt * self.turned(self.speed)
+            + self._at_the_beginning(p)
+        )
+
+    def _at_the_beginning(self, p: Parameters) -> Float:
+        """Return the same of the rows in which it begins to move: what friction at rest does not hold turns it."""
+        rows = np.flatnonzero(self.begins)
+        if rows.size == 0:
+            return np.zeros(self.speed.size)
+        way = self.side[rows[-1] + 1]
+        width = 2 * round(SMOOTHING_S / 2 / self.dt_s) + 1
+        held = way * self.friction[rows[-1] + 1]
+        net = way * p.K * moving_mean(self.current, width) - held - way * p.ft * self.speed
+        push = np.where(self.begins, np.maximum(net, 0.0), 0.0) * self.dt_s
+        gained = np.where(self.begins, np.append(np.diff(self.speed), 0.0), 0.0)
+        made: Float = np.concatenate([[0.0], np.cumsum(way * push - p.Jt * gained)[:-1]])
+        return made
+
+    def whole(self, p: Parameters) -> Float:
+        """Return the momentum (n,) of all torque that the model has."""
+        return self.integral(self.friction) + p.Jt * self.turned(self.speed)
+
+    def slower(self, p: Parameters, share: float) -> Move:
+        """Return the move at a share of its speed, by the same model: what is cut."""
+        speed = share * self.speed
+        friction = self.friction + p.ft * (speed - self.speed)
+        current = (p.Jt * np.gradient(speed, self.dt_s) + friction) / p.K
+        return replace(self, speed=speed, friction=friction, current=np.where(self.side != 0, current, self.current))
+
+    def of_shift(self, p: Parameters, shift: Float) -> Float:
+        """Return the momentum (n,) that parameters off by ``shift`` (6,) make."""
+        _, _, of_k, of_jt, of_ft, of_cd = shift
+        off = of_ft * self.speed + of_cd * self.side - of_k * self.current
+        made: Float = self.integral(off) + of_jt * self.turned(self.speed)
+        return made
+
+
+def to_and_fro(momentum: Float) -> Float:
+    """Return the momentum (2 n,) of a move and its way back at once, where dry and viscous friction differ."""
+    return np.concatenate([momentum, momentum[-1] - momentum])
+
+
+def weigh(
+    window: Window,
+    settings: Identification,
+    parameters: Parameters,
+    move: Move,
+    noise: tuple[float, float],
+    axis: Axis | None,
+    sync_period_s: float,
+) -> Weight | None:
+    """Return what a model leaves of a window; ``noise`` are the deviations of current (A) and speed (rad/s)."""
+    if not _runs(parameters):
+        return None
+    loop = TableError.of(parameters, window.pitch_mm, axis)
+    whole, left = (rms(row) for row in loop.um(np.array([move.whole(parameters), move.left(parameters)]), window.dt_s))
+    left = _beyond_noise(left, loop, parameters, move, noise)
+    told = _replayed(window, parameters, axis, sync_period_s)
+    if told is None and axis is not None:
+        return Weight(left, tolerance_um(settings, whole), whole, left, "own loop")
+    if told is None:
+        limit = TOLERANCE_SHARE * max(whole, _followed_um(window))
+        return Weight(left, limit, whole, left, "ordinary loop")
+    return Weight(told.unexplained_um, tolerance_um(settings, told.measured_um), told.measured_um, left, "replay")
+
+
+def _followed_um(window: Window) -> float:
+    """Return the RMS following error that was recorded beyond that at rest, um; 0 where the demand was not."""
+    apart = (window.position_mm - window.demand_mm)[np.isfinite(window.position_mm - window.demand_mm)]
+    if apart.size == 0 or not np.nanmax(window.demand_mm) > np.nanmin(window.demand_mm):
+        return 0.0
+    return 1e3 * rms(apart - apart[0])
+
+
+def _runs(parameters: Parameters) -> bool:
+    values = np.array(list(parameters.as_dict().values()))
+    return bool(np.isfinite(values).all() and (values[:4] > 0).all())
+
+
+def _replayed(window: Window, parameters: Parameters, axis: Axis | None, sync_period_s: float) -> Replay | None:
+    return None if axis is None else replay_window(window, parameters, axis, sync_period_s)
+
+
+def _beyond_noise(left: float, loop: TableError, p: Parameters, move: Move, noise: tuple[float, float]) -> float:
+    """Return what surely lies beyond the noise of the sensors."""
+    n, dt_s = move.speed.size, move.dt_s
+    current_a, speed_rad_s = noise
+    moving = float(np.mean(move.side != 0))
+    expected = loop.noise_um(p.Jt * speed_rad_s, p.K * current_a * dt_s, n, dt_s) * math.sqrt(moving)
+    independent = max(1.0, moving * n * dt_s / max(NOISE_ROWS, dt_s))
+    return math.sqrt(max(0.0, left**2 - expected**2 * (1.0 + SCATTER * math.sqrt(2.0 / independent))))
+
+
+def completed(parameters: Parameters, spare: Parameters) -> Parameters:
+    """Return the parameters with what is not known of them taken from ``spare``: R and L do little at the table."""
+    values = parameters.as_dict()
+    return parameters.changed(
+        **{name: getattr(spare, name) for name in PARAMETERS[:2] if not math.isfinite(values[name])}
+    )

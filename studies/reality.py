@@ -1,0 +1,382 @@
+"""Machines as they are, by Monte Carlo (``python -m studies.reality``): what is believed of them, what it is worth.
+
+Each effect alone, all together, and machines that are drawn at random, each with rapids at two speeds in both
+directions; an independent plant (:mod:`studies.real_plant`) moves, reports, and cuts the bench path. The page goes to
+``docs/studies/reality.md``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from fdhil.config import MachineConfig, parse
+from fdhil.correction.learning import Lesson, learn
+from fdhil.correction.limits import fit_all
+from fdhil.correction.planning import plan
+from fdhil.identification.loops import with_loops
+from fdhil.identification.windows import find_windows
+from fdhil.pipeline import analyse, pool
+from fdhil.pipeline.own_loops import better_axis, loops_of, suspected
+from fdhil.prediction.contour import contour_error_um
+from fdhil.program.loading import load_trajectory
+from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Parameters, Trajectory, WindowOutcome, rms
+from studies import pages
+from studies.bench import Array, shuttle
+from studies.comparison import SURE_95
+from studies.pages import grid, paragraph
+from studies.real_plant import (
+    GOOD_LOOPS,
+    GOOD_MECHANICS,
+    GOOD_SENSORS,
+    ORDINARY_LOOPS,
+    ORDINARY_MECHANICS,
+    ORDINARY_SENSORS,
+    SLOW,
+    SLOW_LOOPS,
+    Loops,
+    Mechanics,
+    Sensors,
+    at_rest,
+    drawn,
+    recording,
+    run,
+)
+
+SHARES = (1.0, 0.7)  # of the rapid speed
+RAPIDS = 4
+PASSES = 3  # in which the machine learns
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """One machine of the study: what it is, and ``told``, the regulators that its configuration has."""
+
+    name: str
+    base: str
+    mechanics: Mechanics
+    loops: Loops
+    sensors: Sensors
+    told: Loops
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What was made of one machine: windows believed, errors of the pool in per cent and in its deviations, the cut."""
+
+    name: str
+    base: str
+    windows: int
+    believed: int
+    pooled: bool
+    errors: Array
+    deviations: Array
+    window_errors: Array
+    window_deviations: Array
+    unexplained_um: float | None
+    following_um: float
+    before_um: float
+    after_um: float
+    worse_um: float
+    passes_um: tuple[float, ...]
+    reasons: dict[str, int]
+
+
+BASES = {
+    "bench": (Mechanics(), Loops(), 0.5, 4.0, 10.0),  # rapid m/s, acceleration m/s2, feed m/min
+    "slow": (SLOW, SLOW_LOOPS, 65 * 0.02 / (2 * np.pi), 2.0, 5.0),
+}
+
+
+def machines(base: str) -> list[Machine]:
+    """Return the machines with one effect each, and with all together."""
+    m, g, *_ = BASES[base]
+    s = Sensors()
+    rated = 40.0 if base == "bench" else 11.0
+    scaled = {"motor_ripple_nm": rated * 0.01, "screw_ripple": 0.05}
+    rows: list[tuple[str, Mechanics, Loops, Sensors]] = [
+        ("none: the model's own plant", m, g, s),
+        ("static friction 1.1 Cd below 10 rad/s", replace(m, static=0.1), g, s),
+        ("static friction 1.3 Cd below 10 rad/s", replace(m, static=0.3), g, s),
+        ("friction builds up by 25 % of Cd over 20 rad/s", replace(m, static=-0.25, static_speed_rad_s=20.0), g, s),
+        ("dry friction +-10 % by direction", replace(m, asymmetry=0.1), g, s),
+        ("gravity 0.5 Cd", replace(m, load_nm=0.5 * m.Cd), g, s),
+        ("gravity 1.0 Cd", replace(m, load_nm=m.Cd), g, s),
+        ("friction ripple 10 % once per turn", replace(m, screw_ripple=0.1), g, s),
+        ("motor ripple 2 % of rated, order 24", replace(m, motor_ripple_nm=0.02 * rated), g, s),
+        ("resonance 150 Hz, motor encoder", replace(m, resonance_hz=150.0), g, s),
+        ("resonance 80 Hz, motor encoder", replace(m, resonance_hz=80.0), g, s),
+        ("speed: difference of a 20-bit encoder", m, g, replace(s, speed="difference")),
+        ("speed: difference of a 13-bit encoder", m, g, replace(s, speed="difference", encoder_bits=13)),
+        ("speed: difference, 2 ms filter", m, g, replace(s, speed="difference", filter_s=0.002)),
+        ("speed: at mid-interval", m, g, replace(s, speed="middle")),
+        ("dead time 2 V, command recorded", m, replace(g, dead_time_v=2.0), replace(s, command=True)),
+        ("bus sag 5 %, command recorded", m, replace(g, bus_sag=0.05), replace(s, command=True)),
+        ("winding warms by 5 %", replace(m, warming=0.05), g, s),
+        ("current sensor +1 %", m, g, replace(s, current_gain=0.01)),
+        ("a good new machine", _like(GOOD_MECHANICS, m, scaled), replace(g, **_inverter(GOOD_LOOPS)), GOOD_SENSORS),
+        (
+            "an ordinary machine",
+            _like(ORDINARY_MECHANICS, m, scaled),
+            replace(g, **_inverter(ORDINARY_LOOPS)),
+            ORDINARY_SENSORS,
+        ),
+    ]
+    made = [Machine(name, base, *parts, told=g) for name, *parts in rows]
+    drives = {
+        "drive: Kv 2 % higher": {"position_gain_per_s": 1.02 * g.position_gain_per_s},
+        "drive: speed loop 10 % slower": {"speed_kp": 0.9 * g.speed_kp, "speed_ki": 0.81 * g.speed_ki},
+        "drive: 0.25 ms computing delay": {"delay_s": 0.00025},
+        "drive: speed filter 0.5 ms": {"speed_filter_s": 0.0005},
+        "drive: speed filter 2 ms": {"speed_filter_s": 0.002},
+    }
+    return made + [Machine(name, base, m, replace(g, **values), s, g) for name, values in drives.items()]
+
+
+def _like(real: Mechanics, base: Mechanics, scaled: Mapping[str, float]) -> Mechanics:
+    """Return the effects of ``real``, told in shares, on another base."""
+    same = {"R": base.R, "L": base.L, "K": base.K, "Jt": base.Jt, "ft": base.ft, "Cd": base.Cd}
+    ripple = scaled["motor_ripple_nm"] * real.motor_ripple_nm / 0.4
+    return replace(real, **same, load_nm=real.load_nm / 5.0 * base.Cd, motor_ripple_nm=ripple)
+
+
+def _inverter(loops: Loops) -> dict[str, float]:
+    return {"dead_time_v": loops.dead_time_v, "bus_sag": loops.bus_sag}
+
+
+def random_machines(count: int, seed: int) -> list[Machine]:
+    """Return machines with every effect at a random level, half of them on each base."""
+    made = []
+    for k in range(count):
+        rng = np.random.default_rng([seed, k])
+        base = list(BASES)[k % len(BASES)]
+        m, g, *_ = BASES[base]
+        made.append(Machine("drawn at random", base, *drawn(rng, m), told=g))
+    return made
+
+
+def config_of(machine: Machine) -> MachineConfig:
+    """Return the machine's configuration: the base's nominal values and the regulators that were told."""
+    m, _, rapid_m_s, acceleration_m_s2, _ = BASES[machine.base]
+    gains = ("position_gain_per_s", "speed_feedforward", "speed_kp", "speed_ki", "current_kp", "current_ki")
+    told = {k: v for k, v in asdict(machine.told).items() if k in (*gains, "current_limit_a", "voltage_limit_v")}
+    axis = {
+        "screw_pitch_mm": m.pitch_m * 1e3,
+        "rapid_speed_mm_s": rapid_m_s * 1e3,
+        "max_acceleration_mm_s2": acceleration_m_s2 * 1e3,
+        "nominal": m.truth(),
+        "regulators": told,
+        "correction": {"max_offset_um": 250.0, "max_speed_mm_s": 20.0, "max_acceleration_mm_s2": 2000.0},
+    }
+    return parse({"machine": {"name": "study"}, "axis": {"X": axis, "Y": axis}}, "study", made_up=True)
+
+
+@lru_cache(maxsize=4)
+def path(base: str) -> Trajectory:
+    """Return the bench path at the base's feed."""
+    feed = BASES[base][4]
+    program = pages.ROOT / "configs" / "programs" / "bench_10m.ngc"
+    text = program.read_text("utf-8").replace("F10000", f"F{1000 * feed:.0f}")
+    written = pages.ROOT / "out" / f"bench_{feed:g}m.ngc"
+    written.parent.mkdir(exist_ok=True)
+    written.write_text(text, "utf-8")
+    return load_trajectory(written, config_of(machines(base)[0]))
+
+
+def outcomes_of(machine: Machine, seed: int) -> tuple[list[WindowOutcome], float, LoopEstimate | None]:
+    """Return what is made of the machine's rapids, the RMS of their following error in um, loops other than told."""
+    _, _, rapid_m_s, acceleration_m_s2, _ = BASES[machine.base]
+    config = config_of(machine)
+    outcomes: list[WindowOutcome] = []
+    following = []
+    for k, share in enumerate(SHARES):
+        demand = shuttle(0.4, share * rapid_m_s, acceleration_m_s2, RAPIDS)
+        moved = run(machine.mechanics, demand, machine.loops)
+        told = recording(moved, machine.mechanics, machine.sensors, rapid_m_s, 1000 * seed + k)
+        outcomes += [
+            analyse(w, config.identification, config.axis["X"], config.machine.sync_period_s)
+            for w in find_windows(told)
+        ]
+        following.append(rms((moved.motor_m - moved.demand) * 1e6))
+    settings, axis, period_s = config.identification, config.axis["X"], config.machine.sync_period_s
+    loops = loops_of(outcomes, axis, settings, period_s) if suspected(outcomes) else None
+    better = better_axis(axis, loops)
+    if better is not None:
+        outcomes = [analyse(o.window, settings, better, period_s) for o in outcomes]
+    return outcomes, float(np.mean(following)), loops if better is not None else None
+
+
+def cut(machine: Machine, reference: Trajectory, offset_um: Mapping[str, Array] | None = None) -> tuple[Array, Array]:
+    """Return where the table is (n, d), and where the motors' encoders say that it is, in mm."""
+    tables, motors = [], []
+    step_mm = machine.mechanics.pitch_m * 1e3 / 65536
+    for axis in reference.axes:
+        wanted = np.asarray(reference.position_mm[axis])
+        commanded = wanted if offset_um is None else wanted + offset_um[axis] * 1e-3
+        begin = at_rest(machine.mechanics, machine.loops, float(wanted[0]) * 1e-3)
+        moved = run(machine.mechanics, commanded * 1e-3, machine.loops, start=begin)
+        tables.append(moved.table_m * 1e3)
+        motors.append(np.round(moved.motor_m * 1e3 / step_mm) * step_mm)
+    return np.column_stack(tables), np.column_stack(motors)
+
+
+def contour(
+    machine: Machine, model: Parameters, loops: LoopEstimate | None
+) -> tuple[float, float, float, tuple[float, ...]]:
+    """Return RMS um at the table without and with the correction, the most that a point gets worse, what passes leave.
+
+    In these the machine learns from what its motors' encoders measure.
+    """
+    reference, config = path(machine.base), config_of(machine)
+    if loops is not None:
+        axes = {name: with_loops(axis, loops) for name, axis in config.axis.items()}
+        config = config.model_copy(update={"axis": axes})
+    models = dict.fromkeys(reference.axes, model)
+    planned = plan(reference, models, config).offset_um
+
+    def error_um(places: Array) -> Array:
+        return contour_error_um(reference.path_mm, places, reference.dt_s)
+
+    before = error_um(cut(machine, reference)[0])
+    table, motor = cut(machine, reference, planned)
+    after, lesson, passes = error_um(table), Lesson.none(reference), []
+    for _ in range(PASSES):
+        own = {axis: (reference.position_mm[axis] - motor[:, k]) * 1e3 for k, axis in enumerate(reference.axes)}
+        lesson = learn(lesson, own, rms(error_um(motor)), models, config)
+        wanted = {axis: planned[axis] + lesson.offset_um[axis] for axis in reference.axes}
+        table, motor = cut(machine, reference, fit_all(wanted, config.axis, reference.dt_s))
+        passes.append(rms(error_um(table)))
+    return rms(before), rms(after), float((after - before).max()), tuple(passes)
+
+
+def errors_of(estimate: Estimate | None, truth: Array) -> tuple[Array, Array]:
+    """Return errors in per cent of the truth, and in the estimate's deviations, (6,) each."""
+    if estimate is None:
+        return np.full(6, np.nan), np.full(6, np.nan)
+    values = np.array([estimate.value(name) for name in PARAMETERS])
+    stds = np.array([estimate.std(name) for name in PARAMETERS])
+    return 100 * (values / truth - 1), (values - truth) / stds
+
+
+def examine(machine: Machine, seed: int = 0) -> Found:
+    """Return what is made of one machine."""
+    outcomes, following_um, loops = outcomes_of(machine, seed)
+    truth = np.array(list(machine.mechanics.truth().values()))
+    settings = config_of(machine).identification
+    estimate, verdict = pool(outcomes, settings)
+    told = [errors_of(o.estimate, truth) for o in outcomes if o.verdict.accepted]
+    candidates = [estimate, *(o.estimate for o in outcomes)]  # a refused model is cut with all the same
+    usable = [e.parameters() for e in candidates if e is not None and _whole(e)]
+    nothing = (np.nan, np.nan, np.nan, ())
+    before_um, after_um, worse_um, passes_um = contour(machine, usable[0], loops) if usable else nothing
+    left = [o.verdict.unexplained_um for o in outcomes if o.verdict.unexplained_um is not None]
+    reasons = Counter(reason.code for o in outcomes for reason in o.verdict.reasons)
+    return Found(
+        machine.name,
+        machine.base,
+        len(outcomes),
+        sum(o.verdict.accepted for o in outcomes),
+        verdict.accepted,
+        *errors_of(estimate, truth),
+        np.array([e for e, _ in told]).reshape(-1, 6),
+        np.array([d for _, d in told]).reshape(-1, 6),
+        float(np.mean(left)) if left else None,
+        following_um,
+        before_um,
+        after_um,
+        worse_um,
+        passes_um,
+        dict(reasons.most_common(3)),
+    )
+
+
+def _whole(estimate: Estimate) -> bool:
+    values = np.array([estimate.value(name) for name in PARAMETERS])
+    return bool(np.isfinite(values).all() and (values[:4] > 0).all() and (values[4:] >= 0).all())
+
+
+def measure(options: argparse.Namespace) -> dict[str, Any]:
+    """Return what is made of every machine."""
+    alone = [machine for base in BASES for machine in machines(base)]
+    several = random_machines(options.machines, options.seed)
+    with ProcessPoolExecutor(options.processes) as executor:
+        found = list(executor.map(examine, [*alone, *several], range(len(alone) + len(several))))
+    return {"alone": [asdict(f) for f in found[: len(alone)]], "random": [asdict(f) for f in found[len(alone) :]]}
+
+
+def page(told: pages.Run, figures: Mapping[str, Any]) -> str:
+    """Return the study's page."""
+    several = figures["random"]
+    believed, windows = (sum(f[key] for f in several) for key in ("believed", "windows"))
+    gains = np.array([f["before_um"] / f["after_um"] for f in several if f["after_um"]], dtype=np.float64)
+    taught = np.array([f["before_um"] / f["passes_um"][-1] for f in several if f["passes_um"]], dtype=np.float64)
+    lines = pages.head("Machines as they are", "reality", told)
+    lines += paragraph(
+        f"""Of {len(several)} machines with every effect at a random level, {believed} of {windows} rapids are
+        believed, and {sum(f["pooled"] for f in several)} pools. The contour error of the bench path at the table falls
+        by {np.median(gains):.1f} times in the median, by {np.percentile(gains, 5):.1f} at the fifth percentile; no
+        point gets worse by more than {max((f["worse_um"] or 0.0) for f in several):.2f} um. After {PASSES} passes that
+        learned from the motors' encoders it is {np.median(taught):.1f} and {np.percentile(taught, 5):.1f} times."""
+    )
+    lines += ["## What the intervals hold", ""]
+    rows = [
+        [name, *(_coverage(several, key, k) for key in ("deviations", "window_deviations"))]
+        for k, name in enumerate(PARAMETERS)
+    ]
+    lines += [*grid(["", "pools: 95 % intervals that hold the truth", "believed rapids"], rows), ""]
+    lines += ["## Each effect alone, and all together", ""]
+    names = ["base", "machine", "rapids believed", "pool", "errors of R L K Jt ft Cd, %", "left of following error, um"]
+    lines += grid(
+        [*names, "contour RMS, um", "gain", "worst, um", "learned, um", "reasons"], [_row(f) for f in figures["alone"]]
+    )
+    return "\n".join(lines)
+
+
+def _coverage(found: Sequence[Mapping[str, Any]], key: str, k: int) -> str:
+    values = np.array(
+        [row[k] for f in found for row in ([f[key]] if key == "deviations" else f[key]) if row[k] is not None]
+    )
+    return f"{100 * np.mean(np.abs(values) < SURE_95):.0f} % of {values.size}" if values.size else "-"
+
+
+def _row(f: Mapping[str, Any]) -> list[str]:
+    errors = " ".join("-" if e is None else f"{e:+.1f}" for e in f["errors"])
+    left = "-" if f["unexplained_um"] is None else f"{f['unexplained_um']:.2f} of {f['following_um']:.0f}"
+    reasons = ", ".join(f"{count} {code}" for code, count in f["reasons"].items())
+    cut_um = "-" if f["before_um"] is None else f"{f['before_um']:.1f} -> {f['after_um']:.1f}"
+    gain = "-" if not f["after_um"] else f"{f['before_um'] / f['after_um']:.1f}"
+    worst = "-" if f["worse_um"] is None else f"{f['worse_um']:.1f}"
+    learned = f"{f['passes_um'][-1]:.2f}" if f["passes_um"] else "-"
+    believed = f"{f['believed']}/{f['windows']}"
+    return [
+        f["base"],
+        f["name"],
+        believed,
+        "yes" if f["pooled"] else "no",
+        errors,
+        left,
+        cut_um,
+        gain,
+        worst,
+        learned,
+        reasons,
+    ]
+
+
+def main() -> None:
+    """Run the study."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--machines", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=1)
+    pages.conduct("reality", parser, lambda o: f"{o.seed}", measure)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,146 @@
+"""The first rows begin from what the drives hold at rest, as it is heard on the bus."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil import correction
+from fdhil.arming.checked_program import Piece
+from fdhil.arming.first_block import FirstBlock
+from fdhil.arming.program_check import encoded
+from fdhil.arming.standstill import WATCHED_S, AtRest, Standstill
+from fdhil.config import MachineConfig
+from fdhil.correction import PlanLimits, check
+from fdhil.prediction import contour_error_um
+from fdhil.prediction.models import nominal_models
+from fdhil.program import load_trajectory
+from fdhil.records import AxisSamples, Float, Parameters, frozen, frozen_ints
+from tests.bench import bench_config
+from tests.model.slow_drive import SlowDrive
+from tests.paths import rms
+
+CONFIG = bench_config()
+MODELS = nominal_models(CONFIG)
+LONG = "G21 G90 G94\nG1 Y55 F10000\nG1 X100\nG1 Y5\nG1 X0\nG4 P0.2\nM2\n"
+SHORT = "G21 G90 G94\nG1 X20 F4000\nG1 Y20\nG4 P0.2\nM2\n"
+
+
+def checked(folder: Path, text: str, models: dict[str, Parameters], config: MachineConfig) -> tuple[Path, Piece]:
+    """Return a program and its rows as a check finds them: for drives without current."""
+    program = folder / "part.ngc"
+    program.write_text(text)
+    reference = load_trajectory(program, config)
+    planned = correction.plan(reference, models, config, "inverse")
+    assert not planned.refused
+    rows = np.frombuffer(encoded(reference.position_mm, planned.offset_um, config), "<i4").reshape(-1, 4).T.tolist()
+    return program, Piece(0, dict(zip("XY", rows[:2], strict=True)), dict(zip("XY", rows[2:], strict=True)), True)
+
+
+def resting(amperes: dict[str, float]) -> dict[str, AtRest]:
+    """Return axes that stand at the origin with a current."""
+    return {axis: AtRest(0.0, 0.0, current) for axis, current in amperes.items()}
+
+
+def cut(program: Path, piece: Piece, amperes: dict[str, float], config: MachineConfig) -> Float:
+    """Return the contour error (n,) of independent drives that begin with a current."""
+    reference = load_trajectory(program, config)
+    positions = []
+    for axis, path in reference.position_mm.items():
+        drive = SlowDrive(MODELS[axis], config.axis[axis], 0.001)
+        drive.i = drive.speed_sum = amperes[axis]
+        drive.current_sum = MODELS[axis].R * amperes[axis]
+        offset_mm = np.array(piece.offset[axis]) / config.axis[axis].scaling.increments_per_mm
+        positions.append(drive.run((path + config.axis[axis].drive.sign * offset_mm).tolist()))
+    return contour_error_um(reference.path_mm, np.column_stack(positions), 0.001)
+
+
+@pytest.mark.parametrize("text", [LONG, SHORT])
+def test_the_error_before_the_first_corner_is_gone(text: str, tmp_path: Path) -> None:
+    """Drives that stand with a current somewhere in the band of dry friction: what is left is what is left without."""
+    amperes = {"X": 4.0, "Y": -3.0}
+    program, begin = checked(tmp_path, text, MODELS, CONFIG)
+    first = FirstBlock(begin, program, MODELS, CONFIG)
+    rows = first.renew(resting(amperes))
+    anew = first.begin
+    before, after = (cut(program, piece, amperes, CONFIG) for piece in (begin, anew))
+    without = cut(program, begin, {"X": 0.0, "Y": 0.0}, CONFIG)
+    assert rms(after[:600]) < 0.2 * rms(before[:600])
+    assert rms(after) < 1.1 * rms(without)
+    assert anew.demand == begin.demand
+    assert rows is not None
+    assert all(rows.offset[axis] == anew.offset[axis][: len(rows.offset[axis])] for axis in "XY")
+    assert all(rows.demand[axis] == anew.demand[axis][: len(rows.offset[axis])] for axis in "XY")
+    for axis in "XY":
+        assert len(anew.offset[axis]) == len(begin.offset[axis])
+        assert anew.offset[axis][1700:] == begin.offset[axis][1700:] or text == SHORT
+        limits = PlanLimits.of(CONFIG.axis[axis], 0.001)
+        assert check(np.array(anew.offset[axis]), limits) == []
+
+
+def test_rows_that_are_right_already_stay(tmp_path: Path) -> None:
+    """Axes without a current begin as the check assumed, others as they were known to stand."""
+    program, begin = checked(tmp_path, SHORT, MODELS, CONFIG)
+    first = FirstBlock(begin, program, MODELS, CONFIG)
+    assert first.renew(resting({"X": 0.1, "Y": -0.1})) is None
+    assert first.renew(resting({"X": 0.0, "Y": 4.0})) is not None
+    assert first.renew(resting({"X": 0.0, "Y": 4.1})) is None
+    assert first.renew(resting({"X": 0.0, "Y": 0.0})) is not None  # it has moved since
+
+
+def test_what_the_way_to_the_start_leaves_is_expected(tmp_path: Path) -> None:
+    """X comes from the positive side, Y stands there: independent drives that do so are corrected from their start."""
+    program, begin = checked(tmp_path, LONG, MODELS, CONFIG)
+    first = FirstBlock(begin, program, MODELS, CONFIG)
+    assert first.expect({"X": AtRest(250.0, 250.0, 3.0), "Y": AtRest(0.0, 0.0, 5.0)}) is not None
+    amperes = {"X": -6.0, "Y": 5.0}
+    before, after = (cut(program, piece, amperes, CONFIG) for piece in (begin, first.begin))
+    assert rms(after[:600]) < 0.3 * rms(before[:600])
+    assert first.renew(resting(amperes)) is None  # as it was expected
+
+
+@pytest.mark.parametrize("rest", [{}, {"X": AtRest(0, 0, 3)}, {"X": AtRest(0, 0, 3), "Y": AtRest(5, 5, 3)}])
+def test_an_axis_that_does_not_stand_at_the_start_leaves_the_rows(rest: dict[str, AtRest], tmp_path: Path) -> None:
+    """What it holds when the program starts is not known yet."""
+    program, begin = checked(tmp_path, SHORT, MODELS, CONFIG)
+    first = FirstBlock(begin, program, MODELS, CONFIG)
+    assert first.renew(rest) is None
+    assert first.begin is begin
+
+
+def heard(first: int, current: Float, position: float = 1.0) -> AxisSamples:
+    """Return samples of an axis that stands, from a tick on."""
+    n = current.size
+    still = frozen(np.full(n, position))
+    zero, ticks = frozen(np.zeros(n)), frozen_ints(np.arange(first, first + n))
+    return AxisSamples("X", ticks, still, still, zero, frozen(current), None, zero, frozen_ints(np.zeros(n)))
+
+
+def test_the_current_is_that_of_the_last_samples() -> None:
+    """It is heard once the axis has stood for a while, and is the newest that is known."""
+    standstill = Standstill(CONFIG)
+    rows = round(WATCHED_S / 0.001)
+    standstill.take(heard(0, np.full(rows // 2, 1.0)))
+    assert standstill.now() == {}
+    standstill.take(heard(rows // 2, np.full(rows, 2.0)))
+    assert standstill.now()["X"] == pytest.approx(AtRest(1.0, 1.0, 2.0))
+
+
+def test_an_axis_that_moves_or_was_not_heard_is_not_at_rest() -> None:
+    """Motion, a lost row, an offset in force, or a SYNC count that begins anew."""
+    rows = round(WATCHED_S / 0.001)
+    good = heard(0, np.full(2 * rows, 2.0))
+    moved = replace(good, position_mm=frozen(np.linspace(0, 1, 2 * rows)))
+    holed = replace(good, tick=frozen_ints(np.where(good.tick > rows, good.tick + 1, good.tick)))
+    offset = replace(good, offset_mm=frozen(np.full(2 * rows, 0.001)))
+    for samples in (moved, holed, offset):
+        standstill = Standstill(CONFIG)
+        standstill.take(samples)
+        assert standstill.now() == {}
+    standstill = Standstill(CONFIG)
+    standstill.take(good)
+    standstill.take(heard(0, np.full(10, 2.0)))
+    assert standstill.now() == {}

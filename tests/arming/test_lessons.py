@@ -1,0 +1,92 @@
+"""A program that is armed again carries what its last pass taught; a disturbed pass teaches nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil import correction
+from fdhil.arming import passes
+from fdhil.config import MachineConfig
+from fdhil.config.controller import Correction as Learning
+from fdhil.program import load_trajectory
+from fdhil.records import Correction
+from tests.arming.mill import Mill
+from tests.arming.test_ahead import opened
+from tests.arming.test_passes import heard, measured
+from tests.arming.test_preparing import GENTLE, save_records
+from tests.daemon.machine import config_of
+from tests.store.made import published
+
+WAVE_MM = 2e-3
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> MachineConfig:
+    """The bench, two axes, commissioned; it learns."""
+    config = config_of(tmp_path, ("X", "Y")).model_copy(update={"correction": Learning(learning=True)})
+    save_records(config)
+    return config
+
+
+@pytest.fixture
+def mill(config: MachineConfig) -> Iterator[Mill]:
+    """The guard."""
+    assert config.store.run_directory is not None
+    config.store.run_directory.mkdir(parents=True)
+    made = Mill(config.store.run_directory)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def program(tmp_path: Path) -> Path:
+    """A corner."""
+    path = tmp_path / "gentle.ngc"
+    path.write_text(GENTLE)
+    return path
+
+
+@pytest.fixture
+def planned(config: MachineConfig, program: Path) -> Correction:
+    """The corner, planned."""
+    models = {axis: published().parameters for axis in "XY"}
+    return correction.plan(load_trajectory(program, config), models, config)
+
+
+async def test_the_next_pass_carries_what_the_last_one_taught(
+    config: MachineConfig, mill: Mill, program: Path, planned: Correction, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(passes, "LATE_S", 0.0)
+    reference = planned.before.reference
+    wave = WAVE_MM * np.sin(2 * np.pi * 3.0 * reference.time_s) * np.hanning(reference.time_s.size)
+    off = {"X": planned.after.predicted_mm["X"] + wave, "Y": planned.after.predicted_mm["Y"]}
+    slower = {axis: np.interp(reference.time_s * 0.9, reference.time_s, p) for axis, p in reference.position_mm.items()}
+    offsets, warnings = [], []
+    async with opened(config, mill) as shop:
+        for number, (demand, cause) in enumerate(
+            [(slower, "Finished"), (reference.position_mm, "Disarmed"), (reference.position_mm, "Finished")], 1
+        ):
+            answer = await shop.arm(program)
+            assert answer["ok"], answer
+            warnings.append(answer["warnings"])
+            offsets.append(np.array([row[2:] for row in mill.rows]))
+            for block in heard(demand, off if demand is not slower else demand):
+                shop.desk.hear(block)
+            mill.state, mill.cause = "OFF", cause
+            await shop.until(partial(measured, shop.desk, number))
+        answer = await shop.arm(program)
+        learned = np.array([row[2:] for row in mill.rows])
+    assert [told.get("learned") is not None for told in shop.desk.passes] == [False, False, True]
+    assert shop.desk.passes[-1]["learned"]["passes"] == 1
+    assert all(np.array_equal(offsets[0], other) for other in offsets), "a disturbed pass has taught something"
+    assert not any("Learned" in text for told in warnings for text in told)
+    assert any("Learned: what 1 passes taught is added" in text for text in answer["warnings"])
+    added_mm = (learned - offsets[0])[: wave.size, 0] * config.axis["X"].screw_pitch_mm / 65536
+    assert np.corrcoef(added_mm, -wave)[0, 1] > 0.95
+    assert not np.array_equal(learned[:, 0], offsets[0][:, 0])
+    assert np.abs((learned - offsets[0])[:, 1]).max() <= 2, "Y had nothing to learn"

@@ -1,0 +1,87 @@
+"""Learning from pass to pass on a plant that the model does not hold, measured by its motor's encoder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil.config import MachineConfig
+from fdhil.correction.learning import MOST_SHARE, Lesson, learn
+from fdhil.correction.limits import fit_all
+from fdhil.correction.planning import plan
+from fdhil.prediction import contour_error_um
+from fdhil.records import Float, Parameters, Trajectory, rms
+from studies.real_plant import Loops, Mechanics, at_rest, run
+from tests.bench import bench_config
+from tests.paths import bench_trajectory
+
+INCREMENT_MM = 20.0 / 65536
+REAL = Mechanics(static=0.2, asymmetry=0.05, screw_ripple=0.05, motor_ripple_nm=0.4, load_nm=2.0)
+
+
+def cut(mechanics: Mechanics, loops: Loops, reference: Trajectory, offset_um: Mapping[str, Float]) -> dict[str, Float]:
+    """Return where the encoders of X and Y say that they are, mm."""
+    found = {}
+    for axis, path in reference.position_mm.items():
+        begin = at_rest(mechanics, loops, float(path[0]) * 1e-3)
+        moved = run(mechanics, (path + offset_um[axis] * 1e-3) * 1e-3, loops, start=begin)
+        found[axis] = np.round(moved.motor_m * 1e3 / INCREMENT_MM) * INCREMENT_MM
+    return found
+
+
+def passes(count: int, loops: Loops, wear: float = 0.0, disturbed: int = -1) -> tuple[list[float], list[float]]:
+    """Return the RMS (um) of each pass as it learned, and of the model alone on the same machine at that pass."""
+    config, reference = bench_config(), bench_trajectory(10)
+    models = dict.fromkeys(reference.axes, Parameters.of(REAL.truth()).changed(Cd=5.2))
+    offset = plan(reference, models, config).offset_um
+    lesson, mechanics = Lesson.none(reference), REAL
+    learned, alone = [], []
+    for number in range(count):
+        if number == disturbed:
+            lesson = replace(lesson, offset_um={axis: u + 20.0 for axis, u in lesson.offset_um.items()})
+        rough = {axis: offset[axis] + lesson.offset_um[axis] for axis in reference.axes}
+        at = cut(mechanics, loops, reference, fit_all(rough, config.axis, reference.dt_s))
+        learned.append(left(reference, at))
+        alone.append(left(reference, cut(mechanics, loops, reference, offset)))
+        error_um = {axis: (reference.position_mm[axis] - at[axis]) * 1e3 for axis in reference.axes}
+        lesson = learn(lesson, error_um, learned[-1], models, config)
+        bounded(lesson, config)
+        mechanics = replace(mechanics, Cd=mechanics.Cd * (1 - wear))
+    return learned, alone
+
+
+def left(reference: Trajectory, at: Mapping[str, Float]) -> float:
+    """Return the RMS of the contour error, um."""
+    return rms(contour_error_um(reference.path_mm, np.column_stack(list(at.values())), reference.dt_s))
+
+
+def bounded(lesson: Lesson, config: MachineConfig) -> None:
+    """Nothing learned is beyond its share of what an offset may be."""
+    for axis, offset in lesson.offset_um.items():
+        limits = config.axis[axis].correction
+        assert limits is not None
+        assert float(np.abs(offset).max()) <= MOST_SHARE * limits.max_offset_um
+
+
+@pytest.mark.parametrize("loops", [Loops(), Loops(speed_filter_s=0.001)], ids=["as configured", "unknown filter"])
+def test_three_passes_leave_a_third_of_what_the_model_alone_leaves(loops: Loops) -> None:
+    learned, alone = passes(4, loops)
+    assert learned[0] == pytest.approx(alone[0])
+    assert learned[3] * 3 <= alone[3], (learned, alone)
+    assert all(now <= 1.02 * then for now, then in zip(learned, alone, strict=True)), (learned, alone)
+
+
+def test_friction_that_drifts_is_followed() -> None:
+    learned, alone = passes(5, Loops(), wear=0.03)
+    assert all(now <= 1.02 * then for now, then in zip(learned, alone, strict=True)), (learned, alone)
+    assert learned[4] * 2 <= alone[4], (learned, alone)
+
+
+def test_a_pass_that_is_worse_than_without_ends_what_was_learned() -> None:
+    learned, alone = passes(5, Loops(), disturbed=2)
+    assert learned[2] > alone[2], "the disturbance does not disturb"
+    assert learned[3] == pytest.approx(alone[3], rel=0.01)
+    assert learned[4] < alone[4]

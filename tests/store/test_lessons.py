@@ -1,0 +1,50 @@
+"""What passes taught is there after a restart, and what is damaged is learned anew."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil.correction.learning import Lesson
+from fdhil.errors import StoreError
+from fdhil.store.lessons import MOST_PROGRAMS, lesson_path, read_lesson, write_lesson
+
+LESSON = Lesson({"X": np.linspace(-3.0, 3.0, 50), "Y": np.zeros(50)}, 1.5, 0.35, (1.5, 0.6, 0.4))
+
+
+def test_a_lesson_is_read_as_it_was_written(tmp_path: Path) -> None:
+    path = lesson_path(tmp_path / "lessons", "ab" * 32, "cd" * 8)
+    assert read_lesson(path) is None
+    write_lesson(path, LESSON)
+    found = read_lesson(path)
+    assert found is not None
+    assert (found.without_um, found.gain, found.curve_um) == (1.5, 0.35, (1.5, 0.6, 0.4))
+    assert all(np.array_equal(found.offset_um[axis], LESSON.offset_um[axis]) for axis in "XY")
+
+
+@pytest.mark.parametrize("keep", [0, 10, 400])
+def test_a_damaged_lesson_is_none(tmp_path: Path, keep: int) -> None:
+    path = tmp_path / "a.npz"
+    write_lesson(path, LESSON)
+    path.write_bytes(path.read_bytes()[:keep])
+    assert read_lesson(path) is None
+
+
+def test_a_lesson_that_is_not_finite_is_none(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    write_lesson(path, Lesson({"X": np.array([1.0, np.nan])}))
+    assert read_lesson(path) is None
+
+
+def test_the_oldest_lessons_go(tmp_path: Path) -> None:
+    for number in range(MOST_PROGRAMS + 3):
+        write_lesson(tmp_path / f"{number}.npz", Lesson({"X": np.zeros(2)}))
+    assert len(list(tmp_path.glob("*.npz"))) == MOST_PROGRAMS
+
+
+def test_a_folder_that_cannot_be_written_is_told(tmp_path: Path) -> None:
+    (tmp_path / "lessons").write_text("no folder")
+    with pytest.raises(StoreError, match="could not be written"):
+        write_lesson(tmp_path / "lessons" / "a.npz", LESSON)
