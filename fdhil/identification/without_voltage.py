@@ -158,8 +158,10 @@ def candidates(fitted: TorqueFit) -> list[Term]:
     rows, joined = fitted.rows, {name for term in fitted.terms for name in term.names}
     found = []
     if "stribeck" not in joined:
-        top = float(np.abs(rows.speed).max())
-        found += [_stribeck(rows, share * top) for share in STRIBECK_SHARES]
+        speed = np.abs(rows.speed[rows.usable])
+        found += [
+            _stribeck(rows, share * speed.max()) for share in STRIBECK_SHARES if share * speed.max() > speed.min()
+        ]
     for order in SCREW_ORDERS:
         name = f"ripple_screw_{order}"
         if name not in joined:
