@@ -17,7 +17,8 @@ from fdhil.config import Identification, MachineConfig
 from fdhil.errors import FdhilError
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
-from fdhil.records import Estimate, Reason, Recording, Verdict, Window, WindowOutcome
+from fdhil.pipeline.own_loops import better_axis, loops_of, suspected
+from fdhil.records import Estimate, LoopEstimate, Reason, Recording, Verdict, Window, WindowOutcome
 from fdhil.store.recording_csv import SOURCES, read_recording
 
 MANY_FILES = 16  # from here on further processes pay for their start
@@ -28,7 +29,10 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, slots=True)
 class FileResult:
-    """One recording: its windows analysed, and their pool; one that cannot be read has an ``error`` and no axis."""
+    """One recording: its windows analysed, and their pool; one that cannot be read has an ``error`` and no axis.
+
+    ``loops`` are the drive's own, where the configured ones did not explain its rapids.
+    """
 
     file: str
     axis: str | None
@@ -36,6 +40,7 @@ class FileResult:
     pooled: Estimate | None
     verdict: Verdict
     error: Mapping[str, Any] | None = None
+    loops: LoopEstimate | None = None
 
 
 def unseen(share: float) -> None:
@@ -87,9 +92,13 @@ def analyse_file(
     for outcome in _outcomes(windows, work):
         outcomes.append(outcome)
         progress(1.0 / (len(windows) + 1))
+    loops = loops_of(outcomes, axis, settings, period_s) if suspected(outcomes) else None
+    own_axis = better_axis(axis, loops)
+    if own_axis is not None:
+        outcomes = list(_outcomes(windows, partial(work, axis=own_axis)))
     estimate, verdict = pool(outcomes, settings)
     progress(1.0 / (len(windows) + 1))
-    return FileResult(str(path), recording.axis, tuple(outcomes), estimate, verdict)
+    return FileResult(str(path), recording.axis, tuple(outcomes), estimate, verdict, loops=loops)
 
 
 def told_by(recording: Recording, settings: Identification) -> Identification:

@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from fdhil.config import Axis, Identification
+from fdhil.config.controller import TOLERANCE_SHARE
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.windows import carried
 from fdhil.model.terms import torque
@@ -22,7 +23,6 @@ from fdhil.records import PARAMETERS, Bool, Float, Parameters, Reason, Window, r
 from fdhil.validation.replay import Replay, replay_window
 from fdhil.validation.table_error import TableError
 
-TOLERANCE_SHARE = 0.05  # of the following error: on two machines with 90 real effects it parts what gains from what not
 NEXT_SPEED = 0.3  # of the rapid speed: that of a program that is cut
 SCATTER = 3.0  # deviations by which the power of noise may lie above what is expected
 BEGINNING_S = 0.060  # before the drive surely moves
@@ -33,7 +33,7 @@ NOISE_ROWS = 25.0e-3  # s: over which noise behind a position loop hangs togethe
 
 def tolerance_um(settings: Identification, following_um: float) -> float:
     """Return the RMS at the table that a model may leave of a rapid with this following error."""
-    return settings.tolerance_um or TOLERANCE_SHARE * following_um
+    return settings.tolerance_for(following_um)
 
 
 @dataclass(frozen=True, slots=True)
