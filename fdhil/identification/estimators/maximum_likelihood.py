@@ -26,6 +26,7 @@ from fdhil.identification.normal import inverse_of, solve
 from fdhil.identification.selection import joined
 from fdhil.identification.signals import mended
 from fdhil.identification.slow_descent import Likelihood, likelier_delay
+from fdhil.identification.slow_rows import with_open_course
 from fdhil.identification.slow_start import slow_least_squares, slow_start, with_course
 from fdhil.identification.slow_voltage import in_order
 from fdhil.identification.term_estimates import told_terms
@@ -65,7 +66,7 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
     start = starting_point(least_squares.raw_values(signals, [w.dt_s for w in usable]))
     if start is None:
         return None
-    motions = [prepare(w) for w in usable]
+    motions = [with_open_course(prepare(w), start) for w in usable]
     delays = [coarse_delay(s, w.dt_s) for s, w in zip(signals, usable, strict=True)]
     command = settings.voltage_source != "terminals"
     if any(w.voltage_delay_s is not None for w in usable):
@@ -184,15 +185,17 @@ def delay_direction(result: Fit) -> Float:
 
 
 def doubts(result: Fit, inverse: Float) -> Float:
-    """Return what noise cannot explain: one standard deviation (k, 2) of the entries of theta.
+    """Return what noise cannot explain: one standard deviation (k, q) of the entries of theta.
 
     An interval mean leaves the voltage's course within the sample open: its largest part, the back-EMF's ramp, is
     known but for the regulators' answer to it (first column); what looks like a delay is the second. Either is the
     same in all windows of a drive, so that more windows do not lessen it.
     """
-    columns = np.zeros((result.theta.size, 2))
+    effects = result.problem.course_effects(result.theta)
+    columns = np.zeros((result.theta.size, 1 + effects.shape[1]))
     free = list(result.free)
-    columns[free, 0] = inverse @ (result.jacobian.T @ result.problem.shape_effect(result.theta))
+    columns[free, 0] = inverse @ (result.jacobian.T @ effects[:, 0])
+    columns[free, 2:] = inverse @ (result.jacobian.T @ effects[:, 1:])
     if result.delay_doubt_s > 0.0:
         others = but_delay(free)
         columns[others, 1] = -result.delay_doubt_s * solve(result.but_delay, delay_direction(result))[0]
