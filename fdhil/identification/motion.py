@@ -70,7 +70,7 @@ class Motion:
     and ``shape_variance`` (m,), V^2, what the voltage's course within a row adds to its noise. ``courses`` are those of
     the terms that joined, in the order of the last entries of theta;
     ``angle_rad`` (n,) is the shaft's as its place tells, or has no rows;
-    ``within`` is what is open within long rows;
+    ``within`` is what is open within long rows, ``known`` are courses whose size is;
     ``speed_late`` is by how many seconds the recorded speed was late, and the standard deviation of that.
     """
 
@@ -91,6 +91,7 @@ class Motion:
     angle_rad: Float = field(default_factory=lambda: np.zeros(0))
     speed_late: tuple[float, float] | None = None
     within: Within | None = None
+    known: tuple[Course, ...] = ()
 
     @property
     def n(self) -> int:
