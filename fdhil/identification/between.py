@@ -23,8 +23,7 @@ STEPS = np.array([0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064])
 SCATTERS = np.array([0.0, 0.003, 0.01, 0.03])
 SMALL_SCATTERS = np.array([0.0, 0.0005, 0.002, 0.008])
 SURELY = 6.9  # logarithm of a ratio of likelihoods: two sizes more explain so much by chance once in a thousand
-STEADY = 0.3  # prior chance that there is no walk at all
-NO_SCATTER = 0.7  # prior chance that there is no scatter at all
+NO_SCATTER = 0.9  # prior chance that there is no scatter at all
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,16 +67,20 @@ ALIKE = Between({}, {}, {}, surely=False)
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """Parameters that differ together, and the grid of what they may do."""
+    """Parameters that differ together, and the grid of what they may do.
+
+    ``steady`` is the prior chance that they do not walk at all.
+    """
 
     names: tuple[str, ...]
     steps: Float
     scatters: Float
+    steady: float = 1.0
 
     def grid(self) -> tuple[Float, Float]:
         """Return (g, 2) shares of walk and scatter, and the logarithms (g,) of their prior chances."""
         pairs = np.array([(walk, scatter) for walk in self.steps for scatter in self.scatters])
-        chances = np.outer(_chances(self.steps, STEADY), _chances(self.scatters, NO_SCATTER))
+        chances = np.outer(_chances(self.steps, self.steady), _chances(self.scatters, NO_SCATTER))
         return pairs, np.log(chances.ravel())
 
 
@@ -89,11 +92,11 @@ def _chances(sizes: Float, none: float) -> Float:
 
 _NONE = np.zeros(1)
 KINDS = (
-    Kind(("R",), STEPS, _NONE),
+    Kind(("R",), STEPS, _NONE, 0.7),
     Kind(("L",), _NONE, SMALL_SCATTERS),
     Kind(("K",), _NONE, SMALL_SCATTERS),
     Kind(("Jt",), _NONE, SMALL_SCATTERS),
-    Kind(("ft", "Cd"), STEPS, SCATTERS),
+    Kind(("ft", "Cd"), STEPS, SCATTERS, 0.3),
 )
 
 

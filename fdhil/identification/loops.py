@@ -2,9 +2,9 @@
 
 The four gains every cascade has are fitted first. What else a drive may have joins one key at a time, the likeliest of
 all first, as long as it explains a tenth of the tolerance at the table, or a quarter of what is left: over hundreds of
-rows no chance does either. The other structures of the table are tried against the cascade by the same measure. With full feed-forward and no filter, a
-cascade answers the same when position_gain_per_s and speed_ki / speed_kp change places: of the two the one nearer to
-where the fit began is told.
+rows no chance does either. The other structures of the table are tried against the cascade by the same measure. With
+full feed-forward and no filter, a cascade answers the same when position_gain_per_s and speed_ki / speed_kp change
+places: of the two the one nearer to where the fit began is told.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,6 @@ from fdhil.identification.loop_replay import Rapid, fitting_periods, rapid_of, w
 from fdhil.identification.loop_start import CASCADE, begun_anew, made_up_axis
 from fdhil.records import INTERVAL_95, LoopEstimate, Parameters, Reason, Verdict, Window, frozen, rms
 
-EXPLAINED_SHARE = 0.05  # of the following error, where the config has no tolerance
 WORTH, WORTH_LEFT = 0.1, 0.25  # of the tolerance, or of what is left: what a key must explain to join
 LEAST_UM = 0.1
 WELL = 0.25  # of the tolerance: with less left no other structure is tried
@@ -60,14 +60,16 @@ def identify_loops(
     ``mechanics`` are what each window's estimate says of the motor and what it moves, ``axis`` the machine's section:
     without it the search begins from the demand alone. Set-points come every ``sync_period_s`` (left out: each row).
     """
-    pairs = [(rapid_of(w, sync_period_s), own) for w, own in zip(windows, mechanics, strict=True)]
-    told = [(rapid, own) for rapid, own in pairs if rapid is not None and np.isfinite([*own.as_dict().values()]).all()]
-    if not told:
+    pairs = [
+        (w, own) for w, own in zip(windows, mechanics, strict=True) if np.isfinite([*own.as_dict().values()]).all()
+    ]
+    told = [rapid for w, own in pairs if (rapid := rapid_of(w, own, sync_period_s)) is not None]
+    rapids = tuple(told[-MOST_WINDOWS:])
+    if not rapids:
         return None
-    rapids, plants = zip(*told[-MOST_WINDOWS:], strict=True)
     following = rms(np.concatenate([one.lag_mm[one.known] for one in rapids])) * 1e3
-    tolerance = settings.tolerance_um or EXPLAINED_SHARE * following
-    problem = _problem(rapids, plants, axis, windows[0])
+    tolerance = settings.tolerance_for(following)
+    problem = _problem(rapids, axis, windows[0])
     found = _whole_delay(_best(problem, tolerance, axis is not None))
     configured = None if axis is None else _left_um(problem)
     verdict = _verdict(found, tolerance, following, configured)
@@ -75,17 +77,16 @@ def identify_loops(
 
 
 def _left_um(problem: Problem) -> float:
-    """Return what the configured regulators leave of the position, the dry friction of each window found anew."""
-    return loop_fit.fit(replace(problem, names=())).unexplained_um
+    """Return what the regulators that the search begins with leave of the position."""
+    return float(loop_fit.spread_of(problem, loop_fit.left_of(problem, problem.start())[0])[0]) * 1e3
 
 
-def _problem(rapids: tuple[Rapid, ...], plants: tuple[Parameters, ...], axis: Axis | None, window: Window) -> Problem:
+def _problem(rapids: tuple[Rapid, ...], axis: Axis | None, window: Window) -> Problem:
     """Return where the search begins: at the configured regulators, or at what the demand alone says."""
     if axis is None:
-        made_up = made_up_axis(window, plants[-1], rapids[-1].dt_s)
-        return begun_anew(Problem(rapids, plants, made_up, CASCADE))
+        return begun_anew(Problem(rapids, made_up_axis(window, rapids[-1]), CASCADE))
     axis = with_regulators(axis, **fitting_periods(axis.regulators, rapids[0].dt_s))
-    return Problem(rapids, plants, axis, _names(axis.regulators))
+    return Problem(rapids, axis, _names(axis.regulators))
 
 
 def _names(regulators: Regulators) -> tuple[str, ...]:
@@ -128,10 +129,8 @@ def worth_um(made: Fit, tolerance_um: float) -> float:
 
 def _with(made: Fit, name: str) -> Fit:
     """Return the fit with one key more, begun where it was without, and where all began: its lack bends the others."""
-    k = made.problem.k
     wider = replace(made.problem, names=(*made.problem.names, name))
-    starts = [np.insert(made.coordinates, k, KEYS[name].step), wider.start()]
-    starts[1][k] = KEYS[name].usual
+    starts = [np.append(made.coordinates, KEYS[name].step), np.append(made.problem.start(), KEYS[name].usual)]
     return min((loop_fit.fit(wider, start) for start in starts), key=lambda fit: fit.deviance)
 
 
@@ -212,21 +211,20 @@ def _verdict(made: Fit, tolerance_um: float, following_um: float, configured_um:
 
 def better_loops(loops: LoopEstimate) -> bool:
     """Return whether loops are believed and explain more than the configured ones, so that they are used instead."""
-    differ = loops.configured_um is None or any(warning.code == DIFFER for warning in loops.verdict.warnings)
-    return loops.verdict.accepted and differ
+    return loops.verdict.accepted and any(warning.code == DIFFER for warning in loops.verdict.warnings)
 
 
 def with_loops(axis: Axis, loops: LoopEstimate) -> Axis:
     """Return the axis with the regulators that were identified in the place of the configured ones."""
-    values: dict[str, object] = axis.regulators.model_dump()
-    values |= {"structure": loops.structure} | dict(zip(loops.names, loops.values.tolist(), strict=True))
-    if DELAY in loops.names:
-        values[DELAY] = round(float(loops.values[loops.names.index(DELAY)]))
-    if loops.structure == "pid":
-        values |= {"speed_ki": 0.0, "speed_filter_s": 0.0}
-    elif loops.structure == "p_pi_pi":
-        values["position_ki_per_s2"] = 0.0
+    values = {**axis.regulators.model_dump(), **regulators_of(loops)}
     return axis.model_copy(update={"regulators": Regulators.model_validate(values)})
+
+
+def regulators_of(loops: LoopEstimate) -> dict[str, Any]:
+    """Return keys of ``[axis.X.regulators]`` as they were found; what a structure does not have is 0."""
+    lacks = {"pid": ("speed_ki", "speed_filter_s"), "p_pi_pi": ("position_ki_per_s2",)}.get(loops.structure, ())
+    found = dict(zip(loops.names, loops.values.tolist(), strict=True))
+    return {"structure": loops.structure, **found, **dict.fromkeys(lacks, 0.0)}
 
 
 def differences(axis: Axis, loops: LoopEstimate) -> list[Difference]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from fdhil.config import Identification
-from fdhil.identification import without_voltage
 from fdhil.identification.between import ALIKE, Between, Member, between
 from fdhil.identification.estimators import chosen
 from fdhil.identification.identifiability import unphysical, untold
@@ -27,6 +29,7 @@ OF_THE_MOVE = (
     "LoadDetected",
     "Timing",
 )
+_FIGURES = re.compile(r"[-+]?[0-9][-+.0-9e]*")  # in which warnings of one kind differ
 
 Told = list[tuple[Window, Estimate]]
 
@@ -66,27 +69,14 @@ def together(
     reasons = list(one_sided(outcomes))
     estimate: Estimate | None = told[0][1]
     if len(told) > 1:
-        deaf = not any(window.voltage_v is not None or window.slow_voltage is not None for window, _ in told)
         try:
-            estimate = (
-                without_voltage.pooled(told, settings)
-                if deaf
-                else _estimated(told, members, between(history), settings, refit=refit)
-            )
+            estimate = _estimated(told, members, between(history), settings, refit=refit)
         except GAVE_UP as error:
             return None, Verdict(False, None, (gave_up(error, "look at the windows"),))
-        slow = any(window.slow_voltage is not None for window, _ in told)
-        reasons += untold(estimate, slow=slow or deaf) + unphysical(estimate) + _moved(told, deaf)
-    return estimate, _verdict([o.verdict for o in accepted], reasons)
-
-
-def _moved(told: Told, deaf: bool) -> list[Reason]:
-    """Return what differs between windows; without a voltage a constant load makes friction differ by direction."""
-    if not deaf:
-        return moved(told)
-    six = [(w, replace(e, values=e.values[:6], covariance=e.covariance[:6, :6])) for w, e in told]
-    ways = ([pair for pair in six if pair[0].direction == side] for side in (1, -1))
-    return [reason for way in ways if len(way) > 1 for reason in moved(way)]
+        # where the voltage is slow, or there is none, R and L may stay open
+        slow = any(window.slow_voltage is not None or window.voltage_v is None for window, _ in told)
+        reasons += untold(estimate, slow=slow) + unphysical(estimate) + moved(told)
+    return estimate, _verdict(accepted, reasons)
 
 
 def _estimated(
@@ -96,12 +86,14 @@ def _estimated(
     first = told[0][1]
     quick = pooled(members, first, apart)
     whole = all(set(PARAMETERS) <= set(m.names) for m in members)
-    if (not refit and whole) or quick.terms or apart.surely:
+    deaf = all(window.voltage_v is None and window.slow_voltage is None for window, _ in told)
+    if deaf or quick.terms or apart.surely or (whole and not refit):
         return quick
     again = chosen(settings)[1]([window for window, _ in told], settings)
-    if not whole or again.names != quick.names:
+    alike = pooled(members, first, ALIKE)
+    if not again.names == alike.names == quick.names:
         return again
-    wider = quick.covariance - pooled(members, first, ALIKE, joining=False).covariance
+    wider = np.nan_to_num(quick.covariance - alike.covariance)  # nothing where a slow voltage leaves R or L open
     return replace(again, covariance=frozen(again.covariance + wider))
 
 
@@ -129,11 +121,15 @@ def refuses_the_model(outcome: WindowOutcome) -> bool:
     return not outcome.verdict.accepted and not any(part in code for code in codes for part in OF_THE_MOVE)
 
 
-def _verdict(verdicts: Sequence[Verdict], reasons: Sequence[Reason]) -> Verdict:
+def _verdict(accepted: Sequence[WindowOutcome], reasons: Sequence[Reason]) -> Verdict:
     """Return the pool's verdict: its own reasons, the worst of the windows' figures, each of their warnings once."""
+    verdicts = [o.verdict for o in accepted]
     fits = [v.fit_percent for v in verdicts if v.fit_percent is not None]
     unexplained = [v.unexplained_um for v in verdicts if v.unexplained_um is not None]
-    warnings = {warning.code: warning for v in verdicts for warning in v.warnings}
-    return Verdict(
-        not reasons, min(fits, default=None), tuple(reasons), max(unexplained, default=None), tuple(warnings.values())
-    )
+    warnings = {_FIGURES.sub("", str(warning)): warning for v in verdicts for warning in v.warnings}
+    told = list(warnings.values())
+    if len({o.window.direction for o in accepted}) == 1 and not reasons:
+        text = "all moves go one way: a constant load is part of Cd, as nothing tells it apart"
+        told.append(Reason("OneDirection", text, "record rapids in both directions"))
+    figure = max(unexplained, default=None)
+    return Verdict(not reasons, min(fits, default=None), tuple(reasons), figure, tuple(told))

@@ -27,6 +27,7 @@ UNITS: Mapping[str, str] = {
     "Jt/K": "A.s2/rad",
     "ft/K": "A.s/rad",
     "Cd/K": "A",
+    "friction_at_rapid": "N.m",  # Cd + ft w at the rapid speed
 }
 
 # what may join the six; of a ripple's name the number is its periods in a turn of the motor
@@ -42,7 +43,7 @@ _TERMS: Mapping[str, str] = {
     r"bus_sag": "1/W",
     r"speed_delay": "s",
     r"resonance": "Hz",
-    r"resonance_damping": "1",
+    r"resonance_(damping|share)": "1",
 }
 
 

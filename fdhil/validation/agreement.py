@@ -7,6 +7,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 
+from fdhil.identification.drift import FRICTION, LEAST_JUMP
 from fdhil.identification.pooling import difference_covariance
 from fdhil.records import PARAMETERS, Estimate, Float, Reason, Window
 from fdhil.validation.significance import BUDGET
@@ -20,7 +21,6 @@ GAINS: Mapping[str, Float] = {  # powers of R, L, K, Jt, ft, Cd
     "speed": np.array([0.0, 0.0, -1.0, -2.0, -2.0, -1.0]),
 }
 LEAST_GAIN_CHANGE = 0.02
-FRICTION = ("ft", "Cd")
 WARMING = ("R", *FRICTION)
 LEAST_CHANGE: Mapping[str, float] = {"R": 0.02, "L": 0.03, "K": 0.01, "Jt": 0.02, "ft": 0.15, "Cd": 0.10}
 
@@ -45,7 +45,7 @@ def values_apart(estimate: Estimate, likeliest: Float) -> Iterator[Reason]:
 def moved(told: Sequence[tuple[Window, Estimate]]) -> list[Reason]:
     """Return a reason for each parameter that differs between windows beyond chance and by enough to matter.
 
-    L, K and Jt are the same in all windows, given in order. What warms moves on from window to window and is no jump: R
+    L, K and Jt are the same in all windows, given in order. What warms drifts from window to window and is no jump: R
     is compared with the window before, friction with that before in the same direction, as a load and the screw make
     it another in the other. One sensor's gain moves several parameters at once, each in its own proportion: where that
     explains all of it, the sensor is the reason, even where no parameter alone moves enough to tell.
@@ -81,7 +81,8 @@ def _farthest(told: Sequence[tuple[Window, Estimate]], name: str) -> Pair | None
     one, other = max(pairs, key=lambda pair: abs(pair[1][1].value(name) - pair[0][1].value(name)))
     k = PARAMETERS.index(name)
     chance = BEYOND_CHANCE * float(np.sqrt(difference_covariance(one, other)[k, k]))
-    least = LEAST_CHANGE[name] * abs(float(np.median([e.value(name) for _, e in known])))
+    share = LEAST_JUMP[name] if name in WARMING else LEAST_CHANGE[name]
+    least = share * abs(float(np.median([e.value(name) for _, e in known])))
     return (one, other) if abs(other[1].value(name) - one[1].value(name)) > max(chance, least) else None
 
 

@@ -11,7 +11,7 @@ from fdhil.validation.agreement import values_apart
 from fdhil.validation.evidence import LEAST_ROWS, Evidence
 from fdhil.validation.interruptions import interruptions
 from fdhil.validation.plausibility import clipped, gaps, missing_stages, not_finite, position_parted
-from fdhil.validation.rest import rest_faults
+from fdhil.validation.rest import friction_at_rest, rest_faults
 from fdhil.validation.simulation import expected_fit_percent
 from fdhil.validation.slow_fitted import slow_faults_beside
 from fdhil.validation.slow_readings import slow_voltage_faults
@@ -34,7 +34,7 @@ def _enough_rows(evidence: Evidence) -> bool:
 
 
 def _has_voltage(evidence: Evidence) -> bool:
-    return evidence.window.voltage_v is not None or evidence.window.slow_voltage is not None
+    return evidence.has_voltage
 
 
 def _fitted(evidence: Evidence) -> bool:
@@ -91,7 +91,7 @@ def _estimate_faults(evidence: Evidence) -> Iterator[Reason]:
     open_end = bool(estimate.missing) and not missing and fit is not None and not fit.converged
     if open_end or estimate.result is Result.DIVERGED:
         yield Reason("SolverFailed", "the fit does not converge", "look at the window's signals")
-    yield from unphysical(evidence.told or estimate)
+    yield from unphysical(evidence.told or estimate, one_way=True)
 
 
 def _no_fit(evidence: Evidence) -> Iterator[Reason]:
@@ -134,7 +134,17 @@ def _values(evidence: Evidence) -> Iterable[Reason]:
     return values_apart(evidence.estimate, evidence.judged.theta[:6])
 
 
-MODEL = ("estimate", "fit", "late voltage", "late current", "structure", "whiteness", "excess noise", "standstill")
+MODEL = (
+    "estimate",
+    "fit",
+    "late voltage",
+    "late current",
+    "structure",
+    "whiteness",
+    "excess noise",
+    "standstill",
+    "friction at rest",
+)
 BEFORE_ANY_FIT: Sequence[Check] = (
     Check("finite", not_finite),
     Check("stages", missing_stages),
@@ -151,10 +161,10 @@ BEFORE_ANY_FIT: Sequence[Check] = (
 OF_THE_FIT: Sequence[Check] = (
     Check("stuck", stuck_values),
     Check("cut off", clipped_peaks, _fitted),
-    Check("estimate", _estimate_faults),
-    Check("late torque", torque_late, _without_voltage, ("estimate",)),
-    Check("load", load_comes_and_goes, _without_voltage, ("estimate", "late torque")),
-    Check("torque", torque_unexplained, _without_voltage, ("estimate", "late torque", "load")),
+    Check("late torque", torque_late, _without_voltage),
+    Check("load", load_comes_and_goes, _without_voltage, ("late torque",)),
+    Check("torque", torque_unexplained, _without_voltage, ("late torque", "load")),
+    Check("estimate", _estimate_faults, unless=("late torque", "load", "torque")),
     Check("fit", _no_fit, _has_voltage, ("estimate",)),
     Check("late voltage", _electrically_late, _fitted),
     Check("late current", _current_late, _sound, ("late voltage",)),
@@ -162,7 +172,8 @@ OF_THE_FIT: Sequence[Check] = (
     Check("whiteness", whiteness, _sound, ("late voltage", "late current", "structure"), weighed=True),
     Check("excess noise", excess_noise, _sound, ("late voltage", "late current", "structure"), weighed=True),
     # a late current seems to move a shaft at rest
-    Check("standstill", rest_faults, _sound, ("late voltage", "late current"), weighed=True),
+    Check("standstill", rest_faults, _sound, ("late voltage", "late current")),
+    Check("friction at rest", friction_at_rest, _sound, ("late voltage", "late current"), weighed=True),
     Check("delay", _late, _fitted, MODEL[2:]),
     Check("simulation", _simulation, _fitted, (*MODEL, "delay"), weighed=True),
     Check("values", _values, _fitted, (*MODEL, "delay")),
