@@ -64,7 +64,7 @@ def joined(base: Fit, command: bool, told: Callable[[Fit], Estimate]) -> Fit:
 
 def _weak(estimate: Estimate, chosen: Sequence[Candidate], untold: set[str]) -> set[str]:
     """Return the families of what is not sure beside all else; the last chosen where the six are told no more."""
-    if not set(estimate.missing) <= untold:
+    if not set(estimate.missing) <= untold or chosen[-1].family not in estimate.names:
         return {chosen[-1].family}
     return {c.family for c in chosen if not abs(estimate.value(c.family)) > LEAST_SURE * estimate.std(c.family)}
 

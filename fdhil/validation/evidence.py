@@ -21,6 +21,7 @@ from fdhil.records import PARAMETERS, Bool, Estimate, Float, Parameters, Reason,
 from fdhil.validation.backlash import DeadBand, backlash
 from fdhil.validation.selection import Lacking, lacking
 from fdhil.validation.sensor_reconstruction import Bridge
+from fdhil.validation.shifts import Shift, late_findings, shifts
 from fdhil.validation.simulation import fit_percent
 from fdhil.validation.structure import DEAD_TIME, OFFSET_CURRENT, Finding, findings
 from fdhil.validation.table_error import TableError
@@ -176,7 +177,7 @@ class Evidence:
     @cached_property
     def harmless(self) -> bool:
         """Whether the model explains the rapid at the table, and nothing it surely lacks makes a next one worse."""
-        if self.weight is None or not self.weight.believed:
+        if self.weight is None or not self.weight.believed or (self.fit is not None and self.late_s):
             return False
         return all(self.weight.allows(self.cost_um(lack) / _known(lack)) for lack in self.lacks)
 
@@ -244,7 +245,15 @@ class Evidence:
     @cached_property
     def lacks(self) -> list[Lacking]:
         """What of that surely is there, each beside those before it."""
-        return lacking(self.on_time, self.findings) if self.sound else []
+        if not self.sound:
+            return []
+        late = late_findings(self.shifts) if self.window.slow_voltage is None else []
+        return lacking(self.on_time, [*self.findings, *late])
+
+    @cached_property
+    def shifts(self) -> tuple[Shift, Shift]:
+        """By how much voltage and current seem late."""
+        return shifts(self.on_time)
 
     def time_s(self, row: int) -> float:
         """Return the time of a row as its recording counts it."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from fdhil.identification.courses import voltage_terms_v
+from fdhil.identification.courses import terms_nm, voltage_terms_v
 from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.filtering import moving_mean
@@ -111,7 +111,9 @@ def breakaway(window: Window, fit: Fit) -> Iterator[Reason]:
         return
     torque = side * theta[2] * motion.current[still:end]
     speed = side * motion.speed[still:end]
-    net = np.where(np.arange(still, end) < begin, np.maximum(torque - theta[5], 0.0), torque - theta[5])
+    drag = theta[5] + side * terms_nm(motion, theta)[still:end]
+    drag[: begin - still] = drag[begin - still]  # what joined the six is known where the shaft surely moves
+    net = np.where(np.arange(still, end) < begin, np.maximum(torque - drag, 0.0), torque - drag)
     net = net - theta[4] * np.maximum(speed, 0.0)
     predicted = np.concatenate([[0.0], np.cumsum((net[1:] + net[:-1]) / 2)]) * window.dt_s / theta[3]
     late = predicted[begin - still :] - speed[begin - still :]

@@ -264,4 +264,6 @@ def finish(result: Fit) -> Estimate:
         answer, beyond = told_terms(answer, result, values, beyond)
     # what the data can tell is the information's to say; that residuals are coloured is no lack of excitation
     judged = judge(answer, condition, max(float(np.abs(m.speed).max()) for m in result.problem.motions))
+    if judged.names != answer.names:  # nothing is told
+        return judged
     return replace(judged, covariance=judged.covariance + beyond)
