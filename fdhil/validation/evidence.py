@@ -23,7 +23,7 @@ from fdhil.validation.selection import Lacking, lacking
 from fdhil.validation.sensor_reconstruction import Bridge
 from fdhil.validation.shifts import Shift, late_findings, shifts
 from fdhil.validation.simulation import fit_percent
-from fdhil.validation.structure import DEAD_TIME, OFFSET_CURRENT, Finding, findings
+from fdhil.validation.structure import DEAD_TIME, FRICTION, OFFSET_CURRENT, Finding, findings
 from fdhil.validation.table_error import TableError
 from fdhil.validation.weight import NEXT_SPEED, Move, Weight, completed, to_and_fro, weigh
 from fdhil.validation.widening import widened
@@ -151,7 +151,8 @@ class Evidence:
         whole, here, all_cut, there, *load = (
             rms(row) for row in loop.um(np.array([to_and_fro(row) for row in torques]), dt_s)
         )
-        return max(here, there * whole / max(all_cut, 1e-300), *load)
+        slower = whole / max(all_cut, 1e-300)
+        return max(here, there * slower, *(um * (slower if lack.finding.name == FRICTION else 1.0) for um in load))
 
     @cached_property
     def told(self) -> Estimate | None:
