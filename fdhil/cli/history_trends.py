@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from fdhil.cli.parameter_view import DISPLAY, cell, half_of
-from fdhil.records import PARAMETERS, RATIOS, UNITS
+from fdhil.records import PARAMETERS, RATIOS, unit_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -69,9 +69,14 @@ def of_axis(
     """Return an axis' health; ``limits`` maps a symbol to its first published value and the change that it may have."""
     import numpy as np
 
-    from fdhil.identification.trends import slope, steps
+    from fdhil.identification.trends import BY_DIRECTION, FRICTION, slope, steps, without_direction
 
+    symbols = (*symbols, FRICTION) if symbols == PARAMETERS else symbols
     values, stds = (_columns(windows, key, symbols) for key in ("value", "std"))
+    values[stds == 0.0] = np.nan  # given, not estimated: a data sheet's value has no course
+    direction = np.array([window.direction for window in windows], dtype=np.float64)
+    for k in (k for k, symbol in enumerate(symbols) if symbol in BY_DIRECTION):
+        values[:, k] = without_direction(values[:, k], direction)
     time_s = np.array([window.stamp.wall_s for window in windows])
     celsius = np.array([np.nan if w.temperature_c is None else w.temperature_c for w in windows], dtype=np.float64)
     known = bool(np.isfinite(celsius).all())
@@ -101,7 +106,10 @@ def _columns(windows: Sequence[StoredWindow], key: str, symbols: Sequence[str]) 
     """Return (n, k) of the windows' values or standard deviations, NaN where one was not told."""
     import numpy as np
 
-    told = [[(window.parameters or {}).get(name, {}).get(key) for name in symbols] for window in windows]
+    from fdhil.identification.trends import FRICTION
+
+    known: list[dict[str, Any]] = [{**(window.parameters or {}), FRICTION: window.friction or {}} for window in windows]
+    told = [[parameters.get(name, {}).get(key) for name in symbols] for parameters in known]
     return np.array(told, dtype=np.float64).reshape(-1, len(symbols))
 
 
@@ -139,6 +147,8 @@ def _dates(reached: Crossing, newest_s: float) -> dict[str, str | None]:
 
 def _changes(found: Sequence[Step], windows: Sequence[StoredWindow]) -> list[dict[str, Any]]:
     """Return the steps with those of other parameters at about the same window taken together."""
+    from fdhil.identification.trends import FRICTION
+
     changes: list[list[Step]] = []
     for step in found:
         if changes and step.row - changes[-1][0].row <= TOGETHER:
@@ -149,10 +159,11 @@ def _changes(found: Sequence[Step], windows: Sequence[StoredWindow]) -> list[dic
     for together in changes:
         window = windows[together[0].row]
         parameters = {
-            s.name: {"before": s.before, "after": s.before + s.size, "std": s.std, "unit": UNITS[s.name]}
+            s.name: {"before": s.before, "after": s.before + s.size, "std": s.std, "unit": unit_of(s.name)}
             for s in together
         }
-        moved_by = frozenset(name.removesuffix("/K") for name in parameters)
+        # the sum of ft and Cd tells no cause beside either
+        moved_by = frozenset(name.removesuffix("/K") for name in parameters) - {FRICTION} or frozenset({"ft", "Cd"})
         cause = CAUSES.get(moved_by, "a changed drive or sensor")
         told.append(
             {"window": window.number, "time": _date(window.stamp.wall_s), "cause": cause, "parameters": parameters}
@@ -203,13 +214,13 @@ def slope_rows(told: Mapping[str, Any]) -> list[list[str]]:
     """Return a row per parameter that has a slope: per kelvin, per day, and its limit's date."""
     slopes, trends, limits = (told[key] for key in ("slopes", "trends", "limits"))
     rows = []
-    for name in (*PARAMETERS, *RATIOS):
+    for name in DISPLAY:
         if name in slopes or name in trends:
             cells = [
                 cell(name, line[key], half_of(line), " ") if (line := lines.get(name)) else "-"
                 for lines, key in ((slopes, "per_kelvin"), (trends, "per_day"))
             ]
-            rows.append([f"{name} {DISPLAY[name][0]}", *cells, _when(name, limits.get(name))])
+            rows.append([f"{name.partition('_')[0]} {DISPLAY[name][0]}", *cells, _when(name, limits.get(name))])
     return rows
 
 

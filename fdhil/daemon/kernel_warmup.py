@@ -10,6 +10,7 @@ from fdhil import correction
 from fdhil.config import Axis, MachineConfig
 from fdhil.correction.kernels import project
 from fdhil.identification.kalman import departure
+from fdhil.model import closed_loop
 from fdhil.pipeline import AxisPipeline
 from fdhil.records import Float, Parameters, Stages, Trajectory, Window, frozen, frozen_ints
 
@@ -29,6 +30,8 @@ def warm(config: MachineConfig, method: str | None = None) -> None:
     reference = Trajectory(dt_s, frozen(np.arange(rows) * dt_s), demand, still.astype(np.bool_), frozen_ints(still))
     models = {name: Parameters(**axis.nominal.model_dump()) for name, axis in config.axis.items()}
     correction.plan(reference, models, config)
+    for name, model in models.items():
+        closed_loop.simulate(model.changed(load=0.0), config.axis[name], dt_s, demand[name][:8])
     _warm_what_is_rare()
 
 
@@ -40,27 +43,31 @@ def _warm_what_is_rare() -> None:
 
 
 def nominal_rapid(name: str, axis: Axis, dt_s: float, direction: int = 1, seed: int = 1) -> Window:
-    """Return a rapid that the nominal drive would make (equations [1] and [2] solved for the voltage), with noise."""
-    nominal, top = axis.nominal, axis.rapid_speed_rad_s
+    """Return a rapid that the nominal drive makes under its regulators, with noise; the voltage follows from [1]."""
+    top = axis.rapid_speed_rad_s
+    nominal = Parameters(**axis.nominal.model_dump())
     ramp_s = axis.rapid_speed_mm_s / axis.max_acceleration_mm_s2
     margin, ramp, cruise = (round(seconds / dt_s) for seconds in (0.1, ramp_s, 0.4))
-    speed = direction * top * _trapezoid(margin, ramp, cruise)
-    torque = nominal.Jt * np.gradient(speed, dt_s) + nominal.ft * speed + nominal.Cd * np.sign(speed)
-    current = torque / nominal.K
+    wanted = direction * top * _trapezoid(margin, ramp, cruise)
+    turned = np.cumsum(wanted) - 0.5 * (wanted + wanted[0])  # trapezoids
+    demand = turned * dt_s * axis.screw_pitch_mm / (2 * math.pi)
+    moved = closed_loop.simulate(nominal, axis, dt_s, frozen(demand))
+    position, speed, current = moved.position_mm, moved.speed_rad_s, moved.current_a
+    angle = position * (2 * math.pi / axis.screw_pitch_mm)
     voltage = nominal.R * current + nominal.L * np.gradient(current, dt_s) + nominal.K * speed
-    if axis.voltage.sampling == "interval_mean":
-        voltage = (voltage + np.append(voltage[1:], voltage[-1])) / 2
-    turned = np.cumsum(speed) - 0.5 * (speed + speed[0])  # trapezoids
-    position = turned * dt_s * axis.screw_pitch_mm / (2 * math.pi)
+    if axis.voltage.sampling == "interval_mean":  # [1] over the row
+        held = (current + np.append(current[1:], current[-1])) / 2
+        steps = [np.diff(values, append=values[-1]) / dt_s for values in (current, angle)]
+        voltage = nominal.R * held + nominal.L * steps[0] + nominal.K * steps[1]
     rng = np.random.default_rng(seed)
     noisy = [frozen(s + rng.normal(0, 1e-3 * np.abs(s).max(), s.size)) for s in (speed, current, voltage)]
-    begin, end = margin, speed.size - margin
+    begin, end = margin, wanted.size - margin
     return Window(
         axis=name,
         start_tick=0,
         start_s=0.0,
         dt_s=dt_s,
-        demand_mm=frozen(position),
+        demand_mm=frozen(demand),
         position_mm=frozen(position),
         speed_rad_s=noisy[0],
         current_a=noisy[1],

@@ -63,10 +63,26 @@ def joined(base: Fit, command: bool, told: Callable[[Fit], Estimate]) -> Fit:
 
 
 def _weak(estimate: Estimate, chosen: Sequence[Candidate], untold: set[str]) -> set[str]:
-    """Return the families of what is not sure beside all else; the last chosen where the six are told no more."""
+    """Return the families of what is not sure beside all else; the last chosen where the six are told no more.
+
+    Friction that pushes is none: what makes it so stands for something else.
+    """
     if not set(estimate.missing) <= untold or chosen[-1].family not in estimate.names:
         return {chosen[-1].family}
-    return {c.family for c in chosen if not abs(estimate.value(c.family)) > LEAST_SURE * estimate.std(c.family)}
+    weak = {c.family for c in chosen if not abs(estimate.value(c.family)) > LEAST_SURE * _std(estimate, c.family)}
+    low = estimate.value("stribeck") if "stribeck" in estimate.names else 0.0
+    if low and min(estimate.value("Cd"), estimate.value("Cd") + low) < 0.0:
+        weak.add("stribeck")
+    return weak
+
+
+def _std(estimate: Estimate, family: str) -> float:
+    """Return the deviation of a term; of friction at low speed for the speed that was chosen: whether it is there."""
+    if family != "stribeck":
+        return estimate.std(family)
+    k, speed = estimate.names.index(family), estimate.names.index("stribeck_speed")
+    covariance = estimate.covariance
+    return math.sqrt(covariance[k, k] - covariance[k, speed] ** 2 / covariance[speed, speed])
 
 
 def _with(base: Fit, chosen: Sequence[Candidate]) -> Fit:

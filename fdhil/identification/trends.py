@@ -25,8 +25,11 @@ SURE_SLOPE = 3.0  # standard deviations
 LEAST_DAYS = 1.0
 FARTHEST_SPANS = 5.0
 COLLINEAR = 1e-4  # share of a covariate that the others must leave
+FRICTION = "friction_at_rapid"  # Cd + ft w at the rapid speed: where ft and Cd trade it is what is known of them
+BY_DIRECTION = ("ft", "Cd", FRICTION)
+LEAST_TURNS = 3  # from which on it is told what friction owes to the direction
 # a smaller step is not told: drift that is no straight line looks like one
-LEAST_STEP: dict[str, float] = {"R": 0.05, "L": 0.08, "K": 0.03, "Jt": 0.02, "ft": 0.15, "Cd": 0.10}
+LEAST_STEP: dict[str, float] = {"R": 0.05, "L": 0.08, "K": 0.03, "Jt": 0.02, "ft": 0.15, "Cd": 0.10, FRICTION: 0.10}
 LEAST_STEP |= {f"{name}/K": LEAST_STEP[name] for name in ("Jt", "ft", "Cd")}  # as K hardly moves
 
 
@@ -118,6 +121,22 @@ def _without(other: Float, column: Float) -> Float:
     length = float(other @ other)
     rest: Float = column - other * (float(other @ column) / length if length > 0 else 0.0)
     return rest
+
+
+def without_direction(points: Float, direction: Float) -> Float:
+    """Return ``points`` (n,) without what they owe to the ``direction`` (n,), 1 or -1: a constant load, a screw's bias.
+
+    It is half the median difference between windows that follow each other in opposite directions, so that drift and
+    steps leave it alone; nothing where there are fewer than ``LEAST_TURNS``.
+    """
+    known = np.isfinite(points)
+    y, side = points[known], direction[known]
+    turns = np.flatnonzero(side[1:] != side[:-1])
+    if turns.size < LEAST_TURNS:
+        return points
+    load = float(np.median(side[turns] * (y[turns] - y[turns + 1]) / 2))
+    freed: Float = points - load * direction
+    return freed
 
 
 def crossing(line: Slope, limit: float) -> Crossing | None:

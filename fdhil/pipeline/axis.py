@@ -16,13 +16,14 @@ from fdhil.identification.between import HISTORY, Member
 from fdhil.identification.drift import LEAST_JUMP, DriftTracker, Point
 from fdhil.identification.pooling import member
 from fdhil.identification.windows import find_windows
-from fdhil.pipeline.analysis import analyse
+from fdhil.pipeline.own_loops import OwnLoops
 from fdhil.pipeline.pooling import one_sided, refuses_the_model, together
 from fdhil.pipeline.recent_samples import RecentSamples
 from fdhil.prediction import skill
 from fdhil.records import (
     AxisSamples,
     Estimate,
+    LoopEstimate,
     MoveEvent,
     MoveKind,
     Notice,
@@ -62,13 +63,14 @@ class _Rapid:
 @dataclass(frozen=True, slots=True)
 class Known:
     """What the history knows of an axis: the first values in either direction, the newest published set, and the
-    newest accepted windows' estimates, for the tracker and for the pool.
+    newest accepted windows' estimates, for the tracker and for the pool, and the newest identified loops.
     """
 
     first: Mapping[int, Parameters] = field(default_factory=dict)
     newest: ParameterSet | None = None
     points: tuple[Point, ...] = ()
     members: tuple[Member, ...] = ()
+    loops: LoopEstimate | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,21 +109,23 @@ class AxisPipeline:
         self._config = config
         self._settings = _settings(config, method)
         self._period_s = config.machine.sync_period_s
+        known = known or Known()
         self._recent = RecentSamples(axis, config.axis[axis], self._ticks(RECENT_S), self._period_s)
         self._rapids: deque[_Rapid] = deque()
         self._temperature: Temperature | None = None
         self._pool: list[_Pooled] = []
         self._held: list[_Pooled] = []
         self._refused: dict[int, WindowOutcome] = {}  # the newest window of a direction, where its model was refused
-        known = known or Known()
         self._published = known.newest
         self._tracker = DriftTracker(config.maintenance, axis)
         self._tracker.resume(known.first, known.points)
         self._history: deque[Member] = deque(_since_jump(known), maxlen=HISTORY)
         self._with_skill = with_skill
+        # else the axis' section is made up
+        self._loops = OwnLoops(config.axis[axis] if with_skill else None, self._settings, self._period_s, known.loops)
         self._gain_suspected = False
         self._place = self._history[-1].place if self._history else 0
-        self._withheld = ""
+        self._withheld: tuple[str, ...] = ()  # why the newest pool was not published: told once
 
     @property
     def published(self) -> ParameterSet | None:
@@ -196,9 +200,9 @@ class AxisPipeline:
         return [w for w in find_windows(recording) if rapid.start <= w.start_tick + w.n // 2 <= end]
 
     def _analyse(self, window: Window) -> list[Outcome]:
-        outcome = analyse(window, self._settings)
+        outcome, loops = self._loops.analyse(window)
         before = self._published
-        outcomes: list[Outcome] = [outcome]
+        outcomes: list[Outcome] = [outcome] if loops is None else [outcome, loops]
         if refuses_the_model(outcome):
             self._refused[window.direction] = outcome
         # a correction needs all six: what a slow voltage leaves open keeps the older set in use
@@ -240,9 +244,10 @@ class AxisPipeline:
             estimate, verdict = self._pooled()
         if estimate is None or not verdict.accepted:
             text = "the pool of the newest windows is not believed (" + _listed(verdict) + "), the older set stays"
-            again, self._withheld = self._withheld == text, text
+            codes = tuple(reason.code for reason in verdict.reasons)
+            again, self._withheld = self._withheld == codes, codes
             return [] if again else [Notice("ValidationFailed", "minor", text, self.axis, window.start_tick)]
-        self._withheld = ""
+        self._withheld = ()
         self._published = ParameterSet(
             axis=self.axis,
             revision=1 if self._published is None else self._published.revision + 1,
@@ -281,7 +286,7 @@ class AxisPipeline:
         """Compare the move with what the set that was valid before it predicts; None where that cannot be done."""
         if published is None or not self._with_skill:
             return None
-        axis = self._config.axis[self.axis]
+        axis = self._loops.axis or self._config.axis[self.axis]
         signals = (window.demand_mm, window.position_mm)
         try:
             return skill(

@@ -27,6 +27,7 @@ UNITS: Mapping[str, str] = {
     "Jt/K": "A.s2/rad",
     "ft/K": "A.s/rad",
     "Cd/K": "A",
+    "friction_at_rapid": "N.m",  # Cd + ft w at the rapid speed
 }
 
 # what may join the six; of a ripple's name the number is its periods in a turn of the motor
