@@ -120,7 +120,9 @@ def _current_late(evidence: Evidence) -> Iterable[Reason]:
 
 def _structure(evidence: Evidence) -> Iterator[Reason]:
     """Yield what the model lacks, each with its cost."""
-    yield from (evidence.priced(lack) for lack in evidence.lacks if lack.finding.matters)
+    for lack in evidence.lacks:
+        if lack.finding.matters:
+            yield evidence.with_cost(lack.finding.reason(), evidence.cost_um(lack))
 
 
 def _late(evidence: Evidence) -> Iterable[Reason]:
