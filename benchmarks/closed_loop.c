@@ -5,8 +5,8 @@
 static double low(double a, double b) { return a < b ? a : b; }
 static double high(double a, double b) { return a > b ? a : b; }
 
-void p_pi_pi(const double *reference, long n, long first, long rows, const double *p, const double *g,
-             long n_speed, long n_current, double *state, double *out)
+void p_pi_pi(const double *reference, long n, long first, long rows, const double *p, const double *g, const double *t,
+             long n_terms, long n_speed, long n_current, double *state, double *out)
 {
     const double kv = g[0], kff = g[1], speed_kp = g[2], speed_ki = g[3], current_max = g[4];
     const double current_kp = g[5], current_ki = g[6], voltage_max = g[7], period = g[8], half_step_mm = g[9];
@@ -30,6 +30,35 @@ void p_pi_pi(const double *reference, long n, long first, long rows, const doubl
             demand_a = low(high(raw, -current_max), current_max);
             int current_limited = demand_a != raw;
             if (!current_limited) speed_integral = candidate;
+            if (n_terms > 0) {
+                for (long c = 0; c < n_current; c++) {
+                    error = demand_a - i;
+                    candidate = current_integral + current_ki * error;
+                    raw = current_kp * error + candidate;
+                    double u = low(high(raw, -voltage_max), voltage_max);
+                    if (u == raw) {
+                        current_integral = candidate;
+                        if (current_limited) limited++;
+                    } else limited++;
+                    if (t[8] != 0.0) u -= t[8] * low(high(i / g[16], -1.0), 1.0);
+                    double against = t[0] + ((w > 0.0 ? t[4] : t[5]) - t[3]) * w, angle = g[13] * (x + half_step_mm * w);
+                    for (long r = 11; r < n_terms; r += 3) against += t[r + 1] * sin(t[r] * angle + t[r + 2]);
+                    double push = p[14] * i - against;
+                    double side = (w > 0.0 || (w == 0.0 && push > 0.0)) ? 1.0 : -1.0;
+                    double dry = side > 0.0 ? t[1] : t[2];
+                    if (t[6] != 0.0 && fabs(w) <= 6.0 * t[7]) dry += t[6] * exp(-(w / t[7]) * (w / t[7]));
+                    if (w == 0.0 && fabs(push) <= dry) { i = p[12] * i + p[13] * u; continue; }
+                    double torque = -against - side * dry;
+                    double w_next = p[2] * i + p[3] * w + p[7] * u + p[10] * torque;
+                    if (w_next * side < 0.0) {
+                        x += half_step_mm * w;
+                        w_next = 0.0;
+                    } else x += p[4] * i + p[5] * w + p[8] * u + p[11] * torque;
+                    i = p[0] * i + p[1] * w + p[6] * u + p[9] * torque;
+                    w = w_next;
+                }
+                continue;
+            }
             for (long c = 0; c < n_current; c++) {
                 error = demand_a - i;
                 candidate = current_integral + current_ki * error;

@@ -10,24 +10,36 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from fdhil.config import parse
-from fdhil.model import closed_loop, kernels
-from fdhil.model.leap import leap
-from fdhil.model.loops import gains as loop_gains
-from fdhil.model.loops import plant_step
+from fdhil.model import closed_loop
+from fdhil.model.loops import Drive
 from fdhil.prediction.models import nominal_models
 from fdhil.records import Float
 from tests.bench import bench_config, bench_document
 from tests.paths import bench_demand
 
 REPEATS = 40
-N_SPEED, N_CURRENT = 4, 8
+# what an ordinary machine has
+TERMS = {
+    "load": {"load": 2.0, "coulomb_positive": 5.2},
+    "low speed": {"stribeck": 1.0, "stribeck_speed": 10.0},
+    "ripples": {"ripple_screw_1": 0.3, "ripple_motor_24": 0.3},
+    "all": {
+        "load": 2.0,
+        "stribeck": 1.0,
+        "stribeck_speed": 10.0,
+        "ripple_screw_1": 0.3,
+        "ripple_motor_24": 0.3,
+        "dead_time": 2.0,
+    },
+}
 OPTIONS = {
     "torque_feedforward": 0.5,
     "setpoint_filter_s": 0.001,
@@ -59,37 +71,32 @@ def best(run: Callable[[], object]) -> float:
     return min(times)
 
 
-def measure() -> dict[str, float]:
-    """Return seconds per run in numba (leaping, and step by step) and in C.
+def measure(terms: Mapping[str, float] | None = None) -> dict[str, float]:
+    """Return seconds per run in numba (leaping, and step by step) and in C, for the bench's X with ``terms``.
 
     Also the ratio of the last two, the real-time factor, and the largest difference in um.
     """
     config = bench_config()
-    axis, model = config.axis["X"], nominal_models(config)["X"]
+    axis, model = config.axis["X"], nominal_models(config)["X"].changed(**terms or {})
     reference = np.ascontiguousarray(bench_demand(10.0)[:, 0])
-    plant = plant_step(model, axis.screw_pitch_mm, axis.regulators.current_period_s)
-    gains, n = loop_gains(axis, 0.001), reference.size
-    whole = leap(plant, gains[kernels.CURRENT_KP], gains[kernels.CURRENT_KI], N_CURRENT)
-    empty = np.empty(0)
-    shape = (kernels.CASCADE, kernels.POSITION_INTEGRAL, N_SPEED, N_CURRENT, 0, 0)
-
-    def numba(leaps: Float = whole) -> Float:
-        return kernels.run(reference, empty, empty, 0, n, plant, leaps, gains, shape, np.zeros(kernels.STATES))
-
+    drive = closed_loop.prepare(model, axis, 0.001)
+    assert isinstance(drive, Drive)
+    stepping, commands = replace(drive, leap=drive.leap[:0]), closed_loop.Commands(reference)
+    start, n = closed_loop.standing(model, axis, float(reference[0])), reference.size
     with tempfile.TemporaryDirectory() as folder:
         library = compiled(Path(folder))
         out, state = np.empty((7, n)), np.zeros(12)
-        pointers = [ctypes.c_void_p(array.ctypes.data) for array in (reference, plant, gains, state, out)]
+        arrays = (reference, drive.plant, drive.gains, drive.terms, state, out)
+        r, p, g, t, s, o = (ctypes.c_void_p(array.ctypes.data) for array in arrays)
+        long, size = ctypes.c_long, drive.terms.size
 
         def c() -> Float:
-            state[:] = 0.0
-            r, p, g, s, o = pointers
-            long = ctypes.c_long
-            library.p_pi_pi(r, long(n), long(0), long(n), p, g, long(N_SPEED), long(N_CURRENT), s, o)
+            state[:] = start[:12]
+            library.p_pi_pi(r, long(n), long(0), long(n), p, g, t, long(size), long(4), long(8), s, o)
             return out
 
-        difference = float(np.abs(numba()[3] - c()[3]).max()) * 1e3
-        steps = partial(numba, np.empty((0, kernels.LEAP_COLUMNS)))
+        difference = float(np.abs(drive.run(commands, start).position_mm - c()[3]).max()) * 1e3
+        numba, steps = (partial(one.run, commands, start) for one in (drive, stepping))
         seconds = {"numba_s": best(numba), "steps_s": best(steps), "c_s": best(c)}
     ratio = seconds["steps_s"] / seconds["c_s"]
     return seconds | {"ratio": ratio, "real_time": n * 0.001 / seconds["numba_s"], "difference_um": difference}
@@ -116,6 +123,10 @@ def main() -> None:
     print(f"bench path: {figures['numba_s'] * 1e3:.2f} ms; step by step {figures['steps_s'] * 1e3:.2f} ms,", end=" ")
     print(f"C -O3 step by step {figures['c_s'] * 1e3:.2f} ms: {figures['ratio']:.2f} x (wanted: <= 1.2);", end=" ")
     print(f"largest difference {figures['difference_um']:.1e} um")
+    for name, terms in TERMS.items():
+        figures = measure(terms)
+        print(f"with {name}: {figures['real_time']:.0f} x real time,", end=" ")
+        print(f"{figures['ratio']:.2f} x C, difference {figures['difference_um']:.1e} um")
     for name, real_time in structures().items():
         print(f"{name} with torque feed-forward, filter and delay: {real_time:.0f} x real time")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
@@ -13,8 +14,10 @@ from scipy.stats import beta
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
-from studies import faults
+from fdhil.records import WindowOutcome
+from studies import drives, faults, harm
 from studies.pages import grid, paragraph
+from studies.scenes import Scene
 
 GOOD = "good"
 NAMED = 0.9  # kinds that are named rightly less often are told by name
@@ -25,7 +28,8 @@ Made = TypeVar("Made")
 class Judged:
     """One recording: its kind, the fault's severity, windows listed, whether its pool was accepted, all codes.
 
-    ``left_open`` names what each accepted window that does not tell all leaves null.
+    ``left_open`` names what each accepted window that does not tell all leaves null, ``harm`` what would go wrong with
+    what was accepted, and ``warned`` are the codes of its warnings.
     """
 
     seed: int
@@ -37,6 +41,8 @@ class Judged:
     codes: tuple[str, ...]
     texts: tuple[str, ...]
     left_open: tuple[str, ...]
+    harm: tuple[str, ...] = ()
+    warned: tuple[str, ...] = ()
 
 
 @dataclass
@@ -45,6 +51,7 @@ class Tally:
 
     count: int = 0
     accepted: int = 0
+    harmful: int = 0
     right: int = 0
     windows: int = 0
     refused: int = 0
@@ -59,10 +66,16 @@ class Tally:
         return cls(**{**told, "codes": Counter(told["codes"]), "left_open": Counter(told["left_open"])})
 
 
-def judge(kind: str, seed: int, spoilt: faults.Spoilt) -> Judged:
-    """Return what the validation says of one recording."""
+def judge(
+    kind: str, seed: int, spoilt: faults.Spoilt, scene: Scene | None = None, *, configured: bool = False
+) -> Judged:
+    """Return what the validation says of one recording, ``configured`` with the machine's section.
+
+    Of a ``scene`` with the true drive is told, too, what of that does harm.
+    """
     settings = Identification()
-    outcomes = [analyse(window, settings) for window in find_windows(spoilt.recording)]
+    axis = harm.axis_of(scene) if configured and scene is not None else None
+    outcomes = [analyse(window, settings, axis, drives.CYCLE_S) for window in find_windows(spoilt.recording)]
     _, verdict = pool(outcomes, settings)
     reasons = [reason for outcome in outcomes for reason in outcome.verdict.reasons] + list(verdict.reasons)
     refused = sum(not outcome.verdict.accepted for outcome in outcomes)
@@ -79,7 +92,16 @@ def judge(kind: str, seed: int, spoilt: faults.Spoilt) -> Judged:
         codes=tuple(sorted({reason.code for reason in reasons})),
         texts=tuple(dict.fromkeys(str(reason) for reason in reasons)),
         left_open=tuple(" and ".join(estimate.missing) for estimate in told if estimate.missing),
+        harm=() if scene is None or kind in faults.BETWEEN else _harm(outcomes, spoilt.scene or scene),
+        warned=tuple(sorted({warning.code for o in outcomes for warning in o.verdict.warnings})),
     )
+
+
+def _harm(outcomes: Iterable[WindowOutcome], scene: Scene) -> tuple[str, ...]:
+    told = [o.estimate for o in outcomes if o.verdict.accepted and o.estimate is not None]
+    wrong = [text for estimate in told for text in harm.off(estimate, scene.drive)]
+    models = [p for p in (estimate.parameters() for estimate in told) if math.isfinite(sum(p.as_dict().values()))]
+    return (*wrong, *(harm.beside_the_path(models, scene) if models else ()))
 
 
 def survey(seeds: Iterable[int], one: Callable[[int], Made], processes: int) -> Iterator[Made]:
@@ -98,14 +120,15 @@ def tally(judged: Iterable[Judged], kinds: Mapping[str, faults.Kind]) -> dict[st
         entry = counted[one.kind]
         entry.count += 1
         entry.accepted += one.accepted
+        entry.harmful += bool(one.harm)
         entry.windows += one.windows
         entry.refused += one.refused
         entry.least = one.severity if entry.least is None else min(entry.least, one.severity)
         entry.codes.update(one.codes)
         entry.left_open.update(one.left_open)
         is_good = one.kind == GOOD
-        entry.right += not one.codes if is_good else bool(kinds[one.kind].named & set(one.codes))
-        if one.accepted != is_good:
+        entry.right += not one.codes if is_good else bool(kinds[one.kind].named & {*one.codes, *one.warned})
+        if one.harm or (is_good and not one.accepted):
             entry.wrong.append(one.seed)
     return counted
 

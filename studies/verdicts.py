@@ -7,7 +7,7 @@ gets one fault of random severity. The table goes to ``docs/studies/verdicts.md`
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -15,18 +15,27 @@ import numpy as np
 
 from studies import faults, pages
 from studies.judging import GOOD, Judged, Tally, judge, report, survey, tally
+from studies.scenes import draw_scene
 
 
 def good(seed: int, study: int = 1) -> Judged:
     """Judge one good recording."""
-    return judge(GOOD, seed, faults.good(np.random.default_rng([study, 1, seed])))
+    draws = [study, 1, seed]
+    return judge(GOOD, seed, faults.good(_rng(draws)), draw_scene(_rng(draws)), configured=bool(seed % 2))
 
 
 def bad(seed: int, study: int = 1) -> Judged:
     """Judge one recording with the kind of fault that ``seed`` chooses."""
     names = list(faults.KINDS)
     name = names[seed % len(names)]
-    return judge(name, seed, faults.KINDS[name].make(np.random.default_rng([study, 2, seed])))
+    draws = [study, 2, seed]
+    # the machine is the first that is drawn; half of them come with their configuration
+    scene, configured = draw_scene(_rng(draws)), bool(seed // len(names) % 2)
+    return judge(name, seed, faults.KINDS[name].make(_rng(draws)), scene, configured=configured)
+
+
+def _rng(draws: Sequence[int]) -> np.random.Generator:
+    return np.random.default_rng(draws)
 
 
 def measure(options: argparse.Namespace) -> dict[str, Any]:

@@ -178,7 +178,7 @@ class ArmingDesk:
         if not answer["ok"]:
             self._passes.forget()
             return answer
-        self._feeder = StreamFeeder(armament, self.guard)
+        self._feeder = StreamFeeder(armament, self.guard, self._standstill)
         text = f"armed {program.name} by {summary['method']}: {summary['promise']}"
         if not summary["check"]["whole"]:
             text += f" in its first {summary['check']['checked_s']:.0f} s; the check of the rest goes on ahead of it"

@@ -1,14 +1,15 @@
-"""Begins a correction from what the drives hold at rest: the first rows are found anew when a program is armed.
+"""Begins a correction from what the drives hold at rest: its first rows are found anew when the axes stand there.
 
 A check of a program knows nothing of the current at which an axis will stand when it starts: that is somewhere in the
 band of its dry friction, wherever the last move has left it, and up to the first corner it is most of the error that
 the check's own rows leave. Once the axes stand at the start it is heard on the bus. The rows that are found from it go
-over into the checked ones, and take their place only where the model says that they are better.
+over into the checked ones, and take their place only where the model says that they are better. Until the axes stand
+there, what the way to the start will leave is expected.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,65 +24,131 @@ from fdhil.correction.limits import check
 from fdhil.model import closed_loop, kernels
 from fdhil.model.closed_loop import State
 from fdhil.prediction.contour import contour_error_um
+from fdhil.prediction.model_terms import Band, band
 from fdhil.records import Float, Parameters, rms
 
-ALONE_S, JOINED_S = 1.2, 1.7  # from where on rows go over into the checked ones, and where they are those
+ALONE_S, JOINED_S = 0.9, 1.4  # from where on rows go over into the checked ones, and where they are those
 AT_START_INCREMENTS = 1.5
+CHANGED_SHARE = 0.05  # of the dry friction: a current that differs by less from the one that was used changes nothing
 
 
 @dataclass(frozen=True, slots=True)
-class _Axis:
-    """One axis on its first rows: offsets (n,) found anew, in increments, the positions with the checked ones and with
-    these, and whether the limits allow them."""
+class _Found:
+    """What was found for one axis: its offsets (n,) in increments, and the positions with the old ones and with these.
 
-    anew: Float
-    checked_mm: Float
-    anew_mm: Float
+    ``allowed``: the limits allow them.
+    """
+
+    offset: Float
+    old_mm: Float
+    new_mm: Float
     allowed: bool
 
 
-def from_rest(
-    begin: Piece, program: Path, models: Mapping[str, Parameters], config: MachineConfig, rest: Mapping[str, AtRest]
-) -> Piece:
-    """Return the first rows of the inverse correction with offsets that begin where the axes stand.
+class FirstBlock:
+    """The first rows of an inverse correction, as they are in force, and what is needed to find them anew."""
 
-    They stay as they are where an axis does not stand at the program's start, or where nothing is gained.
-    """
-    path = _first_rows(program, config)
-    axes = tuple(begin.offset)
-    if not set(axes) <= set(path) or not all(_stands(rest.get(axis), path[axis], config.axis[axis]) for axis in axes):
-        return begin
-    # rows that lag on purpose lag by what the whole path asks for
-    if common_delay_s({axis: config.axis[axis].rapid_speed_mm_s for axis in axes}, models, config)[0] != 0.0:
-        return begin
-    found = {
-        axis: _solved(axis, path[axis], rest[axis], np.array(begin.offset[axis], dtype=np.float64), models, config)
-        for axis in axes
-    }
-    if not all(one.allowed for one in found.values()) or not _better(found, path, config.machine.sync_period_s):
-        return begin
-    signs = {axis: config.axis[axis].scaling.sign for axis in axes}
-    rows = {axis: (signs[axis] * one.anew).astype(np.int64).tolist() for axis, one in found.items()}
-    return begin._replace(offset={axis: rows[axis] + begin.offset[axis][len(rows[axis]) :] for axis in axes})
+    def __init__(self, begin: Piece, program: Path, models: Mapping[str, Parameters], config: MachineConfig) -> None:
+        """Prepare for a checked program that begins with ``begin``; ProgramError when it can no longer be read."""
+        self.begin = begin
+        self._models, self._config, self._period_s = models, config, config.machine.sync_period_s
+        self._path = _first_rows(program, config)
+        self._used_a = dict.fromkeys(begin.offset, 0.0)
+        rapid = {axis: config.axis[axis].rapid_speed_mm_s for axis in begin.offset}
+        # rows that lag on purpose lag by what the whole path asks for
+        self._fits = set(begin.offset) <= set(self._path) and common_delay_s(rapid, models, config)[0] == 0.0
+        self._walks = {}
+        if self._fits:
+            starts = {axis: float(self._path[axis][0]) for axis in begin.offset}
+            self._walks = {axis: AxisInverse.of(models[axis], config, axis, start) for axis, start in starts.items()}
+
+    def renew(self, rest: Mapping[str, AtRest]) -> Piece | None:
+        """Return rows that begin where the axes stand, now in force; None where those that are in force stay.
+
+        They stay where an axis does not stand at the program's start, where it stands as it was known to, or where
+        nothing is gained.
+        """
+        axes = tuple(self.begin.offset)
+        if not self._fits or not all(self._stands(axis, rest.get(axis)) for axis in axes):
+            return None
+        if not any(self._differs(axis, rest[axis]) for axis in axes):
+            return None
+        self._used_a = {axis: rest[axis].current_a for axis in axes}
+        found = closed_loop.each_axis(lambda axis: self._solved(axis, rest[axis]), axes)
+        if not all(one.allowed for one in found.values()) or not self._better(found):
+            return None
+        signs = {axis: self._config.axis[axis].scaling.sign for axis in axes}
+        offset = {axis: (signs[axis] * one.offset).astype(np.int64).tolist() for axis, one in found.items()}
+        rows = len(next(iter(offset.values())))
+        behind = {axis: values[rows:] for axis, values in self.begin.offset.items()}
+        self.begin = self.begin._replace(offset={axis: offset[axis] + behind[axis] for axis in axes})
+        return Piece(0, {axis: values[:rows] for axis, values in self.begin.demand.items()}, offset, self.begin.final)
+
+    def expect(self, rest: Mapping[str, AtRest]) -> Piece | None:
+        """Return rows for a machine that is taken to the start from where its axes ``rest``, as :meth:`renew` does.
+
+        Each axis that has a way to go will stop with its regulators' integral at the edge of the dry friction's band,
+        on the side of its last motion: creeping to its target it has nothing else to push against.
+        """
+        return self.renew({axis: self._arrived(axis, there) for axis, there in rest.items() if axis in self._walks})
+
+    def _arrived(self, axis: str, rest: AtRest) -> AtRest:
+        if self._stands(axis, rest):
+            return rest
+        start_mm = float(self._path[axis][0])
+        held, model = self._band(axis, start_mm), self._models[axis]
+        torque_nm = held.high if start_mm > rest.demand_mm else held.low
+        return AtRest(start_mm, start_mm, torque_nm / model.K)
+
+    def _band(self, axis: str, position_mm: float) -> Band:
+        return band(self._models[axis], position_mm * 2 * np.pi / self._config.axis[axis].screw_pitch_mm)
+
+    def _stands(self, axis: str, rest: AtRest | None) -> bool:
+        room_mm = AT_START_INCREMENTS / self._config.axis[axis].scaling.increments_per_mm
+        return rest is not None and abs(rest.demand_mm - self._path[axis][0]) <= room_mm
+
+    def _differs(self, axis: str, rest: AtRest) -> bool:
+        held, change_a = self._band(axis, rest.position_mm), rest.current_a - self._used_a[axis]
+        return abs(change_a) * self._models[axis].K > CHANGED_SHARE * 0.5 * (held.high - held.low)
+
+    def _solved(self, name: str, rest: AtRest) -> _Found:
+        """Find the offsets of one axis' first rows."""
+        walk, axis, path_mm = self._walks[name], self._config.axis[name], self._path[name]
+        block, ahead = block_rows(self._period_s)
+        ends = path_mm.size <= block + ahead
+        path_mm = np.ascontiguousarray(path_mm[: block + ahead])
+        rows = path_mm.size if ends else min(block, round(JOINED_S / self._period_s))
+        loop, state = walk.loop, rest_state(rest, float(path_mm[0]), self._models[name], axis)
+        fresh = AxisInverse(loop, replace(walk.carry, state=state))
+        solved = fresh.block(path_mm, path_mm, path_mm.size if ends else block, ends).offset[:rows]
+        old = axis.scaling.sign * np.array(self.begin.offset[name][: rows + 2], dtype=np.float64)  # it looks two ahead
+        new = old.copy()
+        new[:rows] = solved if ends else np.rint(old[:rows] + (solved - old[:rows]) * _share(rows, self._period_s))
+        allowed = not check(new[2:].astype(np.int64), loop.limits, (float(new[1]), float(new[0])))
+        old_mm, new_mm = (loop.run(path_mm[: old.size], offset, state, 0, rows).position_mm for offset in (old, new))
+        return _Found(new[:rows], old_mm, new_mm, allowed)
+
+    def _better(self, found: Mapping[str, _Found]) -> bool:
+        """Whether the contour error is smaller with the rows found anew."""
+        around = np.column_stack([self._path[axis] for axis in found])
+        old_um, new_um = (
+            rms(contour_error_um(around, np.column_stack(positions), self._period_s, 0))
+            for positions in ([one.old_mm for one in found.values()], [one.new_mm for one in found.values()])
+        )
+        return new_um < old_um
 
 
 def _first_rows(program: Path, config: MachineConfig) -> dict[str, Float]:
     """Return the path's first block, what is looked at behind it, and a row that tells whether it goes on."""
     block, ahead = block_rows(config.machine.sync_period_s)
     pieces: list[Mapping[str, Float]] = []
-    source: Iterator[Mapping[str, Float]] = (part.position_mm for part in reference_blocks(program, config))
     rows = 0
-    for piece in source:
-        pieces.append(piece)
-        rows += next(iter(piece.values())).size
+    for part in reference_blocks(program, config):
+        pieces.append(part.position_mm)
+        rows += part.time_s.size
         if rows > block + ahead:
             break
     return {axis: np.concatenate([piece[axis] for piece in pieces])[: block + ahead + 1] for axis in pieces[0]}
-
-
-def _stands(rest: AtRest | None, path_mm: Float, axis: Axis) -> bool:
-    room_mm = AT_START_INCREMENTS / axis.scaling.increments_per_mm
-    return rest is not None and abs(rest.demand_mm - path_mm[0]) <= room_mm
 
 
 def rest_state(rest: AtRest, start_mm: float, parameters: Parameters, axis: Axis) -> State:
@@ -90,45 +157,13 @@ def rest_state(rest: AtRest, start_mm: float, parameters: Parameters, axis: Axis
     if abs(off_mm) * axis.scaling.increments_per_mm < 1.0:  # the drive itself sees none
         off_mm = 0.0
     state = closed_loop.start(start_mm + off_mm)
-    state[[kernels.CURRENT, kernels.SPEED_INTEGRAL, kernels.CURRENT_DEMAND]] = rest.current_a
+    state[[kernels.CURRENT, kernels.SPEED_INTEGRAL]] = rest.current_a
+    state[kernels.CURRENT_DEMAND] = rest.current_a
     state[kernels.CURRENT_INTEGRAL] = parameters.R * rest.current_a
     return state
-
-
-def _solved(
-    name: str, path_mm: Float, rest: AtRest, checked: Float, models: Mapping[str, Parameters], config: MachineConfig
-) -> _Axis:
-    """Find the offsets of one axis' first rows."""
-    period, axis, model = config.machine.sync_period_s, config.axis[name], models[name]
-    block, ahead = block_rows(period)
-    ends = path_mm.size <= block + ahead
-    path_mm = np.ascontiguousarray(path_mm[: block + ahead])
-    rows = path_mm.size if ends else block
-    walk = AxisInverse.of(model, config, name, float(path_mm[0]))
-    loop, state = walk.loop, rest_state(rest, float(path_mm[0]), model, axis)
-    walk.carry = replace(walk.carry, state=state)
-    solved = walk.block(path_mm, path_mm, rows, ends).offset[:rows]
-    checked = axis.scaling.sign * checked
-    old = checked[: rows + 2]  # a cycle looks two rows ahead
-    anew = old.copy()
-    anew[:rows] = solved if ends else np.rint(old[:rows] + (solved - old[:rows]) * _share(rows, period))
-    allowed = not check(anew[2:].astype(np.int64), loop.limits, (float(anew[1]), float(anew[0])))
-    path_mm = path_mm[: old.size]
-    old_mm, anew_mm = (loop.run(path_mm, offset, state, 0, rows).position_mm for offset in (old, anew))
-    return _Axis(anew[:rows], old_mm, anew_mm, allowed)
 
 
 def _share(rows: int, period_s: float) -> Float:
     """Return (rows,) the share of the rows found anew: 1, then smoothly down to 0."""
     gone = np.clip((np.arange(rows) * period_s - ALONE_S) / (JOINED_S - ALONE_S), 0.0, 1.0)
     return np.asarray(1.0 - gone**3 * (10 - 15 * gone + 6 * gone**2))
-
-
-def _better(found: Mapping[str, _Axis], path: Mapping[str, Float], period_s: float) -> bool:
-    """Whether the contour error is smaller with the rows found anew."""
-    around = np.column_stack([path[axis] for axis in found])
-    checked_um, anew_um = (
-        rms(contour_error_um(around, np.column_stack(positions), period_s, 0))
-        for positions in ([one.checked_mm for one in found.values()], [one.anew_mm for one in found.values()])
-    )
-    return anew_um < checked_um

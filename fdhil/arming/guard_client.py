@@ -61,16 +61,18 @@ class GuardClient:
         program_digest: str,
         first: int = 0,
         final: bool = True,
+        renew: bool = False,
     ) -> dict[str, Any]:
         """Hand a table over (or with ``first`` and ``final`` a piece of a streamed one); have it checked and loaded.
 
+        ``renew``: they take the place of the first rows of what is armed and has not begun.
         Rows per axis: demand and offset in drive increments (sequences of int or numpy integer arrays). StoreError when
         it is too long or there is no memory for it, ValueError when a value is no 32 bit integer.
         """
         body = table.encode(axes, demand, offset, program_digest, first, final)
         descriptor = table.seal(body)
         try:
-            return self.ask({"request": "table"}, self._timeout_s + len(body) / 2e5, descriptor)
+            return self.ask({"request": "table", "renew": renew}, self._timeout_s + len(body) / 2e5, descriptor)
         finally:
             os.close(descriptor)
 

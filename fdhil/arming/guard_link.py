@@ -122,14 +122,19 @@ class GuardLink:
             return self._ask(client, lambda: client.arm(token, armament.stream.program_digest, armament.facts))
 
     @staticmethod
-    def _load(client: GuardClient, armament: Armament, piece: Piece) -> Mapping[str, Any]:
+    def _load(client: GuardClient, armament: Armament, piece: Piece, renew: bool = False) -> Mapping[str, Any]:
         digest = armament.stream.program_digest
-        return client.load(armament.stream.axes, piece.demand, piece.offset, digest, piece.first, piece.final)
+        return client.load(armament.stream.axes, piece.demand, piece.offset, digest, piece.first, piece.final, renew)
 
     def extend(self, armament: Armament, piece: Piece) -> Mapping[str, Any]:
         """Hand on more rows of a running stream (blocking); DeviceError when there is no guard."""
         with self._asked() as client:
             return self._load(client, armament, piece)
+
+    def renew(self, armament: Armament, piece: Piece) -> Mapping[str, Any]:
+        """Put other offsets into the first rows of what has not begun (blocking); DeviceError without a guard."""
+        with self._asked() as client:
+            return self._load(client, armament, piece, renew=True)
 
     def feed_forward(self, feeding: Feeding, token: str) -> Mapping[str, Any]:
         """Switch the on-line feed-forward on (blocking); return the guard's answer. DeviceError without a guard."""

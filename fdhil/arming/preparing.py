@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.arming.checked_program import FIRST_S, CheckedProgram, Piece, RowStream
-from fdhil.arming.first_block import from_rest
+from fdhil.arming.first_block import FirstBlock
 from fdhil.arming.knowledge import SKILL_MOVES, AxisKnowledge
 from fdhil.arming.program_check import reference_blocks
 from fdhil.arming.standstill import AtRest
@@ -54,7 +54,7 @@ class Armament:
     """A correction ready for the guard: its first rows, the stream of all that passed and will pass, and the facts.
 
     ``begun_um`` is what the rows promised that were checked when it was armed, ``half_um`` half the 95 % interval of
-    the error that is left, None: not known.
+    the error that is left, None: not known. ``first`` finds the first rows anew where the axes stand otherwise.
     """
 
     program: str
@@ -63,6 +63,7 @@ class Armament:
     facts: dict[str, bool]
     begun_um: float
     half_um: float | None = None
+    first: FirstBlock | None = None
 
     @property
     def rows(self) -> int | None:
@@ -184,10 +185,12 @@ def prepare_armament(
     half_um = checked.half_um
     if half_um is None:
         half_um = skill_of({axis: found.skills for axis, found in known.items()}, stream.axes)
-    begin = stream.take(FIRST_S)
-    if rest and checked.method == "inverse":
-        begin = from_rest(begin, request.program, request.models, request.config, rest)
-    return Armament(str(request.program), stream, begin, facts, gain_um, half_um)
+    begin, first = stream.take(FIRST_S), None
+    if checked.method == "inverse":
+        first = FirstBlock(begin, request.program, request.models, request.config)
+        first.expect(rest or {})
+        begin = first.begin
+    return Armament(str(request.program), stream, begin, facts, gain_um, half_um, first)
 
 
 @dataclass(frozen=True, slots=True)

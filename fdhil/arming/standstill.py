@@ -11,8 +11,8 @@ import numpy as np
 from fdhil.config import MachineConfig
 from fdhil.records import AxisSamples, Float
 
-WATCHED_S = 0.1  # for which it must have stood
-RECENT_S = 0.03  # of which the current is taken: on a remaining error it goes on
+WATCHED_S = 0.06  # for which it must have stood
+RECENT_S = 0.02  # of which the current is taken: on a remaining error it goes on
 STILL_INCREMENTS = 1.5
 
 

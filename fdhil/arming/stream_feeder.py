@@ -8,6 +8,7 @@ from pathlib import Path
 from fdhil.arming.guard_link import GuardLink
 from fdhil.arming.preparing import Armament
 from fdhil.arming.standing import REST
+from fdhil.arming.standstill import Standstill
 from fdhil.errors import DeviceError, StoreError
 from fdhil.guard.protocol import RESERVE_S
 from fdhil.records import Notice
@@ -18,8 +19,8 @@ SCARCE_S = 5.0  # half the ring: a check that lets it fall so far is told before
 class StreamFeeder:
     """Feeds the guard with one program's rows; ``go_on`` blocks and is called every few cycles of the daemon."""
 
-    def __init__(self, armed: Armament, guard: GuardLink) -> None:
-        self._armed, self._guard = armed, guard
+    def __init__(self, armed: Armament, guard: GuardLink, standstill: Standstill) -> None:
+        self._armed, self._guard, self._standstill = armed, guard, standstill
         self._name = Path(armed.program).name
         self._told = 0
         self._scarce = self._broken = False
@@ -29,6 +30,7 @@ class StreamFeeder:
         notices, stream = self._guard.refresh(), self._armed.stream
         if self._guard.state in REST:
             return notices
+        self._begin_from_rest()
         notices += self._found()
         if self._broken:
             return notices
@@ -36,6 +38,16 @@ class StreamFeeder:
             self._scarce = False
             return notices
         return notices + (self._extend() if stream.ready else self._missing())
+
+    def _begin_from_rest(self) -> None:
+        """Put the rows in force that begin where the axes stand now; what has begun meanwhile goes on as it is."""
+        first = self._armed.first
+        if first is None or self._guard.state != "ARMED":
+            return
+        rows = first.renew(self._standstill.now())
+        if rows is not None:
+            with contextlib.suppress(DeviceError, StoreError):  # the rows that were checked are still there
+                self._guard.renew(self._armed, rows)
 
     def _found(self) -> list[Notice]:
         """Tell what the check refuses; a program that has not begun is disarmed, one that runs goes on to there."""

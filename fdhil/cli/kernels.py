@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 from fdhil import config as machine_config
 from fdhil import tables
+from fdhil.cli.demo.machines import REAL, machine_document
 from fdhil.config import MachineConfig
 from fdhil.daemon.kernel_warmup import nominal_rapid, warm
 from fdhil.pipeline import analyse
@@ -24,12 +24,13 @@ SLOW_ROWS = 5
 
 def compile_all() -> None:
     """Send made-up rapids through everything that computes: estimators, checks, corrections, the simulated drive."""
-    config = machine_config.load(Path(__file__).with_name("demo") / "machine.toml")
+    config = machine_config.parse(machine_document())
     for method in (None, *tables.ESTIMATORS):
         warm(config, method)
     for window in _unusual(config):
         analyse(window, config.identification)
-    Machine(config).power_on()
+    for machine in (config, machine_config.parse(machine_document(REAL))):
+        Machine(machine).power_on()
 
 
 def _unusual(config: MachineConfig) -> Iterator[Window]:

@@ -27,6 +27,7 @@ class Intake:
         self._settings = settings
         self._journal = journal
         self._loading: tuple[table.Loading, Client, Document] | None = None
+        self._renews = False
         self._taken = 0
         self._refused = ""
 
@@ -36,27 +37,34 @@ class Intake:
         return self._loading is not None
 
     def begin(self, client: Client, document: Document, state: State) -> None:
-        """Take the table that came with a request; the answer follows when its rows are checked."""
+        """Take the table that came with a request; the answer follows when its rows are checked.
+
+        A request that says ``renew`` puts other offsets into the first rows, while nothing has begun.
+        """
         running = state.sending or state.mode is not Mode.OFF
+        renews = state.mode is Mode.ARMED and document.get("renew") is True
         try:
             if self._loading is not None:
                 raise table.TableRefused("TableBusy", "another table is being checked; wait for its answer")
             most_bytes = MAX_RUNNING_PIECE_BYTES if running else table.MAX_TABLE_BYTES
-            loading = self._joined(table.read_sealed(client.descriptor, most_bytes), state, running)
-            if running and loading.joined.first == 0 and loading.next_row == 0:
+            loading = self._joined(table.read_sealed(client.descriptor, most_bytes), state, running, renews)
+            if running and not renews and loading.joined.first == 0 and loading.next_row == 0:
                 raise table.TableRefused("TableBusy", Alarm("TableBusy").cause)
         except table.TableRefused as refusal:
             self._refuse(client, document, refusal)
         else:
             self._taken += 1
-            self._loading = loading, client, document
+            self._loading, self._renews = (loading, client, document), renews
         client.release()
 
-    def _joined(self, body: bytes, state: State, running: bool) -> table.Loading:
+    def _joined(self, body: bytes, state: State, running: bool, renews: bool) -> table.Loading:
         axes = self._settings.axes
         keep = state.places[0].row - 2 if running and state.places else 0
         limits, travel = tuple(axis.limits for axis in axes), tuple(axis.travel for axis in axes)
-        return table.begin(body, self._taken + 1, [axis.name for axis in axes], limits, self.path, keep, travel)
+        names = [axis.name for axis in axes]
+        if renews:
+            return table.renew(body, self._taken + 1, names, limits, self.path, travel)
+        return table.begin(body, self._taken + 1, names, limits, self.path, keep, travel)
 
     def check(self, state: State) -> None:
         """Check the next rows of the table on its way in; a few at a time while frames have to leave in time."""
@@ -64,6 +72,8 @@ class Intake:
             return
         loading, client, document = self._loading
         try:
+            if self._renews and state.mode is not Mode.ARMED:
+                raise table.TableRefused("TableBusy", Alarm("TableBusy").cause)
             loading.check(ROWS_PER_TURN if state.sending else ROWS_PER_IDLE_TURN)
         except table.TableRefused as refusal:
             self._loading = None

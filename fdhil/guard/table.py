@@ -12,7 +12,7 @@ import struct
 import sys
 from array import array
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from fdhil.errors import StoreError
 from fdhil.guard.limits import OffsetLimits, violation
@@ -182,23 +182,30 @@ def near_no_end(travel: tuple[int, int], limits: OffsetLimits, demand: Sequence[
 class Loading:
     """A table on its way in: its rows are checked a piece at a time, so that no SYNC waits for it.
 
-    ``joined`` is the path with the new rows behind the old ones; ``done`` once every row has passed.
+    ``joined`` is the path with the new rows behind the old ones, or in their place; ``done`` once all have passed, or
+    those before ``stop``: the others are as they were.
     """
 
     joined: CorrectedPath
     limits: tuple[OffsetLimits, ...]
     travel: tuple[Travel, ...] = ()
     next_row: int = field(default=0)
+    stop: int | None = None
+
+    @property
+    def last(self) -> int:
+        """One past the last row to be checked."""
+        return self.joined.end if self.stop is None else self.stop
 
     @property
     def done(self) -> bool:
         """Whether all rows were checked."""
-        return self.next_row >= self.joined.end
+        return self.next_row >= self.last
 
     def check(self, rows: int) -> None:
         """Check the next rows of all axes; TableRefused with the class of the first limit that is broken."""
         first = self.joined.first
-        stop = min(self.next_row + rows, self.joined.end)
+        stop = min(self.next_row + rows, self.last)
         for limits, travel, demand in zip(self.limits, self.travel, self.joined.demand, strict=False):
             rows_now = demand[self.next_row - first : stop - first]
             if travel is not None and not near_no_end(travel, limits, rows_now):
@@ -249,6 +256,32 @@ def begin(
         sequence,
     )
     return Loading(joined, limits, travel, next_row=loaded.end)
+
+
+def renew(
+    body: bytes,
+    sequence: int,
+    axes: Sequence[str],
+    limits: tuple[OffsetLimits, ...],
+    loaded: CorrectedPath | None,
+    travel: tuple[Travel, ...] = (),
+) -> Loading:
+    """Put other offsets into the first rows of what is loaded, for a machine that has not begun.
+
+    TableRefused when they are not those rows: of another program, more than there are, or of another demand.
+    """
+    names, path = decode(body, sequence)
+    rows = path.end - path.first
+    same = loaded is not None and names == tuple(axes) and path.first == loaded.first == 0 and path.end <= loaded.end
+    if loaded is None or not same or path.program_digest != loaded.program_digest:
+        raise TableRefused("ProgramMismatch", "the rows are not the first ones of the loaded table; load it anew")
+    if any(list(new) != list(old[:rows]) for new, old in zip(path.demand, loaded.demand, strict=True)):
+        raise TableRefused("ProgramMismatch", "the rows are those of another path than the loaded one; load it anew")
+    offset = tuple(
+        [array("i", new) + array("i", old[rows:]) for new, old in zip(path.offset, loaded.offset, strict=True)]
+    )
+    joined = replace(loaded, offset=offset, sequence=sequence)
+    return Loading(joined, limits, travel, stop=min(joined.end, rows + limits[0].window + 3))
 
 
 def _join(old: Sequence[Sequence[int]], new: Sequence[Sequence[int]], cut: int) -> tuple[Sequence[int], ...]:

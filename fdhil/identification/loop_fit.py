@@ -1,9 +1,8 @@
 """Fits a drive's own loops by output error: the closed loop's answer to the demand against position and current.
 
-The demand is the drive's own input and has no noise, so nothing is biased by a sensor's noise. Mechanics are held by
-what the rapids' estimate says of them: the inertia and each window's dry friction may move by a little, so that what
-they are off does not end in a regulator's gain. Levenberg and Marquardt's steps on the kernel; both signals weigh as
-what is left of them, renewed between the rounds.
+The demand is the drive's own input and has no noise, so nothing is biased by a sensor's noise; what the mechanics do
+not explain is a known load. Levenberg and Marquardt's steps on the kernel; both signals weigh as what is left of them,
+renewed between the rounds.
 """
 
 from __future__ import annotations
@@ -17,14 +16,12 @@ import numpy as np
 from fdhil.config import Axis
 from fdhil.identification.covariance import SUMMED_LAGS
 from fdhil.identification.loop_replay import Rapid, replay, with_regulators
-from fdhil.records import Float, Parameters
+from fdhil.records import Float
 
 DELAY = "current_delay_cycles"
 ROUNDS = 4
 STEPS = 12
 CONVERGED = 1e-4  # of the squares' sum
-INERTIA_DOUBT = 0.03  # one standard deviation, relative: a sensor's gain moves K and Jt alike
-FRICTION_DOUBT = 0.3
 SYSTEMATIC = 0.005  # of a gain: what rounding of the demand and a start that is not quite at rest do to all rapids
 LEAST_POSITION_MM, LEAST_CURRENT_A = 1e-5, 1e-4
 
@@ -69,68 +66,46 @@ KEYS: dict[str, Key] = {
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Rapids with the mechanics of each, and the axis whose regulators are sought; ``names`` are the keys that move."""
+    """Rapids, and the axis whose regulators are sought: ``names`` are the keys that move, k of them."""
 
     rapids: tuple[Rapid, ...]
-    mechanics: tuple[Parameters, ...]
     axis: Axis
     names: tuple[str, ...]
 
-    @property
-    def k(self) -> int:
-        """Number of keys that move; behind them the inertia and each window's dry friction."""
-        return len(self.names)
-
     def start(self) -> Float:
-        """Return the coordinates (k + 1 + windows,) of the axis as it is."""
+        """Return the coordinates (k,) of the axis as it is."""
         regulators = self.axis.regulators
-        keys = [KEYS[name].coordinate(float(getattr(regulators, name))) for name in self.names]
-        return np.array([*keys, *([0.0] * (1 + len(self.rapids)))])
+        return np.array([KEYS[name].coordinate(float(getattr(regulators, name))) for name in self.names])
 
     def doubt(self) -> Float:
-        """Return the standard deviations before any data, of the same shape."""
-        return np.array([*(KEYS[n].doubt for n in self.names), INERTIA_DOUBT, *([FRICTION_DOUBT] * len(self.rapids))])
+        """Return the standard deviations (k,) before any data."""
+        return np.array([KEYS[name].doubt for name in self.names])
 
     def bounds(self) -> tuple[Float, Float]:
-        """Return the least and the largest coordinates."""
-        more = 1 + len(self.rapids)
-        low = [KEYS[n].low for n in self.names] + [-0.5] * more
-        return np.array(low), np.array([KEYS[n].high for n in self.names] + [0.5] * more)
+        """Return the least and the largest coordinates, (k,)."""
+        return np.array([KEYS[n].low for n in self.names]), np.array([KEYS[n].high for n in self.names])
 
     def drive(self, coordinates: Float) -> tuple[Axis, float]:
         """Return the axis with the regulators of some coordinates, and the delay in cycles, which need not be whole."""
-        values = {n: KEYS[n].value(float(c)) for n, c in zip(self.names, coordinates, strict=False)}
+        values = {n: KEYS[n].value(float(c)) for n, c in zip(self.names, coordinates, strict=True)}
         delay = values.pop(DELAY, float(self.axis.regulators.current_delay_cycles))
         return with_regulators(self.axis, **values), delay
 
-    def plant(self, window: int, coordinates: Float) -> Parameters:
-        """Return the mechanics of a window at some coordinates."""
-        own, inertia, friction = self.mechanics[window], coordinates[self.k], coordinates[self.k + 1 + window]
-        return replace(own, Jt=own.Jt * (1.0 + float(inertia)), Cd=own.Cd * (1.0 + float(friction)))
-
     def answers(self, coordinates: Float) -> list[Float]:
-        """Return position and current (2, n) of each window."""
+        """Return position and current (2, n) of each rapid."""
         drive, delay = self.drive(coordinates)
-        return [self._answer(j, drive, delay, coordinates) for j in range(len(self.rapids))]
-
-    def _answer(self, window: int, drive: Axis, delay: float, coordinates: Float) -> Float:
-        return replay(self.rapids[window], self.plant(window, coordinates), drive, delay)
+        return [replay(rapid, drive, delay) for rapid in self.rapids]
 
     def slopes(self, coordinates: Float, answers: Sequence[Float]) -> list[Float]:
-        """Return how each window's position and current change (2, n, k + 2): with keys, inertia, its own friction."""
-        out = [np.empty((*answer.shape, self.k + 2)) for answer in answers]
+        """Return how each rapid's position and current change with the keys, (2, n, k)."""
+        out = [np.empty((*answer.shape, len(self.names))) for answer in answers]
         _, high = self.bounds()
-        for c in range(self.k + 1):
-            step = KEYS[self.names[c]].step if c < self.k else 2e-3
+        for c, name in enumerate(self.names):
+            step = KEYS[name].step if coordinates[c] + KEYS[name].step <= high[c] else -KEYS[name].step
             moved = coordinates.copy()
-            step = -step if moved[c] + step > high[c] else step
             moved[c] += step
             for slope, one, answer in zip(out, self.answers(moved), answers, strict=True):
                 slope[..., c] = (one - answer) / step
-        moved = coordinates.copy()
-        moved[self.k + 1 :] += 5e-3
-        for slope, one, answer in zip(out, self.answers(moved), answers, strict=True):
-            slope[..., -1] = (one - answer) / 5e-3
         return out
 
 
@@ -156,7 +131,7 @@ class Fit:
     @property
     def values(self) -> dict[str, float]:
         """The keys that moved, in their units."""
-        pairs = zip(self.problem.names, self.coordinates, strict=False)
+        pairs = zip(self.problem.names, self.coordinates, strict=True)
         return {name: KEYS[name].value(float(c)) for name, c in pairs}
 
     def axis(self) -> Axis:
@@ -242,24 +217,22 @@ def _free_step(matrix: Float, score: Float, at: Float, low: Float, high: Float) 
 
 
 def normal(made: Fit) -> tuple[Float, Float, Float]:
-    """Return information (q, q), score (q,), and the score's covariance (q, q) of residuals that hang together.
+    """Return information (k, k), score (k,), and the score's covariance (k, k) of residuals that hang together.
 
     The last is Newey and West's (1987), a window at a time: what the model does not have is no white noise.
     """
-    problem = made.problem
-    size = problem.k + 1 + len(problem.rapids)
-    information, score, meat = np.zeros((size, size)), np.zeros(size), np.zeros((size, size))
+    problem, k = made.problem, len(made.problem.names)
+    information, score, meat = np.zeros((k, k)), np.zeros(k), np.zeros((k, k))
     pairs = zip(problem.rapids, made.left, strict=True)
     answers = [np.stack((rapid.position_mm, rapid.current_a)) - left for rapid, left in pairs]
     for j, slope in enumerate(problem.slopes(made.coordinates, answers)):
         known = problem.rapids[j].known
-        columns = np.array([*range(problem.k + 1), problem.k + 1 + j])
         phi = slope[:, known] / made.scale[:, None, None]
         rest = made.left[j][:, known] / made.scale[:, None]
-        rows = np.einsum("cnq,cn->nq", phi, rest)
-        information[np.ix_(columns, columns)] += np.einsum("cnp,cnq->pq", phi, phi)
-        score[columns] += rows.sum(axis=0)
-        meat[np.ix_(columns, columns)] += _hanging(rows)
+        rows = np.einsum("cnk,cn->nk", phi, rest)
+        information += np.einsum("cnj,cnk->jk", phi, phi)
+        score += rows.sum(axis=0)
+        meat += _hanging(rows)
     return information, score, meat
 
 
@@ -276,7 +249,6 @@ def covariance_of(made: Fit) -> Float:
     information, _, meat = normal(made)
     inverse = np.linalg.inv(information + np.diag(1.0 / made.problem.doubt() ** 2))
     sandwich = inverse @ meat @ inverse
-    k = made.problem.k
     wider = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(inverse), 1.0))
     floor = np.diag([(SYSTEMATIC if KEYS[name].scale == 0.0 else 0.0) ** 2 for name in made.problem.names])
-    return np.asarray((inverse * np.outer(wider, wider))[:k, :k] + floor)
+    return np.asarray((inverse * np.outer(wider, wider)) + floor)

@@ -9,6 +9,8 @@ import numpy as np
 from scipy.linalg import solveh_banded
 
 from fdhil.config import Axis, Regulators
+from fdhil.identification.filtering import all_about, moving_mean
+from fdhil.identification.motion import surely_moving
 from fdhil.identification.windows import bridged
 from fdhil.model import closed_loop, kernels
 from fdhil.records import Bool, Float, Parameters, Window, read_only, rms
@@ -22,6 +24,7 @@ EDGE_ROWS = 3  # at either end, where the demand may be cut
 NIL_MM = 1e-9
 PENALISED = 3  # order of the differences
 WEIGHTS = tuple(10.0**k for k in range(6))
+LOW_PASS_S = 0.009  # twice: about 40 Hz, as far as the outer loops reach
 ROUNDED = 0.7  # of a step: half of one, and what the neighbours' rounding adds at a corner
 
 
@@ -30,7 +33,7 @@ class Rapid:
     """One rapid on its grid, rows (n,), from shortly before it begins: what the drive was asked for, and what it did.
 
     ``known`` marks whole rows; the axis stood at ``standstill_mm``, held by ``standstill_a``, or crept on at
-    ``creep_mm_s`` from the move before.
+    ``creep_mm_s`` from the move before. ``load_nm`` (n,) is the torque that ``plant`` does not explain.
     """
 
     dt_s: float
@@ -41,6 +44,8 @@ class Rapid:
     standstill_mm: float
     standstill_a: float
     creep_mm_s: float
+    plant: Parameters
+    load_nm: Float
 
     @property
     def lag_mm(self) -> Float:
@@ -53,8 +58,8 @@ class Rapid:
         return rms(self.lag_mm[self.known]) * 1e3
 
 
-def rapid_of(window: Window, sync_period_s: float | None = None) -> Rapid | None:
-    """Return the rapid of a window; None where demand, position and current are not all told.
+def rapid_of(window: Window, plant: Parameters, sync_period_s: float | None = None) -> Rapid | None:
+    """Return the rapid of a window, moved by ``plant``; None where demand, position and current are not all told.
 
     Set-points come every ``sync_period_s`` (left out: with every row); of rows that come more often only theirs count.
     """
@@ -84,11 +89,13 @@ def rapid_of(window: Window, sync_period_s: float | None = None) -> Rapid | None
         float(position[cut][0]) if creep else float(position[still].mean()),
         _held(current[still], first - still.start),
         creep,
+        replace(plant, terms=()),
+        _load(position, current, plant, window)[cut],
     )
 
 
 def _held(current_a: Float, row: int) -> float:
-    """Return the current that is held at a row: while dry friction holds an axis beside its place, it rises steadily."""
+    """Return the current that is held at a row: held by friction beside its place, an axis pulls ever more."""
     rows = np.arange(current_a.size)
     return float(np.polyval(np.polyfit(rows, current_a, 1), row)) if rows.size > LEAD_ROWS else float(current_a.mean())
 
@@ -107,6 +114,28 @@ def _on_the_grid(window: Window, sync_period_s: float | None) -> Window:
         current_a=window.current_a[kept],
         offset_mm=None if window.offset_mm is None else window.offset_mm[kept],
     )
+
+
+def _load(position_mm: Float, current_a: Float, plant: Parameters, window: Window) -> Float:
+    """Return the torque (n,) that a plant of six parameters does not explain, low-passed; held where it stands.
+
+    Friction that is not as modelled, a load, ripples: whatever it is, the loops answer it, and it must not end in their
+    gains. Current and motion tell it without them. All of it goes through the same low-pass, whose second differences
+    of the position are exact.
+    """
+    width = max(1, round(LOW_PASS_S / window.dt_s)) | 1
+    rad_per_mm = 2 * math.pi / window.pitch_mm
+    angle = moving_mean(moving_mean(position_mm * rad_per_mm, width), width)
+    speed = np.gradient(angle, window.dt_s)
+    moving = surely_moving(window.speed_rad_s, window.rapid_speed_rad_s)
+    friction = plant.Cd * np.sign(speed) + plant.ft * speed
+    torque = plant.K * moving_mean(moving_mean(current_a, width), width)
+    acceleration = np.diff(angle, 2, prepend=angle[0], append=angle[-1]) / window.dt_s**2
+    rows = np.flatnonzero(all_about(moving, 2 * width + 1, beyond=False))
+    if not rows.size:
+        return np.zeros(window.n)
+    left = torque - friction - plant.Jt * acceleration
+    return np.asarray(np.interp(np.arange(window.n), rows, left[rows]))
 
 
 def _creep(position_mm: Float, dt_s: float, least_mm: float) -> float:
@@ -147,41 +176,44 @@ def _whittaker(values: Float, weight: float) -> Float:
     return np.asarray(solveh_banded(bands, values))
 
 
-def replay(rapid: Rapid, parameters: Parameters, axis: Axis, delay_cycles: float) -> Float:
+def replay(rapid: Rapid, axis: Axis, delay_cycles: float) -> Float:
     """Return position in mm and current in A (2, n) of the closed loop along a rapid's demand.
 
     ``delay_cycles`` may lie between two whole numbers: it stands in the place of the regulators' own.
     """
     whole = math.floor(delay_cycles)
     part = delay_cycles - whole
-    answer = _run(rapid, parameters, axis, whole)
+    answer = _run(rapid, axis, whole)
     if part > 0.0:
-        answer = (1.0 - part) * answer + part * _run(rapid, parameters, axis, whole + 1)
+        answer = (1.0 - part) * answer + part * _run(rapid, axis, whole + 1)
     return answer
 
 
-def _run(rapid: Rapid, parameters: Parameters, axis: Axis, delay_cycles: int) -> Float:
+def _run(rapid: Rapid, axis: Axis, delay_cycles: int) -> Float:
     drive = with_regulators(axis, current_delay_cycles=delay_cycles)
-    start = standing(rapid, parameters, drive)
-    answer = closed_loop.simulate(parameters, drive, rapid.dt_s, rapid.demand_mm, state=start)
-    return np.stack((answer.position_mm, answer.current_a))
+    # a load is a torque offset of the other sign, but for the current, which has it
+    offset = -rapid.load_nm * (axis.nominal.K / rapid.plant.K)
+    start = standing(rapid, drive)
+    answer = closed_loop.simulate(rapid.plant, drive, rapid.dt_s, rapid.demand_mm, torque_offset_nm=offset, state=start)
+    return np.stack((answer.position_mm, answer.current_a + rapid.load_nm / rapid.plant.K))
 
 
-def standing(rapid: Rapid, parameters: Parameters, axis: Axis) -> closed_loop.State:
+def standing(rapid: Rapid, axis: Axis) -> closed_loop.State:
     """Return the state of an axis that stands, held by a current: what the position does not ask for is integrated."""
     g, rad_per_mm = axis.regulators, 2 * math.pi / axis.screw_pitch_mm
     speed = rapid.creep_mm_s * rad_per_mm
     lag = (rapid.demand_mm[0] - rapid.standstill_mm) * rad_per_mm
+    current = rapid.standstill_a - rapid.load_nm[0] / rapid.plant.K
     held = rapid.standstill_a - g.speed_kp * (g.position_gain_per_s * lag - speed)
     state = closed_loop.start(rapid.standstill_mm)
-    state[[kernels.CURRENT, kernels.CURRENT_DEMAND]] = rapid.standstill_a
+    state[[kernels.CURRENT, kernels.CURRENT_DEMAND]] = current
     state[[kernels.SPEED, kernels.SPEED_FILTERED]] = speed
     if g.structure == "pid":
         state[kernels.POSITION_INTEGRAL] = held / g.speed_kp
         state[kernels.POSITION_BEFORE] -= rapid.creep_mm_s * g.speed_period_s
     else:
         state[kernels.SPEED_INTEGRAL] = held
-    voltage = parameters.R * rapid.standstill_a + parameters.K * speed
+    voltage = rapid.plant.R * current + rapid.plant.K * speed
     state[kernels.CURRENT_INTEGRAL] = voltage
     state[kernels.WAITING : kernels.WAITING + g.current_delay_cycles] = voltage
     return state

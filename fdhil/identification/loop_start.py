@@ -15,7 +15,7 @@ import numpy as np
 from fdhil.config import Axis, Nominal, Regulators
 from fdhil.identification.loop_fit import Problem, left_of, scale_of
 from fdhil.identification.loop_replay import Rapid, fitting_periods, with_regulators
-from fdhil.records import Parameters, Window
+from fdhil.records import Window
 
 CASCADE = ("position_gain_per_s", "speed_feedforward", "speed_kp", "speed_ki")
 CORNERS_HZ = (8.0, 16.0, 32.0, 64.0, 128.0)
@@ -27,7 +27,8 @@ NO_LIMIT = 1e5
 def begun_anew(problem: Problem) -> Problem:
     """Return the problem begun at the best cascade of the grid, judged by the longest rapid; limits and cycles stay."""
     longest = int(np.argmax([np.ptp(one.demand_mm) for one in problem.rapids]))
-    rapid, plant = problem.rapids[longest], problem.mechanics[longest]
+    rapid = problem.rapids[longest]
+    plant = rapid.plant
     best, least = problem, math.inf
     for corner_hz, inner, outer in product(CORNERS_HZ, SLOWER, SLOWER):
         corner = 2 * math.pi * corner_hz
@@ -44,7 +45,7 @@ def begun_anew(problem: Problem) -> Problem:
             setpoint_filter_s=0.0,
             current_delay_cycles=0,
         )
-        trial = Problem((rapid,), (plant,), start, CASCADE)
+        trial = Problem((rapid,), start, CASCADE)
         left, _ = left_of(trial, trial.start())
         cost = float(np.log(scale_of(trial, left)).sum())
         if cost < least:
@@ -60,9 +61,9 @@ def _feedforward(rapid: Rapid, gain: float) -> float:
     return float(np.clip(share, 0.0, 1.5))
 
 
-def made_up_axis(window: Window, plant: Parameters, dt_s: float) -> Axis:
+def made_up_axis(window: Window, rapid: Rapid) -> Axis:
     """Return an axis of which only a recording is known: a fast current loop, no limits, cycles that divide a row."""
-    current = 2 * math.pi * CURRENT_CORNER_HZ
+    plant, current = rapid.plant, 2 * math.pi * CURRENT_CORNER_HZ
     regulators = Regulators(
         position_gain_per_s=1.0,
         speed_kp=1.0,
@@ -80,4 +81,4 @@ def made_up_axis(window: Window, plant: Parameters, dt_s: float) -> Axis:
         nominal=Nominal(**{name: max(value, 0.0) for name, value in plant.as_dict().items()}),
         regulators=regulators,
     )
-    return with_regulators(axis, **fitting_periods(regulators, dt_s))
+    return with_regulators(axis, **fitting_periods(regulators, rapid.dt_s))

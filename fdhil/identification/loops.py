@@ -2,9 +2,9 @@
 
 The four gains every cascade has are fitted first. What else a drive may have joins one key at a time, the likeliest of
 all first, as long as it explains a tenth of the tolerance at the table, or a quarter of what is left: over hundreds of
-rows no chance does either. The other structures of the table are tried against the cascade by the same measure. With full feed-forward and no filter, a
-cascade answers the same when position_gain_per_s and speed_ki / speed_kp change places: of the two the one nearer to
-where the fit began is told.
+rows no chance does either. The other structures of the table are tried against the cascade by the same measure. With
+full feed-forward and no filter, a cascade answers the same when position_gain_per_s and speed_ki / speed_kp change
+places: of the two the one nearer to where the fit began is told.
 """
 
 from __future__ import annotations
@@ -60,14 +60,16 @@ def identify_loops(
     ``mechanics`` are what each window's estimate says of the motor and what it moves, ``axis`` the machine's section:
     without it the search begins from the demand alone. Set-points come every ``sync_period_s`` (left out: each row).
     """
-    pairs = [(rapid_of(w, sync_period_s), own) for w, own in zip(windows, mechanics, strict=True)]
-    told = [(rapid, own) for rapid, own in pairs if rapid is not None and np.isfinite([*own.as_dict().values()]).all()]
-    if not told:
+    pairs = [
+        (w, own) for w, own in zip(windows, mechanics, strict=True) if np.isfinite([*own.as_dict().values()]).all()
+    ]
+    told = [rapid for w, own in pairs if (rapid := rapid_of(w, own, sync_period_s)) is not None]
+    rapids = tuple(told[-MOST_WINDOWS:])
+    if not rapids:
         return None
-    rapids, plants = zip(*told[-MOST_WINDOWS:], strict=True)
     following = rms(np.concatenate([one.lag_mm[one.known] for one in rapids])) * 1e3
     tolerance = settings.tolerance_um or EXPLAINED_SHARE * following
-    problem = _problem(rapids, plants, axis, windows[0])
+    problem = _problem(rapids, axis, windows[0])
     found = _whole_delay(_best(problem, tolerance, axis is not None))
     configured = None if axis is None else _left_um(problem)
     verdict = _verdict(found, tolerance, following, configured)
@@ -75,17 +77,16 @@ def identify_loops(
 
 
 def _left_um(problem: Problem) -> float:
-    """Return what the configured regulators leave of the position, the dry friction of each window found anew."""
-    return loop_fit.fit(replace(problem, names=())).unexplained_um
+    """Return what the regulators that the search begins with leave of the position."""
+    return float(loop_fit.spread_of(problem, loop_fit.left_of(problem, problem.start())[0])[0]) * 1e3
 
 
-def _problem(rapids: tuple[Rapid, ...], plants: tuple[Parameters, ...], axis: Axis | None, window: Window) -> Problem:
+def _problem(rapids: tuple[Rapid, ...], axis: Axis | None, window: Window) -> Problem:
     """Return where the search begins: at the configured regulators, or at what the demand alone says."""
     if axis is None:
-        made_up = made_up_axis(window, plants[-1], rapids[-1].dt_s)
-        return begun_anew(Problem(rapids, plants, made_up, CASCADE))
+        return begun_anew(Problem(rapids, made_up_axis(window, rapids[-1]), CASCADE))
     axis = with_regulators(axis, **fitting_periods(axis.regulators, rapids[0].dt_s))
-    return Problem(rapids, plants, axis, _names(axis.regulators))
+    return Problem(rapids, axis, _names(axis.regulators))
 
 
 def _names(regulators: Regulators) -> tuple[str, ...]:
@@ -128,10 +129,8 @@ def worth_um(made: Fit, tolerance_um: float) -> float:
 
 def _with(made: Fit, name: str) -> Fit:
     """Return the fit with one key more, begun where it was without, and where all began: its lack bends the others."""
-    k = made.problem.k
     wider = replace(made.problem, names=(*made.problem.names, name))
-    starts = [np.insert(made.coordinates, k, KEYS[name].step), wider.start()]
-    starts[1][k] = KEYS[name].usual
+    starts = [np.append(made.coordinates, KEYS[name].step), np.append(made.problem.start(), KEYS[name].usual)]
     return min((loop_fit.fit(wider, start) for start in starts), key=lambda fit: fit.deviance)
 
 

@@ -11,10 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from fdhil.identification.covariance import summed
+from fdhil.identification.covariance import SUMMED_LAGS
 from fdhil.identification.fit import Fit, fit
 from fdhil.identification.kalman import DELAY, LOAD
 from fdhil.identification.motion import Course, Motion
@@ -23,20 +25,15 @@ from fdhil.identification.slow_voltage import in_order
 from fdhil.identification.terms import Candidate, candidates
 from fdhil.records import Estimate, Float
 
+Rows = npt.NDArray[np.intp]
+
 ROUNDS = 3
-MOST = 6  # terms in all
+MOST = 8  # courses in all
+IMITATED = 1e-6  # share of a direction below which only rounding is left of it
 WORTH = 0.005  # of the motor's torque (RMS): a tenth of the share of the following error that is tolerated
 SHIFT = 1.0  # standard deviations of one of the six: a smaller shift is within its interval anyway
 SIX = 6
-LEAST_SURE = 4.0  # standard deviations of a term, colour and all: of 50 candidates, one in 300 windows is by chance
-
-
-@dataclass(frozen=True, slots=True)
-class Tried:
-    """A candidate on a fit, and the columns (m, q) of its courses."""
-
-    candidate: Candidate
-    columns: Float
+LEAST_SURE = 3.5  # standard deviations of a term, colour and all else that was chosen included
 
 
 def joined(base: Fit, command: bool, told: Callable[[Fit], Estimate]) -> Fit:
@@ -66,10 +63,26 @@ def joined(base: Fit, command: bool, told: Callable[[Fit], Estimate]) -> Fit:
 
 
 def _weak(estimate: Estimate, chosen: Sequence[Candidate], untold: set[str]) -> set[str]:
-    """Return the families of what is not sure beside all else; the last chosen where the six are told no more."""
+    """Return the families of what is not sure beside all else; the last chosen where the six are told no more.
+
+    Friction that pushes is none: what makes it so stands for something else.
+    """
     if not set(estimate.missing) <= untold:
         return {chosen[-1].family}
-    return {c.family for c in chosen if not abs(estimate.value(c.family)) > LEAST_SURE * estimate.std(c.family)}
+    weak = {c.family for c in chosen if not abs(estimate.value(c.family)) > LEAST_SURE * _std(estimate, c.family)}
+    low = estimate.value("stribeck") if "stribeck" in estimate.names else 0.0
+    if low and min(estimate.value("Cd"), estimate.value("Cd") + low) < 0.0:
+        weak.add("stribeck")
+    return weak
+
+
+def _std(estimate: Estimate, family: str) -> float:
+    """Return the deviation of a term; of friction at low speed for the speed that was chosen: whether it is there."""
+    if family != "stribeck":
+        return estimate.std(family)
+    k, speed = estimate.names.index(family), estimate.names.index("stribeck_speed")
+    covariance = estimate.covariance
+    return math.sqrt(covariance[k, k] - covariance[k, speed] ** 2 / covariance[speed, speed])
 
 
 def _with(base: Fit, chosen: Sequence[Candidate]) -> Fit:
@@ -86,129 +99,144 @@ def _with(base: Fit, chosen: Sequence[Candidate]) -> Fit:
 
 def _chosen(base: Fit, left: Sequence[Candidate]) -> list[Candidate]:
     """Return the candidates that join this fit, the surest first."""
-    room = MOST - len({c.name for c in base.problem.motions[0].courses})
-    sizes = [len(c.courses[0]) for c in left]
-    if not left or room <= 0:
-        return []
-    courses = [[course for c in left for course in c.courses[k]] for k in range(len(base.problem.motions))]
-    columns = base.problem.answer(base.theta, courses)
-    ends = np.cumsum(sizes)
-    tried = [Tried(c, columns[:, e - s : e]) for c, s, e in zip(left, sizes, ends, strict=True)]
-    bench = _Bench.of(base)
+    number, room = len(left), MOST - len(base.problem.motions[0].courses)
+    bench = _Bench.of(base, left) if left else None
     found: list[Candidate] = []
-    while tried and len(found) < room:
-        taken = _surest(bench, tried, len(left))
-        if taken is None:
+    while bench is not None and len(found) < room:
+        scores = bench.scores()
+        plain = scores.gains - _price(scores.freedom, bench.rows, number)
+        hopeful = np.flatnonzero(plain > 0.0)  # were all innovations independent
+        colour = bench.colour(scores, hopeful)
+        sure = scores.gains[hopeful] / colour - _price(scores.freedom[hopeful], bench.rows / colour, number)
+        if not (sure.size and sure.max() > 0.0):
             break
-        if _worth(base, bench, taken):
-            found.append(taken.candidate)
-            bench = bench.wider(taken.columns)
-        tried = [t for t in tried if t.candidate.family != taken.candidate.family]
+        best = int(hopeful[int(np.argmax(sure))])
+        worth = _worth(bench, scores, best)
+        if worth:
+            found.append(bench.left[best])
+        bench = bench.without(best, hopeful, worth)
     return found
 
 
-def _surest(bench: _Bench, tried: Sequence[Tried], number: int) -> Tried | None:
-    """Return the term that gains most beyond its price; None where none does.
+def _price(freedom: Float, rows: float | Float, number: int) -> Float:
+    price: Float = freedom * np.log(np.maximum(rows, 2.0)) + 2.0 * math.log(number)
+    return price
 
-    What it gains were all innovations independent comes first: only where that is enough it is asked what is left
-    with innovations that hang together.
+
+class _Scores(NamedTuple):
+    """What each of c candidates, of one course or two, explains beyond all that is free.
+
+    ``beyond`` (2, m, c) are the courses' columns without what is free of them, ``shares`` (2, k, c); ``powers`` (2, c)
+    their squares, ``amplitudes`` (2, c), and ``gains`` (c,) the fall of minus twice the log likelihood.
     """
-    plain = [bench.gain(t.columns) - _price(t, bench.rows, number) for t in tried]
-    best, most = None, 0.0
-    for k in sorted(range(len(tried)), key=lambda k: -plain[k]):
-        if plain[k] <= most:
-            break
-        colour = bench.colour(tried[k].columns)
-        left = bench.gain(tried[k].columns) / colour - _price(tried[k], bench.rows / colour, number)
-        if left > most:
-            best, most = tried[k], left
-    return best
 
-
-def _price(tried: Tried, rows: float, number: int) -> float:
-    freedom = int(tried.columns.shape[1])
-    return freedom * math.log(max(rows, 2.0)) + 2.0 * math.log(number)
+    beyond: Float
+    shares: Float
+    powers: Float
+    amplitudes: Float
+    gains: Float
+    freedom: Float
 
 
 @dataclass(frozen=True, slots=True)
 class _Bench:
-    """A fit, and the ``basis`` (m, k) of all that is free in it, after the voltage's course, of which one deviation is
-    a prior."""
+    """A fit with the candidates that are ``left``, their ``columns`` (2, m, c): the second is nil where there is one.
+
+    ``basis`` (m, k) is all that is free, after the voltage's course, and ``inverse`` (k, k) the covariance of that.
+    """
 
     fit: Fit
+    left: Sequence[Candidate]
+    columns: Float
     basis: Float
     inverse: Float
 
     @classmethod
-    def of(cls, base: Fit) -> _Bench:
-        return cls._made(base, np.column_stack([base.problem.shape_effect(base.theta), base.jacobian]))
+    def of(cls, base: Fit, left: Sequence[Candidate]) -> _Bench:
+        """Return the bench of a fit."""
+        motions = range(len(base.problem.motions))
+        pairs = [k for k, c in enumerate(left) if len(c.courses[0]) == 2]
+        courses = [[c.courses[k][0] for c in left] + [left[p].courses[k][1] for p in pairs] for k in motions]
+        answer = base.problem.answer(base.theta, courses)
+        columns = np.zeros((2, answer.shape[0], len(left)))
+        columns[0], columns[1][:, pairs] = answer[:, : len(left)], answer[:, len(left) :]
+        basis = np.column_stack([base.problem.shape_effect(base.theta), base.jacobian])
+        return cls(base, left, columns, basis, _inverse(basis))
 
-    @classmethod
-    def _made(cls, base: Fit, basis: Float) -> _Bench:
-        gram = basis.T @ basis
-        gram[0, 0] += 1.0
-        return cls(base, basis, inverse_of(gram)[0])
-
-    def wider(self, columns: Float) -> _Bench:
-        """Return the bench with a term's columns free too."""
-        return self._made(self.fit, np.column_stack([self.basis, columns]))
-
-    @property
-    def residuals(self) -> Float:
-        """The innovations (m,)."""
-        return self.fit.residuals
+    def without(self, taken: int, kept: Rows, joins: bool) -> _Bench:
+        """Return the bench of those ``kept`` that are of another family than the ``taken``, which ``joins`` or not."""
+        family = self.left[taken].family
+        others = [int(k) for k in kept if self.left[k].family != family]
+        more = [c[:, taken] for c in self.columns if c[:, taken].any()] if joins else []
+        basis = np.column_stack([self.basis, *more])
+        return _Bench(self.fit, [self.left[k] for k in others], self.columns[:, :, others], basis, _inverse(basis))
 
     @property
     def rows(self) -> float:
         """How many innovations tell of the motion."""
         return 2.0 * sum(int(np.count_nonzero(np.abs(m.mode) == 1)) for m in self.fit.problem.motions)
 
-    def step(self, columns: Float) -> tuple[Float, Float, Float]:
-        """Return score (q,), information (q, q) of ``columns`` (m, q) beyond the basis, and their shares (k, q)."""
-        shared = self.basis.T @ columns
-        shares = self.inverse @ shared
-        pulled = self.basis.T @ self.residuals
-        score = columns.T @ self.residuals - shares.T @ pulled
-        return score, columns.T @ columns - shared.T @ shares, shares
+    @property
+    def rest(self) -> Float:
+        """The innovations (m,) without what all that is free could explain of them."""
+        e = self.fit.residuals
+        left: Float = e - self.basis @ (self.inverse @ (self.basis.T @ e))
+        return left
 
-    def colour(self, columns: Float) -> float:
-        """Return by how much the scores of ``columns`` (m, q) vary more than they would were innovations independent.
+    def scores(self) -> _Scores:
+        """Return what each candidate explains."""
+        shares = self.inverse @ (self.basis.T @ self.columns)
+        beyond = self.columns - self.basis @ shares
+        whole, powers = (np.einsum("pmc,pmc->pc", part, part) for part in (self.columns, beyond))
+        seen = powers > IMITATED * whole
+        beyond, powers = np.where(seen[:, None], beyond, 0.0), np.where(seen, powers, 1.0)
+        s = beyond.transpose(0, 2, 1) @ self.rest
+        both = np.einsum("mc,mc->c", *beyond)
+        determinant = np.maximum(powers[0] * powers[1] - both**2, IMITATED * powers[0] * powers[1])
+        amplitudes = (powers[::-1] * s - both * s[::-1]) / determinant
+        return _Scores(beyond, shares, powers, amplitudes, (amplitudes * s).sum(axis=0), seen.sum(axis=0) * 1.0)
 
-        After Newey and West (1987), by rows, of what is left with them: what they explain is no colour.
+    def colour(self, scores: _Scores, asked: Rows) -> Float:
+        """Return by how much the scores of those ``asked`` (c,) vary more than were innovations independent.
+
+        After Newey and West (1987), by rows, of what is left with the candidate: what it explains is no colour.
+        Bartlett's weights over lags are the mean square of moving sums.
         """
-        score, information, shares = self.step(columns)
-        beyond = columns - self.basis @ shares
-        left = self.residuals - beyond @ (inverse_of(information)[0] @ score)
-        scores = self.fit.by_window(beyond * left[:, None])
-        motions, delay = self.fit.problem.motions, float(self.fit.theta[DELAY])
-        meat = sum(summed(in_order(m, delay, own)) for m, own in zip(motions, scores, strict=True))
-        ratio = np.diag(meat) / np.diag(information)
-        return max(1.0, float(ratio.max()))
-
-    def gain(self, columns: Float) -> float:
-        """Return by how much minus twice the log likelihood falls with these columns."""
-        score, information, _ = self.step(columns)
-        inverse, condition = inverse_of(information)
-        return float(score @ inverse @ score) if math.isfinite(condition) else 0.0
+        beyond, amplitudes = scores.beyond[:, :, asked], scores.amplitudes[:, asked]
+        left = self.rest[:, None] - np.einsum("pmc,pc->mc", beyond, amplitudes)
+        meat = np.zeros(amplitudes.shape)
+        for own, signal in enumerate(beyond):
+            for motion, part in zip(self.fit.problem.motions, self.fit.by_window(signal * left), strict=True):
+                by_row = in_order(motion, float(self.fit.theta[DELAY]), part)
+                sums = np.cumsum(np.pad(by_row, ((SUMMED_LAGS + 1, SUMMED_LAGS), (0, 0))), axis=0)
+                moving = sums[SUMMED_LAGS + 1 :] - sums[: -SUMMED_LAGS - 1]
+                meat[own] += np.square(moving).sum(axis=0) / (SUMMED_LAGS + 1)
+        colour: Float = np.maximum(1.0, (meat / scores.powers[:, asked]).max(axis=0, initial=1.0))
+        return colour
 
 
-def _worth(base: Fit, bench: _Bench, tried: Tried) -> bool:
+def _inverse(basis: Float) -> Float:
+    gram = basis.T @ basis
+    gram[0, 0] += 1.0  # one deviation of the voltage's course is all that is expected of it
+    return inverse_of(gram)[0]
+
+
+def _worth(bench: _Bench, scores: _Scores, k: int) -> bool:
     """Return whether a term's torque matters to the path, or without it one of the six is beyond its interval."""
-    score, information, shares = bench.step(tried.columns)
-    amplitudes = inverse_of(information)[0] @ score
-    moved = shares[1 : SIX + 1] @ amplitudes
+    amplitudes = scores.amplitudes[:, k]
+    moved = np.einsum("pk,p->k", scores.shares[:, :, k], amplitudes)[1 : SIX + 1]
     if (np.abs(moved) > SHIFT * np.sqrt(np.diag(bench.inverse)[1 : SIX + 1])).any():
         return True
-    first = tried.candidate.courses[0][0]
-    if first.kind != LOAD:
+    courses, base = bench.left[k].courses, bench.fit
+    if courses[0][0].kind != LOAD:
         return False
-    torque = sum(float(np.square(_torque(own, amplitudes)).sum()) for own in tried.candidate.courses)
+    torque = sum(float(np.square(_torque(own, amplitudes)).sum()) for own in courses)
     whole = sum(float(np.square(base.theta[2] * _sure(m)).sum()) for m in base.problem.motions)
     return torque > WORTH**2 * whole
 
 
 def _torque(courses: Sequence[Course], amplitudes: Float) -> Float:
-    total: Float = amplitudes @ np.stack([course.values for course in courses])
+    total: Float = amplitudes[: len(courses)] @ np.stack([course.values for course in courses])
     return total
 
 

@@ -14,6 +14,7 @@ from typing import Literal
 
 import numpy as np
 
+from fdhil.identification.covariance import summed
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.motion import resolution, surely_moving
 from fdhil.identification.normal import inverse_gram
@@ -78,7 +79,8 @@ def mended(window: Window, source: SpeedSource = "auto") -> Window:
 
 @lru_cache(maxsize=8)
 def _mended(window: Window, source: SpeedSource) -> Window:
-    found = lag_of(window, source)
+    with np.errstate(over="ignore", invalid="ignore"):  # a signal that no drive has tells no lag
+        found = lag_of(window, source)
     if found is None:
         return window
     angle, dt = _angle(window), window.dt_s
@@ -144,10 +146,12 @@ def _lateness(window: Window) -> tuple[float, float] | None:
         return None
     inverse, condition = inverse_gram(columns)
     weights = inverse @ (columns.T @ speed)
-    if not (math.isfinite(condition) and weights[1] != 0.0):
-        return None
     left = speed - columns @ weights
-    deviation = math.sqrt(float(left @ left) / left.size * float(inverse[0, 0]))
+    scores = (columns @ inverse[:, :1]) * left[:, None]
+    variance = float(summed(scores)[0, 0])  # noise of either may hang together over rows
+    if not (math.isfinite(condition) and 0.0 <= variance < np.inf and weights[1] != 0.0):
+        return None
+    deviation = math.sqrt(variance)
     return -float(weights[0] / weights[1]), deviation / abs(float(weights[1]))
 
 

@@ -15,7 +15,8 @@ from fdhil.identification.fit import Fit
 from fdhil.identification.kalman import DELAY, SPEED
 from fdhil.identification.motion import Course
 from fdhil.identification.normal import inverse_of
-from fdhil.identification.terms import PHASE, stribeck_slope
+from fdhil.identification.ripple_parts import as_amplitude
+from fdhil.identification.terms import stribeck_slope
 from fdhil.records import PARAMETERS, Estimate, Float
 
 SPACING = 0.1  # of a speed on the grid: one standard deviation of where between two of them the best lies
@@ -27,41 +28,20 @@ def told_terms(six: Estimate, result: Fit, values: Float, beyond: Float) -> tupl
 
     ``six`` is the estimate with the covariance of all entries of theta but the delay, whose ``values`` are given.
     """
-    motion = result.problem.motions[0]
-    names = (*PARAMETERS, *(course.name for course in motion.courses))
-    told, turn = _turned(names, values)
-    covariance, systematic = turn @ six.covariance @ turn.T, turn @ _columns(six)
-    beyond = turn @ beyond @ turn.T
+    names = (*PARAMETERS, *(course.name for course in result.problem.motions[0].courses))
+    assert six.systematic is not None
+    covariance, systematic, told = six.covariance, six.systematic, values
     for name, value, own, effect in _chosen_before(result):
-        moved = turn @ effect
-        wider = np.empty((len(names) + 1, len(names) + 1))
+        moved = np.pad(effect, (0, told.size - effect.size))
+        wider = np.empty((told.size + 1, told.size + 1))
         wider[:-1, :-1] = covariance + np.outer(moved, moved)
         wider[-1, :-1] = wider[:-1, -1] = own * moved
         wider[-1, -1] = own**2
         covariance, told, names = wider, np.append(told, value), (*names, name)
-        systematic, beyond = np.vstack([systematic, np.zeros((1, systematic.shape[1]))]), np.pad(beyond, (0, 1))
-        turn = np.vstack([turn, np.zeros((1, turn.shape[1]))])
+        systematic, beyond = np.pad(systematic, ((0, 1), (0, 0))), np.pad(beyond, (0, 1))
+    beyond = as_amplitude(names, told, beyond, systematic)[1]
+    told, covariance, systematic = as_amplitude(names, told, covariance, systematic)
     return replace(six, names=names, values=told, covariance=covariance, systematic=systematic), beyond
-
-
-def _columns(six: Estimate) -> Float:
-    assert six.systematic is not None
-    return six.systematic
-
-
-def _turned(names: tuple[str, ...], values: Float) -> tuple[Float, Float]:
-    """Return the values (k,) with amplitude and phase of each ripple, and their derivatives (k, k) by what was fitted.
-
-    s sin(a) + c cos(a) = A sin(a + phase).
-    """
-    told, turn = values.copy(), np.eye(values.size)
-    for k, name in enumerate(names):
-        if name.endswith(PHASE):
-            s, c = values[k - 1], values[k]
-            size = max(math.hypot(s, c), 1e-300)
-            told[k - 1], told[k] = size, math.atan2(c, s)
-            turn[k - 1 : k + 1, k - 1 : k + 1] = np.array([[s, c], [-c / size, s / size]]) / size
-    return told, turn
 
 
 def _chosen_before(result: Fit) -> list[tuple[str, float, float, Float]]:

@@ -17,11 +17,13 @@ from fdhil.identification.kalman import LOAD, VOLTAGE
 from fdhil.identification.motion import Course, Motion
 from fdhil.records import Float
 
-SPEEDS = np.geomspace(0.02, 0.35, 9)  # of the top speed, at which friction at low speed may fall off
+SPEEDS = np.geomspace(0.02, 0.35, 8)  # of the top speed, at which friction at low speed may fall off
 SCREW_ORDERS = (1, 2)  # periods in a turn
-MOTOR_ORDERS = range(3, 37)
+# of 2 to 8 pole pairs: sensors' zeros and gains once and twice an electrical turn, windings 6 times, slots
+MOTOR_ORDERS = (3, 4, 5, 6, 8, 10, 12, 16, 18, 20, 24, 30, 36)
 SMOOTHING_S = 0.005
 WHOLE_DEAD_TIME = 0.01  # of the peak current: from there on a dead time has its whole effect
+LEAST_TURN = 1e-9  # rad in an interval
 PHASE = "_phase"  # ends the name of a ripple's cosine, as of its phase
 
 
@@ -38,8 +40,8 @@ def candidates(motions: Sequence[Motion], command: bool) -> list[Candidate]:
     top = max(float(np.abs(m.speed).max()) for m in motions)
     found = [Candidate("stribeck", tuple((stribeck(m, speed),) for m in motions)) for speed in SPEEDS * top]
     if all(m.angle_rad.size for m in motions):
-        names = [(f"ripple_screw_{k}", k) for k in SCREW_ORDERS] + [(f"ripple_motor_{k}", k) for k in MOTOR_ORDERS]
-        found += [Candidate(name, tuple(ripple(m, name, k) for m in motions)) for name, k in names]
+        made = [ripples(m) for m in motions]
+        found += [Candidate(name, tuple(own[name] for own in made)) for name in made[0]]
     if command and all(m.slow is None for m in motions):
         found += [Candidate("dead_time", tuple((dead_time(m),) for m in motions))]
         found += [Candidate("bus_sag", tuple((bus_sag(m),) for m in motions))]
@@ -58,12 +60,22 @@ def stribeck_slope(motion: Motion, course: Course) -> Course:
     return Course("stribeck_speed", LOAD, course.values * 2 * np.square(speed) / course.speed_rad_s**3)
 
 
-def ripple(motion: Motion, name: str, order: int) -> tuple[Course, Course]:
-    """Return sine and cosine of ``order`` times the shaft's angle, as means over each interval."""
+def ripples(motion: Motion) -> dict[str, tuple[Course, Course]]:
+    """Return sine and cosine of each order times the shaft's angle, as means over each interval, by name."""
     turned = np.diff(motion.angle_rad, append=motion.angle_rad[-1])
-    angle = order * (motion.angle_rad + turned / 2)
-    share = np.sinc(order * turned / (2 * np.pi)) * np.abs(_side(motion))
-    return Course(name, LOAD, share * np.sin(angle)), Course(name + PHASE, LOAD, share * np.cos(angle))
+    still = np.abs(turned) < LEAST_TURN
+    share = np.abs(_side(motion)) / np.where(still, 1.0, turned)
+    at = np.exp(1j * motion.angle_rad)
+    wave, made = np.ones_like(at), {}
+    for order in range(1, MOTOR_ORDERS[-1] + 1):
+        wave = wave * at
+        if order not in SCREW_ORDERS and order not in MOTOR_ORDERS:
+            continue
+        # the integral of exp(j k a) is exp(j k a) / (j k)
+        mean = np.where(still, 0.0, np.append(wave[1:], wave[-1]) - wave) * (share / order)
+        name = f"ripple_{'screw' if order in SCREW_ORDERS else 'motor'}_{order}"
+        made[name] = (Course(name, LOAD, -mean.real), Course(name + PHASE, LOAD, mean.imag))
+    return made
 
 
 def dead_time(motion: Motion) -> Course:

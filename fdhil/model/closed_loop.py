@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from fdhil import tables
 from fdhil.config import Axis
-from fdhil.model import kernels
+from fdhil.model import kernels, terms
 from fdhil.records import Float, Parameters
 
 State = npt.NDArray[np.float64]
@@ -48,11 +48,18 @@ class Response:
     limited: Float
     end: State
     sync_period_s: float
+    parted: bool = False
+    """Whether the table is told apart from the motor."""
 
     @property
     def position_mm(self) -> Float:
-        """The place of the table, (n,)."""
+        """The place that the drive's encoder tells, (n,): that of the table, unless a resonance parts the two."""
         return np.asarray(self.states[kernels.POSITION])
+
+    @property
+    def table_mm(self) -> Float:
+        """The place of the table, (n,), less what a constant load bends."""
+        return np.asarray(self.states[kernels.TABLE if self.parted else kernels.POSITION])
 
     @property
     def speed_rad_s(self) -> Float:
@@ -91,8 +98,8 @@ def simulate(
 ) -> Response:
     """Simulate one axis along ``reference_mm`` (n,) + ``offset_mm`` (n,), from rest at its first row.
 
-    ``state`` (of :class:`Response` ``end``) continues a run at row ``first``; ``rows`` stops it early. ValueError for
-    an empty or non-finite reference.
+    All ``terms`` of the parameters act, but ``speed_delay``, which is the sensor's. ``state`` (of :class:`Response`
+    ``end``) continues a run at row ``first``; ``rows`` stops it early. ValueError for an empty or non-finite reference.
     """
     commanded = np.asarray(reference_mm, dtype=np.float64)
     if offset_mm is not None:
@@ -106,7 +113,7 @@ def simulate(
         raise ValueError("the reference must be one row of finite positions")
     if state is None:
         # at rest on the reference, not on the offset reference: an offset at row 0 is a step
-        state = start(float(reference_mm[0]))
+        state = standing(parameters, axis, float(reference_mm[0]))
     return prepare(parameters, axis, sync_period_s).run(commands, state, first, rows)
 
 
@@ -128,7 +135,29 @@ def start(position_mm: float) -> State:
     state = np.zeros(kernels.STATES)
     # what differences and filters remember of the set-point and the position is where the axis stands
     state[[kernels.POSITION, kernels.SET_POINT_BEFORE, kernels.POSITION_BEFORE]] = position_mm
-    state[[kernels.FILTERED, kernels.FILTERED + 3]] = position_mm
+    state[[kernels.FILTERED, kernels.FILTERED + 3, kernels.TABLE]] = position_mm
+    return state
+
+
+def standing(parameters: Parameters, axis: Axis, position_mm: float, current_a: float | None = None) -> State:
+    """Return the state of an axis that stands at ``position_mm``, its regulators holding ``current_a`` for long.
+
+    That current is on the bus at standstill; left out it is what load and ripples need, in the middle of the dry
+    friction's band. The integral that a drive has tells it to the current loop, whose own holds the voltage.
+    """
+    g, state = axis.regulators, start(position_mm)
+    pull_nm = float(terms.torque(parameters, np.zeros(1), np.array([position_mm * terms.rad_per_mm(axis)]))[0])
+    held_a = pull_nm / parameters.K if current_a is None else current_a
+    voltage_v = parameters.R * held_a + terms.dead_time_v(parameters, axis, held_a)
+    state[[kernels.CURRENT, kernels.CURRENT_DEMAND]] = held_a
+    state[kernels.CURRENT_INTEGRAL] = state[kernels.WAITING :] = voltage_v
+    if g.speed_ki > 0:
+        state[kernels.SPEED_INTEGRAL] = held_a
+    elif g.structure == "pid" and g.position_ki_per_s2 > 0:
+        state[kernels.POSITION_INTEGRAL] = held_a / g.speed_kp
+    if terms.has_spring(parameters):  # what friction takes up at the table has gone through the spring
+        stiffness = terms.spring(parameters)[0] * terms.rad_per_mm(axis)
+        state[kernels.TABLE] -= (parameters.K * held_a - pull_nm) / stiffness
     return state
 
 

@@ -13,15 +13,20 @@ from fdhil.records import Float
 
 # places in the state vector: what every drive has, then what structures and options add
 CURRENT, SPEED, POSITION, SPEED_INTEGRAL, CURRENT_INTEGRAL, CURRENT_DEMAND = range(6)
-POSITION_INTEGRAL, SET_POINT_BEFORE, POSITION_BEFORE, FILTERED, SPEED_FILTERED, NEXT, WAITING = 6, 7, 8, 9, 15, 16, 17
+POSITION_INTEGRAL, SET_POINT_BEFORE, POSITION_BEFORE, FILTERED, SPEED_FILTERED = 6, 7, 8, 9, 15
+TABLE, TABLE_SPEED, NEXT, WAITING = 16, 17, 18, 19  # a table behind a spring; the voltages that wait, as a ring
 MOST_WAITING = 32
 STATES = WAITING + MOST_WAITING
 # what a run records at each SYNC instant: how many of the cycle's steps have a limit acting, the state
 ROW_LIMITED, ROW_STATE = range(2)
 # places in the gains, see fdhil.model.loops.gains
 KV, KFF, SPEED_KP, SPEED_KI, CURRENT_MAX, CURRENT_KP, CURRENT_KI, VOLTAGE_MAX, PERIOD, HALF_STEP_MM = range(10)
-POSITION_KI, ACCELERATION, DECAY, RAD_PER_MM, SPEED_CYCLES_PER_S, SPEED_DECAY = range(10, 16)
-GAINS = 16
+POSITION_KI, ACCELERATION, DECAY, RAD_PER_MM, SPEED_CYCLES_PER_S, SPEED_DECAY, FULL_DEAD_TIME_A = range(10, 17)
+GAINS = 17
+# places in the terms, see fdhil.model.terms.packed; behind them periods in a turn, amplitude and phase of each ripple
+LOAD, DRY_POSITIVE, DRY_NEGATIVE, VISCOUS, VISCOUS_POSITIVE, VISCOUS_NEGATIVE, STRIBECK, STRIBECK_SPEED = range(8)
+DEAD_TIME, SPRING, DAMPER, RIPPLES = range(8, 12)
+STRIBECK_REACH = 6.0  # times its speed, from where it is less than the last bit of the friction
 # the laws from set-point to current demand
 CASCADE, PID = range(2)
 # rows of the leap, see fdhil.model.leap: what a whole speed cycle does to a table that moves or is held, and its bounds
@@ -125,19 +130,69 @@ def _current_cycles(demand_a: float, limited: bool, plant: Float, gains: Float, 
     return steps
 
 
-@compiled
-def _delayed_cycles(
-    demand_a: float, limited: bool, plant: Float, gains: Float, n_current: int, delay: int, state: Float
-) -> int:
-    """Run a speed cycle as :func:`_current_cycles` does, of a drive whose voltage acts late.
+@inlined
+def _ripple(angle: float, terms: Float) -> float:
+    """Return the torque of all ripples at an angle of the motor."""
+    torque = 0.0
+    for n in range(RIPPLES, terms.size, 3):
+        torque += terms[n + 1] * np.sin(terms[n] * angle + terms[n + 2])
+    return torque
 
-    The voltage acts ``delay`` steps after it was computed.
+
+@inlined
+def _low_speed(w: float, stribeck: float, stribeck_speed: float) -> float:
+    """Return the dry friction that is there at low speed only."""
+    if stribeck == 0.0 or abs(w) > STRIBECK_REACH * stribeck_speed:
+        return 0.0
+    return float(stribeck * np.exp(-((w / stribeck_speed) ** 2)))
+
+
+@compiled
+def torque(speed: Float, angle: Float, terms: Float) -> Float:
+    """Return the torque (n,) against the positive direction at speeds rad/s and angles rad of the motor, (n,) each."""
+    out = np.empty(speed.size)
+    for n in range(speed.size):
+        w = speed[n]
+        dry = terms[DRY_POSITIVE] if w > 0.0 else terms[DRY_NEGATIVE]
+        dry += _low_speed(w, terms[STRIBECK], terms[STRIBECK_SPEED])
+        viscous = terms[VISCOUS_POSITIVE] if w > 0.0 else terms[VISCOUS_NEGATIVE]
+        out[n] = terms[LOAD] + np.sign(w) * dry + viscous * w + _ripple(angle[n], terms)
+    return out
+
+
+@compiled
+def _cycles_with_terms(
+    demand_a: float,
+    limited: bool,
+    plant: Float,
+    masses: Float,
+    gains: Float,
+    terms: Float,
+    n_current: int,
+    delay: int,
+    state: Float,
+) -> int:
+    """Run a speed cycle as :func:`_current_cycles` does, with what may join the plain drive.
+
+    A voltage acts ``delay`` steps after it was computed, less the inverter's dead time. Ripples are those of the middle
+    of each step. ``masses`` (2, 5, 8), or empty where motor and table are one, is the exact step of motor and table,
+    free and with the table held; dry friction acts on the table then, all else on the motor.
     """
     phi_ii, phi_iw, phi_wi, phi_ww, phi_xi, phi_xw = plant[0], plant[1], plant[2], plant[3], plant[4], plant[5]
     i_u, w_u, x_u, i_t, w_t, x_t = plant[6], plant[7], plant[8], plant[9], plant[10], plant[11]
-    still, still_u, torque_constant, dry = plant[12], plant[13], plant[14], plant[15]
+    still, still_u, torque_constant, load = plant[12], plant[13], plant[14], terms[LOAD]
     kp, ki, voltage_max, half_step_mm = gains[CURRENT_KP], gains[CURRENT_KI], gains[VOLTAGE_MAX], gains[HALF_STEP_MM]
+    rad_per_mm, dead_v, full_a = gains[RAD_PER_MM], terms[DEAD_TIME], gains[FULL_DEAD_TIME_A]
+    positive, negative, slow, slow_speed = (
+        terms[DRY_POSITIVE],
+        terms[DRY_NEGATIVE],
+        terms[STRIBECK],
+        terms[STRIBECK_SPEED],
+    )
+    more_positive, more_negative = terms[VISCOUS_POSITIVE] - terms[VISCOUS], terms[VISCOUS_NEGATIVE] - terms[VISCOUS]
+    spring, damper, two = terms[SPRING] * rad_per_mm, terms[DAMPER], masses.size > 0
     i, w, x, integral = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL]
+    table_w, table = state[TABLE_SPEED], state[TABLE]
     steps, at = 0, int(state[NEXT])
     for _ in range(n_current):
         error = demand_a - i
@@ -150,28 +205,52 @@ def _delayed_cycles(
                 steps += 1
         else:
             steps += 1
-        u, state[WAITING + at] = state[WAITING + at], u
-        at = at + 1 if at + 1 < delay else 0
-        torque = torque_constant * i
-        if w == 0.0 and abs(torque) <= dry:
+        if delay > 0:
+            u, state[WAITING + at] = state[WAITING + at], u
+            at = at + 1 if at + 1 < delay else 0
+        if dead_v != 0.0:
+            u -= dead_v * min(max(i / full_a, -1.0), 1.0)
+        against = load + (more_positive if w > 0.0 else more_negative) * w
+        if terms.size > RIPPLES:
+            against += _ripple(rad_per_mm * (x + half_step_mm * w), terms)
+        rubbing, push = w, torque_constant * i - against
+        if two:
+            rubbing, push = table_w, spring * (x - table) + damper * w
+        # one side per step: that of the motion, or where the torque will start it
+        side = 1.0 if rubbing > 0.0 or (rubbing == 0.0 and push > 0.0) else -1.0
+        dry = (positive if side > 0.0 else negative) + _low_speed(rubbing, slow, slow_speed)
+        held = rubbing == 0.0 and abs(push) <= dry
+        if two:
+            m = masses[1 if held else 0]
+            dry, apart = side * dry, x - table
+            x = table + m[2, 0] * i + m[2, 1] * w + m[2, 2] * apart + m[2, 3] * table_w
+            x += m[2, 5] * u - m[2, 6] * against - m[2, 7] * dry
+            w_next = m[1, 0] * i + m[1, 1] * w + m[1, 2] * apart + m[1, 3] * table_w
+            w_next += m[1, 5] * u - m[1, 6] * against - m[1, 7] * dry
+            i_next = m[0, 0] * i + m[0, 1] * w + m[0, 2] * apart + m[0, 3] * table_w
+            i_next += m[0, 5] * u - m[0, 6] * against - m[0, 7] * dry
+            moved = m[4, 0] * i + m[4, 1] * w + m[4, 2] * apart + m[4, 3] * table_w
+            moved += m[4, 5] * u - m[4, 6] * against - m[4, 7] * dry
+            table_next = m[3, 0] * i + m[3, 1] * w + m[3, 2] * apart + m[3, 3] * table_w
+            table_next += m[3, 5] * u - m[3, 6] * against - m[3, 7] * dry
+            if table_next * side < 0.0:
+                moved, table_next = half_step_mm * table_w, 0.0
+            i, w, table, table_w = i_next, w_next, table + moved, table_next
+            continue
+        if held:
             i = still * i + still_u * u
             continue
-        # one friction sign per step: that of the motion, or where the torque will start it
-        if w > 0.0 or (w == 0.0 and torque > 0.0):
-            friction = -dry
-        else:
-            friction = dry
+        friction = -against - side * dry
         w_next = phi_wi * i + phi_ww * w + w_u * u + w_t * friction
-        if w_next * friction > 0.0:  # the sign changed: the table stops for this step
+        if w_next * side < 0.0:  # the sign changed: the table stops for this step
             x += half_step_mm * w
-            i = phi_ii * i + phi_iw * w + i_u * u + i_t * friction
-            w = 0.0
+            w_next = 0.0
         else:
             x += phi_xi * i + phi_xw * w + x_u * u + x_t * friction
-            i = phi_ii * i + phi_iw * w + i_u * u + i_t * friction
-            w = w_next
+        i = phi_ii * i + phi_iw * w + i_u * u + i_t * friction
+        w = w_next
     state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL] = i, w, x, integral
-    state[NEXT] = at
+    state[TABLE_SPEED], state[TABLE], state[NEXT] = table_w, table, at
     return steps
 
 
@@ -320,7 +399,9 @@ def run(
     rows: int,
     plant: Float,
     leap: Float,
+    masses: Float,
     gains: Float,
+    terms: Float,
     shape: tuple[int, int, int, int, int, int],
     state: Float,
 ) -> Float:
@@ -328,13 +409,14 @@ def run(
 
     ``reference`` (n,) mm is held beyond its end; ``speed_offset`` rad/s and ``current_offset`` A are (n,) or empty.
     ``plant`` (16,), ``leap`` (LEAP_ROWS, LEAP_COLUMNS) or empty, and ``gains`` (GAINS,): see :mod:`fdhil.model.loops`.
-    ``shape``: law, states kept of each row, speed cycles per SYNC cycle, current cycles per speed cycle, order of the
-    set-point filter, current cycles of delay. ``state`` (STATES,) is written.
+    ``terms``, empty for a plain drive, and ``masses``: see :mod:`fdhil.model.terms`. ``shape``: law, states kept of
+    each row, speed cycles per SYNC cycle, current cycles per speed cycle, order of the set-point filter, current cycles
+    of delay. ``state`` (STATES,) is written.
     """
     law, kept, n_speed, n_current, order, delay = shape
     last = reference.size - 1
     out = np.empty((ROW_STATE + kept, rows))
-    if law == CASCADE and leap.size > 0 and delay + speed_offset.size + current_offset.size == 0:
+    if law == CASCADE and leap.size > 0 and speed_offset.size + current_offset.size == 0:
         _run_leaping(reference, first, plant, leap, gains, shape, state, out)
         return out
     kff, period, current_max, filtered = gains[KFF], gains[PERIOD], gains[CURRENT_MAX], gains[SPEED_DECAY] > 0.0
@@ -367,9 +449,10 @@ def run(
             if demand_a == raw:  # all integrals stand while the limit acts
                 state[SPEED_INTEGRAL], state[POSITION_INTEGRAL] = speed_integral, position_integral
             state[CURRENT_DEMAND] = demand_a
-            if delay > 0:
-                limited += _delayed_cycles(demand_a, demand_a != raw, plant, gains, n_current, delay, state)
+            clipped = demand_a != raw
+            if terms.size > 0:
+                limited += _cycles_with_terms(demand_a, clipped, plant, masses, gains, terms, n_current, delay, state)
             else:
-                limited += _current_cycles(demand_a, demand_a != raw, plant, gains, n_current, state)
+                limited += _current_cycles(demand_a, clipped, plant, gains, n_current, state)
         out[ROW_LIMITED, row] = limited
     return out

@@ -14,10 +14,14 @@ from functools import lru_cache
 import numpy as np
 
 from fdhil.config import Axis
-from fdhil.model import kernels
+from fdhil.model import kernels, terms
 from fdhil.model.closed_loop import Commands, Response, State
 from fdhil.model.leap import leap
+from fdhil.model.terms import exponential
 from fdhil.records import Float, Parameters, read_only
+
+_NO_LEAP = read_only(np.empty((0, kernels.LEAP_COLUMNS)))
+_NO_TERMS = read_only(np.empty(0))
 
 
 @lru_cache(maxsize=64)
@@ -35,7 +39,7 @@ def plant_step(parameters: Parameters, pitch_mm: float, step_s: float) -> Float:
     a[1, :2] = p.K / p.Jt, -p.ft / p.Jt
     a[1, 4] = 1 / p.Jt
     a[2, 1] = mm_per_rad
-    e = _exponential(a * step_s)
+    e = exponential(a * step_s)
     still = math.exp(-p.R / p.L * step_s)
     still_u = -math.expm1(-p.R / p.L * step_s) / p.R
     moving = (e[0, 0], e[0, 1], e[1, 0], e[1, 1], e[2, 0], e[2, 1], *e[:3, 3], *e[:3, 4])
@@ -44,23 +48,10 @@ def plant_step(parameters: Parameters, pitch_mm: float, step_s: float) -> Float:
     return step
 
 
-def _exponential(a: Float) -> Float:
-    """Return exp(a) of a small matrix by Taylor's series, halved until it converges to the last bit."""
-    halvings = max(0, math.ceil(math.log2(max(float(np.abs(a).sum(axis=1).max()), 1e-12) / 0.5)))
-    scaled = a / 2.0**halvings
-    result = term = np.eye(len(a))
-    for order in range(1, 19):
-        term = term @ scaled / order
-        result = result + term
-    for _ in range(halvings):
-        result = result @ result
-    return result
-
-
 def gains(axis: Axis, sync_period_s: float) -> Float:
     """Return (GAINS,) the gains in the order of :mod:`fdhil.model.kernels`."""
     g = axis.regulators
-    rad_per_mm = 2 * math.pi / axis.screw_pitch_mm
+    rad_per_mm = terms.rad_per_mm(axis)
     values = np.zeros(kernels.GAINS)
     values[kernels.KV] = g.position_gain_per_s * rad_per_mm
     values[kernels.KFF] = g.speed_feedforward * rad_per_mm
@@ -76,6 +67,7 @@ def gains(axis: Axis, sync_period_s: float) -> Float:
     values[kernels.ACCELERATION] = g.torque_feedforward * rad_per_mm * axis.nominal.Jt / axis.nominal.K
     values[kernels.DECAY] = math.exp(-g.speed_period_s / g.setpoint_filter_s) if g.setpoint_filter_s > 0 else 0.0
     values[kernels.RAD_PER_MM] = rad_per_mm
+    values[kernels.FULL_DEAD_TIME_A] = terms.full_dead_time_a(axis)
     values[kernels.SPEED_CYCLES_PER_S] = 1.0 / g.speed_period_s
     values[kernels.SPEED_DECAY] = math.exp(-g.speed_period_s / g.speed_filter_s) if g.speed_filter_s > 0 else 0.0
     return values
@@ -87,7 +79,9 @@ class Drive:
 
     plant: Float
     leap: Float
+    masses: Float
     gains: Float
+    terms: Float
     shape: tuple[int, int, int, int, int, int]
     sync_period_s: float
     nominal_k: float
@@ -104,13 +98,15 @@ class Drive:
             commands.reference_mm.size - first if rows is None else rows,
             self.plant,
             read_only(self.leap),
+            self.masses,
             self.gains,
+            self.terms,
             self.shape,
             end,
         )
         _, _, n_speed, n_current, _, _ = self.shape
         limited = out[kernels.ROW_LIMITED] / (n_speed * n_current)
-        return Response(out[kernels.ROW_STATE :], limited, end, self.sync_period_s)
+        return Response(out[kernels.ROW_STATE :], limited, end, self.sync_period_s, self.masses.size > 0)
 
 
 def prepare(law: int, places: int, parameters: Parameters, axis: Axis, sync_period_s: float) -> Drive:
@@ -119,18 +115,28 @@ def prepare(law: int, places: int, parameters: Parameters, axis: Axis, sync_peri
     n_speed = round(sync_period_s / g.speed_period_s)
     n_current = round(g.speed_period_s / g.current_period_s)
     order = g.setpoint_filter_order if g.setpoint_filter_s > 0 else 0
-    if order:
-        places = kernels.SPEED_FILTERED
-    if g.speed_filter_s > 0:
-        places = kernels.NEXT
-    if g.current_delay_cycles:
-        places = kernels.WAITING + g.current_delay_cycles
+    more = terms.more_than_plain(parameters, axis)
     plant, values = plant_step(parameters, axis.screw_pitch_mm, g.current_period_s), gains(axis, sync_period_s)
+    kp, ki = values[kernels.CURRENT_KP], values[kernels.CURRENT_KI]
     return Drive(
         plant,
-        leap(plant, values[kernels.CURRENT_KP], values[kernels.CURRENT_KI], n_current),
+        _NO_LEAP if more else leap(plant, kp, ki, n_current),
+        terms.masses(parameters, axis.screw_pitch_mm, g.current_period_s),
         values,
-        (law, places, n_speed, n_current, order, g.current_delay_cycles),
+        terms.packed(parameters) if more else _NO_TERMS,
+        (law, _kept(places, parameters, axis), n_speed, n_current, order, g.current_delay_cycles),
         sync_period_s,
         axis.nominal.K,
     )
+
+
+def _kept(places: int, parameters: Parameters, axis: Axis) -> int:
+    """Return how many places of the state a drive uses: those of its structure, then of its options and terms."""
+    g = axis.regulators
+    if g.current_delay_cycles:
+        return kernels.WAITING + g.current_delay_cycles
+    if terms.has_spring(parameters):
+        return kernels.NEXT
+    if g.speed_filter_s > 0:
+        return kernels.TABLE
+    return kernels.SPEED_FILTERED if g.setpoint_filter_s > 0 else places

@@ -29,9 +29,8 @@ def analyse(
     ``axis``' section the rapid is replayed through the closed loop, whose set-points come every ``sync_period_s``
     (left out: with every row).
     """
-    signals = Evidence(
-        mended(window, settings.speed_source), settings, axis=own(window, axis), sync_period_s=sync_period_s
-    )
+    at_instants = mended(window, settings.speed_source)
+    signals = Evidence(at_instants, settings, axis=own(window, axis), sync_period_s=sync_period_s, recorded=window)
     return replace(_analysed(signals), window=window)
 
 

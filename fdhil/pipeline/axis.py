@@ -17,12 +17,14 @@ from fdhil.identification.drift import LEAST_JUMP, DriftTracker, Point
 from fdhil.identification.pooling import member
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline.analysis import analyse
+from fdhil.pipeline.drive_loops import DriveLoops
 from fdhil.pipeline.pooling import one_sided, refuses_the_model, together
 from fdhil.pipeline.recent_samples import RecentSamples
 from fdhil.prediction import skill
 from fdhil.records import (
     AxisSamples,
     Estimate,
+    LoopEstimate,
     MoveEvent,
     MoveKind,
     Notice,
@@ -62,13 +64,14 @@ class _Rapid:
 @dataclass(frozen=True, slots=True)
 class Known:
     """What the history knows of an axis: the first values in either direction, the newest published set, and the
-    newest accepted windows' estimates, for the tracker and for the pool.
+    newest accepted windows' estimates, for the tracker and for the pool, and the newest identified loops.
     """
 
     first: Mapping[int, Parameters] = field(default_factory=dict)
     newest: ParameterSet | None = None
     points: tuple[Point, ...] = ()
     members: tuple[Member, ...] = ()
+    loops: LoopEstimate | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,13 +110,14 @@ class AxisPipeline:
         self._config = config
         self._settings = _settings(config, method)
         self._period_s = config.machine.sync_period_s
+        known = known or Known()
+        self._loops = DriveLoops(config.axis[axis], self._settings, self._period_s, known.loops)
         self._recent = RecentSamples(axis, config.axis[axis], self._ticks(RECENT_S), self._period_s)
         self._rapids: deque[_Rapid] = deque()
         self._temperature: Temperature | None = None
         self._pool: list[_Pooled] = []
         self._held: list[_Pooled] = []
         self._refused: dict[int, WindowOutcome] = {}  # the newest window of a direction, where its model was refused
-        known = known or Known()
         self._published = known.newest
         self._tracker = DriftTracker(config.maintenance, axis)
         self._tracker.resume(known.first, known.points)
@@ -196,10 +200,13 @@ class AxisPipeline:
         return [w for w in find_windows(recording) if rapid.start <= w.start_tick + w.n // 2 <= end]
 
     def _analyse(self, window: Window) -> list[Outcome]:
-        section = self._config.axis[self.axis] if self._with_skill else None  # else it is made up
-        outcome = analyse(window, self._settings, section, self._period_s)
+        outcome = self._judged_window(window)
         before = self._published
         outcomes: list[Outcome] = [outcome]
+        found = self._loops.take(outcome) if self._with_skill else None
+        if found is not None:
+            outcome = self._judged_window(window)
+            outcomes = [outcome, found]
         if refuses_the_model(outcome):
             self._refused[window.direction] = outcome
         # a correction needs all six: what a slow voltage leaves open keeps the older set in use
@@ -211,6 +218,10 @@ class AxisPipeline:
                 outcomes += self._publish(window)
         judged = self._judge(window, before or self._published)
         return [*outcomes, judged] if judged else outcomes
+
+    def _judged_window(self, window: Window) -> WindowOutcome:
+        """Return what one window says, judged by the loops that are used now."""
+        return analyse(window, self._settings, self._loops.axis if self._with_skill else None, self._period_s)
 
     def _track(self, outcome: WindowOutcome, estimate: Estimate) -> list[Notice]:
         """Hold a window back that jumped; once further ones agree with it they are the new pool."""
@@ -283,7 +294,7 @@ class AxisPipeline:
         """Compare the move with what the set that was valid before it predicts; None where that cannot be done."""
         if published is None or not self._with_skill:
             return None
-        axis = self._config.axis[self.axis]
+        axis = self._loops.axis
         signals = (window.demand_mm, window.position_mm)
         try:
             return skill(

@@ -43,7 +43,7 @@ _TERMS: Mapping[str, str] = {
     r"bus_sag": "1/W",
     r"speed_delay": "s",
     r"resonance": "Hz",
-    r"resonance_damping": "1",
+    r"resonance_(damping|share)": "1",
 }
 
 

@@ -11,7 +11,7 @@ from fdhil.validation.agreement import values_apart
 from fdhil.validation.evidence import LEAST_ROWS, Evidence
 from fdhil.validation.interruptions import interruptions
 from fdhil.validation.plausibility import clipped, gaps, missing_stages, not_finite, position_parted
-from fdhil.validation.rest import rest_faults
+from fdhil.validation.rest import friction_at_rest, rest_faults
 from fdhil.validation.simulation import expected_fit_percent
 from fdhil.validation.slow_fitted import slow_faults_beside
 from fdhil.validation.slow_readings import slow_voltage_faults
@@ -134,7 +134,17 @@ def _values(evidence: Evidence) -> Iterable[Reason]:
     return values_apart(evidence.estimate, evidence.judged.theta[:6])
 
 
-MODEL = ("estimate", "fit", "late voltage", "late current", "structure", "whiteness", "excess noise", "standstill")
+MODEL = (
+    "estimate",
+    "fit",
+    "late voltage",
+    "late current",
+    "structure",
+    "whiteness",
+    "excess noise",
+    "standstill",
+    "friction at rest",
+)
 BEFORE_ANY_FIT: Sequence[Check] = (
     Check("finite", not_finite),
     Check("stages", missing_stages),
@@ -162,7 +172,8 @@ OF_THE_FIT: Sequence[Check] = (
     Check("whiteness", whiteness, _sound, ("late voltage", "late current", "structure"), weighed=True),
     Check("excess noise", excess_noise, _sound, ("late voltage", "late current", "structure"), weighed=True),
     # a late current seems to move a shaft at rest
-    Check("standstill", rest_faults, _sound, ("late voltage", "late current"), weighed=True),
+    Check("standstill", rest_faults, _sound, ("late voltage", "late current")),
+    Check("friction at rest", friction_at_rest, _sound, ("late voltage", "late current"), weighed=True),
     Check("delay", _late, _fitted, MODEL[2:]),
     Check("simulation", _simulation, _fitted, (*MODEL, "delay"), weighed=True),
     Check("values", _values, _fitted, (*MODEL, "delay")),

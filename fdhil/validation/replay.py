@@ -10,11 +10,13 @@ import numpy as np
 from fdhil.config import Axis
 from fdhil.identification.motion import resolution
 from fdhil.identification.windows import moving_range
-from fdhil.model import closed_loop, kernels
+from fdhil.model import closed_loop
 from fdhil.records import Float, Int, Parameters, Window, rms
 
 LEAST_ROWS = 20
 OFF_GRID = 1e-3  # of a cycle, by which a row may differ from it
+SHARES_OF_LOAD = (0.0, -0.5, -0.25, -0.75, 0.5, 1.0, 2.0)  # of the friction in this direction, the likeliest first
+ENOUGH = 0.02  # of the following error: left with less, no better share is looked for
 STANDSTILL_S = 0.015  # over which the current before a move is taken
 _EDGE = 8  # rows at either end that a shifted comparison leaves out
 
@@ -32,6 +34,15 @@ class Replay:
     difference_um: Float
     following_um: Float
     step_um: float
+
+    def during(self, begin: int, end: int) -> Replay:
+        """Return the comparison of the rows from ``begin`` up to ``end`` alone, or of all where these are few."""
+        kept = (self.rows >= begin) & (self.rows < end)
+        if np.count_nonzero(kept) < LEAST_ROWS:
+            return self
+        return Replay(
+            self.predicted_mm, self.rows[kept], self.difference_um[kept], self.following_um[kept], self.step_um
+        )
 
     @property
     def unexplained_um(self) -> float:
@@ -51,16 +62,17 @@ def replay(
     axis: Axis,
     sync_period_s: float,
     offset_mm: Float | None = None,
-    standstill_a: float = 0.0,
+    standstill_a: float | None = None,
 ) -> Replay:
     """Run a move from rest, rows (n,) on the SYNC grid, through the closed loop and compare it with the measured one.
 
     ``demand_mm`` is r[k], what the drive follows at row k; lost rows are NaN and not compared. ``standstill_a`` is what
-    the regulators hold before the move. ValueError when fewer than ``LEAST_ROWS`` rows can be compared.
+    the regulators hold before the move (None: what they need). ValueError when fewer than ``LEAST_ROWS`` rows can be
+    compared.
     """
     demand = _filled(demand_mm, "demand")
     offset = None if offset_mm is None else np.nan_to_num(offset_mm)
-    start = _at_rest(float(_filled(position_mm, "position")[0]), standstill_a, parameters.R)
+    start = closed_loop.standing(parameters, axis, float(_filled(position_mm, "position")[0]), standstill_a)
     predicted = closed_loop.simulate(parameters, axis, sync_period_s, demand, offset, state=start).position_mm
     rows = np.flatnonzero(np.isfinite(demand_mm) & np.isfinite(position_mm))
     rows = rows[(rows >= _EDGE) & (rows < demand.size - _EDGE)]
@@ -76,43 +88,50 @@ def replay_window(window: Window, parameters: Parameters, axis: Axis, sync_perio
     """Return the replay of a window whose rows are the drive's set-points; None for any other.
 
     What a drive makes of its set-points between rows, or of those between two rows, is not recorded. None too where
-    demand or position were not recorded, or did not move.
+    demand or position were not recorded, or did not move. What is compared is the move: where within its friction the
+    shaft comes to rest, one rapid does not tell. Its dry friction holds a constant load, too, and how much of it is load
+    shows as it leaves rest alone: of what it may be, that is taken which explains the rapid best.
     """
     if abs(window.dt_s / sync_period_s - 1.0) > OFF_GRID or not (
         _moves(window.demand_mm) and _moves(window.position_mm)
     ):
         return None
-    held, current = _holding(parameters, window.direction, _standstill_a(window))
-    try:
-        return replay(
-            window.demand_mm, window.position_mm, held, axis, sync_period_s, window.offset_mm, standstill_a=current
-        )
-    except ValueError:  # too few whole rows, or no drive
-        return None
+    signals, moving = (window.demand_mm, window.position_mm), moving_range(window)
+    best: Replay | None = None
+    for share in SHARES_OF_LOAD if not parameters.term("load") else (0.0,):
+        parted = _parted(parameters, window.direction, _standstill_a(window), share)
+        if parted is None:
+            continue
+        try:
+            told = replay(*signals, parted[0], axis, sync_period_s, window.offset_mm, standstill_a=parted[1])
+            told = told.during(*moving)
+        except ValueError:  # too few whole rows, or no drive
+            return None
+        best = told if best is None or told.unexplained_um < best.unexplained_um else best
+        if best.unexplained_um < ENOUGH * best.measured_um:
+            break
+    return best
 
 
-def _at_rest(position_mm: float, current_a: float, resistance: float) -> closed_loop.State:
-    """Return the state of an axis whose regulators hold a current against friction: both integrals make it."""
-    state = closed_loop.start(position_mm)
-    state[[kernels.CURRENT, kernels.CURRENT_DEMAND, kernels.SPEED_INTEGRAL]] = current_a
-    state[kernels.CURRENT_INTEGRAL] = resistance * current_a
-    return state
+def _parted(p: Parameters, direction: int, current_a: float, share: float) -> tuple[Parameters, float] | None:
+    """Return a drive that moves the same way in ``direction`` with a load, and the current that it holds at rest.
 
-
-def _holding(p: Parameters, direction: int, current_a: float) -> tuple[Parameters, float]:
-    """Return a drive that moves the same way in ``direction``, and rests under the current; and that current.
-
-    The dry friction of one rapid holds a constant load, too: how much, it cannot tell, but the current before the move
-    may. A drive with the friction Cd + D and a load D that helps the move goes as one with Cd does, and with D / K more
-    current as one that has no load. Where even that does not hold the shaft, the model lacks friction at rest.
+    With the friction Cd + D and a load D that helps the move it goes as with Cd. D is ``share`` of Cd, and at least what
+    holds the shaft under the current; None where that is another share. Where no load holds it, it has friction at rest
+    that the model lacks, and the current is what the model holds.
     """
-    held, band = p.K * current_a - p.term("load"), p.Cd + max(p.term("stribeck"), 0.0)
-    beyond = abs(held) - band
-    if beyond <= 0.0:
-        return p, current_a
-    if held * direction > 0.0:
-        return p, current_a - direction * beyond / p.K
-    return p.changed(Cd=p.Cd + beyond / 2), current_a + direction * beyond / 2 / p.K
+    helping = share * p.Cd
+    held, rests = direction * (p.K * current_a - p.term("load")), max(p.term("stribeck"), 0.0)
+    least = (-held - p.Cd - rests) / 2.0
+    if share == 0.0:
+        helping = max(0.0, least)
+    elif helping < least:
+        return None
+    most = p.Cd + rests  # held less what the load takes is at most the friction at rest
+    current = current_a - direction * max(0.0, held - most) / p.K
+    if helping == 0.0:
+        return p, current
+    return p.changed(Cd=p.Cd + helping, load=p.term("load") - direction * helping), current
 
 
 def _standstill_a(window: Window) -> float:

@@ -33,7 +33,7 @@ LONGEST_BREAKAWAY_S = 0.060
 
 
 def rest_faults(evidence: Evidence) -> Iterator[Reason]:
-    """Yield what the rows at standstill contradict."""
+    """Yield the sensors whose zero the rows at standstill contradict."""
     window, fit, noise = evidence.window, evidence.on_time, evidence.noise
     rows = np.flatnonzero(evidence.at_rest)
     if rows.size < ROWS or (window.voltage_v is None and window.slow_voltage is None):
@@ -43,13 +43,24 @@ def rest_faults(evidence: Evidence) -> Iterator[Reason]:
     if abs(speed) > limit:
         text = f"speed reads {speed:+.3g} rad/s at standstill, limit {limit:.2g}"
         yield Reason("CalibrationSuspect", text, "set the zero of the speed sensor at standstill")
-    yield from _contradiction(window, fit, noise, rows)
+    yield from _contradiction(window, fit, noise, rows, evidence.lost_v)
+
+
+def friction_at_rest(evidence: Evidence) -> Iterator[Reason]:
+    """Yield what friction holds at standstill, or takes to begin to move, that the model does not have."""
+    window, fit = evidence.window, evidence.on_time
+    rows = np.flatnonzero(evidence.at_rest)
+    if rows.size < ROWS or (window.voltage_v is None and window.slow_voltage is None):
+        return
     yield from _holding(window, fit, rows)
     yield from breakaway(window, fit)
 
 
-def _contradiction(window: Window, fit: Fit, noise: Noise, rows: Rows) -> Iterator[Reason]:
-    """At standstill u = R i + L di/dt: the zero of current or voltage is off where they contradict each other."""
+def _contradiction(window: Window, fit: Fit, noise: Noise, rows: Rows, lost_v: float) -> Iterator[Reason]:
+    """At standstill u = R i + L di/dt: the zero of current or voltage is off where they contradict each other.
+
+    ``lost_v`` of the recorded voltage may not reach the motor.
+    """
     if window.voltage_v is None:
         return
     peak = float(np.nanmax(np.abs(window.current_a)))
@@ -71,6 +82,7 @@ def _contradiction(window: Window, fit: Fit, noise: Noise, rows: Rows) -> Iterat
             torque_constant / resistance * crept / (still.size * window.dt_s),
         )
         limit = max(SURE * float(np.linalg.norm(doubts)), LEAST_CURRENT * peak)
+        limit += lost_v / float(resistance)
         if abs(excess) > limit and abs(excess) > SURE * _resistance_share(fit) * abs(float(current.mean())):
             text = f"at standstill the current reads {excess:+.3g} A more than voltage and resistance make"
             yield Reason("CalibrationSuspect", text, "set the zeros of current and voltage sensor at standstill")
@@ -132,12 +144,16 @@ def _rest_before(fit: Fit, begin: int, side: int) -> int | None:
 
 
 def _holding(window: Window, fit: Fit, rows: Rows) -> Iterator[Reason]:
-    """A shaft that sticks although K i exceeds Cd has friction that the model does not have."""
-    current = smooth(carried(window.current_a), window.dt_s)[rows]
-    torque = abs(fit.theta[2]) * float(np.median(np.abs(current)))
+    """A shaft that sticks although K i exceeds Cd has friction, or bears a load, that the model does not have."""
+    held = float(fit.theta[2]) * float(np.median(smooth(carried(window.current_a), window.dt_s)[rows]))
     peak = abs(fit.theta[2]) * float(np.nanmax(np.abs(window.current_a)))
     spread = float(np.sqrt(inverse_of(fit.information)[0][5, 5]))
     limit = HOLDING_SHARE * max(fit.theta[5], 0.0) + SURE * spread + LEAST_TORQUE * peak
-    if torque > limit:
-        text = f"the shaft rests under {torque:.3g} N.m, though dry friction is {fit.theta[5]:.3g} N.m (Stribeck)"
-        yield Reason("ValidationFailed", text, "lubricate the slide-way, or check for a clamped axis")
+    if abs(held) <= limit:
+        return
+    told = f"the shaft rests under {abs(held):.3g} N.m, though dry friction is {fit.theta[5]:.3g} N.m"
+    if held * window.direction < 0.0:  # what pushes against this direction holds the shaft
+        text = f"{told} in this direction: a load, or friction that differs by direction"
+        yield Reason("ValidationFailed", text, "identify rapids of both directions")
+    else:
+        yield Reason("ValidationFailed", f"{told} (Stribeck)", "lubricate the slide-way, or check for a clamped axis")

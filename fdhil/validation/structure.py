@@ -33,6 +33,7 @@ LAGS = 25
 SLOPE_S = 0.005  # over which the acceleration is taken
 _KINDS = {"current": CURRENT, "speed": SPEED}
 STRIBECK_SPEEDS = (0.01, 0.03, 0.06, 0.12, 0.25)  # of the rapid speed
+DEAD_TIME, OFFSET_CURRENT = "dead_time", "current offset"
 SATURATED = 0.02  # of the peak current, at which an inverter's dead time has its whole effect
 
 
@@ -52,6 +53,7 @@ class Finding:
     amplitude: float
     direction: Float
     load_nm: Float | None = None
+    name: str = ""
 
     @property
     def sure(self) -> bool:
@@ -329,7 +331,8 @@ def _offset(bench: Bench, name: str, unit: str, drift: Float) -> Finding:
     k, statistic, amplitude, direction = bench.best(bench.offset_answers(name, np.vstack([np.ones(motion.n), drift])))
     text = f"{name} has an offset of {{:+.3g}} {unit}" if k == 0 else f"the zero of {name} drifts by {{:+.3g}} {unit}"
     advice = f"set the zero of the {name} sensor at standstill"
-    return Finding("CalibrationSuspect", text, advice, LEAST_OFFSET * peak, statistic, -amplitude, direction)
+    kind = OFFSET_CURRENT if name == "current" and k == 0 else ""
+    return Finding("CalibrationSuspect", text, advice, LEAST_OFFSET * peak, statistic, -amplitude, direction, name=kind)
 
 
 def _of_the_voltage(bench: Bench, drift: Float) -> list[Finding]:
@@ -343,28 +346,33 @@ def _of_the_voltage(bench: Bench, drift: Float) -> list[Finding]:
     power = np.maximum(volts * current, 0.0)
     tried = (
         (
+            DEAD_TIME,
             np.clip(current / (SATURATED * peak), -1.0, 1.0),
             ("CalibrationSuspect", "{:+.3g} V are lost before the motor, whatever its current (dead time)"),
             "set voltage_source = 'command' where the voltage is what the drive asks for",
             LEAST_OFFSET * most,
         ),
         (
+            "bus_sag",
             volts * power / float(power.max()),
             ("CalibrationSuspect", "{:+.2%} of the voltage are lost at the largest power (the bus sags)"),
             "record the voltage at the motor, or map the bus voltage",
             LEAST_GAIN,
         ),
         (
+            "warming",
             drift * current,
             ("ParameterJump", "the resistance changes by {:+.3g} ohm over the move (the winding warms)"),
             "let the motor reach its temperature before identifying",
             LEAST_GAIN * float(bench.fit.theta[0]),
         ),
     )
+    joined = {course.name for course in motion.courses}
     found = []
-    for course, (code, text), advice, least in tried:
-        _, statistic, amplitude, direction = bench.best(bench.offset_answers("voltage", course[None]))
-        found.append(Finding(code, text, advice, least, statistic, -amplitude, direction))
+    for name, course, (code, text), advice, least in tried:
+        if name not in joined:
+            _, statistic, amplitude, direction = bench.best(bench.offset_answers("voltage", course[None]))
+            found.append(Finding(code, text, advice, least, statistic, -amplitude, direction, name=name))
     return found
 
 

@@ -8,7 +8,7 @@ through an ordinary loop, and weighed against what all torque of the move makes 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from fdhil.config import Axis, Identification
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.windows import carried
+from fdhil.model.terms import torque
 from fdhil.records import PARAMETERS, Bool, Float, Parameters, Reason, Window, rms
 from fdhil.validation.replay import Replay, replay_window
 from fdhil.validation.table_error import TableError
@@ -25,6 +26,7 @@ NEXT_SPEED = 0.3  # of the rapid speed: that of a program that is cut
 SCATTER = 3.0  # deviations by which the power of noise may lie above what is expected
 BEGINNING_S = 0.060  # before the drive surely moves
 SMOOTHING_S = 0.002  # of the current, whose noise would push a shaft at rest
+LOOPS_DIFFER = "LoopsDiffer"  # code of what the torque explains, and the closed loop does not
 NOISE_ROWS = 25.0e-3  # s: over which noise behind a position loop hangs together
 
 
@@ -73,6 +75,7 @@ class Weight:
         )
         if self.allows(self.torque_um):
             advice = "the torque is explained, so the drive's loops are not as configured: fdhil identify --loops"
+            return Reason(LOOPS_DIFFER, text, advice)
         return Reason("ValidationFailed", text, advice)
 
     def told(self, um: float) -> str:
@@ -99,16 +102,17 @@ class Move:
     def of(cls, window: Window, parameters: Parameters, side: Float) -> Move:
         """Return the move of a window, with the friction of a model."""
         speed = carried(window.speed_rad_s)
-        friction = parameters.Cd * side + parameters.ft * speed
+        angle = 2 * math.pi / window.pitch_mm * carried(window.position_mm)
+        friction = np.where(side != 0, torque(parameters, np.abs(speed) * side, angle), 0.0)
         moving = np.flatnonzero(side)
         first = int(moving[0]) if moving.size else 0
         begins = np.zeros(side.size, dtype=np.bool_)
         begins[max(0, first - round(BEGINNING_S / window.dt_s)) : first] = True
         return cls(carried(window.current_a), speed, side, friction, begins, window.dt_s)
 
-    def integral(self, torque: Float) -> Float:
+    def integral(self, torque_nm: Float) -> Float:
         """Return the integral (n,) of a torque (n,) over the rows in which the drive surely moves."""
-        over = np.where(self.side[:-1] != 0, (torque[1:] + torque[:-1]) / 2, 0.0) * self.dt_s
+        over = np.where(self.side[:-1] != 0, (torque_nm[1:] + torque_nm[:-1]) / 2, 0.0) * self.dt_s
         return np.concatenate([[0.0], np.cumsum(over)])
 
     def turned(self, speed: Float) -> Float:
@@ -117,8 +121,11 @@ class Move:
 
     def left(self, p: Parameters) -> Float:
         """Return the momentum (n,) that the model leaves unexplained, N.m.s."""
-        torque = p.K * self.current - self.friction
-        return self.integral(torque) - p.Jt * self.turned(self.speed) + self._at_the_beginning(p)
+        return (
+            self.integral(p.K * self.current - self.friction)
+            - p.Jt * self.turned(self.speed)
+            + self._at_the_beginning(p)
+        )
 
     def _at_the_beginning(self, p: Parameters) -> Float:
         """Return the same of the rows in which it begins to move: what friction at rest does not hold turns it."""
@@ -127,8 +134,9 @@ class Move:
             return np.zeros(self.speed.size)
         way = self.side[rows[-1] + 1]
         width = 2 * round(SMOOTHING_S / 2 / self.dt_s) + 1
-        torque = way * p.K * moving_mean(self.current, width) - p.Cd - way * p.ft * self.speed
-        push = np.where(self.begins, np.maximum(torque, 0.0), 0.0) * self.dt_s
+        held = way * self.friction[rows[-1] + 1]
+        net = way * p.K * moving_mean(self.current, width) - held - way * p.ft * self.speed
+        push = np.where(self.begins, np.maximum(net, 0.0), 0.0) * self.dt_s
         gained = np.where(self.begins, np.append(np.diff(self.speed), 0.0), 0.0)
         made: Float = np.concatenate([[0.0], np.cumsum(way * push - p.Jt * gained)[:-1]])
         return made
@@ -137,25 +145,24 @@ class Move:
         """Return the momentum (n,) of all torque that the model has."""
         return self.integral(self.friction) + p.Jt * self.turned(self.speed)
 
+    def slower(self, p: Parameters, share: float) -> Move:
+        """Return the move at a share of its speed, by the same model: what is cut."""
+        speed = share * self.speed
+        friction = self.friction + p.ft * (speed - self.speed)
+        current = (p.Jt * np.gradient(speed, self.dt_s) + friction) / p.K
+        return replace(self, speed=speed, friction=friction, current=np.where(self.side != 0, current, self.current))
+
     def of_shift(self, p: Parameters, shift: Float) -> Float:
-        """Return the momentum (2, 2 n) that parameters off by ``shift`` (6,) make: on this rapid, and on what is cut.
-
-        Of the second the speed is lower, and it comes back at once: dry and viscous friction no longer hide each other.
-        """
+        """Return the momentum (n,) that parameters off by ``shift`` (6,) make."""
         _, _, of_k, of_jt, of_ft, of_cd = shift
-        made = []
-        for share in (1.0, NEXT_SPEED):
-            speed = share * self.speed
-            current = self.current + (share - 1.0) * (self.integral_free(p) / p.K)
-            torque = of_ft * speed + of_cd * self.side - of_k * current
-            there = self.integral(torque) + of_jt * self.turned(speed)
-            made.append(np.concatenate([there, there[-1] - there]))
-        return np.array(made)
+        off = of_ft * self.speed + of_cd * self.side - of_k * self.current
+        made: Float = self.integral(off) + of_jt * self.turned(self.speed)
+        return made
 
-    def integral_free(self, p: Parameters) -> Float:
-        """Return the torque (n,) of the model that goes with the speed: inertia and viscous friction."""
-        torque: Float = p.Jt * np.gradient(self.speed, self.dt_s) + p.ft * self.speed
-        return torque
+
+def to_and_fro(momentum: Float) -> Float:
+    """Return the momentum (2 n,) of a move and its way back at once, where dry and viscous friction differ."""
+    return np.concatenate([momentum, momentum[-1] - momentum])
 
 
 def weigh(

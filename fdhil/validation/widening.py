@@ -12,7 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdhil.identification.estimators.maximum_likelihood import Fit
+from fdhil.identification.courses import FIRST_COURSE
+from fdhil.identification.fit import Fit
+from fdhil.identification.kalman import DELAY
+from fdhil.identification.terms import PHASE
 from fdhil.records import PARAMETERS, Estimate, Float, frozen
 from fdhil.validation.selection import Lacking
 
@@ -26,10 +29,14 @@ def widened(estimate: Estimate, fit: Fit, lacks: Sequence[Lacking]) -> Estimate:
 
 
 def _of_names(estimate: Estimate, fit: Fit, shift: Float) -> Float:
-    """Return the shift (k,) of what the estimate names: the six first, of the fit's columns, and last the terms."""
+    """Return the shift (k,) of what the estimate names, from that of the fit's free entries.
+
+    The parts of a ripple have no name of their own: what moves them is left to their covariance.
+    """
     moved = np.zeros(len(estimate.names))
-    moved[: len(PARAMETERS)] = shift[: len(PARAMETERS)]
-    terms = len(fit.jacobian[0]) - len(fit.free)
-    if terms > 0 and len(PARAMETERS) + terms == len(estimate.names):
-        moved[len(PARAMETERS) :] = shift[len(fit.free) :]
+    courses = fit.problem.motions[0].courses
+    for entry, by in zip(fit.free, shift, strict=True):
+        name = PARAMETERS[entry] if entry < DELAY else courses[entry - FIRST_COURSE].name if entry > DELAY else ""
+        if name in estimate.names and f"{name}{PHASE}" not in estimate.names and not name.endswith(PHASE):
+            moved[estimate.names.index(name)] = by
     return moved

@@ -22,6 +22,7 @@ from fdhil.arming.desk import ArmingDesk
 from fdhil.arming.guard_link import GuardLink
 from fdhil.arming.preparing import AHEAD_S, Armament, may_begin
 from fdhil.arming.program_check import encoded
+from fdhil.arming.standstill import Standstill
 from fdhil.arming.stream_feeder import StreamFeeder
 from fdhil.arming.token import read_token
 from fdhil.config import MachineConfig
@@ -31,6 +32,7 @@ from fdhil.store.rows import Revision, Stamp
 from tests.arming.mill import RESERVE_ROWS, Mill
 from tests.arming.test_preparing import known, save_records
 from tests.arming.test_program_check import HEAD, SQUARE
+from tests.bench import bench_config
 from tests.daemon.machine import config_of
 from tests.store.made import published
 
@@ -302,7 +304,7 @@ def feeder_of(checked: CheckedProgram, mill: Mill, folder: Path) -> tuple[Stream
     link.look()
     stream = RowStream(checked, "digest", 0.001)
     armed = Armament("long.ngc", stream, Piece(0, {}, {}, False), {}, 29.0)
-    return StreamFeeder(armed, link), link
+    return StreamFeeder(armed, link, Standstill(bench_config())), link
 
 
 def test_what_is_refused_before_it_begins_is_disarmed(config: MachineConfig, mill: Mill, tmp_path: Path) -> None:

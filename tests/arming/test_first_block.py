@@ -10,7 +10,7 @@ import pytest
 
 from fdhil import correction
 from fdhil.arming.checked_program import Piece
-from fdhil.arming.first_block import from_rest
+from fdhil.arming.first_block import FirstBlock
 from fdhil.arming.program_check import encoded
 from fdhil.arming.standstill import WATCHED_S, AtRest, Standstill
 from fdhil.config import MachineConfig
@@ -63,12 +63,17 @@ def test_the_error_before_the_first_corner_is_gone(text: str, tmp_path: Path) ->
     """Drives that stand with a current somewhere in the band of dry friction: what is left is what is left without."""
     amperes = {"X": 4.0, "Y": -3.0}
     program, begin = checked(tmp_path, text, MODELS, CONFIG)
-    anew = from_rest(begin, program, MODELS, CONFIG, resting(amperes))
+    first = FirstBlock(begin, program, MODELS, CONFIG)
+    rows = first.renew(resting(amperes))
+    anew = first.begin
     before, after = (cut(program, piece, amperes, CONFIG) for piece in (begin, anew))
     without = cut(program, begin, {"X": 0.0, "Y": 0.0}, CONFIG)
     assert rms(after[:600]) < 0.2 * rms(before[:600])
     assert rms(after) < 1.1 * rms(without)
     assert anew.demand == begin.demand
+    assert rows is not None
+    assert all(rows.offset[axis] == anew.offset[axis][: len(rows.offset[axis])] for axis in "XY")
+    assert all(rows.demand[axis] == anew.demand[axis][: len(rows.offset[axis])] for axis in "XY")
     for axis in "XY":
         assert len(anew.offset[axis]) == len(begin.offset[axis])
         assert anew.offset[axis][1700:] == begin.offset[axis][1700:] or text == SHORT
@@ -77,17 +82,33 @@ def test_the_error_before_the_first_corner_is_gone(text: str, tmp_path: Path) ->
 
 
 def test_rows_that_are_right_already_stay(tmp_path: Path) -> None:
-    """Axes without a current begin as the check assumed."""
+    """Axes without a current begin as the check assumed, others as they were known to stand."""
     program, begin = checked(tmp_path, SHORT, MODELS, CONFIG)
-    anew = from_rest(begin, program, MODELS, CONFIG, resting({"X": 0.0, "Y": 0.0}))
-    assert anew.offset == begin.offset
+    first = FirstBlock(begin, program, MODELS, CONFIG)
+    assert first.renew(resting({"X": 0.1, "Y": -0.1})) is None
+    assert first.renew(resting({"X": 0.0, "Y": 4.0})) is not None
+    assert first.renew(resting({"X": 0.0, "Y": 4.1})) is None
+    assert first.renew(resting({"X": 0.0, "Y": 0.0})) is not None  # it has moved since
+
+
+def test_what_the_way_to_the_start_leaves_is_expected(tmp_path: Path) -> None:
+    """X comes from the positive side, Y stands there: independent drives that do so are corrected from their start."""
+    program, begin = checked(tmp_path, LONG, MODELS, CONFIG)
+    first = FirstBlock(begin, program, MODELS, CONFIG)
+    assert first.expect({"X": AtRest(250.0, 250.0, 3.0), "Y": AtRest(0.0, 0.0, 5.0)}) is not None
+    amperes = {"X": -6.0, "Y": 5.0}
+    before, after = (cut(program, piece, amperes, CONFIG) for piece in (begin, first.begin))
+    assert rms(after[:600]) < 0.3 * rms(before[:600])
+    assert first.renew(resting(amperes)) is None  # as it was expected
 
 
 @pytest.mark.parametrize("rest", [{}, {"X": AtRest(0, 0, 3)}, {"X": AtRest(0, 0, 3), "Y": AtRest(5, 5, 3)}])
 def test_an_axis_that_does_not_stand_at_the_start_leaves_the_rows(rest: dict[str, AtRest], tmp_path: Path) -> None:
     """What it holds when the program starts is not known yet."""
     program, begin = checked(tmp_path, SHORT, MODELS, CONFIG)
-    assert from_rest(begin, program, MODELS, CONFIG, rest) is begin
+    first = FirstBlock(begin, program, MODELS, CONFIG)
+    assert first.renew(rest) is None
+    assert first.begin is begin
 
 
 def heard(first: int, current: Float, position: float = 1.0) -> AxisSamples:

@@ -25,28 +25,57 @@ class SlowDrive:
         self.pitch, self.increments = axis.screw_pitch_mm, increments
         self.i = self.w = self.theta = 0.0
         self.speed_sum = self.current_sum = self.position_sum = 0.0
+        self.start = 0.0
         self.before: tuple[float, float] | None = None
         self.seen = 0.0
         self.pipeline = [0.0] * axis.regulators.current_delay_cycles
         self.memory: list[list[float]] = []
 
-    def _slopes(self, i: float, w: float, u: float, friction: float) -> tuple[float, float, float]:
+    def _smooth(self, w: float, theta: float, side: float) -> float:
+        """Every torque against the positive direction but dry friction."""
+        p, terms = self.p, dict(self.p.terms)
+        angle = theta + self.start * 2 * math.pi / self.pitch
+        total = p.term("load") + w * p.term("viscous_positive" if side > 0 else "viscous_negative", p.ft)
+        for name, amplitude in terms.items():
+            if name.startswith("ripple") and not name.endswith("phase"):
+                total += amplitude * math.sin(int(name.split("_")[2]) * angle + terms.get(name + "_phase", 0.0))
+        return total
+
+    def _dry(self, w: float, side: float) -> float:
+        """Dry friction, a positive number."""
         p = self.p
-        return (u - p.R * i - p.K * w) / p.L, (p.K * i - p.ft * w - friction) / p.Jt, w
+        dry = p.term("coulomb_positive" if side > 0 else "coulomb_negative", p.Cd)
+        return dry + (p.term("stribeck") * math.exp(-((w / p.term("stribeck_speed", 1.0)) ** 2)))
+
+    def _behind_the_inverter(self, u: float) -> float:
+        whole_at = self.g.voltage_limit_v * self.g.current_period_s / (4 * self.nominal.L)
+        return u - self.p.term("dead_time") * max(-1.0, min(1.0, self.i / whole_at))
+
+    def _slopes(self, i: float, w: float, theta: float, u: float, side: float) -> tuple[float, float, float]:
+        p = self.p
+        against = self._smooth(w, theta, side) + side * self._dry(w, side)
+        return (u - p.R * i - p.K * w) / p.L, (p.K * i - against) / p.Jt, w
+
+    def _held(self) -> bool:
+        push = self.p.K * self.i - self._smooth(0.0, self.theta, 1.0)
+        return self.w == 0.0 and abs(push) <= self._dry(0.0, push)
+
+    def _sign(self) -> float:
+        return math.copysign(1.0, self.w if self.w != 0.0 else self.p.K * self.i - self._smooth(0.0, self.theta, 1.0))
 
     def _integrate(self, u: float, h: float) -> None:
         p = self.p
-        if self.w == 0.0 and abs(p.K * self.i) <= p.Cd:
+        if self._held():
             self.i += (u / p.R - self.i) * (1 - math.exp(-p.R * h / p.L))
             return
-        sign = math.copysign(1.0, self.w if self.w != 0.0 else self.i)
+        sign = self._sign()
         x = (self.i, self.w, self.theta)
         for _ in range(SUBSTEPS):
             d = h / SUBSTEPS
-            k1 = self._slopes(x[0], x[1], u, sign * p.Cd)
-            k2 = self._slopes(x[0] + d / 2 * k1[0], x[1] + d / 2 * k1[1], u, sign * p.Cd)
-            k3 = self._slopes(x[0] + d / 2 * k2[0], x[1] + d / 2 * k2[1], u, sign * p.Cd)
-            k4 = self._slopes(x[0] + d * k3[0], x[1] + d * k3[1], u, sign * p.Cd)
+            k1 = self._slopes(x[0], x[1], x[2], u, sign)
+            k2 = self._slopes(x[0] + d / 2 * k1[0], x[1] + d / 2 * k1[1], x[2] + d / 2 * k1[2], u, sign)
+            k3 = self._slopes(x[0] + d / 2 * k2[0], x[1] + d / 2 * k2[1], x[2] + d / 2 * k2[2], u, sign)
+            k4 = self._slopes(x[0] + d * k3[0], x[1] + d * k3[1], x[2] + d * k3[2], u, sign)
             x = (
                 x[0] + d / 6 * (k1[0] + 2 * k2[0] + 2 * k3[0] + k4[0]),
                 x[1] + d / 6 * (k1[1] + 2 * k2[1] + 2 * k3[1] + k4[1]),
@@ -58,7 +87,7 @@ class SlowDrive:
         """Follow ``demand_mm`` (n,) from rest at its first row; return the positions (n,) in mm."""
         per_mm = self.increments / self.pitch
         targets = [round(mm * per_mm) for mm in demand_mm]
-        start = demand_mm[0]
+        start = self.start = demand_mm[0]
         self.theta = 0.0
         self.memory = [[targets[0], 0.0, 0.0] for _ in range(self.g.setpoint_filter_order)]
         n_speed = round(self.period / self.g.speed_period_s)
@@ -123,7 +152,7 @@ class SlowDrive:
         if volts == wanted:
             self.current_sum = candidate
         self.pipeline.append(volts)
-        self._integrate(self.pipeline.pop(0), g.current_period_s)
+        self._integrate(self._behind_the_inverter(self.pipeline.pop(0)), g.current_period_s)
 
 
 class EventDrive(SlowDrive):
@@ -131,13 +160,13 @@ class EventDrive(SlowDrive):
 
     def _integrate(self, u: float, h: float) -> None:
         p = self.p
-        if self.w == 0.0 and abs(p.K * self.i) <= p.Cd:
+        if self._held():
             super()._integrate(u, h)
             return
-        sign = math.copysign(1.0, self.w if self.w != 0.0 else self.i)
+        sign = self._sign()
 
         def slopes(_t: float, x: Float) -> tuple[float, float, float]:
-            return self._slopes(x[0], x[1], u, sign * p.Cd)
+            return self._slopes(x[0], x[1], x[2], u, sign)
 
         def standstill(_t: float, x: Float) -> float:
             return float(x[1])
@@ -150,3 +179,43 @@ class EventDrive(SlowDrive):
             left = h - float(solution.t[-1])
             self.w = 0.0
             self.i += (u / p.R - self.i) * (1 - math.exp(-p.R * left / p.L))
+
+
+class TwoMassDrive(SlowDrive):
+    """The same regulators around a motor that pulls its table by a spring; dry friction acts on the table."""
+
+    def __init__(self, parameters: Parameters, axis: Axis, period_s: float, increments: int = 65536) -> None:
+        super().__init__(parameters, axis, period_s, increments)
+        p, self.share = parameters, parameters.term("resonance_share", 0.5)
+        reduced = p.Jt * self.share * (1 - self.share)
+        self.stiffness = reduced * (2 * math.pi * p.term("resonance")) ** 2
+        self.damping = 2 * p.term("resonance_damping") * math.sqrt(self.stiffness * reduced)
+        self.table = self.table_w = 0.0
+        self.tables_mm: list[float] = []
+
+    def _pull(self, x: Float) -> float:
+        return float(self.stiffness * (x[2] - x[4]) + self.damping * (x[1] - x[3]))
+
+    def _both(self, x: Float, u: float, side: float) -> Float:
+        p, pull = self.p, self._pull(x)
+        motor = p.K * x[0] - self._smooth(x[1], x[2], math.copysign(1.0, x[1])) - pull
+        table = 0.0 if side == 0.0 else pull - side * self._dry(x[3], side)
+        slopes = [(u - p.R * x[0] - p.K * x[1]) / p.L, motor / (p.Jt * (1 - self.share)), x[1]]
+        return np.array([*slopes, table / (p.Jt * self.share), x[3]])
+
+    def _integrate(self, u: float, h: float) -> None:
+        x, d = np.array([self.i, self.w, self.theta, self.table_w, self.table]), h / SUBSTEPS
+        for _ in range(SUBSTEPS):
+            side = math.copysign(1.0, x[3] if x[3] != 0.0 else self._pull(x))
+            if x[3] == 0.0 and abs(self._pull(x)) <= self._dry(0.0, side):
+                side = 0.0
+            k1 = self._both(x, u, side)
+            k2 = self._both(x + d / 2 * k1, u, side)
+            k3 = self._both(x + d / 2 * k2, u, side)
+            x = x + d / 6 * (k1 + 2 * k2 + 2 * k3 + self._both(x + d * k3, u, side))
+            x[3] = 0.0 if x[3] * side < 0 else x[3]
+        self.i, self.w, self.theta, self.table_w, self.table = x.tolist()
+
+    def _cycle(self, place: float, rate: float, acceleration: float, encoder: float) -> None:
+        self.tables_mm.append(self.start + self.table * self.pitch / (2 * math.pi))
+        super()._cycle(place, rate, acceleration, encoder)

@@ -275,3 +275,36 @@ def test_a_setpoint_filter_delays_the_axis() -> None:
     regulators = AXIS.regulators.model_copy(update={"setpoint_filter_s": 0.01, "setpoint_filter_order": 2})
     machine = RealPhysics(PLANT, regulators, 1e-3, INC, Reality(), rad_per_mm=RAD_PER_MM)
     assert RAMP[-1] - cut(machine, RAMP)[-1, 1] == pytest.approx(100.0 * 0.02, rel=0.02)  # two times 10 ms
+
+
+def test_the_kernel_says_the_same_in_plain_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    keys: dict[str, Any] = {"static_friction": 0.2, "presliding_um": 5.0, "friction_ripple": 0.05, "load_nm": 1.0,
+            "screw_ripple_nm": 0.2, "motor_ripple_nm": 0.2, "resonance_hz": 90.0, "table_friction": 0.5,
+            "pitch_error_um": 2.0, "dead_time_v": 1.0, "bus_sag": 0.03, "encoder_bits": 20,
+            "speed_feedback": "difference", "setpoint_filter_s": 1e-3, "current_delay_cycles": 2}  # fmt: skip
+    compiled, plain = axis(backlash_um=5.0, **keys), axis(backlash_um=5.0, **keys)
+    rows = cut(compiled, there_and_back()[:40])
+    for name, kernel in vars(real_cycle).items():
+        if hasattr(kernel, "py_func"):
+            monkeypatch.setattr(real_cycle, name, kernel.py_func)
+    np.testing.assert_allclose(cut(plain, there_and_back()[:40]), rows, rtol=1e-7, atol=1e-7)
+    for machine in (compiled, plain):
+        machine.cycle(False, REST)
+
+
+@pytest.mark.parametrize("presliding_um", [0.0, 0.5, 10.0])
+@pytest.mark.parametrize("static_friction", [-0.5, 0.5])
+@pytest.mark.parametrize("resonance_hz", [0.0, 40.0, 400.0])
+def test_it_follows_whatever_is_combined(presliding_um: float, static_friction: float, resonance_hz: float) -> None:
+    machine = axis(
+        backlash_um=10.0 if resonance_hz else 0.0,
+        presliding_um=presliding_um,
+        static_friction=static_friction,
+        resonance_hz=resonance_hz,
+        table_friction=0.5,
+        position_encoder="motor",
+    )
+    rows = cut(machine, there_and_back())
+    assert np.all(np.isfinite(rows))
+    assert np.abs(rows[:, 0] - there_and_back()).max() < 0.3
+    assert np.abs(rows[-1, 2]) < 1.0

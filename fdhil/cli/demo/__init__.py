@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
-    from fdhil.cli.demo.report import Loop
+    from fdhil.cli.demo.realistic import Realistic
+    from fdhil.cli.demo.report import Loop, Published
+    from fdhil.records import Parameters
 
 
 @click.command()
@@ -25,9 +27,11 @@ def demo(out: Path, realtime: bool, as_json: bool) -> int:
 
     Starts the twin (drives, sensors, NC), the guard and the daemon; commissions the drives; shuttles the axes and
     identifies them; predicts the path of the paper, cuts it, arms, cuts it corrected; warms the slide-ways and cuts
-    again.
+    again. Then it identifies and cuts once more on a machine with what real ones have.
     """
+    from fdhil.cli.demo import realistic_page
     from fdhil.cli.demo.loop import run_loop
+    from fdhil.cli.demo.realistic import run_realistic
     from fdhil.cli.demo.report import page
     from fdhil.report import write
 
@@ -36,31 +40,49 @@ def demo(out: Path, realtime: bool, as_json: bool) -> int:
             click.echo(text, err=as_json)
 
     loop = run_loop(out, realtime, say)
+    realistic = run_realistic(out / "realistic", realtime, say)
     report = out / "report.html"
-    write(page(loop), report)
+    write(page(loop, [realistic_page.headline(realistic)], [realistic_page.section(realistic)]), report)
     if as_json:
-        click.echo(json.dumps(_document(loop, report)))
+        click.echo(json.dumps({**_document(loop, report), "realistic": _realistic(realistic)}))
     else:
-        _tables(loop, report)
+        _tables(loop, realistic, report)
     return 0
+
+
+def _parameters(found: Published, truth: Parameters) -> dict[str, Any]:
+    from fdhil.records import PARAMETERS, UNITS
+
+    return {
+        name: {
+            "value": getattr(found.parameters, name),
+            "std": found.std[name],
+            "unit": UNITS[name],
+            "true": getattr(truth, name),
+        }
+        for name in PARAMETERS
+    }
+
+
+def _realistic(realistic: Realistic) -> dict[str, Any]:
+    axes = {
+        axis: {
+            "rapids": told.rapids,
+            "believed": told.believed,
+            "reasons": dict(told.reasons),
+            "parameters": told.published and _parameters(told.published, realistic.truth[axis]),
+            "terms": told.published and dict(told.published.parameters.terms),
+        }
+        for axis, told in realistic.verdicts.items()
+    }
+    cuts = [{"label": cut.label, "rms_um": cut.rms_um, "max_um": cut.max_um} for cut in realistic.cuts]
+    return {"axes": axes, "cuts": cuts, "refused": realistic.refused or None}
 
 
 def _document(loop: Loop, report: Path) -> dict[str, Any]:
     from fdhil.cli.demo.report import rms
-    from fdhil.records import PARAMETERS, UNITS
 
-    identified = {
-        axis: {
-            name: {
-                "value": getattr(sets[0].parameters, name),
-                "std": sets[0].std[name],
-                "unit": UNITS[name],
-                "true": getattr(loop.truth[axis], name),
-            }
-            for name in PARAMETERS
-        }
-        for axis, sets in loop.published.items()
-    }
+    identified = {axis: _parameters(sets[0], loop.truth[axis]) for axis, sets in loop.published.items()}
     before, mirror, after, *rest = loop.cuts
     contour = loop.predicted.contour_um
     return {
@@ -76,16 +98,19 @@ def _document(loop: Loop, report: Path) -> dict[str, Any]:
     }
 
 
-def _tables(loop: Loop, report: Path) -> None:
+def _tables(loop: Loop, realistic: Realistic, report: Path) -> None:
     from rich.console import Console
     from rich.table import Table
 
+    from fdhil.cli.demo import realistic_page
     from fdhil.cli.demo.report import CUT_HEAD, PARAMETER_HEAD, cut_rows, parameter_rows
 
     console = Console()
     for title, head, rows in (
         ("Identified from the rapids", PARAMETER_HEAD, parameter_rows(loop)),
         ("Contour error, measured by the twin at its own table", CUT_HEAD, cut_rows(loop)),
+        ("Believed of the realistic machine", realistic_page.VERDICT_HEAD, realistic_page.verdict_rows(realistic)),
+        ("Contour error of the realistic machine", CUT_HEAD, realistic_page.cut_rows(realistic)),
     ):
         table = Table(title=title, title_justify="left")
         for k, name in enumerate(head):

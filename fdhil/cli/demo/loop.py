@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import shutil
 import time
-import tomllib
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from fdhil import config as machine_config
+from fdhil.cli.demo.machines import machine_document
 from fdhil.cli.demo.processes import PATIENCE_S, Process, Twin
 from fdhil.cli.demo.report import Cut, Loop, Published, rms
 from fdhil.cli.demo.toml import to_toml
@@ -24,7 +24,7 @@ from fdhil.daemon.control import SOCKET_NAME, ask
 from fdhil.errors import DeviceTimeout, FdhilError, RecordingError
 from fdhil.prediction import contour_error_um, predict
 from fdhil.program import load_trajectory
-from fdhil.records import PARAMETERS, Window
+from fdhil.records import PARAMETERS, Parameters, ParameterSet, Window
 from fdhil.sim.drive.physics import true_parameters
 from fdhil.store.history import History
 from fdhil.store.windows import read_window
@@ -70,13 +70,20 @@ class Stage:
 
 def run_loop(out: Path, realtime: bool, say: Say) -> Loop:
     """Run the whole loop below ``out`` and return what was measured; FdhilError when a step fails."""
+    with running(out, realtime, say, machine_document()) as stage:
+        return _measure(stage)
+
+
+@contextmanager
+def running(out: Path, realtime: bool, say: Say, document: dict[str, Any]) -> Iterator[Stage]:
+    """Have a machine, commissioned, with guard and daemon, its NC on; all of it ends with the block."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FdhilError(f"the folder {out} cannot be made: {error.strerror}; choose another --out") from None
     with ExitStack() as stack:
         say("starting the simulated machine: two drives, two voltage sensors, an NC")
-        stage = _start_twin(out, realtime, say, stack)
+        stage = _start_twin(out, realtime, say, stack, document)
         _commission(stage)
         for name, module in (("guard", ["fdhil.cli.guard"]), ("daemon", ["fdhil", "run"])):
             process = Process(name, [*module, str(out / "machine.toml")], out / f"{name}.log")
@@ -84,13 +91,11 @@ def run_loop(out: Path, realtime: bool, say: Say) -> Loop:
         _await(lambda: _alive(stage), "the daemon did not get ready", stage)
         stage.twin.command("nc", on=True)
         stage.twin.event("nc")
-        return _measure(stage)
+        yield stage
 
 
-def _start_twin(out: Path, realtime: bool, say: Say, stack: ExitStack) -> Stage:
+def _start_twin(out: Path, realtime: bool, say: Say, stack: ExitStack, document: dict[str, Any]) -> Stage:
     shutil.rmtree(out / "data", ignore_errors=True)
-    source = Path(__file__).with_name("machine.toml")
-    document = tomllib.loads(source.read_text("utf-8"))
     document["sim"]["pace"] = "realtime" if realtime else "lockstep"
     (out / "twin.toml").write_text(to_toml(document), "utf-8")
     twin = stack.enter_context(Twin(out / "twin.toml", out / "twin.log"))
@@ -98,7 +103,7 @@ def _start_twin(out: Path, realtime: bool, say: Say, stack: ExitStack) -> Stage:
     for axis, sensor in twin.ready["modbus"].items():  # the twin's voltage sensors tell the slide-way's temperature too
         document["axis"][axis]["temperature"] = {**sensor, "period_s": 0.2}
     (out / "machine.toml").write_text(to_toml(document), "utf-8")
-    folder = source.parent
+    folder = Path(__file__).parent
     programs = {label: folder / name for label, name in PROGRAMS.items()}
     return Stage(out, machine_config.load(out / "machine.toml"), twin, say, programs)
 
@@ -139,19 +144,19 @@ def _measure(stage: Stage) -> Loop:
     models = {axis: found[0].parameters for axis, found in published.items()}
     predicted = predict(programs["10 m/min"], models, config)
     stage.say(f"predicted contour error of the path: {rms(predicted.contour_um):.1f} um RMS")
-    _cut(stage, "uncorrected", 20.0)
-    _cut(stage, "mirror", 20.0, "mirror")
-    _cut(stage, "inverse", 20.0, "inverse")
+    cut(stage, "uncorrected", 20.0)
+    cut(stage, "mirror", 20.0, "mirror")
+    cut(stage, "inverse", 20.0, "inverse")
     warm = cold
     for celsius in WARM_C:
         stage.say(f"slide-ways at {celsius:.1f} degC, shuttling")
         stage.twin.command("temperature", celsius=celsius)
         warm = _shuttle(stage, published)
-    _cut(stage, "inverse, warm", WARM_C[-1], "inverse")
+    cut(stage, "inverse, warm", WARM_C[-1], "inverse")
     counters = stage.ask("status")["frames"]
     return Loop(
         config=config,
-        truth={a: true_parameters(settings.nominal, config.sim.axis[a]) for a, settings in config.axis.items()},
+        truth=true_plants(config),
         published=published,
         cold=cold,
         warm={axis: window for axis, (window, _) in warm.items()},
@@ -164,19 +169,34 @@ def _measure(stage: Stage) -> Loop:
 
 def _shuttle(stage: Stage, published: dict[str, list[Published]]) -> dict[str, tuple[Window, float | None]]:
     """Play the shuttle, wait until both axes publish, and return the last accepted window of each with its fit."""
-    before = _analysed(stage)
-    stage.twin.play(stage.programs["shuttle"])
-    _await(lambda: _settled(stage, before), "the rapids of the shuttle were not analysed", stage)
+    play_shuttle(stage)
     newest: dict[str, tuple[Window, float | None]] = {}
     with History.read(stage.config.store.directory) as history:
         for axis in stage.config.axis:
-            revision = history.revisions(axis, limit=1)[0].set
-            std = dict(zip(PARAMETERS, np.sqrt(np.diag(revision.covariance)).tolist(), strict=True))
-            published[axis].append(Published(revision.parameters, std, revision.temperature_c or 20.0))
+            published[axis].append(published_of(history.revisions(axis, limit=1)[0].set))
             stored = [row for row in history.windows(axis) if row.accepted][-1]
             window = read_window(stage.config.store.directory / "windows" / stored.file)
             newest[axis] = (window, stored.fit_percent)
     return newest
+
+
+def play_shuttle(stage: Stage) -> None:
+    """Play the shuttle and wait until all its rapids were analysed."""
+    before = _analysed(stage)
+    stage.twin.play(stage.programs["shuttle"])
+    _await(lambda: _settled(stage, before), "the rapids of the shuttle were not analysed", stage)
+
+
+def published_of(found: ParameterSet) -> Published:
+    """Return a published set as the pages show it."""
+    names = (*PARAMETERS, *(name for name, _ in found.parameters.terms))
+    std = dict(zip(names, np.sqrt(np.diag(found.covariance)).tolist(), strict=True))
+    return Published(found.parameters, std, found.temperature_c or 20.0)
+
+
+def true_plants(config: MachineConfig) -> dict[str, Parameters]:
+    """Return what the six parameters of each axis truly are."""
+    return {axis: true_parameters(settings.nominal, config.sim.axis[axis]) for axis, settings in config.axis.items()}
 
 
 def _analysed(stage: Stage) -> dict[str, int]:
@@ -189,15 +209,16 @@ def _settled(stage: Stage, before: Mapping[str, int]) -> bool:
     return all(now >= before[axis] + RAPIDS for axis, now in _analysed(stage).items())
 
 
-def _cut(stage: Stage, label: str, celsius: float, method: str | None = None) -> None:
+def cut(stage: Stage, label: str, celsius: float, method: str | None = None) -> None:
+    """Cut the path, corrected by ``method`` if there is one; FdhilError when the daemon refuses to."""
     program, trace = stage.programs["10 m/min"], stage.out / f"cut-{len(stage.cuts) + 1}.csv"
     finished = stage.twin.play(program, trace) if method is None else _corrected(stage, program, trace, method)
     reference, table = read_trace(trace, tuple(stage.config.axis))
     contour = contour_error_um(reference, table, stage.config.machine.sync_period_s)
     late = sum(int(n) for n in finished["late_rpdo"].values())
-    cut = Cut(label, celsius, reference, table, contour, late)
-    stage.cuts.append(cut)
-    stage.say(f"cut {label}: {cut.rms_um:.2f} um RMS, {cut.max_um:.1f} um at most, {late} late offset frames")
+    done = Cut(label, celsius, reference, table, contour, late)
+    stage.cuts.append(done)
+    stage.say(f"cut {label}: {done.rms_um:.2f} um RMS, {done.max_um:.1f} um at most, {late} late offset frames")
 
 
 def _corrected(stage: Stage, program: Path, trace: Path, method: str) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from fdhil.records import (
     Prediction,
     Trajectory,
     Window,
+    unit_of,
 )
 from fdhil.report import Page, Section, Table, figures
 from fdhil.report.figures import Curve
@@ -90,8 +91,8 @@ class Loop:
     frames: tuple[int, int]
 
 
-def page(loop: Loop) -> Page:
-    """Lay the loop out as a report."""
+def page(loop: Loop, headline: Sequence[tuple[str, str]] = (), more: Sequence[Section] = ()) -> Page:
+    """Lay the loop out as a report, with lines and sections that others add to it."""
     before, mirror, after = loop.cuts[:3]
     return Page(
         title="From rapid moves to a corrected path",
@@ -102,32 +103,42 @@ def page(loop: Loop) -> Page:
             ("measured with the paper's mirror", f"{mirror.rms_um:.2f} um"),
             ("measured with the inverse, RMS", f"{after.rms_um:.2f} um"),
             ("smaller by, as measured", f"{before.rms_um / after.rms_um:.0f} x"),
+            *headline,
         ],
-        sections=[_identified(loop), _drifted(loop), _path(loop), _predicted(loop), _corrected(loop)],
+        sections=[_identified(loop), _drifted(loop), _path(loop), _predicted(loop), _corrected(loop), *more],
     )
 
 
 def parameter_rows(loop: Loop) -> list[list[str]]:
     """Return the table of true and identified parameters: axis, symbol, truth, identified with interval, deviation."""
+    return [row for axis, truth in loop.truth.items() for row in identified_rows(axis, truth, loop.published[axis][0])]
+
+
+def identified_rows(axis: str, truth: Parameters, found: Published) -> list[list[str]]:
+    """Return the rows of one axis; what has joined the six has no truth beside it."""
     rows = []
-    for axis, truth in loop.truth.items():
-        found = loop.published[axis][0]
-        for name in PARAMETERS:
-            true, value, std = getattr(truth, name), getattr(found.parameters, name), found.std[name]
-            unit, factor = DISPLAY[name]
-            found_text, deviation = cell(name, value, INTERVAL_95 * std, " "), f"{100 * (value / true - 1):+.2f} %"
-            rows.append([axis, name, f"{true * factor:.5g} {unit}", found_text, deviation])
+    for name in PARAMETERS:
+        true, value, std = getattr(truth, name), getattr(found.parameters, name), found.std[name]
+        unit, factor = DISPLAY[name]
+        found_text, deviation = cell(name, value, INTERVAL_95 * std, " "), f"{100 * (value / true - 1):+.2f} %"
+        rows.append([axis, name, f"{true * factor:.5g} {unit}", found_text, deviation])
+    for name, value in found.parameters.terms:
+        rows.append([axis, name, "", f"{value:.4g} ±{INTERVAL_95 * found.std[name]:.2g} {unit_of(name)}", ""])
     return rows
 
 
 def cut_rows(loop: Loop) -> list[list[str]]:
     """Return the table of contour errors: predicted, then each cut as measured at the table."""
     rows = [["predicted", "", f"{rms(loop.predicted.contour_um):.2f}", f"{loop.predicted.contour_um.max():.1f}", ""]]
-    rows += [
+    return rows + cut_rows_of(loop.cuts)
+
+
+def cut_rows_of(cuts: Sequence[Cut]) -> list[list[str]]:
+    """Return one row per pass, as measured at the table."""
+    return [
         [cut.label, f"{cut.temperature_c:.1f}", f"{cut.rms_um:.2f}", f"{cut.max_um:.1f}", str(cut.late_offsets)]
-        for cut in loop.cuts
+        for cut in cuts
     ]
-    return rows
 
 
 CUT_HEAD = ("pass", "slide-way degC", "RMS um", "max um", "late offsets")

@@ -263,5 +263,8 @@ def finish(result: Fit) -> Estimate:
     if first.courses or first.speed_late is not None:
         answer, beyond = told_terms(answer, result, values, beyond)
     # what the data can tell is the information's to say; that residuals are coloured is no lack of excitation
-    judged = judge(answer, condition, max(float(np.abs(m.speed).max()) for m in result.problem.motions))
+    top_rad_s, top_a = (
+        max(float(np.abs(getattr(m, n)).max()) for m in result.problem.motions) for n in ("speed", "current")
+    )
+    judged = judge(answer, condition, top_rad_s, abs(float(result.theta[K])) * top_a)
     return replace(judged, covariance=judged.covariance + beyond)

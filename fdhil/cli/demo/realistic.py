@@ -1,0 +1,82 @@
+"""Runs the demonstration on a machine with what real ones have: what fdhil believes of it, and what that is worth."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from fdhil.cli.demo.loop import Say, Stage, cut, play_shuttle, published_of, running, true_plants
+from fdhil.cli.demo.machines import REAL, machine_document
+from fdhil.cli.demo.report import Cut, Published
+from fdhil.config import MachineConfig
+from fdhil.errors import FdhilError
+from fdhil.prediction import predict
+from fdhil.program import load_trajectory
+from fdhil.records import Parameters, Prediction
+from fdhil.store.history import History
+
+AMBIENT_C = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class AxisVerdict:
+    """What fdhil makes of one axis: what it published, how many rapids it believed, and why not the others."""
+
+    published: Published | None
+    believed: int
+    rapids: int
+    reasons: Mapping[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Realistic:
+    """All that was measured on the realistic machine; ``refused`` is why no correction was sent, empty if one was."""
+
+    config: MachineConfig
+    truth: Mapping[str, Parameters]
+    verdicts: Mapping[str, AxisVerdict]
+    predicted: Prediction | None
+    cuts: Sequence[Cut]
+    refused: str
+
+
+def run_realistic(out: Path, realtime: bool, say: Say) -> Realistic:
+    """Shuttle, identify and cut below ``out``; FdhilError when a step fails, while a refusal is an answer."""
+    say("once more on a machine with what real ones have: friction, weight, ripples, a soft screw, an inverter")
+    with running(out, realtime, say, machine_document(REAL)) as stage:
+        say("shuttling both axes at rapid speed, listening")
+        play_shuttle(stage)
+        verdicts = {axis: _verdict(stage, axis) for axis in stage.config.axis}
+        cut(stage, "uncorrected", AMBIENT_C)
+        refused = _corrected(stage)
+        plants = true_plants(stage.config)
+        return Realistic(stage.config, plants, verdicts, _predicted(stage, verdicts), stage.cuts, refused)
+
+
+def _verdict(stage: Stage, axis: str) -> AxisVerdict:
+    with History.read(stage.config.store.directory) as history:
+        sets, windows = history.revisions(axis, limit=1), history.windows(axis)
+    reasons = Counter(reason.partition(":")[0] for window in windows for reason in window.reasons)
+    believed = sum(window.accepted for window in windows)
+    stage.say(f"{axis}: {believed} of {len(windows)} rapids believed, {'a' if sets else 'no'} model published")
+    return AxisVerdict(published_of(sets[0].set) if sets else None, believed, len(windows), reasons)
+
+
+def _predicted(stage: Stage, verdicts: Mapping[str, AxisVerdict]) -> Prediction | None:
+    """Return what the published models predict; None unless there is one of every axis."""
+    models = {axis: told.published.parameters for axis, told in verdicts.items() if told.published is not None}
+    if len(models) < len(verdicts):
+        return None
+    return predict(load_trajectory(stage.programs["10 m/min"], stage.config), models, stage.config)
+
+
+def _corrected(stage: Stage) -> str:
+    """Cut by the inverse; return why not, in the daemon's words, where it refuses."""
+    try:
+        cut(stage, "inverse", AMBIENT_C, "inverse")
+    except FdhilError as error:
+        stage.say(f"not corrected: {error}")
+        return str(error)
+    return ""

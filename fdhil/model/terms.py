@@ -1,0 +1,128 @@
+"""What may join equations [1] and [2] of [DES], see :class:`fdhil.records.Parameters`, as the kernels take it."""
+
+from __future__ import annotations
+
+import math
+import re
+from functools import lru_cache
+
+import numpy as np
+
+from fdhil.config import Axis
+from fdhil.model import kernels
+from fdhil.records import Float, Parameters, read_only
+
+_RIPPLE = re.compile(r"ripple_(?:screw|motor)_(\d+)")
+_SPEEDS = ("speed_delay",)  # of what a drive reports, not of what it does
+TABLE_SHARE = 0.5  # of the inertia is behind the spring where nothing else is known
+
+
+def torque(parameters: Parameters, speed_rad_s: Float, angle_rad: Float) -> Float:
+    """Return the torque (n,) in N.m against the positive direction of a motor at speeds and angles (n,).
+
+    It is load + side (C + stribeck exp(-(w / stribeck_speed)^2)) + f w + ripples, with side = sign(w), 0 at rest; the
+    angle is 2 pi x / pitch.
+    """
+    speed, angle = (np.ascontiguousarray(values, dtype=np.float64) for values in (speed_rad_s, angle_rad))
+    return kernels.torque(read_only(speed), read_only(angle), packed(parameters))
+
+
+def rad_per_mm(axis: Axis) -> float:
+    """Return by what angle the motor turns while the table goes one mm."""
+    return 2 * math.pi / axis.screw_pitch_mm
+
+
+def full_dead_time_a(axis: Axis) -> float:
+    """Return the current from which on the inverter's dead time takes all its voltage.
+
+    It is half of the ripple that switching once in a cycle leaves in the current: below it both transistors conduct in
+    turn, and the losses cancel.
+    """
+    g = axis.regulators
+    return g.voltage_limit_v * g.current_period_s / (4 * axis.nominal.L)
+
+
+def dead_time_v(parameters: Parameters, axis: Axis, current_a: float) -> float:
+    """Return the voltage that the dead time takes from what the regulator asks for."""
+    share = max(-1.0, min(1.0, current_a / full_dead_time_a(axis)))
+    return parameters.term("dead_time") * share
+
+
+def more_than_plain(parameters: Parameters, axis: Axis) -> bool:
+    """Whether a drive needs the kernel's steps with terms: the plain ones are faster."""
+    return axis.regulators.current_delay_cycles > 0 or any(name not in _SPEEDS for name, _ in parameters.terms)
+
+
+def has_spring(parameters: Parameters) -> bool:
+    """Whether the table is told apart from the motor."""
+    return parameters.term("resonance") > 0.0
+
+
+@lru_cache(maxsize=256)
+def packed(parameters: Parameters) -> Float:
+    """Return (12 + 3 ripples,) the terms in the kernels' order."""
+    p, values = parameters, np.zeros(kernels.RIPPLES)
+    values[kernels.LOAD] = p.term("load")
+    values[kernels.DRY_POSITIVE] = p.term("coulomb_positive", p.Cd)
+    values[kernels.DRY_NEGATIVE] = p.term("coulomb_negative", p.Cd)
+    values[kernels.VISCOUS] = p.ft
+    values[kernels.VISCOUS_POSITIVE] = p.term("viscous_positive", p.ft)
+    values[kernels.VISCOUS_NEGATIVE] = p.term("viscous_negative", p.ft)
+    values[kernels.STRIBECK] = p.term("stribeck")
+    values[kernels.STRIBECK_SPEED] = p.term("stribeck_speed")
+    values[kernels.DEAD_TIME] = p.term("dead_time")
+    values[kernels.SPRING], values[kernels.DAMPER] = spring(p)
+    ripples = [
+        (float(found[1]), amplitude, p.term(f"{name}_phase"))
+        for name, amplitude in p.terms
+        if (found := _RIPPLE.fullmatch(name))
+    ]
+    return read_only(np.concatenate([values, *ripples]))
+
+
+def spring(parameters: Parameters) -> tuple[float, float]:
+    """Return stiffness in N.m/rad and damping in N.m.s of what is between motor and table; 0 where they are one.
+
+    ``resonance`` is that of both masses against each other, the motor free: the peak from its torque to its speed. A
+    motor that is held leaves the table sqrt(1 - share) of it; share = ``resonance_share`` of Jt is the table's.
+    """
+    share, whole = parameters.term("resonance_share", TABLE_SHARE), 2 * math.pi * parameters.term("resonance")
+    reduced = parameters.Jt * share * (1.0 - share)
+    return whole**2 * reduced, 2 * parameters.term("resonance_damping") * whole * reduced
+
+
+@lru_cache(maxsize=64)
+def masses(parameters: Parameters, pitch_mm: float, step_s: float) -> Float:
+    """Return (2, 5, 8) the exact step of motor and table, moving and with the table held; (0, 5, 8) where they are one.
+
+    Rows: current, speed, place of the motor, speed and place of the table; columns: the same, then voltage, torque on
+    the motor, torque on the table. Places are in mm. Of the viscous friction all is the motor's.
+    """
+    p = parameters
+    if not has_spring(p):
+        return read_only(np.zeros((0, 5, 8)))
+    share = p.term("resonance_share", TABLE_SHARE)
+    mm_per_rad, (k, d) = pitch_mm / (2 * math.pi), spring(p)
+    motor, table = p.Jt * (1 - share), p.Jt * share
+    a = np.zeros((8, 8))
+    a[0, [0, 1, 5]] = -p.R / p.L, -p.K / p.L, 1 / p.L
+    a[1, [0, 1, 2, 3, 4, 6]] = p.K, -p.ft - d, -k / mm_per_rad, d, k / mm_per_rad, 1.0
+    a[1] /= motor
+    a[2, 1] = a[4, 3] = mm_per_rad
+    a[3, [1, 2, 3, 4, 7]] = np.array([d, k / mm_per_rad, -d, -k / mm_per_rad, 1.0]) / table
+    held = a.copy()
+    held[3] = held[4] = 0.0
+    return read_only(np.array([exponential(one * step_s)[:5] for one in (a, held)]))
+
+
+def exponential(a: Float) -> Float:
+    """Return exp(a) of a small matrix by Taylor's series, halved until it converges to the last bit."""
+    halvings = max(0, math.ceil(math.log2(max(float(np.abs(a).sum(axis=1).max()), 1e-12) / 0.5)))
+    scaled = a / 2.0**halvings
+    result = term = np.eye(len(a))
+    for order in range(1, 19):
+        term = term @ scaled / order
+        result = result + term
+    for _ in range(halvings):
+        result = result @ result
+    return result

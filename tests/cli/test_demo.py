@@ -1,0 +1,76 @@
+"""The demonstration's realistic machine: its configuration, and its page whether it was believed or refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from fdhil import config as machine_config
+from fdhil.cli.demo import _realistic, realistic_page
+from fdhil.cli.demo.machines import REAL, machine_document
+from fdhil.cli.demo.realistic import AxisVerdict, Realistic
+from fdhil.cli.demo.report import Cut, Published
+from fdhil.config import Reality
+from fdhil.records import PARAMETERS, Parameters
+from fdhil.report import Page, write
+
+SHIPPED = Path(__file__).parents[2] / "configs" / "realistic.toml"
+TRUE = Parameters(0.5, 0.005, 0.8, 0.075, 0.05, 5.0)
+WAY = np.column_stack([np.linspace(0, 10, 50), np.zeros(50)])
+
+
+def machine() -> machine_config.MachineConfig:
+    return machine_config.parse(machine_document(REAL))
+
+
+def passes(*labels: str) -> list[Cut]:
+    return [Cut(label, 20.0, WAY, WAY, np.full(50, 8.0 / 4.0**n), 0) for n, label in enumerate(labels)]
+
+
+def published() -> Published:
+    names = (*PARAMETERS, "load")
+    return Published(TRUE.changed(Jt=0.0751, load=2.5), dict.fromkeys(names, 1e-3), 20.0)
+
+
+def test_the_shipped_configuration_is_the_demonstrations_machine() -> None:
+    shipped, shown = machine_config.load(SHIPPED), machine()
+    assert {axis: twin.reality for axis, twin in shipped.sim.axis.items()} == {
+        axis: twin.reality for axis, twin in shown.sim.axis.items()
+    }
+    assert Reality() not in [twin.reality for twin in shown.sim.axis.values()]
+
+
+def test_a_refusal_is_told_with_its_reasons(tmp_path: Path) -> None:
+    refused = Realistic(
+        machine(),
+        dict.fromkeys("XY", TRUE),
+        dict.fromkeys("XY", AxisVerdict(None, 0, 4, {"Implausible": 4})),
+        None,
+        passes("uncorrected"),
+        "the daemon refuses to arm: ModelNotValidated",
+    )
+    section = realistic_page.section(refused)
+    assert "ModelNotValidated" in section.text
+    assert realistic_page.headline(refused)[1] == "refused"
+    assert realistic_page.verdict_rows(refused)[0] == ["X", "0 of 4", "none published", "4 x Implausible"]
+    assert realistic_page.parameter_rows(refused) == []
+    assert ["load_nm", "", "2.5"] in realistic_page.effect_rows(refused)
+    write(Page("title", "subtitle", [realistic_page.headline(refused)], [section]), tmp_path / "report.html")
+    assert "0 of 4" in (tmp_path / "report.html").read_text("utf-8")
+    told = _realistic(refused)
+    assert told["axes"]["X"]["parameters"] is None
+    assert told["refused"]
+
+
+def test_what_was_believed_stands_beside_the_truth() -> None:
+    verdict = AxisVerdict(published(), 4, 4, {})
+    believed = Realistic(machine(), {"X": TRUE}, {"X": verdict}, None, passes("uncorrected", "inverse"), "")
+    assert realistic_page.headline(believed) == ("on a realistic machine smaller by", "4.0 x")
+    rows = realistic_page.parameter_rows(believed)
+    assert [row[1] for row in rows] == [*PARAMETERS, "load"]
+    assert rows[-1][3] == "2.5 ±0.002 N.m"
+    assert realistic_page.verdict_rows(believed)[0] == ["X", "4 of 4", "the six and load", ""]
+    told = _realistic(believed)
+    assert told["axes"]["X"]["terms"] == {"load": 2.5}
+    assert [cut["label"] for cut in told["cuts"]] == ["uncorrected", "inverse"]

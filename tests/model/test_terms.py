@@ -1,0 +1,194 @@
+"""What joins the plain drive: the closed loop with terms against independent physics, and their own laws."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil.config import Axis, parse
+from fdhil.model import closed_loop, loops, terms
+from fdhil.records import Float, Parameters
+from studies import real_plant
+from tests.bench import bench_document
+from tests.model.slow_drive import EventDrive, SlowDrive, TwoMassDrive
+from tests.paths import smooth
+
+PERIOD = 0.001
+PLAIN = Parameters(0.53, 0.0047, 0.82, 0.081, 0.04, 4.2)
+TERMS: dict[str, dict[str, float]] = {
+    "load": {"load": 2.3},
+    "load above friction": {"load": -9.0},
+    "dry by direction": {"coulomb_positive": 5.0, "coulomb_negative": 3.1},
+    "viscous by direction": {"viscous_positive": 0.06, "viscous_negative": 0.02},
+    "stribeck": {"stribeck": 1.2, "stribeck_speed": 6.0},
+    "rising": {"stribeck": -1.1, "stribeck_speed": 15.0},
+    "ripples": {"ripple_screw_1": 0.5, "ripple_screw_1_phase": 0.7, "ripple_motor_24": 0.4},
+    "dead time": {"dead_time": 3.0},
+    "all": {
+        "load": -1.5,
+        "viscous_positive": 0.05,
+        "stribeck": 0.8,
+        "stribeck_speed": 10.0,
+        "ripple_screw_1": 0.3,
+        "ripple_motor_12": 0.2,
+        "ripple_motor_12_phase": -1.0,
+        "dead_time": 1.5,
+        "speed_delay": 0.0005,
+    },
+}
+
+
+def bench(**regulators: Any) -> Axis:
+    """The bench's X axis with other regulators."""
+    document = bench_document("X")
+    document["axis"]["X"]["regulators"] |= regulators
+    return parse(document).axis["X"]
+
+
+def there_and_back(n: int, smoothed_s: tuple[float, float] = (0.020, 0.010)) -> Float:
+    """A move that reverses and comes to rest, in mm, away from 0."""
+    speed = np.concatenate([np.zeros(5), np.full(n // 3, 60.0), np.full(n // 3, -40.0), np.zeros(n - n // 3 * 2 - 5)])
+    return 3.0 + smooth(np.cumsum(speed * PERIOD)[:, None], smoothed_s, PERIOD)[:, 0]
+
+
+def loaded(slow: SlowDrive, axis: Axis, demand: Float) -> SlowDrive:
+    """The slow drive with what its regulators hold at rest in the middle of the friction's band."""
+    slow.start = float(demand[0])
+    pull = slow._smooth(0.0, 0.0, 1.0)
+    slow.i = slow.speed_sum = pull / slow.p.K
+    slow.current_sum = slow.p.R * slow.i
+    slow.current_sum -= slow._behind_the_inverter(0.0)
+    slow.pipeline = [slow.current_sum] * axis.regulators.current_delay_cycles
+    return slow
+
+
+@pytest.mark.parametrize("delay", [0, 3])
+@pytest.mark.parametrize("joined", TERMS)
+def test_agrees_with_independent_physics(joined: str, delay: int) -> None:
+    """Move, reversal and rest, as a drive of other code makes them."""
+    axis, parameters = bench(current_delay_cycles=delay), PLAIN.changed(**TERMS[joined])
+    demand = there_and_back(150)
+    response = closed_loop.simulate(parameters, axis, PERIOD, demand)
+    slow = loaded(SlowDrive(parameters, axis, PERIOD, increments=65536 << 20), axis, demand).run(demand.tolist())
+    assert response.limited_s == 0.0
+    assert np.abs(response.position_mm - slow).max() < 0.1e-3
+
+
+@pytest.mark.parametrize("joined", TERMS)
+def test_agrees_with_an_adaptive_solver(joined: str) -> None:
+    """The same with ``solve_ivp``, the standstill found as an event."""
+    axis, parameters = bench(), PLAIN.changed(**TERMS[joined])
+    demand = there_and_back(60)
+    response = closed_loop.simulate(parameters, axis, PERIOD, demand)
+    exact = loaded(EventDrive(parameters, axis, PERIOD, 65536 << 20), axis, demand).run(demand.tolist())
+    assert np.abs(response.position_mm - exact).max() < 0.1e-3
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7])
+def test_a_table_behind_a_spring_agrees_with_independent_physics(share: float) -> None:
+    """Motor and table as a drive of other code makes them; what is left is when in a step the table stops."""
+    axis = bench(current_delay_cycles=1)
+    parameters = PLAIN.changed(
+        resonance=70.0, resonance_damping=0.03, resonance_share=share, stribeck=0.5, stribeck_speed=8.0
+    )
+    demand = there_and_back(240, (0.060, 0.030))
+    response = closed_loop.simulate(parameters, axis, PERIOD, demand)
+    slow = TwoMassDrive(parameters, axis, PERIOD, 65536 << 20)
+    assert np.abs(response.position_mm - slow.run(demand.tolist())).max() < 0.1e-3
+    assert np.abs(response.table_mm - slow.tables_mm[::4]).max() < 0.2e-3
+    assert np.abs(response.table_mm - response.position_mm).max() > 20e-3
+
+
+def test_a_stiff_spring_is_none() -> None:
+    """At a resonance far beyond the drive's reach motor and table are one."""
+    demand, axis = there_and_back(150), bench()
+    stiff = closed_loop.simulate(PLAIN.changed(resonance=3000.0, resonance_damping=0.1), axis, PERIOD, demand)
+    one = closed_loop.simulate(PLAIN, axis, PERIOD, demand)
+    assert np.abs(stiff.table_mm - one.table_mm).max() < 0.1e-3
+
+
+def test_agrees_with_the_plant_of_the_studies() -> None:
+    """An ordinary machine with everything at once, from what its regulators hold at rest: within 0.1 um."""
+    mechanics = replace(real_plant.ORDINARY_MECHANICS, asymmetry=0.1)
+    loops_ = real_plant.Loops(dead_time_v=2.0, speed_filter_s=0.0005, delay_s=2 * real_plant.STEP_S)
+    demand = there_and_back(300)
+    truth = real_plant.run(mechanics, demand * 1e-3, loops_)
+    parameters = Parameters.of(mechanics.truth()).changed(
+        load=mechanics.load_nm,
+        coulomb_positive=1.1 * mechanics.Cd,
+        coulomb_negative=0.9 * mechanics.Cd,
+        stribeck=mechanics.static * mechanics.Cd,
+        stribeck_speed=mechanics.static_speed_rad_s,
+        ripple_screw_1=mechanics.screw_ripple * mechanics.Cd,
+        ripple_motor_24=mechanics.motor_ripple_nm,
+        resonance=mechanics.resonance_hz,
+        resonance_damping=mechanics.damping,
+        resonance_share=mechanics.table_share,
+        dead_time=2.0,
+    )
+    axis = bench(speed_filter_s=0.0005, current_delay_cycles=2)
+    state = closed_loop.standing(parameters, axis, float(demand[0]), truth.standstill_a)
+    response = closed_loop.simulate(parameters, axis, PERIOD, demand, state=state)
+    assert np.abs(response.position_mm - truth.motor_m * 1e3).max() < 0.1e-3
+    bent = truth.table_m * 1e3 - response.table_mm
+    assert np.ptp(bent) < 0.1e-3
+    assert np.abs(response.current_a - truth.current).max() < 0.05
+
+
+@pytest.mark.parametrize("structure", ["p_pi_pi", "double_pi", "pid"])
+@pytest.mark.parametrize("share", [-0.9, 0.0, 0.9])
+def test_an_axis_stands_as_long_as_it_is_told_to(structure: str, share: float) -> None:
+    """Whatever current within the band its regulators hold: nothing moves, and the current stays."""
+    more = {"double_pi": {"position_ki_per_s2": 300.0}, "pid": {"position_ki_per_s2": 2500.0, "speed_ki": 0.0}}
+    axis = bench(structure=structure, current_delay_cycles=2, speed_filter_s=0.0005, **more.get(structure, {}))
+    parameters = PLAIN.changed(**TERMS["all"], resonance=90.0)
+    pull = float(terms.torque(parameters, np.zeros(1), np.array([7.0 * terms.rad_per_mm(axis)]))[0])
+    current = (pull + share * parameters.Cd) / parameters.K
+    state = closed_loop.standing(parameters, axis, 7.0, current)
+    response = closed_loop.simulate(parameters, axis, PERIOD, np.full(300, 7.0), state=state)
+    assert np.abs(response.current_a - current).max() < 1e-6
+    assert np.abs(response.position_mm - 7.0).max() < 1e-6
+    assert np.ptp(response.table_mm) < 1e-6
+
+
+@pytest.mark.parametrize("joined", [*TERMS, "resonance"])
+def test_runs_in_pieces_give_the_same_bits(joined: str) -> None:
+    """A run that continues from a row's state is the run that was not interrupted."""
+    axis = bench(current_delay_cycles=5, speed_filter_s=0.0004)
+    parameters = PLAIN.changed(**TERMS.get(joined, {"resonance": 80.0}))
+    demand = there_and_back(90)
+    whole = closed_loop.simulate(parameters, axis, PERIOD, demand)
+    tail = closed_loop.simulate(parameters, axis, PERIOD, demand, state=whole.state_at(41), first=41)
+    assert np.array_equal(whole.states[:, 41:], tail.states)
+
+
+def test_terms_that_are_nil_are_none() -> None:
+    """The steps with terms are the plain ones where every term is 0."""
+    demand, axis = there_and_back(150), bench()
+    nil = closed_loop.simulate(PLAIN.changed(load=0.0), axis, PERIOD, demand)
+    drive = closed_loop.prepare(PLAIN, axis, PERIOD)
+    assert isinstance(drive, loops.Drive)
+    stepping = replace(drive, leap=np.empty((0, drive.leap.shape[1])))
+    plain = stepping.run(closed_loop.Commands(demand), closed_loop.start(float(demand[0])))
+    assert np.array_equal(nil.position_mm, plain.position_mm)
+    assert np.array_equal(nil.current_a, plain.current_a)
+
+
+def test_the_speed_delay_is_the_sensors() -> None:
+    """The drive itself is not slower for it: the same bits as without."""
+    demand, axis = there_and_back(90), bench()
+    late = closed_loop.simulate(PLAIN.changed(speed_delay=0.002), axis, PERIOD, demand)
+    assert np.array_equal(late.position_mm, closed_loop.simulate(PLAIN, axis, PERIOD, demand).position_mm)
+
+
+def test_the_torque_is_the_formula() -> None:
+    """Term by term, also at rest, where no dry friction has a side."""
+    p = PLAIN.changed(**TERMS["all"], coulomb_negative=3.0)
+    speed, angle = np.array([-20.0, 0.0, 5.0]), np.array([1.0, 2.0, 3.0])
+    ripple = 0.3 * np.sin(angle) + 0.2 * np.sin(12 * angle - 1.0)
+    dry = np.array([-3.0 - 0.8 * np.exp(-4.0), 0.0, 4.2 + 0.8 * np.exp(-0.25)])
+    expected = -1.5 + dry + np.array([0.04, 0.0, 0.05]) * speed + ripple
+    assert np.allclose(terms.torque(p, speed, angle), expected, rtol=1e-14)
