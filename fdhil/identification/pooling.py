@@ -141,7 +141,9 @@ class _Stack:
             shared[rows, : m.shared.shape[1]] = m.shared[own]
             start = rows.stop
         scale = unit[which]
-        weight: Float = np.linalg.inv(total / np.outer(scale, scale) + LEAST_SHARE**2 * np.eye(which.size))
+        weight = np.asarray(
+            np.linalg.inv(total / np.outer(scale, scale) + LEAST_SHARE**2 * np.eye(which.size)), dtype=np.float64
+        )
         return cls(names, values, which, side, shared, unit, weight)
 
 
