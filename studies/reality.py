@@ -23,7 +23,8 @@ from fdhil.correction.limits import fit_all
 from fdhil.correction.planning import plan
 from fdhil.identification.loops import with_loops
 from fdhil.identification.windows import find_windows
-from fdhil.pipeline import analyse, judged_again, pool
+from fdhil.pipeline import analyse, pool
+from fdhil.pipeline.own_loops import better_axis, loops_of, suspected
 from fdhil.prediction.contour import contour_error_um
 from fdhil.program.loading import load_trajectory
 from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Parameters, Trajectory, WindowOutcome, rms
@@ -204,8 +205,12 @@ def outcomes_of(machine: Machine, seed: int) -> tuple[list[WindowOutcome], float
             for w in find_windows(told)
         ]
         following.append(rms((moved.motor_m - moved.demand) * 1e6))
-    again, loops = judged_again(outcomes, config.identification, config.axis["X"], config.machine.sync_period_s)
-    return again, float(np.mean(following)), loops
+    settings, axis, period_s = config.identification, config.axis["X"], config.machine.sync_period_s
+    loops = loops_of(outcomes, axis, settings, period_s) if suspected(outcomes) else None
+    better = better_axis(axis, loops)
+    if better is not None:
+        outcomes = [analyse(o.window, settings, better, period_s) for o in outcomes]
+    return outcomes, float(np.mean(following)), loops if better is not None else None
 
 
 def cut(machine: Machine, reference: Trajectory, offset_um: Mapping[str, Array] | None = None) -> tuple[Array, Array]:

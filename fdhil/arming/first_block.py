@@ -21,7 +21,7 @@ from fdhil.arming.standstill import AtRest
 from fdhil.config import Axis, MachineConfig
 from fdhil.correction.inverse import AxisInverse, block_rows, common_delay_s
 from fdhil.correction.limits import check
-from fdhil.model import closed_loop, kernels
+from fdhil.model import closed_loop
 from fdhil.model.closed_loop import State
 from fdhil.prediction.contour import contour_error_um
 from fdhil.prediction.model_terms import Band, band
@@ -125,7 +125,7 @@ class FirstBlock:
         new = old.copy()
         new[:rows] = solved if ends else np.rint(old[:rows] + (solved - old[:rows]) * _share(rows, self._period_s))
         allowed = not check(new[2:].astype(np.int64), loop.limits, (float(new[1]), float(new[0])))
-        old_mm, new_mm = (loop.run(path_mm[: old.size], offset, state, 0, rows).position_mm for offset in (old, new))
+        old_mm, new_mm = (loop.run(path_mm[: old.size], offset, state, 0, rows).table_mm for offset in (old, new))
         return _Found(new[:rows], old_mm, new_mm, allowed)
 
     def _better(self, found: Mapping[str, _Found]) -> bool:
@@ -156,11 +156,7 @@ def rest_state(rest: AtRest, start_mm: float, parameters: Parameters, axis: Axis
     off_mm = rest.position_mm - rest.demand_mm
     if abs(off_mm) * axis.scaling.increments_per_mm < 1.0:  # the drive itself sees none
         off_mm = 0.0
-    state = closed_loop.start(start_mm + off_mm)
-    state[[kernels.CURRENT, kernels.SPEED_INTEGRAL]] = rest.current_a
-    state[kernels.CURRENT_DEMAND] = rest.current_a
-    state[kernels.CURRENT_INTEGRAL] = parameters.R * rest.current_a
-    return state
+    return closed_loop.standing(parameters, axis, start_mm + off_mm, rest.current_a)
 
 
 def _share(rows: int, period_s: float) -> Float:

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from fdhil.identification.loops import better_loops
 from fdhil.records import LoopEstimate, Notice, Outcome, ParameterSet, Skill, Temperature
 from fdhil.store.rows import Revision
 
@@ -17,7 +18,7 @@ SKILL_MOVES = 3  # FAULTS E19: the last three recorded moves
 class AxisKnowledge:
     """An axis when it is armed, as the daemon knows it: newest published set with its age, last moves' skills.
 
-    ``loops`` are the newest that were identified and are believed.
+    ``loops`` are the newest that were identified, where they explain what the configured ones do not.
     """
 
     published: ParameterSet | None
@@ -60,7 +61,7 @@ class Knowledge:
             elif isinstance(outcome, Skill):
                 self._axes[outcome.axis].skills.append(outcome)
             elif isinstance(outcome, LoopEstimate):
-                self._axes[outcome.axis].loops = outcome if outcome.verdict.accepted else None
+                self._axes[outcome.axis].loops = outcome if better_loops(outcome) else None
             elif isinstance(outcome, Notice) and outcome.code == "LoadChanged" and outcome.severity == "MAJOR":
                 self._axes[outcome.axis].load_changed = True
 

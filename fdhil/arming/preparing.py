@@ -21,6 +21,7 @@ from fdhil.commissioning.record import CommissioningRecord, holds, load_record
 from fdhil.config import MachineConfig
 from fdhil.correction import gate, online
 from fdhil.drivers.cia402.profile import load_profile
+from fdhil.identification.loops import regulators_of
 from fdhil.prediction.gain import Gain, skill_of
 from fdhil.prediction.model_terms import with_resonance
 from fdhil.prediction.models import with_loops
@@ -132,11 +133,7 @@ def prepare(
 
 def with_identified_loops(config: MachineConfig, known: Mapping[str, AxisKnowledge]) -> MachineConfig:
     """Return the configuration with those regulators that were identified and are believed."""
-    loops = {}
-    for name, axis in known.items():
-        if axis.loops is not None:
-            found = dict(zip(axis.loops.names, axis.loops.values.tolist(), strict=True))
-            loops[name] = {"structure": axis.loops.structure, **found}
+    loops = {name: regulators_of(axis.loops) for name, axis in known.items() if axis.loops is not None}
     return with_loops(config, loops, "the identified loops")
 
 

@@ -19,7 +19,7 @@ from fdhil.records import INTERVAL_95, unit_of
 
 if TYPE_CHECKING:
     from fdhil.cli.batch import FileResult
-    from fdhil.config import Axis, Identification
+    from fdhil.config import Axis, Identification, MachineConfig
     from fdhil.records import Estimate, Verdict, WindowOutcome
 
 SCHEMA = "fdhil-identify-1"
@@ -36,42 +36,54 @@ UNREADABLE = 3
     type=OutputFile(".json"),
     help="Write the validated pools as a model file, which --model of predict and correct reads.",
 )
+@click.option("--loops", "with_loops", is_flag=True, help="Identify the drive's own loops, too.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
 def identify(
-    recordings: tuple[Path, ...], config_path: Path | None, method: str | None, model: Path | None, as_json: bool
+    recordings: tuple[Path, ...],
+    config_path: Path | None,
+    method: str | None,
+    model: Path | None,
+    with_loops: bool,
+    as_json: bool,
 ) -> int:
     """Identify a drive from the rapid moves in each RECORDING (CSV).
 
     Each rapid is a window: it is checked, the six parameters are estimated from it, and the model is validated. The
     accepted windows of a file together give its pooled parameters. With --config they are also compared with the axis'
     nominal values: a sensor whose gain is wrong all along shows in no other way. A recording may have no voltage: then
-    K is the one in its header torque_constant_nm_per_a, else the nominal one of --config. Exit codes: 0 every file's
+    K is the one in its header torque_constant_nm_per_a, else the nominal one of --config. Where the configured
+    regulators do not explain the rapids, and with --loops always, the drive's own are identified; those that explain
+    more are used. Exit codes: 0 every file's
     pool is validated, 1 some pool is not, 2 wrong option or configuration, 3 a recording cannot be read (the others
     are identified all the same).
     """
-    settings, axes = _settings(config_path, method)
-    results = [_against_data_sheet(r, axes) for r in _analyse(recordings, settings, axes)]
+    settings, machine = _settings(config_path, method)
+    axes = machine.axis if machine is not None else {}
+    results = [_against_data_sheet(r, axes) for r in _analyse(recordings, settings, machine)]
     if model is not None:
         from fdhil.cli.model_file import write_model
 
         write_model(results, axes, model)
+    if with_loops:
+        from fdhil.cli.loops_view import with_all_loops
+
+        results = with_all_loops(results, settings, axes)
     if as_json:
-        document = {"schema": SCHEMA, "files": [_file_document(r) for r in results]}
+        document = {"schema": SCHEMA, "files": [_file_document(r, axes, with_loops) for r in results]}
         click.echo(json.dumps(document, allow_nan=False))
     else:
-        _show(results)
+        _show(results, axes, with_loops)
     if any(result.error for result in results):
         return UNREADABLE
     return 0 if all(r.verdict.accepted for r in results) else 1
 
 
-def _settings(path: Path | None, method: str | None) -> tuple[Identification, Mapping[str, Axis]]:
+def _settings(path: Path | None, method: str | None) -> tuple[Identification, MachineConfig | None]:
     from fdhil import config
 
     machine = config.load(path) if path is not None else None
     settings = machine.identification if machine is not None else config.Identification()
-    axes = machine.axis if machine is not None else {}
-    return (settings.model_copy(update={"method": method}) if method else settings), axes
+    return (settings.model_copy(update={"method": method}) if method else settings), machine
 
 
 def _against_data_sheet(result: FileResult, axes: Mapping[str, Axis]) -> FileResult:
@@ -90,7 +102,7 @@ def _against_data_sheet(result: FileResult, axes: Mapping[str, Axis]) -> FileRes
     return replace(result, verdict=replace(result.verdict, accepted=False, reasons=(reason,)))
 
 
-def _analyse(paths: Sequence[Path], settings: Identification, axes: Mapping[str, Axis]) -> list[FileResult]:
+def _analyse(paths: Sequence[Path], settings: Identification, machine: MachineConfig | None) -> list[FileResult]:
     """Analyse the files, with a progress bar on stderr when that is a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -98,14 +110,16 @@ def _analyse(paths: Sequence[Path], settings: Identification, axes: Mapping[str,
     from fdhil.cli.batch import analyse_files
 
     if not sys.stderr.isatty():
-        return list(analyse_files(paths, settings, axes))
+        return list(analyse_files(paths, settings, machine))
     columns = (TextColumn("identifying"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("identifying", total=len(paths))
-        return list(analyse_files(paths, settings, axes, partial(progress.advance, task)))
+        return list(analyse_files(paths, settings, machine, partial(progress.advance, task)))
 
 
-def _file_document(result: FileResult) -> dict[str, Any]:
+def _file_document(result: FileResult, axes: Mapping[str, Axis], with_loops: bool) -> dict[str, Any]:
+    from fdhil.cli.loops_view import compared
+
     document = {
         "file": result.file,
         "axis": result.axis,
@@ -118,6 +132,8 @@ def _file_document(result: FileResult) -> dict[str, Any]:
             **_verdict(result.verdict),
         },
     }
+    if with_loops or result.loops is not None:
+        document["loops"] = compared(result.loops, axes.get(result.axis or ""))
     return document if result.error is None else document | {"error": result.error}
 
 
@@ -192,12 +208,13 @@ def _parameters(estimate: Estimate | None, verdict: Verdict) -> dict[str, Any]:
     return answer
 
 
-def _show(results: Sequence[FileResult]) -> None:
-    """Write a table per file for people: every window, then the pool."""
+def _show(results: Sequence[FileResult], axes: Mapping[str, Axis], with_loops: bool) -> None:
+    """Write a table per file for people: every window, then the pool, then the loops."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
+    from fdhil.cli.loops_view import show_loops
     from fdhil.identification.windows import moving_range
     from fdhil.records import PARAMETERS
 
@@ -229,6 +246,8 @@ def _show(results: Sequence[FileResult]) -> None:
         console.print(table)
         _show_terms(console, result)
         _show_reasons(console, result)
+        if with_loops or result.loops is not None:
+            show_loops(result, axes.get(result.axis or ""), console)
 
 
 def _cells(estimate: Estimate | None, verdict: Verdict, weighed: bool) -> list[str]:

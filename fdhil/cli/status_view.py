@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from fdhil.cli.loops_view import loops_line
 from fdhil.cli.parameter_view import MEANING, cell, half_of, head
 from fdhil.records import PARAMETERS
 
@@ -74,6 +75,8 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
     for axis, told in status["axes"].items():
         if unused := _unused(told):
             out.print(escape(f"{axis}: {unused}"))
+        if (loops := told.get("loops")) and (line := loops_line(loops)):
+            out.print(escape(f"{axis}: {line}"))
     for notice in status["notices"][-5:]:
         axis = f"{notice['axis']}: " if notice["axis"] else ""
         out.print(

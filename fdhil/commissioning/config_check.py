@@ -19,6 +19,8 @@ from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec, load_profile
 from fdhil.drivers.moves import load_event_source
 from fdhil.drivers.sensor_source import Sensor, sensors_of
 from fdhil.errors import DeviceError, StoreError
+from fdhil.identification.loops import better_loops, differences
+from fdhil.store.history import History
 
 RATE_TOLERANCE = 0.1
 PERIOD_TOLERANCE = 0.02
@@ -41,7 +43,7 @@ def check_machine(config: MachineConfig, say: Callable[[str], None] = lambda _te
         for axis in (name for name, settings in config.axis.items() if settings.drive.bus == bus):
             say(f"comparing axis {axis}")
             compared = compare_asked(config, axis) if traffic.master is None else compare_heard(traffic, config, axis)
-            found += [(f"axis {axis}", finding) for finding in compared]
+            found += [(f"axis {axis}", finding) for finding in (*compared, *compare_loops(config, axis))]
             found += [(f"axis {axis}", finding) for finding in asyncio.run(compare_sensors(config, axis))]
     return found
 
@@ -94,6 +96,24 @@ def _record(config: MachineConfig, axis: str, found: Survey) -> Iterator[Finding
         return
     if record is not None:
         yield compare_record(record, found)
+
+
+def compare_loops(config: MachineConfig, axis: str) -> Iterator[Finding]:
+    """Compare the regulators with those that the drive's rapids showed last; nothing where none did yet."""
+    try:
+        with History.read(config.store.directory) as history:
+            told = history.loops(axis, 1)
+    except StoreError:  # there is no history yet, or the daemon tells what is wrong with it
+        return
+    for _, loops in told:
+        settings = config.axis[axis]
+        apart = [d for d in differences(settings, loops) if d.apart]
+        found = ", ".join(f"{d.key} {d.found:.4g}" for d in apart) or "the same"
+        reasons = (*loops.verdict.reasons, *loops.verdict.warnings)
+        same = loops.verdict.accepted and not better_loops(loops)
+        cause, advice = (reasons[0].text, reasons[0].advice) if reasons else ("", "")
+        shown = "as configured" if same else f"{loops.structure}: {found}"
+        yield Finding("loops", f"{settings.regulators.structure} as configured", shown, same, cause, advice)
 
 
 def _unreachable(point: str, expected: str, error: DeviceError) -> Finding:

@@ -93,6 +93,7 @@ def loops_document(found: LoopEstimate) -> dict[str, Any]:
         "gains": {name: {"value": value, "std": std if math.isfinite(std) else None} for name, value, std in gains},
         "validated": found.verdict.accepted,
         "unexplained_um": found.verdict.unexplained_um,
+        "configured_um": found.configured_um,
         "reasons": [str(reason) for reason in found.verdict.reasons],
         "warnings": [str(warning) for warning in found.verdict.warnings],
     }

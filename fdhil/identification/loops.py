@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,6 @@ from fdhil.identification.loop_replay import Rapid, fitting_periods, rapid_of, w
 from fdhil.identification.loop_start import CASCADE, begun_anew, made_up_axis
 from fdhil.records import INTERVAL_95, LoopEstimate, Parameters, Reason, Verdict, Window, frozen, rms
 
-EXPLAINED_SHARE = 0.05  # of the following error, where the config has no tolerance
 WORTH, WORTH_LEFT = 0.1, 0.25  # of the tolerance, or of what is left: what a key must explain to join
 LEAST_UM = 0.1
 WELL = 0.25  # of the tolerance: with less left no other structure is tried
@@ -68,7 +68,7 @@ def identify_loops(
     if not rapids:
         return None
     following = rms(np.concatenate([one.lag_mm[one.known] for one in rapids])) * 1e3
-    tolerance = settings.tolerance_um or EXPLAINED_SHARE * following
+    tolerance = settings.tolerance_for(following)
     problem = _problem(rapids, axis, windows[0])
     found = _whole_delay(_best(problem, tolerance, axis is not None))
     configured = None if axis is None else _left_um(problem)
@@ -211,21 +211,20 @@ def _verdict(made: Fit, tolerance_um: float, following_um: float, configured_um:
 
 def better_loops(loops: LoopEstimate) -> bool:
     """Return whether loops are believed and explain more than the configured ones, so that they are used instead."""
-    differ = loops.configured_um is None or any(warning.code == DIFFER for warning in loops.verdict.warnings)
-    return loops.verdict.accepted and differ
+    return loops.verdict.accepted and any(warning.code == DIFFER for warning in loops.verdict.warnings)
 
 
 def with_loops(axis: Axis, loops: LoopEstimate) -> Axis:
     """Return the axis with the regulators that were identified in the place of the configured ones."""
-    values: dict[str, object] = axis.regulators.model_dump()
-    values |= {"structure": loops.structure} | dict(zip(loops.names, loops.values.tolist(), strict=True))
-    if DELAY in loops.names:
-        values[DELAY] = round(float(loops.values[loops.names.index(DELAY)]))
-    if loops.structure == "pid":
-        values |= {"speed_ki": 0.0, "speed_filter_s": 0.0}
-    elif loops.structure == "p_pi_pi":
-        values["position_ki_per_s2"] = 0.0
+    values = {**axis.regulators.model_dump(), **regulators_of(loops)}
     return axis.model_copy(update={"regulators": Regulators.model_validate(values)})
+
+
+def regulators_of(loops: LoopEstimate) -> dict[str, Any]:
+    """Return keys of ``[axis.X.regulators]`` as they were found; what a structure does not have is 0."""
+    lacks = {"pid": ("speed_ki", "speed_filter_s"), "p_pi_pi": ("position_ki_per_s2",)}.get(loops.structure, ())
+    found = dict(zip(loops.names, loops.values.tolist(), strict=True))
+    return {"structure": loops.structure, **found, **dict.fromkeys(lacks, 0.0)}
 
 
 def differences(axis: Axis, loops: LoopEstimate) -> list[Difference]:

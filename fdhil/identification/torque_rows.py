@@ -39,7 +39,7 @@ class TorqueRows:
     error_rad_s2: float
 
     @property
-    def rows(self) -> int:
+    def count(self) -> int:
         """Number of rows to fit."""
         return int(np.count_nonzero(self.usable))
 

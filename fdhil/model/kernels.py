@@ -58,15 +58,14 @@ def _cascade(place: float, rate: float, speed: float, state: Float, gains: Float
 
 
 @compiled
-def _pid(place: float, rate: float, state: Float, gains: Float) -> tuple[float, float, float]:
+def _pid(place: float, rate: float, turned: float, state: Float, gains: Float) -> tuple[float, float, float]:
     """PID on position: return the current demand, the speed integral it does not have, and its own integral.
 
     The derivative is the difference of Kff times set-point less position over one cycle; ``rate`` rad/s adds to it.
-    The filter on the speed feedback acts on the position's part of it.
+    ``turned`` rad is the position's part of it, as the filter on the speed feedback lets it through.
     """
     lag = place - state[POSITION]
     integral = state[POSITION_INTEGRAL] + gains[POSITION_KI] * lag
-    turned = _seen(gains[RAD_PER_MM] * (state[POSITION] - state[POSITION_BEFORE]), state, gains)
     moved = gains[KFF] * (place - state[SET_POINT_BEFORE]) - turned
     state[SET_POINT_BEFORE] = place
     state[POSITION_BEFORE] = state[POSITION]
@@ -86,17 +85,19 @@ def _filter(place: float, rate: float, bend: float, order: int, decay: float, st
 
 
 @compiled
-def _current_cycles(demand_a: float, limited: bool, plant: Float, gains: Float, n_current: int, state: Float) -> int:
+def _current_cycles(
+    demand_a: float, limited: bool, plant: Float, gains: Float, n_current: int, delay: int, state: Float
+) -> int:
     """Run the current loop and the plant for one speed cycle, step by step: return the steps with a limit acting.
 
-    ``limited``: the current demand is at its limit. This is the plain drive: what it has not would cost it a tenth.
+    ``limited``: the current demand is at its limit. The voltage acts ``delay`` steps after it was computed.
     """
     phi_ii, phi_iw, phi_wi, phi_ww, phi_xi, phi_xw = plant[0], plant[1], plant[2], plant[3], plant[4], plant[5]
     i_u, w_u, x_u, i_t, w_t, x_t = plant[6], plant[7], plant[8], plant[9], plant[10], plant[11]
     still, still_u, torque_constant, dry = plant[12], plant[13], plant[14], plant[15]
     kp, ki, voltage_max, half_step_mm = gains[CURRENT_KP], gains[CURRENT_KI], gains[VOLTAGE_MAX], gains[HALF_STEP_MM]
     i, w, x, integral = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL]
-    steps = 0
+    steps, at = 0, int(state[NEXT])
     for _ in range(n_current):
         error = demand_a - i
         candidate = integral + ki * error
@@ -108,6 +109,9 @@ def _current_cycles(demand_a: float, limited: bool, plant: Float, gains: Float, 
                 steps += 1
         else:
             steps += 1
+        if delay > 0:
+            u, state[WAITING + at] = state[WAITING + at], u
+            at = at + 1 if at + 1 < delay else 0
         torque = torque_constant * i
         if w == 0.0 and abs(torque) <= dry:
             i = still * i + still_u * u
@@ -127,6 +131,7 @@ def _current_cycles(demand_a: float, limited: bool, plant: Float, gains: Float, 
             i = phi_ii * i + phi_iw * w + i_u * u + i_t * friction
             w = w_next
     state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL] = i, w, x, integral
+    state[NEXT] = at
     return steps
 
 
@@ -165,7 +170,7 @@ def _cycles_with_terms(
     demand_a: float,
     limited: bool,
     plant: Float,
-    masses: Float,
+    masses: Float | None,
     gains: Float,
     terms: Float,
     n_current: int,
@@ -175,7 +180,7 @@ def _cycles_with_terms(
     """Run a speed cycle as :func:`_current_cycles` does, with what may join the plain drive.
 
     A voltage acts ``delay`` steps after it was computed, less the inverter's dead time. Ripples are those of the middle
-    of each step. ``masses`` (2, 5, 8), or empty where motor and table are one, is the exact step of motor and table,
+    of each step. ``masses`` (2, 5, 8), or None where motor and table are one, is the exact step of motor and table,
     free and with the table held; dry friction acts on the table then, all else on the motor.
     """
     phi_ii, phi_iw, phi_wi, phi_ww, phi_xi, phi_xw = plant[0], plant[1], plant[2], plant[3], plant[4], plant[5]
@@ -190,7 +195,7 @@ def _cycles_with_terms(
         terms[STRIBECK_SPEED],
     )
     more_positive, more_negative = terms[VISCOUS_POSITIVE] - terms[VISCOUS], terms[VISCOUS_NEGATIVE] - terms[VISCOUS]
-    spring, damper, two = terms[SPRING] * rad_per_mm, terms[DAMPER], masses.size > 0
+    spring, damper = terms[SPRING] * rad_per_mm, terms[DAMPER]
     i, w, x, integral = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL]
     table_w, table = state[TABLE_SPEED], state[TABLE]
     steps, at = 0, int(state[NEXT])
@@ -214,13 +219,13 @@ def _cycles_with_terms(
         if terms.size > RIPPLES:
             against += _ripple(rad_per_mm * (x + half_step_mm * w), terms)
         rubbing, push = w, torque_constant * i - against
-        if two:
+        if masses is not None:
             rubbing, push = table_w, spring * (x - table) + damper * w
         # one side per step: that of the motion, or where the torque will start it
         side = 1.0 if rubbing > 0.0 or (rubbing == 0.0 and push > 0.0) else -1.0
         dry = (positive if side > 0.0 else negative) + _low_speed(rubbing, slow, slow_speed)
         held = rubbing == 0.0 and abs(push) <= dry
-        if two:
+        if masses is not None:
             m = masses[1 if held else 0]
             dry, apart = side * dry, x - table
             x = table + m[2, 0] * i + m[2, 1] * w + m[2, 2] * apart + m[2, 3] * table_w
@@ -263,22 +268,30 @@ def _between(values: Float, k: int, part: float) -> float:
 
 
 @inlined
-def _may_move(i: float, w: float, integral: float, demand_a: float, plant: Float, leap: Float) -> float:
-    """Return the largest voltage that a moving table may be asked for in a speed cycle; inf where it may turn."""
-    net = abs(i - plant[15] / plant[14] if w > 0.0 else i + plant[15] / plant[14])
+def _may_move(
+    i: float, w: float, integral: float, demand_a: float, friction: float, unit: float, plant: Float, leap: Float
+) -> float:
+    """Return the largest voltage that a moving table may be asked for in a speed cycle; inf where it may turn.
+
+    ``friction`` N.m is the torque against the positive direction, ``unit`` its size in what the leap takes for 1.
+    """
+    net = abs(i - friction / plant[14])
     e, q, ai, aw = abs(demand_a - i), abs(integral - leap[LEAP_RESISTANCE, 0] * i - plant[14] * w), abs(i), abs(w)
     turn = leap[LEAP_TURN, 0] * net + leap[LEAP_TURN, 1] * aw + leap[LEAP_TURN, 2] * e + leap[LEAP_TURN, 3] * q
-    if plant[15] > 0.0 and not aw > turn + leap[LEAP_TURN, 4]:
+    if unit > 0.0 and not aw > turn + leap[LEAP_TURN, 4] * unit:
         return float(np.inf)
     peak = leap[LEAP_VOLTAGE, 0] * ai + leap[LEAP_VOLTAGE, 1] * aw + leap[LEAP_VOLTAGE, 2] * e
-    return float(peak + leap[LEAP_VOLTAGE, 3] * q + leap[LEAP_VOLTAGE, 4])
+    return float(peak + leap[LEAP_VOLTAGE, 3] * q + leap[LEAP_VOLTAGE, 4] * unit)
 
 
 @inlined
-def _may_hold(i: float, integral: float, demand_a: float, plant: Float, leap: Float) -> float:
-    """Return the largest voltage that a table held by dry friction may be asked for; inf where it may break loose."""
+def _may_hold(i: float, integral: float, demand_a: float, room: float, plant: Float, leap: Float) -> float:
+    """Return the largest voltage that a held table may be asked for; inf where it may break loose.
+
+    ``room`` N.m is what the motor's torque may change by before it does.
+    """
     ai, e, q = abs(i), abs(demand_a - i), abs(integral - leap[LEAP_RESISTANCE, 0] * i)
-    if not plant[14] * (ai + leap[HELD_BREAK, 2] * e + leap[HELD_BREAK, 3] * q) <= plant[15]:
+    if not plant[14] * (leap[HELD_BREAK, 2] * e + leap[HELD_BREAK, 3] * q) <= room:
         return float(np.inf)
     return float(leap[HELD_VOLTAGE, 0] * ai + leap[HELD_VOLTAGE, 2] * e + leap[HELD_VOLTAGE, 3] * q)
 
@@ -293,9 +306,34 @@ def _mapped(leap: Float, row: int, i: float, w: float, integral: float, demand_a
 @inlined
 def _leapable(i: float, w: float, integral: float, demand_a: float, plant: Float, leap: Float) -> tuple[float, float]:
     """Return the largest voltage of a speed cycle, inf where it is not linear, and the side: 0 for a held table."""
-    if w == 0.0 and plant[15] > 0.0:
-        return _may_hold(i, integral, demand_a, plant, leap), 0.0
-    return _may_move(i, w, integral, demand_a, plant, leap), 1.0 if w > 0.0 else -1.0
+    dry = plant[15]
+    if w == 0.0 and dry > 0.0:
+        return _may_hold(i, integral, demand_a, dry - plant[14] * abs(i), plant, leap), 0.0
+    side = 1.0 if w > 0.0 else -1.0
+    return _may_move(i, w, integral, demand_a, side * dry, 1.0 if dry > 0.0 else 0.0, plant, leap), side
+
+
+@inlined
+def _mean_torque(
+    i: float, w: float, x: float, half_mm: float, faster: float, plant: Float, rad_per_mm: float, terms: Float
+) -> float:
+    """Return the mean of the torque against the positive direction over a speed cycle in which the table moves.
+
+    ``half_mm`` is how far the table goes in half of it at 1 rad/s, ``faster`` by how much 1 N.m speeds it up in that
+    time. A ripple is averaged, the friction is that of the cycle's middle.
+    """
+    side = 1.0 if w > 0.0 else -1.0
+    dry = terms[DRY_POSITIVE] if w > 0.0 else terms[DRY_NEGATIVE]
+    viscous = (terms[VISCOUS_POSITIVE] if w > 0.0 else terms[VISCOUS_NEGATIVE]) - terms[VISCOUS]
+    middle = w + faster * (plant[14] * i - terms[LOAD] - side * dry)
+    if middle * side <= 0.0:
+        middle = w
+    mean = terms[LOAD] + side * (dry + _low_speed(middle, terms[STRIBECK], terms[STRIBECK_SPEED])) + viscous * middle
+    for n in range(RIPPLES, terms.size, 3):
+        turned = terms[n] * rad_per_mm * half_mm * middle
+        ripple = np.sin(terms[n] * rad_per_mm * (x + 0.5 * half_mm * (w + middle)) + terms[n + 2])
+        mean += terms[n + 1] * ripple * (np.sin(turned) / turned if turned != 0.0 else 1.0)
+    return float(mean)
 
 
 @inlined
@@ -382,7 +420,114 @@ def _run_leaping(
                 i, w, currents = _leapt(i, w, currents, demand_a, side, leap)
             else:
                 state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL] = i, w, x, currents
-                limited += _current_cycles(demand_a, demand_a != raw, plant, gains, n_current, state)
+                limited += _current_cycles(demand_a, demand_a != raw, plant, gains, n_current, 0, state)
+                i, w, x, currents = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL]
+        out[ROW_LIMITED, row] = limited
+    state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_DEMAND] = i, w, x, demand_a
+    state[SPEED_INTEGRAL], state[CURRENT_INTEGRAL], state[POSITION_INTEGRAL] = speeds, currents, places
+    state[SPEED_FILTERED] = seen if decay > 0.0 else 0.0
+
+
+@compiled
+def _run_leaping_with_terms(
+    reference: Float,
+    first: int,
+    plant: Float,
+    leap: Float,
+    masses: Float | None,
+    gains: Float,
+    terms: Float,
+    shape: tuple[int, int, int, int, int, int],
+    state: Float,
+    out: Float,
+) -> None:
+    """Run as :func:`_run_leaping` does, with what has joined the plain drive but a spring.
+
+    Within a leap the torque is its mean: what bends in between is not seen at the table.
+    """
+    kept, n_speed, n_current, order, last = shape[1], shape[2], shape[3], shape[4], reference.size - 1
+    kv, kff, speed_kp, speed_ki, position_ki = (
+        gains[KV],
+        gains[KFF],
+        gains[SPEED_KP],
+        gains[SPEED_KI],
+        gains[POSITION_KI],
+    )
+    period, current_max, voltage_max = gains[PERIOD], gains[CURRENT_MAX], gains[VOLTAGE_MAX]
+    decay, seen = gains[SPEED_DECAY], state[SPEED_FILTERED]
+    i, w, x, demand_a = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_DEMAND]
+    speeds, currents, places = state[SPEED_INTEGRAL], state[CURRENT_INTEGRAL], state[POSITION_INTEGRAL]
+    torque_constant, rad_per_mm, load, slow = plant[14], gains[RAD_PER_MM], terms[LOAD], terms[STRIBECK]
+    positive, negative, dead_v, full_a = (
+        terms[DRY_POSITIVE],
+        terms[DRY_NEGATIVE],
+        terms[DEAD_TIME],
+        gains[FULL_DEAD_TIME_A],
+    )
+    half_mm, faster = gains[HALF_STEP_MM] * n_current, plant[10] * (0.5 * n_current)
+    for row in range(out.shape[1]):
+        k = first + row
+        r0, r1, r2 = reference[min(k, last)], reference[min(k + 1, last)], reference[min(k + 2, last)]
+        slope = (r1 - r0) / period
+        bend = (r2 - r1) / period - slope
+        forward = gains[ACCELERATION] * (bend / period)
+        out[ROW_STATE + CURRENT, row], out[ROW_STATE + SPEED, row], out[ROW_STATE + POSITION, row] = i, w, x
+        out[ROW_STATE + SPEED_INTEGRAL, row], out[ROW_STATE + CURRENT_INTEGRAL, row] = speeds, currents
+        out[ROW_STATE + CURRENT_DEMAND, row] = demand_a
+        if kept > POSITION_INTEGRAL:
+            out[ROW_STATE + POSITION_INTEGRAL, row] = places
+            state[SPEED_FILTERED] = seen
+            for n in range(SET_POINT_BEFORE, kept):
+                out[ROW_STATE + n, row] = state[n]
+        limited = 0
+        for m in range(n_speed):
+            part = m / n_speed
+            wanted, rate = r0 + (r1 - r0) * part, slope + bend * part
+            if order > 0:
+                _filter(wanted, rate, bend / period, order, gains[DECAY], state)
+                at = FILTERED + 3 * (order - 1)
+                wanted, rate, forward = state[at], state[at + 1], gains[ACCELERATION] * state[at + 2]
+            lag = wanted - x
+            place = places + position_ki * lag
+            seen = decay * seen + (1.0 - decay) * w
+            error = kv * lag + place + kff * rate - seen
+            candidate = speeds + speed_ki * error
+            raw = speed_kp * error + candidate + forward
+            demand_a = min(max(raw, -current_max), current_max)
+            if demand_a == raw:
+                speeds, places = candidate, place
+            shift = dead_v if i > 0.0 else -dead_v
+            left = currents - shift  # a constant voltage is taken from the integral, which comes to the same
+            if w == 0.0:
+                torque = 0.0
+                against = load + _ripple(rad_per_mm * x, terms)
+                push = torque_constant * i - against
+                room = min(positive - push, negative + push) + slow
+                may = _may_hold(i, left, demand_a, room, plant, leap)
+            else:
+                torque = _mean_torque(i, w, x, half_mm, faster, plant, rad_per_mm, terms)
+                may = _may_move(i, w, left, demand_a, torque, abs(torque), plant, leap)
+                if not w * _mapped(leap, LEAP_SPEED, i, w, left, demand_a, torque) > 0.0:
+                    may = np.inf
+            if dead_v != 0.0 and (min(abs(i), abs(demand_a)) < full_a or i * demand_a < 0.0):
+                may = np.inf
+            if may <= voltage_max - abs(dead_v):
+                limited += n_current if demand_a != raw else 0
+                if w == 0.0:
+                    i, _, currents = _leapt(i, w, left, demand_a, 0.0, leap)
+                else:
+                    x += _mapped(leap, LEAP_WAY, i, w, left, demand_a, torque)
+                    i, w, currents = (
+                        _mapped(leap, LEAP_CURRENT, i, w, left, demand_a, torque),
+                        _mapped(leap, LEAP_SPEED, i, w, left, demand_a, torque),
+                        _mapped(leap, LEAP_INTEGRAL, i, w, left, demand_a, torque),
+                    )
+                currents += shift
+            else:
+                state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL] = i, w, x, currents
+                limited += _cycles_with_terms(
+                    demand_a, demand_a != raw, plant, masses, gains, terms, n_current, 0, state
+                )
                 i, w, x, currents = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL]
         out[ROW_LIMITED, row] = limited
     state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_DEMAND] = i, w, x, demand_a
@@ -399,9 +544,9 @@ def run(
     rows: int,
     plant: Float,
     leap: Float,
-    masses: Float,
+    masses: Float | None,
     gains: Float,
-    terms: Float,
+    terms: Float | None,
     shape: tuple[int, int, int, int, int, int],
     state: Float,
 ) -> Float:
@@ -409,7 +554,7 @@ def run(
 
     ``reference`` (n,) mm is held beyond its end; ``speed_offset`` rad/s and ``current_offset`` A are (n,) or empty.
     ``plant`` (16,), ``leap`` (LEAP_ROWS, LEAP_COLUMNS) or empty, and ``gains`` (GAINS,): see :mod:`fdhil.model.loops`.
-    ``terms``, empty for a plain drive, and ``masses``: see :mod:`fdhil.model.terms`. ``shape``: law, states kept of
+    ``terms``, None for a plain drive, and ``masses``: see :mod:`fdhil.model.terms`. ``shape``: law, states kept of
     each row, speed cycles per SYNC cycle, current cycles per speed cycle, order of the set-point filter, current cycles
     of delay. ``state`` (STATES,) is written.
     """
@@ -417,7 +562,10 @@ def run(
     last = reference.size - 1
     out = np.empty((ROW_STATE + kept, rows))
     if law == CASCADE and leap.size > 0 and speed_offset.size + current_offset.size == 0:
-        _run_leaping(reference, first, plant, leap, gains, shape, state, out)
+        if terms is None:
+            _run_leaping(reference, first, plant, leap, gains, shape, state, out)
+        else:
+            _run_leaping_with_terms(reference, first, plant, leap, masses, gains, terms, shape, state, out)
         return out
     kff, period, current_max, filtered = gains[KFF], gains[PERIOD], gains[CURRENT_MAX], gains[SPEED_DECAY] > 0.0
     for row in range(rows):
@@ -441,7 +589,9 @@ def run(
                 speed = _seen(state[SPEED], state, gains) if filtered else state[SPEED]
                 raw, speed_integral, position_integral = _cascade(place, kff * rate + more, speed, state, gains)
             else:
-                raw, speed_integral, position_integral = _pid(place, more, state, gains)
+                turned = gains[RAD_PER_MM] * (state[POSITION] - state[POSITION_BEFORE])
+                turned = _seen(turned, state, gains) if filtered else turned
+                raw, speed_integral, position_integral = _pid(place, more, turned, state, gains)
             raw += gains[ACCELERATION] * acceleration
             if current_offset.size > 0:
                 raw += _between(current_offset, k, part)
@@ -450,9 +600,9 @@ def run(
                 state[SPEED_INTEGRAL], state[POSITION_INTEGRAL] = speed_integral, position_integral
             state[CURRENT_DEMAND] = demand_a
             clipped = demand_a != raw
-            if terms.size > 0:
-                limited += _cycles_with_terms(demand_a, clipped, plant, masses, gains, terms, n_current, delay, state)
+            if terms is None:
+                limited += _current_cycles(demand_a, clipped, plant, gains, n_current, delay, state)
             else:
-                limited += _current_cycles(demand_a, clipped, plant, gains, n_current, state)
+                limited += _cycles_with_terms(demand_a, clipped, plant, masses, gains, terms, n_current, delay, state)
         out[ROW_LIMITED, row] = limited
     return out

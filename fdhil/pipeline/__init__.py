@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from fdhil.pipeline.analysis import analyse
 from fdhil.pipeline.axis import POOL_WINDOWS, AxisPipeline, Known, Record
-from fdhil.pipeline.drive_loops import judged_again
 from fdhil.pipeline.pooling import pool
 
-__all__ = ["POOL_WINDOWS", "AxisPipeline", "Known", "Record", "analyse", "judged_again", "pool"]
+__all__ = ["POOL_WINDOWS", "AxisPipeline", "Known", "Record", "analyse", "pool"]

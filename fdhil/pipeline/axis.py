@@ -16,8 +16,7 @@ from fdhil.identification.between import HISTORY, Member
 from fdhil.identification.drift import LEAST_JUMP, DriftTracker, Point
 from fdhil.identification.pooling import member
 from fdhil.identification.windows import find_windows
-from fdhil.pipeline.analysis import analyse
-from fdhil.pipeline.drive_loops import DriveLoops
+from fdhil.pipeline.own_loops import OwnLoops
 from fdhil.pipeline.pooling import one_sided, refuses_the_model, together
 from fdhil.pipeline.recent_samples import RecentSamples
 from fdhil.prediction import skill
@@ -111,7 +110,6 @@ class AxisPipeline:
         self._settings = _settings(config, method)
         self._period_s = config.machine.sync_period_s
         known = known or Known()
-        self._loops = DriveLoops(config.axis[axis], self._settings, self._period_s, known.loops)
         self._recent = RecentSamples(axis, config.axis[axis], self._ticks(RECENT_S), self._period_s)
         self._rapids: deque[_Rapid] = deque()
         self._temperature: Temperature | None = None
@@ -123,6 +121,8 @@ class AxisPipeline:
         self._tracker.resume(known.first, known.points)
         self._history: deque[Member] = deque(_since_jump(known), maxlen=HISTORY)
         self._with_skill = with_skill
+        # else the axis' section is made up
+        self._loops = OwnLoops(config.axis[axis] if with_skill else None, self._settings, self._period_s, known.loops)
         self._gain_suspected = False
         self._place = self._history[-1].place if self._history else 0
         self._withheld: tuple[str, ...] = ()  # why the newest pool was not published: told once
@@ -200,13 +200,9 @@ class AxisPipeline:
         return [w for w in find_windows(recording) if rapid.start <= w.start_tick + w.n // 2 <= end]
 
     def _analyse(self, window: Window) -> list[Outcome]:
-        outcome = self._judged_window(window)
+        outcome, loops = self._loops.analyse(window)
         before = self._published
-        outcomes: list[Outcome] = [outcome]
-        found = self._loops.take(outcome) if self._with_skill else None
-        if found is not None:
-            outcome = self._judged_window(window)
-            outcomes = [outcome, found]
+        outcomes: list[Outcome] = [outcome] if loops is None else [outcome, loops]
         if refuses_the_model(outcome):
             self._refused[window.direction] = outcome
         # a correction needs all six: what a slow voltage leaves open keeps the older set in use
@@ -218,10 +214,6 @@ class AxisPipeline:
                 outcomes += self._publish(window)
         judged = self._judge(window, before or self._published)
         return [*outcomes, judged] if judged else outcomes
-
-    def _judged_window(self, window: Window) -> WindowOutcome:
-        """Return what one window says, judged by the loops that are used now."""
-        return analyse(window, self._settings, self._loops.axis if self._with_skill else None, self._period_s)
 
     def _track(self, outcome: WindowOutcome, estimate: Estimate) -> list[Notice]:
         """Hold a window back that jumped; once further ones agree with it they are the new pool."""
@@ -294,7 +286,7 @@ class AxisPipeline:
         """Compare the move with what the set that was valid before it predicts; None where that cannot be done."""
         if published is None or not self._with_skill:
             return None
-        axis = self._loops.axis
+        axis = self._loops.axis or self._config.axis[self.axis]
         signals = (window.demand_mm, window.position_mm)
         try:
             return skill(

@@ -34,7 +34,7 @@ def _enough_rows(evidence: Evidence) -> bool:
 
 
 def _has_voltage(evidence: Evidence) -> bool:
-    return evidence.window.voltage_v is not None or evidence.window.slow_voltage is not None
+    return evidence.has_voltage
 
 
 def _fitted(evidence: Evidence) -> bool:
@@ -161,10 +161,10 @@ BEFORE_ANY_FIT: Sequence[Check] = (
 OF_THE_FIT: Sequence[Check] = (
     Check("stuck", stuck_values),
     Check("cut off", clipped_peaks, _fitted),
-    Check("estimate", _estimate_faults),
-    Check("late torque", torque_late, _without_voltage, ("estimate",)),
-    Check("load", load_comes_and_goes, _without_voltage, ("estimate", "late torque")),
-    Check("torque", torque_unexplained, _without_voltage, ("estimate", "late torque", "load")),
+    Check("late torque", torque_late, _without_voltage),
+    Check("load", load_comes_and_goes, _without_voltage, ("late torque",)),
+    Check("torque", torque_unexplained, _without_voltage, ("late torque", "load")),
+    Check("estimate", _estimate_faults, unless=("late torque", "load", "torque")),
     Check("fit", _no_fit, _has_voltage, ("estimate",)),
     Check("late voltage", _electrically_late, _fitted),
     Check("late current", _current_late, _sound, ("late voltage",)),

@@ -104,6 +104,16 @@ class Evidence:
         return backlash(self.window)
 
     @cached_property
+    def torque(self) -> TorqueFit | None:
+        """The fit of [2] alone, for a window without a voltage; None where hardly any row surely moves."""
+        return None if self.has_voltage else fit_torque(self.window, self.settings)
+
+    @property
+    def has_voltage(self) -> bool:
+        """Whether the window has a voltage, of the drive or of a slow sensor."""
+        return self.window.voltage_v is not None or self.window.slow_voltage is not None
+
+    @cached_property
     def parameters(self) -> Parameters | None:
         """The estimate as a drive that can be run; what a voltage would tell of it, and did not, is the fit's own."""
         if self.estimate is None or not set(PARAMETERS) <= set(self.estimate.names):
@@ -111,7 +121,10 @@ class Evidence:
         told = self.estimate.parameters()
         if self.fit is not None:
             told = completed(told, Parameters(*self.fit.theta[:6]))
-        return completed(told, Parameters(**self.axis.nominal.model_dump())) if self.axis is not None else told
+        if self.axis is not None:
+            return completed(told, Parameters(**self.axis.nominal.model_dump()))
+        # through an ordinary loop R and L, which only a voltage tells, do nothing
+        return told if self.has_voltage else told.changed(R=1.0, L=1.0)
 
     @cached_property
     def move(self) -> Move | None:
@@ -120,6 +133,8 @@ class Evidence:
             return None
         moving = np.zeros(self.window.n)
         moving[slice(*self.moving)] = self.window.direction
+        if self.torque is not None:
+            moving = self.torque.rows.side
         mode = moving if self.fit is None else self.fit.problem.motions[0].mode
         return Move.of(self.window, self.parameters, np.where(np.abs(mode) == 1, mode, 0.0))
 
@@ -186,11 +201,6 @@ class Evidence:
         if self.weight is None:
             return reason
         return replace(reason, text=f"{reason.text}; at the table {self.weight.told(self.cost_um(lack))}")
-
-    @cached_property
-    def torque(self) -> TorqueFit | None:
-        """The fit of [2] alone; None where hardly any row surely moves."""
-        return fit_torque([self.window], self.settings)
 
     @property
     def judged(self) -> Fit:

@@ -89,7 +89,7 @@ def replay_window(window: Window, parameters: Parameters, axis: Axis, sync_perio
 
     What a drive makes of its set-points between rows, or of those between two rows, is not recorded. None too where
     demand or position were not recorded, or did not move. What is compared is the move: where within its friction the
-    shaft comes to rest, one rapid does not tell. Its dry friction holds a constant load, too, and how much of it is load
+    shaft comes to rest, one rapid does not tell. Its dry friction holds a constant load, too; how much of it is load
     shows as it leaves rest alone: of what it may be, that is taken which explains the rapid best.
     """
     if abs(window.dt_s / sync_period_s - 1.0) > OFF_GRID or not (
@@ -116,7 +116,7 @@ def replay_window(window: Window, parameters: Parameters, axis: Axis, sync_perio
 def _parted(p: Parameters, direction: int, current_a: float, share: float) -> tuple[Parameters, float] | None:
     """Return a drive that moves the same way in ``direction`` with a load, and the current that it holds at rest.
 
-    With the friction Cd + D and a load D that helps the move it goes as with Cd. D is ``share`` of Cd, and at least what
+    With the friction Cd + D and a load D that helps the move it goes as with Cd. D is ``share`` of Cd, at least what
     holds the shaft under the current; None where that is another share. Where no load holds it, it has friction at rest
     that the model lacks, and the current is what the model holds.
     """

@@ -2,7 +2,8 @@
 
 Where the axis' regulators are known, the rapid is replayed through the closed loop with the model, and what that leaves
 of the measured positions is weighed against the tolerance. Where they are not, the torque that the model leaves is sent
-through an ordinary loop, and weighed against what all torque of the move makes there: the share hardly depends on it.
+through an ordinary loop, and weighed against what all torque of the move makes there (the share hardly depends on the
+loop), or against the following error that was recorded where that is larger: a drive without feed-forward.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from fdhil.config import Axis, Identification
+from fdhil.config.controller import TOLERANCE_SHARE
 from fdhil.identification.filtering import moving_mean
 from fdhil.identification.windows import carried
 from fdhil.model.terms import torque
@@ -21,7 +23,6 @@ from fdhil.records import PARAMETERS, Bool, Float, Parameters, Reason, Window, r
 from fdhil.validation.replay import Replay, replay_window
 from fdhil.validation.table_error import TableError
 
-TOLERANCE_SHARE = 0.05  # of the following error: on two machines with 90 real effects it parts what gains from what not
 NEXT_SPEED = 0.3  # of the rapid speed: that of a program that is cut
 SCATTER = 3.0  # deviations by which the power of noise may lie above what is expected
 BEGINNING_S = 0.060  # before the drive surely moves
@@ -32,7 +33,7 @@ NOISE_ROWS = 25.0e-3  # s: over which noise behind a position loop hangs togethe
 
 def tolerance_um(settings: Identification, following_um: float) -> float:
     """Return the RMS at the table that a model may leave of a rapid with this following error."""
-    return settings.tolerance_um or TOLERANCE_SHARE * following_um
+    return settings.tolerance_for(following_um)
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,10 +182,20 @@ def weigh(
     whole, left = (rms(row) for row in loop.um(np.array([move.whole(parameters), move.left(parameters)]), window.dt_s))
     left = _beyond_noise(left, loop, parameters, move, noise)
     told = _replayed(window, parameters, axis, sync_period_s)
+    if told is None and axis is not None:
+        return Weight(left, tolerance_um(settings, whole), whole, left, "own loop")
     if told is None:
-        limit = tolerance_um(settings, whole) if axis is not None else TOLERANCE_SHARE * whole
-        return Weight(left, limit, whole, left, "own loop" if axis is not None else "ordinary loop")
+        limit = TOLERANCE_SHARE * max(whole, _followed_um(window))
+        return Weight(left, limit, whole, left, "ordinary loop")
     return Weight(told.unexplained_um, tolerance_um(settings, told.measured_um), told.measured_um, left, "replay")
+
+
+def _followed_um(window: Window) -> float:
+    """Return the RMS following error that was recorded beyond that at rest, um; 0 where the demand was not."""
+    apart = (window.position_mm - window.demand_mm)[np.isfinite(window.position_mm - window.demand_mm)]
+    if apart.size == 0 or not np.nanmax(window.demand_mm) > np.nanmin(window.demand_mm):
+        return 0.0
+    return 1e3 * rms(apart - apart[0])
 
 
 def _runs(parameters: Parameters) -> bool:

@@ -14,7 +14,7 @@ from fdhil.validation.significance import BUDGET
 
 EDGES = 20  # instants at which a load may begin or end
 LEAST_LOAD = 0.05  # of the peak current: a screw's friction differs from place to place by less
-LARGEST_SHARE = 0.05  # of the torque's RMS that the model may leave unexplained
+LARGEST_SHARE = 0.10  # of the torque's RMS that the model may leave unexplained: more, and it is no model of this drive
 LATE_ROWS = 1.0
 IMITATED = 1e-6  # of a course's power, below which only rounding is left of it
 
@@ -50,10 +50,11 @@ def load_comes_and_goes(evidence: Evidence) -> Iterator[Reason]:
     seen = power > IMITATED * np.square(blocks).sum(axis=0)
     amplitude = np.where(seen, beyond.T @ left / np.where(seen, power, 1.0), 0.0)
     k = int(np.argmax(np.abs(amplitude) * np.sqrt(power)))
-    chance = rms(left) * np.sqrt(left.size / effective_rows(fitted) / max(power[k], 1e-300))
+    rest = left - amplitude[k] * beyond[:, k]
+    chance = rms(rest) * np.sqrt(rest.size / effective_rows(rest) / max(power[k], 1e-300))
     least = LEAST_LOAD * float(np.abs(fitted.current).max())
     if abs(amplitude[k]) > max(least, BUDGET["structure"].deviations * chance):
-        rows = np.flatnonzero(fitted.parts[0].usable)
+        rows = np.flatnonzero(fitted.rows.usable)
         a, b = (evidence.time_s(int(rows[min(edge, rows.size - 1)])) for edge in edges[[starts[k], ends[k]]])
         text = f"a torque as of {amplitude[k]:+.3g} A that is no friction acts from {a:.3f} to {b:.3f} s"
         yield Reason("LoadDetected", text, "identify from moves without cutting, clamping or collision")

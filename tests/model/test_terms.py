@@ -168,11 +168,12 @@ def test_runs_in_pieces_give_the_same_bits(joined: str) -> None:
 def test_terms_that_are_nil_are_none() -> None:
     """The steps with terms are the plain ones where every term is 0."""
     demand, axis = there_and_back(150), bench()
-    nil = closed_loop.simulate(PLAIN.changed(load=0.0), axis, PERIOD, demand)
-    drive = closed_loop.prepare(PLAIN, axis, PERIOD)
-    assert isinstance(drive, loops.Drive)
-    stepping = replace(drive, leap=np.empty((0, drive.leap.shape[1])))
-    plain = stepping.run(closed_loop.Commands(demand), closed_loop.start(float(demand[0])))
+    start, found = closed_loop.start(float(demand[0])), []
+    for parameters in (PLAIN, PLAIN.changed(load=0.0)):
+        drive = closed_loop.prepare(parameters, axis, PERIOD)
+        assert isinstance(drive, loops.Drive)
+        found.append(replace(drive, leap=drive.leap[:0]).run(closed_loop.Commands(demand), start))
+    plain, nil = found
     assert np.array_equal(nil.position_mm, plain.position_mm)
     assert np.array_equal(nil.current_a, plain.current_a)
 
@@ -192,3 +193,21 @@ def test_the_torque_is_the_formula() -> None:
     dry = np.array([-3.0 - 0.8 * np.exp(-4.0), 0.0, 4.2 + 0.8 * np.exp(-0.25)])
     expected = -1.5 + dry + np.array([0.04, 0.0, 0.05]) * speed + ripple
     assert np.allclose(terms.torque(p, speed, angle), expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("joined", TERMS)
+def test_leaps_give_what_steps_give(joined: str, seed: int) -> None:
+    """Speed cycles taken at once, with the mean of what bends in between, are those taken step by step."""
+    random = np.random.default_rng(seed)
+    axis = bench(speed_filter_s=0.0005 * (seed == 1), setpoint_filter_s=0.001 * (seed == 2))
+    parameters = PLAIN.changed(**TERMS[joined], Jt=PLAIN.Jt * random.uniform(0.7, 1.4))
+    demand = there_and_back(300) + (np.arange(300) > 200) * 3.0 * (seed == 3)  # a jump clips
+    drive = closed_loop.prepare(parameters, axis, PERIOD)
+    assert isinstance(drive, loops.Drive)
+    stepping = replace(drive, leap=drive.leap[:0])
+    start = closed_loop.standing(parameters, axis, float(demand[0]))
+    one, other = (d.run(closed_loop.Commands(demand), start) for d in (drive, stepping))
+    assert np.abs(one.position_mm - other.position_mm).max() < 0.02e-3
+    assert np.abs(one.current_a - other.current_a).max() < 0.05
+    assert np.abs(one.limited - other.limited).max() <= 1 / 16

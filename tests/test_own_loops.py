@@ -7,10 +7,9 @@ from dataclasses import replace
 import pytest
 
 from fdhil.config import Identification
-from fdhil.identification.loops import better_loops
 from fdhil.identification.windows import find_windows
-from fdhil.pipeline import analyse, judged_again
-from fdhil.pipeline.drive_loops import DriveLoops
+from fdhil.pipeline import analyse
+from fdhil.pipeline.own_loops import OwnLoops, better_axis, loops_of, suspected
 from fdhil.records import WindowOutcome
 from fdhil.validation.weight import LOOPS_DIFFER
 from studies.bench import shuttle
@@ -38,28 +37,32 @@ def filtered() -> list[WindowOutcome]:
 def test_other_loops_are_named_and_then_used(filtered: list[WindowOutcome]) -> None:
     for outcome in filtered:
         assert [reason.code for reason in outcome.verdict.reasons] == [LOOPS_DIFFER]
-    again, found = judged_again(filtered, SETTINGS, AXIS, PERIOD_S)
+    assert suspected(filtered)
+    found = loops_of(filtered, AXIS, SETTINGS, PERIOD_S)
     assert found is not None
     told = dict(zip(found.names, found.values.tolist(), strict=True))
     assert told["speed_filter_s"] == pytest.approx(0.001, rel=0.05)
     assert told["speed_kp"] == pytest.approx(AXIS.regulators.speed_kp, rel=0.05)
+    better = better_axis(AXIS, found)
+    assert better is not None
+    again = [analyse(outcome.window, SETTINGS, better, PERIOD_S) for outcome in filtered]
     assert all(outcome.verdict.accepted for outcome in again)
 
 
-def test_the_second_rapid_shows_them_on_a_running_machine(filtered: list[WindowOutcome]) -> None:
-    loops = DriveLoops(AXIS, SETTINGS, PERIOD_S)
-    assert loops.take(filtered[0]) is None
-    assert loops.axis is AXIS
-    found = loops.take(filtered[1])
+def test_a_running_machine_goes_on_with_its_own_loops(filtered: list[WindowOutcome]) -> None:
+    loops = OwnLoops(AXIS, SETTINGS, PERIOD_S)
+    first, found = loops.analyse(filtered[0].window)
     assert found is not None
-    assert better_loops(found)
+    assert first.verdict.accepted
+    assert loops.axis is not None
     assert loops.axis.regulators.speed_filter_s == pytest.approx(0.001, rel=0.05)
-    after_restart = DriveLoops(AXIS, SETTINGS, PERIOD_S, known=found)
+    second, again = loops.analyse(filtered[1].window)
+    assert again is None
+    assert second.verdict.accepted
+    after_restart = OwnLoops(AXIS, SETTINGS, PERIOD_S, known=found)
+    assert after_restart.axis is not None
     assert after_restart.axis.regulators == loops.axis.regulators
 
 
 def test_loops_that_explain_the_rapids_are_left_alone() -> None:
-    good = outcomes(Loops())
-    again, found = judged_again(good, SETTINGS, AXIS, PERIOD_S)
-    assert found is None
-    assert all(one is other for one, other in zip(again, good, strict=True))
+    assert not suspected(outcomes(Loops()))

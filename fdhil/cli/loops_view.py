@@ -1,0 +1,100 @@
+"""``fdhil identify --loops``: the drive's own loops beside the configured ones."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from fdhil.records import INTERVAL_95
+
+if TYPE_CHECKING:
+    from fdhil.cli.batch import FileResult
+    from fdhil.config import Axis, Identification, Regulators
+    from fdhil.records import LoopEstimate
+
+UNITS: Mapping[str, str] = {
+    "position_gain_per_s": "1/s",
+    "speed_feedforward": "1",
+    "speed_kp": "A.s/rad",
+    "speed_ki": "A/rad",
+    "position_ki_per_s2": "1/s2",
+    "torque_feedforward": "1",
+    "speed_filter_s": "s",
+    "setpoint_filter_s": "s",
+    "current_delay_cycles": "1",
+}
+
+
+def with_all_loops(
+    results: Sequence[FileResult], settings: Identification, axes: Mapping[str, Axis]
+) -> list[FileResult]:
+    """Return the results with the loops of each recording, also where nothing had called for them."""
+    from fdhil.pipeline.own_loops import loops_of
+
+    return [r if r.loops else replace(r, loops=loops_of(r.outcomes, axes.get(r.axis or ""), settings)) for r in results]
+
+
+def compared(found: LoopEstimate | None, axis: Axis | None) -> dict[str, Any] | None:
+    """Return the loops as JSON has them, beside the configured ones; None where the recording shows none."""
+    from fdhil.daemon.outcome_json import loops_document
+
+    if found is None:
+        return None
+    regulators = None if axis is None else axis.regulators
+    document = loops_document(found)
+    gains = document["gains"].items()
+    return {
+        "structure": found.structure,
+        "configured_structure": None if regulators is None else regulators.structure,
+        "gains": {n: {**told, "unit": UNITS[n], "configured": _configured(regulators, n)} for n, told in gains},
+        **{key: document[key] for key in ("validated", "unexplained_um", "configured_um", "reasons", "warnings")},
+    }
+
+
+def loops_line(told: Mapping[str, Any]) -> str:
+    """Return what the status tells of an axis' loops, for people; nothing where they are as configured."""
+    if told["validated"] and not told["warnings"]:
+        return ""
+    gains = ", ".join(f"{name} {figures['value']:.4g}" for name, figures in told["gains"].items())
+    return f"loops {told['structure']}, {gains}; {'; '.join((*told['reasons'], *told['warnings']))}"
+
+
+def _each(found: LoopEstimate) -> list[tuple[str, float, float]]:
+    stds = (math.sqrt(found.covariance[k, k]) for k in range(len(found.names)))
+    return list(zip(found.names, found.values.tolist(), stds, strict=True))
+
+
+def _configured(regulators: Regulators | None, name: str) -> float | None:
+    return None if regulators is None else float(getattr(regulators, name))
+
+
+def show_loops(result: FileResult, axis: Axis | None, console: Any) -> None:
+    """Write a table of the loops of one recording, and what they explain."""
+    from rich import box
+    from rich.table import Table
+
+    found = result.loops
+    if found is None:
+        text = "  the loops are not shown: no rapid whose demand, position and current were recorded"
+        console.print(text, highlight=False, markup=False)
+        return
+    regulators = None if axis is None else axis.regulators
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+    told = "" if regulators is None else f" (configured: {regulators.structure})"
+    console.print(f"loops: {found.structure}{told}", style="italic", highlight=False, markup=False)
+    for head in ("regulators", "found", "configured", "unit"):
+        table.add_column(head, justify="left" if head in ("regulators", "unit") else "right", no_wrap=True)
+    for name, value, std in _each(found):
+        configured = _configured(regulators, name)
+        shown = "-" if configured is None else f"{configured:.5g}"
+        table.add_row(name, f"{value:.4g} ± {INTERVAL_95 * std:.2g}", shown, UNITS[name])
+    console.print(table)
+    left = found.verdict.unexplained_um
+    text = f"  these loops leave {left:.3g} um of the following error"
+    if found.configured_um is not None:
+        text += f", the configured ones {found.configured_um:.3g} um"
+    console.print(text, highlight=False, markup=False)
+    for reason in (*found.verdict.reasons, *found.verdict.warnings):
+        console.print(f"  {reason}; {reason.advice}", highlight=False, markup=False)

@@ -1,0 +1,102 @@
+"""Seeks a drive's own loops where the configured ones do not explain its rapids, for the analysis to go on with."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+from fdhil.config import Axis, Identification
+from fdhil.identification.loops import better_loops, identify_loops, with_loops
+from fdhil.pipeline.analysis import analyse, own
+from fdhil.records import LoopEstimate, Parameters, Window, WindowOutcome
+from fdhil.validation.weight import LOOPS_DIFFER
+
+ENOUGH = 4  # windows, both directions twice
+KEPT = 6
+# of a motor whose data sheet is not known: fast enough to be no part of what is sought
+UNKNOWN_R, UNKNOWN_L = 1.0, 5e-3
+
+
+def loops_of(
+    outcomes: Sequence[WindowOutcome],
+    axis: Axis | None,
+    settings: Identification,
+    sync_period_s: float | None = None,
+) -> LoopEstimate | None:
+    """Return the loops of a drive as the windows show them that were analysed; None where they show none.
+
+    What the axis' section or a window's own estimate does not tell of the winding is made up: the current loop hides
+    it. Windows that are believed go before the others, and a section that is another machine's is none.
+    """
+    axis = own(outcomes[0].window, axis) if outcomes else None
+    told = [(o, mechanics_of(o, axis)) for o in outcomes]
+    known = [(o, plant) for o, plant in told if plant is not None]
+    believed = [(o, plant) for o, plant in known if o.verdict.accepted]
+    chosen = believed or known
+    return identify_loops([o.window for o, _ in chosen], [p for _, p in chosen], axis, settings, sync_period_s)
+
+
+def mechanics_of(outcome: WindowOutcome, axis: Axis | None) -> Parameters | None:
+    """Return the parameters of a window's estimate, its winding filled up; None where K, Jt, ft or Cd is not told."""
+    if outcome.estimate is None:
+        return None
+    found = outcome.estimate.parameters()
+    values = found.as_dict()
+    winding = {"R": UNKNOWN_R, "L": UNKNOWN_L} if axis is None else {"R": axis.nominal.R, "L": axis.nominal.L}
+    filled = {name: winding.get(name, value) if value != value else value for name, value in values.items()}
+    if any(value != value for value in filled.values()) or filled["Jt"] <= 0.0 or filled["K"] <= 0.0:
+        return None
+    return found.changed(**filled)
+
+
+def suspected(outcomes: Sequence[WindowOutcome]) -> bool:
+    """Return whether some window is refused for its loops: the model explains its torque, and not its replay."""
+    return any(reason.code == LOOPS_DIFFER for o in outcomes for reason in o.verdict.reasons)
+
+
+def better_axis(axis: Axis | None, found: LoopEstimate | None) -> Axis | None:
+    """Return the axis with the loops that were found, where they explain what the configured ones do not; else None."""
+    return with_loops(axis, found) if axis is not None and found is not None and better_loops(found) else None
+
+
+class OwnLoops:
+    """An axis' own loops as its rapids come one by one: each is analysed through the best that are known.
+
+    They are sought once after the first ``ENOUGH`` rapids, so that they are told, and where a rapid is refused that was
+    replayed: at once, and each time after twice as many refused rapids as before, since it takes long.
+    """
+
+    def __init__(
+        self, axis: Axis | None, settings: Identification, sync_period_s: float, known: LoopEstimate | None = None
+    ) -> None:
+        """``axis`` is the machine's section, None where none is known: then no loops are sought.
+
+        ``known`` are those that were found in an earlier run.
+        """
+        self._configured = axis
+        self._settings = settings
+        self._period_s = sync_period_s
+        self._outcomes: deque[WindowOutcome] = deque(maxlen=KEPT)
+        self._seen = self._refused = 0
+        self._due = 1
+        self.axis = better_axis(axis, known) or axis
+
+    def analyse(self, window: Window) -> tuple[WindowOutcome, LoopEstimate | None]:
+        """Return what a window says of the drive, and its loops where they were sought again."""
+        outcome = analyse(window, self._settings, self.axis, self._period_s)
+        if self._configured is None:
+            return outcome, None
+        self._outcomes.append(outcome)
+        self._seen += 1
+        self._refused += suspected([outcome])
+        wanted = self._refused >= self._due
+        if wanted:
+            self._refused, self._due = 0, 2 * self._due
+        elif self._seen != ENOUGH:
+            return outcome, None
+        found = loops_of(tuple(self._outcomes), self._configured, self._settings, self._period_s)
+        better = better_axis(self._configured, found)
+        if better is not None:
+            self.axis = better
+            outcome = analyse(window, self._settings, better, self._period_s) if wanted else outcome
+        return outcome, found
