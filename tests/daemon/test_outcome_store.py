@@ -15,7 +15,7 @@ import pytest
 from fdhil.daemon.outcome_json import as_document, set_document
 from fdhil.daemon.outcome_store import OutcomeStore, raw_scales
 from fdhil.identification.pooling import member
-from fdhil.records import Notice, Outcome, frozen
+from fdhil.records import LoopEstimate, Notice, Outcome, Verdict, frozen
 from fdhil.store.history import FILE_NAME, History
 from fdhil.store.windows import encode_window, list_windows
 from tests.daemon.machine import config_of
@@ -136,6 +136,19 @@ def test_what_windows_tell_a_pool_is_known_again(tmp_path: Path) -> None:
     fresh = member(made.window, made.estimate)
     for name in ("values", "own", "shared"):
         assert getattr(known.members[0], name).tobytes() == getattr(fresh, name).tobytes()
+
+
+def test_loops_are_known_again_as_long_as_the_configuration_is_the_same(tmp_path: Path) -> None:
+    found = LoopEstimate("X", "cascade", ("speed_filter_s",), frozen([1e-3]), frozen([[1e-10]]), Verdict(True, None))
+    store, _ = opened(tmp_path)
+    digest = config_of(tmp_path).digest
+    assert store.keep([found, published(1)]) == []
+    assert store.known("X").loops is None
+    assert store.keep([replace(published(2), config_digest=digest)]) == []
+    loops = store.known("X").loops
+    store.close()
+    assert loops is not None
+    assert (loops.names, loops.values.tolist()) == (found.names, [1e-3])
 
 
 def test_a_load_is_part_of_what_is_told_in_json() -> None:
