@@ -18,8 +18,8 @@ def section(realistic: Realistic) -> Section:
     text = (
         "The same loop on the same machine with what ordinary real ones have besides the equations of the paper. "
         "The errors are those of the true table. Its motors' encoders do not see how the screws give: that resonance "
-        "is told to fdhil, the rest it found out from four rapids of each axis. The current sensors are 1 % off, and so "
-        "are R, L, Jt, ft and Cd, which are told in their amperes."
+        "is told to fdhil, the rest it found out from four rapids of each axis. The current sensors are 1 % off, and "
+        "so are R, L, Jt, ft and Cd, which are told in their amperes."
     )
     if realistic.refused:
         text += f" It was not corrected: {realistic.refused}."
