@@ -36,7 +36,8 @@ TERMS = ("stribeck", *(f"ripple_screw_{order}" for order in SCREW_ORDERS))
 WORTH = 0.005  # of the torque's RMS: what a term must explain, a tenth of what may be left
 SUMMED_SHARE = 0.1  # of a window's rows: over which its residuals may hang together
 WIDENED = 2.9694 / 1.96  # per share, of the 95 % interval: Kiefer and Vogelsang 2005, Bartlett's weights
-OPEN_SHARE = 3e-4  # of Jt: what the current's course between two rows leaves open
+OPEN_SHARE = 3e-4  # of Jt: what a current that is read once a row leaves open
+OPEN_SHARE_ROWS = 3e-5  # the same in rows of 1 ms; it grows with their square
 NO_VOLTAGE = Reason("LowExcitation", "there is no voltage, so [1] gives no R and L", "connect the voltage sensor")
 NO_K = Reason(
     "LowExcitation",
@@ -315,7 +316,8 @@ def _doubts(fitted: TorqueFit, rates: Float) -> Float:
     """
     power = float(np.mean(np.square(fitted.design[:, 0])))
     noise = fitted.rows.error_rad_s2**2 / max(power, 1e-300)
-    inertia = np.eye(len(rates))[0] * abs(fitted.theta[0]) * np.hypot(OPEN_SHARE, noise)
+    unread = OPEN_SHARE + OPEN_SHARE_ROWS * (1e3 * fitted.rows.dt_s) ** 2
+    inertia = np.eye(len(rates))[0] * abs(fitted.theta[0]) * np.hypot(unread, noise)
     none = np.zeros(fitted.theta.size)
     shifts = [rates[:, : none.size] @ fitted.shifts.get(name, none) for name in TERMS]
     return np.column_stack([inertia, *shifts])
