@@ -131,3 +131,8 @@ def test_hardly_any_row_is_an_empty_estimate() -> None:
     assert torque_rows(lost, SETTINGS) is None
     assert fit(lost, SETTINGS) is None
     assert estimate(lost).result is Result.UNDER_EXCITED
+
+
+def test_a_screw_that_gives_takes_nothing_from_the_mass() -> None:
+    found = estimate(screw_windows(2, 0, replace(SCREW, resonance_hz=60.0))[0])
+    assert found.value("Jt") == pytest.approx(SCREW.Jt, rel=0.005)
