@@ -67,7 +67,7 @@ def _weak(estimate: Estimate, chosen: Sequence[Candidate], untold: set[str]) -> 
 
     Friction that pushes is none: what makes it so stands for something else.
     """
-    if not set(estimate.missing) <= untold:
+    if not set(estimate.missing) <= untold or chosen[-1].family not in estimate.names:
         return {chosen[-1].family}
     weak = {c.family for c in chosen if not abs(estimate.value(c.family)) > LEAST_SURE * _std(estimate, c.family)}
     low = estimate.value("stribeck") if "stribeck" in estimate.names else 0.0
