@@ -23,6 +23,7 @@ from fdhil.correction.inverse import AxisInverse, block_rows, common_delay_s
 from fdhil.correction.limits import check
 from fdhil.model import closed_loop
 from fdhil.model.closed_loop import State
+from fdhil.model.kernels import CURRENT
 from fdhil.prediction.contour import contour_error_um
 from fdhil.prediction.model_terms import Band, band
 from fdhil.records import Float, Parameters, rms
@@ -53,7 +54,6 @@ class FirstBlock:
         self.begin = begin
         self._models, self._config, self._period_s = models, config, config.machine.sync_period_s
         self._path = _first_rows(program, config)
-        self._used_a = dict.fromkeys(begin.offset, 0.0)
         rapid = {axis: config.axis[axis].rapid_speed_mm_s for axis in begin.offset}
         # rows that lag on purpose lag by what the whole path asks for
         self._fits = set(begin.offset) <= set(self._path) and common_delay_s(rapid, models, config)[0] == 0.0
@@ -61,11 +61,12 @@ class FirstBlock:
         if self._fits:
             starts = {axis: float(self._path[axis][0]) for axis in begin.offset}
             self._walks = {axis: AxisInverse.of(models[axis], config, axis, start) for axis, start in starts.items()}
+        self._used_a = {axis: float(walk.carry.state[CURRENT]) for axis, walk in self._walks.items()}
 
     def renew(self, rest: Mapping[str, AtRest]) -> Piece | None:
-        """Return rows that begin where the axes stand, now in force; None where those that are in force stay.
+        """Return rows that begin where the axes stand; None where those that are in force are to stay.
 
-        They stay where an axis does not stand at the program's start, where it stands as it was known to, or where
+        They are where an axis does not stand at the program's start, where all stand as they were known to, or where
         nothing is gained.
         """
         axes = tuple(self.begin.offset)
@@ -80,9 +81,12 @@ class FirstBlock:
         signs = {axis: self._config.axis[axis].scaling.sign for axis in axes}
         offset = {axis: (signs[axis] * one.offset).astype(np.int64).tolist() for axis, one in found.items()}
         rows = len(next(iter(offset.values())))
-        behind = {axis: values[rows:] for axis, values in self.begin.offset.items()}
-        self.begin = self.begin._replace(offset={axis: offset[axis] + behind[axis] for axis in axes})
         return Piece(0, {axis: values[:rows] for axis, values in self.begin.demand.items()}, offset, self.begin.final)
+
+    def take(self, rows: Piece) -> None:
+        """Know that these are in force."""
+        behind = {axis: values[len(rows.offset[axis]) :] for axis, values in self.begin.offset.items()}
+        self.begin = self.begin._replace(offset={axis: rows.offset[axis] + behind[axis] for axis in rows.offset})
 
     def expect(self, rest: Mapping[str, AtRest]) -> Piece | None:
         """Return rows for a machine that is taken to the start from where its axes ``rest``, as :meth:`renew` does.

@@ -14,6 +14,7 @@ from fdhil.validation.evidence import LEAST_ROWS, Evidence
 from fdhil.validation.interruptions import interruptions
 from fdhil.validation.plausibility import clipped, gaps, missing_stages, not_finite, position_parted
 from fdhil.validation.rest import friction_at_rest, rest_faults
+from fdhil.validation.shifts import LATE
 from fdhil.validation.simulation import expected_fit_percent
 from fdhil.validation.slow_fitted import slow_faults_beside
 from fdhil.validation.slow_readings import slow_voltage_faults
@@ -22,6 +23,9 @@ from fdhil.validation.stuck import clipped_peaks, stuck_values
 from fdhil.validation.timing import timing_faults, voltage_late
 from fdhil.validation.whiteness import excess_noise, whiteness
 from fdhil.validation.without_voltage import load_comes_and_goes, torque_late, torque_unexplained
+
+NEVER_NEGATIVE = ("dead_time",)
+SURE = 3.0  # standard deviations
 
 Findings = dict[str, list[Reason]]
 """What each check that was asked found, in the order of the table."""
@@ -94,6 +98,10 @@ def _estimate_faults(evidence: Evidence) -> Iterator[Reason]:
     if open_end or estimate.result is Result.DIVERGED:
         yield Reason("SolverFailed", "the fit does not converge", "look at the window's signals")
     yield from unphysical(evidence.told or estimate, one_way=True)
+    for name in estimate.terms:
+        if name in NEVER_NEGATIVE and estimate.value(name) < -SURE * estimate.std(name):
+            text = f"{name} = {estimate.value(name):.4g} would add voltage: voltage or current is off"
+            yield Reason("CalibrationSuspect", text, "set the zeros of current and voltage sensor at standstill")
 
 
 def _slips(evidence: Evidence) -> Iterator[Reason]:
@@ -125,13 +133,17 @@ def _current_late(evidence: Evidence) -> Iterable[Reason]:
 
 def _structure(evidence: Evidence) -> Iterator[Reason]:
     """Yield what the model lacks, each with its cost."""
-    yield from (evidence.priced(lack) for lack in evidence.lacks if lack.finding.matters)
+    for lack in evidence.lacks:
+        if lack.finding.matters:
+            yield evidence.with_cost(lack.finding.reason(), evidence.cost_um(lack))
 
 
 def _late(evidence: Evidence) -> Iterable[Reason]:
+    """Ask for a delay where the fit needs one, and where nothing else explains more of what a delay would do."""
     if evidence.late_s:
-        return voltage_late(evidence)
-    return timing_faults(evidence) if _sound(evidence) else ()
+        return voltage_late(evidence) if not evidence.lacks else ()
+    first = evidence.lacks[0].finding.name if evidence.lacks else LATE
+    return timing_faults(evidence) if _sound(evidence) and first.endswith(LATE) else ()
 
 
 def _simulation(evidence: Evidence) -> Iterator[Reason]:
@@ -167,7 +179,7 @@ BEFORE_ANY_FIT: Sequence[Check] = (
     Check("position", position_parted, _enough_rows, ("finite",)),
     # what position tells of the move's course is worth nothing where it contradicts the speed
     Check("whole move", interruptions, _enough_rows, ("finite", "position")),
-    Check("play", _play, _enough_rows, ("finite",), weighed=True),
+    Check("play", _play, _enough_rows, ("finite",)),
     Check("slow readings", slow_voltage_faults),
     Check("voltage", _no_voltage),
     Check("rows", _few_rows, unless=("finite", "stages", "slow readings", "voltage")),
@@ -189,7 +201,7 @@ OF_THE_FIT: Sequence[Check] = (
     # a late current seems to move a shaft at rest
     Check("standstill", rest_faults, _sound, ("late voltage", "late current")),
     Check("friction at rest", friction_at_rest, _sound, ("late voltage", "late current"), weighed=True),
-    Check("delay", _late, _fitted, MODEL[2:]),
+    Check("delay", _late, _fitted, ("late voltage", "late current", "standstill")),
     Check("simulation", _simulation, _fitted, (*MODEL, "delay"), weighed=True),
     Check("values", _values, _fitted, (*MODEL, "delay")),
     Check("slow sensor", slow_faults_beside, _fitted, ("range", "slow readings")),

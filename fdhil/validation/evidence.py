@@ -19,10 +19,12 @@ from fdhil.identification.without_voltage import TorqueFit
 from fdhil.identification.without_voltage import fit as fit_torque
 from fdhil.records import PARAMETERS, Bool, Estimate, Float, Parameters, Reason, Window, rms
 from fdhil.validation.backlash import DeadBand, backlash
+from fdhil.validation.breakaway import Breakaway, breakaway
 from fdhil.validation.selection import Lacking, lacking
 from fdhil.validation.sensor_reconstruction import Bridge
+from fdhil.validation.shifts import Shift, late_findings, shifts
 from fdhil.validation.simulation import fit_percent
-from fdhil.validation.structure import DEAD_TIME, OFFSET_CURRENT, Finding, findings
+from fdhil.validation.structure import DEAD_TIME, FRICTION, OFFSET_CURRENT, Finding, findings
 from fdhil.validation.table_error import TableError
 from fdhil.validation.weight import NEXT_SPEED, Move, Weight, completed, to_and_fro, weigh
 from fdhil.validation.widening import widened
@@ -165,7 +167,24 @@ class Evidence:
         whole, here, all_cut, there, *load = (
             rms(row) for row in loop.um(np.array([to_and_fro(row) for row in torques]), dt_s)
         )
-        return max(here, there * whole / max(all_cut, 1e-300), *load)
+        slower = whole / max(all_cut, 1e-300)
+        return max(here, there * slower, *(um * (slower if lack.finding.name == FRICTION else 1.0) for um in load))
+
+    @cached_property
+    def breakaway(self) -> Breakaway | None:
+        """What the move takes more to begin than the model says."""
+        return breakaway(self.window, self.on_time) if self.sound else None
+
+    def breakaway_um(self, found: Breakaway) -> float:
+        """Return what it makes at the table where a program is cut: the drive turns there, and is slow for longer."""
+        p, move = self.parameters, self.move
+        if p is None or move is None:
+            return math.inf
+        loop = TableError.of(p, self.window.pitch_mm, self.axis)
+        torques = [move.whole(p), move.slower(p, NEXT_SPEED).whole(p), found.momentum(self.window.n) / NEXT_SPEED]
+        courses = loop.um(np.array([to_and_fro(row) for row in torques]), self.window.dt_s)
+        whole, all_cut, late = (rms(row) for row in courses)
+        return late * whole / max(all_cut, 1e-300)
 
     @cached_property
     def told(self) -> Estimate | None:
@@ -191,16 +210,18 @@ class Evidence:
     @cached_property
     def harmless(self) -> bool:
         """Whether the model explains the rapid at the table, and nothing it surely lacks makes a next one worse."""
-        if self.weight is None or not self.weight.believed:
+        if self.weight is None or not self.weight.believed or (self.fit is not None and self.late_s):
+            return False
+        late = self.breakaway if self.weight.through != "replay" else None  # which has the move's beginning
+        if late is not None and not self.weight.allows(self.breakaway_um(late)):
             return False
         return all(self.weight.allows(self.cost_um(lack) / _known(lack)) for lack in self.lacks)
 
-    def priced(self, lack: Lacking) -> Reason:
-        """Return what the model lacks as a reason, with what that costs."""
-        reason = lack.finding.reason()
+    def with_cost(self, reason: Reason, um: float) -> Reason:
+        """Return a reason with what it costs at the table."""
         if self.weight is None:
             return reason
-        return replace(reason, text=f"{reason.text}; at the table {self.weight.told(self.cost_um(lack))}")
+        return replace(reason, text=f"{reason.text}; at the table {self.weight.told(um)}")
 
     @property
     def judged(self) -> Fit:
@@ -254,7 +275,15 @@ class Evidence:
     @cached_property
     def lacks(self) -> list[Lacking]:
         """What of that surely is there, each beside those before it."""
-        return lacking(self.on_time, self.findings) if self.sound else []
+        if not self.sound:
+            return []
+        late = late_findings(self.shifts) if self.window.slow_voltage is None else []
+        return lacking(self.on_time, [*self.findings, *late])
+
+    @cached_property
+    def shifts(self) -> tuple[Shift, Shift]:
+        """By how much voltage and current seem late."""
+        return shifts(self.on_time)
 
     def time_s(self, row: int) -> float:
         """Return the time of a row as its recording counts it."""
