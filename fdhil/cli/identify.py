@@ -262,6 +262,8 @@ def _cells(estimate: Estimate | None, verdict: Verdict, weighed: bool) -> list[s
 
 
 def _cell(estimate: Estimate, name: str) -> str:
+    if name in estimate.given and name != "K":
+        return "-"  # of the data sheet, and no answer of this recording
     value, half = estimate.value(name), INTERVAL_95 * estimate.std(name)
     return cell(name, value, None).replace("(no ±)", "(given)") if name in estimate.given else cell(name, value, half)
 

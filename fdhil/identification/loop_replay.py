@@ -30,13 +30,14 @@ ROUNDED = 0.7  # of a step: half of one, and what the neighbours' rounding adds 
 
 @dataclass(frozen=True, slots=True)
 class Rapid:
-    """One rapid on its grid, rows (n,), from shortly before it begins: what the drive was asked for, and what it did.
+    """One rapid on its grid, rows (n,) of its window from ``first`` on: what the drive was asked for, and what it did.
 
     ``known`` marks whole rows; the axis stood at ``standstill_mm``, held by ``standstill_a``, or crept on at
     ``creep_mm_s`` from the move before. ``load_nm`` (n,) is the torque that ``plant`` does not explain.
     """
 
     dt_s: float
+    first: int
     demand_mm: Float
     position_mm: Float
     current_a: Float
@@ -82,6 +83,7 @@ def rapid_of(window: Window, plant: Parameters, sync_period_s: float | None = No
     creep = _creep(position[still], window.dt_s, CREEP * way)
     return Rapid(
         window.dt_s,
+        first,
         read_only(demand[cut].copy()),
         position[cut],
         current[cut],
@@ -132,7 +134,7 @@ def _load(position_mm: Float, current_a: Float, plant: Parameters, window: Windo
     torque = plant.K * moving_mean(moving_mean(current_a, width), width)
     acceleration = np.diff(angle, 2, prepend=angle[0], append=angle[-1]) / window.dt_s**2
     rows = np.flatnonzero(all_about(moving, 2 * width + 1, beyond=False))
-    if not rows.size:
+    if not rows.size or width == 1:  # between rows so far apart the current is not what its instants say
         return np.zeros(window.n)
     left = torque - friction - plant.Jt * acceleration
     return np.asarray(np.interp(np.arange(window.n), rows, left[rows]))

@@ -24,13 +24,15 @@ from fdhil.identification.loop_start import CASCADE, begun_anew, made_up_axis
 from fdhil.records import INTERVAL_95, LoopEstimate, Parameters, Reason, Verdict, Window, frozen, rms
 
 WORTH, WORTH_LEFT = 0.1, 0.25  # of the tolerance, or of what is left: what a key must explain to join
-LEAST_UM = 0.1
+LEAST_UM = 0.05
 WELL = 0.25  # of the tolerance: with less left no other structure is tried
 MOST_WINDOWS = 6
 DIFFER = "LoopsDiffer"
 LOOSE = 0.25  # relative standard deviation above which a gain is not known
 PID = ("position_gain_per_s", "speed_feedforward", "speed_kp", "position_ki_per_s2")
-OPTIONS = ("speed_filter_s", "setpoint_filter_s", DELAY, "torque_feedforward", "position_ki_per_s2")
+SINGLE = ("speed_filter_s", "setpoint_filter_s", DELAY, "torque_feedforward", "position_ki_per_s2")
+SINGLE_KEYS = tuple((name,) for name in SINGLE)
+FILTERS = (("speed_filter_s", "setpoint_filter_s"),)  # they hide each other: neither alone explains much
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,14 +65,18 @@ def identify_loops(
     pairs = [
         (w, own) for w, own in zip(windows, mechanics, strict=True) if np.isfinite([*own.as_dict().values()]).all()
     ]
-    told = [rapid for w, own in pairs if (rapid := rapid_of(w, own, sync_period_s)) is not None]
-    rapids = tuple(told[-MOST_WINDOWS:])
-    if not rapids:
+    told = [(rapid, own) for w, own in pairs if (rapid := rapid_of(w, own, sync_period_s)) is not None][-MOST_WINDOWS:]
+    if not told:
         return None
+    rapids = tuple(rapid for rapid, _ in told)
     following = rms(np.concatenate([one.lag_mm[one.known] for one in rapids])) * 1e3
     tolerance = settings.tolerance_for(following)
     problem = _problem(rapids, axis, windows[0])
-    found = _whole_delay(_best(problem, tolerance, axis is not None))
+    found = _best(problem, tolerance, axis is not None)
+    # where the model has all that is there, it is better without what noise makes of the rest
+    modelled = tuple(replace(rapid, plant=own, load_nm=np.zeros_like(rapid.load_nm)) for rapid, own in told)
+    plain = loop_fit.fit(replace(found.problem, rapids=modelled), found.coordinates)
+    found = _whole_delay(min(found, plain, key=lambda fit: fit.deviance))
     configured = None if axis is None else _left_um(problem)
     verdict = _verdict(found, tolerance, following, configured)
     return _told(windows[0].axis, found, verdict, configured)
@@ -94,7 +100,7 @@ def _names(regulators: Regulators) -> tuple[str, ...]:
     base: tuple[str, ...] = PID if regulators.structure == "pid" else CASCADE
     if base == CASCADE and regulators.speed_ki == 0.0:
         base = CASCADE[:3]
-    return (*base, *(n for n in OPTIONS if n not in base and getattr(regulators, n) > 0))
+    return (*base, *(n for n in SINGLE if n not in base and getattr(regulators, n) > 0))
 
 
 def _best(problem: Problem, tolerance_um: float, configured: bool) -> Fit:
@@ -102,8 +108,8 @@ def _best(problem: Problem, tolerance_um: float, configured: bool) -> Fit:
     best = _grown(loop_fit.fit(problem), tolerance_um)
     if configured and best.unexplained_um > tolerance_um:  # the configuration may have led astray
         best = min(best, _grown(loop_fit.fit(begun_anew(problem)), tolerance_um), key=lambda f: f.unexplained_um)
-    if best.unexplained_um < WELL * tolerance_um:
-        return best
+    if best.problem.names == CASCADE and best.unexplained_um < WELL * tolerance_um:
+        return best  # nothing is missing
     other = _other_structure(best)
     if other is not None:
         rival = _grown(loop_fit.fit(other), tolerance_um)
@@ -113,13 +119,17 @@ def _best(problem: Problem, tolerance_um: float, configured: bool) -> Fit:
 
 
 def _grown(made: Fit, tolerance_um: float) -> Fit:
-    """Let keys join, the best of all first, as long as it is worth it."""
-    while options := [n for n in OPTIONS if n not in made.problem.names]:
-        grown = min((_with(made, name) for name in options), key=lambda fit: fit.deviance)
-        if made.unexplained_um - grown.unexplained_um < worth_um(made, tolerance_um):
-            break
-        made = grown
-    return made
+    """Let keys join, the best of all first, as long as it is worth it; two at once where that is worth more."""
+    while True:
+        best = made
+        for options in (SINGLE_KEYS, FILTERS):
+            free = [option for option in options if not {*option} & {*made.problem.names}]
+            grown = min((_with(made, option) for option in free), key=lambda fit: fit.deviance, default=best)
+            if best.unexplained_um - grown.unexplained_um > worth_um(best, tolerance_um):
+                best = grown
+        if best is made:
+            return made
+        made = best
 
 
 def worth_um(made: Fit, tolerance_um: float) -> float:
@@ -127,10 +137,13 @@ def worth_um(made: Fit, tolerance_um: float) -> float:
     return max(LEAST_UM, min(WORTH * tolerance_um, WORTH_LEFT * made.unexplained_um))
 
 
-def _with(made: Fit, name: str) -> Fit:
-    """Return the fit with one key more, begun where it was without, and where all began: its lack bends the others."""
-    wider = replace(made.problem, names=(*made.problem.names, name))
-    starts = [np.append(made.coordinates, KEYS[name].step), np.append(made.problem.start(), KEYS[name].usual)]
+def _with(made: Fit, option: tuple[str, ...]) -> Fit:
+    """Return the fit with further keys, begun where it was without, and where all began: a lack bends what is there."""
+    wider = replace(made.problem, names=(*made.problem.names, *option))
+    starts = [
+        np.append(made.coordinates, [KEYS[name].step for name in option]),
+        np.append(made.problem.start(), [KEYS[name].usual for name in option]),
+    ]
     return min((loop_fit.fit(wider, start) for start in starts), key=lambda fit: fit.deviance)
 
 
@@ -139,7 +152,7 @@ def _other_structure(made: Fit) -> Problem | None:
     problem = made.problem
     found = made.axis()
     g = found.regulators
-    keep = tuple(n for n in problem.names if n in OPTIONS and n not in ("speed_filter_s", "position_ki_per_s2"))
+    keep = tuple(n for n in problem.names if n in SINGLE and n not in ("speed_filter_s", "position_ki_per_s2"))
     if g.structure == "pid":
         half = g.position_gain_per_s / 2
         rest = max(half * half - g.position_ki_per_s2, 0.0)
@@ -157,7 +170,7 @@ def _other_structure(made: Fit) -> Problem | None:
         found,
         structure="pid",
         position_gain_per_s=g.position_gain_per_s + slow,
-        position_ki_per_s2=g.position_gain_per_s * slow,
+        position_ki_per_s2=g.position_gain_per_s * slow + g.position_ki_per_s2,
         speed_ki=0.0,
         speed_filter_s=0.0,
     )

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -84,22 +85,27 @@ class TorqueFit:
         return rms(self.residual) / max(rms(self.current), 1e-300)
 
 
+@lru_cache(maxsize=8)
 def fit(window: Window, settings: Identification) -> TorqueFit | None:
-    """Fit [2] and the terms that join it to a window; None where hardly any row surely moves."""
+    """Fit [2] and the terms that join it to a window; None where hardly any row surely moves.
+
+    Estimate and checks ask for it.
+    """
     rows = torque_rows(window, settings)
     if rows is None or rows.count < LEAST_ROWS:
         return None
-    fitted = _fitted(rows, ())
-    if not (np.isfinite(fitted.design).all() and np.isfinite(fitted.current).all()):
-        return None
-    return _joined(fitted)
-
-
-def _fitted(rows: TorqueRows, terms: tuple[Term, ...]) -> TorqueFit:
     base = np.column_stack([rows.acceleration, rows.jerk, rows.speed])[rows.usable]
-    design = np.column_stack([base, rows.through(rows.side[None]), *(t.columns for t in terms)])
-    current = rows.current[rows.usable]
-    return TorqueFit(rows, design, current, solve(design, current)[0], terms)
+    design, current = np.column_stack([base, rows.through(rows.side[None])]), rows.current[rows.usable]
+    if not (np.isfinite(design).all() and np.isfinite(current).all()):
+        return None
+    return _joined(TorqueFit(rows, design, current, solve(design, current)[0], ()))
+
+
+def _beside(fitted: TorqueFit, term: Term) -> TorqueFit:
+    """Return the fit with one term more."""
+    design = np.column_stack([fitted.design, term.columns])
+    theta, _ = solve(design, fitted.current)
+    return replace(fitted, design=design, theta=theta, terms=(*fitted.terms, term))
 
 
 def _joined(fitted: TorqueFit) -> TorqueFit:
@@ -119,7 +125,7 @@ def _wanted(fitted: TorqueFit, news: float) -> list[TorqueFit]:
     """Return the fits with one term more that the criterion prefers, the best first, one for each kind of term."""
     power, found = float(np.square(fitted.residual).sum()), []
     for term in candidates(fitted):
-        tried = _fitted(fitted.rows, (*fitted.terms, term))
+        tried = _beside(fitted, term)
         left = float(np.square(tried.residual).sum())
         gain = news * np.log(power / max(left, 1e-300)) - len(term.names) * np.log(news)
         if gain > 0.0:
@@ -152,8 +158,10 @@ def candidates(fitted: TorqueFit) -> list[Term]:
     rows, joined = fitted.rows, {name for term in fitted.terms for name in term.names}
     found = []
     if "stribeck" not in joined:
-        top = float(np.abs(rows.speed).max())
-        found += [_stribeck(rows, share * top) for share in STRIBECK_SHARES]
+        speed = np.abs(rows.speed[rows.usable])
+        found += [
+            _stribeck(rows, share * speed.max()) for share in STRIBECK_SHARES if share * speed.max() > speed.min()
+        ]
     for order in SCREW_ORDERS:
         name = f"ripple_screw_{order}"
         if name not in joined:

@@ -71,6 +71,8 @@ def estimated(signals: Evidence) -> Evidence:
         return replace(signals, estimate=told(window, signals.torque, known))
     name, estimator = chosen(settings)
     fit = maximum_likelihood.fit_windows([window], settings)
+    if fit is not None and axis is not None:
+        fit = maximum_likelihood.with_loops(fit, window, settings, axis, signals.sync_period_s)
     if name == maximum_likelihood.NAME and fit is not None:
         return replace(signals, estimate=maximum_likelihood.finish(fit), fit=fit)
     return replace(signals, estimate=estimator([window], settings), fit=fit)

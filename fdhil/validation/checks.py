@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from fdhil.identification.identifiability import unphysical, untold
 from fdhil.records import Reason, Result
 from fdhil.validation.agreement import values_apart
@@ -101,6 +103,17 @@ def _estimate_faults(evidence: Evidence) -> Iterator[Reason]:
             yield Reason("CalibrationSuspect", text, "set the zeros of current and voltage sensor at standstill")
 
 
+def _slips(evidence: Evidence) -> Iterator[Reason]:
+    """Yield a reason where friction falls so much with speed that the axis sticks and slips."""
+    if evidence.estimate is None or "stribeck" not in evidence.estimate.terms:
+        return
+    more, dry = evidence.estimate.value("stribeck"), abs(evidence.estimate.value("Cd"))
+    torque_nm = evidence.estimate.value("K") * float(np.nanmax(np.abs(evidence.window.current_a)))
+    if more > max(dry, SLIPPING_SHARE * torque_nm):
+        text = f"friction at low speed is {more:.3g} N.m higher than the dry friction of {dry:.3g} N.m: the axis slips"
+        yield Reason("ValidationFailed", text, "lubricate the slide-way, and look at its guides, before anything else")
+
+
 def _no_fit(evidence: Evidence) -> Iterator[Reason]:
     if not _fitted(evidence):
         yield Reason("RankDeficient", "there is no fit to check", "record a whole rapid")
@@ -143,6 +156,7 @@ def _values(evidence: Evidence) -> Iterable[Reason]:
     return values_apart(evidence.estimate, evidence.judged.theta[:6])
 
 
+SLIPPING_SHARE = 0.1  # of the largest torque of the move: less than this more friction at low speed does little
 MODEL = (
     "estimate",
     "fit",
@@ -174,6 +188,7 @@ OF_THE_FIT: Sequence[Check] = (
     Check("load", load_comes_and_goes, _without_voltage, ("late torque",)),
     Check("torque", torque_unexplained, _without_voltage, ("late torque", "load")),
     Check("estimate", _estimate_faults, unless=("late torque", "load", "torque")),
+    Check("slips", _slips),
     Check("fit", _no_fit, _has_voltage, ("estimate",)),
     Check("late voltage", _electrically_late, _fitted),
     Check("late current", _current_late, _sound, ("late voltage",)),

@@ -210,7 +210,7 @@ def courses(fit: Fit) -> Float:
     back-EMF, are off in proportion to the acceleration too; what they are off in proportion to current and its slope,
     R and L imitate.
     """
-    shape = fit.problem.shape_effect(fit.theta)[:, None]
+    shape = fit.problem.course_effects(fit.theta)
     motion, theta = fit.problem.motions[0], fit.theta
     doubt = aliasing(motion.voltage_sampling, motion.voltage_period_s)[0]
     if doubt == 0.0:

@@ -27,8 +27,9 @@ from fdhil.arming.whole_plan import plan_whole
 from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
 from fdhil.config import MachineConfig
 from fdhil.daemon.outcome_store import OutcomeStore
+from fdhil.identification.loops import DIFFER
 from fdhil.program import program_digest
-from fdhil.records import LoopEstimate, Notice, Skill, Verdict
+from fdhil.records import LoopEstimate, Notice, Reason, Skill, Verdict
 from fdhil.store.rows import Revision, Stamp
 from tests.daemon.machine import config_of
 from tests.store.made import published
@@ -220,7 +221,7 @@ def test_a_changed_load_is_remembered_until_new_parameters_come(config: MachineC
 
 def test_loops_that_were_identified_and_are_believed_are_planned_with(config: MachineConfig, program: Path) -> None:
     """Others are not; the configuration that was commissioned stays what it is."""
-    believed = Verdict(True, None, unexplained_um=0.5)
+    believed = Verdict(True, None, unexplained_um=0.5, warnings=(Reason(DIFFER, "speed_kp is 21"),))
     loops = LoopEstimate(
         "X", "p_pi_pi", ("speed_kp", "speed_filter_s"), np.array([21.0, 5e-4]), np.zeros((2, 2)), believed
     )

@@ -10,8 +10,8 @@ import pytest
 
 from fdhil import config
 from fdhil.config import Axis, Identification
-from fdhil.pipeline import analyse, pool
-from fdhil.records import Window, WindowOutcome, frozen
+from fdhil.pipeline import AxisPipeline, analyse, pool
+from fdhil.records import ParameterSet, Skill, Window, WindowOutcome, frozen
 from studies import real_plant
 from tests.bench import bench_axis
 from tests.identification.deaf import LOOPS, RAPID_M_S, SCREW, SECTION, SENSORS, screw_windows, to_and_fro
@@ -155,3 +155,25 @@ def test_a_drive_without_feed_forward_is_weighed_by_its_following_error() -> Non
     assert analyse(rough, SETTINGS).verdict.accepted
     unled = replace(rough, demand_mm=frozen(np.zeros(window.n)))
     assert "ValidationFailed" in [reason.code for reason in analyse(unled, SETTINGS).verdict.reasons]
+
+
+def test_a_running_machine_without_a_voltage_publishes_sets_that_predict_its_moves() -> None:
+    nominal = {**SECTION["nominal"], "K": SCREW.K}
+    document = {
+        "machine": {"name": "screw", "sync_period_s": 0.001},
+        "axis": {"X": bench_axis(**{**SECTION, "nominal": nominal})},
+    }
+    pipeline = AxisPipeline("X", config.parse(document))
+    outcomes = [
+        outcome
+        for window in screw_windows()
+        for outcome in pipeline.feed(replace(window, torque_constant_nm_per_a=None))
+    ]
+    assert sum(isinstance(outcome, ParameterSet) for outcome in outcomes) == 4
+    published = pipeline.published
+    assert published is not None
+    assert published.parameters.Cd == pytest.approx(SCREW.Cd, rel=0.03)
+    assert published.parameters.term("load") == pytest.approx(SCREW.load_nm, rel=0.05)
+    assert np.isfinite(published.covariance).all()
+    skills = [outcome for outcome in outcomes if isinstance(outcome, Skill)]
+    assert skills[-1].rms_um < 0.005 * skills[-1].measured_rms_um
