@@ -72,7 +72,7 @@ def _weak(estimate: Estimate, chosen: Sequence[Candidate], untold: set[str]) -> 
     weak = {c.family for c in chosen if not abs(estimate.value(c.family)) > LEAST_SURE * _std(estimate, c.family)}
     low = estimate.value("stribeck") if "stribeck" in estimate.names else 0.0
     if low and min(estimate.value("Cd"), estimate.value("Cd") + low) < 0.0:
-        weak.add("stribeck")
+        weak.add("stribeck" if any(c.family == "stribeck" for c in chosen) else chosen[-1].family)
     return weak
 
 

@@ -14,7 +14,6 @@ from fdhil.validation.evidence import LEAST_ROWS, Evidence
 from fdhil.validation.interruptions import interruptions
 from fdhil.validation.plausibility import clipped, gaps, missing_stages, not_finite, position_parted
 from fdhil.validation.rest import friction_at_rest, rest_faults
-from fdhil.validation.shifts import LATE
 from fdhil.validation.simulation import expected_fit_percent
 from fdhil.validation.slow_fitted import slow_faults_beside
 from fdhil.validation.slow_readings import slow_voltage_faults
@@ -139,11 +138,9 @@ def _structure(evidence: Evidence) -> Iterator[Reason]:
 
 
 def _late(evidence: Evidence) -> Iterable[Reason]:
-    """Ask for a delay where the fit needs one, and where nothing else explains more of what a delay would do."""
-    if evidence.late_s:
+    if evidence.late_s:  # by what else the model lacks, where there is such
         return voltage_late(evidence) if not evidence.lacks else ()
-    first = evidence.lacks[0].finding.name if evidence.lacks else LATE
-    return timing_faults(evidence) if _sound(evidence) and first.endswith(LATE) else ()
+    return timing_faults(evidence) if _sound(evidence) else ()
 
 
 def _simulation(evidence: Evidence) -> Iterator[Reason]:

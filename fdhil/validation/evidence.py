@@ -168,7 +168,9 @@ class Evidence:
             rms(row) for row in loop.um(np.array([to_and_fro(row) for row in torques]), dt_s)
         )
         slower = whole / max(all_cut, 1e-300)
-        return max(here, there * slower, *(um * (slower if lack.finding.name == FRICTION else 1.0) for um in load))
+        # what a replay shows of a friction, it shows at all speeds
+        shown = lack.finding.name != FRICTION or (self.weight is not None and self.weight.through == "replay")
+        return max(here, there * slower, *(um * (1.0 if shown else slower) for um in load))
 
     @cached_property
     def breakaway(self) -> Breakaway | None:
