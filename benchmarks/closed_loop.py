@@ -86,9 +86,10 @@ def measure(terms: Mapping[str, float] | None = None) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         library = compiled(Path(folder))
         out, state = np.empty((7, n)), np.zeros(12)
-        arrays = (reference, drive.plant, drive.gains, drive.terms, state, out)
+        joined = np.empty(0) if drive.terms is None else drive.terms
+        arrays = (reference, drive.plant, drive.gains, joined, state, out)
         r, p, g, t, s, o = (ctypes.c_void_p(array.ctypes.data) for array in arrays)
-        long, size = ctypes.c_long, drive.terms.size
+        long, size = ctypes.c_long, joined.size
 
         def c() -> Float:
             state[:] = start[:12]

@@ -54,9 +54,12 @@ def off(estimate: Estimate, drive: Drive) -> list[str]:
 
 
 def beside_the_path(models: Sequence[Parameters], scene: Scene) -> list[str]:
-    """Return by how much the table of the true machine, at the rapid and at what is cut, is not where a model says."""
-    found = []
-    axis = axis_of(scene)
+    """Return by how much the table of the true machine, at the rapid and at what is cut, is not where a model says.
+
+    The tolerance is that of the rapid, in micrometres.
+    """
+    found: list[str] = []
+    axis, limit = axis_of(scene), 0.0
     for share in (1.0, NEXT_SHARE):
         move = replace(scene.move, speed=share * scene.move.speed, distance=share * scene.move.distance)
         there = move.direction * drives.rates(move)
@@ -64,13 +67,12 @@ def beside_the_path(models: Sequence[Parameters], scene: Scene) -> list[str]:
         true = drives.run(scene.drive, demand, drives.CYCLE_S)
         for model in models:
             missed, following = _missed(model, axis, 1e3 * demand, 1e3 * true.position)
-            limit = max(tolerance_um(Identification(), following), STEPS_UM)
+            limit = limit or max(tolerance_um(Identification(), following), STEPS_UM)
             if missed > limit:
                 found.append(f"{missed:.2g} um of {following:.3g} um beside the path at {share:.0%} of the speed")
     return found
 
 
 def _missed(model: Parameters, axis: Axis, demand_mm: Float, position_mm: Float) -> tuple[float, float]:
-    runnable = model.changed(ft=max(model.ft, 0.0), Cd=max(model.Cd, 0.0))
-    told = closed_loop.simulate(runnable, axis, drives.CYCLE_S, demand_mm).position_mm
+    told = closed_loop.simulate(model, axis, drives.CYCLE_S, demand_mm).position_mm
     return 1e3 * rms(position_mm - told), 1e3 * rms(position_mm - demand_mm)

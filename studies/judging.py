@@ -92,7 +92,7 @@ def judge(
         codes=tuple(sorted({reason.code for reason in reasons})),
         texts=tuple(dict.fromkeys(str(reason) for reason in reasons)),
         left_open=tuple(" and ".join(estimate.missing) for estimate in told if estimate.missing),
-        harm=() if scene is None or kind in faults.BETWEEN else _harm(outcomes, scene),
+        harm=() if scene is None or kind in faults.BETWEEN else _harm(outcomes, spoilt.scene or scene),
         warned=tuple(sorted({warning.code for o in outcomes for warning in o.verdict.warnings})),
     )
 
@@ -136,7 +136,8 @@ def tally(judged: Iterable[Judged], kinds: Mapping[str, faults.Kind]) -> dict[st
 def report(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Kind]) -> list[str]:
     """Return what became of good recordings and of bad ones, in words and as a table."""
     fine, bad = counted[GOOD], [counted[name] for name in kinds]
-    recordings, accepted, right = (sum(getattr(e, part) for e in bad) for part in ("count", "accepted", "right"))
+    parts = ("count", "accepted", "harmful", "right")
+    recordings, accepted, harmful, right = (sum(getattr(e, part) for e in bad) for part in parts)
     lines = paragraph(
         f"""Good: {fine.windows} windows of {fine.count} recordings, {fine.refused} windows refused
         ({_percent(fine.refused, fine.windows)}; {_at_most(fine.refused, fine.windows)}), {len(fine.wrong)} recordings
@@ -146,20 +147,38 @@ def report(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Kind]) -> li
         nulls = ", ".join(f"{count} without {names}" for names, count in fine.left_open.most_common())
         lines += paragraph(f"{fine.left_open.total()} windows are accepted with a null and its reason: {nulls}.")
     lines += paragraph(
-        f"""Bad: {recordings} recordings, {accepted} accepted ({_at_most(accepted, recordings)}),
-        {_percent(right, recordings)} named rightly. {_worst(counted, kinds)}"""
+        f"""Bad: {recordings} recordings, {accepted} accepted, {harmful} of them to harm
+        ({_at_most(harmful, recordings)}), {_percent(right, recordings)} named rightly. {_worst(counted, kinds)}"""
     )
     wrong = [f"{name} {', '.join(map(str, entry.wrong))}" for name, entry in counted.items() if entry.wrong]
     lines += paragraph(f"Judged wrongly, by seed: {'; '.join(wrong) or 'none'}.")
     rows = [_row(name, kind, counted[name]) for name, kind in kinds.items() if counted[name].count]
-    columns = ["fault", "matrix", "recordings", "smallest severity", "accepted", "named rightly", "reasons given"]
-    return [*lines, *grid(columns, rows), ""]
+    columns = [
+        "fault",
+        "matrix",
+        "recordings",
+        "smallest severity",
+        "accepted",
+        "harmful",
+        "named rightly",
+        "reasons given",
+    ]
+    return [*lines, *grid([*columns, "reasons given"], rows), ""]
 
 
 def _row(name: str, kind: faults.Kind, entry: Tally) -> list[str]:
     least = f"{entry.least:.3g} {kind.unit}" if kind.unit else ""
     right = f"{entry.right / entry.count:.0%}"
-    return [name, kind.matrix, str(entry.count), least, str(entry.accepted), right, listed(entry.codes)]
+    return [
+        name,
+        kind.matrix,
+        str(entry.count),
+        least,
+        str(entry.accepted),
+        str(entry.harmful),
+        right,
+        listed(entry.codes),
+    ]
 
 
 def _worst(counted: Mapping[str, Tally], kinds: Mapping[str, faults.Kind]) -> str:

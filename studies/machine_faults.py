@@ -21,7 +21,7 @@ def of_machine(change: Callable[[Rng, Scene], tuple[Scene, Array | None, float]]
     def make(rng: Rng) -> Spoilt:
         scene, load, severity = change(rng, draw_scene(rng))
         rows = measured(rng, scene, drives.run(scene.drive, demand_of(scene), scene.dt_s, load))
-        return Spoilt(recorded(scene, rows), severity)
+        return Spoilt(recorded(scene, rows), severity, scene)
 
     return make
 

@@ -21,11 +21,13 @@ from fdhil.config import MachineConfig, parse
 from fdhil.correction.learning import Lesson, learn
 from fdhil.correction.limits import fit_all
 from fdhil.correction.planning import plan
+from fdhil.identification.loops import with_loops
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
+from fdhil.pipeline.own_loops import better_axis, loops_of, suspected
 from fdhil.prediction.contour import contour_error_um
 from fdhil.program.loading import load_trajectory
-from fdhil.records import PARAMETERS, Estimate, Parameters, Trajectory, WindowOutcome, rms
+from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Parameters, Trajectory, WindowOutcome, rms
 from studies import pages
 from studies.bench import Array, shuttle
 from studies.comparison import SURE_95
@@ -188,11 +190,12 @@ def path(base: str) -> Trajectory:
     return load_trajectory(written, config_of(machines(base)[0]))
 
 
-def outcomes_of(machine: Machine, seed: int) -> tuple[list[WindowOutcome], float]:
-    """Return what is made of the machine's rapids, and the RMS of their following error in um."""
+def outcomes_of(machine: Machine, seed: int) -> tuple[list[WindowOutcome], float, LoopEstimate | None]:
+    """Return what is made of the machine's rapids, the RMS of their following error in um, loops other than told."""
     _, _, rapid_m_s, acceleration_m_s2, _ = BASES[machine.base]
     config = config_of(machine)
-    outcomes, following = [], []
+    outcomes: list[WindowOutcome] = []
+    following = []
     for k, share in enumerate(SHARES):
         demand = shuttle(0.4, share * rapid_m_s, acceleration_m_s2, RAPIDS)
         moved = run(machine.mechanics, demand, machine.loops)
@@ -202,7 +205,12 @@ def outcomes_of(machine: Machine, seed: int) -> tuple[list[WindowOutcome], float
             for w in find_windows(told)
         ]
         following.append(rms((moved.motor_m - moved.demand) * 1e6))
-    return outcomes, float(np.mean(following))
+    settings, axis, period_s = config.identification, config.axis["X"], config.machine.sync_period_s
+    loops = loops_of(outcomes, axis, settings, period_s) if suspected(outcomes) else None
+    better = better_axis(axis, loops)
+    if better is not None:
+        outcomes = [analyse(o.window, settings, better, period_s) for o in outcomes]
+    return outcomes, float(np.mean(following)), loops if better is not None else None
 
 
 def cut(machine: Machine, reference: Trajectory, offset_um: Mapping[str, Array] | None = None) -> tuple[Array, Array]:
@@ -219,12 +227,17 @@ def cut(machine: Machine, reference: Trajectory, offset_um: Mapping[str, Array] 
     return np.column_stack(tables), np.column_stack(motors)
 
 
-def contour(machine: Machine, model: Parameters) -> tuple[float, float, float, tuple[float, ...]]:
+def contour(
+    machine: Machine, model: Parameters, loops: LoopEstimate | None
+) -> tuple[float, float, float, tuple[float, ...]]:
     """Return RMS um at the table without and with the correction, the most that a point gets worse, what passes leave.
 
     In these the machine learns from what its motors' encoders measure.
     """
     reference, config = path(machine.base), config_of(machine)
+    if loops is not None:
+        axes = {name: with_loops(axis, loops) for name, axis in config.axis.items()}
+        config = config.model_copy(update={"axis": axes})
     models = dict.fromkeys(reference.axes, model)
     planned = plan(reference, models, config).offset_um
 
@@ -254,7 +267,7 @@ def errors_of(estimate: Estimate | None, truth: Array) -> tuple[Array, Array]:
 
 def examine(machine: Machine, seed: int = 0) -> Found:
     """Return what is made of one machine."""
-    outcomes, following_um = outcomes_of(machine, seed)
+    outcomes, following_um, loops = outcomes_of(machine, seed)
     truth = np.array(list(machine.mechanics.truth().values()))
     settings = config_of(machine).identification
     estimate, verdict = pool(outcomes, settings)
@@ -262,7 +275,7 @@ def examine(machine: Machine, seed: int = 0) -> Found:
     candidates = [estimate, *(o.estimate for o in outcomes)]  # a refused model is cut with all the same
     usable = [e.parameters() for e in candidates if e is not None and _whole(e)]
     nothing = (np.nan, np.nan, np.nan, ())
-    before_um, after_um, worse_um, passes_um = contour(machine, usable[0]) if usable else nothing
+    before_um, after_um, worse_um, passes_um = contour(machine, usable[0], loops) if usable else nothing
     left = [o.verdict.unexplained_um for o in outcomes if o.verdict.unexplained_um is not None]
     reasons = Counter(reason.code for o in outcomes for reason in o.verdict.reasons)
     return Found(

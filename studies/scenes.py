@@ -69,10 +69,11 @@ class Rows:
 
 @dataclass(frozen=True, slots=True)
 class Spoilt:
-    """A recording with its fault: the severity in ``unit``."""
+    """A recording with its fault: the severity in ``unit``, and the scene where the fault is one of the machine."""
 
     recording: Recording
     severity: float = 0.0
+    scene: Scene | None = None
 
 
 def draw_scene(rng: Rng) -> Scene:

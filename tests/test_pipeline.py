@@ -16,16 +16,18 @@ from hypothesis import strategies as st
 from fdhil.config import MachineConfig
 from fdhil.daemon.kernel_warmup import nominal_rapid
 from fdhil.identification.windows import find_windows
-from fdhil.pipeline import AxisPipeline, Record
+from fdhil.pipeline import AxisPipeline, Record, analyse
 from fdhil.pipeline.recent_samples import RecentSamples
 from fdhil.records import (
     AxisSamples,
     Notice,
     Outcome,
     ParameterSet,
+    Reason,
     Skill,
     Temperature,
     TickTimes,
+    Verdict,
     VoltageSamples,
     Window,
     WindowOutcome,
@@ -292,3 +294,44 @@ def test_a_window_that_leaves_l_open_is_accepted_and_publishes_nothing(tmp_path:
     assert outcome.verdict.accepted
     assert outcome.estimate is not None
     assert set(outcome.estimate.missing) == {"L"}
+
+
+def vertical(config: MachineConfig, k: int, load_nm: float) -> Window:
+    """Return a rapid of an axis on which a constant load acts: it is part of the dry friction of its direction."""
+    axis, side = config.axis["X"], 1 if k % 2 else -1
+    nominal = axis.nominal.model_copy(update={"Cd": 5.0 + side * load_nm})
+    made = nominal_rapid("X", axis.model_copy(update={"nominal": nominal}), 0.001, side, seed=k)
+    return replace(made, start_tick=2000 * k)
+
+
+def test_a_load_is_published_and_no_set_flips_with_the_direction(config: MachineConfig) -> None:
+    pipeline, sets = AxisPipeline("X", config), []
+    for k in (1, 2, 3, 4, 5, 7, 9, 11, 13):  # from the fifth on all in one direction
+        outcomes = pipeline.feed(vertical(config, k, 1.0))
+        assert not any(isinstance(o, Notice) for o in outcomes)
+        sets += [o for o in outcomes if isinstance(o, ParameterSet)]
+    assert len(sets) == 9
+    assert [warning.code for warning in sets[0].warnings] == ["OneDirection"]
+    for each in sets[1:]:
+        assert each.parameters.term("load") == pytest.approx(1.0, abs=0.1)
+        assert each.parameters.Cd == pytest.approx(5.0, rel=0.1)
+        assert each.covariance.shape == (7, 7)
+    assert sets[-1].windows == 6  # the newest four, and the newest two of the other direction
+    assert sets[-1].window_ticks == (4000, 8000, 14000, 18000, 22000, 26000)
+
+
+def test_nothing_is_published_from_one_direction_while_the_other_is_refused(
+    config: MachineConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refusing(window: Window, *known: Any) -> WindowOutcome:
+        outcome = analyse(window, *known)
+        reason = Reason("ValidationFailed", "the drive does what the model does not have")
+        return outcome if window.direction > 0 else replace(outcome, verdict=Verdict(False, 90.0, (reason,)))
+
+    monkeypatch.setattr("fdhil.pipeline.own_loops.analyse", refusing)
+    pipeline, told = AxisPipeline("X", config), []
+    for k in range(1, 7):
+        outcomes = pipeline.feed(vertical(config, k, 0.0))
+        told.append([type(o).__name__ for o in outcomes if isinstance(o, Notice | ParameterSet)])
+    # the first came before the other direction was known to be refused; then it is said once
+    assert told == [["ParameterSet"], [], ["Notice"], [], [], []]

@@ -21,8 +21,9 @@ from fdhil.arming.standstill import AtRest
 from fdhil.config import Axis, MachineConfig
 from fdhil.correction.inverse import AxisInverse, block_rows, common_delay_s
 from fdhil.correction.limits import check
-from fdhil.model import closed_loop, kernels
+from fdhil.model import closed_loop
 from fdhil.model.closed_loop import State
+from fdhil.model.kernels import CURRENT
 from fdhil.prediction.contour import contour_error_um
 from fdhil.prediction.model_terms import Band, band
 from fdhil.records import Float, Parameters, rms
@@ -34,9 +35,9 @@ CHANGED_SHARE = 0.05  # of the dry friction: a current that differs by less from
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """What was found for one axis: its offsets (n,) in increments, and the positions with the old ones and with these.
+    """What was found for one axis: its offsets (n,) in increments, and whether the limits allow them.
 
-    ``allowed``: the limits allow them.
+    The positions are those that the model's own rows lead to, with what is in force added to them, and with this.
     """
 
     offset: Float
@@ -50,10 +51,9 @@ class FirstBlock:
 
     def __init__(self, begin: Piece, program: Path, models: Mapping[str, Parameters], config: MachineConfig) -> None:
         """Prepare for a checked program that begins with ``begin``; ProgramError when it can no longer be read."""
-        self.begin = begin
+        self.begin = self._checked = begin
         self._models, self._config, self._period_s = models, config, config.machine.sync_period_s
         self._path = _first_rows(program, config)
-        self._used_a = dict.fromkeys(begin.offset, 0.0)
         rapid = {axis: config.axis[axis].rapid_speed_mm_s for axis in begin.offset}
         # rows that lag on purpose lag by what the whole path asks for
         self._fits = set(begin.offset) <= set(self._path) and common_delay_s(rapid, models, config)[0] == 0.0
@@ -61,11 +61,13 @@ class FirstBlock:
         if self._fits:
             starts = {axis: float(self._path[axis][0]) for axis in begin.offset}
             self._walks = {axis: AxisInverse.of(models[axis], config, axis, start) for axis, start in starts.items()}
+        self._used_a = {axis: float(walk.carry.state[CURRENT]) for axis, walk in self._walks.items()}
+        self._own: dict[str, Float] = {}
 
     def renew(self, rest: Mapping[str, AtRest]) -> Piece | None:
-        """Return rows that begin where the axes stand, now in force; None where those that are in force stay.
+        """Return rows that begin where the axes stand; None where those that are in force are to stay.
 
-        They stay where an axis does not stand at the program's start, where it stands as it was known to, or where
+        They are where an axis does not stand at the program's start, where all stand as they were known to, or where
         nothing is gained.
         """
         axes = tuple(self.begin.offset)
@@ -80,9 +82,12 @@ class FirstBlock:
         signs = {axis: self._config.axis[axis].scaling.sign for axis in axes}
         offset = {axis: (signs[axis] * one.offset).astype(np.int64).tolist() for axis, one in found.items()}
         rows = len(next(iter(offset.values())))
-        behind = {axis: values[rows:] for axis, values in self.begin.offset.items()}
-        self.begin = self.begin._replace(offset={axis: offset[axis] + behind[axis] for axis in axes})
         return Piece(0, {axis: values[:rows] for axis, values in self.begin.demand.items()}, offset, self.begin.final)
+
+    def take(self, rows: Piece) -> None:
+        """Know that these are in force."""
+        behind = {axis: values[len(rows.offset[axis]) :] for axis, values in self.begin.offset.items()}
+        self.begin = self.begin._replace(offset={axis: rows.offset[axis] + behind[axis] for axis in rows.offset})
 
     def expect(self, rest: Mapping[str, AtRest]) -> Piece | None:
         """Return rows for a machine that is taken to the start from where its axes ``rest``, as :meth:`renew` does.
@@ -112,21 +117,41 @@ class FirstBlock:
         return abs(change_a) * self._models[axis].K > CHANGED_SHARE * 0.5 * (held.high - held.low)
 
     def _solved(self, name: str, rest: AtRest) -> _Found:
-        """Find the offsets of one axis' first rows."""
+        """Find the offsets of one axis' first rows: those that were checked, and what another begin makes of them.
+
+        What was checked may be more than the model's own rows, where passes have taught it.
+        """
         walk, axis, path_mm = self._walks[name], self._config.axis[name], self._path[name]
+        loop, state = walk.loop, rest_state(rest, float(path_mm[0]), self._models[name], axis)
+        if name not in self._own:
+            self._own[name] = self._block(name, walk.carry.state)
+        own, ends = self._own[name], path_mm.size <= sum(block_rows(self._period_s))
+        rows = own.size if ends else round(JOINED_S / self._period_s)
+        share = 1.0 if ends else _share(rows, self._period_s)
+        more = np.rint((self._block(name, state)[:rows] - own[:rows]) * share)
+        checked, begin = (
+            axis.scaling.sign * np.array(piece.offset[name][: rows + 2], dtype=np.float64)  # a cycle looks two ahead
+            for piece in (self._checked, self.begin)
+        )
+        new = checked.copy()
+        new[:rows] += more
+        allowed = not check(new[2:].astype(np.int64), loop.limits, (float(new[1]), float(new[0])))
+        own = own[: new.size]
+        old_mm, new_mm = (
+            loop.run(path_mm[: new.size], own + offset - checked, state, 0, rows).table_mm for offset in (begin, new)
+        )
+        return _Found(new[:rows], old_mm, new_mm, allowed)
+
+    def _block(self, name: str, state: State) -> Float:
+        """Return the model's own offsets of an axis' first block that begins in a state."""
+        walk, path_mm = self._walks[name], self._path[name]
         block, ahead = block_rows(self._period_s)
         ends = path_mm.size <= block + ahead
         path_mm = np.ascontiguousarray(path_mm[: block + ahead])
-        rows = path_mm.size if ends else min(block, round(JOINED_S / self._period_s))
-        loop, state = walk.loop, rest_state(rest, float(path_mm[0]), self._models[name], axis)
-        fresh = AxisInverse(loop, replace(walk.carry, state=state))
-        solved = fresh.block(path_mm, path_mm, path_mm.size if ends else block, ends).offset[:rows]
-        old = axis.scaling.sign * np.array(self.begin.offset[name][: rows + 2], dtype=np.float64)  # it looks two ahead
-        new = old.copy()
-        new[:rows] = solved if ends else np.rint(old[:rows] + (solved - old[:rows]) * _share(rows, self._period_s))
-        allowed = not check(new[2:].astype(np.int64), loop.limits, (float(new[1]), float(new[0])))
-        old_mm, new_mm = (loop.run(path_mm[: old.size], offset, state, 0, rows).position_mm for offset in (old, new))
-        return _Found(new[:rows], old_mm, new_mm, allowed)
+        rows = path_mm.size if ends else block
+        return (
+            AxisInverse(walk.loop, replace(walk.carry, state=state)).block(path_mm, path_mm, rows, ends).offset[:rows]
+        )
 
     def _better(self, found: Mapping[str, _Found]) -> bool:
         """Whether the contour error is smaller with the rows found anew."""
@@ -156,11 +181,7 @@ def rest_state(rest: AtRest, start_mm: float, parameters: Parameters, axis: Axis
     off_mm = rest.position_mm - rest.demand_mm
     if abs(off_mm) * axis.scaling.increments_per_mm < 1.0:  # the drive itself sees none
         off_mm = 0.0
-    state = closed_loop.start(start_mm + off_mm)
-    state[[kernels.CURRENT, kernels.SPEED_INTEGRAL]] = rest.current_a
-    state[kernels.CURRENT_DEMAND] = rest.current_a
-    state[kernels.CURRENT_INTEGRAL] = parameters.R * rest.current_a
-    return state
+    return closed_loop.standing(parameters, axis, start_mm + off_mm, rest.current_a)
 
 
 def _share(rows: int, period_s: float) -> Float:

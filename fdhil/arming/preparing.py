@@ -185,7 +185,8 @@ def prepare_armament(
     begin, first = stream.take(FIRST_S), None
     if checked.method == "inverse":
         first = FirstBlock(begin, request.program, request.models, request.config)
-        first.expect(rest or {})
+        if (rows := first.expect(rest or {})) is not None:
+            first.take(rows)
         begin = first.begin
     return Armament(str(request.program), stream, begin, facts, gain_um, half_um, first)
 

@@ -45,9 +45,11 @@ class StreamFeeder:
         if first is None or self._guard.state != "ARMED":
             return
         rows = first.renew(self._standstill.now())
-        if rows is not None:
-            with contextlib.suppress(DeviceError, StoreError):  # the rows that were checked are still there
-                self._guard.renew(self._armed, rows)
+        if rows is None:
+            return
+        with contextlib.suppress(DeviceError, StoreError):  # the rows that were armed are still there
+            if self._guard.renew(self._armed, rows)["ok"]:
+                first.take(rows)
 
     def _found(self) -> list[Notice]:
         """Tell what the check refuses; a program that has not begun is disarmed, one that runs goes on to there."""

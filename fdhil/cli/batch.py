@@ -13,7 +13,7 @@ from typing import Any
 
 from fdhil.cli.compiling import forewarn
 from fdhil.cli.failing import error_document
-from fdhil.config import Axis, Identification
+from fdhil.config import Identification, MachineConfig
 from fdhil.errors import FdhilError
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
@@ -50,21 +50,21 @@ def unseen(share: float) -> None:
 def analyse_files(
     paths: Sequence[Path],
     settings: Identification,
-    axes: Mapping[str, Axis],
+    machine: MachineConfig | None = None,
     progress: Progress = unseen,
 ) -> Iterator[FileResult]:
     """Yield the result of each recording in order, also of those that cannot be read.
 
-    ``axes`` are the sections of the axes that are known: their rapid speed is that of recordings that do not say
-    theirs, and their nominal values tell what a recording without voltage cannot. ``progress`` is told the share of a
-    file that each step was: a window of it, or the whole.
+    The ``machine``, where it is known, tells the rapid speed of recordings that do not say theirs, the regulators, and
+    what a recording without voltage cannot. ``progress`` is told the share of a file that each step was: a window of
+    it, or the whole.
     """
     if len(paths) < MANY_FILES or _cores() < 2:
         for path in paths:
-            yield analyse_file(path, settings, axes, progress)
+            yield analyse_file(path, settings, machine, progress)
         return
     forewarn("identify")
-    work = partial(analyse_file, settings=settings, axes=axes)
+    work = partial(analyse_file, settings=settings, machine=machine)
     with _processes() as executor:
         for result in executor.map(work, paths, chunksize=CHUNK):
             progress(1.0)
@@ -72,7 +72,7 @@ def analyse_files(
 
 
 def analyse_file(
-    path: Path, settings: Identification, axes: Mapping[str, Axis], progress: Progress = unseen
+    path: Path, settings: Identification, machine: MachineConfig | None = None, progress: Progress = unseen
 ) -> FileResult:
     """Return the windows of one recording analysed, and their pool, or why it cannot be read."""
     try:
@@ -84,16 +84,18 @@ def analyse_file(
     if multiprocessing.parent_process() is None:
         forewarn("identify")
     outcomes = []
-    axis = axes.get(recording.axis)
+    axis = None if machine is None else machine.axis.get(recording.axis)
     settings = told_by(recording, settings)
     windows = find_windows(recording, None if axis is None else axis.rapid_speed_rad_s)
-    for outcome in _outcomes(windows, settings, axis):
+    period_s = None if machine is None else machine.machine.sync_period_s
+    work = partial(analyse, settings=settings, axis=axis, sync_period_s=period_s)
+    for outcome in _outcomes(windows, work):
         outcomes.append(outcome)
         progress(1.0 / (len(windows) + 1))
-    loops = loops_of(outcomes, axis, settings) if suspected(outcomes) else None
+    loops = loops_of(outcomes, axis, settings, period_s) if suspected(outcomes) else None
     own_axis = better_axis(axis, loops)
     if own_axis is not None:
-        outcomes = list(_outcomes(windows, settings, own_axis))
+        outcomes = list(_outcomes(windows, partial(work, axis=own_axis)))
     estimate, verdict = pool(outcomes, settings)
     progress(1.0 / (len(windows) + 1))
     return FileResult(str(path), recording.axis, tuple(outcomes), estimate, verdict, loops=loops)
@@ -105,8 +107,7 @@ def told_by(recording: Recording, settings: Identification) -> Identification:
     return settings.model_copy(update=told) if told else settings
 
 
-def _outcomes(windows: Sequence[Window], settings: Identification, axis: Axis | None) -> Iterator[WindowOutcome]:
-    work = partial(analyse, settings=settings, axis=axis)
+def _outcomes(windows: Sequence[Window], work: Callable[[Window], WindowOutcome]) -> Iterator[WindowOutcome]:
     if len(windows) < MANY_WINDOWS or _cores() < 2 or multiprocessing.parent_process() is not None:
         yield from map(work, windows)
         return

@@ -73,6 +73,7 @@ def of_axis(
 
     symbols = (*symbols, FRICTION) if symbols == PARAMETERS else symbols
     values, stds = (_columns(windows, key, symbols) for key in ("value", "std"))
+    values[stds == 0.0] = np.nan  # given, not estimated: a data sheet's value has no course
     direction = np.array([window.direction for window in windows], dtype=np.float64)
     for k in (k for k, symbol in enumerate(symbols) if symbol in BY_DIRECTION):
         values[:, k] = without_direction(values[:, k], direction)

@@ -19,7 +19,7 @@ from fdhil.records import INTERVAL_95, unit_of
 
 if TYPE_CHECKING:
     from fdhil.cli.batch import FileResult
-    from fdhil.config import Axis, Identification
+    from fdhil.config import Axis, Identification, MachineConfig
     from fdhil.records import Estimate, Verdict, WindowOutcome
 
 SCHEMA = "fdhil-identify-1"
@@ -57,8 +57,9 @@ def identify(
     pool is validated, 1 some pool is not, 2 wrong option or configuration, 3 a recording cannot be read (the others
     are identified all the same).
     """
-    settings, axes = _settings(config_path, method)
-    results = [_against_data_sheet(r, axes) for r in _analyse(recordings, settings, axes)]
+    settings, machine = _settings(config_path, method)
+    axes = machine.axis if machine is not None else {}
+    results = [_against_data_sheet(r, axes) for r in _analyse(recordings, settings, machine)]
     if model is not None:
         from fdhil.cli.model_file import write_model
 
@@ -77,13 +78,12 @@ def identify(
     return 0 if all(r.verdict.accepted for r in results) else 1
 
 
-def _settings(path: Path | None, method: str | None) -> tuple[Identification, Mapping[str, Axis]]:
+def _settings(path: Path | None, method: str | None) -> tuple[Identification, MachineConfig | None]:
     from fdhil import config
 
     machine = config.load(path) if path is not None else None
     settings = machine.identification if machine is not None else config.Identification()
-    axes = machine.axis if machine is not None else {}
-    return (settings.model_copy(update={"method": method}) if method else settings), axes
+    return (settings.model_copy(update={"method": method}) if method else settings), machine
 
 
 def _against_data_sheet(result: FileResult, axes: Mapping[str, Axis]) -> FileResult:
@@ -102,7 +102,7 @@ def _against_data_sheet(result: FileResult, axes: Mapping[str, Axis]) -> FileRes
     return replace(result, verdict=replace(result.verdict, accepted=False, reasons=(reason,)))
 
 
-def _analyse(paths: Sequence[Path], settings: Identification, axes: Mapping[str, Axis]) -> list[FileResult]:
+def _analyse(paths: Sequence[Path], settings: Identification, machine: MachineConfig | None) -> list[FileResult]:
     """Analyse the files, with a progress bar on stderr when that is a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -110,11 +110,11 @@ def _analyse(paths: Sequence[Path], settings: Identification, axes: Mapping[str,
     from fdhil.cli.batch import analyse_files
 
     if not sys.stderr.isatty():
-        return list(analyse_files(paths, settings, axes))
+        return list(analyse_files(paths, settings, machine))
     columns = (TextColumn("identifying"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("identifying", total=len(paths))
-        return list(analyse_files(paths, settings, axes, partial(progress.advance, task)))
+        return list(analyse_files(paths, settings, machine, partial(progress.advance, task)))
 
 
 def _file_document(result: FileResult, axes: Mapping[str, Axis], with_loops: bool) -> dict[str, Any]:
@@ -262,6 +262,8 @@ def _cells(estimate: Estimate | None, verdict: Verdict, weighed: bool) -> list[s
 
 
 def _cell(estimate: Estimate, name: str) -> str:
+    if name in estimate.given and name != "K":
+        return "-"  # of the data sheet, and no answer of this recording
     value, half = estimate.value(name), INTERVAL_95 * estimate.std(name)
     return cell(name, value, None).replace("(no ±)", "(given)") if name in estimate.given else cell(name, value, half)
 

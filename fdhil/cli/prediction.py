@@ -97,7 +97,7 @@ def predict(asked: Asked, sensitivity: bool, tolerance_um: float | None, since: 
     forewarn("predict")
     predicted = prediction.predict(reference, models, config)
     columns = _prediction_columns(predicted)
-    document = {"schema": "fdhil-predict-1", "program": str(asked.program), **_prediction_document(predicted)}
+    document = {"schema": "fdhil-predict-1", "program": str(asked.program), **_prediction_document(predicted, models)}
     told = None
     if sensitivity or tolerance_um is not None:
         told = prediction.sensitivity_um(predicted, models, config)
@@ -180,9 +180,9 @@ def correct(asked: Asked, method: str | None) -> int:
     if asked.report is not None:
         _report(asked.report, asked, config, planned, predicted)
     if asked.as_json:
-        click.echo(json.dumps(_correction_document(str(asked.program), planned, predicted), allow_nan=False))
+        click.echo(json.dumps(_correction_document(str(asked.program), planned, predicted, models), allow_nan=False))
     else:
-        _show_correction(planned, predicted)
+        _show_correction(planned, predicted, models)
     return 1 if planned.refused else 0
 
 
@@ -282,13 +282,19 @@ def _contour(predicted: Prediction) -> dict[str, float]:
     return {"rms_um": predicted.rms_um, "max_um": float(predicted.contour_um.max())}
 
 
-def _prediction_document(predicted: Prediction) -> dict[str, Any]:
+def _seen_at(models: Mapping[str, Parameters]) -> dict[str, str]:
+    """Return per axis where it is predicted: what a table does behind its motor only a known resonance tells."""
+    return {axis: "table" if model.term("resonance") else "encoder" for axis, model in models.items()}
+
+
+def _prediction_document(predicted: Prediction, models: Mapping[str, Parameters]) -> dict[str, Any]:
     return {
         "duration_s": round(float(predicted.reference.time_s[-1] - predicted.reference.time_s[0]), 6),
         "axes": {
             axis: {"rms_error_um": rms(error), "max_error_um": float(abs(error).max())}
             for axis, error in predicted.error_um.items()
         },
+        "seen_at": _seen_at(models),
         "contour": _contour(predicted),
         "zones": _zones(predicted),
     }
@@ -312,13 +318,15 @@ def _reasons(reasons: Sequence[Reason]) -> list[dict[str, str]]:
     return [asdict(reason) for reason in reasons]
 
 
-def _correction_document(program: str, planned: Correction, predicted: Gain) -> dict[str, Any]:
+def _correction_document(
+    program: str, planned: Correction, predicted: Gain, models: Mapping[str, Parameters]
+) -> dict[str, Any]:
     before, after = _contour(planned.before), _contour(planned.after)
     return {
         "schema": "fdhil-correct-1",
         "program": program,
         "method": planned.method,
-        **_prediction_document(planned.before),
+        **_prediction_document(planned.before, models),
         "before": before,
         "after": {**after, "uncertainty_um": predicted.half_um},
         "gain": before["rms_um"] / after["rms_um"] if after["rms_um"] > 0 else 1.0,
@@ -367,7 +375,7 @@ def _driver(per_axis: Mapping[str, Mapping[str, float]]) -> str:
     return f"1 % more {name} of axis {axis} changes it by {rise:+.2f} um"
 
 
-def _show_correction(planned: Correction, predicted: Gain) -> None:
+def _show_correction(planned: Correction, predicted: Gain, models: Mapping[str, Parameters]) -> None:
     _show_prediction(planned.before)
     for reason in planned.warnings:
         click.echo(f"warning, {reason}; {reason.advice}", err=True)
@@ -377,3 +385,7 @@ def _show_correction(planned: Correction, predicted: Gain) -> None:
         sure = "" if predicted.at_least is None else f", at least {predicted.at_least:.1f} times better"
         most = f"{_contour(planned.after)['max_um']:.1f} um at most"
         click.echo(f"predicted with the {planned.method} correction: {predicted}; {most}{sure}")
+        blind = [axis for axis, where in _seen_at(models).items() if where == "encoder"]
+        if blind:
+            told = f"that is where the encoders of {', '.join(blind)} are: what a table swings behind its motor they"
+            click.echo(f"{told} do not see; where it does, tell resonance_hz of the axis")

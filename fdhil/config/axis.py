@@ -120,8 +120,8 @@ class Axis(Section):
         None,
         ge=5.0,
         le=2000.0,
-        description="first resonance between motor and table, measured at the table; left out: the table is where the "
-        "motor's encoder is, which cannot see it",
+        description="resonance of motor and table against each other, the motor free to turn, as the drive's frequency "
+        "response has it; the motor's encoder cannot see what the table does then: left out, the table is where it is",
     )
     resonance_damping: NotNegative = Field(0.03, le=0.7, description="damping ratio of that resonance")
     nominal: Nominal

@@ -17,6 +17,7 @@ from fdhil.correction.limits import PlanLimits, check, fit
 from fdhil.correction.linear import Inverse
 from fdhil.correction.resting import Resting, run_with
 from fdhil.model.closed_loop import Ready, Response, State
+from fdhil.model.kernels import SPEED, TABLE_SPEED
 from fdhil.records import Bool, Float, Parameters
 
 ITERATIONS = 8
@@ -175,7 +176,7 @@ def _run(
         # dry friction takes hold early in a rest or not at all
         look = min(stop, max(first, done) + round(SEARCH_S / loop.sync_period_s))
         response = loop.run(reference_mm, offset, state, done, look)
-        position[done:look] = response.position_mm
+        position[done:look] = response.table_mm
         stuck = _stuck(loop, response, target_mm[done:look], max(first - done, 0))
         if stuck is None:
             state, done = response.end, look
@@ -185,15 +186,15 @@ def _run(
         if lead:
             _hold(loop, reference_mm, offset, state, row, stop)
         response = loop.run(reference_mm, offset, state, row, stop)
-        position[row:stop], state, done = response.position_mm, response.end, stop
+        position[row:stop], state, done = response.table_mm, response.end, stop
         held[row:stop] = True
         gone = np.maximum(0.0, 1 - np.arange(stop - row) * loop.sync_period_s / FORGET_S)
         error_of_rest[row:stop] = (target_mm[row] - position[row]) * gone
     if done < guess.size:
-        position[done:] = loop.run(reference_mm, offset, state, done, guess.size).position_mm
+        position[done:] = loop.run(reference_mm, offset, state, done, guess.size).table_mm
     if held.any() and check(offset[2:].astype(np.int64), loop.limits, before):
         offset[2:] = np.rint(fit(offset[2:], loop.limits, before))
-        position = loop.run(reference_mm, offset, carry.state, 0, guess.size).position_mm
+        position = loop.run(reference_mm, offset, carry.state, 0, guess.size).table_mm
     return offset, position, np.where(held, error_of_rest, target_mm - position)
 
 
@@ -201,9 +202,9 @@ def _stuck(loop: AxisLoop, response: Response, target_mm: Float, first: int) -> 
     """Return the first row from ``first`` on at which dry friction holds the table near its target."""
     band = loop.resting.band_at(float(target_mm[first]))
     near: Bool = (
-        (response.speed_rad_s == 0.0)
+        (response.states[TABLE_SPEED if response.parted else SPEED] == 0.0)
         & band.holds(loop.parameters.K * response.current_a, BAND)
-        & (np.abs(response.position_mm - target_mm) <= STUCK_UM * 1e-3)
+        & (np.abs(response.table_mm - target_mm) <= STUCK_UM * 1e-3)
     )
     rows = np.flatnonzero(near[first:])
     return first + int(rows[0]) if rows.size else None

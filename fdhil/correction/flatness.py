@@ -40,8 +40,8 @@ def offsets(reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: float
     lead = lead_s(parameters, axis)
     demanded = np.gradient(reference_mm, dt_s) * 2 * np.pi / axis.screw_pitch_mm
     acceleration = np.gradient(demanded, dt_s)
-    sign = np.where(np.abs(demanded) > STILL_RAD_S, np.sign(demanded), 0.0)
-    smooth, dry = resisting(p, demanded, reference_mm * 2 * np.pi / axis.screw_pitch_mm, sign)
+    turning = np.where(np.abs(demanded) > STILL_RAD_S, demanded, 0.0)
+    smooth, dry = resisting(p, turning, reference_mm * 2 * np.pi / axis.screw_pitch_mm)
     # a load acts at rest too: what stands still while the axis does, the speed loop's integral holds by itself
     current = (p.Jt * acceleration + smooth + dry - p.term("load")) / p.K
     times = np.arange(reference_mm.size) * dt_s

@@ -80,6 +80,15 @@ def worse_rows(before_um: Float, after_um: Float, dt_s: float) -> Bool:
     return np.asarray((now > then + WORSE_UM) & (after_um > then + WORSE_UM))
 
 
+def harm_advice(models: Mapping[str, Parameters]) -> str:
+    """Say what may be done where a correction would do harm."""
+    swinging = {axis: model.term("resonance") for axis, model in models.items() if model.term("resonance")}
+    if not swinging:
+        return "try the method inverse, or lower the feed there"
+    told = ", ".join(f"{axis} at {hertz:.0f} Hz" for axis, hertz in swinging.items())
+    return f"lower the feed there, or smooth more: a table that swings behind its motor ({told}) is beyond the drive"
+
+
 def fade(worse: Bool, dt_s: float) -> Float:
     """Return a factor (n,): 0 in and around the rows that get worse, 1 far from them, smooth in between."""
     if not worse.any():

@@ -43,7 +43,7 @@ def common_delay_s(
         return 0.0, ()
     tau = 0.5 * (min(delays.values()) + max(delays.values()))
     needed_um = {axis: abs(delay - tau) * speeds_mm_s[axis] * 1e3 for axis, delay in delays.items()}
-    return tau, too_large(needed_um, config)
+    return tau, too_large(needed_um, models, config)
 
 
 def delayed(path: Float, delay_rows: float) -> Float:
@@ -72,7 +72,7 @@ def plan(reference: Trajectory, models: Mapping[str, Parameters], config: Machin
         return walk.whole(path, delayed(path, tau / reference.dt_s))
 
     found = closed_loop.each_axis(one, reference.axes)
-    refused = too_large({axis: needed for axis, (_, needed) in found.items()}, config)
+    refused = too_large({axis: needed for axis, (_, needed) in found.items()}, models, config)
     return Plan(nothing if refused else {axis: offset for axis, (offset, _) in found.items()}, tau, refused)
 
 
@@ -97,7 +97,7 @@ class AxisInverse:
             linear.inverse(parameters, drive, period, sum(block_rows(period))),
             Resting(parameters, drive, period, limits.um_per_increment * 1e-3),
         )
-        return AxisInverse(loop, Carry(closed_loop.start(start_mm), np.zeros(2), np.empty(0)))
+        return AxisInverse(loop, Carry(closed_loop.standing(parameters, drive, start_mm), np.zeros(2), np.empty(0)))
 
     def block(self, reference_mm: Float, target_mm: Float, rows: int, ends: bool) -> Solution:
         """Solve the next ``rows``, with what is known of the rows behind them, and go on to those.

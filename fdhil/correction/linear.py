@@ -19,6 +19,7 @@ from fdhil.records import Float, Parameters
 
 BANDWIDTH_HZ = 120.0
 REGULARISATION = 1e-3
+RESONANCE_SHARE = 0.5  # of a resonance's frequency: near it a little error of the model turns the answer's sign
 IMPULSE_S = 1.0
 AHEAD_S = 0.064  # of the impulse's answer that may come before it: the feed-forward looks ahead
 PAD_S = 0.5
@@ -64,7 +65,7 @@ def inverse(parameters: Parameters, axis: Axis, sync_period_s: float, rows: int)
     ahead = round(AHEAD_S / sync_period_s)
     impulse = np.zeros(ahead + round(IMPULSE_S / sync_period_s))
     impulse[ahead] = 1.0
-    answer = closed_loop.simulate(linear, free, sync_period_s, impulse).position_mm
+    answer = closed_loop.simulate(linear, free, sync_period_s, impulse).table_mm
     pad = round(PAD_S / sync_period_s)
     size = int(2 ** np.ceil(np.log2(rows + 2 * pad)))
     around = np.zeros(size)
@@ -72,7 +73,8 @@ def inverse(parameters: Parameters, axis: Axis, sync_period_s: float, rows: int)
     around = np.roll(around, -ahead)
     spectrum = np.fft.rfft(around)
     frequency = np.fft.rfftfreq(size, sync_period_s)
-    roll_off = 1 / (1 + (frequency / min(BANDWIDTH_HZ, 0.2 / sync_period_s)) ** 4)
+    bandwidth = min(BANDWIDTH_HZ, 0.2 / sync_period_s, RESONANCE_SHARE * parameters.term("resonance", np.inf))
+    roll_off = 1 / (1 + (frequency / bandwidth) ** 4)
     gain = roll_off / (np.abs(spectrum) ** 2 + REGULARISATION)
     factor = np.asarray(np.conj(spectrum) * gain, dtype=np.complex128)
     return Inverse(factor, size, pad)

@@ -6,15 +6,17 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from fdhil.config import MachineConfig
+from fdhil.config import Axis, MachineConfig
 from fdhil.correction.limits import fit_all
 from fdhil.correction.method import Plan
 from fdhil.records import Parameters, Prediction, Reason, Trajectory
 
+FULL = 0.95  # of the speed fed forward: less leaves a lag
+
 
 def plan(
     reference: Trajectory,
-    _models: Mapping[str, Parameters],
+    models: Mapping[str, Parameters],
     config: MachineConfig,
     before: Prediction,
 ) -> Plan:
@@ -24,13 +26,17 @@ def plan(
     """
     wanted = {axis: -error for axis, error in before.error_um.items()}
     largest = {axis: float(np.abs(offset).max(initial=0.0)) for axis, offset in wanted.items()}
-    return Plan(fit_all(wanted, config.axis, reference.dt_s), refused=too_large(largest, config), untouched=True)
+    return Plan(
+        fit_all(wanted, config.axis, reference.dt_s), refused=too_large(largest, models, config), untouched=True
+    )
 
 
-def too_large(needed_um: Mapping[str, float], config: MachineConfig) -> tuple[Reason, ...]:
-    """Return ``LagTooLarge`` for each axis whose largest offset is beyond its ceiling."""
+def too_large(
+    needed_um: Mapping[str, float], models: Mapping[str, Parameters], config: MachineConfig
+) -> tuple[Reason, ...]:
+    """Return the reason for each axis whose largest offset is beyond its ceiling."""
     return tuple(
-        lag_reason(axis, needed, allowed_um(config, axis), config.axis[axis].regulators.speed_feedforward)
+        lag_reason(axis, needed, allowed_um(config, axis), models[axis], config.axis[axis])
         for axis, needed in needed_um.items()
         if not needed <= allowed_um(config, axis)
     )
@@ -42,13 +48,16 @@ def allowed_um(config: MachineConfig, axis: str) -> float:
     return limits.max_offset_um if limits is not None else 0.0
 
 
-def lag_reason(axis: str, needed_um: float, allowed_um: float, feedforward: float) -> Reason:
-    """Say that an axis lags by more than an offset may make up for."""
+def lag_reason(name: str, needed_um: float, allowed_um: float, model: Parameters, axis: Axis) -> Reason:
+    """Say that an axis lags, or its table swings, by more than an offset may make up for."""
+    feedforward, hertz = axis.regulators.speed_feedforward, model.term("resonance")
+    needs = f"needs offsets of {needed_um:.0f} um, {allowed_um:.0f} um are allowed"
+    if hertz and feedforward >= FULL:
+        text = f"axis {name} {needs}: its table swings behind the motor at {hertz:.0f} Hz, beyond the drive's reach"
+        return Reason("ResonanceBeyondReach", text, "lower the feed, or smooth more")
     advice = (
         f"enable the drive's speed feed-forward (it is {feedforward:g}), then identify and plan again"
-        if feedforward < 0.95
-        else f"lower the feed, or raise max_offset_um of axis {axis} if the machine allows it"
+        if feedforward < FULL
+        else f"lower the feed, or raise max_offset_um of axis {name} if the machine allows it"
     )
-    return Reason(
-        "LagTooLarge", f"axis {axis} needs offsets of {needed_um:.0f} um, {allowed_um:.0f} um are allowed", advice
-    )
+    return Reason("LagTooLarge", f"axis {name} {needs}", advice)

@@ -98,4 +98,4 @@ def _mask_harm(
     text = f"{worse.sum() * reference.dt_s:.2f} s between {first:.2f} s and {last:.2f} s would get worse"
     if not wanted.untouched:
         text += " and are left as they are"
-    return offset, after, (Reason("HarmPredicted", text, "try the method inverse, or lower the feed there"),)
+    return offset, after, (Reason("HarmPredicted", text, gate.harm_advice(models)),)

@@ -17,9 +17,9 @@ from scipy.linalg.lapack import dposv
 from fdhil.config import Axis
 from fdhil.correction import kernels
 from fdhil.correction.linear import unlimited
-from fdhil.model import closed_loop
+from fdhil.model import closed_loop, terms
 from fdhil.model.closed_loop import Commands, Ready, Response, State
-from fdhil.model.kernels import CURRENT_DEMAND, POSITION
+from fdhil.model.kernels import CURRENT_DEMAND, POSITION, TABLE
 from fdhil.prediction.model_terms import Band, band
 from fdhil.records import Float, Parameters
 
@@ -41,7 +41,8 @@ class Resting:
 
     def __init__(self, parameters: Parameters, axis: Axis, sync_period_s: float, increment_mm: float) -> None:
         self._held = closed_loop.prepare(*unlimited(parameters, axis, HELD_NM), sync_period_s)
-        self._parameters, self._rad_per_mm = parameters, 2 * np.pi / axis.screw_pitch_mm
+        self._parameters, self._rad_per_mm = parameters, terms.rad_per_mm(axis)
+        self._place = TABLE if terms.has_spring(parameters) else POSITION
         self._period_s, self._increment_mm = sync_period_s, increment_mm
         self._free, self._again = round(FREE_S / sync_period_s), round(AGAIN_S / sync_period_s)
         impulse = np.zeros(round((FREE_S + WATCHED_S) / sync_period_s))
@@ -58,8 +59,9 @@ class Resting:
 
         ``fixed`` (2,): the offsets of its first two rows, which are already used.
         """
-        silent = float(state[POSITION] - reference_mm[0]) / self._increment_mm
-        middle_a = self.band_at(float(state[POSITION])).middle / self._parameters.K
+        stands_mm = float(state[self._place])
+        silent = (stands_mm - float(reference_mm[0])) / self._increment_mm
+        middle_a = self.band_at(stands_mm).middle / self._parameters.K
         offset = np.full(reference_mm.size, silent)
         offset[:2] = fixed
         for first in range(0, reference_mm.size - 2, self._again):  # what rounding left is led away as well

@@ -20,7 +20,7 @@ from fdhil.correction.block import AxisLoop, Solution
 from fdhil.correction.inverse import AxisInverse, block_rows, common_delay_s, delayed
 from fdhil.correction.limits import check
 from fdhil.correction.mirror import lag_reason
-from fdhil.model.closed_loop import Commands, Response, State, start
+from fdhil.model.closed_loop import Commands, Response, State, standing
 from fdhil.prediction.contour import WINDOW_S, contour_error_um
 from fdhil.records import Float, Parameters, Reason
 
@@ -100,7 +100,11 @@ def stream(
             return
         if not axes:
             axes = {
-                name: _Axis(name, AxisInverse.of(models[name], config, name, v[0]), start(v[0]))
+                name: _Axis(
+                    name,
+                    AxisInverse.of(models[name], config, name, v[0]),
+                    standing(models[name], config.axis[name], v[0]),
+                )
                 for name, v in path.items()
             }
             # before any speed is known: as if every axis may run its rapid speed
@@ -133,7 +137,7 @@ def _solve(axis: _Axis, path: Float, kept: int, rows: int, delay_rows: float, en
     solution = axis.inverse.block(reference, target, rows, ends)
     refused = _refused(axis.name, loop, solution, free, rows)
     offset = solution.offset[:rows] * loop.limits.um_per_increment
-    return _Piece(offset, free.position_mm, solution.position_mm[:rows], refused)
+    return _Piece(offset, free.table_mm, solution.position_mm[:rows], refused)
 
 
 def _refused(name: str, loop: AxisLoop, solution: Solution, free: Response, rows: int) -> tuple[_Refusal, ...]:
@@ -147,8 +151,7 @@ def _refused(name: str, loop: AxisLoop, solution: Solution, free: Response, rows
         reason = Reason("DemandTooHigh", text, "lower the feed, or smooth more")
         refused.append(_Refusal(int(np.argmax(free.limited > 0.0)), reason))
     elif solution.needed_um > loop.limits.offset * um:
-        feedforward = loop.axis.regulators.speed_feedforward
-        reason = lag_reason(name, solution.needed_um, loop.limits.offset * um, feedforward)
+        reason = lag_reason(name, solution.needed_um, loop.limits.offset * um, loop.parameters, loop.axis)
         refused.append(_Refusal(solution.needed_at, reason))
     before = float(solution.offset[1]), float(solution.offset[0])
     broken = check(solution.offset[2:rows].astype(np.int64), loop.limits, before)

@@ -10,7 +10,7 @@ from fdhil import correction
 from fdhil.config import Axis, MachineConfig
 from fdhil.correction.kernels import project
 from fdhil.identification.kalman import departure
-from fdhil.model.closed_loop import simulate
+from fdhil.model import closed_loop
 from fdhil.pipeline import AxisPipeline
 from fdhil.records import Float, Parameters, Stages, Trajectory, Window, frozen, frozen_ints
 
@@ -30,6 +30,8 @@ def warm(config: MachineConfig, method: str | None = None) -> None:
     reference = Trajectory(dt_s, frozen(np.arange(rows) * dt_s), demand, still.astype(np.bool_), frozen_ints(still))
     models = {name: Parameters(**axis.nominal.model_dump()) for name, axis in config.axis.items()}
     correction.plan(reference, models, config)
+    for name, model in models.items():
+        closed_loop.simulate(model.changed(load=0.0), config.axis[name], dt_s, demand[name][:8])
     _warm_what_is_rare()
 
 
@@ -49,7 +51,7 @@ def nominal_rapid(name: str, axis: Axis, dt_s: float, direction: int = 1, seed: 
     wanted = direction * top * _trapezoid(margin, ramp, cruise)
     turned = np.cumsum(wanted) - 0.5 * (wanted + wanted[0])  # trapezoids
     demand = turned * dt_s * axis.screw_pitch_mm / (2 * math.pi)
-    moved = simulate(nominal, axis, dt_s, frozen(demand))
+    moved = closed_loop.simulate(nominal, axis, dt_s, frozen(demand))
     position, speed, current = moved.position_mm, moved.speed_rad_s, moved.current_a
     angle = position * (2 * math.pi / axis.screw_pitch_mm)
     voltage = nominal.R * current + nominal.L * np.gradient(current, dt_s) + nominal.K * speed

@@ -160,7 +160,10 @@ class OutcomeStore:
         return [skill for axis in self._config.axis for skill in self._history.skills(axis, limit=SKILLS)]
 
     def known(self, axis: str) -> Known:
-        """Return where an earlier run left off: first values, newest set, the newest accepted windows' estimates."""
+        """Return where an earlier run left off: first values, newest set, the newest accepted windows' estimates.
+
+        Loops are known as long as the configuration is the same: a drive may have been tuned with it.
+        """
         if self._history is None:
             return Known()
         newest = self._history.revisions(axis, limit=1)
@@ -170,7 +173,10 @@ class OutcomeStore:
         }
         windows = [window for window in self._history.windows(axis, limit=2 * HISTORY) if window.accepted][-HISTORY:]
         points = tuple(map(_point, windows[-4 * POOL_WINDOWS :]))
-        return Known(first, newest[0].set if newest else None, points, _members(windows))
+        published = newest[0].set if newest else None
+        same = published is not None and published.config_digest == self._config.digest
+        loops = self._history.loops(axis, limit=1) if same else []
+        return Known(first, published, points, _members(windows), loops[0][1] if loops else None)
 
     def counts(self, axis: str) -> tuple[int, int]:
         """Return how many windows of an axis were ever accepted and refused."""

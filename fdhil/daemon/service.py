@@ -142,7 +142,7 @@ class Service:
         for axis in self._config.axis:
             known = self._store.known(axis)
             self._pipelines[axis] = AxisPipeline(axis, self._config, self._method, known)
-            self._watch.begin(axis, known.newest, self._store.counts(axis))
+            self._watch.begin(axis, known.newest, self._store.counts(axis), known.loops)
         warm(self._config, self._method)
 
     async def _say_ready(self) -> None:

@@ -39,9 +39,12 @@ class Watch:
         self._troubles: dict[Trouble, str] = {}
         self.hearing = Hearing(config, now_s)
 
-    def begin(self, axis: str, published: ParameterSet | None, counts: tuple[int, int]) -> None:
+    def begin(
+        self, axis: str, published: ParameterSet | None, counts: tuple[int, int], loops: LoopEstimate | None = None
+    ) -> None:
         """Start from what the history knows of an axis."""
         watch = self._axes[axis]
+        watch.loops = loops
         watch.published, (watch.accepted, watch.refused) = published, counts
 
     def outcome_came(self, outcome: Outcome, now_s: float) -> None:

@@ -9,11 +9,13 @@ with: few windows leave much open, and are told so.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from fdhil.model.compiled import compiled
 from fdhil.records import Float
 
 HISTORY = 24  # windows: what came before says little of how fast the drive warms now
@@ -22,6 +24,7 @@ FOR_BOTH_SLOPES = 3  # windows in either direction from which on viscous frictio
 STEPS = np.array([0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 0.064])
 SCATTERS = np.array([0.0, 0.003, 0.01, 0.03])
 SMALL_SCATTERS = np.array([0.0, 0.0005, 0.002, 0.008])
+UNKNOWN = 100.0  # squared shares of a parameter's size: what is known of it before the first window
 SURELY = 6.9  # logarithm of a ratio of likelihoods: two sizes more explain so much by chance once in a thousand
 NO_SCATTER = 0.9  # prior chance that there is no scatter at all
 
@@ -44,7 +47,7 @@ class Member:
     def part(self, names: Sequence[str]) -> tuple[Float, Float]:
         """Return values (p,) and own covariance (p, p) of some names."""
         rows = [self.names.index(name) for name in names]
-        return self.values[rows], self.own[np.ix_(rows, rows)]
+        return self.values[rows], self.own[rows][:, rows]
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,8 +131,8 @@ def _weighed(members: Sequence[Member], kind: Kind) -> tuple[Float, Float, Float
     typical[typical == 0.0] = 1.0
     owns = np.array([own for _, own in told]) / np.outer(typical, typical)
     pairs, prior = kind.grid()
-    known = np.concatenate([_levels(members, kind), (values / typical)[:, :, None]], axis=2)
-    likely = _restricted(owns, known, np.array([m.place for m in members], dtype=np.float64), pairs)
+    places = np.array([m.place for m in members], dtype=np.float64)
+    likely = _likelihoods(owns, _levels(members, kind), values / typical, places, pairs)
     return likely, prior, pairs, typical
 
 
@@ -150,23 +153,54 @@ def _levels(members: Sequence[Member], kind: Kind) -> Float:
     return np.concatenate(columns, axis=2)
 
 
-def _restricted(owns: Float, known: Float, places: Float, pairs: Float) -> Float:
-    """Return the restricted log-likelihood (g,) of each pair of walk and scatter.
+def _bank(owns: Float, levels: Float, values: Float, places: Float, pairs: Float) -> Float:
+    """Return the log-likelihood (g,) of each pair of walk and scatter: a Kalman filter for each, over the windows.
 
-    ``owns`` (n, p, p) are the windows' covariances, ``known`` (n, p, k + 1) the levels' columns and then the values.
+    ``owns`` (n, p, p) are the windows' covariances, ``levels`` (n, p, k) what the state (k,) makes of each value of
+    ``values`` (n, p); the first p of the state walk. Nothing is known of it at first, so the likelihood is restricted
+    to what windows tell of each other. A window's values are made independent, and taken one by one.
     """
-    n, p, _ = known.shape
-    own = np.zeros((n, p, n, p))
-    own[np.arange(n), :, np.arange(n), :] = owns
-    steps = places - places[0]
-    walk = np.kron(np.minimum.outer(steps, steps), np.eye(p))
-    spread = own.reshape(n * p, n * p) + pairs[:, :1, None] ** 2 * walk + pairs[:, 1:, None] ** 2 * np.eye(n * p)
-    root = np.linalg.cholesky(spread)
-    white = np.linalg.solve(root, np.broadcast_to(known.reshape(n * p, -1), (len(pairs), n * p, known.shape[2])))
-    levels, values = white[:, :, :-1], white[:, :, -1:]
-    triangle = np.linalg.cholesky(levels.transpose(0, 2, 1) @ levels)
-    followed = np.linalg.solve(triangle, levels.transpose(0, 2, 1) @ values)
-    left = np.square(values).sum(axis=(1, 2)) - np.square(followed).sum(axis=(1, 2))
-    logs = sum(np.log(np.diagonal(each, axis1=1, axis2=2)).sum(axis=1) for each in (root, triangle))
-    likely: Float = -0.5 * left - logs
+    n, p, k = levels.shape
+    likely, state, spread, lever = np.zeros(len(pairs)), np.zeros(k), np.zeros((k, k)), np.zeros(k)
+    root, rows, told = np.zeros((p, p)), np.zeros((p, k)), np.zeros(p)
+    for g in range(len(pairs)):
+        walk, scatter = pairs[g, 0] ** 2, pairs[g, 1] ** 2
+        state[:], spread[:] = 0.0, 0.0
+        for a in range(k):
+            spread[a, a] = UNKNOWN
+        for j in range(n):
+            for q in range(p):
+                spread[q, q] += walk * (places[j] - places[max(j - 1, 0)])
+                # the next row of the covariance's Cholesky root, and what it makes of the columns
+                for a in range(q + 1):
+                    left = owns[j, q, a] + (scatter if a == q else 0.0)
+                    for c in range(a):
+                        left -= root[q, c] * root[a, c]
+                    root[q, a] = math.sqrt(left) if a == q else left / root[a, a]
+                told[q] = values[j, q]
+                for a in range(k):
+                    rows[q, a] = levels[j, q, a]
+                for c in range(q):
+                    told[q] -= root[q, c] * told[c]
+                    for a in range(k):
+                        rows[q, a] -= root[q, c] * rows[c, a]
+                told[q] /= root[q, q]
+                for a in range(k):
+                    rows[q, a] /= root[q, q]
+            for q in range(p):
+                size, off = 1.0, told[q]
+                for a in range(k):
+                    lever[a] = 0.0
+                    for c in range(k):
+                        lever[a] += spread[a, c] * rows[q, c]
+                    size += rows[q, a] * lever[a]
+                    off -= rows[q, a] * state[a]
+                for a in range(k):
+                    state[a] += lever[a] * off / size
+                    for c in range(k):
+                        spread[a, c] -= lever[a] * lever[c] / size
+                likely[g] -= 0.5 * (math.log(size) + off**2 / size) + math.log(root[q, q])
     return likely
+
+
+_likelihoods = compiled(_bank)

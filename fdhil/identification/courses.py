@@ -18,7 +18,7 @@ def any_voltage(motion: Motion) -> bool:
 
 def load_nm(motion: Motion, theta: Float) -> Float:
     """Return dry friction and the torque of the terms (n,) against the positive direction over each interval."""
-    return _added(theta[CD] * motion.mode, motion, theta, LOAD)
+    return _known(_added(theta[CD] * motion.mode, motion, theta, LOAD), motion, LOAD)
 
 
 def terms_nm(motion: Motion, theta: Float) -> Float:
@@ -28,7 +28,7 @@ def terms_nm(motion: Motion, theta: Float) -> Float:
 
 def voltage_v(motion: Motion, theta: Float) -> Float:
     """Return the mean voltage (n,) that reaches the motor over each interval, without its delay."""
-    return _added(motion.delayed(float(theta[DELAY])), motion, theta, VOLTAGE)
+    return _known(_added(motion.delayed(float(theta[DELAY])), motion, theta, VOLTAGE), motion, VOLTAGE)
 
 
 def voltage_terms_v(motion: Motion, theta: Float) -> Float:
@@ -40,4 +40,11 @@ def _added(values: Float, motion: Motion, theta: Float, kind: int) -> Float:
     for course, amplitude in zip(motion.courses, theta[FIRST_COURSE:], strict=False):
         if course.kind == kind:
             values = values + amplitude * course.values
+    return values
+
+
+def _known(values: Float, motion: Motion, kind: int) -> Float:
+    for course in motion.known:
+        if course.kind == kind:
+            values = values + course.values
     return values

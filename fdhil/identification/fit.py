@@ -13,7 +13,7 @@ import numpy as np
 
 from fdhil.identification.courses import FIRST_COURSE
 from fdhil.identification.identifiability import admissible
-from fdhil.identification.innovations import Gains, answers, gains_of, innovations, whiten
+from fdhil.identification.innovations import Gains, answers, course_answers, gains_of, innovations, whiten
 from fdhil.identification.kalman import CD, DELAY, FT, LOAD, SPEED, VOLTAGE, K
 from fdhil.identification.motion import Course, Motion, Noise
 from fdhil.identification.noise import fit_noise
@@ -71,6 +71,17 @@ class Problem:
         """
         parts = zip(self.motions, self.noises, courses, strict=True)
         return np.concatenate([-_answered(m, theta, s, own) for m, s, own in parts])
+
+    def course_effects(self, theta: Float) -> Float:
+        """Return how the innovations (m, c) change with one deviation of each thing not known of the voltage's course.
+
+        The first is :meth:`shape_effect`; in long rows the regulators' part has one of its own.
+        """
+        shape = self.shape_effect(theta)[:, None]
+        if any(m.within is None for m in self.motions):
+            return shape
+        pairs = zip(self.motions, self.filters, strict=True)
+        return np.column_stack([shape, np.concatenate([course_answers(m, theta, f) for m, f in pairs])])
 
     def _all(self, theta: Float, emf_share: float) -> Float:
         pairs = zip(self.motions, self.filters, strict=True)

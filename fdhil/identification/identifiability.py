@@ -11,7 +11,7 @@ from fdhil.records import PARAMETERS, Estimate, Float, Reason, Result
 
 CONDITION_LIMIT = 1e6
 RELATIVE_STD_LIMIT: Mapping[str, float] = {"R": 0.10, "L": 0.25, "K": 0.05, "Jt": 0.10, "ft": 0.5, "Cd": 0.5}
-FRICTION_SHARE = 0.25
+FRICTION_SHARE, TORQUE_SHARE = 0.25, 0.02
 TOLD_BY_VOLTAGE = frozenset({"R", "L"})
 PHYSICAL: Mapping[str, tuple[float, float]] = {
     "R": (1e-3, 1e3),
@@ -42,10 +42,11 @@ def empty_estimate(method: str, result: Result, reason: Reason) -> Estimate:
     )
 
 
-def judge(estimate: Estimate, condition: float, top_rad_s: float) -> Estimate:
+def judge(estimate: Estimate, condition: float, top_rad_s: float, top_nm: float = 0.0) -> Estimate:
     """Return the estimate with its result set, and NaN with a reason where the data cannot tell a parameter.
 
-    ``condition`` is that of the regressor with columns of equal length, ``top_rad_s`` the largest speed in the data.
+    ``condition`` is that of the regressor with columns of equal length, ``top_rad_s`` the largest speed in the data,
+    ``top_nm`` the largest torque.
     """
     if not np.isfinite(condition) or condition > CONDITION_LIMIT:
         text = f"the regressor is rank deficient (condition number {condition:.1e})"
@@ -55,7 +56,7 @@ def judge(estimate: Estimate, condition: float, top_rad_s: float) -> Estimate:
         return empty_estimate(
             estimate.method, Result.NOT_FINITE, Reason("NotFinite", "the fit is not finite", "record again")
         )
-    missing = _unknown(estimate, top_rad_s)
+    missing = _unknown(estimate, top_rad_s, top_nm)
     values, covariance = estimate.values.copy(), estimate.covariance.copy()
     for name in missing:
         k = estimate.names.index(name)
@@ -64,12 +65,14 @@ def judge(estimate: Estimate, condition: float, top_rad_s: float) -> Estimate:
     return replace(estimate, values=values, covariance=covariance, missing=missing, result=result)
 
 
-def _unknown(estimate: Estimate, top_rad_s: float) -> dict[str, Reason]:
+def _unknown(estimate: Estimate, top_rad_s: float, top_nm: float) -> dict[str, Reason]:
     """Return the parameters whose standard deviation is too large to publish them."""
     missing = {}
     friction = abs(estimate.value("ft")) * top_rad_s + abs(estimate.value("Cd"))
-    # a friction coefficient may be nil: its interval is measured against the friction torque that there is
-    least = {"ft": FRICTION_SHARE * friction / max(top_rad_s, 1e-300), "Cd": FRICTION_SHARE * friction}
+    # a friction coefficient may be nil: its interval is measured against the friction torque that
+    # there is, or, since a weight may balance it in one direction, against the torque that the drive makes
+    matters = max(FRICTION_SHARE * friction, TORQUE_SHARE * top_nm)
+    least = {"ft": matters / max(top_rad_s, 1e-300), "Cd": matters}
     for name, limit in RELATIVE_STD_LIMIT.items():
         value, std = estimate.value(name), estimate.std(name)
         size = max(abs(value), least.get(name, 0.0))

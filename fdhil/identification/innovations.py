@@ -18,7 +18,18 @@ from fdhil.identification.motion import Motion, Noise
 from fdhil.identification.slow_voltage import innovations_of
 from fdhil.records import Float
 
-__all__ = ["CURRENT", "LOAD", "SPEED", "VOLTAGE", "Gains", "answers", "gains_of", "innovations", "whiten"]
+__all__ = [
+    "CURRENT",
+    "LOAD",
+    "SPEED",
+    "VOLTAGE",
+    "Gains",
+    "answers",
+    "course_answers",
+    "gains_of",
+    "innovations",
+    "whiten",
+]
 NOTHING: Float = np.zeros((0, 0))
 
 
@@ -107,3 +118,12 @@ def answers(
     signals = np.zeros((4, motion.n))
     white = kalman.respond(theta, readings, signals, kind, np.asarray(courses), within, gains.gains)
     return white.reshape(len(courses), -1).T
+
+
+def course_answers(motion: Motion, theta: Float, gains: Gains) -> Float:
+    """Return the change (2 n, q) of the innovations with what is open of voltage and current within rows."""
+    assert motion.within is not None
+    rises, currents = motion.within.rise_v, motion.within.current_a
+    readings, signals = Readings.of(motion), np.zeros((4, motion.n))
+    white = kalman.respond(theta, readings, signals, VOLTAGE, np.zeros_like(rises), rises, gains.gains)
+    return white.reshape(len(rises), -1).T + answers(motion, theta, gains, CURRENT, currents)

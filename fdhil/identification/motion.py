@@ -51,6 +51,14 @@ class Course:
 
 
 @dataclass(frozen=True, slots=True)
+class Within:
+    """What is not known of long rows, (q, n) one standard deviation a row of each: the voltage's rise, the current."""
+
+    rise_v: Float
+    current_a: Float
+
+
+@dataclass(frozen=True, slots=True)
 class Motion:
     """One window on its grid: ``mode`` (n,) says what is known of the interval that begins at each row.
 
@@ -62,6 +70,7 @@ class Motion:
     and ``shape_variance`` (m,), V^2, what the voltage's course within a row adds to its noise. ``courses`` are those of
     the terms that joined, in the order of the last entries of theta;
     ``angle_rad`` (n,) is the shaft's as its place tells, or has no rows;
+    ``within`` is what is open within long rows, ``known`` are courses whose size is;
     ``speed_late`` is by how many seconds the recorded speed was late, and the standard deviation of that.
     """
 
@@ -81,6 +90,8 @@ class Motion:
     courses: tuple[Course, ...] = ()
     angle_rad: Float = field(default_factory=lambda: np.zeros(0))
     speed_late: tuple[float, float] | None = None
+    within: Within | None = None
+    known: tuple[Course, ...] = ()
 
     @property
     def n(self) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 from fdhil.identification.between import ALIKE, Between, Member
 from fdhil.identification.covariance import aliasing
 from fdhil.identification.ripple_parts import as_amplitude, as_parts
-from fdhil.records import PARAMETERS, Estimate, Float, Window, frozen
+from fdhil.records import PARAMETERS, Estimate, Float, Int, Window, frozen
 
 # of a doubt that windows of one drive share, what may still differ between them: its size depends on the regulators,
 # which are the same, and a little on the move
@@ -56,9 +56,10 @@ def pooled(members: Sequence[Member], first: Estimate, apart: Between, *, joinin
     """
     names = _common(members)
     joined: list[str] = []
-    answer = _solved(members, names, joined, apart)
+    told = _Stack.of(members, names, apart)
+    answer = _solved(told, joined)
     while joining:
-        trials = {term: _solved(members, names, [*joined, term], apart) for term in _open(members, names, joined)}
+        trials = {term: _solved(told, [*joined, term]) for term in _open(members, names, joined)}
         surest = max(trials, key=lambda term: trials[term].surety(), default=None)
         if surest is None or trials[surest].surety() < JOINS:
             break
@@ -95,51 +96,71 @@ class _Solution:
         return abs(float(self.values[-1])) / float(np.sqrt(self.chance[-1, -1]))
 
 
-def _solved(members: Sequence[Member], names: Sequence[str], joined: Sequence[str], apart: Between) -> _Solution:
-    """Return the generalised least squares of what the windows tell, by ``names`` and then the terms ``joined``."""
-    rows = [(j, name) for j, m in enumerate(members) for name in m.names if name in names]
-    values = np.array([members[j].values[members[j].names.index(name)] for j, name in rows])
-    scale = {name: max((abs(v) for v, (_, n) in zip(values, rows, strict=True) if n == name), default=0.0) or 1.0
-             for name in names}  # fmt: skip
-    scales = np.array([scale[name] for _, name in rows])
-    levels = _columns(members, rows, names, joined)
-    weight = np.linalg.inv(_covariance(members, rows, apart) / np.outer(scales, scales))
-    unit = np.array([scale[BY_DIRECTION.get(name, name)] for name in (*names, *joined)])
-    phi = levels * unit / scales[:, None]
-    chance = np.linalg.inv(phi.T @ weight @ phi)
-    gain = chance @ phi.T @ weight / scales
-    shared = np.zeros((len(rows), max(m.shared.shape[1] for m in members)))
-    for row, (j, name) in zip(shared, rows, strict=True):
-        row[: members[j].shared.shape[1]] = members[j].shared[members[j].names.index(name)]
-    return _Solution(gain @ values * unit, chance * np.outer(unit, unit), (gain @ shared) * unit[:, None])
+def _solved(told: _Stack, joined: Sequence[str]) -> _Solution:
+    """Return the generalised least squares of what the windows tell, by the stack's names and the terms ``joined``."""
+    of = [told.names.index(BY_DIRECTION[term]) for term in joined]
+    columns = np.equal.outer(told.which, np.arange(len(told.names))).astype(np.float64)
+    columns = np.column_stack([columns, *(np.where(told.which == k, told.side, 0.0) for k in of)])
+    unit = np.concatenate([told.unit, told.unit[of]])
+    phi = columns * unit / told.unit[told.which][:, None]
+    chance = np.linalg.inv(phi.T @ told.weight @ phi)
+    gain = chance @ phi.T @ told.weight / told.unit[told.which]
+    return _Solution(gain @ told.values * unit, chance * np.outer(unit, unit), (gain @ told.shared) * unit[:, None])
 
 
-def _columns(
-    members: Sequence[Member], rows: Sequence[tuple[int, str]], names: Sequence[str], joined: Sequence[str]
+@dataclass(frozen=True, slots=True)
+class _Stack:
+    """What all windows tell, one value a row (m,): ``which`` of the ``names`` it is and the ``side`` that was moved to.
+
+    ``weight`` (m, m) is the inverse of the rows' covariance about what the drive is at the newest window, in units (k,)
+    of the names; ``shared`` (m, q) are the doubts that the windows share.
+    """
+
+    names: tuple[str, ...]
+    values: Float
+    which: Int
+    side: Float
+    shared: Float
+    unit: Float
+    weight: Float
+
+    @classmethod
+    def of(cls, members: Sequence[Member], names: tuple[str, ...], apart: Between) -> _Stack:
+        """Return the rows of all members that have one of the names."""
+        kept = [[k for k, name in enumerate(m.names) if name in names] for m in members]
+        which = np.array([names.index(m.names[k]) for m, own in zip(members, kept, strict=True) for k in own])
+        values = np.concatenate([m.values[own] for m, own in zip(members, kept, strict=True)])
+        side = np.repeat([float(m.direction) for m in members], [len(own) for own in kept])
+        shared = np.zeros((which.size, max(m.shared.shape[1] for m in members)))
+        unit = np.array([float(np.abs(values[which == k]).max()) for k in range(len(names))])
+        unit[unit == 0.0] = 1.0
+        total, start = _between(members, kept, which, names, apart), 0
+        for m, own in zip(members, kept, strict=True):
+            rows = slice(start, start + len(own))
+            total[rows, rows] += m.own[own][:, own]
+            shared[rows, : m.shared.shape[1]] = m.shared[own]
+            start = rows.stop
+        scale = unit[which]
+        weight = np.asarray(
+            np.linalg.inv(total / np.outer(scale, scale) + LEAST_SHARE**2 * np.eye(which.size)), dtype=np.float64
+        )
+        return cls(names, values, which, side, shared, unit, weight)
+
+
+def _between(
+    members: Sequence[Member], kept: Sequence[Sequence[int]], which: Int, names: Sequence[str], apart: Between
 ) -> Float:
-    """Return (m, k): which common value each row is, and what the direction adds to it."""
-    columns = [[float(name == of) for _, name in rows] for of in names]
-    columns += [[members[j].direction * float(name == BY_DIRECTION[term]) for j, name in rows] for term in joined]
-    return np.array(columns, dtype=np.float64).T
-
-
-def _covariance(members: Sequence[Member], rows: Sequence[tuple[int, str]], apart: Between) -> Float:
-    """Return the covariance (m, m) of the rows about what the drive is at the newest window."""
-    window = np.array([j for j, _ in rows])
-    alike = np.equal.outer([name for _, name in rows], [name for _, name in rows])
-    places = np.array([members[j].place for j, _ in rows], dtype=np.float64)
-    back = places.max() - places
-    squares = {name: size**2 for name, size in apart.sizes.items()}
-    walk = np.array([apart.walk.get(name, 0.0) * squares.get(name, 0.0) for _, name in rows])
-    scatter = np.array([apart.scatter.get(name, 0.0) * squares.get(name, 0.0) for _, name in rows])
+    """Return the covariance (m, m) that windows have because they differ, about what the drive is at the newest."""
+    place = np.repeat([float(m.place) for m in members], [len(own) for own in kept])
+    back = place.max() - place
+    walk, scatter = (
+        np.array([shares.get(name, 0.0) * apart.sizes.get(name, 0.0) ** 2 for name in names])[which]
+        for shares in (apart.walk, apart.scatter)
+    )
     # two windows share the way from the newer of them to the newest
-    total = np.where(alike, walk * np.minimum.outer(back, back), 0.0) + np.diag(scatter)
-    for j, one in enumerate(members):
-        at = np.flatnonzero(window == j)
-        own = [one.names.index(rows[int(k)][1]) for k in at]
-        total[np.ix_(at, at)] += one.own[np.ix_(own, own)]
-        total[at, at] += (LEAST_SHARE * one.values[own]) ** 2
-    return total
+    total = np.where(np.equal.outer(which, which), walk * np.minimum.outer(back, back), 0.0)
+    together: Float = total + np.diag(scatter)
+    return together
 
 
 def _estimate(found: _Solution, names: Sequence[str], joined: Sequence[str], first: Estimate) -> Estimate:

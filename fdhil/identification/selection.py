@@ -63,10 +63,26 @@ def joined(base: Fit, command: bool, told: Callable[[Fit], Estimate]) -> Fit:
 
 
 def _weak(estimate: Estimate, chosen: Sequence[Candidate], untold: set[str]) -> set[str]:
-    """Return the families of what is not sure beside all else; the last chosen where the six are told no more."""
-    if not set(estimate.missing) <= untold:
+    """Return the families of what is not sure beside all else; the last chosen where the six are told no more.
+
+    Friction that pushes is none: what makes it so stands for something else.
+    """
+    if not set(estimate.missing) <= untold or chosen[-1].family not in estimate.names:
         return {chosen[-1].family}
-    return {c.family for c in chosen if not abs(estimate.value(c.family)) > LEAST_SURE * estimate.std(c.family)}
+    weak = {c.family for c in chosen if not abs(estimate.value(c.family)) > LEAST_SURE * _std(estimate, c.family)}
+    low = estimate.value("stribeck") if "stribeck" in estimate.names else 0.0
+    if low and min(estimate.value("Cd"), estimate.value("Cd") + low) < 0.0:
+        weak.add("stribeck" if any(c.family == "stribeck" for c in chosen) else chosen[-1].family)
+    return weak
+
+
+def _std(estimate: Estimate, family: str) -> float:
+    """Return the deviation of a term; of friction at low speed for the speed that was chosen: whether it is there."""
+    if family != "stribeck":
+        return estimate.std(family)
+    k, speed = estimate.names.index(family), estimate.names.index("stribeck_speed")
+    covariance = estimate.covariance
+    return math.sqrt(covariance[k, k] - covariance[k, speed] ** 2 / covariance[speed, speed])
 
 
 def _with(base: Fit, chosen: Sequence[Candidate]) -> Fit:
@@ -126,13 +142,15 @@ class _Scores(NamedTuple):
 class _Bench:
     """A fit with the candidates that are ``left``, their ``columns`` (2, m, c): the second is nil where there is one.
 
-    ``basis`` (m, k) is all that is free, after the voltage's course, and ``inverse`` (k, k) the covariance of that.
+    ``basis`` (m, k) is all that is free, after the ``doubts`` about the voltage's course, and ``inverse`` (k, k) the
+    covariance of that.
     """
 
     fit: Fit
     left: Sequence[Candidate]
     columns: Float
     basis: Float
+    doubts: int
     inverse: Float
 
     @classmethod
@@ -144,8 +162,9 @@ class _Bench:
         answer = base.problem.answer(base.theta, courses)
         columns = np.zeros((2, answer.shape[0], len(left)))
         columns[0], columns[1][:, pairs] = answer[:, : len(left)], answer[:, len(left) :]
-        basis = np.column_stack([base.problem.shape_effect(base.theta), base.jacobian])
-        return cls(base, left, columns, basis, _inverse(basis))
+        doubts = base.problem.course_effects(base.theta)
+        basis = np.column_stack([doubts, base.jacobian])
+        return cls(base, left, columns, basis, doubts.shape[1], _inverse(basis, doubts.shape[1]))
 
     def without(self, taken: int, kept: Rows, joins: bool) -> _Bench:
         """Return the bench of those ``kept`` that are of another family than the ``taken``, which ``joins`` or not."""
@@ -153,7 +172,14 @@ class _Bench:
         others = [int(k) for k in kept if self.left[k].family != family]
         more = [c[:, taken] for c in self.columns if c[:, taken].any()] if joins else []
         basis = np.column_stack([self.basis, *more])
-        return _Bench(self.fit, [self.left[k] for k in others], self.columns[:, :, others], basis, _inverse(basis))
+        return _Bench(
+            self.fit,
+            [self.left[k] for k in others],
+            self.columns[:, :, others],
+            basis,
+            self.doubts,
+            _inverse(basis, self.doubts),
+        )
 
     @property
     def rows(self) -> float:
@@ -199,17 +225,17 @@ class _Bench:
         return colour
 
 
-def _inverse(basis: Float) -> Float:
+def _inverse(basis: Float, doubts: int) -> Float:
     gram = basis.T @ basis
-    gram[0, 0] += 1.0  # one deviation of the voltage's course is all that is expected of it
+    gram[range(doubts), range(doubts)] += 1.0  # one deviation of the voltage's course is all that is expected of it
     return inverse_of(gram)[0]
 
 
 def _worth(bench: _Bench, scores: _Scores, k: int) -> bool:
     """Return whether a term's torque matters to the path, or without it one of the six is beyond its interval."""
-    amplitudes = scores.amplitudes[:, k]
-    moved = np.einsum("pk,p->k", scores.shares[:, :, k], amplitudes)[1 : SIX + 1]
-    if (np.abs(moved) > SHIFT * np.sqrt(np.diag(bench.inverse)[1 : SIX + 1])).any():
+    amplitudes, six = scores.amplitudes[:, k], slice(bench.doubts, bench.doubts + SIX)
+    moved = np.einsum("pk,p->k", scores.shares[:, :, k], amplitudes)[six]
+    if (np.abs(moved) > SHIFT * np.sqrt(np.diag(bench.inverse)[six])).any():
         return True
     courses, base = bench.left[k].courses, bench.fit
     if courses[0][0].kind != LOAD:

@@ -1,8 +1,11 @@
-"""Makes a window ready for [2] alone: current, acceleration, jerk and speed, all filtered alike, rows that surely move.
+"""Makes a window ready for [2] alone: current, speed, acceleration and its derivatives, all filtered alike.
 
 The position is the better signal where its own noise makes less of an acceleration than the speed's does: a drive's
 speed may be a difference of positions, late by half a row, or filtered. Its second difference over a row is exactly the
 acceleration's mean weighted by a triangle two rows wide, so the current is taken through the same triangle.
+
+What is at rest, or lost, is nothing on either side of [2] before the low-pass, so that nothing of it leaks into the
+rows beside it: a shaft at rest is held by a friction that nobody knows.
 """
 
 from __future__ import annotations
@@ -23,7 +26,8 @@ from fdhil.records import Bool, Float, Window
 class TorqueRows:
     """A window's signals (n,), filtered alike; ``usable`` marks the rows to fit, which surely move.
 
-    ``side`` is the direction of motion (0 at rest) and not filtered, nor is ``angle`` = 2 pi x / pitch, rad.
+    ``jerk`` and ``snap`` are the first and second derivative of the acceleration. ``side`` is the direction of motion
+    (0 at rest) and not filtered, nor is ``angle`` = 2 pi x / pitch, rad.
     ``error_rad_s2`` is the standard deviation of the noise on the acceleration.
     """
 
@@ -32,6 +36,7 @@ class TorqueRows:
     current: Float
     acceleration: Float
     jerk: Float
+    snap: Float
     speed: Float
     side: Float
     angle: Float
@@ -39,7 +44,7 @@ class TorqueRows:
     error_rad_s2: float
 
     @property
-    def rows(self) -> int:
+    def count(self) -> int:
         """Number of rows to fit."""
         return int(np.count_nonzero(self.usable))
 
@@ -57,19 +62,27 @@ def torque_rows(window: Window, settings: Identification) -> TorqueRows | None:
         return None
     angle = bridged(window.position_mm) / window.pitch_mm * 2 * math.pi
     speed, acceleration, error = _motion(angle, bridged(window.speed_rad_s), corner, dt)
-    raw = np.stack([_over_rows(bridged(window.current_a), (1 / 6, 2 / 3, 1 / 6)), acceleration, speed])
-    current, acceleration, speed = zero_phase(raw, corner, dt)
-    moving = surely_moving(speed, window.rapid_speed_rad_s)
+    whole = all_about(~broken, 3, beyond=True)
+    moving = surely_moving(speed, window.rapid_speed_rad_s) & whole
+    signals = (
+        _over_rows(bridged(window.current_a), (1 / 6, 2 / 3, 1 / 6)),
+        acceleration,
+        _over_rows(acceleration, (-0.5, 0.0, 0.5)) / dt,
+        _over_rows(acceleration, (1.0, -2.0, 1.0)) / dt**2,
+        speed,
+    )
+    current, acceleration, jerk, snap, speed = zero_phase(np.where(moving, np.stack(signals), 0.0), corner, dt)
     return TorqueRows(
         dt_s=dt,
         lowpass_hz=corner,
         current=current,
         acceleration=acceleration,
-        jerk=_over_rows(acceleration, (-0.5, 0.0, 0.5)) / dt,
+        jerk=jerk,
+        snap=snap,
         speed=speed,
         side=np.where(moving, np.sign(speed), 0.0),
         angle=angle,
-        usable=all_about(moving & ~broken, 2 * reach(corner, dt) + 1, beyond=False),
+        usable=all_about(moving, 2 * reach(corner, dt) + 1, beyond=False),
         error_rad_s2=error,
     )
 

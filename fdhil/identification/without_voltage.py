@@ -1,9 +1,11 @@
 """Fits [2] alone where there is no voltage: Jt, ft and Cd from current and position, with the K that is given.
 
-Least squares on K i = Jt dw/dt + ft w + Cd sign(w), all filtered alike, and on what joins it: a constant load where
-both directions are there, friction at low speed, a ripple with the screw's turn. A term joins where the Bayesian
-information criterion (Schwarz 1978) wants it at the number of rows that tell something new, and where it is worth it.
-The current may be late: -tau (Jt dj/dt + ft dw/dt) is always fitted, so that it biases nothing.
+Least squares on K i = Jt dw/dt + ft w + Cd sign(w), all filtered alike, and on what joins it: friction at low speed, a
+ripple with the screw's turn. A term joins where the Bayesian information criterion (Schwarz 1978) wants it at the
+number of rows that tell something new, and where it is worth it. The current may be late: the torque's own slope
+-tau (Jt dj/dt + ft dw/dt) is always fitted, so that it biases nothing. So is the acceleration's second derivative, by
+which the torque of a table behind a screw that gives differs from that of one mass, to first order. A constant load is
+part of the friction of its direction; windows of both directions tell it.
 
 What is left is friction that no model has, much more than noise, and coloured. So the intervals stand around the
 variance of the scores (Newey and West 1987), widened for what that variance itself scatters (Kiefer and Vogelsang
@@ -13,7 +15,8 @@ variance of the scores (Newey and West 1987), widened for what that variance its
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -27,13 +30,15 @@ from fdhil.records import PARAMETERS, RATIOS, Estimate, Float, Reason, Result, W
 METHOD = "least_squares"
 TOLD_BY_SHEET = ("R", "L", "K")
 LEAST_ROWS = 32
-BASE = ("Jt", "delay", "ft", "Cd")
+BASE = ("Jt", "delay", "give", "ft", "Cd")
 STRIBECK_SHARES = (0.02, 0.03, 0.05, 0.08, 0.12, 0.18, 0.27)  # of the top speed
 SCREW_ORDERS = (1, 2)
-WORTH = 0.01  # of the torque's RMS: what a term must explain
+TERMS = ("stribeck", *(f"ripple_screw_{order}" for order in SCREW_ORDERS))
+WORTH = 0.005  # of the torque's RMS: what a term must explain, a tenth of what may be left
 SUMMED_SHARE = 0.1  # of a window's rows: over which its residuals may hang together
 WIDENED = 2.9694 / 1.96  # per share, of the 95 % interval: Kiefer and Vogelsang 2005, Bartlett's weights
-OPEN_SHARE = 3e-4  # of Jt: what the current's course between two rows leaves open
+OPEN_SHARE = 3e-4  # of Jt: what a current that is read once a row leaves open
+OPEN_SHARE_ROWS = 3e-5  # the same in rows of 1 ms; it grows with their square
 NO_VOLTAGE = Reason("LowExcitation", "there is no voltage, so [1] gives no R and L", "connect the voltage sensor")
 NO_K = Reason(
     "LowExcitation",
@@ -57,16 +62,18 @@ class Term:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TorqueFit:
-    """[2] in amperes, fitted to the rows of some windows together: ``design`` (m, k) and what it leaves, (m,).
+    """[2] in amperes, fitted to the rows of a window: ``design`` (m, k) and ``current`` (m,).
 
-    ``theta`` (k,) are the columns' amplitudes: those of ``BASE``, then of each of ``terms``.
+    ``theta`` (k,) are the columns' amplitudes: those of ``BASE``, then of each of ``terms``. ``shifts`` (k,) are
+    by how much they would move with a term that is there and was not worth joining, by its name.
     """
 
-    parts: tuple[TorqueRows, ...]
+    rows: TorqueRows
     design: Float
     current: Float
     theta: Float
     terms: tuple[Term, ...]
+    shifts: Mapping[str, Float] = field(default_factory=dict)
 
     @property
     def residual(self) -> Float:
@@ -80,47 +87,65 @@ class TorqueFit:
         return rms(self.residual) / max(rms(self.current), 1e-300)
 
 
-def fit(windows: Sequence[Window], settings: Identification) -> TorqueFit | None:
-    """Fit [2] and the terms that join it to the windows together; None where hardly any row surely moves."""
-    parts = [p for p in (torque_rows(w, settings) for w in windows) if p is not None and p.rows]
-    if sum(p.rows for p in parts) < LEAST_ROWS:
+@lru_cache(maxsize=8)
+def fit(window: Window, settings: Identification) -> TorqueFit | None:
+    """Fit [2] and the terms that join it to a window; None where hardly any row surely moves.
+
+    Estimate and checks ask for it.
+    """
+    rows = torque_rows(window, settings)
+    if rows is None or rows.count < LEAST_ROWS:
         return None
-    fitted = _fitted(tuple(parts), ())
-    if not (np.isfinite(fitted.design).all() and np.isfinite(fitted.current).all()):
+    base = np.column_stack([rows.acceleration, rows.jerk, rows.snap, rows.speed])[rows.usable]
+    design, current = np.column_stack([base, rows.through(rows.side[None])]), rows.current[rows.usable]
+    if not (np.isfinite(design).all() and np.isfinite(current).all()):
         return None
-    return _joined(fitted)
+    return _joined(TorqueFit(rows, design, current, solve(design, current)[0], ()))
 
 
-def _fitted(parts: tuple[TorqueRows, ...], terms: tuple[Term, ...]) -> TorqueFit:
-    base = np.vstack([np.column_stack([p.acceleration, p.jerk, p.speed])[p.usable] for p in parts])
-    side = np.vstack([p.through(p.side[None]) for p in parts])
-    design = np.column_stack([base, side, *(t.columns for t in terms)])
-    current = np.concatenate([p.current[p.usable] for p in parts])
-    return TorqueFit(parts, design, current, solve(design, current)[0], terms)
+def _beside(fitted: TorqueFit, term: Term) -> TorqueFit:
+    """Return the fit with one term more."""
+    design = np.column_stack([fitted.design, term.columns])
+    theta, _ = solve(design, fitted.current)
+    return replace(fitted, design=design, theta=theta, terms=(*fitted.terms, term))
 
 
 def _joined(fitted: TorqueFit) -> TorqueFit:
-    """Let the best candidate join, as long as one is wanted and worth it."""
-    rows = effective_rows(fitted)
+    """Let the best term join as long as one is wanted and worth it; what is wanted only puts the others in doubt."""
+    news = effective_rows(fitted.residual)
     while True:
-        power = float(fitted.residual @ fitted.residual)
-        best, gained = None, 0.0
-        for term in candidates(fitted):
-            tried = _fitted(fitted.parts, (*fitted.terms, term))
-            left = float(tried.residual @ tried.residual)
-            values = len(term.names)
-            gain = rows * np.log(power / max(left, 1e-300)) - values * np.log(rows)
-            worth = rms(tried.design @ tried.theta - fitted.design @ fitted.theta)
-            if gain > gained and worth > WORTH * rms(fitted.current):
-                best, gained = tried, gain
-        if best is None:
-            return fitted
-        fitted = best
+        wanted = _wanted(fitted, news)
+        worth = [other for other in wanted if _explained(other, fitted) > WORTH * rms(fitted.current)]
+        if not worth:
+            size = fitted.theta.size
+            shifts = {other.terms[-1].names[0]: other.theta[:size] - fitted.theta for other in wanted}
+            return replace(fitted, shifts=shifts)
+        fitted = worth[0]
 
 
-def effective_rows(fitted: TorqueFit) -> float:
-    """Return how many rows tell something new: n / (1 + 2 sum rho), rho summed up to where it is nil."""
-    e = fitted.residual
+def _wanted(fitted: TorqueFit, news: float) -> list[TorqueFit]:
+    """Return the fits with one term more that the criterion prefers, the best first, one for each kind of term."""
+    power, found = float(np.square(fitted.residual).sum()), []
+    for term in candidates(fitted):
+        tried = _beside(fitted, term)
+        left = float(np.square(tried.residual).sum())
+        gain = news * np.log(power / max(left, 1e-300)) - len(term.names) * np.log(news)
+        if gain > 0.0:
+            found.append((gain, tried))
+    found.sort(key=lambda pair: -pair[0])
+    best: dict[tuple[str, ...], TorqueFit] = {}
+    for _, tried in found:
+        best.setdefault(tried.terms[-1].names, tried)
+    return list(best.values())
+
+
+def _explained(other: TorqueFit, fitted: TorqueFit) -> float:
+    """Return the RMS of the torque by which two fits differ, A."""
+    return rms(other.design @ other.theta - fitted.design @ fitted.theta)
+
+
+def effective_rows(e: Float) -> float:
+    """Return how many rows of residuals (n,) tell something new: n / (1 + 2 sum rho), rho up to where it is nil."""
     size = 1 << (2 * e.size).bit_length()
     correlation = np.fft.irfft(np.abs(np.fft.rfft(e, size)) ** 2, size)[: e.size]
     if correlation[0] <= 0.0:
@@ -132,35 +157,30 @@ def effective_rows(fitted: TorqueFit) -> float:
 
 def candidates(fitted: TorqueFit) -> list[Term]:
     """Return the terms that have not joined and that these rows could tell."""
-    parts, joined = fitted.parts, {name for term in fitted.terms for name in term.names}
+    rows, joined = fitted.rows, {name for term in fitted.terms for name in term.names}
     found = []
-    sides = {int(s) for p in parts for s in np.unique(p.side[p.usable])}
-    if "load" not in joined and {1, -1} <= sides:
-        found.append(Term(("load",), np.ones((fitted.current.size, 1))))
     if "stribeck" not in joined:
-        top = max(float(np.abs(p.speed).max()) for p in parts)
-        found += [_stribeck(parts, share * top) for share in STRIBECK_SHARES]
+        speed = np.abs(rows.speed[rows.usable])
+        found += [
+            _stribeck(rows, share * speed.max()) for share in STRIBECK_SHARES if share * speed.max() > speed.min()
+        ]
     for order in SCREW_ORDERS:
         name = f"ripple_screw_{order}"
         if name not in joined:
-            both = [p.through(np.stack([np.sin(order * p.angle), np.cos(order * p.angle)])) for p in parts]
-            found.append(Term((name, f"{name}_phase"), np.vstack(both)))
+            both = rows.through(np.stack([np.sin(order * rows.angle), np.cos(order * rows.angle)]))
+            found.append(Term((name, f"{name}_phase"), both))
     return found
 
 
-def _stribeck(parts: Sequence[TorqueRows], speed_rad_s: float) -> Term:
-    columns, slopes = [], []
-    for p in parts:
-        share = p.speed / speed_rad_s
-        course = p.side * np.exp(-np.square(share))
-        both = p.through(np.stack([course, course * 2.0 * share**2 / speed_rad_s]))
-        columns.append(both[:, :1])
-        slopes.append(both[:, 1])
-    return Term(("stribeck", "stribeck_speed"), np.vstack(columns), speed_rad_s, np.concatenate(slopes))
+def _stribeck(rows: TorqueRows, speed_rad_s: float) -> Term:
+    share = rows.speed / speed_rad_s
+    course = rows.side * np.exp(-np.square(share))
+    both = rows.through(np.stack([course, course * 2.0 * share**2 / speed_rad_s]))
+    return Term(("stribeck", "stribeck_speed"), both[:, :1], speed_rad_s, both[:, 1])
 
 
-def told(windows: Sequence[Window], fitted: TorqueFit | None, known: Mapping[str, float]) -> Estimate:
-    """Return what the fit of some windows tells, with the K of the recording itself, else the one ``known``.
+def told(window: Window, fitted: TorqueFit | None, known: Mapping[str, float]) -> Estimate:
+    """Return what the fit of a window tells, with the K of the recording itself, else the one ``known``.
 
     ``known`` may hold K, R and L of the data sheet: they are ``given`` in the estimate. R and L that are not known are
     missing. Without any K all six are, and ``RATIOS`` follow them.
@@ -169,15 +189,9 @@ def told(windows: Sequence[Window], fitted: TorqueFit | None, known: Mapping[str
         text = "hardly any row lies beyond the low-pass's reach from standstill"
         reason = Reason("LowExcitation", text, "record a longer rapid or raise lowpass_hz")
         return empty_estimate(METHOD, Result.UNDER_EXCITED, reason)
-    own = {w.torque_constant_nm_per_a for w in windows} - {None}
-    given = {**known, **({"K": constant} if len(own) == 1 and (constant := own.pop()) is not None else {})}
+    own = window.torque_constant_nm_per_a
+    given = dict(known) if own is None else {**known, "K": own}
     return _with_constant(fitted, given) if "K" in given else _ratios(fitted)
-
-
-def pooled(estimates: Sequence[tuple[Window, Estimate]], settings: Identification) -> Estimate:
-    """Return what windows without a voltage tell together, with what their own estimates were given."""
-    windows, first = [window for window, _ in estimates], estimates[0][1]
-    return told(windows, fit(windows, settings), {name: first.value(name) for name in first.given})
 
 
 def late_s(fitted: TorqueFit) -> tuple[float, float]:
@@ -198,14 +212,10 @@ def _covariance(fitted: TorqueFit) -> Float:
     slopes = [t.slope * fitted.theta[_first(fitted, t)] for t in fitted.terms if t.slope is not None]
     design = np.column_stack([fitted.design, *slopes])
     inverse, _ = inverse_gram(design)
-    scores = design * fitted.residual[:, None]
-    meat, start = np.zeros((design.shape[1], design.shape[1])), 0
-    for part in fitted.parts:
-        meat += _summed(scores[start : start + part.rows], round(SUMMED_SHARE * part.rows))
-        start += part.rows
+    meat = _summed(design * fitted.residual[:, None], round(SUMMED_SHARE * len(design)))
     meat *= (1.0 + WIDENED * SUMMED_SHARE) ** 2
     power = max(float(np.square(fitted.residual).sum()), 1e-12 * float(np.square(fitted.current).sum()))
-    alike = design.T @ design * power / max(effective_rows(fitted) - design.shape[1], 1.0)
+    alike = design.T @ design * power / max(effective_rows(fitted.residual) - design.shape[1], 1.0)
     scale = np.sqrt(np.diag(alike))
     scaled = np.outer(scale, scale)
     covariance: Float = inverse @ (larger(meat / scaled, alike / scaled) * scaled) @ inverse.T
@@ -230,9 +240,8 @@ def _first(fitted: TorqueFit, term: Term) -> int:
 def _with_constant(fitted: TorqueFit, given: Mapping[str, float]) -> Estimate:
     """Return the parameters and terms with the torque constant that is ``given``, N.m/A, and R and L if they are."""
     values, rates = _values(fitted)
-    covariance = rates @ _covariance(fitted) @ rates.T
-    doubts = _doubts(fitted)
-    covariance[: len(doubts), : len(doubts)] += np.diag(doubts**2)
+    doubts = _doubts(fitted, rates)
+    covariance = rates @ _covariance(fitted) @ rates.T + doubts @ doubts.T
     units = np.array([1.0 if name.endswith(("_speed", "_phase")) else given["K"] for name in values])
     whole = np.zeros((len(TOLD_BY_SHEET) + len(values),) * 2)
     whole[len(TOLD_BY_SHEET) :, len(TOLD_BY_SHEET) :] = covariance * np.outer(units, units)
@@ -246,9 +255,9 @@ def _with_constant(fitted: TorqueFit, given: Mapping[str, float]) -> Estimate:
         residuals={"mechanical": fitted.residual},
         result=Result.OK,
         given=tuple(name for name in TOLD_BY_SHEET if name in given),
+        systematic=np.vstack([np.zeros((len(TOLD_BY_SHEET), doubts.shape[1])), units[:, None] * doubts]),
     )
-    top = max(float(np.abs(p.speed).max()) for p in fitted.parts)
-    judged = judge(answer, inverse_gram(fitted.design)[1], top)
+    judged = judge(answer, inverse_gram(fitted.design)[1], float(np.abs(fitted.rows.speed).max()))
     return _without(judged, [name for name in TOLD_BY_SHEET if name not in given])
 
 
@@ -268,7 +277,8 @@ def _ratios(fitted: TorqueFit) -> Estimate:
     values, rates = _values(fitted)
     known, k = len(RATIOS), len(PARAMETERS)
     whole = np.full((k + known, k + known), np.nan)
-    whole[k:, k:] = (rates @ _covariance(fitted) @ rates.T)[:known, :known] + np.diag(_doubts(fitted) ** 2)
+    doubts = _doubts(fitted, rates)
+    whole[k:, k:] = (rates @ _covariance(fitted) @ rates.T + doubts @ doubts.T)[:known, :known]
     return Estimate(
         method=METHOD,
         names=(*PARAMETERS, *RATIOS),
@@ -282,29 +292,33 @@ def _ratios(fitted: TorqueFit) -> Estimate:
 
 def _values(fitted: TorqueFit) -> tuple[dict[str, float], Float]:
     """Return Jt, ft, Cd and the terms' values by name, per N.m/A, and how they follow from what was fitted."""
-    inertia, lag, viscous, dry = fitted.theta[: len(BASE)]
+    inertia, lag, _, viscous, dry = fitted.theta[: len(BASE)]
     told = {"Jt": float(inertia - lag / inertia * viscous), "ft": float(viscous), "Cd": float(dry)}
     size, others = fitted.theta.size, sum(t.slope is not None for t in fitted.terms)
-    rates = [np.eye(size + others)[k] for k in (0, 2, 3)]
+    rates = [np.eye(size + others)[k] for k in (0, 3, 4)]
     for term in fitted.terms:
         k, unit = _first(fitted, term), np.eye(size + others)
         if term.at is not None:
             told |= dict(zip(term.names, (float(fitted.theta[k]), term.at), strict=True))
             rates += [unit[k], unit[size]]  # of such terms there is one
-        elif term.columns.shape[1] == 2:  # sine and cosine
-            sine, cosine = fitted.theta[k : k + 2]
-            size_nm = float(np.hypot(sine, cosine))
-            told |= dict(zip(term.names, (size_nm, float(np.arctan2(cosine, sine))), strict=True))
-            rates.append((sine * unit[k] + cosine * unit[k + 1]) / size_nm)
-            rates.append((sine * unit[k + 1] - cosine * unit[k]) / size_nm**2)
-        else:
-            told[term.names[0]] = float(fitted.theta[k])
-            rates.append(unit[k])
+            continue
+        sine, cosine = fitted.theta[k : k + 2]
+        whole = float(np.hypot(sine, cosine))
+        told |= dict(zip(term.names, (whole, float(np.arctan2(cosine, sine))), strict=True))
+        rates.append((sine * unit[k] + cosine * unit[k + 1]) / whole)
+        rates.append((sine * unit[k + 1] - cosine * unit[k]) / whole**2)
     return told, np.array(rates)
 
 
-def _doubts(fitted: TorqueFit) -> Float:
-    """Return what is in doubt of Jt, ft and Cd (3,), per N.m/A, beyond chance: noise on a regressor takes from it."""
+def _doubts(fitted: TorqueFit, rates: Float) -> Float:
+    """Return what is in doubt of each value (v, q), the same in all windows of a drive: one deviation a column.
+
+    Noise on the acceleration takes from Jt; and each term that is there and did not join would move them all.
+    """
     power = float(np.mean(np.square(fitted.design[:, 0])))
-    noise = float(np.mean([np.square(p.error_rad_s2) for p in fitted.parts]))
-    return np.array([abs(fitted.theta[0]) * np.hypot(OPEN_SHARE, noise / max(power, 1e-300)), 0.0, 0.0])
+    noise = fitted.rows.error_rad_s2**2 / max(power, 1e-300)
+    unread = OPEN_SHARE + OPEN_SHARE_ROWS * (1e3 * fitted.rows.dt_s) ** 2
+    inertia = np.eye(len(rates))[0] * abs(fitted.theta[0]) * np.hypot(unread, noise)
+    none = np.zeros(fitted.theta.size)
+    shifts = [rates[:, : none.size] @ fitted.shifts.get(name, none) for name in TERMS]
+    return np.column_stack([inertia, *shifts])

@@ -146,7 +146,8 @@ def standing(parameters: Parameters, axis: Axis, position_mm: float, current_a: 
     friction's band. The integral that a drive has tells it to the current loop, whose own holds the voltage.
     """
     g, state = axis.regulators, start(position_mm)
-    pull_nm = float(terms.torque(parameters, np.zeros(1), np.array([position_mm * terms.rad_per_mm(axis)]))[0])
+    angle = np.array([position_mm * terms.rad_per_mm(axis)])
+    pull_nm = float(terms.torque(parameters, np.zeros(1), angle)[0]) if parameters.terms else 0.0
     held_a = pull_nm / parameters.K if current_a is None else current_a
     voltage_v = parameters.R * held_a + terms.dead_time_v(parameters, axis, held_a)
     state[[kernels.CURRENT, kernels.CURRENT_DEMAND]] = held_a

@@ -58,15 +58,14 @@ def _cascade(place: float, rate: float, speed: float, state: Float, gains: Float
 
 
 @compiled
-def _pid(place: float, rate: float, state: Float, gains: Float) -> tuple[float, float, float]:
+def _pid(place: float, rate: float, turned: float, state: Float, gains: Float) -> tuple[float, float, float]:
     """PID on position: return the current demand, the speed integral it does not have, and its own integral.
 
     The derivative is the difference of Kff times set-point less position over one cycle; ``rate`` rad/s adds to it.
-    The filter on the speed feedback acts on the position's part of it.
+    ``turned`` rad is the position's part of it, as the filter on the speed feedback lets it through.
     """
     lag = place - state[POSITION]
     integral = state[POSITION_INTEGRAL] + gains[POSITION_KI] * lag
-    turned = _seen(gains[RAD_PER_MM] * (state[POSITION] - state[POSITION_BEFORE]), state, gains)
     moved = gains[KFF] * (place - state[SET_POINT_BEFORE]) - turned
     state[SET_POINT_BEFORE] = place
     state[POSITION_BEFORE] = state[POSITION]
@@ -83,51 +82,6 @@ def _filter(place: float, rate: float, bend: float, order: int, decay: float, st
         rate = decay * state[at + 1] + (1.0 - decay) * rate
         bend = decay * state[at + 2] + (1.0 - decay) * bend
         state[at], state[at + 1], state[at + 2] = place, rate, bend
-
-
-@compiled
-def _current_cycles(demand_a: float, limited: bool, plant: Float, gains: Float, n_current: int, state: Float) -> int:
-    """Run the current loop and the plant for one speed cycle, step by step: return the steps with a limit acting.
-
-    ``limited``: the current demand is at its limit. This is the plain drive: what it has not would cost it a tenth.
-    """
-    phi_ii, phi_iw, phi_wi, phi_ww, phi_xi, phi_xw = plant[0], plant[1], plant[2], plant[3], plant[4], plant[5]
-    i_u, w_u, x_u, i_t, w_t, x_t = plant[6], plant[7], plant[8], plant[9], plant[10], plant[11]
-    still, still_u, torque_constant, dry = plant[12], plant[13], plant[14], plant[15]
-    kp, ki, voltage_max, half_step_mm = gains[CURRENT_KP], gains[CURRENT_KI], gains[VOLTAGE_MAX], gains[HALF_STEP_MM]
-    i, w, x, integral = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL]
-    steps = 0
-    for _ in range(n_current):
-        error = demand_a - i
-        candidate = integral + ki * error
-        raw = kp * error + candidate
-        u = min(max(raw, -voltage_max), voltage_max)
-        if u == raw:
-            integral = candidate
-            if limited:
-                steps += 1
-        else:
-            steps += 1
-        torque = torque_constant * i
-        if w == 0.0 and abs(torque) <= dry:
-            i = still * i + still_u * u
-            continue
-        # one friction sign per step: that of the motion, or where the torque will start it
-        if w > 0.0 or (w == 0.0 and torque > 0.0):
-            friction = -dry
-        else:
-            friction = dry
-        w_next = phi_wi * i + phi_ww * w + w_u * u + w_t * friction
-        if w_next * friction > 0.0:  # the sign changed: the table stops for this step
-            x += half_step_mm * w
-            i = phi_ii * i + phi_iw * w + i_u * u + i_t * friction
-            w = 0.0
-        else:
-            x += phi_xi * i + phi_xw * w + x_u * u + x_t * friction
-            i = phi_ii * i + phi_iw * w + i_u * u + i_t * friction
-            w = w_next
-    state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL] = i, w, x, integral
-    return steps
 
 
 @inlined
@@ -160,40 +114,46 @@ def torque(speed: Float, angle: Float, terms: Float) -> Float:
     return out
 
 
+@inlined
+def _stepped(
+    step: Float, row: int, i: float, w: float, apart: float, table_w: float, u: float, against: float, dry: float
+) -> float:
+    """Return what a row of the step of motor and table makes of a state; ``apart`` is motor less table."""
+    moved = step[row, 0] * i + step[row, 1] * w + step[row, 2] * apart + step[row, 3] * table_w
+    return float(moved + step[row, 5] * u - step[row, 6] * against - step[row, 7] * dry)
+
+
 @compiled
-def _cycles_with_terms(
+def _current_cycles(
     demand_a: float,
     limited: bool,
     plant: Float,
-    masses: Float,
+    masses: Float | None,
     gains: Float,
-    terms: Float,
+    terms: Float | None,
     n_current: int,
     delay: int,
     state: Float,
 ) -> int:
-    """Run a speed cycle as :func:`_current_cycles` does, with what may join the plain drive.
+    """Run the current loop and the plant for one speed cycle, step by step: return the steps with a limit acting.
 
-    A voltage acts ``delay`` steps after it was computed, less the inverter's dead time. Ripples are those of the middle
-    of each step. ``masses`` (2, 5, 8), or empty where motor and table are one, is the exact step of motor and table,
-    free and with the table held; dry friction acts on the table then, all else on the motor.
+    ``limited``: the current demand is at its limit. The voltage acts ``delay`` steps after it was computed, less the
+    inverter's dead time. Ripples are those of the middle of each step. ``masses`` (2, 5, 8), or None where motor and
+    table are one, is the exact step of both, free and with the table held; the table has the dry friction then.
+    What is None is not compiled.
     """
     phi_ii, phi_iw, phi_wi, phi_ww, phi_xi, phi_xw = plant[0], plant[1], plant[2], plant[3], plant[4], plant[5]
     i_u, w_u, x_u, i_t, w_t, x_t = plant[6], plant[7], plant[8], plant[9], plant[10], plant[11]
-    still, still_u, torque_constant, load = plant[12], plant[13], plant[14], terms[LOAD]
+    still, still_u, torque_constant, dry = plant[12], plant[13], plant[14], plant[15]
     kp, ki, voltage_max, half_step_mm = gains[CURRENT_KP], gains[CURRENT_KI], gains[VOLTAGE_MAX], gains[HALF_STEP_MM]
-    rad_per_mm, dead_v, full_a = gains[RAD_PER_MM], terms[DEAD_TIME], gains[FULL_DEAD_TIME_A]
-    positive, negative, slow, slow_speed = (
-        terms[DRY_POSITIVE],
-        terms[DRY_NEGATIVE],
-        terms[STRIBECK],
-        terms[STRIBECK_SPEED],
-    )
-    more_positive, more_negative = terms[VISCOUS_POSITIVE] - terms[VISCOUS], terms[VISCOUS_NEGATIVE] - terms[VISCOUS]
-    spring, damper, two = terms[SPRING] * rad_per_mm, terms[DAMPER], masses.size > 0
     i, w, x, integral = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL]
-    table_w, table = state[TABLE_SPEED], state[TABLE]
     steps, at = 0, int(state[NEXT])
+    if terms is not None:
+        load, viscous, dead_v, slow = terms[LOAD], terms[VISCOUS], terms[DEAD_TIME], terms[STRIBECK]
+        positive, negative, slow_speed = terms[DRY_POSITIVE], terms[DRY_NEGATIVE], terms[STRIBECK_SPEED]
+        more_positive, more_negative = terms[VISCOUS_POSITIVE] - viscous, terms[VISCOUS_NEGATIVE] - viscous
+        rad_per_mm, full_a = gains[RAD_PER_MM], gains[FULL_DEAD_TIME_A]
+        spring, damper, table_w, table = terms[SPRING] * rad_per_mm, terms[DAMPER], state[TABLE_SPEED], state[TABLE]
     for _ in range(n_current):
         error = demand_a - i
         candidate = integral + ki * error
@@ -208,49 +168,49 @@ def _cycles_with_terms(
         if delay > 0:
             u, state[WAITING + at] = state[WAITING + at], u
             at = at + 1 if at + 1 < delay else 0
-        if dead_v != 0.0:
-            u -= dead_v * min(max(i / full_a, -1.0), 1.0)
-        against = load + (more_positive if w > 0.0 else more_negative) * w
-        if terms.size > RIPPLES:
-            against += _ripple(rad_per_mm * (x + half_step_mm * w), terms)
-        rubbing, push = w, torque_constant * i - against
-        if two:
-            rubbing, push = table_w, spring * (x - table) + damper * w
-        # one side per step: that of the motion, or where the torque will start it
-        side = 1.0 if rubbing > 0.0 or (rubbing == 0.0 and push > 0.0) else -1.0
-        dry = (positive if side > 0.0 else negative) + _low_speed(rubbing, slow, slow_speed)
+        against, push, rubbing = 0.0, torque_constant * i, w
+        if terms is not None:
+            if dead_v != 0.0:
+                u -= dead_v * min(max(i / full_a, -1.0), 1.0)
+            against = load + (more_positive if w > 0.0 else more_negative) * w
+            if terms.size > RIPPLES:
+                against += _ripple(rad_per_mm * (x + half_step_mm * w), terms)
+            push -= against
+            if masses is not None:
+                rubbing, push = table_w, spring * (x - table) + damper * w
+        # one friction sign per step: that of the motion, or where the torque will start it
+        forward = rubbing > 0.0 or (rubbing == 0.0 and push > 0.0)
+        if terms is not None:
+            dry = (positive if forward else negative) + _low_speed(rubbing, slow, slow_speed)
+        friction = -dry if forward else dry
         held = rubbing == 0.0 and abs(push) <= dry
-        if two:
-            m = masses[1 if held else 0]
-            dry, apart = side * dry, x - table
-            x = table + m[2, 0] * i + m[2, 1] * w + m[2, 2] * apart + m[2, 3] * table_w
-            x += m[2, 5] * u - m[2, 6] * against - m[2, 7] * dry
-            w_next = m[1, 0] * i + m[1, 1] * w + m[1, 2] * apart + m[1, 3] * table_w
-            w_next += m[1, 5] * u - m[1, 6] * against - m[1, 7] * dry
-            i_next = m[0, 0] * i + m[0, 1] * w + m[0, 2] * apart + m[0, 3] * table_w
-            i_next += m[0, 5] * u - m[0, 6] * against - m[0, 7] * dry
-            moved = m[4, 0] * i + m[4, 1] * w + m[4, 2] * apart + m[4, 3] * table_w
-            moved += m[4, 5] * u - m[4, 6] * against - m[4, 7] * dry
-            table_next = m[3, 0] * i + m[3, 1] * w + m[3, 2] * apart + m[3, 3] * table_w
-            table_next += m[3, 5] * u - m[3, 6] * against - m[3, 7] * dry
-            if table_next * side < 0.0:
+        if masses is not None:
+            m, apart = masses[1 if held else 0], x - table
+            table_next = _stepped(m, 3, i, w, apart, table_w, u, against, -friction)
+            moved = _stepped(m, 4, i, w, apart, table_w, u, against, -friction)
+            if table_next * friction > 0.0:
                 moved, table_next = half_step_mm * table_w, 0.0
-            i, w, table, table_w = i_next, w_next, table + moved, table_next
+            w_next = _stepped(m, 1, i, w, apart, table_w, u, against, -friction)
+            x = table + _stepped(m, 2, i, w, apart, table_w, u, against, -friction)
+            i = _stepped(m, 0, i, w, apart, table_w, u, against, -friction)
+            w, table, table_w = w_next, table + moved, table_next
             continue
         if held:
             i = still * i + still_u * u
             continue
-        friction = -against - side * dry
-        w_next = phi_wi * i + phi_ww * w + w_u * u + w_t * friction
-        if w_next * side < 0.0:  # the sign changed: the table stops for this step
+        total = friction - against
+        w_next = phi_wi * i + phi_ww * w + w_u * u + w_t * total
+        if w_next * friction > 0.0:  # the sign changed: the table stops for this step
             x += half_step_mm * w
             w_next = 0.0
         else:
-            x += phi_xi * i + phi_xw * w + x_u * u + x_t * friction
-        i = phi_ii * i + phi_iw * w + i_u * u + i_t * friction
+            x += phi_xi * i + phi_xw * w + x_u * u + x_t * total
+        i = phi_ii * i + phi_iw * w + i_u * u + i_t * total
         w = w_next
     state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL] = i, w, x, integral
-    state[TABLE_SPEED], state[TABLE], state[NEXT] = table_w, table, at
+    state[NEXT] = at
+    if masses is not None:
+        state[TABLE_SPEED], state[TABLE] = table_w, table
     return steps
 
 
@@ -333,10 +293,10 @@ def _mean_torque(
 
 @inlined
 def _leapt(
-    i: float, w: float, integral: float, demand_a: float, side: float, leap: Float
+    i: float, w: float, integral: float, demand_a: float, side: float, held: bool, leap: Float
 ) -> tuple[float, float, float]:
     """Return current, speed and integral of the current loop after a speed cycle."""
-    if side == 0.0:
+    if held:
         return (
             _mapped(leap, HELD_CURRENT, i, w, integral, demand_a, side),
             0.0,
@@ -356,12 +316,14 @@ def _run_leaping(
     plant: Float,
     leap: Float,
     gains: Float,
+    terms: Float | None,
     shape: tuple[int, int, int, int, int, int],
     state: Float,
     out: Float,
 ) -> None:
     """Run a cascade without delay and offsets as :func:`run` does, each speed cycle in one leap where it is linear.
 
+    With terms a leap takes the mean of their torque; a constant voltage that is lost comes to a change of the integral.
     ``out`` (1 + kept, rows) is written. All that a cycle changes is in plain variables: memory would take most of it.
     """
     kept, n_speed, n_current, order, last = shape[1], shape[2], shape[3], shape[4], reference.size - 1
@@ -376,6 +338,10 @@ def _run_leaping(
     decay, seen = gains[SPEED_DECAY], state[SPEED_FILTERED]
     i, w, x, demand_a = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_DEMAND]
     speeds, currents, places = state[SPEED_INTEGRAL], state[CURRENT_INTEGRAL], state[POSITION_INTEGRAL]
+    if terms is not None:
+        rad_per_mm, load, dead_v, full_a = gains[RAD_PER_MM], terms[LOAD], terms[DEAD_TIME], gains[FULL_DEAD_TIME_A]
+        positive, negative, slow = terms[DRY_POSITIVE], terms[DRY_NEGATIVE], terms[STRIBECK]
+        half_mm, faster = gains[HALF_STEP_MM] * n_current, plant[10] * (0.5 * n_current)
     for row in range(out.shape[1]):
         k = first + row
         r0, r1, r2 = reference[min(k, last)], reference[min(k + 1, last)], reference[min(k + 2, last)]
@@ -407,122 +373,33 @@ def _run_leaping(
             demand_a = min(max(raw, -current_max), current_max)
             if demand_a == raw:
                 speeds, places = candidate, place
-            may, side = _leapable(i, w, currents, demand_a, plant, leap)
-            if may <= voltage_max:
-                limited += n_current if demand_a != raw else 0
-                if side != 0.0:
-                    x += _mapped(leap, LEAP_WAY, i, w, currents, demand_a, side)
-                i, w, currents = _leapt(i, w, currents, demand_a, side, leap)
+            lost_v = 0.0
+            if terms is None:
+                may, side = _leapable(i, w, currents, demand_a, plant, leap)
+                held = side == 0.0
             else:
-                state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL] = i, w, x, currents
-                limited += _current_cycles(demand_a, demand_a != raw, plant, gains, n_current, state)
-                i, w, x, currents = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL]
-        out[ROW_LIMITED, row] = limited
-    state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_DEMAND] = i, w, x, demand_a
-    state[SPEED_INTEGRAL], state[CURRENT_INTEGRAL], state[POSITION_INTEGRAL] = speeds, currents, places
-    state[SPEED_FILTERED] = seen if decay > 0.0 else 0.0
-
-
-@compiled
-def _run_leaping_with_terms(
-    reference: Float,
-    first: int,
-    plant: Float,
-    leap: Float,
-    masses: Float,
-    gains: Float,
-    terms: Float,
-    shape: tuple[int, int, int, int, int, int],
-    state: Float,
-    out: Float,
-) -> None:
-    """Run as :func:`_run_leaping` does, with what has joined the plain drive but a spring.
-
-    Within a leap the torque is its mean: what bends in between is not seen at the table.
-    """
-    kept, n_speed, n_current, order, last = shape[1], shape[2], shape[3], shape[4], reference.size - 1
-    kv, kff, speed_kp, speed_ki, position_ki = (
-        gains[KV],
-        gains[KFF],
-        gains[SPEED_KP],
-        gains[SPEED_KI],
-        gains[POSITION_KI],
-    )
-    period, current_max, voltage_max = gains[PERIOD], gains[CURRENT_MAX], gains[VOLTAGE_MAX]
-    decay, seen = gains[SPEED_DECAY], state[SPEED_FILTERED]
-    i, w, x, demand_a = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_DEMAND]
-    speeds, currents, places = state[SPEED_INTEGRAL], state[CURRENT_INTEGRAL], state[POSITION_INTEGRAL]
-    torque_constant, rad_per_mm, load, slow = plant[14], gains[RAD_PER_MM], terms[LOAD], terms[STRIBECK]
-    positive, negative, dead_v, full_a = (
-        terms[DRY_POSITIVE],
-        terms[DRY_NEGATIVE],
-        terms[DEAD_TIME],
-        gains[FULL_DEAD_TIME_A],
-    )
-    half_mm, faster = gains[HALF_STEP_MM] * n_current, plant[10] * (0.5 * n_current)
-    for row in range(out.shape[1]):
-        k = first + row
-        r0, r1, r2 = reference[min(k, last)], reference[min(k + 1, last)], reference[min(k + 2, last)]
-        slope = (r1 - r0) / period
-        bend = (r2 - r1) / period - slope
-        forward = gains[ACCELERATION] * (bend / period)
-        out[ROW_STATE + CURRENT, row], out[ROW_STATE + SPEED, row], out[ROW_STATE + POSITION, row] = i, w, x
-        out[ROW_STATE + SPEED_INTEGRAL, row], out[ROW_STATE + CURRENT_INTEGRAL, row] = speeds, currents
-        out[ROW_STATE + CURRENT_DEMAND, row] = demand_a
-        if kept > POSITION_INTEGRAL:
-            out[ROW_STATE + POSITION_INTEGRAL, row] = places
-            state[SPEED_FILTERED] = seen
-            for n in range(SET_POINT_BEFORE, kept):
-                out[ROW_STATE + n, row] = state[n]
-        limited = 0
-        for m in range(n_speed):
-            part = m / n_speed
-            wanted, rate = r0 + (r1 - r0) * part, slope + bend * part
-            if order > 0:
-                _filter(wanted, rate, bend / period, order, gains[DECAY], state)
-                at = FILTERED + 3 * (order - 1)
-                wanted, rate, forward = state[at], state[at + 1], gains[ACCELERATION] * state[at + 2]
-            lag = wanted - x
-            place = places + position_ki * lag
-            seen = decay * seen + (1.0 - decay) * w
-            error = kv * lag + place + kff * rate - seen
-            candidate = speeds + speed_ki * error
-            raw = speed_kp * error + candidate + forward
-            demand_a = min(max(raw, -current_max), current_max)
-            if demand_a == raw:
-                speeds, places = candidate, place
-            shift = dead_v if i > 0.0 else -dead_v
-            left = currents - shift  # a constant voltage is taken from the integral, which comes to the same
-            if w == 0.0:
-                torque = 0.0
-                against = load + _ripple(rad_per_mm * x, terms)
-                push = torque_constant * i - against
-                room = min(positive - push, negative + push) + slow
-                may = _may_hold(i, left, demand_a, room, plant, leap)
-            else:
-                torque = _mean_torque(i, w, x, half_mm, faster, plant, rad_per_mm, terms)
-                may = _may_move(i, w, left, demand_a, torque, abs(torque), plant, leap)
-                if not w * _mapped(leap, LEAP_SPEED, i, w, left, demand_a, torque) > 0.0:
-                    may = np.inf
-            if dead_v != 0.0 and (min(abs(i), abs(demand_a)) < full_a or i * demand_a < 0.0):
-                may = np.inf
-            if may <= voltage_max - abs(dead_v):
-                limited += n_current if demand_a != raw else 0
-                if w == 0.0:
-                    i, _, currents = _leapt(i, w, left, demand_a, 0.0, leap)
+                lost_v, held = dead_v if i > 0.0 else -dead_v, w == 0.0
+                left, side, may = currents - lost_v, 0.0, np.inf
+                if dead_v != 0.0 and (min(abs(i), abs(demand_a)) < full_a or i * demand_a < 0.0):
+                    pass  # the dead time's effect changes on the way
+                elif held:
+                    push = plant[14] * i - load - _ripple(rad_per_mm * x, terms)
+                    room = min(positive - push, negative + push) + slow
+                    may = _may_hold(i, left, demand_a, room, plant, leap)
                 else:
-                    x += _mapped(leap, LEAP_WAY, i, w, left, demand_a, torque)
-                    i, w, currents = (
-                        _mapped(leap, LEAP_CURRENT, i, w, left, demand_a, torque),
-                        _mapped(leap, LEAP_SPEED, i, w, left, demand_a, torque),
-                        _mapped(leap, LEAP_INTEGRAL, i, w, left, demand_a, torque),
-                    )
-                currents += shift
+                    side = _mean_torque(i, w, x, half_mm, faster, plant, rad_per_mm, terms)
+                    if w * _mapped(leap, LEAP_SPEED, i, w, left, demand_a, side) > 0.0:
+                        may = _may_move(i, w, left, demand_a, side, abs(side), plant, leap)
+            if may <= voltage_max - abs(lost_v):
+                limited += n_current if demand_a != raw else 0
+                if not held:
+                    x += _mapped(leap, LEAP_WAY, i, w, currents - lost_v, demand_a, side)
+                i, w, currents = _leapt(i, w, currents - lost_v, demand_a, side, held, leap)
+                currents += lost_v
             else:
                 state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL] = i, w, x, currents
-                limited += _cycles_with_terms(
-                    demand_a, demand_a != raw, plant, masses, gains, terms, n_current, 0, state
-                )
+                clipped = demand_a != raw
+                limited += _current_cycles(demand_a, clipped, plant, None, gains, terms, n_current, 0, state)
                 i, w, x, currents = state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_INTEGRAL]
         out[ROW_LIMITED, row] = limited
     state[CURRENT], state[SPEED], state[POSITION], state[CURRENT_DEMAND] = i, w, x, demand_a
@@ -539,9 +416,9 @@ def run(
     rows: int,
     plant: Float,
     leap: Float,
-    masses: Float,
+    masses: Float | None,
     gains: Float,
-    terms: Float,
+    terms: Float | None,
     shape: tuple[int, int, int, int, int, int],
     state: Float,
 ) -> Float:
@@ -549,7 +426,7 @@ def run(
 
     ``reference`` (n,) mm is held beyond its end; ``speed_offset`` rad/s and ``current_offset`` A are (n,) or empty.
     ``plant`` (16,), ``leap`` (LEAP_ROWS, LEAP_COLUMNS) or empty, and ``gains`` (GAINS,): see :mod:`fdhil.model.loops`.
-    ``terms``, empty for a plain drive, and ``masses``: see :mod:`fdhil.model.terms`. ``shape``: law, states kept of
+    ``terms``, None for a plain drive, and ``masses``: see :mod:`fdhil.model.terms`. ``shape``: law, states kept of
     each row, speed cycles per SYNC cycle, current cycles per speed cycle, order of the set-point filter, current cycles
     of delay. ``state`` (STATES,) is written.
     """
@@ -557,10 +434,7 @@ def run(
     last = reference.size - 1
     out = np.empty((ROW_STATE + kept, rows))
     if law == CASCADE and leap.size > 0 and speed_offset.size + current_offset.size == 0:
-        if terms.size > 0:
-            _run_leaping_with_terms(reference, first, plant, leap, masses, gains, terms, shape, state, out)
-        else:
-            _run_leaping(reference, first, plant, leap, gains, shape, state, out)
+        _run_leaping(reference, first, plant, leap, gains, terms, shape, state, out)
         return out
     kff, period, current_max, filtered = gains[KFF], gains[PERIOD], gains[CURRENT_MAX], gains[SPEED_DECAY] > 0.0
     for row in range(rows):
@@ -584,7 +458,9 @@ def run(
                 speed = _seen(state[SPEED], state, gains) if filtered else state[SPEED]
                 raw, speed_integral, position_integral = _cascade(place, kff * rate + more, speed, state, gains)
             else:
-                raw, speed_integral, position_integral = _pid(place, more, state, gains)
+                turned = gains[RAD_PER_MM] * (state[POSITION] - state[POSITION_BEFORE])
+                turned = _seen(turned, state, gains) if filtered else turned
+                raw, speed_integral, position_integral = _pid(place, more, turned, state, gains)
             raw += gains[ACCELERATION] * acceleration
             if current_offset.size > 0:
                 raw += _between(current_offset, k, part)
@@ -593,9 +469,6 @@ def run(
                 state[SPEED_INTEGRAL], state[POSITION_INTEGRAL] = speed_integral, position_integral
             state[CURRENT_DEMAND] = demand_a
             clipped = demand_a != raw
-            if terms.size > 0:
-                limited += _cycles_with_terms(demand_a, clipped, plant, masses, gains, terms, n_current, delay, state)
-            else:
-                limited += _current_cycles(demand_a, clipped, plant, gains, n_current, state)
+            limited += _current_cycles(demand_a, clipped, plant, masses, gains, terms, n_current, delay, state)
         out[ROW_LIMITED, row] = limited
     return out

@@ -21,7 +21,6 @@ from fdhil.model.terms import exponential
 from fdhil.records import Float, Parameters, read_only
 
 _NO_LEAP = read_only(np.empty((0, kernels.LEAP_COLUMNS)))
-_NO_TERMS = read_only(np.empty(0))
 
 
 @lru_cache(maxsize=64)
@@ -79,9 +78,9 @@ class Drive:
 
     plant: Float
     leap: Float
-    masses: Float
+    masses: Float | None
     gains: Float
-    terms: Float
+    terms: Float | None
     shape: tuple[int, int, int, int, int, int]
     sync_period_s: float
     nominal_k: float
@@ -106,7 +105,7 @@ class Drive:
         )
         _, _, n_speed, n_current, _, _ = self.shape
         limited = out[kernels.ROW_LIMITED] / (n_speed * n_current)
-        return Response(out[kernels.ROW_STATE :], limited, end, self.sync_period_s, self.masses.size > 0)
+        return Response(out[kernels.ROW_STATE :], limited, end, self.sync_period_s, self.masses is not None)
 
 
 def prepare(law: int, places: int, parameters: Parameters, axis: Axis, sync_period_s: float) -> Drive:
@@ -115,7 +114,7 @@ def prepare(law: int, places: int, parameters: Parameters, axis: Axis, sync_peri
     n_speed = round(sync_period_s / g.speed_period_s)
     n_current = round(g.speed_period_s / g.current_period_s)
     order = g.setpoint_filter_order if g.setpoint_filter_s > 0 else 0
-    more = terms.more_than_plain(parameters, axis)
+    more = terms.any_of(parameters)
     plant, values = plant_step(parameters, axis.screw_pitch_mm, g.current_period_s), gains(axis, sync_period_s)
     kp, ki = values[kernels.CURRENT_KP], values[kernels.CURRENT_KI]
     steps_only = g.current_delay_cycles > 0 or terms.has_spring(parameters)
@@ -123,9 +122,9 @@ def prepare(law: int, places: int, parameters: Parameters, axis: Axis, sync_peri
     return Drive(
         plant,
         through,
-        terms.masses(parameters, axis.screw_pitch_mm, g.current_period_s),
+        terms.masses(parameters, axis.screw_pitch_mm, g.current_period_s) if terms.has_spring(parameters) else None,
         values,
-        terms.packed(parameters) if more else _NO_TERMS,
+        terms.packed(parameters) if more else None,
         (law, _kept(places, parameters, axis), n_speed, n_current, order, g.current_delay_cycles),
         sync_period_s,
         axis.nominal.K,

@@ -13,7 +13,7 @@ from fdhil.model import kernels
 from fdhil.records import Float, Parameters, read_only
 
 _RIPPLE = re.compile(r"ripple_(?:screw|motor)_(\d+)")
-_SPEEDS = ("speed_delay",)  # of what a drive reports, not of what it does
+_SENSORS = ("speed_delay",)  # of what a drive reports, not of what it does
 TABLE_SHARE = 0.5  # of the inertia is behind the spring where nothing else is known
 
 
@@ -48,9 +48,9 @@ def dead_time_v(parameters: Parameters, axis: Axis, current_a: float) -> float:
     return parameters.term("dead_time") * share
 
 
-def more_than_plain(parameters: Parameters, axis: Axis) -> bool:
+def any_of(parameters: Parameters) -> bool:
     """Whether a drive needs the kernel's steps with terms: the plain ones are faster."""
-    return axis.regulators.current_delay_cycles > 0 or any(name not in _SPEEDS for name, _ in parameters.terms)
+    return any(name not in _SENSORS for name, _ in parameters.terms)
 
 
 def has_spring(parameters: Parameters) -> bool:
@@ -93,14 +93,12 @@ def spring(parameters: Parameters) -> tuple[float, float]:
 
 @lru_cache(maxsize=64)
 def masses(parameters: Parameters, pitch_mm: float, step_s: float) -> Float:
-    """Return (2, 5, 8) the exact step of motor and table, moving and with the table held; (0, 5, 8) where they are one.
+    """Return (2, 5, 8) the exact step of motor and table, moving and with the table held.
 
     Rows: current, speed, place of the motor, speed and place of the table; columns: the same, then voltage, torque on
     the motor, torque on the table. Places are in mm. Of the viscous friction all is the motor's.
     """
     p = parameters
-    if not has_spring(p):
-        return read_only(np.zeros((0, 5, 8)))
     share = p.term("resonance_share", TABLE_SHARE)
     mm_per_rad, (k, d) = pitch_mm / (2 * math.pi), spring(p)
     motor, table = p.Jt * (1 - share), p.Jt * share

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from fdhil.config import Axis, Identification
-from fdhil.identification import without_voltage
 from fdhil.identification.estimators import chosen, maximum_likelihood
 from fdhil.identification.identifiability import empty_estimate
 from fdhil.identification.signals import mended
+from fdhil.identification.without_voltage import told
 from fdhil.records import Estimate, Reason, Result, Verdict, Window, WindowOutcome
 from fdhil.validation import BEFORE_ANY_FIT, LEAST_ROWS, OF_THE_FIT, WEIGHED, Evidence, Findings, ask
 
@@ -62,15 +62,17 @@ def own(window: Window, axis: Axis | None) -> Axis | None:
 def estimated(signals: Evidence) -> Evidence:
     """Return the evidence with the estimate by the method asked for, and the fit that is judged.
 
-    Without a voltage [2] alone is fitted, with the torque constant of the recording or of the axis: there is no fit
-    of both equations.
+    Without a voltage [2] alone is fitted, with the torque constant of the recording or of the axis: there is no fit of
+    both equations.
     """
     window, settings, axis = signals.window, signals.settings, signals.axis
     if window.voltage_v is None and window.slow_voltage is None:
         known = {} if axis is None else {"R": axis.nominal.R, "L": axis.nominal.L, "K": axis.nominal.K}
-        return replace(signals, estimate=without_voltage.told([window], signals.torque, known))
+        return replace(signals, estimate=told(window, signals.torque, known))
     name, estimator = chosen(settings)
     fit = maximum_likelihood.fit_windows([window], settings)
+    if fit is not None and axis is not None:
+        fit = maximum_likelihood.with_loops(fit, window, settings, axis, signals.sync_period_s)
     if name == maximum_likelihood.NAME and fit is not None:
         return replace(signals, estimate=maximum_likelihood.finish(fit), fit=fit)
     return replace(signals, estimate=estimator([window], settings), fit=fit)

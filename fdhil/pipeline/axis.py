@@ -23,6 +23,7 @@ from fdhil.prediction import skill
 from fdhil.records import (
     AxisSamples,
     Estimate,
+    LoopEstimate,
     MoveEvent,
     MoveKind,
     Notice,
@@ -62,13 +63,14 @@ class _Rapid:
 @dataclass(frozen=True, slots=True)
 class Known:
     """What the history knows of an axis: the first values in either direction, the newest published set, and the
-    newest accepted windows' estimates, for the tracker and for the pool.
+    newest accepted windows' estimates, for the tracker and for the pool, and the newest identified loops.
     """
 
     first: Mapping[int, Parameters] = field(default_factory=dict)
     newest: ParameterSet | None = None
     points: tuple[Point, ...] = ()
     members: tuple[Member, ...] = ()
+    loops: LoopEstimate | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,20 +109,20 @@ class AxisPipeline:
         self._config = config
         self._settings = _settings(config, method)
         self._period_s = config.machine.sync_period_s
+        known = known or Known()
         self._recent = RecentSamples(axis, config.axis[axis], self._ticks(RECENT_S), self._period_s)
         self._rapids: deque[_Rapid] = deque()
         self._temperature: Temperature | None = None
         self._pool: list[_Pooled] = []
         self._held: list[_Pooled] = []
         self._refused: dict[int, WindowOutcome] = {}  # the newest window of a direction, where its model was refused
-        known = known or Known()
         self._published = known.newest
         self._tracker = DriftTracker(config.maintenance, axis)
         self._tracker.resume(known.first, known.points)
         self._history: deque[Member] = deque(_since_jump(known), maxlen=HISTORY)
         self._with_skill = with_skill
         # else the axis' section is made up
-        self._loops = OwnLoops(config.axis[axis] if with_skill else None, self._settings, self._period_s)
+        self._loops = OwnLoops(config.axis[axis] if with_skill else None, self._settings, self._period_s, known.loops)
         self._gain_suspected = False
         self._place = self._history[-1].place if self._history else 0
         self._withheld: tuple[str, ...] = ()  # why the newest pool was not published: told once

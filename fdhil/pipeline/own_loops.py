@@ -9,6 +9,7 @@ from fdhil.config import Axis, Identification
 from fdhil.identification.loops import better_loops, identify_loops, with_loops
 from fdhil.pipeline.analysis import analyse, own
 from fdhil.records import LoopEstimate, Parameters, Window, WindowOutcome
+from fdhil.validation.weight import LOOPS_DIFFER
 
 ENOUGH = 4  # windows, both directions twice
 KEPT = 6
@@ -49,8 +50,8 @@ def mechanics_of(outcome: WindowOutcome, axis: Axis | None) -> Parameters | None
 
 
 def suspected(outcomes: Sequence[WindowOutcome]) -> bool:
-    """Return whether some window is refused though its rapid was replayed: perhaps through loops that are not its."""
-    return any(not o.verdict.accepted and o.verdict.unexplained_um is not None for o in outcomes)
+    """Return whether some window is refused for its loops: the model explains its torque, and not its replay."""
+    return any(reason.code == LOOPS_DIFFER for o in outcomes for reason in o.verdict.reasons)
 
 
 def better_axis(axis: Axis | None, found: LoopEstimate | None) -> Axis | None:
@@ -65,15 +66,20 @@ class OwnLoops:
     replayed: at once, and each time after twice as many refused rapids as before, since it takes long.
     """
 
-    def __init__(self, axis: Axis | None, settings: Identification, sync_period_s: float) -> None:
-        """``axis`` is the machine's section, None where none is known: then no loops are sought."""
+    def __init__(
+        self, axis: Axis | None, settings: Identification, sync_period_s: float, known: LoopEstimate | None = None
+    ) -> None:
+        """``axis`` is the machine's section, None where none is known: then no loops are sought.
+
+        ``known`` are those that were found in an earlier run.
+        """
         self._configured = axis
         self._settings = settings
         self._period_s = sync_period_s
         self._outcomes: deque[WindowOutcome] = deque(maxlen=KEPT)
         self._seen = self._refused = 0
         self._due = 1
-        self.axis = axis
+        self.axis = better_axis(axis, known) or axis
 
     def analyse(self, window: Window) -> tuple[WindowOutcome, LoopEstimate | None]:
         """Return what a window says of the drive, and its loops where they were sought again."""

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from fdhil.config import Identification
-from fdhil.identification import without_voltage
 from fdhil.identification.between import ALIKE, Between, Member, between
 from fdhil.identification.estimators import chosen
 from fdhil.identification.identifiability import unphysical, untold
@@ -87,14 +86,10 @@ def _estimated(
     first = told[0][1]
     quick = pooled(members, first, apart)
     whole = all(set(PARAMETERS) <= set(m.names) for m in members)
-    if any(window.voltage_v is not None or window.slow_voltage is not None for window, _ in told):
-        if quick.terms or apart.surely or (whole and not refit):
-            return quick
-        again = chosen(settings)[1]([window for window, _ in told], settings)
-    elif apart.surely or not refit:
+    deaf = all(window.voltage_v is None and window.slow_voltage is None for window, _ in told)
+    if deaf or quick.terms or apart.surely or (whole and not refit):
         return quick
-    else:
-        again = without_voltage.pooled(told, settings)
+    again = chosen(settings)[1]([window for window, _ in told], settings)
     alike = pooled(members, first, ALIKE)
     if not again.names == alike.names == quick.names:
         return again

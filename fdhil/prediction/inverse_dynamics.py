@@ -21,7 +21,7 @@ def required(reference_mm: Float, parameters: Parameters, axis: Axis, dt_s: floa
     acceleration = np.gradient(speed, dt_s)
     moving = np.abs(speed) > 1e-9 * max(1.0, float(np.abs(speed).max()))
     angle = reference_mm * 2 * np.pi / axis.screw_pitch_mm
-    smooth, dry = resisting(p, speed, angle, np.where(moving, np.sign(speed), 0.0))
+    smooth, dry = resisting(p, np.where(moving, speed, 0.0), angle)
     current = (p.Jt * acceleration + smooth + dry) / p.K
     # dry friction's steps are left out of di/dt: the current loop takes them in a fraction of a cycle
     slope = np.gradient((p.Jt * acceleration + smooth) / p.K, dt_s)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -10,12 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from fdhil.config import Axis
+from fdhil.model import terms
 from fdhil.records import PARAMETERS, Bool, Float, Parameters
 
 DRY = ("coulomb_positive", "coulomb_negative", "stribeck", "stribeck_speed")
-LINEAR = ("resonance", "resonance_damping")
+LINEAR = ("resonance", "resonance_damping", "resonance_share")
 # what a term's second and third value are called: they mean nothing alone
-_PARTS = ("_phase", "_speed", "_damping")
+_PARTS = ("_phase", "_speed", "_damping", "_share")
 
 
 def values_of(parameters: Parameters) -> dict[str, float]:
@@ -71,34 +71,18 @@ class Band(NamedTuple):
 
 def band(parameters: Parameters, angle_rad: float) -> Band:
     """Return the band of a shaft that rests at an angle."""
-    p, still = parameters, np.array([angle_rad])
-    pull = float(p.term("load") + ripples(p, still)[0])
-    reach = p.term("stribeck")
-    low = p.term("coulomb_negative", p.Cd) + reach
-    return Band(pull - low, pull + p.term("coulomb_positive", p.Cd) + reach)
+    p = parameters
+    pull = float(terms.torque(p, np.zeros(1), np.array([angle_rad]))[0])
+    low, high = (p.term(f"coulomb_{side}", p.Cd) + p.term("stribeck") for side in ("negative", "positive"))
+    return Band(pull - low, pull + high)
 
 
-def ripples(parameters: Parameters, angle_rad: Float) -> Float:
-    """Return the torque (n,) of all ripples against the positive direction at angles (n,)."""
-    total, terms = np.zeros(np.shape(angle_rad)), dict(parameters.terms)
-    for name, amplitude in terms.items():
-        if found := re.fullmatch(r"ripple_(?:screw|motor)_(\d+)", name):
-            total += amplitude * np.sin(int(found[1]) * angle_rad + terms.get(f"{name}_phase", 0.0))
-    return total
-
-
-def resisting(parameters: Parameters, speed_rad_s: Float, angle_rad: Float, side: Float) -> tuple[Float, Float]:
-    """Return the torque (n,) against the positive direction of a shaft that turns: its smooth part, and dry friction's.
-
-    ``side`` (n,) is the direction, 0 at rest.
-    """
-    p, forward = parameters, side > 0.0
-    viscous = np.where(forward, p.term("viscous_positive", p.ft), p.term("viscous_negative", p.ft))
-    dry = np.where(forward, p.term("coulomb_positive", p.Cd), p.term("coulomb_negative", p.Cd))
-    if p.term("stribeck"):
-        dry = dry + p.term("stribeck") * np.exp(-((speed_rad_s / p.term("stribeck_speed")) ** 2))
-    smooth = viscous * speed_rad_s + p.term("load") + ripples(p, angle_rad)
-    return np.asarray(smooth), np.asarray(side * dry)
+def resisting(parameters: Parameters, speed_rad_s: Float, angle_rad: Float) -> tuple[Float, Float]:
+    """Return the torque (n,) against the positive direction of a shaft that turns: its smooth and its dry part."""
+    dry = replace(parameters, ft=0.0, terms=tuple(pair for pair in parameters.terms if pair[0] in DRY))
+    models = without_dry_friction(parameters), dry
+    smooth_nm, dry_nm = (terms.torque(model, speed_rad_s, angle_rad) for model in models)
+    return smooth_nm, dry_nm
 
 
 def main_name(name: str) -> str:

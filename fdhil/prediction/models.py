@@ -31,7 +31,7 @@ _ABOVE_ZERO = ("R", "L", "K", "Jt", "stribeck_speed", "resonance")
 _TABLES = ("terms", "loops")
 TERMS = ("load", "coulomb_positive", "coulomb_negative", "viscous_positive", "viscous_negative", "stribeck",
          "stribeck_speed", "ripple_screw_1", "ripple_screw_1_phase", "ripple_motor_1", "ripple_motor_1_phase",
-         "dead_time", "speed_delay", "resonance", "resonance_damping")  # fmt: skip
+         "dead_time", "speed_delay", "resonance", "resonance_damping", "resonance_share")  # fmt: skip
 """The terms' names, of the ripples the first ones."""
 
 Loops = Mapping[str, Mapping[str, float | str]]

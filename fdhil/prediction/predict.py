@@ -76,7 +76,7 @@ def _responses(
 
 
 def _contour(reference: Trajectory, responses: Mapping[str, Response]) -> Float:
-    actual = np.column_stack([responses[axis].position_mm for axis in reference.axes])
+    actual = np.column_stack([responses[axis].table_mm for axis in reference.axes])
     return contour_error_um(reference.path_mm, actual, reference.dt_s)
 
 
@@ -94,8 +94,8 @@ def _assemble(
     limited = np.max([responses[axis].limited for axis in axes], axis=0)
     return Prediction(
         reference=reference,
-        predicted_mm={axis: frozen(responses[axis].position_mm) for axis in axes},
-        error_um={axis: frozen((responses[axis].position_mm - reference.position_mm[axis]) * 1e3) for axis in axes},
+        predicted_mm={axis: frozen(responses[axis].table_mm) for axis in axes},
+        error_um={axis: frozen((responses[axis].table_mm - reference.position_mm[axis]) * 1e3) for axis in axes},
         contour_um=contour,
         current_a={axis: frozen(responses[axis].current_a) for axis in axes},
         limited_s={axis: responses[axis].limited_s for axis in axes},

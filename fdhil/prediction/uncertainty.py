@@ -40,7 +40,7 @@ def _positions(
         path = reference.position_mm[axis]
         changed, steps = zip(*(_changed(models[axis], name) for name in values_of(models[axis])), strict=True)
         here, *moved = (
-            closed_loop.simulate(model, config.axis[axis], reference.dt_s, path, offset_mm).position_mm
+            closed_loop.simulate(model, config.axis[axis], reference.dt_s, path, offset_mm).table_mm
             for model in (models[axis], *changed)
         )
         return np.array(moved), np.array(steps), here

@@ -91,6 +91,10 @@ class Parameters:
 
     C is ``coulomb_positive`` or ``coulomb_negative`` where there are such, else Cd; f the same with ``viscous_...`` and
     ft. The shaft sticks while |K i - load - ripples| <= C + stribeck. ``terms`` are pairs of name and value.
+
+    ``dead_time`` is the voltage that the inverter takes against the current's direction from what is asked of it.
+    ``resonance`` is that of motor and table against each other, the motor free, as seen from its torque to its speed;
+    the table is ``resonance_share`` of Jt (left out: half), and what rubs is the table.
     """
 
     R: float

@@ -27,7 +27,7 @@ def csv_lines(window: Window) -> Iterator[str]:
     headers = {
         "format": "fdhil-recording-1",
         "sample_rate_hz": f"{1 / window.dt_s:.12g}",
-        "voltage_sampling": None if voltage is None else window.voltage_sampling,
+        "voltage_sampling": window.voltage_sampling,
         "axis": window.axis,
         "pitch_m_per_rev": f"{window.pitch_mm / 1000:.12g}",
         "rapid_speed_m_per_s": f"{rapid_m_s:.12g}",
@@ -37,7 +37,8 @@ def csv_lines(window: Window) -> Iterator[str]:
         "start_tick": str(window.start_tick),
         "source": window.source or None,
     } | (_samples(slow) if slow is not None else {})
-    yield from (f"# {key}: {value}" for key, value in headers.items() if value is not None)
+    left_out = () if voltage is not None else ("voltage_sampling", "voltage_delay_s")
+    yield from (f"# {key}: {value}" for key, value in headers.items() if value is not None and key not in left_out)
     yield ",".join((TIME, OTHERS) if voltage is None else (TIME, VOLTAGE, OTHERS))
     path_m = (window.position_mm / 1000, window.demand_mm / 1000)
     signals = (window.current_a, window.speed_rad_s, *path_m)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from fdhil.identification.identifiability import unphysical, untold
 from fdhil.records import Reason, Result
 from fdhil.validation.agreement import values_apart
@@ -21,6 +23,9 @@ from fdhil.validation.timing import timing_faults, voltage_late
 from fdhil.validation.whiteness import excess_noise, whiteness
 from fdhil.validation.without_voltage import load_comes_and_goes, torque_late, torque_unexplained
 
+NEVER_NEGATIVE = ("dead_time",)
+SURE = 3.0  # standard deviations
+
 Findings = dict[str, list[Reason]]
 """What each check that was asked found, in the order of the table."""
 
@@ -34,7 +39,7 @@ def _enough_rows(evidence: Evidence) -> bool:
 
 
 def _has_voltage(evidence: Evidence) -> bool:
-    return evidence.window.voltage_v is not None or evidence.window.slow_voltage is not None
+    return evidence.has_voltage
 
 
 def _fitted(evidence: Evidence) -> bool:
@@ -92,6 +97,21 @@ def _estimate_faults(evidence: Evidence) -> Iterator[Reason]:
     if open_end or estimate.result is Result.DIVERGED:
         yield Reason("SolverFailed", "the fit does not converge", "look at the window's signals")
     yield from unphysical(evidence.told or estimate, one_way=True)
+    for name in estimate.terms:
+        if name in NEVER_NEGATIVE and estimate.value(name) < -SURE * estimate.std(name):
+            text = f"{name} = {estimate.value(name):.4g} would add voltage: voltage or current is off"
+            yield Reason("CalibrationSuspect", text, "set the zeros of current and voltage sensor at standstill")
+
+
+def _slips(evidence: Evidence) -> Iterator[Reason]:
+    """Yield a reason where friction falls so much with speed that the axis sticks and slips."""
+    if evidence.estimate is None or "stribeck" not in evidence.estimate.terms:
+        return
+    more, dry = evidence.estimate.value("stribeck"), abs(evidence.estimate.value("Cd"))
+    torque_nm = evidence.estimate.value("K") * float(np.nanmax(np.abs(evidence.window.current_a)))
+    if more > max(dry, SLIPPING_SHARE * torque_nm):
+        text = f"friction at low speed is {more:.3g} N.m higher than the dry friction of {dry:.3g} N.m: the axis slips"
+        yield Reason("ValidationFailed", text, "lubricate the slide-way, and look at its guides, before anything else")
 
 
 def _no_fit(evidence: Evidence) -> Iterator[Reason]:
@@ -112,12 +132,14 @@ def _current_late(evidence: Evidence) -> Iterable[Reason]:
 
 def _structure(evidence: Evidence) -> Iterator[Reason]:
     """Yield what the model lacks, each with its cost."""
-    yield from (evidence.priced(lack) for lack in evidence.lacks if lack.finding.matters)
+    for lack in evidence.lacks:
+        if lack.finding.matters:
+            yield evidence.with_cost(lack.finding.reason(), evidence.cost_um(lack))
 
 
 def _late(evidence: Evidence) -> Iterable[Reason]:
-    if evidence.late_s:
-        return voltage_late(evidence)
+    if evidence.late_s:  # by what else the model lacks, where there is such
+        return voltage_late(evidence) if not evidence.lacks else ()
     return timing_faults(evidence) if _sound(evidence) else ()
 
 
@@ -134,6 +156,7 @@ def _values(evidence: Evidence) -> Iterable[Reason]:
     return values_apart(evidence.estimate, evidence.judged.theta[:6])
 
 
+SLIPPING_SHARE = 0.1  # of the largest torque of the move: less than this more friction at low speed does little
 MODEL = (
     "estimate",
     "fit",
@@ -153,7 +176,7 @@ BEFORE_ANY_FIT: Sequence[Check] = (
     Check("position", position_parted, _enough_rows, ("finite",)),
     # what position tells of the move's course is worth nothing where it contradicts the speed
     Check("whole move", interruptions, _enough_rows, ("finite", "position")),
-    Check("play", _play, _enough_rows, ("finite",), weighed=True),
+    Check("play", _play, _enough_rows, ("finite",)),
     Check("slow readings", slow_voltage_faults),
     Check("voltage", _no_voltage),
     Check("rows", _few_rows, unless=("finite", "stages", "slow readings", "voltage")),
@@ -161,10 +184,11 @@ BEFORE_ANY_FIT: Sequence[Check] = (
 OF_THE_FIT: Sequence[Check] = (
     Check("stuck", stuck_values),
     Check("cut off", clipped_peaks, _fitted),
-    Check("estimate", _estimate_faults),
-    Check("late torque", torque_late, _without_voltage, ("estimate",)),
-    Check("load", load_comes_and_goes, _without_voltage, ("estimate", "late torque")),
-    Check("torque", torque_unexplained, _without_voltage, ("estimate", "late torque", "load")),
+    Check("late torque", torque_late, _without_voltage),
+    Check("load", load_comes_and_goes, _without_voltage, ("late torque",)),
+    Check("torque", torque_unexplained, _without_voltage, ("late torque", "load")),
+    Check("estimate", _estimate_faults, unless=("late torque", "load", "torque")),
+    Check("slips", _slips),
     Check("fit", _no_fit, _has_voltage, ("estimate",)),
     Check("late voltage", _electrically_late, _fitted),
     Check("late current", _current_late, _sound, ("late voltage",)),
@@ -174,7 +198,7 @@ OF_THE_FIT: Sequence[Check] = (
     # a late current seems to move a shaft at rest
     Check("standstill", rest_faults, _sound, ("late voltage", "late current")),
     Check("friction at rest", friction_at_rest, _sound, ("late voltage", "late current"), weighed=True),
-    Check("delay", _late, _fitted, MODEL[2:]),
+    Check("delay", _late, _fitted, ("late voltage", "late current", "standstill")),
     Check("simulation", _simulation, _fitted, (*MODEL, "delay"), weighed=True),
     Check("values", _values, _fitted, (*MODEL, "delay")),
     Check("slow sensor", slow_faults_beside, _fitted, ("range", "slow readings")),

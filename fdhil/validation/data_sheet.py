@@ -22,7 +22,8 @@ LEAST_BEYOND = 2  # one alone is a warm winding, a saturated core, another load
 
 def gain_error(estimate: Estimate, nominal: Parameters) -> Reason | None:
     """Return the signal whose constant gain explains how the estimate differs from the data sheet, None for none."""
-    told = [name for name in COMPARED if estimate.value(name) > 0 and np.isfinite(estimate.std(name))]
+    known = [name for name in COMPARED if name not in estimate.given]  # what is given tells of no sensor
+    told = [name for name in known if estimate.value(name) > 0 and np.isfinite(estimate.std(name))]
     if len(told) < LEAST_BEYOND:
         return None
     rows = [PARAMETERS.index(name) for name in told]

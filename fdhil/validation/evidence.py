@@ -19,17 +19,19 @@ from fdhil.identification.without_voltage import TorqueFit
 from fdhil.identification.without_voltage import fit as fit_torque
 from fdhil.records import PARAMETERS, Bool, Estimate, Float, Parameters, Reason, Window, rms
 from fdhil.validation.backlash import DeadBand, backlash
+from fdhil.validation.breakaway import Breakaway, breakaway
 from fdhil.validation.selection import Lacking, lacking
 from fdhil.validation.sensor_reconstruction import Bridge
+from fdhil.validation.shifts import Shift, late_findings, shifts
 from fdhil.validation.simulation import fit_percent
-from fdhil.validation.structure import DEAD_TIME, Finding, findings
+from fdhil.validation.structure import DEAD_TIME, FRICTION, OFFSET_CURRENT, Finding, findings
 from fdhil.validation.table_error import TableError
 from fdhil.validation.weight import NEXT_SPEED, Move, Weight, completed, to_and_fro, weigh
 from fdhil.validation.widening import widened
 
 STILL_MM = 0.004  # of the table at rest
 STILL_S, STILL_SHARE = 0.010, 0.02  # of the rapid speed
-KNOWN = 0.5  # of what a lack makes at the table: it resembles what is tried, and is not known to more
+SENSOR_KNOWN = 0.5  # of what a sensor's fault makes at the table: it resembles what is tried, and does not show there
 LEAST_ROWS = 32  # of a window that may hold a rapid move
 
 
@@ -104,6 +106,16 @@ class Evidence:
         return backlash(self.window)
 
     @cached_property
+    def torque(self) -> TorqueFit | None:
+        """The fit of [2] alone, for a window without a voltage; None where hardly any row surely moves."""
+        return None if self.has_voltage else fit_torque(self.window, self.settings)
+
+    @property
+    def has_voltage(self) -> bool:
+        """Whether the window has a voltage, of the drive or of a slow sensor."""
+        return self.window.voltage_v is not None or self.window.slow_voltage is not None
+
+    @cached_property
     def parameters(self) -> Parameters | None:
         """The estimate as a drive that can be run; what a voltage would tell of it, and did not, is the fit's own."""
         if self.estimate is None or not set(PARAMETERS) <= set(self.estimate.names):
@@ -111,7 +123,10 @@ class Evidence:
         told = self.estimate.parameters()
         if self.fit is not None:
             told = completed(told, Parameters(*self.fit.theta[:6]))
-        return completed(told, Parameters(**self.axis.nominal.model_dump())) if self.axis is not None else told
+        if self.axis is not None:
+            return completed(told, Parameters(**self.axis.nominal.model_dump()))
+        # through an ordinary loop R and L, which only a voltage tells, do nothing
+        return told if self.has_voltage else told.changed(R=1.0, L=1.0)
 
     @cached_property
     def move(self) -> Move | None:
@@ -120,6 +135,8 @@ class Evidence:
             return None
         moving = np.zeros(self.window.n)
         moving[slice(*self.moving)] = self.window.direction
+        if self.torque is not None:
+            moving = self.torque.rows.side
         mode = moving if self.fit is None else self.fit.problem.motions[0].mode
         return Move.of(self.window, self.parameters, np.where(np.abs(mode) == 1, mode, 0.0))
 
@@ -141,14 +158,35 @@ class Evidence:
         if p is None or move is None:
             return math.inf
         loop, dt_s = TableError.of(p, self.window.pitch_mm, self.axis), self.window.dt_s
-        cut, shift = move.slower(p, NEXT_SPEED), lack.shift[: len(PARAMETERS)]
+        cut, shift = move.slower(p, NEXT_SPEED), lack.shift[: len(PARAMETERS)].copy()
+        if lack.finding.name == OFFSET_CURRENT:  # to the loop it is a load, which is part of one direction's friction
+            shift[PARAMETERS.index("Cd")] = 0.0
         torques = [move.whole(p), move.of_shift(p, shift), cut.whole(p), cut.of_shift(p, shift)]
         if lack.load_nm is not None:
             torques.append(move.integral(lack.load_nm))
         whole, here, all_cut, there, *load = (
             rms(row) for row in loop.um(np.array([to_and_fro(row) for row in torques]), dt_s)
         )
-        return max(here, there * whole / max(all_cut, 1e-300), *load)
+        slower = whole / max(all_cut, 1e-300)
+        # what a replay shows of a friction, it shows at all speeds
+        shown = lack.finding.name != FRICTION or (self.weight is not None and self.weight.through == "replay")
+        return max(here, there * slower, *(um * (1.0 if shown else slower) for um in load))
+
+    @cached_property
+    def breakaway(self) -> Breakaway | None:
+        """What the move takes more to begin than the model says."""
+        return breakaway(self.window, self.on_time) if self.sound else None
+
+    def breakaway_um(self, found: Breakaway) -> float:
+        """Return what it makes at the table where a program is cut: the drive turns there, and is slow for longer."""
+        p, move = self.parameters, self.move
+        if p is None or move is None:
+            return math.inf
+        loop = TableError.of(p, self.window.pitch_mm, self.axis)
+        torques = [move.whole(p), move.slower(p, NEXT_SPEED).whole(p), found.momentum(self.window.n) / NEXT_SPEED]
+        courses = loop.um(np.array([to_and_fro(row) for row in torques]), self.window.dt_s)
+        whole, all_cut, late = (rms(row) for row in courses)
+        return late * whole / max(all_cut, 1e-300)
 
     @cached_property
     def told(self) -> Estimate | None:
@@ -174,21 +212,18 @@ class Evidence:
     @cached_property
     def harmless(self) -> bool:
         """Whether the model explains the rapid at the table, and nothing it surely lacks makes a next one worse."""
-        if self.weight is None or not self.weight.believed:
+        if self.weight is None or not self.weight.believed or (self.fit is not None and self.late_s):
             return False
-        return all(self.weight.allows(self.cost_um(lack) / KNOWN) for lack in self.lacks)
+        late = self.breakaway if self.weight.through != "replay" else None  # which has the move's beginning
+        if late is not None and not self.weight.allows(self.breakaway_um(late)):
+            return False
+        return all(self.weight.allows(self.cost_um(lack) / _known(lack)) for lack in self.lacks)
 
-    def priced(self, lack: Lacking) -> Reason:
-        """Return what the model lacks as a reason, with what that costs."""
-        reason = lack.finding.reason()
+    def with_cost(self, reason: Reason, um: float) -> Reason:
+        """Return a reason with what it costs at the table."""
         if self.weight is None:
             return reason
-        return replace(reason, text=f"{reason.text}; at the table {self.weight.told(self.cost_um(lack))}")
-
-    @cached_property
-    def torque(self) -> TorqueFit | None:
-        """The fit of [2] alone; None where hardly any row surely moves."""
-        return fit_torque([self.window], self.settings)
+        return replace(reason, text=f"{reason.text}; at the table {self.weight.told(um)}")
 
     @property
     def judged(self) -> Fit:
@@ -242,8 +277,21 @@ class Evidence:
     @cached_property
     def lacks(self) -> list[Lacking]:
         """What of that surely is there, each beside those before it."""
-        return lacking(self.on_time, self.findings) if self.sound else []
+        if not self.sound:
+            return []
+        late = late_findings(self.shifts) if self.window.slow_voltage is None else []
+        return lacking(self.on_time, [*self.findings, *late])
+
+    @cached_property
+    def shifts(self) -> tuple[Shift, Shift]:
+        """By how much voltage and current seem late."""
+        return shifts(self.on_time)
 
     def time_s(self, row: int) -> float:
         """Return the time of a row as its recording counts it."""
         return self.window.start_s + row * self.window.dt_s
+
+
+def _known(lack: Lacking) -> float:
+    """Return what share of a lack's error is known: a replay shows a torque, and no sensor."""
+    return 1.0 if lack.load_nm is not None else SENSOR_KNOWN

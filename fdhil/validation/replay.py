@@ -35,6 +35,15 @@ class Replay:
     following_um: Float
     step_um: float
 
+    def during(self, begin: int, end: int) -> Replay:
+        """Return the comparison of the rows from ``begin`` up to ``end`` alone, or of all where these are few."""
+        kept = (self.rows >= begin) & (self.rows < end)
+        if np.count_nonzero(kept) < LEAST_ROWS:
+            return self
+        return Replay(
+            self.predicted_mm, self.rows[kept], self.difference_um[kept], self.following_um[kept], self.step_um
+        )
+
     @property
     def unexplained_um(self) -> float:
         """RMS of what the model does not explain, without what the position's own steps make of any model."""
@@ -79,14 +88,15 @@ def replay_window(window: Window, parameters: Parameters, axis: Axis, sync_perio
     """Return the replay of a window whose rows are the drive's set-points; None for any other.
 
     What a drive makes of its set-points between rows, or of those between two rows, is not recorded. None too where
-    demand or position were not recorded, or did not move. The dry friction of one rapid holds a constant load, too, and
-    how much of it is load shows at rest alone: of what it may be, that is taken which explains the rapid best.
+    demand or position were not recorded, or did not move. What is compared is the move: where within its friction the
+    shaft comes to rest, one rapid does not tell. Its dry friction holds a constant load, too; how much of it is load
+    shows as it leaves rest alone: of what it may be, that is taken which explains the rapid best.
     """
     if abs(window.dt_s / sync_period_s - 1.0) > OFF_GRID or not (
         _moves(window.demand_mm) and _moves(window.position_mm)
     ):
         return None
-    signals = window.demand_mm, window.position_mm
+    signals, moving = (window.demand_mm, window.position_mm), moving_range(window)
     best: Replay | None = None
     for share in SHARES_OF_LOAD if not parameters.term("load") else (0.0,):
         parted = _parted(parameters, window.direction, _standstill_a(window), share)
@@ -94,6 +104,7 @@ def replay_window(window: Window, parameters: Parameters, axis: Axis, sync_perio
             continue
         try:
             told = replay(*signals, parted[0], axis, sync_period_s, window.offset_mm, standstill_a=parted[1])
+            told = told.during(*moving)
         except ValueError:  # too few whole rows, or no drive
             return None
         best = told if best is None or told.unexplained_um < best.unexplained_um else best
@@ -105,7 +116,7 @@ def replay_window(window: Window, parameters: Parameters, axis: Axis, sync_perio
 def _parted(p: Parameters, direction: int, current_a: float, share: float) -> tuple[Parameters, float] | None:
     """Return a drive that moves the same way in ``direction`` with a load, and the current that it holds at rest.
 
-    With the friction Cd + D and a load D that helps the move it goes as with Cd. D is ``share`` of Cd, and at least what
+    With the friction Cd + D and a load D that helps the move it goes as with Cd. D is ``share`` of Cd, at least what
     holds the shaft under the current; None where that is another share. Where no load holds it, it has friction at rest
     that the model lacks, and the current is what the model holds.
     """

@@ -9,8 +9,7 @@ import numpy as np
 from fdhil.identification.courses import voltage_terms_v
 from fdhil.identification.estimators import maximum_likelihood
 from fdhil.identification.estimators.maximum_likelihood import Fit
-from fdhil.identification.filtering import moving_mean
-from fdhil.identification.motion import UNKNOWN, Noise
+from fdhil.identification.motion import Noise
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.windows import carried, smooth
 from fdhil.records import Reason, Window
@@ -26,10 +25,6 @@ LEAST_CURRENT = 0.01  # of the peak current
 SETTLING_S, RISING_S = 0.010, 0.020  # at the ends of standstill, in which the current follows from or for a move
 HOLDING_SHARE = 1.15  # a drive at rest may hold as much as dry friction drags, and no more
 LEAST_TORQUE = 0.01
-LEAST_BREAKAWAY = 0.02  # of the peak torque
-AFTER_S = 0.015
-HELD_SHARE = 0.7  # of dry friction: what surely does not move the shaft
-LONGEST_BREAKAWAY_S = 0.060
 
 
 def rest_faults(evidence: Evidence) -> Iterator[Reason]:
@@ -53,7 +48,8 @@ def friction_at_rest(evidence: Evidence) -> Iterator[Reason]:
     if rows.size < ROWS or (window.voltage_v is None and window.slow_voltage is None):
         return
     yield from _holding(window, fit, rows)
-    yield from breakaway(window, fit)
+    if (late := evidence.breakaway) is not None:
+        yield evidence.with_cost(late.reason(), evidence.breakaway_um(late))
 
 
 def _contradiction(window: Window, fit: Fit, noise: Noise, rows: Rows, lost_v: float) -> Iterator[Reason]:
@@ -92,55 +88,6 @@ def _contradiction(window: Window, fit: Fit, noise: Noise, rows: Rows, lost_v: f
 def _resistance_share(fit: Fit) -> float:
     """Return the standard deviation of the resistance as a share of it."""
     return maximum_likelihood.finish(fit).std("R") / float(fit.theta[0])
-
-
-def breakaway(window: Window, fit: Fit) -> Iterator[Reason]:
-    """Yield a reason where the move takes more impulse to begin than [2] says: friction is higher at low speed.
-
-    From rest, Jt w(t) is the integral of what K i exceeds dry friction by, less viscous friction. The current's noise
-    averages out in that integral, so the speed it predicts for the first surely moving rows is sharp.
-    """
-    motion, theta = fit.problem.motions[0], fit.theta
-    sure = np.flatnonzero(np.abs(motion.mode) == 1)
-    if sure.size < 2 * AFTER_S / window.dt_s:
-        return
-    begin, side = int(sure[0]), int(motion.mode[sure[0]])
-    end = begin + round(AFTER_S / window.dt_s)
-    still = _rest_before(fit, begin, side)
-    if still is None:
-        return
-    torque = side * theta[2] * motion.current[still:end]
-    speed = side * motion.speed[still:end]
-    net = np.where(np.arange(still, end) < begin, np.maximum(torque - theta[5], 0.0), torque - theta[5])
-    net = net - theta[4] * np.maximum(speed, 0.0)
-    predicted = np.concatenate([[0.0], np.cumsum((net[1:] + net[:-1]) / 2)]) * window.dt_s / theta[3]
-    late = predicted[begin - still :] - speed[begin - still :]
-    spread = fit.problem.noises[0].speed_rad_s / np.sqrt(late.size)
-    lasted = (begin - still) * window.dt_s
-    excess = float(np.mean(late)) * theta[3] / lasted
-    sure_by = SURE * spread * theta[3] / lasted
-    peak = theta[2] * float(np.abs(motion.current).max())
-    if abs(excess) > sure_by + LEAST_BREAKAWAY * peak:
-        text = (
-            f"beginning to move takes {excess:+.3g} N.m more over {1e3 * lasted:.0f} ms than friction drags (Stribeck)"
-        )
-        yield Reason("ValidationFailed", text, "lubricate the slide-way, or check for a clamp or backlash")
-
-
-def _rest_before(fit: Fit, begin: int, side: int) -> int | None:
-    """Return the last row before the move at which the torque surely holds the shaft at rest; None without one."""
-    motion, noise = fit.problem.motions[0], fit.problem.noises[0]
-    rows = max(8, round(0.010 / motion.dt_s))
-    first = max(rows, begin - round(LONGEST_BREAKAWAY_S / motion.dt_s))
-    width = 2 * round(0.0005 / motion.dt_s) + 1
-    torque = side * fit.theta[2] * moving_mean(motion.current, width)
-    holding = np.flatnonzero(torque[first:begin] < HELD_SHARE * fit.theta[5])
-    if holding.size == 0:
-        return None
-    row = first + int(holding[-1])
-    quiet = abs(float(motion.speed[row - rows : row + 1].mean())) < 4 * noise.speed_rad_s / np.sqrt(rows)
-    unknown = bool((motion.mode[row - rows : row + 1] == UNKNOWN).all())
-    return row if quiet and unknown and row < begin - 1 else None
 
 
 def _holding(window: Window, fit: Fit, rows: Rows) -> Iterator[Reason]:

@@ -19,8 +19,9 @@ from fdhil.identification.motion import Motion
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import innovations_of
 from fdhil.records import Float, Reason, Window
+from fdhil.validation.shifts import LARGEST, SMOOTHING_S
 from fdhil.validation.significance import BUDGET
-from fdhil.validation.timing import LARGEST, SEARCH, SMOOTHING_S
+from fdhil.validation.timing import SEARCH
 
 LEAST_GAIN = BUDGET["timing"].deviations ** 2
 FIRST_SHARE = 0.1  # of the gain wanted that the score, too small for a long delay, shows at first sight

@@ -33,7 +33,7 @@ LAGS = 25
 SLOPE_S = 0.005  # over which the acceleration is taken
 _KINDS = {"current": CURRENT, "speed": SPEED}
 STRIBECK_SPEEDS = (0.01, 0.03, 0.06, 0.12, 0.25)  # of the rapid speed
-DEAD_TIME = "dead_time"
+DEAD_TIME, OFFSET_CURRENT, FRICTION = "dead_time", "current offset", "friction"
 SATURATED = 0.02  # of the peak current, at which an inverter's dead time has its whole effect
 
 
@@ -210,7 +210,7 @@ def courses(fit: Fit) -> Float:
     back-EMF, are off in proportion to the acceleration too; what they are off in proportion to current and its slope,
     R and L imitate.
     """
-    shape = fit.problem.shape_effect(fit.theta)[:, None]
+    shape = fit.problem.course_effects(fit.theta)
     motion, theta = fit.problem.motions[0], fit.theta
     doubt = aliasing(motion.voltage_sampling, motion.voltage_period_s)[0]
     if doubt == 0.0:
@@ -331,7 +331,8 @@ def _offset(bench: Bench, name: str, unit: str, drift: Float) -> Finding:
     k, statistic, amplitude, direction = bench.best(bench.offset_answers(name, np.vstack([np.ones(motion.n), drift])))
     text = f"{name} has an offset of {{:+.3g}} {unit}" if k == 0 else f"the zero of {name} drifts by {{:+.3g}} {unit}"
     advice = f"set the zero of the {name} sensor at standstill"
-    return Finding("CalibrationSuspect", text, advice, LEAST_OFFSET * peak, statistic, -amplitude, direction)
+    kind = OFFSET_CURRENT if name == "current" and k == 0 else ""
+    return Finding("CalibrationSuspect", text, advice, LEAST_OFFSET * peak, statistic, -amplitude, direction, name=kind)
 
 
 def _of_the_voltage(bench: Bench, drift: Float) -> list[Finding]:
@@ -397,4 +398,5 @@ def _low_speed_friction(bench: Bench) -> Finding:
         amplitude,
         direction,
         loads[k],
+        FRICTION,
     )

@@ -26,6 +26,7 @@ from fdhil.validation.significance import BUDGET
 NOISES = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}
 SHORTEST_S = 0.003
 TOLD_S = 0.010  # the shortest run that its neighbours or the other signals are asked about
+COMPUTED = 2.0  # times that, of a speed that a drive computes from positions: its neighbours scatter without noise
 LONGEST_RUNS = 2  # of a signal that are judged: a sensor sticks longer than chance repeats
 LEAST_NOISE = 0.2  # steps: what hides in the resolution
 TOLD_NOISE = 0.6  # steps: below it, how readings scatter depends on where in its step the signal lies
@@ -116,9 +117,10 @@ def _is_stuck(evidence: Evidence, readings: Readings, start: int, last: int, lim
         return False
     if readings.steps[start] in readings.rails:
         return False  # that is for saturation to explain
-    if _quieter_than_noise(readings, start, last, limit):
+    computed = readings.signal.name == "speed" and evidence.window.speed_late_s is not None
+    if not computed and _quieter_than_noise(readings, start, last, limit):
         return True
-    if (last - start) * readings.dt_s < TOLD_S:
+    if (last - start) * readings.dt_s < (COMPUTED * TOLD_S if computed else TOLD_S):
         return False
     if readings.beyond_chance(start, last):
         return True

@@ -65,9 +65,9 @@ class TableError:
         n = momentum.shape[-1]
         settled = math.ceil(SETTLED_S / dt_s)
         size = quick_size(n + 3 * settled)
-        # what is left at the end stays until the loop has forgotten, then fades: the transform goes round
-        fading = np.cos(np.linspace(0.0, math.pi, size - n - settled)) / 2 + 0.5
-        tail = np.concatenate([np.ones(settled), fading])
+        # the transform goes round: what is left at the end stays until the loop has forgotten, then fades
+        fading = np.cos(np.linspace(0.0, math.pi, settled)) / 2 + 0.5
+        tail = np.concatenate([np.ones(settled), fading, np.zeros(size - n - 2 * settled)])
         whole = np.concatenate([momentum, momentum[..., -1:] * tail], axis=-1)
         out: Float = np.fft.irfft(np.fft.rfft(whole) * self.response(size, dt_s), size)[..., :n]
         return out

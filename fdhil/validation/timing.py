@@ -8,23 +8,16 @@ late voltage, and not in proportion to the delay, so that its size is searched f
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdhil.identification.courses import voltage_v
-from fdhil.identification.filtering import moving_mean
 from fdhil.identification.fit import Fit, but_delay, descend, with_delay
 from fdhil.identification.fit import fit as fitted
-from fdhil.identification.innovations import CURRENT, VOLTAGE, answers
-from fdhil.identification.normal import inverse_of
-from fdhil.records import Float, Reason
+from fdhil.records import Reason
 from fdhil.validation.evidence import Evidence
+from fdhil.validation.shifts import LARGEST, Shift, shifts
 from fdhil.validation.significance import BUDGET
-from fdhil.validation.structure import courses, expected_correlation
 
-SMOOTHING_S = 0.010  # of the jerk-limited course of a rapid nothing is lost over this time
-LARGEST = 1.0  # samples: a recorder may assign a value to the SYNC before or after it
 DOUBTFUL = 0.5  # samples: a delay that may be larger is searched for
 TOLD = 2.5  # standard deviations
 STRIDE = 1.0  # samples: with other parameters fitted to none, hardly anything may be left of a delay of several
@@ -32,19 +25,6 @@ SEARCH = 6  # fits: each takes away most of what is left
 REACH = 16.0  # samples: longer ones show in whole samples, see identification.delay
 FOUND = 0.1  # samples
 LATE = (1.5, 2.0, 2.5, 3.0)  # samples that a winding shorter than a sample is weighed against
-
-
-@dataclass(frozen=True, slots=True)
-class Shift:
-    """By how many samples the voltage or current of a window is late (early: negative), and the standard deviation."""
-
-    samples: float
-    std: float
-
-    @property
-    def sure(self) -> bool:
-        """Return whether it is beyond chance and more than a sample."""
-        return abs(self.samples) > max(LARGEST, BUDGET["timing"].deviations * self.std)
 
 
 def voltage_late(evidence: Evidence) -> Iterator[Reason]:
@@ -60,7 +40,7 @@ def timing_faults(evidence: Evidence) -> Iterator[Reason]:
     window, fit = evidence.window, evidence.on_time
     if fit.problem.motions[0].slow is not None:
         return  # there the delay is one of the parameters
-    voltage, current = shifts(fit)
+    voltage, current = evidence.shifts
     if current.sure and abs(current.samples) * voltage.std > abs(voltage.samples) * current.std:
         yield _reason("current", "voltage and speed", current.samples * window.dt_s, window.dt_s)
         return
@@ -101,33 +81,6 @@ def _reason(name: str, others: str, late_s: float, period_s: float) -> Reason:
         f"more than a sample of {1e3 * period_s:.3g} ms"
     )
     return Reason("SampleTiming", text, "take voltage, current and speed from one SYNC, or enter the sensor's delay")
-
-
-def shifts(fit: Fit) -> tuple[Shift, Shift]:
-    """Return the delay of voltage and of current that the innovations show, each as if it alone were there."""
-    motion, gains = fit.problem.motions[0], fit.problem.filters[0]
-    width = 2 * round(SMOOTHING_S / 2 / motion.dt_s) + 1
-    found = []
-    jacobian = fit.but_delay
-    inverse, e = inverse_of(jacobian.T @ jacobian)[0], fit.residuals
-    coloured = 1.0 + 2.0 * max(0.0, float(expected_correlation(fit)[0]))
-    whole = np.column_stack([e, courses(fit)])
-    whole = whole - jacobian @ (inverse @ (jacobian.T @ whole))
-    for kind, values in ((VOLTAGE, voltage_v(motion, fit.theta)), (CURRENT, motion.current)):
-        slope = np.gradient(moving_mean(values, width))
-        answer = answers(motion, fit.theta, gains, kind, [slope], _no_rise(kind, motion.n))[:, 0]
-        rest = answer - jacobian @ (inverse @ (jacobian.T @ answer))
-        power = float(rest @ rest)
-        if not power > 0.0:
-            return Shift(0.0, np.inf), Shift(0.0, np.inf)
-        score, *unsure = (rest @ whole) / power
-        found.append(Shift(-float(score), float(np.linalg.norm([*unsure, np.sqrt(coloured / power)]))))
-    voltage, current = found
-    return replace(voltage, samples=voltage.samples + float(fit.theta[6]) / motion.dt_s), current
-
-
-def _no_rise(kind: int, n: int) -> list[Float] | None:
-    return [np.zeros(n)] if kind == VOLTAGE else None
 
 
 def searched(fit: Fit, first: Shift) -> float | None:

@@ -2,7 +2,8 @@
 
 Where the axis' regulators are known, the rapid is replayed through the closed loop with the model, and what that leaves
 of the measured positions is weighed against the tolerance. Where they are not, the torque that the model leaves is sent
-through an ordinary loop, and weighed against what all torque of the move makes there: the share hardly depends on it.
+through an ordinary loop, and weighed against what all torque of the move makes there (the share hardly depends on the
+loop), or against the following error that was recorded where that is larger: a drive without feed-forward.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ NEXT_SPEED = 0.3  # of the rapid speed: that of a program that is cut
 SCATTER = 3.0  # deviations by which the power of noise may lie above what is expected
 BEGINNING_S = 0.060  # before the drive surely moves
 SMOOTHING_S = 0.002  # of the current, whose noise would push a shaft at rest
+LOOPS_DIFFER = "LoopsDiffer"  # code of what the torque explains, and the closed loop does not
 NOISE_ROWS = 25.0e-3  # s: over which noise behind a position loop hangs together
 
 
@@ -74,6 +76,7 @@ class Weight:
         )
         if self.allows(self.torque_um):
             advice = "the torque is explained, so the drive's loops are not as configured: fdhil identify --loops"
+            return Reason(LOOPS_DIFFER, text, advice)
         return Reason("ValidationFailed", text, advice)
 
     def told(self, um: float) -> str:
@@ -179,10 +182,20 @@ def weigh(
     whole, left = (rms(row) for row in loop.um(np.array([move.whole(parameters), move.left(parameters)]), window.dt_s))
     left = _beyond_noise(left, loop, parameters, move, noise)
     told = _replayed(window, parameters, axis, sync_period_s)
+    if told is None and axis is not None:
+        return Weight(left, tolerance_um(settings, whole), whole, left, "own loop")
     if told is None:
-        limit = tolerance_um(settings, whole) if axis is not None else TOLERANCE_SHARE * whole
-        return Weight(left, limit, whole, left, "own loop" if axis is not None else "ordinary loop")
+        limit = TOLERANCE_SHARE * max(whole, _followed_um(window))
+        return Weight(left, limit, whole, left, "ordinary loop")
     return Weight(told.unexplained_um, tolerance_um(settings, told.measured_um), told.measured_um, left, "replay")
+
+
+def _followed_um(window: Window) -> float:
+    """Return the RMS following error that was recorded beyond that at rest, um; 0 where the demand was not."""
+    apart = (window.position_mm - window.demand_mm)[np.isfinite(window.position_mm - window.demand_mm)]
+    if apart.size == 0 or not np.nanmax(window.demand_mm) > np.nanmin(window.demand_mm):
+        return 0.0
+    return 1e3 * rms(apart - apart[0])
 
 
 def _runs(parameters: Parameters) -> bool:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from fdhil.identification.normal import inverse_gram
-from fdhil.identification.without_voltage import candidates, effective_rows, late_s
+from fdhil.identification.without_voltage import TorqueFit, candidates, effective_rows, late_s
 from fdhil.records import Reason, rms
 from fdhil.validation.evidence import Evidence
 from fdhil.validation.significance import BUDGET
 
 EDGES = 20  # instants at which a load may begin or end
 LEAST_LOAD = 0.05  # of the peak current: a screw's friction differs from place to place by less
-LARGEST_SHARE = 0.05  # of the torque's RMS that the model may leave unexplained
+LARGEST_SHARE = 0.10  # of the torque's RMS that the model may leave unexplained: more, and it is no model of this drive
 LATE_ROWS = 1.0
 IMITATED = 1e-6  # of a course's power, below which only rounding is left of it
 
@@ -31,32 +32,53 @@ def torque_late(evidence: Evidence) -> Iterator[Reason]:
         yield Reason("SampleTiming", text, "take current, speed and position from one SYNC")
 
 
+@dataclass(frozen=True, slots=True)
+class Load:
+    """A torque of ``amplitude`` A, with its standard deviation, over the half-open rows to fit ``begin`` to ``end``."""
+
+    amplitude: float
+    std: float
+    begin: int
+    end: int
+
+
 def load_comes_and_goes(evidence: Evidence) -> Iterator[Reason]:
     """Yield a reason where a torque acts over a part of the move that neither the model nor friction explains."""
     fitted = evidence.torque
     if fitted is None:
         return
-    # what friction at low speed, or a ripple, may be is no load, whether it was worth joining or not
-    others = [term.columns for term in candidates(fitted)]
-    design = np.column_stack([fitted.design, *others])
+    load = surest_load(fitted)
+    least = LEAST_LOAD * float(np.abs(fitted.current).max())
+    if abs(load.amplitude) > max(least, BUDGET["structure"].deviations * load.std):
+        rows = np.flatnonzero(fitted.rows.usable)
+        a, b = (evidence.time_s(int(row)) for row in rows[[load.begin, load.end - 1]])
+        text = f"a torque as of {load.amplitude:+.3g} A that is no friction acts from {a:.3f} to {b:.3f} s"
+        yield Reason("LoadDetected", text, "identify from moves without cutting, clamping or collision")
+
+
+def surest_load(fitted: TorqueFit) -> Load:
+    """Return the load between two edges that the fit shows most surely, beside all that friction may be.
+
+    Friction at low speed and ripples are no load, whether they were worth joining or not.
+    """
+    design = np.column_stack([fitted.design, *(term.columns for term in candidates(fitted))])
     inverse, _ = inverse_gram(design)
     left = fitted.current - design @ (inverse @ (design.T @ fitted.current))
     edges = np.linspace(0, left.size, EDGES + 1).astype(int)
-    starts, ends = np.triu_indices(EDGES + 1, 1)
-    steps = (np.arange(left.size)[:, None] < edges[None, :]).astype(np.float64)
-    blocks = steps[:, ends] - steps[:, starts]
-    beyond = blocks - design @ (inverse @ (design.T @ blocks))
-    power = np.square(beyond).sum(axis=0)
-    seen = power > IMITATED * np.square(blocks).sum(axis=0)
-    amplitude = np.where(seen, beyond.T @ left / np.where(seen, power, 1.0), 0.0)
-    k = int(np.argmax(np.abs(amplitude) * np.sqrt(power)))
-    chance = rms(left) * np.sqrt(left.size / effective_rows(fitted) / max(power[k], 1e-300))
-    least = LEAST_LOAD * float(np.abs(fitted.current).max())
-    if abs(amplitude[k]) > max(least, BUDGET["structure"].deviations * chance):
-        rows = np.flatnonzero(fitted.parts[0].usable)
-        a, b = (evidence.time_s(int(rows[min(edge, rows.size - 1)])) for edge in edges[[starts[k], ends[k]]])
-        text = f"a torque as of {amplitude[k]:+.3g} A that is no friction acts from {a:.3f} to {b:.3f} s"
-        yield Reason("LoadDetected", text, "identify from moves without cutting, clamping or collision")
+    # of a step from the begin to an edge, products with design and residual are sums up to it; a load is two steps
+    shared = np.vstack([np.zeros(len(inverse)), np.cumsum(design, axis=0)])[edges]
+    score = np.append(0.0, np.cumsum(left))[edges]
+    gram = np.minimum.outer(edges, edges) - shared @ inverse @ shared.T
+    a, b = np.triu_indices(EDGES + 1, 1)
+    power = gram[b, b] + gram[a, a] - 2.0 * gram[b, a]
+    seen = power > IMITATED * (edges[b] - edges[a])
+    amplitudes = np.where(seen, (score[b] - score[a]) / np.where(seen, power, 1.0), 0.0)
+    k = int(np.argmax(np.abs(amplitudes) * np.sqrt(np.maximum(power, 0.0))))
+    amplitude, begin, end = float(amplitudes[k]), int(edges[a[k]]), int(edges[b[k]])
+    rest = left + amplitude * (design @ (inverse @ (shared[b[k]] - shared[a[k]])))
+    rest[begin:end] -= amplitude
+    std = rms(rest) * float(np.sqrt(rest.size / effective_rows(rest) / max(power[k], 1e-300)))
+    return Load(amplitude, std, begin, end)
 
 
 def torque_unexplained(evidence: Evidence) -> Iterator[Reason]:

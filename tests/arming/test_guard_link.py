@@ -108,8 +108,11 @@ async def test_what_is_given_up_while_it_is_planned_is_not_armed(
         begin = Piece(0, demand, demand, True)
         return SimpleNamespace(facts={}, begin=begin, rows=1, summary=lambda: {"method": "inverse"})
 
-    monkeypatch.setattr("fdhil.arming.desk.prepare", lambda *_: SimpleNamespace(ahead=False))
+    monkeypatch.setattr(
+        "fdhil.arming.desk.prepare", lambda *_: SimpleNamespace(ahead=False, program_digest="", models={})
+    )
     monkeypatch.setattr("fdhil.arming.desk.plan_whole", lambda *_: None)
+    monkeypatch.setattr("fdhil.arming.desk.taught", lambda *_: (None, None))
     monkeypatch.setattr("fdhil.arming.desk.prepare_armament", slow)
     guard.says = lambda _kind: {**FINE, "state": "OFF"}
     desk = ArmingDesk(config, OutcomeStore(config), folder)

@@ -7,10 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from fdhil.arming.desk import ArmingDesk
-from fdhil.arming.knowledge import AxisKnowledge
+from fdhil.arming.knowledge import AxisKnowledge, Knowledge
 from fdhil.arming.preparing import (
     MODEL_AGE_S,
     Armament,
@@ -19,14 +20,16 @@ from fdhil.arming.preparing import (
     prepare,
     prepare_armament,
     standing_facts,
+    with_identified_loops,
 )
 from fdhil.arming.token import read_token
 from fdhil.arming.whole_plan import plan_whole
 from fdhil.commissioning.record import CommissioningRecord, axis_digest, save_record
 from fdhil.config import MachineConfig
 from fdhil.daemon.outcome_store import OutcomeStore
+from fdhil.identification.loops import DIFFER
 from fdhil.program import program_digest
-from fdhil.records import Notice, Skill
+from fdhil.records import LoopEstimate, Notice, Reason, Skill, Verdict
 from fdhil.store.rows import Revision, Stamp
 from tests.daemon.machine import config_of
 from tests.store.made import published
@@ -214,3 +217,35 @@ def test_a_changed_load_is_remembered_until_new_parameters_come(config: MachineC
     assert desk.knowledge.now()["X"].load_changed
     desk.knowledge.note([replace(published(2), config_digest=config.digest)])
     assert not desk.knowledge.now()["X"].load_changed
+
+
+def test_loops_that_were_identified_and_are_believed_are_planned_with(config: MachineConfig, program: Path) -> None:
+    """Others are not; the configuration that was commissioned stays what it is."""
+    believed = Verdict(True, None, unexplained_um=0.5, warnings=(Reason(DIFFER, "speed_kp is 21"),))
+    loops = LoopEstimate(
+        "X", "p_pi_pi", ("speed_kp", "speed_filter_s"), np.array([21.0, 5e-4]), np.zeros((2, 2)), believed
+    )
+    knowledge = Knowledge(config.axis)
+    knowledge.note([loops])
+    found = with_identified_loops(config, knowledge.now())
+    assert found.axis["X"].regulators.speed_kp == 21.0
+    assert found.axis["X"].regulators.speed_filter_s == 5e-4
+    assert found.axis["Y"] == config.axis["Y"]
+    knowledge.note([replace(loops, verdict=replace(believed, accepted=False))])
+    assert with_identified_loops(config, knowledge.now()) is config
+    request = prepare(program, None, config, known(config, loops=loops))
+    assert isinstance(request, ArmRequest)
+    assert request.config.axis["X"].regulators.speed_kp == 21.0
+    save_records(config)
+    armament = whole(program, config, loops=loops)
+    assert isinstance(armament, Armament)
+    assert all(armament.facts.values()), armament.facts
+
+
+def test_a_resonance_that_is_configured_is_planned_with(config: MachineConfig, program: Path) -> None:
+    axis = config.axis["X"].model_copy(update={"resonance_hz": 90.0})
+    config = config.model_copy(update={"axis": {**config.axis, "X": axis}})
+    request = prepare(program, None, config, known(config))
+    assert isinstance(request, ArmRequest)
+    assert request.models["X"].term("resonance") == 90.0
+    assert request.models["Y"].terms == ()

@@ -26,7 +26,7 @@ from fdhil.arming.preparing import ArmRequest, prepare, prepare_armament
 from fdhil.arming.program_check import KEPT, SCHEMA, check, encoded, keep
 from fdhil.config import MachineConfig
 from fdhil.errors import ProgramError, StoreError
-from fdhil.prediction.models import nominal_models
+from fdhil.prediction.models import nominal_models, with_loops
 from fdhil.program import load_trajectory, program_digest
 from fdhil.records import Reason
 from tests.arming.check_process import answered, asked, says_instead
@@ -365,3 +365,21 @@ def test_a_store_that_refuses_is_told(tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(StoreError):
         made(tmp_path / "file" / "folder", "a")
+
+
+async def test_rows_of_other_terms_or_loops_are_other_rows(config: MachineConfig, tmp_path: Path) -> None:
+    """A check is known by all that its rows depend on, and its process is told all of it."""
+    program = written(tmp_path, HEAD + SQUARE + "G4 P0.3\nM2\n")
+    digest, six = program_digest(program), nominal_models(config)
+    rich = {axis: model.changed(stribeck=2.0, stribeck_speed=10.0) for axis, model in six.items()}
+    filtered = with_loops(config, {axis: {"speed_filter_s": 5e-4} for axis in config.axis}, "test")
+    check = BackgroundCheck(config)
+    found = [
+        await check.run(program, digest, models, whole, known)
+        for models, known in ((six, None), (rich, None), (six, filtered), (rich, config))
+    ]
+    assert all(isinstance(one, CheckedProgram) for one in found)
+    bodies = [b"".join(one.content(k) for k in range(len(one.blocks))) for one in found]  # type: ignore[union-attr]
+    assert len(set(bodies)) == 3
+    assert bodies[1] == bodies[3]
+    assert len(list((config.store.directory / FOLDER).glob("*.rows"))) == 3

@@ -30,7 +30,7 @@ def recordings(tmp_path: Path) -> list[Path]:
 
 def test_each_window_and_each_pool_is_a_step_of_its_file(recordings: list[Path]) -> None:
     shares: list[float] = []
-    results = list(batch.analyse_files(recordings, SETTINGS, {}, shares.append))
+    results = list(batch.analyse_files(recordings, SETTINGS, None, shares.append))
     assert [result.file for result in results] == [str(path) for path in recordings]
     assert shares == pytest.approx([1 / 3] * 6)
 
@@ -38,11 +38,11 @@ def test_each_window_and_each_pool_is_a_step_of_its_file(recordings: list[Path])
 @pytest.mark.parametrize("limit", ["MANY_FILES", "MANY_WINDOWS"])
 def test_other_processes_give_the_same(recordings: list[Path], limit: str, monkeypatch: pytest.MonkeyPatch) -> None:
     recordings = recordings if limit == "MANY_FILES" else recordings[:1]
-    alone = list(batch.analyse_files(recordings, SETTINGS, {}))
+    alone = list(batch.analyse_files(recordings, SETTINGS))
     monkeypatch.setattr(batch, limit, 1)
     monkeypatch.setattr(os, "cpu_count", lambda: 2)
     shares: list[float] = []
-    together = list(batch.analyse_files(recordings, SETTINGS, {}, shares.append))
+    together = list(batch.analyse_files(recordings, SETTINGS, None, shares.append))
     assert sum(shares) == pytest.approx(len(recordings))
     for one, other in zip(alone, together, strict=True):
         assert one.file == other.file

@@ -38,6 +38,8 @@ def test_the_shipped_configuration_is_the_demonstrations_machine() -> None:
     assert {axis: twin.reality for axis, twin in shipped.sim.axis.items()} == {
         axis: twin.reality for axis, twin in shown.sim.axis.items()
     }
+    assert {axis: section.resonance_hz for axis, section in shipped.axis.items()} == {"X": 120.0, "Y": 120.0}
+    assert {axis: section.resonance_hz for axis, section in shown.axis.items()} == {"X": 120.0, "Y": 120.0}
     assert Reality() not in [twin.reality for twin in shown.sim.axis.values()]
 
 

@@ -58,3 +58,17 @@ def test_ratios_are_shown_where_nothing_else_is_published(deaf: Path, capsys: An
     assert "Cd/K A" in shown
     assert "a changed load" in shown
     assert plot.stat().st_size > 10_000
+
+
+def test_what_the_data_sheet_gives_has_no_trend(tmp_path: Path, capsys: Any) -> None:
+    path = tmp_path / "machine.toml"
+    path.write_text(BENCH)
+    machine = config_of(tmp_path, ("X",))
+    with History.open(machine.store.directory) as history:
+        for day, window in enumerate(windows(0.003, moves=4)):
+            analysed = analyse(replace(window, voltage_v=None), Identification(), machine.axis["X"], 0.001)
+            assert analysed.verdict.accepted, analysed.verdict
+            history.add_window(analysed, "", Stamp(START_S + 86_400.0 * day, "boot", window.start_tick))
+    document = json.loads(fdhil("history", path, "--json", capsys=capsys)[1])
+    assert {"Jt", "ft", "Cd"} <= set(document["trends"]["X"])
+    assert not {"R", "L", "K"} & set(document["trends"]["X"])

@@ -5,18 +5,21 @@ from __future__ import annotations
 import errno
 import os
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from fdhil.daemon.outcome_json import as_document, set_document
 from fdhil.daemon.outcome_store import OutcomeStore, raw_scales
-from fdhil.records import Notice, Outcome
+from fdhil.identification.pooling import member
+from fdhil.records import LoopEstimate, Notice, Outcome, Verdict, frozen
 from fdhil.store.history import FILE_NAME, History
 from fdhil.store.windows import encode_window, list_windows
 from tests.daemon.machine import config_of
-from tests.store.made import outcome, published, window
+from tests.store.made import BENCH, outcome, published, window
 
 
 def opened(folder: Path) -> tuple[OutcomeStore, list[Notice]]:
@@ -115,3 +118,46 @@ def test_strays_are_named(tmp_path: Path) -> None:
     assert [notice.code for notice in said] == ["StrayFiles"]
     assert "notes.txt" in said[0].text
     store.close()
+
+
+def test_what_windows_tell_a_pool_is_known_again(tmp_path: Path) -> None:
+    store, _ = opened(tmp_path)
+    ways = (1, -1, 1)
+    assert store.keep([outcome(of=window(direction=way, start_tick=1000 * k)) for k, way in enumerate(ways)]) == []
+    store.close()
+    again, _ = opened(tmp_path)
+    known = again.known("X")
+    again.close()
+    assert set(known.first) == {1, -1}
+    assert [told.direction for told in known.members] == list(ways)
+    assert [told.place for told in known.members] == [-2, -1, 0]
+    made = outcome(of=window())
+    assert made.estimate is not None
+    fresh = member(made.window, made.estimate)
+    for name in ("values", "own", "shared"):
+        assert getattr(known.members[0], name).tobytes() == getattr(fresh, name).tobytes()
+
+
+def test_loops_are_known_again_as_long_as_the_configuration_is_the_same(tmp_path: Path) -> None:
+    found = LoopEstimate("X", "cascade", ("speed_filter_s",), frozen([1e-3]), frozen([[1e-10]]), Verdict(True, None))
+    store, _ = opened(tmp_path)
+    digest = config_of(tmp_path).digest
+    assert store.keep([found, published(1)]) == []
+    assert store.known("X").loops is None
+    assert store.keep([replace(published(2), config_digest=digest)]) == []
+    loops = store.known("X").loops
+    store.close()
+    assert loops is not None
+    assert (loops.names, loops.values.tolist()) == (found.names, [1e-3])
+
+
+def test_a_load_is_part_of_what_is_told_in_json() -> None:
+    loaded = BENCH.changed(load=2.5)
+    document = set_document(replace(published(), parameters=loaded, covariance=frozen(np.eye(7)), unexplained_um=0.5))
+    assert document["terms"]["load"]["value"] == 2.5
+    assert document["terms"]["load"]["unit"] == "N.m"
+    assert document["terms"]["load"]["high"] == pytest.approx(2.5 + 1.96, abs=0.01)
+    assert (document["unexplained_um"], document["warnings"]) == (0.5, [])
+    told = as_document(outcome())
+    assert (told["terms"], told["warnings"], told["unexplained_um"]) == ({}, [], None)
+    assert told["friction_at_rapid"]["value"] == pytest.approx(5.0 + 0.05 * 157.08, abs=0.01)

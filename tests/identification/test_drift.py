@@ -111,3 +111,19 @@ def test_not_published_parameters_do_no_harm() -> None:
     covariance = COVARIANCE.copy()
     covariance[4, :] = covariance[:, 4] = np.nan
     assert tracker.update(unknown, covariance, 9) == []
+
+
+def test_friction_that_a_load_makes_differ_by_direction_is_no_jump_and_no_wear() -> None:
+    tracker = DriftTracker(Maintenance(Cd=0.3), "X")
+    for k in range(12):
+        side = 1 - 2 * (k % 2)
+        assert tracker.update(replace(BENCH, Cd=5.0 + 2.5 * side), COVARIANCE, k, side) == []
+    worn = replace(BENCH, Cd=2.5 * 1.9)  # of the negative direction: 90 % more, not 5 % less than 5
+    assert _codes(tracker.update(worn, COVARIANCE, 13, -1)) == ["ParameterJump"]
+
+
+def test_a_restart_measures_wear_against_the_first_values_of_either_direction() -> None:
+    tracker = DriftTracker(Maintenance(Cd=0.3), "X")
+    tracker.resume({1: BENCH, -1: replace(BENCH, Cd=2.5)}, [])
+    assert tracker.update(replace(BENCH, Cd=2.6), COVARIANCE, 1, -1) == []
+    assert _codes(tracker.update(replace(BENCH, Cd=3.9), COVARIANCE, 2, -1)) == ["MaintenanceDue"]

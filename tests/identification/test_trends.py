@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fdhil.identification.trends import crossing, slope, steps, student_95
+from fdhil.identification.trends import crossing, slope, steps, student_95, without_direction
 from fdhil.records import PARAMETERS, Float
 
 BENCH = np.array([0.5, 0.005, 0.8, 0.075, 0.05, 5.0])
@@ -154,3 +154,12 @@ def test_unknown_values_do_no_harm() -> None:
     values[10:, 3] *= 1.2
     assert [(step.name, step.row) for step in steps(values, stds, np.full(20, np.nan))] == [("Jt", 10)]
     assert steps(values[:4], stds[:4]) == []
+
+
+def test_what_friction_owes_to_the_direction_is_no_scatter_and_no_step() -> None:
+    side = np.array([1.0, -1.0] * 10)
+    worn = np.array([5.0 + 0.02 * k for k in range(20)])
+    assert without_direction(worn + 2.5 * side, side) == pytest.approx(worn, abs=0.011)
+    stepped = np.array([5.0] * 10 + [6.0] * 10)
+    assert without_direction(stepped + 2.5 * side, side) == pytest.approx(stepped)
+    assert without_direction(worn, np.ones(20)) is worn

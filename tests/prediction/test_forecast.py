@@ -157,3 +157,17 @@ def test_a_parameter_set_without_covariance_still_has_steps() -> None:
     before, after = (replace(published("X", k, Jt=jt), covariance=unknown) for k, jt in ((1, 0.075), (2, 0.085)))
     assert last_step([before, after]) == 0
     assert isinstance(before.parameters, Parameters)
+
+
+def test_a_term_that_joined_or_left_is_told_as_a_whole() -> None:
+    """What falling friction did since the program was predicted without it, and the other way round."""
+    reference = bench_trajectory(10)
+    rich = NOMINAL.changed(stribeck=2.0, stribeck_speed=10.0)
+    for earlier, now in ((NOMINAL, rich), (rich, NOMINAL)):
+        models = {"X": now, "Y": now}
+        prediction = predict(reference, models, CONFIG)
+        std_um = np.zeros(prediction.contour_um.size)
+        changes = zone_changes(prediction, models, {"X": earlier, "Y": earlier}, std_um, (), CONFIG, True)
+        named = {(axis, name) for change in changes for axis, name, _ in change.by}
+        assert named == {("X", "stribeck"), ("Y", "stribeck")}
+        assert any(abs(change.now_um - change.before_um) > 1.0 for change in changes)

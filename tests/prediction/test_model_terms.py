@@ -38,11 +38,11 @@ def test_the_band_that_holds_a_shaft_is_what_the_torques_leave() -> None:
 def test_the_torque_against_motion_is_the_sum_of_its_terms() -> None:
     """Of the docstring of Parameters, in both directions and at rest."""
     speed, angle = np.array([20.0, -5.0, 0.0]), np.array([0.3, 1.0, 2.0])
-    smooth, dry = resisting(RICH, speed, angle, np.sign(speed))
+    smooth, dry = resisting(RICH, speed, angle)
     ripple = 0.5 * np.sin(2 * angle + np.pi / 2)
     assert smooth == pytest.approx(2.0 + ripple + np.array([0.06 * 20.0, 0.04 * -5.0, 0.0]))
     assert dry == pytest.approx([6.0 + np.exp(-4.0), -(4.0 + np.exp(-0.25)), 0.0])
-    smooth, dry = resisting(BASE, speed, angle, np.sign(speed))
+    smooth, dry = resisting(BASE, speed, angle)
     assert smooth + dry == pytest.approx(0.05 * speed + 5.0 * np.sign(speed))
 
 

@@ -52,6 +52,14 @@ def test_the_voltage_object_is_the_command_and_the_sensor_beside_the_motor_tells
     assert physics.seen.voltage_v == pytest.approx(physics.voltage_mean_v + 3.0 * np.sign(physics.current_a), abs=0.01)
 
 
+def test_the_bus_voltage_is_an_object_and_sags() -> None:
+    rig = Rig(machine(reality={"bus_sag": 0.1, "bus_power_kw": 20.0}))
+    rig.enable()
+    assert rig.read(0x6079) == 300_000
+    bus = told(rig, 0x6079)[:, 0]
+    assert 250_000 < bus.min() < 290_000
+
+
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_weight_pulls_against_the_axis_whichever_way_the_drive_counts(sign: int) -> None:
     document = bench_document("X")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from fdhil.store.export import export_csv
+from fdhil.store.recording_csv import read_recording
+from fdhil.store.windows import decode_window, encode_window
 from tests.store.made import window
 
 
@@ -27,3 +30,20 @@ def test_the_csv_has_every_sample_to_the_last_bit_and_no_row_for_a_lost_one(tmp_
     assert np.array_equal(body[:, 4], made.position_mm[kept] / 1000)
     assert body.shape == (597, 6)
     assert np.allclose(body[:, 0], np.flatnonzero(kept) * 0.001, atol=1e-12)
+
+
+def test_a_window_without_a_voltage_is_exported_and_read_again(tmp_path: Path) -> None:
+    made = replace(window(), voltage_v=None, torque_constant_nm_per_a=0.3)
+    path = tmp_path / "deaf.csv"
+    export_csv(made, path)
+    assert "voltage" not in path.read_text()
+    read = read_recording(path)
+    kept = np.isfinite(made.speed_rad_s)
+    assert (read.voltage_v, read.torque_constant_nm_per_a) == (None, 0.3)
+    assert np.array_equal(read.current_a[kept], made.current_a[kept])
+
+
+def test_the_torque_constant_is_stored_with_a_window_that_tells_it() -> None:
+    made = replace(window(), torque_constant_nm_per_a=0.3)
+    assert decode_window(encode_window(made, "c0ffee")).torque_constant_nm_per_a == 0.3
+    assert b"torque_constant" not in encode_window(window(), "c0ffee")

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 import sqlite3
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fdhil.errors import StoreError
-from fdhil.records import Notice, Parameters, Skill
+from fdhil.records import LoopEstimate, Notice, Parameters, Reason, Skill, Verdict, frozen
 from fdhil.store import history as history_module
 from fdhil.store import schema
 from fdhil.store.history import FILE_NAME, History, latest_parameters
 from fdhil.store.rows import Comparison, Stamp, UsedParameters
 from tests.store.made import BENCH, STAMP, outcome, published
+from tests.store.made import window as made_window
 
 DRIFTED = Parameters(0.5, 0.005, 0.8, 0.075, 0.01 + 1e-17, 1.0 / 3.0)
 
@@ -201,3 +203,58 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
     with pytest.raises(StoreError) as error:
         History.open(tmp_path / "file" / "store")
     assert error.value.code == "ReadOnlyStore"
+
+
+def test_terms_warnings_and_what_is_unexplained_are_kept(tmp_path: Path) -> None:
+    warning = Reason("OneDirection", "all moves go one way", "record both")
+    made = outcome()
+    warned = replace(made, verdict=replace(made.verdict, unexplained_um=1.25, warnings=(warning,)))
+    loaded = replace(published(), parameters=BENCH.changed(load=2.5), unexplained_um=1.25, warnings=(warning,))
+    with History.open(tmp_path) as history:
+        history.add_window(warned, "", STAMP)
+        history.add_revision(loaded, [1], STAMP)
+        (window,), (revision,) = history.windows(), history.revisions()
+    assert (window.unexplained_um, window.warnings) == (1.25, ("OneDirection: all moves go one way",))
+    assert window.friction is not None
+    assert window.friction["value"] == pytest.approx(5.0 + 0.05 * window.friction["speed_rad_s"])
+    assert revision.set.parameters == BENCH.changed(load=2.5)
+    assert (revision.set.unexplained_um, revision.set.warnings) == (1.25, (warning,))
+    assert latest_parameters(tmp_path)["X"].term("load") == 2.5
+
+
+def test_the_first_window_of_either_direction_is_known(tmp_path: Path) -> None:
+    with History.open(tmp_path) as history:
+        for accepted, direction in ((False, 1), (True, 1), (True, 1), (True, -1)):
+            history.add_window(outcome(accepted, of=made_window(direction=direction)), "", STAMP)
+        assert {direction: found.number for direction, found in history.first_windows("X").items()} == {1: 2, -1: 4}
+
+
+def test_what_was_found_of_the_loops_comes_back(tmp_path: Path) -> None:
+    verdict = Verdict(True, None, (), 0.75, (Reason("LoopsDiffer", "the speed filter is 1 ms, not 0"),))
+    names = ("position_gain_per_s", "speed_filter_s")
+    found = LoopEstimate("X", "cascade", names, frozen([49.5, 1e-3]), frozen(np.diag([0.04, 1e-10])), verdict)
+    with History.open(tmp_path) as history:
+        history.add_loops(found, STAMP)
+        ((stamp, stored),) = history.loops("X")
+    assert stamp == STAMP
+    assert (stored.structure, stored.names, stored.verdict) == ("cascade", names, verdict)
+    assert stored.values.tobytes() == found.values.tobytes()
+    assert stored.covariance.tobytes() == found.covariance.tobytes()
+
+
+def test_a_row_that_was_damaged_before_its_schema_was_brought_up_stays_so(tmp_path: Path) -> None:
+    db = sqlite3.connect(tmp_path / FILE_NAME)
+    for step in schema._STEPS[:3]:
+        db.executescript(step)
+    db.execute("PRAGMA user_version = 3")
+    db.isolation_level = None
+    for _ in range(2):
+        schema.insert(
+            db, "skills", {"axis": "X", "tick": 5, "rms_um": 0.5, "wall_s": 1.0, "boot": "b", "monotonic_ns": 1}
+        )
+    db.execute("UPDATE skills SET tick = 6 WHERE id = 2")
+    db.close()
+    with History.open(tmp_path) as history:
+        assert [skill.tick for skill in history.skills()] == [5]
+        assert history.put_damaged_aside() == "1 of skills (row 2)"
+        assert history.loops() == []

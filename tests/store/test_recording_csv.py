@@ -164,3 +164,34 @@ def test_a_file_larger_than_any_recording_is_refused_before_it_is_taken_apart(
         many.write_text(end * 1001)
         with pytest.raises(RecordingError, match="larger than"):
             read_recording(many)
+
+
+def _deaf(**headers: str) -> str:
+    values = np.linspace(0.0, 20.0, 40, endpoint=False)
+    text = bench.table_text(0.001, dict.fromkeys((name for name in COLUMNS if name != "voltage_V"), values), **headers)
+    return _without(text, "# voltage_sampling")
+
+
+def test_a_recording_without_a_voltage_is_read_with_its_torque_constant() -> None:
+    recording = parse_recording(_deaf(torque_constant_nm_per_a="0.3"))
+    assert recording.voltage_v is None
+    assert recording.torque_constant_nm_per_a == 0.3
+    assert recording.current_a[2] == 1.0
+    assert recording.demand_mm[2] == 1000.0
+    assert parse_recording(_deaf()).torque_constant_nm_per_a is None
+    with pytest.raises(RecordingError, match="no header voltage_sampling"):
+        parse_recording(_without(_text(), "# voltage_sampling"))
+
+
+@pytest.mark.parametrize(
+    ("headers", "words"),
+    [
+        ({"torque_constant_nm_per_a": "0"}, "torque_constant_nm_per_a"),
+        ({"torque_constant_nm_per_a": "3000"}, "machines have 0.001 to 100: correct it$"),
+        ({"speed_source": "guess"}, "sensor or difference or filtered"),
+        ({"voltage_source": "mains"}, "terminals or command"),
+    ],
+)
+def test_a_wrong_header_of_the_signals_is_told(headers: dict[str, str], words: str) -> None:
+    with pytest.raises(RecordingError, match=words):
+        parse_recording(_deaf(**headers))

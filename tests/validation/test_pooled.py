@@ -10,10 +10,13 @@ import pytest
 from fdhil.config import Identification
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
-from studies import drives, faults
+from fdhil.records import Reason, Verdict, WindowOutcome
+from studies import bench, drives, faults, real_plant
 from studies.scenes import demand_of, measured, recorded
 from tests.identification.recorded import windows
 from tests.validation.test_interruptions import SCENE
+
+PLANT = real_plant.Mechanics()
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -82,3 +85,73 @@ def test_a_gain_that_changes_between_rapids_is_told_where_no_parameter_alone_tel
     assert all(outcome.verdict.accepted for outcome in outcomes)
     _, verdict = pool(outcomes, Identification())
     assert [reason.code for reason in verdict.reasons] == ["CalibrationSuspect"]
+
+
+def real(mechanics: real_plant.Mechanics, moves: int = 4) -> list[WindowOutcome]:
+    """Return the windows of a shuttle of an axis with what real machines have, analysed."""
+    run, sensors = real_plant.run(mechanics, bench.shuttle(moves=moves)), real_plant.Sensors()
+    recording = real_plant.recording(run, mechanics, sensors, 0.5, seed=2)
+    return [analyse(window, Identification()) for window in find_windows(recording)]
+
+
+@pytest.mark.parametrize("refit", [True, False])
+def test_friction_that_differs_by_direction_is_a_load_and_no_jump(refit: bool) -> None:
+    estimate, verdict = pool(real(replace(PLANT, asymmetry=0.1)), Identification(), refit=refit)
+    assert verdict.accepted, verdict.reasons
+    assert estimate is not None
+    assert estimate.terms == ("load",)
+    assert abs(estimate.value("load") - 0.5) < 3 * estimate.std("load")
+    assert abs(estimate.value("Cd") - 5.0) < 3 * estimate.std("Cd")
+    assert estimate.std("load") < 0.01
+
+
+def test_a_counterweight_that_is_off_by_three_times_the_friction_is_told() -> None:
+    """Of one direction alone its friction is negative; both together are a drive."""
+    outcomes = real(replace(PLANT, load_nm=15.0))
+    assert [o.estimate is not None and o.estimate.value("Cd") < 0 for o in outcomes] == [False, True, False, True]
+    estimate, verdict = pool(outcomes, Identification())
+    assert verdict.accepted, verdict.reasons
+    assert estimate is not None
+    assert estimate.value("load") == pytest.approx(15.0, abs=0.02)
+    assert estimate.value("Cd") == pytest.approx(5.0, rel=0.02)
+
+
+def test_a_winding_that_warms_is_followed_to_the_newest_window() -> None:
+    estimate, verdict = pool(real(replace(PLANT, warming=0.06)), Identification())
+    assert verdict.accepted, verdict.reasons
+    assert estimate is not None
+    assert estimate.value("R") == pytest.approx(0.5 * (1 + 0.06 * 3.5 / 4), rel=0.01)
+
+
+def test_a_pool_is_not_believed_from_one_direction_while_the_other_is_refused() -> None:
+    outcomes = real(replace(PLANT, asymmetry=0.1))
+    refusal = Reason("ValidationFailed", "friction is 2 N.m higher below 10 rad/s", "lubricate the slide-way")
+    lost = Reason("StaleData", "40 samples in a row are lost", "see the bus load")
+    refused, cut = (
+        [
+            replace(o, verdict=Verdict(False, 90.0, (reason,))) if o.window.direction < 0 else o for o in outcomes
+        ]
+        for reason in (refusal, lost)
+    )  # fmt: skip
+    estimate, verdict = pool(refused, Identification())
+    assert estimate is not None
+    assert [reason.code for reason in verdict.reasons] == ["OneDirection"]
+    assert "negative" in verdict.reasons[0].text
+    assert verdict.reasons[0].advice == refusal.advice
+    _, verdict = pool(cut, Identification())  # what is lost says nothing of the drive, but it is said what is missing
+    assert verdict.accepted
+    assert [warning.code for warning in verdict.warnings] == ["OneDirection"]
+
+
+def test_a_pool_tells_the_worst_of_its_windows_and_each_warning_once() -> None:
+    outcomes = real(PLANT)
+    warned = [
+        replace(
+            o,
+            verdict=replace(o.verdict, unexplained_um=0.5 + k, warnings=(Reason("ValidationFailed", f"{k} um of it"),)),
+        )
+        for k, o in enumerate(outcomes)
+    ]
+    _, verdict = pool(warned, Identification(), refit=False)
+    assert verdict.unexplained_um == 3.5
+    assert [str(warning) for warning in verdict.warnings] == ["ValidationFailed: 3 um of it"]

@@ -90,10 +90,12 @@ def test_a_load_torque_is_named_with_its_amount() -> None:
     assert "+7." in reason.text or "+8." in reason.text
 
 
-def test_stribeck_friction_is_named() -> None:
+def test_stribeck_friction_is_a_term_or_named() -> None:
     signals = bench.run(bench.Plant(stribeck=12.0), bench.shuttle())
     outcome = analyse(find_windows(parse_recording(bench.as_csv(signals, 0.003)))[0], SETTINGS)
-    assert any("Stribeck" in reason.text for reason in outcome.verdict.reasons)
+    assert outcome.estimate is not None
+    told = [*outcome.verdict.reasons, *outcome.verdict.warnings]
+    assert "stribeck" in outcome.estimate.terms or any("Stribeck" in reason.text for reason in told)
 
 
 def test_frames_lost_without_a_trace_in_the_time_column() -> None:

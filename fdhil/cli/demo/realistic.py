@@ -13,6 +13,7 @@ from fdhil.cli.demo.report import Cut, Published
 from fdhil.config import MachineConfig
 from fdhil.errors import FdhilError
 from fdhil.prediction import predict
+from fdhil.prediction.model_terms import with_resonance
 from fdhil.program import load_trajectory
 from fdhil.records import Parameters, Prediction
 from fdhil.store.history import History
@@ -66,7 +67,11 @@ def _verdict(stage: Stage, axis: str) -> AxisVerdict:
 
 def _predicted(stage: Stage, verdicts: Mapping[str, AxisVerdict]) -> Prediction | None:
     """Return what the published models predict; None unless there is one of every axis."""
-    models = {axis: told.published.parameters for axis, told in verdicts.items() if told.published is not None}
+    models = {
+        axis: with_resonance(told.published.parameters, stage.config.axis[axis])
+        for axis, told in verdicts.items()
+        if told.published is not None
+    }
     if len(models) < len(verdicts):
         return None
     return predict(load_trajectory(stage.programs["10 m/min"], stage.config), models, stage.config)

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdhil.config import Identification
+from fdhil.config import Axis, Identification
 from fdhil.identification.covariance import TESTED_LAGS, aliasing, robust, suspicious
 from fdhil.identification.delay import coarse_delay
 from fdhil.identification.estimators import least_squares
@@ -26,6 +26,7 @@ from fdhil.identification.normal import inverse_of, solve
 from fdhil.identification.selection import joined
 from fdhil.identification.signals import mended
 from fdhil.identification.slow_descent import Likelihood, likelier_delay
+from fdhil.identification.slow_rows import left_at_the_table_mm, told_by_loops, with_known_course, with_open_course
 from fdhil.identification.slow_start import slow_least_squares, slow_start, with_course
 from fdhil.identification.slow_voltage import in_order
 from fdhil.identification.term_estimates import told_terms
@@ -37,6 +38,7 @@ SURE = 5.0  # standard deviations beyond which a delay is believed
 LEAST_DELAY = 0.05  # of a sample; smaller ones cannot be told from the voltage's course within a sample
 CHANCE = 2.0  # standard deviations of a delay that are chance, not doubt
 INSTANT_DELAY = 0.5  # of a row
+TURNS = 2  # in which what loops do within rows follows the parameters
 FLOORS = np.array([1e-4, 1e-4, 1e-9])  # of R, K and Jt
 LEAST_TIME_CONSTANT_S = 1e-4  # of the winding: noise may drive the starting L below 0
 
@@ -65,13 +67,34 @@ def fit_windows(windows: Sequence[Window], settings: Identification) -> Fit | No
     start = starting_point(least_squares.raw_values(signals, [w.dt_s for w in usable]))
     if start is None:
         return None
-    motions = [prepare(w) for w in usable]
+    motions = [with_open_course(prepare(w), start) for w in usable]
     delays = [coarse_delay(s, w.dt_s) for s, w in zip(signals, usable, strict=True)]
     command = settings.voltage_source != "terminals"
     if any(w.voltage_delay_s is not None for w in usable):
         return joined(_fit_separate(motions, start, delays), command, finish)
     start[DELAY] = float(np.median(delays))
     return _with_terms(_fit_together(motions, start), command, searched=start[DELAY] == 0.0)
+
+
+def with_loops(base: Fit, window: Window, settings: Identification, axis: Axis, sync_period_s: float | None) -> Fit:
+    """Return the fit of a window with long rows and what the ``axis``' loops do within them.
+
+    ``base`` is the window's fit without. It is returned where loops tell nothing of these rows, and where the closed
+    loop explains the measured place no better by the other: then the loops are not these.
+    """
+    begun = base.problem.motions[0]
+    known = np.isfinite(window.demand_mm).all() and np.isfinite(window.position_mm).all()
+    if not (known and base.converged and told_by_loops(begun, sync_period_s)):
+        return base
+    result, plain = base, replace(begun, courses=())
+    for _ in range(TURNS):
+        motion = with_known_course(plain, result.theta, axis, window.demand_mm)
+        result = fit([motion], with_delay(result.theta[: DELAY + 1], 0.0), range(DELAY))
+        if not result.converged:
+            return base
+    result = _with_terms(_delay_told(result), settings.voltage_source != "terminals", searched=True)
+    missed, missed_before = (left_at_the_table_mm(f.theta, axis, window) for f in (result, base))
+    return result if missed < missed_before else base
 
 
 def _fit_together(motions: Sequence[Motion], start: Float) -> Fit:
@@ -184,15 +207,17 @@ def delay_direction(result: Fit) -> Float:
 
 
 def doubts(result: Fit, inverse: Float) -> Float:
-    """Return what noise cannot explain: one standard deviation (k, 2) of the entries of theta.
+    """Return what noise cannot explain: one standard deviation (k, q) of the entries of theta.
 
     An interval mean leaves the voltage's course within the sample open: its largest part, the back-EMF's ramp, is
     known but for the regulators' answer to it (first column); what looks like a delay is the second. Either is the
     same in all windows of a drive, so that more windows do not lessen it.
     """
-    columns = np.zeros((result.theta.size, 2))
+    effects = result.problem.course_effects(result.theta)
+    columns = np.zeros((result.theta.size, 1 + effects.shape[1]))
     free = list(result.free)
-    columns[free, 0] = inverse @ (result.jacobian.T @ result.problem.shape_effect(result.theta))
+    columns[free, 0] = inverse @ (result.jacobian.T @ effects[:, 0])
+    columns[free, 2:] = inverse @ (result.jacobian.T @ effects[:, 1:])
     if result.delay_doubt_s > 0.0:
         others = but_delay(free)
         columns[others, 1] = -result.delay_doubt_s * solve(result.but_delay, delay_direction(result))[0]
@@ -263,5 +288,10 @@ def finish(result: Fit) -> Estimate:
     if first.courses or first.speed_late is not None:
         answer, beyond = told_terms(answer, result, values, beyond)
     # what the data can tell is the information's to say; that residuals are coloured is no lack of excitation
-    judged = judge(answer, condition, max(float(np.abs(m.speed).max()) for m in result.problem.motions))
+    top_rad_s, top_a = (
+        max(float(np.abs(getattr(m, n)).max()) for m in result.problem.motions) for n in ("speed", "current")
+    )
+    judged = judge(answer, condition, top_rad_s, abs(float(result.theta[K])) * top_a)
+    if judged.names != answer.names:  # nothing is told
+        return judged
     return replace(judged, covariance=judged.covariance + beyond)

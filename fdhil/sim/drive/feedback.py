@@ -51,6 +51,7 @@ class Feedback:
         self._inc_per_rad = ratings.increments_per_rev / (2 * math.pi)
         self._counts_per_a = 1e3 / ratings.rated_current_a
         self._kv, self._kff = regulators.position_gain_per_s, regulators.speed_feedforward
+        self._bus_mv = regulators.voltage_limit_v * 1e3
         self.following_error = False
         self.digital_inputs = 0
 
@@ -78,6 +79,7 @@ class Feedback:
         numbers[0x606B00] = self._speed_demand(true_position)
         numbers[0x606C00] = speed_counts
         numbers[0x607700] = numbers[0x607800] = current_counts
+        numbers[0x607900] = round(seen.bus * self._bus_mv)
         numbers[0x210100] = voltage_counts
         numbers[0x60F400] = clip(demand - true_position, INT32)
         numbers[0x60FD00] = self.digital_inputs

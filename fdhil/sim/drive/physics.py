@@ -165,12 +165,16 @@ def run_cycle(
 
 
 class Seen(NamedTuple):
-    """What the drive's own sensors see at a SYNC, without their noise; the position is that of the position loop."""
+    """What the drive's own sensors see at a SYNC, without their noise; the position is that of the position loop.
+
+    ``bus`` is the DC bus' voltage as a share of what it has without load.
+    """
 
     position_rad: float
     speed_rad_s: float
     current_a: float
     voltage_v: float
+    bus: float = 1.0
 
 
 class Physics:

@@ -109,6 +109,7 @@ class RealPhysics(Physics):
             self._seen_speed(motor),
             reality.current_gain * self.current_a + reality.current_offset_a,
             reality.voltage_gain * voltage,
+            float(x[cycle.BUS]),
         )
 
     def _seen_speed(self, encoder_rad: float) -> float:

@@ -1,0 +1,75 @@
+"""Tells by how many samples voltage and current are late, by what that does to the smooth part of a fitted window."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from fdhil.identification.courses import voltage_v
+from fdhil.identification.filtering import moving_mean
+from fdhil.identification.fit import Fit
+from fdhil.identification.innovations import CURRENT, VOLTAGE, answers
+from fdhil.identification.normal import inverse_of
+from fdhil.records import Float
+from fdhil.validation.significance import BUDGET
+from fdhil.validation.structure import Finding, courses, expected_correlation
+
+SMOOTHING_S = 0.010  # of the jerk-limited course of a rapid nothing is lost over this time
+LARGEST = 1.0  # samples: a recorder may assign a value to the SYNC before or after it
+LEAST = 0.1  # samples: what regulators do within one stays below
+LATE = " late"  # ends the names of these findings
+
+
+@dataclass(frozen=True, slots=True)
+class Shift:
+    """By how many samples the voltage or current of a window is late (early: negative), and the standard deviation."""
+
+    samples: float
+    std: float
+    own: float = 0.0  # of the samples, what the fit does not have yet
+    direction: Float = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def sure(self) -> bool:
+        """Return whether it is beyond chance and more than a sample."""
+        return abs(self.samples) > max(LARGEST, BUDGET["timing"].deviations * self.std)
+
+
+def late_findings(shown: tuple[Shift, Shift]) -> list[Finding]:
+    """Return the delays of voltage and current that are more than what regulators do within a sample, as findings."""
+    advice = "take voltage, current and speed from one SYNC, or enter the sensor's delay"
+    return [
+        Finding("SampleTiming", name + " is {:+.2g} samples late", advice, LEAST, shift.own / shift.std, -shift.own,
+                shift.direction, name=name + LATE)
+        for name, shift in zip(("voltage", "current"), shown, strict=True)
+        if abs(shift.own) > LEAST and np.isfinite(shift.std)
+    ]  # fmt: skip
+
+
+def shifts(fit: Fit) -> tuple[Shift, Shift]:
+    """Return the delay of voltage and of current that the innovations show, each as if it alone were there."""
+    motion, gains = fit.problem.motions[0], fit.problem.filters[0]
+    width = 2 * round(SMOOTHING_S / 2 / motion.dt_s) + 1
+    found = []
+    jacobian = fit.but_delay
+    inverse, e = inverse_of(jacobian.T @ jacobian)[0], fit.residuals
+    coloured = 1.0 + 2.0 * max(0.0, float(expected_correlation(fit)[0]))
+    whole = np.column_stack([e, courses(fit)])
+    whole = whole - jacobian @ (inverse @ (jacobian.T @ whole))
+    for kind, values in ((VOLTAGE, voltage_v(motion, fit.theta)), (CURRENT, motion.current)):
+        slope = np.gradient(moving_mean(values, width))
+        answer = answers(motion, fit.theta, gains, kind, [slope], _no_rise(kind, motion.n))[:, 0]
+        rest = answer - jacobian @ (inverse @ (jacobian.T @ answer))
+        power = float(rest @ rest)
+        if not power > 0.0:
+            return Shift(0.0, np.inf), Shift(0.0, np.inf)
+        score, *unsure = (rest @ whole) / power
+        std = float(np.linalg.norm([*unsure, np.sqrt(coloured / power)]))
+        found.append(Shift(-float(score), std, -float(score), answer))
+    voltage, current = found
+    return replace(voltage, samples=voltage.samples + float(fit.theta[6]) / motion.dt_s), current
+
+
+def _no_rise(kind: int, n: int) -> list[Float] | None:
+    return [np.zeros(n)] if kind == VOLTAGE else None

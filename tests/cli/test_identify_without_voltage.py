@@ -1,0 +1,100 @@
+"""``fdhil identify`` of recordings without a voltage, and the model file that it writes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+from click.testing import CliRunner, Result
+
+from fdhil.cli.main import cli
+from fdhil.prediction.models import load_models
+from studies import bench
+from tests.bench import bench_toml
+from tests.identification.deaf import SCREW, SECTION, screw_csv
+from tests.identification.recorded import signals
+
+
+@pytest.fixture
+def deaf(tmp_path: Path) -> Path:
+    path = tmp_path / "deaf.csv"
+    path.write_text(screw_csv())
+    return path
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Path:
+    path = tmp_path / "machine.toml"
+    path.write_text(bench_toml("X", **SECTION))
+    return path
+
+
+def _invoke(*arguments: object) -> Result:
+    return CliRunner().invoke(cli, ["identify", *map(str, arguments)], standalone_mode=False)
+
+
+def _document(result: Result) -> dict[str, Any]:
+    document: dict[str, Any] = json.loads(result.stdout)
+    return document
+
+
+def test_r_and_l_are_null_k_is_given_and_terms_are_told(deaf: Path) -> None:
+    result = _invoke(deaf, "--json")
+    assert result.return_value == 0
+    (told,) = _document(result)["files"]
+    pooled = told["pooled"]
+    assert (pooled["validated"], pooled["windows_used"]) == (True, 4)
+    for name in ("R", "L"):
+        assert pooled["parameters"][name]["value"] is None
+        assert "no voltage" in pooled["parameters"][name]["reason"]
+    assert pooled["parameters"]["K"] == {"value": SCREW.K, "std": 0.0, "unit": "N.m/A", "given": True}
+    assert pooled["parameters"]["Jt"]["value"] == pytest.approx(SCREW.Jt, rel=0.01)
+    assert set(pooled["terms"]["load"]) == {"value", "std", "unit"}
+    assert pooled["terms"]["load"]["unit"] == "N.m"
+    for window in told["windows"]:
+        assert window["validated"] is True
+        assert window["fit_percent"] is None
+        assert {"terms", "unexplained_um", "warnings"} <= set(window)
+    shown = _invoke(deaf).stdout
+    assert "(given)" in shown
+    assert "terms of all: load -0.0" in shown
+
+
+def test_the_config_gives_what_the_recording_does_not(deaf: Path, machine: Path) -> None:
+    text = deaf.read_text()
+    deaf.write_text("".join(x for x in text.splitlines(keepends=True) if "torque_constant" not in x))
+    alone = _invoke(deaf, "--json")
+    assert alone.return_value == 1
+    assert "torque_constant_nm_per_a" in _invoke(deaf).stdout
+    told = _document(_invoke(deaf, "--json", "--config", machine))["files"][0]["pooled"]["parameters"]
+    assert told["K"]["value"] == 0.33
+    assert told["R"]["value"] is None
+    assert told["Jt"]["value"] == pytest.approx(SCREW.Jt * 0.33 / SCREW.K, rel=0.01)
+
+
+def test_a_model_file_is_written_that_predict_reads(deaf: Path, machine: Path, tmp_path: Path) -> None:
+    out = tmp_path / "model.json"
+    without = _invoke(deaf, "--write-model", out).exception
+    assert isinstance(without, click.UsageError)
+    assert "R and L of axis X" in str(without)
+    assert not out.exists()
+    assert _invoke(deaf, "--config", machine, "--write-model", out).return_value == 0
+    written = json.loads(out.read_text())["X"]
+    assert (written["R"], written["L"], written["K"]) == (0.6, 0.003, SCREW.K)
+    assert written["Cd"] == pytest.approx(SCREW.Cd, rel=0.06)
+    assert set(written["terms"]) >= {"load"}
+
+
+def test_a_whole_model_needs_no_config_and_none_is_written_without_a_validated_pool(tmp_path: Path) -> None:
+    recording, out = tmp_path / "shuttle.csv", tmp_path / "model.json"
+    recording.write_text(bench.as_csv(bench.run(bench.Plant(), bench.shuttle(distance=0.02, speed=0.1)), 0.003))
+    refused = _invoke(recording, "--write-model", out)
+    assert refused.return_value == 1
+    assert "is not written" in refused.stderr
+    assert not out.exists()
+    recording.write_text(bench.as_csv(signals(moves=2), 0.003))
+    assert _invoke(recording, "--write-model", out).return_value == 0
+    assert load_models(out)["X"].Jt == pytest.approx(0.075, rel=0.01)

@@ -1,0 +1,96 @@
+"""First rows in the place of others: what is armed and has not begun takes them, whole and checked, or not at all."""
+
+from __future__ import annotations
+
+import os
+import socket
+from typing import Any
+
+import pytest
+
+from fdhil.guard import table
+from tests.guard.machine import DIGEST
+from tests.guard.shop import DEMAND, OFFSET
+from tests.guard.test_shell import Make, inside, make
+
+__all__ = ["make"]
+
+
+def renewing(height: int, rows: int = 200, **changes: Any) -> int:
+    """Sealed first rows of the loaded table: its demand, and on X up to ``height`` increments more than its offset."""
+    demand, offset = ([list(column[:rows]) for column in columns] for columns in (DEMAND, OFFSET))
+    offset[0] = [value + min(height, k // 20, (rows - k) // 20) for k, value in enumerate(offset[0])]
+    values = {"demand": dict(zip("XY", demand, strict=True)), "offset": dict(zip("XY", offset, strict=True))} | changes
+    digest = values.get("program_digest", DIGEST)
+    return table.seal(table.encode("XY", values["demand"], values["offset"], digest, 0, False))
+
+
+def test_what_is_armed_and_has_not_begun_takes_other_first_rows(make: Make) -> None:
+    """They are in force at the start; the rows behind them are those of before."""
+    shop = make()
+    client = shop.arm()
+    assert shop.guard.intake.path is not None
+    before = [list(column) for column in shop.guard.intake.path.offset]
+    sealed = renewing(3)
+    try:
+        assert shop.ask(client, {"request": "table"}, sealed)["code"] == "TableBusy"  # it does not say what it means
+        answer = shop.ask(client, {"request": "table", "renew": True}, sealed)
+    finally:
+        os.close(sealed)
+    assert answer["ok"], answer
+    assert answer["rows"] == [0, len(before[0])]
+    path = shop.guard.intake.path
+    assert path.offset[0][100] == before[0][100] + 3
+    assert list(path.offset[0][200:]) == before[0][200:]
+    assert shop.state == "ARMED"
+    shop.playing = True
+    shop.run(100)
+    assert shop.state == "ACTIVE"
+    row = shop.guard.state.places[0].row + 1
+    assert shop.offsets()[-1] == path.offset[0][row] == before[0][row] + 3
+    inside(shop.offsets())
+
+
+@pytest.mark.parametrize(
+    ("changes", "code"),
+    [
+        ({"program_digest": "another"}, "ProgramMismatch"),
+        ({"demand": {"X": [7] * 200, "Y": [0] * 200}}, "ProgramMismatch"),
+        ({"offset": {"X": [0] * 100 + [200] * 100, "Y": [0] * 200}}, "OffsetRate"),
+    ],
+)
+def test_first_rows_of_something_else_or_beyond_a_limit_are_refused(
+    make: Make, changes: dict[str, Any], code: str
+) -> None:
+    """What was checked when it was armed stays in force."""
+    shop = make()
+    client = shop.arm()
+    before = shop.guard.intake.path
+    sealed = renewing(3, **changes)
+    try:
+        assert shop.ask(client, {"request": "table", "renew": True}, sealed)["code"] == code
+    finally:
+        os.close(sealed)
+    assert shop.guard.intake.path is before
+    assert shop.state == "ARMED"
+
+
+def test_a_machine_that_begins_meanwhile_goes_on_with_what_it_has(make: Make) -> None:
+    """The rows are refused when the first target leaves the start before they are checked, and ever after."""
+    shop = make()
+    client = shop.arm()
+    before = shop.guard.intake.path
+    sealed = renewing(3)
+    try:
+        socket.send_fds(client, [b'{"request": "table", "renew": true}\n'], [sealed])
+        shop.playing = True
+        answer = shop.answer(client)
+        assert answer.get("code") == "TableBusy" or shop.state == "ARMED"
+        shop.run(250)
+        assert shop.ask(client, {"request": "table", "renew": True}, sealed)["code"] == "TableBusy"
+    finally:
+        os.close(sealed)
+    assert shop.state == "ACTIVE"
+    assert shop.guard.intake.path is not None
+    assert before is not None
+    inside(shop.offsets())

@@ -1,0 +1,163 @@
+"""The mixed model of a pool: what windows share, what differs between them, what both directions tell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil.identification.between import ALIKE, Member, between
+from fdhil.identification.pooling import friction_at, member, pooled
+from fdhil.identification.ripple_parts import as_amplitude, as_parts
+from fdhil.records import INTERVAL_95, PARAMETERS, Estimate, Float, Parameters, frozen
+from tests.store.made import outcome, window
+
+BENCH = Parameters(0.5, 0.005, 0.8, 0.075, 0.05, 5.0)
+RAPID = 157.0  # rad/s
+FIRST = outcome(of=window()).estimate
+assert FIRST is not None
+
+
+def covariance_at(speed_rad_s: float) -> Float:
+    """What a rapid tells: the friction torque at its speed to 0.01 N.m, ft and Cd apart to 2 % only."""
+    spread = np.diag(np.array([3e-4, 7e-6, 1.6e-4, 4e-5, 0.0, 0.0]) ** 2)
+    apart, together = 0.09, 0.01
+    spread[4:, 4:] = apart**2 * np.outer([-1 / speed_rad_s, 1.0], [-1 / speed_rad_s, 1.0])
+    spread[4:, 4:] += together**2 / 2 * np.diag([speed_rad_s**-2.0, 1.0])
+    return spread
+
+
+def drawn(
+    rng: np.random.Generator, truth: Sequence[Parameters], speeds: Sequence[float], load: float = 0.0
+) -> list[Member]:
+    """Windows to and fro at some speeds, each with its own truth."""
+    members = []
+    for place, (now, speed) in enumerate(zip(truth, speeds, strict=True)):
+        direction = 1 - 2 * (place % 2)
+        own = covariance_at(speed)
+        values = np.array(list(now.as_dict().values())) + np.linalg.cholesky(own) @ rng.standard_normal(6)
+        values[5] += direction * load
+        members.append(Member(PARAMETERS, values, own, np.zeros((6, 6)), place, direction))
+    return members
+
+
+def deviations(found: Estimate, truth: Parameters) -> Float:
+    """By how many of its standard deviations each of the six parameters is off."""
+    off: Float = (found.values[:6] - list(truth.as_dict().values())) / np.sqrt(np.diag(found.covariance))[:6]
+    return off
+
+
+@pytest.mark.parametrize("kelvin", [0.0, 0.2, 2.0])
+@pytest.mark.parametrize("speeds", [(RAPID,), (RAPID, 132.0, 113.0)])
+def test_intervals_hold_while_friction_falls_as_the_slide_way_warms(kelvin: float, speeds: Sequence[float]) -> None:
+    assert FIRST is not None
+    held = []
+    for seed in range(6):
+        rng = np.random.default_rng([7, seed])
+        warm = kelvin * np.linspace(0.0, 1.0, 24)
+        truth = [replace(BENCH, ft=0.05 * (1 - 0.16 * k), Cd=5.0 * (1 - 0.1 * k)) for k in warm]
+        members = drawn(rng, truth, rng.choice(speeds, 24).tolist())
+        for newest in range(2, 24):
+            apart = between(members[: newest + 1])
+            found = pooled(members[max(0, newest - 3) : newest + 1], FIRST, apart)
+            held.append(np.abs(deviations(found, truth[newest])) < INTERVAL_95)
+    share = np.mean(held, axis=0)
+    assert (share > 0.86).all(), share
+
+
+def test_a_constant_load_joins_where_there_are_both_directions_and_hardly_ever_where_there_is_none() -> None:
+    assert FIRST is not None
+    joined = {0.0: 0, 0.5: 0}
+    for load in joined:
+        for seed in range(60):
+            members = drawn(np.random.default_rng([8, seed]), [BENCH] * 4, [RAPID] * 4, load)
+            found = pooled(members, FIRST, between(members))
+            joined[load] += "load" in found.terms
+            if load and found.terms:
+                assert found.value("load") == pytest.approx(load, abs=6 * found.std("load"))
+                assert found.value("Cd") == pytest.approx(5.0, abs=6 * found.std("Cd"))
+    assert joined[0.5] == 60
+    assert joined[0.0] <= 1
+    one_way = [replace(m, direction=1) for m in drawn(np.random.default_rng(1), [BENCH] * 4, [RAPID] * 4, 0.0)]
+    assert pooled(one_way, FIRST, between(one_way)).terms == ()
+
+
+def test_viscous_friction_by_direction_joins_as_two_values_about_ft() -> None:
+    assert FIRST is not None
+    rng = np.random.default_rng(3)
+    truth = [replace(BENCH, ft=0.06 if k % 2 == 0 else 0.04) for k in range(12)]
+    found = pooled(drawn(rng, truth, [RAPID, RAPID, 100.0, 100.0] * 3), FIRST, ALIKE)
+    assert found.value("viscous_positive") == pytest.approx(0.06, rel=0.03)
+    assert found.value("viscous_negative") == pytest.approx(0.04, rel=0.03)
+    assert found.value("ft") == pytest.approx((found.value("viscous_positive") + found.value("viscous_negative")) / 2)
+    root = np.linalg.eigvalsh(found.covariance / np.outer(*[np.sqrt(np.diag(found.covariance))] * 2))
+    assert root.min() > -1e-9
+
+
+def test_a_drive_that_warms_is_told_from_one_that_does_not() -> None:
+    rng = np.random.default_rng(4)
+    still = between(drawn(rng, [BENCH] * 24, [RAPID] * 24))
+    warming = [replace(BENCH, ft=0.05 * (1 - 0.3 * k / 24), Cd=5.0 * (1 - 0.2 * k / 24)) for k in range(24)]
+    moving = between(drawn(rng, warming, [RAPID] * 24))
+    assert not still.surely
+    assert moving.surely
+    assert moving.walk["Cd"] > 4 * still.walk["Cd"]
+    assert 0.003 < moving.walk["Cd"] ** 0.5 < 0.04  # true: 0.8 to 1.3 % from window to window
+
+
+def test_terms_are_averaged_over_the_windows_that_have_them_and_a_ripples_phase_over_its_turn() -> None:
+    assert FIRST is not None
+    rng, names = np.random.default_rng(5), (*PARAMETERS, "ripple_screw_1", "ripple_screw_1_phase")
+    members = []
+    for place, plain in enumerate(drawn(rng, [BENCH] * 4, [RAPID] * 4)):
+        phase = np.pi + (0.1 if place % 2 else -0.1)  # on either side of where it jumps
+        values = np.array([*plain.values, 0.2, np.arctan2(np.sin(phase), np.cos(phase))])
+        own = np.zeros((8, 8))
+        own[:6, :6], own[6:, 6:] = plain.own, np.diag([0.01**2, 0.05**2])
+        parts = as_parts(names, values, own, np.zeros((8, 6)))
+        members.append(Member(names, *parts, place, plain.direction))
+    members[0] = drawn(rng, [BENCH], [RAPID])[0]
+    found = pooled(members, FIRST, ALIKE, joining=False)
+    assert found.terms == names[6:]
+    assert found.value("ripple_screw_1") == pytest.approx(0.2, abs=0.02)
+    assert abs(abs(found.value("ripple_screw_1_phase")) - np.pi) < 0.1
+    assert found.std("ripple_screw_1") == pytest.approx(0.01 / 3**0.5, rel=0.1)
+    rare = pooled([members[1], *drawn(rng, [BENCH] * 3, [RAPID] * 3)], FIRST, ALIKE, joining=False)
+    assert rare.terms == ()
+
+
+def test_parts_of_a_ripple_come_together_again() -> None:
+    names = ("Cd", "ripple_motor_4", "ripple_motor_4_phase")
+    values, covariance = np.array([5.0, 0.3, -2.0]), np.diag([0.1, 0.02, 0.03]) ** 2
+    told, spread, doubts = as_amplitude(names, *as_parts(names, values, covariance, np.ones((3, 1))))
+    assert told == pytest.approx(values)
+    assert np.allclose(spread, covariance)
+    assert doubts == pytest.approx(np.ones((3, 1)))
+
+
+def test_what_is_given_or_missing_stays_so() -> None:
+    made = outcome(of=window())
+    assert made.estimate is not None
+    values, covariance = made.estimate.values.copy(), made.estimate.covariance.copy()
+    values[:2] = covariance[:2, :] = covariance[:, :2] = np.nan
+    covariance[2, :] = covariance[:, 2] = 0.0
+    deaf = replace(made.estimate, values=frozen(values), covariance=frozen(covariance), given=("K",))
+    members = [member(made.window, deaf, place) for place in range(3)]
+    found = pooled(members, deaf, between(members))
+    assert np.isnan(found.values[:2]).all()
+    assert (found.value("K"), found.std("K")) == (0.8, 0.0)
+    assert found.std("Jt") < deaf.std("Jt")
+
+
+def test_at_one_speed_the_sum_of_friction_is_known_better_than_its_parts() -> None:
+    assert FIRST is not None
+    told = replace(FIRST, values=frozen(list(BENCH.as_dict().values())), covariance=frozen(covariance_at(RAPID)))
+    known = friction_at(told, RAPID)
+    assert known is not None
+    assert known[0] == pytest.approx(5.0 + 0.05 * RAPID)
+    assert known[1] == pytest.approx(0.01, rel=0.01)
+    assert told.std("Cd") > 5 * known[1]
+    unknown = replace(told, values=frozen([*told.values[:4], np.nan, 5.0]))
+    assert friction_at(unknown, RAPID) is None

@@ -1,0 +1,111 @@
+"""Rows of 4 to 10 ms, as four axes on one bus have: what the regulators do within them biases nothing."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from fdhil.config import Axis, Identification
+from fdhil.identification.estimators import maximum_likelihood
+from fdhil.identification.motion import prepare
+from fdhil.identification.slow_rows import beyond_line_a, with_open_course
+from fdhil.identification.windows import find_windows
+from fdhil.pipeline import analyse
+from fdhil.records import Estimate, Float, Parameters, Recording, Window, frozen
+from fdhil.sim.drive.physics import Physics
+from studies.bench import shuttle
+from tests.bench import bench_config
+
+AXIS = bench_config("X").axis["X"]
+TRUTH = Parameters(0.5, 0.005, 0.8, 0.075, 0.05, 5.0)
+SETTINGS = Identification()
+INCREMENTS = 2**20
+VALUES = np.array(list(TRUTH.as_dict().values()))
+
+
+@lru_cache(maxsize=4)
+def _rows(row_s: float) -> tuple[Float, Float]:
+    """Return demand (n,), mm, and rows (4, n) of V, A, rad/s, mm of the twin's drive, whose set-points come so."""
+    demand = 1e3 * shuttle(moves=2)[:: round(row_s / 1e-3)]
+    physics = Physics(TRUTH, AXIS.regulators, row_s, INCREMENTS)
+    counts = np.append(demand, [demand[-1]] * 2) * INCREMENTS / AXIS.screw_pitch_mm
+    rows = np.empty((4, demand.size))
+    for k in range(demand.size):
+        rows[1:, k] = physics.current_a, physics.speed_rad_s, physics.angle_rad * AXIS.screw_pitch_mm / (2 * np.pi)
+        here, then, after = counts[k : k + 3]
+        physics.cycle(True, (here, then, (then - here) / row_s, (after - then) / row_s, 0.0, 0.0, 0.0, 0.0))
+        rows[0, k] = physics.voltage_mean_v
+    return demand, rows
+
+
+def _windows(row_s: float, noise: float = 0.001, seed: int = 1) -> list[Window]:
+    demand, (voltage, current, speed, position) = _rows(row_s)
+    rng = np.random.default_rng(seed)
+    volts, amperes, turns = noise * np.array([60.0, 50.0, 150.0])[:, None] * rng.standard_normal((3, demand.size))
+    recording = Recording(
+        axis="X",
+        dt_s=row_s,
+        time_s=frozen(np.arange(demand.size) * row_s),
+        voltage_v=frozen(voltage + volts),
+        current_a=frozen(current + amperes),
+        speed_rad_s=frozen(speed + turns),
+        position_mm=frozen(position),
+        demand_mm=frozen(demand),
+        voltage_sampling="interval_mean",
+        pitch_mm=AXIS.screw_pitch_mm,
+        rapid_speed_rad_s=AXIS.rapid_speed_rad_s,
+    )
+    return find_windows(recording)
+
+
+def _with_axis(window: Window, axis: Axis | None) -> Estimate:
+    outcome = analyse(window, SETTINGS, axis, window.dt_s)
+    assert outcome.estimate is not None
+    return outcome.estimate
+
+
+@pytest.mark.parametrize("row_ms", [4, 8])
+def test_without_the_loops_no_bias_is_beyond_its_interval(row_ms: int) -> None:
+    for window in _windows(row_ms * 1e-3):
+        estimate = _with_axis(window, None)
+        apart = np.abs(estimate.values[:6] - VALUES) / np.sqrt(np.diag(estimate.covariance)[:6])
+        assert apart[:4].max() < 1.96
+        assert apart.max() < 3.0
+
+
+@pytest.mark.parametrize("row_ms", [4, 8, 10])
+def test_with_the_loops_the_parameters_are_those_of_short_rows(row_ms: int) -> None:
+    for window in _windows(row_ms * 1e-3):
+        outcome = analyse(window, SETTINGS, AXIS, window.dt_s)
+        assert outcome.verdict.accepted, outcome.verdict.reasons
+        assert outcome.estimate is not None
+        np.testing.assert_allclose(outcome.estimate.values[[0, 2, 3]], VALUES[[0, 2, 3]], rtol=0.01)
+
+
+def test_loops_that_are_not_these_are_not_believed() -> None:
+    wrong = AXIS.regulators.model_copy(update={"speed_kp": 0.4 * AXIS.regulators.speed_kp})
+    (window, _) = _windows(0.008)
+    plain = maximum_likelihood.fit_windows([window], SETTINGS)
+    assert plain is not None
+    other = AXIS.model_copy(update={"regulators": wrong})
+    told = maximum_likelihood.with_loops(plain, window, SETTINGS, other, 0.008)
+    right = maximum_likelihood.with_loops(plain, window, SETTINGS, AXIS, 0.008)
+    assert abs(right.theta[0] - 0.5) < abs(plain.theta[0] - 0.5) / 5
+    assert abs(told.theta[0] - 0.5) <= abs(plain.theta[0] - 0.5)
+
+
+def test_short_rows_have_nothing_open() -> None:
+    (window, _) = _windows(0.002)
+    motion = prepare(window)
+    theta = np.append(VALUES, 0.0)
+    assert with_open_course(motion, theta) is motion
+
+
+def test_what_a_current_does_within_its_rows_grows_with_them() -> None:
+    theta = np.append(VALUES, 0.0)
+    most = [
+        float(np.abs(beyond_line_a(theta, AXIS, _windows(ms * 1e-3)[0].demand_mm, ms * 1e-3)).max()) for ms in (2, 4, 8)
+    ]
+    assert most[0] < most[1] / 2 < most[2] / 4

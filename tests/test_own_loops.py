@@ -1,0 +1,68 @@
+"""A drive with a filter that its configuration does not know is judged by the loops that its own rapids show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from fdhil.config import Identification
+from fdhil.identification.windows import find_windows
+from fdhil.pipeline import analyse
+from fdhil.pipeline.own_loops import OwnLoops, better_axis, loops_of, suspected
+from fdhil.records import WindowOutcome
+from fdhil.validation.weight import LOOPS_DIFFER
+from studies.bench import shuttle
+from studies.real_plant import Loops, Mechanics, Sensors, recording, run
+from tests.bench import bench_config
+
+AXIS = bench_config().axis["X"]
+SETTINGS = Identification()
+PERIOD_S = 1e-3
+
+
+def outcomes(loops: Loops) -> list[WindowOutcome]:
+    """Return two rapids of the bench's axis with these loops, judged by the configured ones."""
+    moved = run(Mechanics(), shuttle(moves=2), loops)
+    windows = find_windows(recording(moved, Mechanics(), Sensors(), 0.5))
+    return [analyse(window, SETTINGS, AXIS, PERIOD_S) for window in windows]
+
+
+@pytest.fixture(scope="module")
+def filtered() -> list[WindowOutcome]:
+    """Rapids of a drive that filters its speed over 1 ms."""
+    return outcomes(replace(Loops(), speed_filter_s=0.001))
+
+
+def test_other_loops_are_named_and_then_used(filtered: list[WindowOutcome]) -> None:
+    for outcome in filtered:
+        assert [reason.code for reason in outcome.verdict.reasons] == [LOOPS_DIFFER]
+    assert suspected(filtered)
+    found = loops_of(filtered, AXIS, SETTINGS, PERIOD_S)
+    assert found is not None
+    told = dict(zip(found.names, found.values.tolist(), strict=True))
+    assert told["speed_filter_s"] == pytest.approx(0.001, rel=0.05)
+    assert told["speed_kp"] == pytest.approx(AXIS.regulators.speed_kp, rel=0.05)
+    better = better_axis(AXIS, found)
+    assert better is not None
+    again = [analyse(outcome.window, SETTINGS, better, PERIOD_S) for outcome in filtered]
+    assert all(outcome.verdict.accepted for outcome in again)
+
+
+def test_a_running_machine_goes_on_with_its_own_loops(filtered: list[WindowOutcome]) -> None:
+    loops = OwnLoops(AXIS, SETTINGS, PERIOD_S)
+    first, found = loops.analyse(filtered[0].window)
+    assert found is not None
+    assert first.verdict.accepted
+    assert loops.axis is not None
+    assert loops.axis.regulators.speed_filter_s == pytest.approx(0.001, rel=0.05)
+    second, again = loops.analyse(filtered[1].window)
+    assert again is None
+    assert second.verdict.accepted
+    after_restart = OwnLoops(AXIS, SETTINGS, PERIOD_S, known=found)
+    assert after_restart.axis is not None
+    assert after_restart.axis.regulators == loops.axis.regulators
+
+
+def test_loops_that_explain_the_rapids_are_left_alone() -> None:
+    assert not suspected(outcomes(Loops()))

@@ -1,0 +1,179 @@
+"""Windows without a voltage: believed as they are, refused for what current and position alone can tell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil import config
+from fdhil.config import Axis, Identification
+from fdhil.pipeline import AxisPipeline, analyse, pool
+from fdhil.records import ParameterSet, Skill, Window, WindowOutcome, frozen
+from studies import real_plant
+from tests.bench import bench_axis
+from tests.identification.deaf import LOOPS, RAPID_M_S, SCREW, SECTION, SENSORS, screw_windows, to_and_fro
+
+SETTINGS = Identification()
+
+
+def analysed(moves: int = 4) -> list[WindowOutcome]:
+    return [analyse(window, SETTINGS) for window in screw_windows(moves)]
+
+
+def test_rapids_of_a_screw_with_a_load_and_friction_of_its_own_are_believed_and_so_is_their_pool() -> None:
+    outcomes = analysed()
+    assert [o.verdict.reasons for o in outcomes] == [()] * 4
+    estimate, verdict = pool(outcomes, SETTINGS)
+    assert verdict.accepted
+    assert estimate is not None
+    for name, tolerance in (("Jt", 0.01), ("ft", 0.06), ("Cd", 0.06)):
+        assert estimate.value(name) == pytest.approx(SCREW.truth()[name], rel=tolerance)
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_one_direction_is_a_pool_of_its_own(direction: int) -> None:
+    outcomes = [o for o in analysed() if o.window.direction == direction]
+    estimate, verdict = pool(outcomes, SETTINGS)
+    assert verdict.accepted
+    assert estimate is not None
+    effective = SCREW.Cd + direction * SCREW.load_nm
+    assert estimate.value("Cd") == pytest.approx(effective, rel=0.06)
+
+
+def test_without_a_torque_constant_nothing_is_believed_and_the_way_out_is_told() -> None:
+    outcome = analyse(replace(screw_windows()[0], torque_constant_nm_per_a=None), SETTINGS)
+    (reason,) = outcome.verdict.reasons
+    assert reason.code == "LowExcitation"
+    assert "torque_constant_nm_per_a" in reason.advice
+
+
+def _axis(source: str) -> Axis:
+    document = {"machine": {"name": "screw", "sync_period_s": 0.001}, "axis": {"X": bench_axis(**SECTION)}}
+    axis = config.parse(document).axis["X"]
+    return axis.model_copy(update={"voltage": axis.voltage.model_copy(update={"source": source})})
+
+
+def test_the_data_sheet_stands_in_for_a_drive_that_tells_no_voltage_and_not_for_a_sensor_that_failed() -> None:
+    window = replace(screw_windows()[0], torque_constant_nm_per_a=None)
+    outcome = analyse(window, SETTINGS, _axis("drive"))
+    assert outcome.verdict.accepted
+    assert outcome.verdict.unexplained_um is not None
+    assert 0.0 < outcome.verdict.unexplained_um < 20.0  # of a following error of 800 um
+    told = outcome.estimate
+    assert told is not None
+    assert told.given == ("R", "L", "K")
+    assert told.value("K") == 0.33
+    (reason,) = analyse(window, SETTINGS, _axis("modbus")).verdict.reasons
+    assert str(reason) == "SampleTiming: the window has no voltage"
+
+
+def _late(window: Window) -> Window:
+    return replace(window, current_a=frozen(np.concatenate([np.zeros(4), window.current_a[:-4]])))
+
+
+def _clipped(window: Window) -> Window:
+    top = 0.8 * float(np.abs(window.current_a).max())
+    return replace(window, current_a=frozen(np.clip(window.current_a, -top, top)))
+
+
+def _stuck(window: Window) -> Window:
+    current = window.current_a.copy()
+    current[500:600] = current[500]
+    return replace(window, current_a=frozen(current))
+
+
+def _loaded(window: Window) -> Window:
+    current = window.current_a.copy()
+    current[500:800] += 0.1 * np.abs(current).max()
+    return replace(window, current_a=frozen(current))
+
+
+def _gain(window: Window) -> Window:
+    current = window.current_a.copy()
+    current[window.n // 2 :] *= 1.2
+    return replace(window, current_a=frozen(current))
+
+
+def _coarse(window: Window) -> Window:
+    rng = np.random.default_rng(1)
+    noise = 0.3 * np.abs(window.current_a).max() * rng.standard_normal(window.n // 20 + 1).repeat(20)[: window.n]
+    return replace(window, current_a=frozen(window.current_a + noise))
+
+
+@pytest.mark.parametrize(
+    ("fault", "code"),
+    [
+        (_late, "SampleTiming"),
+        (_clipped, "Saturated"),
+        (_stuck, "StuckValue"),
+        (_loaded, "LoadDetected"),
+        (_gain, "LoadDetected"),
+        (_coarse, "ValidationFailed"),
+    ],
+    ids=lambda value: getattr(value, "__name__", value),
+)
+def test_each_fault_refuses(fault: Callable[[Window], Window], code: str) -> None:
+    outcome = analyse(fault(screw_windows()[0]), SETTINGS)
+    assert code in [reason.code for reason in outcome.verdict.reasons]
+
+
+def test_an_aborted_move_is_refused() -> None:
+    whole = to_and_fro(1)
+    cut = np.minimum(whole, 0.1)
+    run = real_plant.run(SCREW, cut, LOOPS)
+    read = real_plant.recording(run, SCREW, SENSORS, RAPID_M_S, voltage=False)
+    from fdhil.identification.windows import find_windows
+
+    (window,) = find_windows(replace(read, torque_constant_nm_per_a=SCREW.K))
+    reasons = analyse(window, SETTINGS).verdict.reasons
+    assert "EpisodeAborted" in [reason.code for reason in reasons]
+
+
+def test_a_triangular_move_is_listed_with_its_parameters_and_not_believed() -> None:
+    ramp = np.concatenate([np.linspace(0.0, 0.15, 400), np.linspace(0.15, 0.0, 400)])
+    demand = np.concatenate([np.zeros(300), np.cumsum(ramp) * 1e-3, np.full(300, ramp.sum() * 1e-3)])
+    run = real_plant.run(SCREW, demand, LOOPS)
+    read = real_plant.recording(run, SCREW, SENSORS, RAPID_M_S, voltage=False)
+    from fdhil.identification.windows import find_windows
+
+    (window,) = find_windows(replace(read, torque_constant_nm_per_a=SCREW.K))
+    outcome = analyse(window, SETTINGS)
+    assert outcome.estimate is not None
+    assert outcome.estimate.value("Jt") == pytest.approx(SCREW.Jt, rel=0.01)
+    assert [reason.code for reason in outcome.verdict.reasons] == ["MissingStage(cruise)"]
+
+
+def test_a_drive_without_feed_forward_is_weighed_by_its_following_error() -> None:
+    """A torque that would be too much of what the torque makes is nothing beside what the loop itself leaves."""
+    window = screw_windows()[0]
+    rng = np.random.default_rng(3)
+    waves = 0.04 * np.abs(window.current_a).max() * np.sin(np.arange(window.n) / 15.0 + rng.uniform(0, 6))
+    rough = replace(window, current_a=frozen(window.current_a + waves))
+    assert analyse(rough, SETTINGS).verdict.accepted
+    unled = replace(rough, demand_mm=frozen(np.zeros(window.n)))
+    assert "ValidationFailed" in [reason.code for reason in analyse(unled, SETTINGS).verdict.reasons]
+
+
+def test_a_running_machine_without_a_voltage_publishes_sets_that_predict_its_moves() -> None:
+    nominal = {**SECTION["nominal"], "K": SCREW.K}
+    document = {
+        "machine": {"name": "screw", "sync_period_s": 0.001},
+        "axis": {"X": bench_axis(**{**SECTION, "nominal": nominal})},
+    }
+    pipeline = AxisPipeline("X", config.parse(document))
+    outcomes = [
+        outcome
+        for window in screw_windows()
+        for outcome in pipeline.feed(replace(window, torque_constant_nm_per_a=None))
+    ]
+    assert sum(isinstance(outcome, ParameterSet) for outcome in outcomes) == 4
+    published = pipeline.published
+    assert published is not None
+    assert published.parameters.Cd == pytest.approx(SCREW.Cd, rel=0.03)
+    assert published.parameters.term("load") == pytest.approx(SCREW.load_nm, rel=0.05)
+    assert np.isfinite(published.covariance).all()
+    skills = [outcome for outcome in outcomes if isinstance(outcome, Skill)]
+    assert skills[-1].rms_um < 0.005 * skills[-1].measured_rms_um
