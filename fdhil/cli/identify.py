@@ -67,7 +67,7 @@ def identify(
     if with_loops:
         from fdhil.cli.loops_view import with_all_loops
 
-        results = with_all_loops(results, settings, axes)
+        results = with_all_loops(results, settings, machine)
     if as_json:
         document = {"schema": SCHEMA, "files": [_file_document(r, axes, with_loops) for r in results]}
         click.echo(json.dumps(document, allow_nan=False))

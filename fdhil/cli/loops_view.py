@@ -11,7 +11,7 @@ from fdhil.records import INTERVAL_95
 
 if TYPE_CHECKING:
     from fdhil.cli.batch import FileResult
-    from fdhil.config import Axis, Identification, Regulators
+    from fdhil.config import Axis, Identification, MachineConfig, Regulators
     from fdhil.records import LoopEstimate
 
 UNITS: Mapping[str, str] = {
@@ -28,12 +28,17 @@ UNITS: Mapping[str, str] = {
 
 
 def with_all_loops(
-    results: Sequence[FileResult], settings: Identification, axes: Mapping[str, Axis]
+    results: Sequence[FileResult], settings: Identification, machine: MachineConfig | None
 ) -> list[FileResult]:
     """Return the results with the loops of each recording, also where nothing had called for them."""
     from fdhil.pipeline.own_loops import loops_of
 
-    return [r if r.loops else replace(r, loops=loops_of(r.outcomes, axes.get(r.axis or ""), settings)) for r in results]
+    axes = {} if machine is None else machine.axis
+    period_s = None if machine is None else machine.machine.sync_period_s
+    return [
+        r if r.loops else replace(r, loops=loops_of(r.outcomes, axes.get(r.axis or ""), settings, period_s))
+        for r in results
+    ]
 
 
 def compared(found: LoopEstimate | None, axis: Axis | None) -> dict[str, Any] | None:

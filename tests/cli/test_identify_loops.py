@@ -1,0 +1,47 @@
+"""``fdhil identify --loops``: the drive's own loops, told and used."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from fdhil.cli.main import cli
+from studies import real_plant as real
+from tests.bench import bench_toml
+from tests.identification.test_loops import shuttle
+
+
+@pytest.fixture
+def filtered(tmp_path: Path) -> Path:
+    """A recording of a drive with a filter on its speed feedback."""
+    mechanics = real.Mechanics()
+    run = real.run(mechanics, shuttle(2, 0.25, 0.5), real.Loops(speed_filter_s=0.001))
+    path = tmp_path / "filtered.csv"
+    path.write_text(real.as_csv(run, mechanics, real.Sensors(), 0.5))
+    return path
+
+
+def test_a_filter_that_is_not_configured_is_told_and_used(filtered: Path, tmp_path: Path) -> None:
+    config = tmp_path / "machine.toml"
+    config.write_text(bench_toml())
+    result = CliRunner().invoke(cli, ["identify", str(filtered), "--config", str(config), "--json"])
+    (told,) = json.loads(result.stdout)["files"]
+    assert told["pooled"]["validated"]
+    loops = told["loops"]  # the configured ones do not explain the rapids: nobody had to ask
+    assert (loops["structure"], loops["configured_structure"]) == ("p_pi_pi", "p_pi_pi")
+    found = loops["gains"]["speed_filter_s"]
+    assert found["value"] == pytest.approx(0.001, rel=0.06)
+    assert (found["unit"], found["configured"]) == ("s", 0.0)
+    assert loops["unexplained_um"] < 0.5 < 20.0 < loops["configured_um"]
+    assert loops["warnings"][0].startswith("LoopsDiffer: ")
+
+
+def test_people_read_a_table_of_the_loops(filtered: Path) -> None:
+    result = CliRunner().invoke(cli, ["identify", str(filtered), "--loops"])
+    assert result.exit_code == 0
+    assert "loops: p_pi_pi" in result.stdout
+    assert "speed_filter_s" in result.stdout
+    assert "these loops leave 0." in result.stdout
