@@ -1,0 +1,42 @@
+"""Whether the regulators in the configuration are those that the drive's rapids showed last."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from fdhil import config as configuration
+from fdhil.cli.loops_view import loops_line
+from fdhil.commissioning.config_check import compare_loops
+from fdhil.daemon.outcome_json import loops_document
+from fdhil.records import LoopEstimate, Reason, Verdict, frozen
+from fdhil.store.history import History
+from fdhil.store.rows import Stamp
+from tests.bench import bench_document
+
+DIFFER = Reason("LoopsDiffer", "the configured regulators leave 34 um", "put what was found into the configuration")
+
+
+def loops(*warnings: Reason) -> LoopEstimate:
+    """Loops with a position gain that is 10 % off, believed."""
+    verdict = Verdict(True, None, (), 0.3, warnings)
+    return LoopEstimate("X", "p_pi_pi", ("position_gain_per_s",), frozen([55.0]), frozen(np.eye(1)), verdict, 34.0)
+
+
+def test_what_the_rapids_showed_is_compared_with_the_configuration(tmp_path: Path) -> None:
+    config = configuration.parse(bench_document() | {"store": {"directory": str(tmp_path)}})
+    assert not list(compare_loops(config, "X"))  # nothing is known yet
+    for found, same in ((loops(), True), (loops(DIFFER), False)):
+        history = History.open(tmp_path)
+        history.add_loops(found, Stamp(0.0, "boot-1", 1))
+        history.close()
+        (finding,) = compare_loops(config, "X")
+        assert finding.ok is same
+    assert "position_gain_per_s 55" in finding.found
+    assert (finding.cause, finding.advice) == (DIFFER.text, DIFFER.advice)
+
+
+def test_the_status_tells_of_loops_that_are_not_as_configured() -> None:
+    assert loops_line(loops_document(loops())) == ""
+    assert "LoopsDiffer: the configured regulators leave 34 um" in loops_line(loops_document(loops(DIFFER)))
