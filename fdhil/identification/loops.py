@@ -1,7 +1,7 @@
 """Identifies a drive's own loops from its rapids: gains, feed-forward, filters, computing delay, structure.
 
 The four gains every cascade has are fitted first. What else a drive may have joins one key at a time, the likeliest of
-all first, as long as it explains a tenth of the tolerance at the table, or a quarter of what is left: over hundreds of
+all first, as long as it explains a tenth of the tolerance at the table, or of what is left: over hundreds of
 rows no chance does either. The other structures of the table are tried against the cascade by the same measure. With
 full feed-forward and no filter, a cascade answers the same when position_gain_per_s and speed_ki / speed_kp change
 places: of the two the one nearer to where the fit began is told.
@@ -23,9 +23,9 @@ from fdhil.identification.loop_replay import Rapid, fitting_periods, rapid_of, w
 from fdhil.identification.loop_start import CASCADE, begun_anew, made_up_axis
 from fdhil.records import INTERVAL_95, LoopEstimate, Parameters, Reason, Verdict, Window, frozen, rms
 
-WORTH, WORTH_LEFT = 0.1, 0.25  # of the tolerance, or of what is left: what a key must explain to join
-LEAST_UM = 0.05
-WELL, NOTHING_UM = 0.25, 0.25  # of the tolerance, and in um: with less left nothing is missing
+WORTH, WORTH_LEFT = 0.1, 0.1  # of the tolerance, or of what is left: what a key must explain to join
+LEAST_UM = 0.02
+WELL, NOTHING_UM = 0.25, 0.1  # of the tolerance, and in um: with less left nothing is missing
 MOST_WINDOWS = 4
 DIFFER = "LoopsDiffer"
 LOOSE = 0.25  # relative standard deviation above which a gain is not known
