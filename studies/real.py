@@ -57,7 +57,7 @@ def told(axis: str, dt_s: float, speed_rad_s: Array, current_a: Array) -> Record
         voltage_sampling="interval_mean",
         pitch_mm=PITCH_MM,
         rapid_speed_rad_s=None,
-        headers={"torque_constant_nm_per_a": "1"},
+        torque_constant_nm_per_a=1.0,
     )
 
 

@@ -75,6 +75,8 @@ def show(status: Mapping[str, Any], console: Console | None = None) -> None:
     for axis, told in status["axes"].items():
         if unused := _unused(told):
             out.print(escape(f"{axis}: {unused}"))
+        if text := believed(told):
+            out.print(escape(f"{axis}: {text}"))
         if (loops := told.get("loops")) and (line := loops_line(loops)):
             out.print(escape(f"{axis}: {line}"))
     for notice in status["notices"][-5:]:
@@ -145,6 +147,17 @@ def _unused(axis: Mapping[str, Any]) -> str:
     if moves.get("without_plateau"):
         reasons.append(f"{moves['without_plateau']} too short for a plateau")
     return f"{moves.get('seen', 0)} moves seen; not used: {', '.join(reasons)}" if reasons else ""
+
+
+def believed(axis: Mapping[str, Any]) -> str:
+    """Say what joined the six parameters, what the model leaves at the table, and what is warned of."""
+    terms = ", ".join(
+        f"{name} {cell(name, told['value'], half_of(told), ' ')} {told['unit']}"
+        for name, told in (axis.get("terms") or {}).items()
+    )
+    left = axis.get("unexplained_um")
+    parts = [terms, "" if left is None else f"{left:.2g} um of a rapid unexplained", *axis.get("warnings", [])]
+    return "; ".join(part for part in parts if part)
 
 
 def _axes_table(axes: Mapping[str, Any]) -> Table:

@@ -197,9 +197,8 @@ def whiten(
 ) -> tuple[Float, Float]:
     """Return whitened innovations (q, n, 2) and log determinants (q,) for the rows of ``thetas`` (q, 7).
 
-    ``variances`` (q, 3) are those of voltage, current and speed; ``mean_v`` is (q, n) or, when all share it, (1, n),
-    and so are the ``loads``: friction, and what comes on top, against the positive direction. ``gains`` (n, 7), or of
-    no rows, takes those of the last filter.
+    ``variances`` (q, 3) are those of voltage, current and speed; ``mean_v`` and ``loads``, all torque against the
+    positive direction, are (q, n) or, when all share them, (1, n). ``gains`` (n, 7), or of no rows, takes the last's.
     """
     q = thetas.shape[0]
     white = np.empty((q, readings.mode.size, 2))
@@ -365,10 +364,8 @@ def departure(
 
     And how many of the readings of ``signal`` were news: the sum of their shares of variance that were not their own.
     Readings are of current, speed and voltage; their variance (n, 3) is infinite where there is none. ``load`` (n,) is
-    friction, and what comes on top, against the positive direction.
-
-    ``walks`` (n, 3) are the variances that speed (where friction is unknown) and voltage gain over each interval, and
-    of the voltage's rise within it.
+    that of :func:`whiten`; ``walks`` (n, 3) are the variances that speed (where friction is unknown) and voltage gain
+    over each interval, and of the voltage's rise within it.
     """
     steps = interval_steps(theta, dt, 0.0)
     x, p, of_signal = np.zeros(STATES), np.zeros((STATES, STATES)), np.eye(STATES)

@@ -13,7 +13,7 @@ from fdhil.identification.filtering import all_about, moving_mean
 from fdhil.identification.motion import surely_moving
 from fdhil.identification.windows import bridged
 from fdhil.model import closed_loop, kernels
-from fdhil.records import Bool, Float, Parameters, Window, read_only, rms
+from fdhil.records import Bool, Float, Parameters, Window, read_only
 
 LEAST_ROWS = 50
 REST_ROWS = 30
@@ -54,9 +54,10 @@ class Rapid:
         return np.asarray(self.demand_mm - self.position_mm)
 
     @property
-    def following_um(self) -> float:
-        """RMS of the following error."""
-        return rms(self.lag_mm[self.known]) * 1e3
+    def resolution_mm(self) -> float:
+        """The step of the recorded position."""
+        steps = np.abs(np.diff(self.position_mm))
+        return float(steps[steps > NIL_MM].min(initial=np.inf)) if (steps > NIL_MM).any() else 0.0
 
 
 def rapid_of(window: Window, plant: Parameters, sync_period_s: float | None = None) -> Rapid | None:

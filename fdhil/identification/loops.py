@@ -25,8 +25,8 @@ from fdhil.records import INTERVAL_95, LoopEstimate, Parameters, Reason, Verdict
 
 WORTH, WORTH_LEFT = 0.1, 0.25  # of the tolerance, or of what is left: what a key must explain to join
 LEAST_UM = 0.05
-WELL = 0.25  # of the tolerance: with less left no other structure is tried
-MOST_WINDOWS = 6
+WELL, NOTHING_UM = 0.25, 0.25  # of the tolerance, and in um: with less left nothing is missing
+MOST_WINDOWS = 4
 DIFFER = "LoopsDiffer"
 LOOSE = 0.25  # relative standard deviation above which a gain is not known
 PID = ("position_gain_per_s", "speed_feedforward", "speed_kp", "position_ki_per_s2")
@@ -62,24 +62,44 @@ def identify_loops(
     ``mechanics`` are what each window's estimate says of the motor and what it moves, ``axis`` the machine's section:
     without it the search begins from the demand alone. Set-points come every ``sync_period_s`` (left out: each row).
     """
-    pairs = [
-        (w, own) for w, own in zip(windows, mechanics, strict=True) if np.isfinite([*own.as_dict().values()]).all()
-    ]
-    told = [(rapid, own) for w, own in pairs if (rapid := rapid_of(w, own, sync_period_s)) is not None][-MOST_WINDOWS:]
+    pairs = list(zip(windows, mechanics, strict=True))[-MOST_WINDOWS:]
+    told = [(rapid, own) for w, own in pairs if (rapid := rapid_of(w, own, sync_period_s)) is not None]
     if not told:
         return None
     rapids = tuple(rapid for rapid, _ in told)
     following = rms(np.concatenate([one.lag_mm[one.known] for one in rapids])) * 1e3
     tolerance = settings.tolerance_for(following)
     problem = _problem(rapids, axis, windows[0])
-    found = _best(problem, tolerance, axis is not None)
-    # where the model has all that is there, it is better without what noise makes of the rest
     modelled = tuple(replace(rapid, plant=own, load_nm=np.zeros_like(rapid.load_nm)) for rapid, own in told)
-    plain = loop_fit.fit(replace(found.problem, rapids=modelled), found.coordinates)
-    found = _whole_delay(min(found, plain, key=lambda fit: fit.deviance))
-    configured = None if axis is None else _left_um(problem)
+    found = _whole_delay(_of_either(problem, modelled, tolerance, axis is not None))
+    configured = None if axis is None else min(_left_um(replace(problem, rapids=r)) for r in (rapids, modelled))
     verdict = _verdict(found, tolerance, following, configured)
     return _told(windows[0].axis, found, verdict, configured)
+
+
+def _of_either(problem: Problem, modelled: tuple[Rapid, ...], tolerance_um: float, configured: bool) -> Fit:
+    """Return the best fit with what the model lacks as a load, or without: sought again where the other is better.
+
+    A model that has all that is there is better without what noise makes of the rest. Sought is with one rapid of
+    either direction, fitted with all.
+    """
+    few = _both_ways(problem.rapids)
+    kinds = [problem.rapids, modelled]
+    begun = [loop_fit.fit(replace(problem, rapids=tuple(rapids[j] for j in few))) for rapids in kinds]
+    if begun[1].deviance < begun[0].deviance:
+        kinds, begun = kinds[::-1], begun[::-1]
+    found = _best(begun[0].problem, tolerance_um, configured)
+    ends = [loop_fit.fit(replace(found.problem, rapids=rapids), found.coordinates) for rapids in kinds]
+    if ends[0].deviance <= ends[1].deviance:
+        return ends[0]
+    again = _best(replace(begun[1].problem, axis=ends[1].axis(), names=ends[1].problem.names), tolerance_um, configured)
+    return loop_fit.fit(replace(again.problem, rapids=kinds[1]), again.coordinates)
+
+
+def _both_ways(rapids: Sequence[Rapid]) -> list[int]:
+    """Return the newest rapid, and the newest of the other direction where there is one."""
+    ways = [float(np.sign(rapid.demand_mm[-1] - rapid.demand_mm[0])) for rapid in rapids]
+    return [j for side in (-1.0, 1.0) for j in [k for k, way in enumerate(ways) if way == side][-1:]] or [0]
 
 
 def _left_um(problem: Problem) -> float:
@@ -108,8 +128,8 @@ def _best(problem: Problem, tolerance_um: float, configured: bool) -> Fit:
     best = _grown(loop_fit.fit(problem), tolerance_um)
     if configured and best.unexplained_um > tolerance_um:  # the configuration may have led astray
         best = min(best, _grown(loop_fit.fit(begun_anew(problem)), tolerance_um), key=lambda f: f.unexplained_um)
-    if best.problem.names == CASCADE and best.unexplained_um < WELL * tolerance_um:
-        return best  # nothing is missing
+    if best.problem.names == CASCADE and beyond_rounding_um(best) < enough_um(tolerance_um):
+        return best
     other = _other_structure(best)
     if other is not None:
         rival = _grown(loop_fit.fit(other), tolerance_um)
@@ -120,7 +140,7 @@ def _best(problem: Problem, tolerance_um: float, configured: bool) -> Fit:
 
 def _grown(made: Fit, tolerance_um: float) -> Fit:
     """Let keys join, the best of all first, as long as it is worth it; two at once where that is worth more."""
-    while True:
+    while beyond_rounding_um(made) > enough_um(tolerance_um):
         best = made
         for options in (SINGLE_KEYS, FILTERS):
             free = [option for option in options if not {*option} & {*made.problem.names}]
@@ -128,8 +148,20 @@ def _grown(made: Fit, tolerance_um: float) -> Fit:
             if best.unexplained_um - grown.unexplained_um > worth_um(best, tolerance_um):
                 best = grown
         if best is made:
-            return made
+            break
         made = best
+    return made
+
+
+def beyond_rounding_um(made: Fit) -> float:
+    """Return what is left of the position beyond the rounding of its record."""
+    rounding = max(rapid.resolution_mm for rapid in made.problem.rapids) * 1e3
+    return math.sqrt(max(made.unexplained_um**2 - rounding**2 / 12, 0.0))
+
+
+def enough_um(tolerance_um: float) -> float:
+    """Return how little may be left for nothing to be missing."""
+    return min(NOTHING_UM, WELL * tolerance_um)
 
 
 def worth_um(made: Fit, tolerance_um: float) -> float:

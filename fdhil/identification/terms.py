@@ -21,6 +21,7 @@ SPEEDS = np.geomspace(0.02, 0.35, 8)  # of the top speed, at which friction at l
 SCREW_ORDERS = (1, 2)  # periods in a turn
 # of 2 to 8 pole pairs: sensors' zeros and gains once and twice an electrical turn, windings 6 times, slots
 MOTOR_ORDERS = (3, 4, 5, 6, 8, 10, 12, 16, 18, 20, 24, 30, 36)
+MOST_TURN = 0.9 * np.pi  # of a ripple in a row at top speed: beyond it another order looks the same
 SMOOTHING_S = 0.005
 WHOLE_DEAD_TIME = 0.01  # of the peak current: from there on a dead time has its whole effect
 LEAST_TURN = 1e-9  # rad in an interval
@@ -41,7 +42,8 @@ def candidates(motions: Sequence[Motion], command: bool) -> list[Candidate]:
     found = [Candidate("stribeck", tuple((stribeck(m, speed),) for m in motions)) for speed in SPEEDS * top]
     if all(m.angle_rad.size for m in motions):
         made = [ripples(m) for m in motions]
-        found += [Candidate(name, tuple(own[name] for own in made)) for name in made[0]]
+        shared = [name for name in made[0] if all(name in own for own in made)]
+        found += [Candidate(name, tuple(own[name] for own in made)) for name in shared]
     if command and all(m.slow is None for m in motions):
         found += [Candidate("dead_time", tuple((dead_time(m),) for m in motions))]
         found += [Candidate("bus_sag", tuple((bus_sag(m),) for m in motions))]
@@ -67,9 +69,10 @@ def ripples(motion: Motion) -> dict[str, tuple[Course, Course]]:
     share = np.abs(_side(motion)) / np.where(still, 1.0, turned)
     at = np.exp(1j * motion.angle_rad)
     wave, made = np.ones_like(at), {}
+    most = MOST_TURN / max(float(np.abs(turned).max(initial=0.0)), LEAST_TURN)
     for order in range(1, MOTOR_ORDERS[-1] + 1):
         wave = wave * at
-        if order not in SCREW_ORDERS and order not in MOTOR_ORDERS:
+        if (order not in SCREW_ORDERS and order not in MOTOR_ORDERS) or order > most:
             continue
         # the integral of exp(j k a) is exp(j k a) / (j k)
         mean = np.where(still, 0.0, np.append(wave[1:], wave[-1]) - wave) * (share / order)

@@ -1,4 +1,4 @@
-"""Makes a window ready for [2] alone: current, acceleration, jerk and speed, all filtered alike, rows that surely move.
+"""Makes a window ready for [2] alone: current, speed, acceleration and its derivatives, all filtered alike.
 
 The position is the better signal where its own noise makes less of an acceleration than the speed's does: a drive's
 speed may be a difference of positions, late by half a row, or filtered. Its second difference over a row is exactly the
@@ -26,7 +26,8 @@ from fdhil.records import Bool, Float, Window
 class TorqueRows:
     """A window's signals (n,), filtered alike; ``usable`` marks the rows to fit, which surely move.
 
-    ``side`` is the direction of motion (0 at rest) and not filtered, nor is ``angle`` = 2 pi x / pitch, rad.
+    ``jerk`` and ``snap`` are the first and second derivative of the acceleration. ``side`` is the direction of motion
+    (0 at rest) and not filtered, nor is ``angle`` = 2 pi x / pitch, rad.
     ``error_rad_s2`` is the standard deviation of the noise on the acceleration.
     """
 
@@ -35,6 +36,7 @@ class TorqueRows:
     current: Float
     acceleration: Float
     jerk: Float
+    snap: Float
     speed: Float
     side: Float
     angle: Float
@@ -66,15 +68,17 @@ def torque_rows(window: Window, settings: Identification) -> TorqueRows | None:
         _over_rows(bridged(window.current_a), (1 / 6, 2 / 3, 1 / 6)),
         acceleration,
         _over_rows(acceleration, (-0.5, 0.0, 0.5)) / dt,
+        _over_rows(acceleration, (1.0, -2.0, 1.0)) / dt**2,
         speed,
     )
-    current, acceleration, jerk, speed = zero_phase(np.where(moving, np.stack(signals), 0.0), corner, dt)
+    current, acceleration, jerk, snap, speed = zero_phase(np.where(moving, np.stack(signals), 0.0), corner, dt)
     return TorqueRows(
         dt_s=dt,
         lowpass_hz=corner,
         current=current,
         acceleration=acceleration,
         jerk=jerk,
+        snap=snap,
         speed=speed,
         side=np.where(moving, np.sign(speed), 0.0),
         angle=angle,

@@ -3,8 +3,9 @@
 Least squares on K i = Jt dw/dt + ft w + Cd sign(w), all filtered alike, and on what joins it: friction at low speed, a
 ripple with the screw's turn. A term joins where the Bayesian information criterion (Schwarz 1978) wants it at the
 number of rows that tell something new, and where it is worth it. The current may be late: the torque's own slope
--tau (Jt dj/dt + ft dw/dt) is always fitted, so that it biases nothing. A constant load is part of the friction of its
-direction; windows of both directions tell it.
+-tau (Jt dj/dt + ft dw/dt) is always fitted, so that it biases nothing. So is the acceleration's second derivative, by
+which the torque of a table behind a screw that gives differs from that of one mass, to first order. A constant load is
+part of the friction of its direction; windows of both directions tell it.
 
 What is left is friction that no model has, much more than noise, and coloured. So the intervals stand around the
 variance of the scores (Newey and West 1987), widened for what that variance itself scatters (Kiefer and Vogelsang
@@ -29,14 +30,15 @@ from fdhil.records import PARAMETERS, RATIOS, Estimate, Float, Reason, Result, W
 METHOD = "least_squares"
 TOLD_BY_SHEET = ("R", "L", "K")
 LEAST_ROWS = 32
-BASE = ("Jt", "delay", "ft", "Cd")
+BASE = ("Jt", "delay", "give", "ft", "Cd")
 STRIBECK_SHARES = (0.02, 0.03, 0.05, 0.08, 0.12, 0.18, 0.27)  # of the top speed
 SCREW_ORDERS = (1, 2)
 TERMS = ("stribeck", *(f"ripple_screw_{order}" for order in SCREW_ORDERS))
 WORTH = 0.005  # of the torque's RMS: what a term must explain, a tenth of what may be left
 SUMMED_SHARE = 0.1  # of a window's rows: over which its residuals may hang together
 WIDENED = 2.9694 / 1.96  # per share, of the 95 % interval: Kiefer and Vogelsang 2005, Bartlett's weights
-OPEN_SHARE = 3e-4  # of Jt: what the current's course between two rows leaves open
+OPEN_SHARE = 3e-4  # of Jt: what a current that is read once a row leaves open
+OPEN_SHARE_ROWS = 3e-5  # the same in rows of 1 ms; it grows with their square
 NO_VOLTAGE = Reason("LowExcitation", "there is no voltage, so [1] gives no R and L", "connect the voltage sensor")
 NO_K = Reason(
     "LowExcitation",
@@ -94,7 +96,7 @@ def fit(window: Window, settings: Identification) -> TorqueFit | None:
     rows = torque_rows(window, settings)
     if rows is None or rows.count < LEAST_ROWS:
         return None
-    base = np.column_stack([rows.acceleration, rows.jerk, rows.speed])[rows.usable]
+    base = np.column_stack([rows.acceleration, rows.jerk, rows.snap, rows.speed])[rows.usable]
     design, current = np.column_stack([base, rows.through(rows.side[None])]), rows.current[rows.usable]
     if not (np.isfinite(design).all() and np.isfinite(current).all()):
         return None
@@ -290,10 +292,10 @@ def _ratios(fitted: TorqueFit) -> Estimate:
 
 def _values(fitted: TorqueFit) -> tuple[dict[str, float], Float]:
     """Return Jt, ft, Cd and the terms' values by name, per N.m/A, and how they follow from what was fitted."""
-    inertia, lag, viscous, dry = fitted.theta[: len(BASE)]
+    inertia, lag, _, viscous, dry = fitted.theta[: len(BASE)]
     told = {"Jt": float(inertia - lag / inertia * viscous), "ft": float(viscous), "Cd": float(dry)}
     size, others = fitted.theta.size, sum(t.slope is not None for t in fitted.terms)
-    rates = [np.eye(size + others)[k] for k in (0, 2, 3)]
+    rates = [np.eye(size + others)[k] for k in (0, 3, 4)]
     for term in fitted.terms:
         k, unit = _first(fitted, term), np.eye(size + others)
         if term.at is not None:
@@ -315,7 +317,8 @@ def _doubts(fitted: TorqueFit, rates: Float) -> Float:
     """
     power = float(np.mean(np.square(fitted.design[:, 0])))
     noise = fitted.rows.error_rad_s2**2 / max(power, 1e-300)
-    inertia = np.eye(len(rates))[0] * abs(fitted.theta[0]) * np.hypot(OPEN_SHARE, noise)
+    unread = OPEN_SHARE + OPEN_SHARE_ROWS * (1e3 * fitted.rows.dt_s) ** 2
+    inertia = np.eye(len(rates))[0] * abs(fitted.theta[0]) * np.hypot(unread, noise)
     none = np.zeros(fitted.theta.size)
     shifts = [rates[:, : none.size] @ fitted.shifts.get(name, none) for name in TERMS]
     return np.column_stack([inertia, *shifts])

@@ -85,10 +85,11 @@ async def test_the_next_pass_carries_what_the_last_one_taught(
         learned = np.array([row[2:] for row in mill.rows])
     assert [told.get("learned") is not None for told in shop.desk.passes] == [False, False, True]
     assert shop.desk.passes[-1]["learned"]["passes"] == 1
-    assert all(np.array_equal(offsets[0], other) for other in offsets), "a disturbed pass has taught something"
+    # the first arming did not know yet at which current the axes stand
+    assert np.array_equal(offsets[1], offsets[2]), "a disturbed pass has taught something"
     assert not any("Learned" in text for told in warnings for text in told)
     assert any("Learned: what 1 passes taught is added" in text for text in answer["warnings"])
-    added_mm = (learned - offsets[0])[: wave.size, 0] * config.axis["X"].screw_pitch_mm / 65536
+    added_mm = (learned - offsets[2])[: wave.size, 0] * config.axis["X"].screw_pitch_mm / 65536
     assert np.corrcoef(added_mm, -wave)[0, 1] > 0.95
-    assert not np.array_equal(learned[:, 0], offsets[0][:, 0])
-    assert np.abs((learned - offsets[0])[:, 1]).max() <= 2, "Y had nothing to learn"
+    assert not np.array_equal(learned[:, 0], offsets[2][:, 0])
+    assert np.abs((learned - offsets[2])[:, 1]).max() <= 2, "Y had nothing to learn"

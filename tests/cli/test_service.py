@@ -15,7 +15,7 @@ import pytest
 
 from fdhil.arming.token import ensure_token
 from fdhil.cli.parameter_view import cell, half_of
-from fdhil.cli.status_view import sparkline
+from fdhil.cli.status_view import believed, sparkline
 from fdhil.daemon import journal
 from fdhil.daemon.status import Watch
 from fdhil.records import Notice
@@ -203,3 +203,11 @@ def test_lines_of_the_daemon_as_json(capsys: pytest.CaptureFixture[str]) -> None
     assert datetime.fromisoformat(line.pop("time")).tzinfo is not None
     assert line == {"severity": "MAJOR", "text": "X: LoadChanged"}
     assert "said to a person" in said.err
+
+
+def test_terms_and_what_is_warned_of_are_told_beside_the_table() -> None:
+    load = {"value": 2.5, "std": 0.01, "low": 2.48, "high": 2.52, "unit": "N.m"}
+    axis = {"terms": {"load": load}, "unexplained_um": 0.25, "warnings": ["OneDirection: all moves go one way"]}
+    told = "load 2.50 ±0.02 N.m; 0.25 um of a rapid unexplained; OneDirection: all moves go one way"
+    assert believed(axis) == told
+    assert believed({"terms": None, "unexplained_um": None, "warnings": []}) == ""

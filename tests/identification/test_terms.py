@@ -131,11 +131,19 @@ def test_a_load_course_is_what_dry_friction_was() -> None:
 
 def test_ripples_are_means_over_each_interval() -> None:
     motion = prepare(rapids()[0])
-    sine, cosine = ripples(motion)["ripple_motor_24"]
+    sine, cosine = ripples(motion)["ripple_motor_12"]
     row = int(np.flatnonzero(np.abs(motion.mode) == 1)[200])
     angles = np.linspace(motion.angle_rad[row], motion.angle_rad[row + 1], 2001)
-    assert sine.values[row] == pytest.approx(np.trapezoid(np.sin(24 * angles)) / 2000, abs=1e-4)
-    assert cosine.values[row] == pytest.approx(np.trapezoid(np.cos(24 * angles)) / 2000, abs=1e-4)
+    assert sine.values[row] == pytest.approx(np.trapezoid(np.sin(12 * angles)) / 2000, abs=1e-4)
+    assert cosine.values[row] == pytest.approx(np.trapezoid(np.cos(12 * angles)) / 2000, abs=1e-4)
+
+
+def test_an_order_that_looks_like_another_in_these_rows_is_none() -> None:
+    motion = prepare(rapids()[0])
+    top = float(np.abs(np.diff(motion.angle_rad)).max())
+    orders = [int(name.rpartition("_")[2]) for name in ripples(motion)]
+    assert max(orders) * top < np.pi
+    assert 24 * top > np.pi, "the rows are too short for this test"
 
 
 def test_how_low_speed_friction_changes_with_its_speed() -> None:

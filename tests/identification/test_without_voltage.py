@@ -9,9 +9,10 @@ import pytest
 
 from fdhil.config import Identification
 from fdhil.identification.torque_rows import torque_rows
+from fdhil.identification.windows import find_windows
 from fdhil.identification.without_voltage import fit, late_s, told
 from fdhil.records import RATIOS, Estimate, Result, Window, frozen
-from studies.real_plant import SLOW, SLOW_LOOPS, Mechanics, Sensors, recording, run
+from studies.real_plant import SLOW, SLOW_LOOPS, Mechanics, Run, Sensors, recording, run
 from tests.identification.deaf import SCREW, screw_windows, to_and_fro
 
 SETTINGS = Identification()
@@ -80,13 +81,20 @@ def test_intervals_hold_the_truth() -> None:
     assert (np.sqrt(np.mean(np.square(errors), axis=0)) > 0.4).all()
 
 
-def _windows(made: object, mechanics: Mechanics, seed: int) -> list[Window]:
-    from fdhil.identification.windows import find_windows
-    from studies.real_plant import Run
-
-    assert isinstance(made, Run)
-    read = recording(made, mechanics, Sensors(), 0.2, seed, voltage=False)
+def _windows(made: Run, mechanics: Mechanics, seed: int, rapid_m_s: float = 0.2) -> list[Window]:
+    read = recording(made, mechanics, Sensors(), rapid_m_s, seed, voltage=False)
     return find_windows(replace(read, torque_constant_nm_per_a=mechanics.K))
+
+
+@pytest.mark.parametrize("dt_s", [0.004, 0.010])
+def test_slow_rows_tell_the_same(dt_s: float) -> None:
+    """Four axes on one bus leave a row every 4 ms, many machines one in 10; the NC smooths its ramps."""
+    smooth = np.convolve(np.pad(to_and_fro(2, 0.4, 0.5, 4.0), 50, "edge"), np.full(90, 1 / 90), "same")[50:-50]
+    for window in _windows(run(Mechanics(), smooth, dt_s=dt_s), Mechanics(), 1, 0.5):
+        found = estimate(window)
+        for name, truth in Mechanics().truth().items():
+            if name in TOLD:
+                assert abs(found.value(name) - truth) < 3 * found.std(name) < 0.1 * truth
 
 
 def test_friction_at_low_speed_joins_where_it_is_worth_it() -> None:
@@ -123,3 +131,8 @@ def test_hardly_any_row_is_an_empty_estimate() -> None:
     assert torque_rows(lost, SETTINGS) is None
     assert fit(lost, SETTINGS) is None
     assert estimate(lost).result is Result.UNDER_EXCITED
+
+
+def test_a_screw_that_gives_takes_nothing_from_the_mass() -> None:
+    found = estimate(screw_windows(2, 0, replace(SCREW, resonance_hz=60.0))[0])
+    assert found.value("Jt") == pytest.approx(SCREW.Jt, rel=0.005)

@@ -1,0 +1,204 @@
+"""A drive's own loops: found from its rapids, on plants and drives that share no code with the model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil import config as configuration
+from fdhil.config import Axis, Identification
+from fdhil.identification.loops import better_loops, differences, identify_loops, with_loops
+from fdhil.identification.voltage_course import voltage_course
+from fdhil.identification.windows import find_windows
+from fdhil.model import closed_loop
+from fdhil.records import Float, LoopEstimate, Parameters, Recording, Window, frozen
+from studies import real_plant as real
+from tests.bench import bench_document
+from tests.model.slow_drive import SlowDrive
+from tests.paths import bench_demand, rms
+
+PERIOD = 0.001
+SETTINGS = Identification()
+NOMINAL = Parameters.of(real.Mechanics().truth())
+GAINS = ("position_gain_per_s", "speed_feedforward", "speed_kp", "speed_ki")
+
+
+def bench_axis(**regulators: Any) -> Axis:
+    """The bench's X with other regulators."""
+    document = bench_document()
+    document["axis"]["X"]["regulators"] |= regulators
+    return configuration.parse(document).axis["X"]
+
+
+def shuttle(moves: int, way: float, speed: float, rest_s: float = 0.25, step_s: float = PERIOD) -> Float:
+    """A demand to and fro as an NC smooths it, m."""
+    ramp = speed / 4.0
+    t = np.arange(0.0, way / speed + ramp, PERIOD)
+    move = np.minimum(np.minimum(4.0 * t, speed), np.maximum(0.0, 4.0 * (way / speed + ramp - t)))
+    still = np.zeros(round(rest_s / PERIOD))
+    course = np.concatenate([still, *(part for k in range(moves) for part in (move * (-1) ** k, still))])
+    for width in (60, 30):
+        course = np.convolve(course, np.ones(width) / width)[: course.size]
+    place = np.cumsum(course) * PERIOD
+    return np.asarray(
+        np.interp(np.arange(0.0, (place.size - 1) * PERIOD, step_s), np.arange(place.size) * PERIOD, place)
+    )
+
+
+def rapids(loops: real.Loops, mechanics: real.Mechanics | None = None) -> list[Window]:
+    """Rapids of an independent plant, as a drive reports them."""
+    mechanics = mechanics or real.Mechanics()
+    run = real.run(mechanics, shuttle(4, 0.25, 0.5), loops)
+    return find_windows(real.recording(run, mechanics, real.Sensors(), 0.5))
+
+
+class Observed(SlowDrive):
+    """The independent drive, whose voltage, current and speed are noted at every current-loop step."""
+
+    noted: list[tuple[float, float, float]]
+
+    def _integrate(self, u: float, h: float) -> None:
+        self.noted.append((u, self.i, self.w))
+        super()._integrate(u, h)
+
+
+def observed(axis: Axis, demand_m: Float, row_s: float = PERIOD) -> tuple[list[Window], Float]:
+    """The rapids of the independent drive, and its voltage (rows, steps)."""
+    drive = Observed(NOMINAL, axis, row_s, increments=2**24)
+    drive.noted = []
+    place = np.array(drive.run((demand_m * 1e3).tolist()))
+    noted = np.array(drive.noted).reshape(place.size, -1, 3)
+    rng = np.random.default_rng(1)
+    recording = Recording(
+        axis="X",
+        dt_s=row_s,
+        time_s=frozen(np.arange(place.size) * row_s),
+        voltage_v=frozen(noted[:, :, 0].mean(axis=1)),
+        current_a=frozen(noted[:, 0, 1] + 0.15 * rng.standard_normal(place.size)),
+        speed_rad_s=frozen(noted[:, 0, 2]),
+        position_mm=frozen(place),
+        demand_mm=frozen(demand_m * 1e3),
+        voltage_sampling="interval_mean",
+        pitch_mm=20.0,
+        rapid_speed_rad_s=float(np.abs(np.diff(demand_m)).max() / row_s / 0.02 * 2 * np.pi),
+    )
+    return find_windows(recording), noted[:, :, 0]
+
+
+def found(windows: list[Window], axis: Axis | None, mechanics: Parameters = NOMINAL) -> LoopEstimate:
+    """The loops of some windows."""
+    loops = identify_loops(windows, [mechanics] * len(windows), axis, SETTINGS)
+    assert loops is not None
+    return loops
+
+
+def gains(loops: LoopEstimate) -> dict[str, float]:
+    """Values by key."""
+    return dict(zip(loops.names, loops.values.tolist(), strict=True))
+
+
+def test_loops_as_configured_are_told_to_be_the_same() -> None:
+    axis = bench_axis()
+    loops = found(rapids(real.Loops()), axis)
+    assert (loops.structure, loops.names) == ("p_pi_pi", GAINS)
+    for told in differences(axis, loops):
+        assert told.found == pytest.approx(told.configured, rel=0.01)
+    assert loops.verdict.accepted
+    assert loops.configured_um == pytest.approx(loops.verdict.unexplained_um, abs=0.1)
+    assert not better_loops(loops)
+
+
+@pytest.mark.parametrize("configured", [True, False], ids=["configured", "from the demand alone"])
+@pytest.mark.parametrize(
+    "loops",
+    [
+        real.Loops(speed_filter_s=0.001),
+        real.Loops(speed_filter_s=0.002, speed_feedforward=0.8),
+        real.Loops(speed_kp=0.9 * 23.562, speed_ki=0.81 * 1184.35),
+    ],
+    ids=["filter", "filter and lag", "slower speed loop"],
+)
+def test_what_is_not_configured_is_found_within_five_percent(loops: real.Loops, configured: bool) -> None:
+    told = found(rapids(loops), bench_axis() if configured else None)
+    assert told.structure == "p_pi_pi"
+    assert ("speed_filter_s" in told.names) == (loops.speed_filter_s > 0)
+    for name, value in gains(told).items():
+        assert value == pytest.approx(getattr(loops, name), rel=0.05), name
+    assert told.verdict.accepted
+    assert told.verdict.unexplained_um is not None
+    assert told.verdict.unexplained_um < 0.4  # the record is rounded to 1 um
+    assert better_loops(told) == configured
+
+
+@pytest.mark.parametrize(
+    "own",
+    [
+        {"setpoint_filter_s": 0.002},
+        {"torque_feedforward": 0.6},
+        {"setpoint_filter_s": 0.002, "speed_filter_s": 0.001, "speed_feedforward": 0.9},
+        {
+            "structure": "pid", "position_gain_per_s": 100.0, "position_ki_per_s2": 2500.0, "speed_ki": 0.0,
+            "speed_feedforward": 0.8,
+        },
+        {"structure": "double_pi", "position_ki_per_s2": 300.0, "speed_feedforward": 0.8},
+    ],
+    ids=lambda own: "-".join(own),
+)  # fmt: skip
+def test_options_and_structures_are_told_apart(own: dict[str, Any]) -> None:
+    axis = bench_axis(**own)
+    windows, _ = observed(axis, shuttle(1, 0.12, 0.3, rest_s=0.5))
+    loops = found(windows, bench_axis())
+    assert loops.structure == axis.regulators.structure
+    assert {name for name in own if name != "structure"} <= {*loops.names, "speed_ki"}
+    for name, value in gains(loops).items():
+        assert value == pytest.approx(getattr(axis.regulators, name), rel=0.06, abs=3e-4), name
+    used = with_loops(bench_axis(), loops).regulators
+    assert used.structure == axis.regulators.structure
+    assert used.speed_ki == pytest.approx(axis.regulators.speed_ki, rel=0.06)
+
+
+def test_the_path_is_predicted_though_the_machine_has_more_than_the_model() -> None:
+    mechanics = replace(real.ORDINARY_MECHANICS, load_nm=0.0)
+    loops = replace(real.ORDINARY_LOOPS, speed_filter_s=0.001, speed_feedforward=0.95)
+    own = with_loops(bench_axis(), found(rapids(loops, mechanics), bench_axis()))
+    demand = bench_demand(10)[:, 0]
+    truth = real.run(mechanics, demand / 1e3, loops).motor_m * 1e3
+    off = [rms(closed_loop.simulate(NOMINAL, a, PERIOD, demand).position_mm - truth) for a in (bench_axis(), own)]
+    assert off[0] > 0.1
+    assert off[1] < 1e-3
+
+
+def test_loops_are_refused_where_they_do_not_explain() -> None:
+    windows = rapids(real.Loops())
+    strict = SETTINGS.model_copy(update={"tolerance_um": 0.01})
+    loops = identify_loops(windows, [NOMINAL] * len(windows), bench_axis(), strict)
+    assert loops is not None
+    assert [reason.code for reason in loops.verdict.reasons] == ["LoopsUnexplained"]
+    assert not better_loops(loops)
+
+
+def test_without_a_demand_no_loops_are_told() -> None:
+    windows = [replace(window, demand_mm=window.position_mm) for window in rapids(real.Loops())]
+    assert identify_loops(windows, [NOMINAL] * len(windows), bench_axis(), SETTINGS) is None
+
+
+@pytest.mark.parametrize("row_s", [0.004, 0.010])
+def test_slow_rows_show_the_loops_and_their_voltages_course(row_s: float) -> None:
+    axis = bench_axis()
+    (window,), voltage = observed(axis, shuttle(1, 0.25, 0.5, step_s=row_s), row_s)
+    for name, value in gains(found([window], None)).items():
+        assert value == pytest.approx(getattr(axis.regulators, name), rel=0.02), name
+    course = voltage_course(axis, NOMINAL, window)
+    assert course is not None
+    # first moments of the true voltage and of the course move the current by nearly the same
+    rows = voltage[window.start_tick :][: window.n]
+    about = np.arange(rows.shape[1]) / rows.shape[1]
+    rise = 12.0 * ((rows - rows.mean(axis=1, keepdims=True)) * (about - about.mean())).mean(axis=1)
+    beyond = rise - 0.8 * np.diff(window.speed_rad_s, append=window.speed_rad_s[-1])
+    assert window.stages.accelerate is not None
+    moving = slice(window.stages.accelerate[0] + 2, window.stages.accelerate[1])
+    assert rms(beyond[moving]) > 4.0
+    assert rms((beyond - course)[moving]) < 0.1 * rms(beyond[moving])
