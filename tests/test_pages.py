@@ -95,7 +95,12 @@ def _intervals_lie(figures: Figures) -> None:
             "95 % interval holds",
             ("nothing: 100 of 100", "not within 5: 100", "in 0 of 100", "told in 0 of 60 histories."),
         ),
-        ("verdicts", _some_accepted, "backlash (100%)", (" 3 accepted (", "backlash (0%)", "backlash 24, 54, 84")),
+        (
+            "verdicts",
+            _some_accepted,
+            "backlash (100%)",
+            (" 3 accepted, 0 of them to harm (", "backlash (0%)", "backlash 24, 54, 84"),
+        ),
         ("slow_sensor", _intervals_lie, "", ("that of Jt holds the truth least often: 2 %", " 77 windows refused")),
     ],
 )

@@ -124,8 +124,8 @@ def _parted(p: Parameters, direction: int, current_a: float, share: float) -> tu
     held, rests = direction * (p.K * current_a - p.term("load")), max(p.term("stribeck"), 0.0)
     least = (-held - p.Cd - rests) / 2.0
     if share == 0.0:
-        helping = max(0.0, least)
-    elif helping < least:
+        helping = max(0.0, least, -p.Cd)  # a load that helps may be more than friction: then their sum is below 0
+    elif helping < max(least, -p.Cd):
         return None
     most = p.Cd + rests  # held less what the load takes is at most the friction at rest
     current = current_a - direction * max(0.0, held - most) / p.K
