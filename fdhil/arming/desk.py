@@ -15,7 +15,7 @@ from fdhil.arming.background_check import BackgroundCheck
 from fdhil.arming.checked_program import CheckedProgram
 from fdhil.arming.guard_link import GuardLink
 from fdhil.arming.knowledge import Knowledge
-from fdhil.arming.lessons import taught
+from fdhil.arming.lessons import ahead_of_motors_mm, taught
 from fdhil.arming.passes import Passes
 from fdhil.arming.preparing import (
     Armament,
@@ -173,7 +173,8 @@ class ArmingDesk:
         known, rest = self.knowledge.now(), self._standstill.now()
         armament = await asyncio.to_thread(prepare_armament, request, rows, self._config, known, rest)
         summary = armament.summary()
-        self._passes.begin(armament.begin.demand, armament.rows, request.models, pupil)
+        ahead_mm = await asyncio.to_thread(ahead_of_motors_mm, rows, request)
+        self._passes.begin(armament.begin.demand, armament.rows, request.models, pupil, ahead_mm)
         answer = await self._hand_over(self.guard.arm, armament, summary, token)
         if not answer["ok"]:
             self._passes.forget()

@@ -21,6 +21,7 @@ from fdhil.correction.inverse import common_delay_s, delayed
 from fdhil.correction.learning import Lesson, learn
 from fdhil.correction.limits import fit_all
 from fdhil.prediction import contour_error_um
+from fdhil.prediction.behind_motor import ahead_of_motor_mm
 from fdhil.records import Float, Parameters, Reason, rms
 from fdhil.store.lessons import lesson_path, read_lesson, write_lesson
 
@@ -77,6 +78,19 @@ def taught(checked: CheckedProgram, request: ArmRequest, machine: str) -> tuple[
     total = {axis: offset + known.offset_um[axis] for axis, offset in offset_um.items()}
     fitting = fit_all(total, config.axis, config.machine.sync_period_s)
     return _with_offsets(checked, demand_mm, fitting, known, config), pupil
+
+
+def ahead_of_motors_mm(checked: CheckedProgram, request: ArmRequest) -> Float | None:
+    """Return table less motor (n, axes) along a whole program, as its models have it; None where they have no spring.
+
+    StoreError when its rows cannot be read.
+    """
+    sprung = any(model.term("resonance") for model in request.models.values())
+    if not sprung or not checked.whole or checked.rows > MOST_ROWS:
+        return None
+    demand_mm, offset_um = _rows(checked, request.config)
+    ahead = ahead_of_motor_mm(demand_mm, offset_um, request.models, request.config)
+    return np.column_stack([ahead.get(axis, np.zeros(checked.rows)) for axis in checked.axes])
 
 
 def _rows(checked: CheckedProgram, config: MachineConfig) -> tuple[dict[str, Float], dict[str, Float]]:

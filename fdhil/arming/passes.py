@@ -68,9 +68,13 @@ class Passes:
         rows: int | None,
         models: Mapping[str, Parameters],
         pupil: Pupil | None = None,
+        ahead_mm: Float | None = None,
     ) -> None:
-        """A program is about to be armed: the first rows of its table in increments, how many there are, who learns."""
-        self._running = Pass(self._config, demand, rows, pupil)
+        """A program is about to be armed: the first rows of its table in increments, how many there are, who learns.
+
+        ``ahead_mm`` (n, axes) is what the tables are ahead of what the encoders see, where that is known.
+        """
+        self._running = Pass(self._config, demand, rows, pupil, ahead_mm)
         self._models = models
 
     def broken(self, program_digest: str, models: Mapping[str, Parameters]) -> Reason | None:
@@ -145,9 +149,15 @@ class Pass:
     """One pass: rows of all axes of the table, joined by their ticks; ``rows`` None: to the program's end."""
 
     def __init__(
-        self, config: MachineConfig, demand: Mapping[str, Sequence[int]], rows: int | None, pupil: Pupil | None = None
+        self,
+        config: MachineConfig,
+        demand: Mapping[str, Sequence[int]],
+        rows: int | None,
+        pupil: Pupil | None = None,
+        ahead_mm: Float | None = None,
     ) -> None:
         self._pupil = pupil
+        self._ahead_mm = ahead_mm
         self._heard: list[tuple[Float, Float]] = []
         self._left = rows if rows is not None else sys.maxsize
         self._axes = tuple(demand)
@@ -216,6 +226,8 @@ class Pass:
         end = max(self._first, min(end, self._first + self._left))
         if end > self._first:
             position = self._position[self._first : end]
+            if self._ahead_mm is not None:
+                position = position + self._ahead_mm[self._rows : self._rows + len(position)]
             error = contour_error_um(self._demand, position, self._dt_s, self._first)
             self._rows, self._left = self._rows + error.size, self._left - error.size
             self._squares += float(error @ error)

@@ -189,3 +189,20 @@ def test_a_spread_below_the_digits_is_not_zero() -> None:
     assert plus_minus(0.004) == "± <0.1"
     assert plus_minus(0.0) == "± <0.1"
     assert plus_minus(0.004, 2) == "± <0.01"
+
+
+def test_a_table_behind_a_known_spring_is_measured_where_it_is(
+    config: MachineConfig, armament: Armament, planned: Correction
+) -> None:
+    """What the model says that the table is ahead of its motor is added to what the motor's encoder shows."""
+    reference = planned.before.reference
+    rows = reference.time_s.size
+    ahead = np.column_stack([5e-3 * np.sin(2 * np.pi * 2.0 * reference.time_s), np.zeros(rows)])
+    motor = {axis: reference.position_mm[axis] - ahead[:, k] for k, axis in enumerate("XY")}
+    for known, largest_um in ((ahead, 1e-3), (None, 6.0)):
+        running = Pass(config, armament.begin.demand, armament.rows, None, known)
+        for block in sorted(heard(reference.position_mm, motor), key=lambda block: int(block.tick[-1])):
+            running.take(block)
+        told = running.measured()
+        assert told is not None
+        assert 0.1 * largest_um * (known is None) <= told["measured"]["max_um"] <= largest_um
