@@ -43,7 +43,7 @@ def conduct(
     changed = [
         f" --{key.replace('_', '-')} {' '.join(map(str, value)) if isinstance(value, list) else value}"
         for key, value in vars(options).items()
-        if key not in ("processes", "out") and value != parser.get_default(key)
+        if key not in ("processes", "out", "folder") and value != parser.get_default(key)
     ]
     run = provenance(f"python -m studies.{name}{''.join(changed)}") | {"seeds": seeds(options)}
     document = {"study": name, "run": run, "figures": plain(measure(options))}
