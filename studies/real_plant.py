@@ -131,6 +131,7 @@ SLOW_LOOPS = Loops(
     current_kp=2 * np.pi * 400 * 0.003,
     current_ki=2 * np.pi * 400 * 0.35,
 )
+RATED_NM = (11.0, 40.0)  # of the slow axis and of the bench's
 # as the public record of a ball-screw axis: a P-P cascade without feed-forward, current and position at 1 kHz
 SCREW = Mechanics(static=-0.2, static_speed_rad_s=20.0, asymmetry=0.15, load_nm=0.6)
 
@@ -367,10 +368,9 @@ def drawn(rng: np.random.Generator, base: Mechanics, share: float = 1.0) -> tupl
         load_nm=float(0.5 * base.Cd * level[2] * rng.choice((-1.0, 1.0))),
         screw_ripple=float(0.1 * level[3]),
         screw_phase=float(rng.uniform(0, 2 * np.pi)),
-        motor_ripple_nm=float(0.02 * base.K * 50 * level[4]),
+        motor_ripple_nm=float(0.02 * RATED_NM[base.Cd > 3] * level[4]),
         motor_order=int(rng.choice((4, 12, 24))),
         resonance_hz=float(rng.uniform(90.0, 300.0)),
-        warming=float(0.02 * level[5]),
     )
     loops = replace(
         SLOW_LOOPS if base.Cd < 3 else Loops(), dead_time_v=float(2.0 * level[6]), bus_sag=float(0.03 * level[7])

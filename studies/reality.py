@@ -41,6 +41,7 @@ from studies.real_plant import (
     ORDINARY_LOOPS,
     ORDINARY_MECHANICS,
     ORDINARY_SENSORS,
+    RATED_NM,
     SLOW,
     SLOW_LOOPS,
     Loops,
@@ -73,11 +74,14 @@ class Machine:
     told: Loops
     told_resonance_hz: float = 0.0
 
-    @property
-    def truth(self) -> Array:
-        """The six (6,) as the machine's own current sensor sees them: its gain is in no recording."""
-        gain = 1.0 + self.sensors.current_gain
-        true = np.array(list(self.mechanics.truth().values()))
+    def truth(self, direction: int = 0) -> Array:
+        """Return the six (6,) as the machine's own current sensor sees them: its gain is in no recording.
+
+        Moves in one ``direction`` alone see a constant load, and the friction of that direction, as dry friction.
+        """
+        m, gain = self.mechanics, 1.0 + self.sensors.current_gain
+        own = direction * (m.asymmetry * m.Cd + m.load_nm)
+        true = np.array([m.R, m.L, m.K, m.Jt, m.ft, m.Cd + own])
         return true * np.array([1 / gain, 1 / gain, 1.0, gain, gain, gain])
 
 
@@ -113,7 +117,7 @@ def machines(base: str) -> list[Machine]:
     """Return the machines with one effect each, and with all together."""
     m, g, *_ = BASES[base]
     s = Sensors()
-    rated = 40.0 if base == "bench" else 11.0
+    rated = RATED_NM[base == "bench"]
     scaled = {"motor_ripple_nm": rated * 0.01, "screw_ripple": 0.05}
     rows: list[tuple[str, Mechanics, Loops, Sensors]] = [
         ("none: the model's own plant", m, g, s),
@@ -294,10 +298,9 @@ def errors_of(estimate: Estimate | None, truth: Array) -> tuple[Array, Array]:
 def examine(machine: Machine, seed: int = 0) -> Found:
     """Return what is made of one machine."""
     outcomes, following_um, loops = outcomes_of(machine, seed)
-    truth = machine.truth
     settings = config_of(machine).identification
     estimate, verdict = pool(outcomes, settings)
-    told = [errors_of(o.estimate, truth) for o in outcomes if o.verdict.accepted]
+    told = [errors_of(o.estimate, machine.truth(o.window.direction)) for o in outcomes if o.verdict.accepted]
     candidates = [estimate, *(o.estimate for o in outcomes)]  # a refused model is cut with all the same
     usable = [e.parameters() for e in candidates if e is not None and _whole(e)]
     nothing = (np.nan, np.nan, np.nan, ())
@@ -310,7 +313,7 @@ def examine(machine: Machine, seed: int = 0) -> Found:
         len(outcomes),
         sum(o.verdict.accepted for o in outcomes),
         verdict.accepted,
-        *errors_of(estimate, truth),
+        *errors_of(estimate, machine.truth()),
         np.array([e for e, _ in told]).reshape(-1, 6),
         np.array([d for _, d in told]).reshape(-1, 6),
         float(np.mean(left)) if left else None,
