@@ -11,7 +11,7 @@ from importlib import import_module
 
 from studies.pages import FOLDER, write_page
 
-STUDIES = ("estimators", "comparison", "drift", "verdicts", "slow_sensor", "guard_invariants")
+STUDIES = ("estimators", "comparison", "drift", "verdicts", "slow_sensor", "reality", "guard_invariants")
 
 
 def main() -> None:
