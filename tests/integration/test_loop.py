@@ -22,12 +22,12 @@ TRUE = {"R": 0.5, "L": 0.005, "K": 0.8, "Jt": 0.075, "ft": 0.05, "Cd": 5.0}
 SETTLED_ROWS = 500  # after the last rapid: it becomes a window when its axis has stood for a while
 
 
-def settled(records: list[Any], axis: str, rapids: int) -> bool:
+def settled(records: list[Any], axis: str, rapids: int, rows: int = SETTLED_ROWS) -> bool:
     """Whether all rapids of an axis are over, and it has stood for a while: records come later than the NC tells."""
     rests = [r.tick for r in records if isinstance(r, MoveEvent) and r.axis == axis and r.kind is MoveKind.REST]
     blocks = (r for r in reversed(records) if isinstance(r, AxisSamples) and r.axis == axis and r.tick.size)
     newest = next((int(block.tick[-1]) for block in blocks), 0)
-    return len(rests) == rapids and newest >= rests[-1] + SETTLED_ROWS
+    return len(rests) == rapids and newest >= rests[-1] + rows
 
 
 async def recorded(bench: Bench, program: Path) -> tuple[list[Any], dict[str, int]]:
