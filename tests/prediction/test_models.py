@@ -42,7 +42,7 @@ def test_reads_what_it_should(tmp_path: Path) -> None:
         ({"Jt": None}, "X.Jt: must be a number, not None"),
         ({"ft": True}, "X.ft: must be a number"),
         ({"J": 0.07}, "did you mean 'Jt'"),
-        ({"terms": {"laod": 1.0}}, "X.terms.laod: is no parameter (did you mean 'load'?)"),
+        ({"terms": {"loadd": 1.0}}, "X.terms.loadd: is no parameter (did you mean 'load'?)"),
         ({"terms": {"Cd": 1.0}}, "X.terms.Cd: is no parameter"),
         ({"terms": {"load": "2"}}, "X.terms.load: must be a number, not '2' (in N.m)"),
         ({"terms": {"viscous_positive": -0.1}}, "X.terms.viscous_positive: must be at least 0"),

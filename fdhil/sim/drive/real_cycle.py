@@ -6,7 +6,7 @@ Two masses, motor with screw and table, or one where the screw is stiff (x: spee
     Jm dw/dt   = K i - spring - ripples - friction       spring = k d + c (w - wt), d = a - at beyond the backlash
     Jt' dwt/dt = spring - load - friction
 
-Dry friction sticks, or hangs on bristles z (LuGre: Canudas de Wit, Olsson, Astrom, Lischinsky 1995):
+Dry friction sticks, or hangs on bristles z (LuGre: Canudas and others 1995):
 
     level   = C (1 +- asymmetry) (1 + ripple sin a) (1 + static exp(-(w/ws)^2))
     F       = level sign(w)      or      s0 z + s1 dz/dt,   dz/dt = w - s0 |w| z / level
