@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,14 +39,8 @@ def demo(out: Path, realtime: bool, as_json: bool) -> int:
         if not as_json or sys.stderr.isatty():
             click.echo(text, err=as_json)
 
-    def beside(text: str) -> None:
-        say(f"realistic machine: {text}")
-
-    with ThreadPoolExecutor(1) as executor:
-        # on the host's clock both machines at once would be late
-        second = None if realtime else executor.submit(run_realistic, out / "realistic", realtime, beside)
-        loop = run_loop(out, realtime, say)
-        realistic = run_realistic(out / "realistic", realtime, beside) if second is None else second.result()
+    loop = run_loop(out, realtime, say)
+    realistic = run_realistic(out / "realistic", realtime, say)
     report = out / "report.html"
     write(page(loop, [realistic_page.headline(realistic)], [realistic_page.section(realistic)]), report)
     if as_json:

@@ -45,7 +45,7 @@ class Realistic:
 
 def run_realistic(out: Path, realtime: bool, say: Say) -> Realistic:
     """Shuttle, identify and cut below ``out``; FdhilError when a step fails, while a refusal is an answer."""
-    say("it has what real ones have: friction, weight, ripples, a soft screw, an inverter")
+    say("once more on a machine with what real ones have: friction, weight, ripples, a soft screw, an inverter")
     with running(out, realtime, say, machine_document(REAL)) as stage:
         say("shuttling both axes at rapid speed, listening")
         play_shuttle(stage)
