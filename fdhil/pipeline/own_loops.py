@@ -22,8 +22,12 @@ def loops_of(
     axis: Axis | None,
     settings: Identification,
     sync_period_s: float | None = None,
+    *,
+    growing: bool = True,
 ) -> LoopEstimate | None:
     """Return the loops of a drive as the windows show them that were analysed; None where they show none.
+
+    Without ``growing`` no other keys are tried than those that are configured.
 
     What the axis' section or a window's own estimate does not tell of the winding is made up: the current loop hides
     it. Windows that are believed go before the others, and a section that is another machine's is none.
@@ -33,7 +37,8 @@ def loops_of(
     known = [(o, plant) for o, plant in told if plant is not None]
     believed = [(o, plant) for o, plant in known if o.verdict.accepted]
     chosen = believed or known
-    return identify_loops([o.window for o, _ in chosen], [p for _, p in chosen], axis, settings, sync_period_s)
+    windows, plants = [o.window for o, _ in chosen], [p for _, p in chosen]
+    return identify_loops(windows, plants, axis, settings, sync_period_s, growing=growing)
 
 
 def mechanics_of(outcome: WindowOutcome, axis: Axis | None) -> Parameters | None:
@@ -62,8 +67,8 @@ def better_axis(axis: Axis | None, found: LoopEstimate | None) -> Axis | None:
 class OwnLoops:
     """An axis' own loops as its rapids come one by one: each is analysed through the best that are known.
 
-    They are sought once after the first ``ENOUGH`` rapids, so that they are told, and where a rapid is refused that was
-    replayed: at once, and each time after twice as many refused rapids as before, since it takes long.
+    They are fitted once after the first ``ENOUGH`` rapids, so that they are told, and sought where a rapid is
+    refused that was replayed: at once, and each time after twice as many refused rapids as before, since it takes long.
     """
 
     def __init__(
@@ -94,7 +99,7 @@ class OwnLoops:
             self._refused, self._due = 0, 2 * self._due
         elif self._seen != ENOUGH:
             return outcome, None
-        found = loops_of(tuple(self._outcomes), self._configured, self._settings, self._period_s)
+        found = loops_of(tuple(self._outcomes), self._configured, self._settings, self._period_s, growing=wanted)
         better = better_axis(self._configured, found)
         if better is not None:
             self.axis = better
