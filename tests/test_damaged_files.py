@@ -18,7 +18,7 @@ from fdhil.arming.token import TOKEN_NAME, ensure_token, read_token
 from fdhil.config import Nc
 from fdhil.errors import ConfigError, FdhilError, ProgramError
 from fdhil.guard.settings import load, to_json
-from fdhil.prediction.models import load_models
+from fdhil.prediction.models import load_model_file
 from fdhil.program import Budget, interpret
 from fdhil.sim import fault_script
 from tests.guard.machine import settings
@@ -54,7 +54,7 @@ def test_no_flipped_bit_of_the_guards_settings_is_believed(tmp_path: Path) -> No
             load(path)
 
 
-@pytest.mark.parametrize("read", [load, load_models])
+@pytest.mark.parametrize("read", [load, load_model_file])
 @pytest.mark.parametrize("text", HOSTILE.values(), ids=HOSTILE)
 def test_a_hostile_document_is_a_config_error(text: str, read: Callable[[Path], object], tmp_path: Path) -> None:
     """The guard's settings and a model file: whatever they hold, a sentence of bounded length."""
@@ -73,7 +73,7 @@ def test_a_model_file_with_a_flipped_bit_is_numbers_or_a_config_error(tmp_path: 
     for flipped in flips(json.dumps({"X": values, "Y": values}).encode(), 1000, 2):
         path.write_bytes(flipped)
         try:
-            models = load_models(path)
+            models = load_model_file(path).parameters
         except ConfigError:
             refused += 1
             continue

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fdhil.identification.between import ALIKE, Between, Member
+from fdhil.identification.between import Between, Member
 from fdhil.identification.covariance import aliasing
 from fdhil.identification.ripple_parts import as_amplitude, as_parts
 from fdhil.records import PARAMETERS, Estimate, Float, Int, Window, frozen
@@ -34,18 +34,6 @@ def member(window: Window, estimate: Estimate, place: int = 0) -> Member:
     names = tuple(estimate.names[k] for k in kept)
     values, own, doubts = as_parts(names, estimate.values[kept], own[np.ix_(kept, kept)], doubts[kept])
     return Member(names, values, own, doubts, place, window.direction)
-
-
-def weighted(told: Sequence[tuple[Window, Estimate]]) -> Estimate | None:
-    """Return the estimates weighted by the inverse covariance of each window's own chance; None when one lacks a value.
-
-    What windows share (the systematic part, and what instants of the voltage miss) does not average away: it goes
-    through the same weights.
-    """
-    members = [member(window, estimate, k) for k, (window, estimate) in enumerate(told)]
-    if any(not set(PARAMETERS) <= set(m.names) for m in members):
-        return None
-    return pooled(members, told[0][1], ALIKE, joining=False)
 
 
 def pooled(members: Sequence[Member], first: Estimate, apart: Between, *, joining: bool = True) -> Estimate:

@@ -50,11 +50,6 @@ def nominal_models(config: MachineConfig) -> dict[str, Parameters]:
     return {name: Parameters(**axis.nominal.model_dump()) for name, axis in config.axis.items()}
 
 
-def load_models(path: Path) -> dict[str, Parameters]:
-    """Read the parameters of a model file; ConfigError with all its faults."""
-    return load_model_file(path).parameters
-
-
 def load_model_file(path: Path) -> ModelFile:
     """Read a model file; ConfigError with all its faults: missing or unknown keys, no numbers, negative values."""
     try:

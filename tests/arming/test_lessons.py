@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fdhil import correction
 from fdhil.arming import passes
 from fdhil.arming.standstill import Standstill
 from fdhil.config import MachineConfig
 from fdhil.config.controller import Correction as Learning
-from fdhil.program import load_trajectory
 from fdhil.records import Correction
 from tests.arming.mill import Mill
 from tests.arming.test_ahead import opened
 from tests.arming.test_passes import heard, measured
-from tests.arming.test_preparing import GENTLE, save_records
+from tests.arming.test_preparing import save_records
 from tests.daemon.machine import config_of
-from tests.store.made import published
 
 WAVE_MM = 2e-3
 
@@ -32,31 +28,6 @@ def config(tmp_path: Path) -> MachineConfig:
     config = config_of(tmp_path, ("X", "Y")).model_copy(update={"correction": Learning(learning=True)})
     save_records(config)
     return config
-
-
-@pytest.fixture
-def mill(config: MachineConfig) -> Iterator[Mill]:
-    """The guard."""
-    assert config.store.run_directory is not None
-    config.store.run_directory.mkdir(parents=True)
-    made = Mill(config.store.run_directory)
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def program(tmp_path: Path) -> Path:
-    """A corner."""
-    path = tmp_path / "gentle.ngc"
-    path.write_text(GENTLE)
-    return path
-
-
-@pytest.fixture
-def planned(config: MachineConfig, program: Path) -> Correction:
-    """The corner, planned."""
-    models = {axis: published().parameters for axis in "XY"}
-    return correction.plan(load_trajectory(program, config), models, config)
 
 
 async def test_the_next_pass_carries_what_the_last_one_taught(

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdhil import correction
 from fdhil.arming import passes
 from fdhil.arming.desk import ArmingDesk
 from fdhil.arming.passes import Pass
@@ -19,13 +18,11 @@ from fdhil.arming.preparing import Armament
 from fdhil.config import MachineConfig
 from fdhil.prediction import contour_error_um
 from fdhil.prediction.gain import Gain, plus_minus
-from fdhil.program import load_trajectory
 from fdhil.records import AxisSamples, Correction, Float, Skill, frozen, frozen_ints
 from tests.arming.mill import Mill
 from tests.arming.test_ahead import opened
-from tests.arming.test_preparing import GENTLE, save_records, whole
+from tests.arming.test_preparing import save_records, whole
 from tests.daemon.machine import config_of
-from tests.store.made import published
 
 REST_ROWS = 300
 
@@ -39,36 +36,11 @@ def config(tmp_path: Path) -> MachineConfig:
 
 
 @pytest.fixture
-def mill(config: MachineConfig) -> Iterator[Mill]:
-    """The guard."""
-    assert config.store.run_directory is not None
-    config.store.run_directory.mkdir(parents=True)
-    made = Mill(config.store.run_directory)
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def program(tmp_path: Path) -> Path:
-    """A corner."""
-    path = tmp_path / "gentle.ngc"
-    path.write_text(GENTLE)
-    return path
-
-
-@pytest.fixture
 def armament(config: MachineConfig, program: Path) -> Armament:
     """The corner, ready for the guard."""
     found = whole(program, config)
     assert isinstance(found, Armament)
     return found
-
-
-@pytest.fixture
-def planned(config: MachineConfig, program: Path) -> Correction:
-    """The corner, planned."""
-    models = {axis: published().parameters for axis in "XY"}
-    return correction.plan(load_trajectory(program, config), models, config)
 
 
 def heard(demand: Mapping[str, Float], position: Mapping[str, Float]) -> Iterator[AxisSamples]:

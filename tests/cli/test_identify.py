@@ -26,19 +26,21 @@ def shuttle(tmp_path: Path) -> Path:
     return path
 
 
-def _invoke(*arguments: object) -> Result:
+def invoke(*arguments: object) -> Result:
+    """Run ``fdhil identify`` with these arguments."""
     return CliRunner().invoke(cli, ["identify", *map(str, arguments)], standalone_mode=False)
 
 
-def _document(result: Result) -> dict[str, Any]:
+def told_document(result: Result) -> dict[str, Any]:
+    """Return the JSON document that it wrote."""
     document: dict[str, Any] = json.loads(result.stdout)
     return document
 
 
 def test_json_holds_every_window_and_the_pool(shuttle: Path) -> None:
-    result = _invoke(shuttle, "--json")
+    result = invoke(shuttle, "--json")
     assert result.return_value == 0
-    document = _document(result)
+    document = told_document(result)
     assert document["schema"] == "fdhil-identify-1"
     (told,) = document["files"]
     assert (told["file"], told["axis"]) == (str(shuttle), "X")
@@ -64,22 +66,22 @@ def test_json_holds_every_window_and_the_pool(shuttle: Path) -> None:
 def test_the_delay_of_a_slow_sensor_is_told_with_its_deviation(tmp_path: Path) -> None:
     path = tmp_path / "slow.csv"
     export_csv(slow_windows(0.005, delay_s=0.0012)[0], path)
-    result = _invoke(path, "--json")
+    result = invoke(path, "--json")
     assert result.return_value == 0
-    (window,) = _document(result)["files"][0]["windows"]
+    (window,) = told_document(result)["files"][0]["windows"]
     assert set(window["delay_s"]) == {"value", "std", "unit"}
     assert window["delay_s"]["unit"] == "s"
     assert abs(window["delay_s"]["value"] - 0.0012) < 4 * window["delay_s"]["std"] < 2e-4
-    assert "voltage is late by 1.2" in _invoke(path).stdout
+    assert "voltage is late by 1.2" in invoke(path).stdout
 
 
 @pytest.mark.parametrize("method", ["least_squares", "maximum_likelihood"])
 def test_method_is_obeyed(shuttle: Path, method: str) -> None:
-    assert _invoke(shuttle, "--json", "--method", method).return_value == 0
+    assert invoke(shuttle, "--json", "--method", method).return_value == 0
 
 
 def test_people_get_a_table(shuttle: Path) -> None:
-    result = _invoke(shuttle)
+    result = invoke(shuttle)
     assert result.return_value == 0
     assert "all 2" in result.stdout
     assert "g.m2" in result.stdout
@@ -87,7 +89,7 @@ def test_people_get_a_table(shuttle: Path) -> None:
 
 def test_the_table_fits_a_terminal_of_80_columns(shuttle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    lines = _invoke(shuttle).stdout.splitlines()
+    lines = invoke(shuttle).stdout.splitlines()
     assert max(map(len, lines[1:])) <= 80
     assert any(line.split()[-1:] == ["valid"] for line in lines)
     assert not any("\N{HORIZONTAL ELLIPSIS}" in line for line in lines)
@@ -96,15 +98,15 @@ def test_the_table_fits_a_terminal_of_80_columns(shuttle: Path, monkeypatch: pyt
 def test_refused_is_exit_1_with_null_values(tmp_path: Path) -> None:
     path = tmp_path / "still.csv"
     path.write_text(bench.as_csv(bench.run(bench.Plant(), bench.shuttle(distance=0.02, speed=0.1)), 0.003))
-    result = _invoke(path, "--json")
+    result = invoke(path, "--json")
     assert result.return_value == 1
-    (told,) = _document(result)["files"]
+    (told,) = told_document(result)["files"]
     assert told["windows"] == []
     assert told["pooled"]["windows_used"] == 0
     assert told["pooled"]["reasons"][0].startswith("NoWindow")
     assert told["pooled"]["parameters"]["R"]["value"] is None
     assert "reason" in told["pooled"]["parameters"]["R"]
-    assert "NoWindow" in _invoke(path).stdout
+    assert "NoWindow" in invoke(path).stdout
 
 
 def test_config_gives_the_rapid_speed(shuttle: Path, tmp_path: Path) -> None:
@@ -114,8 +116,8 @@ def test_config_gives_the_rapid_speed(shuttle: Path, tmp_path: Path) -> None:
     fast = tmp_path / "fast.toml"
     config.write_text(_config(500.0))
     fast.write_text(_config(2000.0))
-    assert len(_document(_invoke(shuttle, "--json", "--config", config))["files"][0]["windows"]) == 2
-    assert _document(_invoke(shuttle, "--json", "--config", fast))["files"][0]["windows"] == []
+    assert len(told_document(invoke(shuttle, "--json", "--config", config))["files"][0]["windows"]) == 2
+    assert told_document(invoke(shuttle, "--json", "--config", fast))["files"][0]["windows"] == []
 
 
 def _config(rapid: float) -> str:
@@ -126,9 +128,9 @@ def test_one_bad_recording_does_not_end_a_batch(shuttle: Path, tmp_path: Path) -
     """The others are identified; the bad one has its error in the document, in the table and on stderr."""
     bad, absent = tmp_path / "bad.csv", tmp_path / "absent.csv"
     bad.write_bytes(b"time_s,voltage_V\n1,two\n")
-    result = _invoke(bad, shuttle, absent, "--json")
+    result = invoke(bad, shuttle, absent, "--json")
     assert result.return_value == 3
-    first, good, last = _document(result)["files"]
+    first, good, last = told_document(result)["files"]
     assert good["pooled"]["validated"] is True
     assert "error" not in good
     for told, path in ((first, bad), (last, absent)):
@@ -139,7 +141,7 @@ def test_one_bad_recording_does_not_end_a_batch(shuttle: Path, tmp_path: Path) -
         assert told["pooled"]["parameters"]["R"]["value"] is None
         assert told["pooled"]["reasons"] == [f"RecordingError: {told['error']['text']}"]
         assert told["error"]["class"] == "RecordingError"
-    shown = _invoke(bad, shuttle, absent)
+    shown = invoke(bad, shuttle, absent)
     assert shown.return_value == 3
     assert "all 2" in shown.stdout
     assert " ".join(shown.stdout.split()).count("not identified") == 2

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import click
 import pytest
-from click.testing import CliRunner, Result
 
-from fdhil.cli.main import cli
-from fdhil.prediction.models import load_models
+from fdhil.prediction.models import load_model_file
 from studies import bench
 from tests.bench import bench_toml
+from tests.cli.test_identify import invoke, told_document
 from tests.identification.deaf import SCREW, SECTION, screw_csv
 from tests.identification.recorded import signals
 
@@ -32,19 +30,10 @@ def machine(tmp_path: Path) -> Path:
     return path
 
 
-def _invoke(*arguments: object) -> Result:
-    return CliRunner().invoke(cli, ["identify", *map(str, arguments)], standalone_mode=False)
-
-
-def _document(result: Result) -> dict[str, Any]:
-    document: dict[str, Any] = json.loads(result.stdout)
-    return document
-
-
 def test_r_and_l_are_null_k_is_given_and_terms_are_told(deaf: Path) -> None:
-    result = _invoke(deaf, "--json")
+    result = invoke(deaf, "--json")
     assert result.return_value == 0
-    (told,) = _document(result)["files"]
+    (told,) = told_document(result)["files"]
     pooled = told["pooled"]
     assert (pooled["validated"], pooled["windows_used"]) == (True, 4)
     for name in ("R", "L"):
@@ -58,7 +47,7 @@ def test_r_and_l_are_null_k_is_given_and_terms_are_told(deaf: Path) -> None:
         assert window["validated"] is True
         assert window["fit_percent"] is None
         assert {"terms", "unexplained_um", "warnings"} <= set(window)
-    shown = _invoke(deaf).stdout
+    shown = invoke(deaf).stdout
     assert "(given)" in shown
     assert "terms of all: load -0.0" in shown
 
@@ -66,10 +55,10 @@ def test_r_and_l_are_null_k_is_given_and_terms_are_told(deaf: Path) -> None:
 def test_the_config_gives_what_the_recording_does_not(deaf: Path, machine: Path) -> None:
     text = deaf.read_text()
     deaf.write_text("".join(x for x in text.splitlines(keepends=True) if "torque_constant" not in x))
-    alone = _invoke(deaf, "--json")
+    alone = invoke(deaf, "--json")
     assert alone.return_value == 1
-    assert "torque_constant_nm_per_a" in _invoke(deaf).stdout
-    told = _document(_invoke(deaf, "--json", "--config", machine))["files"][0]["pooled"]["parameters"]
+    assert "torque_constant_nm_per_a" in invoke(deaf).stdout
+    told = told_document(invoke(deaf, "--json", "--config", machine))["files"][0]["pooled"]["parameters"]
     assert told["K"]["value"] == 0.33
     assert told["R"]["value"] is None
     assert told["Jt"]["value"] == pytest.approx(SCREW.Jt * 0.33 / SCREW.K, rel=0.01)
@@ -77,11 +66,11 @@ def test_the_config_gives_what_the_recording_does_not(deaf: Path, machine: Path)
 
 def test_a_model_file_is_written_that_predict_reads(deaf: Path, machine: Path, tmp_path: Path) -> None:
     out = tmp_path / "model.json"
-    without = _invoke(deaf, "--write-model", out).exception
+    without = invoke(deaf, "--write-model", out).exception
     assert isinstance(without, click.UsageError)
     assert "R and L of axis X" in str(without)
     assert not out.exists()
-    assert _invoke(deaf, "--config", machine, "--write-model", out).return_value == 0
+    assert invoke(deaf, "--config", machine, "--write-model", out).return_value == 0
     written = json.loads(out.read_text())["X"]
     assert (written["R"], written["L"], written["K"]) == (0.6, 0.003, SCREW.K)
     assert written["Cd"] == pytest.approx(SCREW.Cd, rel=0.06)
@@ -91,10 +80,10 @@ def test_a_model_file_is_written_that_predict_reads(deaf: Path, machine: Path, t
 def test_a_whole_model_needs_no_config_and_none_is_written_without_a_validated_pool(tmp_path: Path) -> None:
     recording, out = tmp_path / "shuttle.csv", tmp_path / "model.json"
     recording.write_text(bench.as_csv(bench.run(bench.Plant(), bench.shuttle(distance=0.02, speed=0.1)), 0.003))
-    refused = _invoke(recording, "--write-model", out)
+    refused = invoke(recording, "--write-model", out)
     assert refused.return_value == 1
     assert "is not written" in refused.stderr
     assert not out.exists()
     recording.write_text(bench.as_csv(signals(moves=2), 0.003))
-    assert _invoke(recording, "--write-model", out).return_value == 0
-    assert load_models(out)["X"].Jt == pytest.approx(0.075, rel=0.01)
+    assert invoke(recording, "--write-model", out).return_value == 0
+    assert load_model_file(out).parameters["X"].Jt == pytest.approx(0.075, rel=0.01)

@@ -10,9 +10,10 @@ from scipy.signal import lfilter
 
 from fdhil import tables
 from fdhil.config import Identification
+from fdhil.identification.between import ALIKE
 from fdhil.identification.estimators import Estimator, chosen, least_squares, maximum_likelihood
 from fdhil.identification.normal import inverse_of
-from fdhil.identification.pooling import weighted
+from fdhil.identification.pooling import member, pooled
 from fdhil.identification.windows import find_windows
 from fdhil.records import PARAMETERS, Estimate, Float, Result, Window, frozen
 from fdhil.store.recording_csv import parse_recording
@@ -176,8 +177,9 @@ def test_what_may_be_the_voltages_course_is_a_doubt_and_no_delay(share: float) -
     late = [_late(window, share) for window in windows(0.0002, moves=4)]
     one = maximum_likelihood.estimate(late[:1], SETTINGS)
     all_four = maximum_likelihood.estimate(late, SETTINGS)
-    averaged = weighted([(window, maximum_likelihood.estimate([window], SETTINGS)) for window in late])
-    assert averaged is not None
+    alone = [maximum_likelihood.estimate([window], SETTINGS) for window in late]
+    members = [member(*told, k) for k, told in enumerate(zip(late, alone, strict=True))]
+    averaged = pooled(members, alone[0], ALIKE, joining=False)
     for estimate in (one, all_four, averaged):
         assert estimate.delay_s is None
         apart = np.abs(estimate.values - TRUTH) / np.sqrt(np.diag(estimate.covariance))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fdhil.errors import ConfigError
-from fdhil.prediction.models import load_model_file, load_models, models_for, nominal_models, with_loops
+from fdhil.prediction.models import load_model_file, models_for, nominal_models, with_loops
 from tests.bench import bench_config
 from tests.paths import trajectory
 
@@ -26,7 +26,7 @@ def write(folder: Path, text: str) -> Path:
 
 def test_reads_what_it_should(tmp_path: Path) -> None:
     """Six numbers per axis; a friction may be 0."""
-    models = load_models(write(tmp_path, json.dumps({"X": GOOD, "Y": GOOD})))
+    models = load_model_file(write(tmp_path, json.dumps({"X": GOOD, "Y": GOOD}))).parameters
     assert models["X"].Cd == 5.0
     assert set(models) == {"X", "Y"}
 
@@ -59,7 +59,7 @@ def test_reads_what_it_should(tmp_path: Path) -> None:
 def test_names_the_fault(tmp_path: Path, change: dict[str, Any], message: str) -> None:
     """Each wrong value is named with its axis and key."""
     with pytest.raises(ConfigError) as caught:
-        load_models(write(tmp_path, json.dumps({"X": GOOD | change})))
+        load_model_file(write(tmp_path, json.dumps({"X": GOOD | change})))
     assert message in str(caught.value)
 
 
@@ -111,13 +111,13 @@ def test_a_configured_resonance_is_in_the_model() -> None:
 def test_refuses_other_files(tmp_path: Path, text: str) -> None:
     """What is no model file is a config error, never another exception."""
     with pytest.raises(ConfigError):
-        load_models(write(tmp_path, text))
+        load_model_file(write(tmp_path, text))
 
 
 def test_all_faults_at_once(tmp_path: Path) -> None:
     """Not only the first fault is told."""
     with pytest.raises(ConfigError) as caught:
-        load_models(write(tmp_path, json.dumps({"X": {"R": -1}, "Y": 2})))
+        load_model_file(write(tmp_path, json.dumps({"X": {"R": -1}, "Y": 2})))
     assert len(caught.value.faults) == 7
 
 

@@ -1,0 +1,41 @@
+"""What the tests of passes share: the guard's stand-in, a corner to be cut, and its plan."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fdhil import correction
+from fdhil.config import MachineConfig
+from fdhil.program import load_trajectory
+from fdhil.records import Correction
+from tests.arming.mill import Mill
+from tests.arming.test_preparing import GENTLE
+from tests.store.made import published
+
+
+@pytest.fixture
+def mill(config: MachineConfig) -> Iterator[Mill]:
+    """The guard."""
+    assert config.store.run_directory is not None
+    config.store.run_directory.mkdir(parents=True)
+    made = Mill(config.store.run_directory)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def program(tmp_path: Path) -> Path:
+    """A corner."""
+    path = tmp_path / "gentle.ngc"
+    path.write_text(GENTLE)
+    return path
+
+
+@pytest.fixture
+def planned(config: MachineConfig, program: Path) -> Correction:
+    """The corner, planned."""
+    models = {axis: published().parameters for axis in "XY"}
+    return correction.plan(load_trajectory(program, config), models, config)
