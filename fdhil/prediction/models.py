@@ -28,6 +28,7 @@ LARGEST, SMALLEST = 1e12, 1e-12
 _MAY_BE_ZERO = ("ft", "Cd", "coulomb_positive", "coulomb_negative", "viscous_positive", "viscous_negative",
                 "resonance_damping")  # fmt: skip
 _ABOVE_ZERO = ("R", "L", "K", "Jt", "stribeck_speed", "resonance")
+_LEAST_SHARE = 0.01  # of the inertia before and behind a spring: with less there is no second mass
 _TABLES = ("terms", "loops")
 TERMS = ("load", "coulomb_positive", "coulomb_negative", "viscous_positive", "viscous_negative", "stribeck",
          "stribeck_speed", "ripple_screw_1", "ripple_screw_1_phase", "ripple_motor_1", "ripple_motor_1_phase",
@@ -155,6 +156,8 @@ def _fault(name: str, value: Any) -> str | None:
         return f"must be above 0, not {_shown(value)}"
     if name in _MAY_BE_ZERO and value < 0:
         return f"must be at least 0, not {_shown(value)}"
+    if name == "resonance_share" and not _LEAST_SHARE <= value <= 1 - _LEAST_SHARE:
+        return f"must be from {_LEAST_SHARE} to {1 - _LEAST_SHARE}, not {_shown(value)}"
     return None
 
 

@@ -72,7 +72,15 @@ def _responses(
     *offsets: Mapping[str, Float] | None,
 ) -> Mapping[str, Response]:
     check_axes(reference, models, config)
-    return simulate_axes(models, config.axis, reference.dt_s, reference.position_mm, *offsets)
+    responses = simulate_axes(models, config.axis, reference.dt_s, reference.position_mm, *offsets)
+    faults = [
+        ConfigFault(f"model.{axis}", "is of no drive: run along the path it overflows", "look at its values and terms")
+        for axis, response in responses.items()
+        if not np.isfinite(response.end).all()
+    ]
+    if faults:
+        raise ConfigError("prediction", faults)
+    return responses
 
 
 def _contour(reference: Trajectory, responses: Mapping[str, Response]) -> Float:

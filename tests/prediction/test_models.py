@@ -46,6 +46,8 @@ def test_reads_what_it_should(tmp_path: Path) -> None:
         ({"terms": {"Cd": 1.0}}, "X.terms.Cd: is no parameter"),
         ({"terms": {"load": "2"}}, "X.terms.load: must be a number, not '2' (in N.m)"),
         ({"terms": {"viscous_positive": -0.1}}, "X.terms.viscous_positive: must be at least 0"),
+        ({"terms": {"resonance": 80, "resonance_share": 1.0}}, "X.terms.resonance_share: must be from 0.01 to 0.99"),
+        ({"terms": {"resonance": 80, "resonance_share": 0}}, "X.terms.resonance_share: must be from 0.01 to 0.99"),
         ({"terms": {"stribeck": 1.0}}, "X.terms.stribeck: needs stribeck_speed beside it"),
         ({"terms": {"stribeck": 1.0, "stribeck_speed": 0}}, "X.terms.stribeck_speed: must be above 0"),
         ({"terms": {"stribeck": -6.0, "stribeck_speed": 5}}, "X.terms.stribeck: takes more from the dry friction"),

@@ -149,3 +149,10 @@ def test_one_axis_alone() -> None:
     demand = bench_trajectory(10).position_mm["Y"][:, None]
     prediction = predict(trajectory(np.asarray(demand), "Y"), MODELS, CONFIG)
     assert prediction.contour_um.max() < np.abs(prediction.error_um["Y"]).max()
+
+
+def test_a_model_that_overflows_is_told() -> None:
+    reference = bench_trajectory(10)
+    wild = MODELS | {"X": MODELS["X"].changed(viscous_positive=1e9)}
+    with pytest.raises(ConfigError, match="overflows"):
+        predict(reference, wild, CONFIG)
