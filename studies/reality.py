@@ -23,11 +23,11 @@ from fdhil.correction.limits import fit_all
 from fdhil.correction.planning import plan
 from fdhil.identification.loops import with_loops
 from fdhil.identification.windows import find_windows
+from fdhil.model.terms import with_resonance
 from fdhil.pipeline import analyse, pool
 from fdhil.pipeline.own_loops import better_axis, loops_of, suspected
 from fdhil.prediction.behind_motor import ahead_of_motor_mm
 from fdhil.prediction.contour import contour_error_um
-from fdhil.prediction.model_terms import with_resonance
 from fdhil.program.loading import load_trajectory
 from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Parameters, Trajectory, WindowOutcome, rms
 from studies import pages

@@ -16,6 +16,7 @@ from fdhil.identification.kalman import DELAY, SPEED
 from fdhil.identification.motion import Course
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.ripple_parts import as_amplitude
+from fdhil.identification.spring import DAMPING, DAMPING_DOUBT
 from fdhil.identification.terms import stribeck_slope
 from fdhil.records import PARAMETERS, Estimate, Float
 
@@ -30,7 +31,8 @@ def told_terms(six: Estimate, result: Fit, values: Float, beyond: Float) -> tupl
     """
     names = (*PARAMETERS, *(course.name for course in result.problem.motions[0].courses))
     assert six.systematic is not None
-    covariance, systematic, told = six.covariance, six.systematic, values
+    covariance, systematic, told = six.covariance, six.systematic, values.copy()
+    told[len(PARAMETERS) :] += [course.about for course in result.problem.motions[0].courses]
     for name, value, own, effect in _chosen_before(result):
         moved = np.pad(effect, (0, told.size - effect.size))
         wider = np.empty((told.size + 1, told.size + 1))
@@ -55,6 +57,7 @@ def _chosen_before(result: Fit) -> list[tuple[str, float, float, Float]]:
             prior = 1.0 / (SPREAD * course.speed_rad_s) ** 2
             own, effect = _marginal(result, slopes, prior)
             found.append(("stribeck_speed", course.speed_rad_s, math.hypot(own, SPACING * course.speed_rad_s), effect))
+    found += [(c.name, c.about, DAMPING_DOUBT, np.zeros(0)) for c in motions[0].known if c.name == DAMPING]
     late = motions[0].speed_late
     if late is not None:
         slopes = [[Course("speed_delay", SPEED, -np.gradient(m.speed, m.dt_s))] for m in motions]
