@@ -114,7 +114,7 @@ class Torques:
             elif course.kind == LOAD:
                 table_whole += amplitude * course.values
         size = 2 * quick_size((motion.n + math.ceil(RINGS_S / dt_s) + 1) // 2)
-        turn: Float = 2 * math.pi * np.fft.rfftfreq(size)
+        turn = np.asarray(2 * math.pi * np.fft.rfftfreq(size), dtype=np.float64)
         return cls(
             n=motion.n,
             p=(1j * turn / dt_s).astype(np.complex128),
