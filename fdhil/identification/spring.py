@@ -89,7 +89,7 @@ def _scores(base: Fit, grid: Float) -> Float:
     motion, theta = base.problem.motions[0], base.theta
     torques = Torques.of(motion, theta)
     springs = [Spring(float(hertz), USUAL_SHARE, USUAL_DAMPING) for hertz in grid]
-    columns = base.problem.answer(theta, [[Course(RESONANCE, LOAD, torques.begun(one)) for one in springs]])
+    columns = base.problem.answer(theta, [[Course(RESONANCE, LOAD, values) for values in torques.begun(springs)]])
     jacobian, inverse = base.jacobian, inverse_of(base.information)[0]
     beyond = columns - jacobian @ (inverse @ (jacobian.T @ columns))
     powers = np.maximum(np.einsum("mg,mg->g", beyond, beyond), 1e-12)

@@ -69,11 +69,11 @@ def better_axis(axis: Axis | None, found: LoopEstimate | None) -> Axis | None:
 
 
 def softened(outcomes: Sequence[WindowOutcome], axis: Axis | None, sync_period_s: float | None) -> Axis | None:
-    """Return the axis with the resonance that explains those of the outcomes that its loops do not; else None."""
-    refused = [o for o in outcomes if suspected([o])]
-    if axis is None or sync_period_s is None or not refused or own(refused[0].window, axis) is None:
+    """Return the axis with the resonance that explains outcomes that its loops do not, or all; else None."""
+    outcomes = [o for o in outcomes if suspected([o])] or outcomes
+    if axis is None or sync_period_s is None or not outcomes or own(outcomes[0].window, axis) is None:
         return None
-    told = [(o.window, mechanics_of(o, axis)) for o in refused]
+    told = [(o.window, mechanics_of(o, axis)) for o in outcomes if o.verdict.accepted or suspected([o])]
     return softer_axis([(w, plant) for w, plant in told if plant is not None], axis, sync_period_s)
 
 
@@ -137,8 +137,8 @@ class OwnLoops:
             known = self.axis.resonance_hz if self.axis is not None else None
             self.axis = better.model_copy(update={"resonance_hz": known})
             outcome = analyse(window, self._settings, self.axis, self._period_s) if wanted else outcome
-        softer = softened([*self._outcomes, outcome], self.axis, self._period_s) if suspected([outcome]) else None
-        if wanted and softer is not None:
+        softer = softened([*self._outcomes, outcome], self.axis, self._period_s)
+        if softer is not None:
             self.axis = softer
             outcome = analyse(window, self._settings, softer, self._period_s)
         return outcome, found
