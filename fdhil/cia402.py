@@ -98,6 +98,20 @@ class Object(IntEnum):
     SUPPORTED_MODES = 0x6502
 
 
+LOGICAL_AXIS_STEP = 0x800
+"""The objects of the next axis of one device lie so much higher (CiA 402-2; 0x6000 to 0x67FF are the first axis')."""
+LOGICAL_AXES = range(1, 9)
+
+
+def first_axis_index(index: int) -> int:
+    """Return the index of the same object on the first axis of its device.
+
+    >>> hex(first_axis_index(0x68B0))
+    '0x60b0'
+    """
+    return 0x6000 + (index - 0x6000) % LOGICAL_AXIS_STEP if 0x6000 <= index < 0xA000 else index
+
+
 class State(Enum):
     """States of the CiA 402 power state machine."""
 

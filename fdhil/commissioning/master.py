@@ -17,7 +17,8 @@ from fdhil import cia402
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.sdo import SdoLink
-from fdhil.drivers.cia402.profile import DriveProfile, load_profile
+from fdhil.drivers.cia402.profile import DriveProfile
+from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.errors import DeviceError, DeviceTimeout
 
 
@@ -45,7 +46,7 @@ class Master:
         settings = config.axis[axis]
         self.config, self.axis = config, axis
         self.node_id = config.node_id(axis)
-        profile = load_profile(settings.drive.profile)
+        profile = load_profile(settings.drive)
         self.profile: DriveProfile = profile.with_feedforward() if settings.feedforward else profile
         self.period_s = config.machine.sync_period_s
         self.device = f"drive {axis}"
@@ -115,10 +116,11 @@ class Master:
             target, offset, controlword, fed = self.target, self.offset, self.controlword, self.fed
         if target is None:
             return
-        values = {self.profile.target: target, self.profile.offset: offset, (0x6040, 0): controlword}
+        profile = self.profile
+        values = {profile.target: target, profile.offset: offset, profile.controlword: controlword}
         if fed is not None:
-            values |= zip((self.profile.speed_offset, self.profile.torque_offset), fed, strict=True)
-        for spec in self.profile.rpdos:
+            values |= zip((profile.speed_offset, profile.torque_offset), fed, strict=True)
+        for spec in profile.rpdos:
             if spec.valid and all((e.index, e.sub) in values for e in spec.entries):
                 data = cia402.pack(spec.entries, [values[e.index, e.sub] for e in spec.entries])
                 self.bus.send(spec.cob_base + self.node_id, data)

@@ -7,8 +7,10 @@ from itertools import pairwise
 import pytest
 
 from fdhil import tables
+from fdhil.config import Drive
 from fdhil.drivers.cia402.drive import Cia402Decoder
-from fdhil.drivers.cia402.profile import DriveProfile, load_profile
+from fdhil.drivers.cia402.profile import DriveProfile
+from fdhil.drivers.cia402.profile_file import load_profile
 from tests.drivers.wire import machine
 
 MAX_BITS = 64
@@ -17,11 +19,11 @@ MAX_BITS = 64
 @pytest.fixture(params=list(tables.DRIVE_PROFILES))
 def profile(request: pytest.FixtureRequest) -> DriveProfile:
     """A listed profile."""
-    return load_profile(str(request.param))
+    return load_profile(Drive(profile=str(request.param)))
 
 
 def test_it_is_listed_under_its_own_name(profile: DriveProfile) -> None:
-    assert load_profile(profile.name) is profile
+    assert load_profile(Drive(profile=profile.name)) is profile
 
 
 def test_what_must_be_heard_is_in_a_tpdo(profile: DriveProfile) -> None:
