@@ -30,7 +30,7 @@ from fdhil.commissioning.survey import (
 )
 from fdhil.commissioning.watchdog import watchdog_test
 from fdhil.config import CorrectionLimits, MachineConfig
-from fdhil.drivers.cia402.profile_file import load_profile, require_offset
+from fdhil.drivers.cia402.profile_file import NO_OFFSET_ADVICE, load_profile, no_offset
 from fdhil.errors import DeviceError, DriveFault, ProtocolError
 
 SIGN_TEST_UM = 10.0
@@ -251,10 +251,12 @@ def commission(
     Nothing moves before ``report`` returns from ``enable``, and nothing is written but the RPDO of the feed-forward,
     which is given back: what ``report`` raises there ends it with no trace.
 
-    ConfigError for a drive that takes no offset.
-    DriveFault, ProtocolError, DeviceTimeout or ConnectError, one sentence each, after everything was rolled back.
+    DriveFault (also for a drive that takes no offset), ProtocolError, DeviceTimeout or ConnectError, one sentence each,
+    after everything was rolled back.
     """
-    require_offset(load_profile(config.axis[axis].drive), axis)
+    profile = load_profile(config.axis[axis].drive)
+    if not profile.takes_offset:
+        raise DriveFault(f"drive {axis}", f"{no_offset(profile)}; {NO_OFFSET_ADVICE}")
     with Master(config, axis) as master:
         report("listen")
         listen(master)

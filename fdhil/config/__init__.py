@@ -15,6 +15,7 @@ from fdhil.config.axis import (
     Drive,
     FeedforwardLimits,
     Nominal,
+    SpeedUnit,
     Thermometer,
 )
 from fdhil.config.controller import Identification, Nc
@@ -48,6 +49,7 @@ __all__ = [
     "Regulators",
     "Section",
     "SimAxis",
+    "SpeedUnit",
     "Thermal",
     "Thermometer",
     "load",

@@ -19,6 +19,10 @@ CEILING_SPEED_MM_S = 20.0
 CEILING_ACCELERATION_MM_S2 = 2000.0
 
 
+SpeedUnit = Literal["increments_per_s", "rpm", "millirpm"]
+"""What a drive's speed object can count in."""
+
+
 class Nominal(Section):
     """[axis.X.nominal]: the data sheet's values, used until validated ones exist."""
 
@@ -67,6 +71,9 @@ class Drive(Section):
     )
     increments_per_rev: int = Field(
         65536, ge=4, le=2**31 - 1, description="encoder and set-point increments per revolution"
+    )
+    speed_unit: SpeedUnit | None = Field(
+        None, description="what 0x606C counts in, where the drive was set to another unit (0x60A9) than its profile's"
     )
     sign: Literal[1, -1] = Field(1, description="-1 where the drive counts against the axis")
     rated_current_a: Positive = Field(50.0, ge=1e-3, le=1e5, description="0x6075; 0x6078 counts in 0.1 % of it")

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from fdhil.cia402 import LOGICAL_AXIS_STEP, PdoEntry, pdo_length
-from fdhil.config import Axis
+from fdhil.config import Axis, SpeedUnit
 
 ObjectKey = tuple[int, int]
 """Index and sub-index."""
@@ -82,14 +82,21 @@ class DriveProfile:
     voltage_magnitude: bool = False
     dc_link: ObjectKey | None = None
     dc_link_v_per_count: float = 0.0
-    speed_unit: Literal["increments_per_s", "rpm", "millirpm"] = "increments_per_s"
+    speed_unit: SpeedUnit = "increments_per_s"
     speed_factor: float = 1.0
-    current_unit: Literal["permille_of_rated", "permille_of_rated_torque", "mA"] = "permille_of_rated"
+    current_unit: Literal["permille_of_rated", "share_of_rated", "permille_of_rated_torque", "mA"] = "permille_of_rated"
     current_factor: float = 1.0
     strict_abort_options: tuple[int, ...] = (1, 3)
     vendor_id: int | None = None
     product_code: int | None = None
     logical_axis: int = 1
+
+    @property
+    def unheard(self) -> tuple[str, ...]:
+        """The signals that must come in a valid TPDO with every SYNC, and do not."""
+        names = ("position", "speed", "current", "statusword")
+        found = {name: self.find_tpdo(getattr(self, name)) for name in names}
+        return tuple(name for name, at in found.items() if at is None or not at[0].valid or at[0].every_sync != 1)
 
     @property
     def takes_offset(self) -> bool:
@@ -121,13 +128,14 @@ class DriveProfile:
             "increments_per_s": 2 * math.pi / axis.drive.increments_per_rev,
             "rpm": 2 * math.pi / 60,
             "millirpm": 2 * math.pi / 60_000,
-        }[self.speed_unit]
+        }[axis.drive.speed_unit or self.speed_unit]
         return axis.drive.sign * self.speed_factor * per_unit
 
     def current_a_per_count(self, axis: Axis) -> float:
         """Scale of the current object, the axis' sign included; a torque is divided by the data sheet's K."""
         per_unit = {
             "permille_of_rated": axis.drive.rated_current_a / 1000,
+            "share_of_rated": axis.drive.rated_current_a,
             "permille_of_rated_torque": axis.drive.rated_torque_nm / axis.nominal.K / 1000,
             "mA": 1e-3,
         }[self.current_unit]
@@ -138,7 +146,7 @@ class DriveProfile:
 
         Where a TPDO carries the DC link it is the scale of the product of both objects' counts.
         """
-        if self.voltage is None:
+        if not self.voltage_objects:
             return 0.0
         link_v = self.dc_link_v_per_count if self._link_is_heard else axis.drive.dc_link_v or 0.0
         return axis.drive.sign * (self.voltage_v_per_count or self.duty_per_count * link_v)
@@ -146,13 +154,27 @@ class DriveProfile:
     @property
     def voltage_objects(self) -> tuple[ObjectKey, ...]:
         """The TPDO objects whose product is the terminal voltage; empty where the drive does not tell it."""
-        if self.voltage is None:
+        if self.voltage is None or self.find_tpdo(self.voltage) is None:
             return ()
         return (self.voltage, self.dc_link) if self.dc_link is not None and self._link_is_heard else (self.voltage,)
 
     @property
     def _link_is_heard(self) -> bool:
         return self.duty_per_count > 0 and self.dc_link is not None and self.find_tpdo(self.dc_link) is not None
+
+
+def speed_unit_of(word: int | None) -> SpeedUnit | None:
+    """Return the unit that 0x60A9 names: prefix, numerator and denominator of CiA 303-2; None for any other.
+
+    >>> speed_unit_of(0x00B44700), speed_unit_of(0xFDB44700), speed_unit_of(0x00B50300)
+    ('rpm', 'millirpm', 'increments_per_s')
+    """
+    units: dict[int | None, SpeedUnit] = {
+        0x00B44700: "rpm",
+        0xFDB44700: "millirpm",
+        0x00B50300: "increments_per_s",
+    }
+    return units.get(word)
 
 
 def _find(pdos: Sequence[PdoSpec], key: ObjectKey) -> tuple[PdoSpec, PdoEntry] | None:

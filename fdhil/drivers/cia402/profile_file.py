@@ -17,13 +17,16 @@ from typing import Any, get_type_hints
 from pydantic import TypeAdapter, ValidationError
 
 from fdhil import tables
-from fdhil.cia402 import LOGICAL_AXIS_STEP, lay_out
+from fdhil.cia402 import LOGICAL_AXIS_STEP, Object, lay_out
 from fdhil.config import Drive
-from fdhil.drivers.cia402.profile import LOGICAL_AXIS_PDOS, DriveProfile, ObjectKey, PdoSpec
+from fdhil.drivers.cia402.device import read_device
+from fdhil.drivers.cia402.mapping import offered, suggest_rpdos, suggest_tpdos
+from fdhil.drivers.cia402.profile import LOGICAL_AXIS_PDOS, DriveProfile, ObjectKey, PdoSpec, speed_unit_of
 from fdhil.errors import ConfigError, ConfigFault
 
 MAX_PROFILE_BYTES = 64 * 1024
 MOST_BASES = 8
+NO_OFFSET_ADVICE = "let the NC play the corrected demand of `fdhil correct --out`; this axis needs no commissioning"
 _PDO_KEYS = frozenset({"name", "cob_base", "entries", "every_sync", "valid"})
 _KINDS: Mapping[str, TypeAdapter[Any]] = {
     name: TypeAdapter(hint) for name, hint in get_type_hints(DriveProfile).items() if name not in ("rpdos", "tpdos")
@@ -33,26 +36,67 @@ _KINDS: Mapping[str, TypeAdapter[Any]] = {
 def load_profile(drive: Drive) -> DriveProfile:
     """Return the profile that ``[axis.X.drive]`` names, for that axis of its device.
 
-    ConfigError when its file cannot be read, or says what no profile can. A process reads a file once: what is changed
-    on disk counts from its next start.
+    ConfigError when its file cannot be read, or says what no profile can, or maps less than must be heard. A process
+    reads a file once: what is changed on disk counts from its next start.
     """
-    profile = _named(drive.profile)
+    profile = read_profile(drive.profile, drive.eds)
+    if deaf := profile.unheard:
+        what = f"no TPDO of every SYNC carries its {', '.join(deaf)}"
+        raise _fault(
+            profile.name, "tpdos", what, "`fdhil eds` tells what the drive has; base a profile of your own on it"
+        )
     return profile if drive.logical_axis == 1 else _of_axis(profile, drive.logical_axis)
 
 
 def require_offset(profile: DriveProfile, axis: str) -> None:
     """ConfigError where the drive takes no offset: what to do instead."""
-    if profile.takes_offset:
-        return
+    if not profile.takes_offset:
+        raise _fault("config", f"axis.{axis}.drive.profile", no_offset(profile), NO_OFFSET_ADVICE)
+
+
+def no_offset(profile: DriveProfile) -> str:
+    """Return why nothing can be added to the set-points of this drive."""
     index, sub = profile.offset
-    what = f"{profile.name} maps no offset ({index:04X}:{sub:02X}) into a valid RPDO: nothing can be added on line"
-    advice = "let the NC play the corrected demand of `fdhil correct --out`; this axis needs no commissioning"
-    raise _fault("config", f"axis.{axis}.drive.profile", what, advice)
+    return (
+        f"profile {profile.name} maps no offset ({index:04X}:{sub:02X}) into a valid RPDO: nothing can be added on line"
+    )
 
 
 @cache
-def _named(name: str) -> DriveProfile:
-    return profile_of(_document(name), name if name in tables.DRIVE_PROFILES else Path(name).stem, name)
+def read_profile(name: str, eds: Path | None = None) -> DriveProfile:
+    """Return a packaged or own profile by its name or path, also one that maps too little; ConfigError, EdsError.
+
+    With the drive's EDS it maps what that offers, and no more.
+    """
+    document, title = _document(name), name if name in tables.DRIVE_PROFILES else Path(name).stem
+    if "tpdos" not in document and "rpdos" not in document:
+        return profile_of(_mapped(document, name, eds), title, name)
+    profile = profile_of(document, title, name)
+    if eds is None:
+        return profile
+    device = read_device(eds)
+    rpdos, tpdos = offered(device, profile.rpdos, sent=True), offered(device, profile.tpdos, sent=False)
+    return replace(profile, rpdos=tuple(rpdos), tpdos=tuple(tpdos))
+
+
+def _mapped(document: Mapping[str, Any], name: str, eds: Path | None) -> dict[str, Any]:
+    """Return a profile that names no PDOs with those that its EDS offers; ConfigError without an EDS."""
+    if eds is None:
+        advice = "give drive.eds, the file that the drive's maker has for it"
+        raise _fault(name, "tpdos", "are not in this profile, and there is no EDS to take them from", advice)
+    device = read_device(eds)
+    told: dict[str, Any] = {"vendor_id": device.vendor_id or None}
+    if unit := speed_unit_of(device.default(Object.VELOCITY_UNIT)):
+        told["speed_unit"] = unit
+    if not device.find((0x6078, 0)) and "current" not in document:
+        told |= {"current": (0x6077, 0), "current_unit": "permille_of_rated_torque"}
+    said = told | dict(document)
+    bare = profile_of(said | {"rpdos": (), "tpdos": ()}, name, name)
+    fast = (bare.position, bare.speed, bare.statusword, bare.current, bare.voltage, bare.dc_link)
+    slow = (bare.position_demand, bare.offset, (int(Object.MODE_DISPLAY), 0), bare.digital_inputs)
+    rpdos = suggest_rpdos(device, bare.target, bare.offset, (bare.speed_offset, bare.torque_offset))
+    tpdos = suggest_tpdos(device, [key for key in fast if key is not None], slow)
+    return said | {"rpdos": rpdos, "tpdos": tpdos}
 
 
 def _document(name: str, depth: int = 0) -> dict[str, Any]:
@@ -108,13 +152,13 @@ def profile_of(document: Mapping[str, Any], name: str, source: str) -> DriveProf
 
 
 def _pdos(given: Any, kind: str, faults: list[ConfigFault]) -> tuple[PdoSpec, ...]:
-    if not isinstance(given, Sequence) or isinstance(given, str) or not given:
+    if not isinstance(given, Sequence) or isinstance(given, str):
         faults.append(ConfigFault(kind, "is missing", f"a table [[{kind}]] for each PDO"))
         return ()
     found = []
     for place, table in enumerate(given, 1):
         try:
-            found.append(_pdo(table))
+            found.append(table if isinstance(table, PdoSpec) else _pdo(table))
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             text = f"has no {error}" if isinstance(error, KeyError) else str(error)
             advice = "name = 'TPDO1', cob_base = 0x180, entries = [[index, sub-index, bits, signed], ...]"
