@@ -39,6 +39,20 @@ LOCKSTEP_WAIT_S = 8.0
 LOCKSTEP_PATIENCE = 20.0  # times as long as on a real machine: a simulated one shares its computer
 
 
+class AxisSdo(SdoLink):
+    """The SDO channel of one axis of a node: objects of CiA 402 are named as the first axis has them."""
+
+    profile: DriveProfile
+
+    def read(self, index: int, sub: int = 0) -> bytes:
+        """Read an object; SdoAbort, DeviceTimeout or ProtocolError."""
+        return super().read(self.profile.object_index(index), sub)
+
+    def write_int(self, index: int, sub: int, value: int, length: int) -> None:
+        """Write an integer of ``length`` bytes."""
+        super().write_int(self.profile.object_index(index), sub, value, length)
+
+
 class Master:
     """A context manager around one bus and one drive; nothing is sent before ``produce_sync`` or an SDO call."""
 
@@ -53,7 +67,8 @@ class Master:
         self.bus = TransmitBus(settings.drive.bus, config.bus[settings.drive.bus])
         self._lockstep = config.guard.clock == "sync"
         self._patience = LOCKSTEP_PATIENCE if self._lockstep else 1.0
-        self.sdo = SdoLink(self.device, self.node_id, self.bus.send, self._patience)
+        self.sdo = AxisSdo(self.device, self.node_id, self.bus.send, self._patience)
+        self.sdo.profile = self.profile
         self.heard = Heard()
         self.cycle = 0
         self.controlword = 0

@@ -76,7 +76,7 @@ def enable(master: Master) -> None:
             master.hold_here()
             master.controlword = word
         master.wait_cycles(10)
-    mode = (0x6061, 0)
+    mode = (master.profile.object_index(Object.MODE_DISPLAY), 0)
     if mode in master.heard.objects:
         master.wait(
             lambda: master.heard.objects[mode] == Mode.CYCLIC_SYNC_POSITION,

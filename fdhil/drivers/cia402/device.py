@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.cia402 import Object
-from fdhil.drivers.cia402.eds import load_eds
 from fdhil.drivers.cia402.profile import ObjectKey
 
 MOST_PDOS = 512
@@ -103,6 +102,8 @@ class Device:
 
 def read_device(path: Path) -> Device:
     """Read an EDS or DCF file; EdsError when it cannot be read. A DCF's values count as its defaults."""
+    from fdhil.drivers.cia402.eds import load_eds  # late: most profiles need no EDS, and its library loads slowly
+
     dictionary = load_eds(path, _NODE)
     told = dictionary.device_information
     objects = {found.key: found for found in _objects(dictionary)}
