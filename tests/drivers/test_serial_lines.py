@@ -51,12 +51,13 @@ async def test_what_never_ends_is_let_go() -> None:
         for _ in range(3):
             peer.put(b"x" * LONGEST)
         peer.put(b"\n5\n")
-        texts = []
+        texts: list[str] = []
         while not texts or texts[-1] != "5":
             line = await lines.next_line(soon())
             assert line is not None
             texts.append(line.text)
         assert lines.overlong
+        assert all(len(text) <= LONGEST for text in texts)
 
 
 async def test_a_port_that_is_gone_is_an_error_and_not_a_loop() -> None:

@@ -43,7 +43,9 @@ class LineReader:
         for line in whole:
             left -= len(line) + 1
             text = line.decode("ascii", "replace").strip()
-            if text:  # what came after it in the same read was on the wire after it
+            if len(line) > LONGEST:
+                self.overlong += 1
+            elif text:  # what came after it in the same read was on the wire after it
                 self._lines.append(TextLine(text, chunk.t_ns - self._port.wire_ns(left)))
         if len(self._begun) > LONGEST:
             self._begun, self.overlong = b"", self.overlong + 1
