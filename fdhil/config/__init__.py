@@ -16,7 +16,6 @@ from fdhil.config.axis import (
     FeedforwardLimits,
     Nominal,
     SpeedUnit,
-    Thermometer,
 )
 from fdhil.config.controller import Identification, Nc
 from fdhil.config.machine import MachineConfig
@@ -25,6 +24,7 @@ from fdhil.config.reading import load, parse, toml_document, unlikely
 from fdhil.config.reality import Reality
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import Section
+from fdhil.config.sensors import Thermometer, Voltage
 from fdhil.config.service import CanBus, Maintenance
 from fdhil.config.simulation import Noise, SimAxis, Thermal
 
@@ -52,6 +52,7 @@ __all__ = [
     "SpeedUnit",
     "Thermal",
     "Thermometer",
+    "Voltage",
     "load",
     "parse",
     "share_fault",
