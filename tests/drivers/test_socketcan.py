@@ -14,7 +14,7 @@ from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import CanBus as BusSettings
 from fdhil.drivers.can.bus import CanBus
 from fdhil.drivers.can.frames import FrameRing
-from fdhil.drivers.can.ports import SocketCanPort
+from fdhil.drivers.can.socketcan import SocketCanPort
 
 pytestmark = pytest.mark.socketcan
 SETTINGS = BusSettings(interface="socketcan", channel="vcan0")
