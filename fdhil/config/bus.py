@@ -36,8 +36,7 @@ class CanBus(Section):
         "usb2can",
     ] = Field(
         "socketcand",
-        description="socketcan: a network interface; socketcand: a hub; virtual: inside one process; the others are "
-        "adapters that python-can opens, for listening only",
+        description="socketcand is a hub, virtual one process; from slcan on: python-can, for listening only",
     )
     channel: str = Field(
         "can0",
@@ -46,17 +45,15 @@ class CanBus(Section):
     host: str = Field("127.0.0.1", description="socketcand: address of the hub")
     port: int = Field(0, ge=0, le=65535, description="socketcand: TCP port of the hub; 0 lets the simulator choose one")
     bitrate: int = Field(
-        1_000_000, ge=10_000, le=1_000_000, description="bit/s, for the bus load; python-can's adapters are set to it"
+        1_000_000, ge=10_000, le=1_000_000, description="bit/s, for the bus load; an adapter of python-can is set to it"
     )
     frames: Literal["all", "drives"] = Field(
         "all",
-        description="drives: the kernel or the adapter hands over SYNC, NMT and the frames of the configured drives "
-        "alone; the bus load and the black box then know no others",
+        description="drives: SYNC, NMT and the drives' frames alone are taken; bus load and black box lack others",
     )
     listen_only: bool = Field(
         True,
-        description="python-can: the adapter acknowledges nothing and disturbs nothing, even at a wrong bit rate, "
-        "where it can be told so",
+        description="python-can: acknowledge nothing, so that a wrong bit rate disturbs nobody, where it can be told",
     )
     options: Mapping[str, bool | Whole | Finite | str] = Field(
         {}, description="python-can: what its interface takes besides, e.g. { tty_baudrate = 3000000 }"
