@@ -6,6 +6,7 @@ a dead program look alive.
 
 from __future__ import annotations
 
+import errno
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
@@ -19,6 +20,8 @@ from fdhil.drivers.can.python_can import VirtualPort
 from fdhil.drivers.can.socketcan import CAN_FRAME, SocketCanPort
 from fdhil.drivers.can.socketcand import CONNECT_TIMEOUT_S, SocketcandPort
 from fdhil.errors import ConnectError, DeviceError
+
+QUEUE_FULL = "the transmit queue is full: no other node acknowledges, check the drives' supply, wiring and bit rate"
 
 
 class SendingPort(Port, Protocol):
@@ -36,7 +39,11 @@ class SocketCanSender(SocketCanPort):
         try:
             self._socket.send(CAN_FRAME.pack(can_id, len(data), data))
         except OSError as error:
-            raise DeviceError(self._name, f"the frame {can_id:03X} was not sent ({error.strerror})") from None
+            full = (
+                "the transmit queue is full: no other node acknowledges what is sent, check supply, wiring and bit rate"
+            )
+            why = full if error.errno in (errno.ENOBUFS, errno.EAGAIN) else error.strerror
+            raise DeviceError(self._name, f"the frame {can_id:03X} was not sent ({why})") from None
 
 
 class SocketcandSender(SocketcandPort):

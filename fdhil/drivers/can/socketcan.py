@@ -67,8 +67,9 @@ class SocketCanPort:
                 raise OSError(errno.ENETDOWN, "it is down")
         except OSError as error:
             self._socket.close()
-            how = f"ip link set {settings.channel} up type can bitrate {settings.bitrate}"
-            text = f"the CAN interface {settings.channel} cannot be opened ({error.strerror}); bring it up: {how}"
+            text = (
+                f"the CAN interface {settings.channel} cannot be opened ({error.strerror}); {_advice(error, settings)}"
+            )
             raise ConnectError(name, text) from None
 
     def _configure(self, filters: Sequence[Filter]) -> None:
@@ -100,7 +101,7 @@ class SocketCanPort:
             except BlockingIOError:
                 break
             except OSError as error:
-                raise BusEnded(f"the CAN interface {self._channel} is gone ({error.strerror})") from None
+                raise BusEnded(f"the CAN interface {self._channel} is down or gone ({error.strerror})") from None
             can_id, length, payload = CAN_FRAME.unpack(data)
             ring.append(self._stamp(ancillary, wall_ahead_ns), can_id, payload[:length])
         self._count_drops()
@@ -135,3 +136,9 @@ class SocketCanPort:
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
+
+
+def _advice(error: OSError, settings: config.CanBus) -> str:
+    if error.errno == errno.ENODEV:
+        return "plug the adapter in, or take a name that ip link shows"
+    return f"bring it up: ip link set {settings.channel} up type can bitrate {settings.bitrate}"
