@@ -17,6 +17,7 @@ from fdhil.config.axis import (
     Nominal,
     SpeedUnit,
 )
+from fdhil.config.bus import CanBus
 from fdhil.config.controller import Identification, Nc
 from fdhil.config.machine import MachineConfig
 from fdhil.config.offset_bounds import VARIATION_MM, OffsetBounds, share_fault
@@ -25,7 +26,7 @@ from fdhil.config.reality import Reality
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import Section
 from fdhil.config.sensors import Thermometer, Voltage
-from fdhil.config.service import CanBus, Maintenance
+from fdhil.config.service import Maintenance
 from fdhil.config.simulation import Noise, SimAxis, Thermal
 
 __all__ = [

@@ -9,13 +9,14 @@ from pathlib import Path
 from pydantic import Field, ValidationInfo, model_validator
 
 from fdhil.config.axis import Axis
+from fdhil.config.bus import CanBus
 from fdhil.config.controller import G0, Correction, Identification, Nc
 from fdhil.config.offset_bounds import limit_faults
 from fdhil.config.plausible import doubts
 from fdhil.config.regulators import period_faults
 from fdhil.config.section import AxisName, Positive, Section
 from fdhil.config.sensors import Thermometer, Voltage, line_faults
-from fdhil.config.service import CanBus, Guard, Maintenance, Store
+from fdhil.config.service import Guard, Maintenance, Store
 from fdhil.config.simulation import Sim
 
 
@@ -48,6 +49,8 @@ class MachineConfig(Section):
         for name, axis in self.axis.items():
             if axis.drive.bus not in self.bus:
                 faults.append(f"axis.{name}.drive.bus: there is no [bus.{axis.drive.bus}]")
+            elif axis.correction is not None and not self.bus[axis.drive.bus].may_send:
+                faults.append(f"axis.{name}.correction: {self._listening(axis.drive.bus)}")
             faults += [f"axis.{name}.regulators.{fault}" for fault in period_faults(axis.regulators, period)]
             limits = [f"axis.{name}.correction: {fault}" for fault in limit_faults(axis, period)]
             # a number in another unit makes limits wrong too, and says so better
@@ -73,6 +76,10 @@ class MachineConfig(Section):
             if axis.temperature is not None:
                 found[f"axis.{name}.temperature"] = axis.temperature
         return found
+
+    def _listening(self, bus: str) -> str:
+        interface = self.bus[bus].interface
+        return f"bus {bus} is only listened to ({interface}); use SocketCAN there, or leave this section out"
 
     def node_id(self, axis: str) -> int:
         """Return the CANopen node-ID of an axis' drive."""
