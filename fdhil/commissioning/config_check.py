@@ -38,6 +38,7 @@ def check_machine(config: MachineConfig, say: Callable[[str], None] = lambda _te
         say(f"listening on bus {bus}")
         with BusListener(CanBus(bus, config.bus[bus])) as listener:
             listener.listen(LISTEN_S)
+            listener.require_readable()
             traffic = listener.traffic
         found += [(f"bus {bus}", finding) for finding in compare_bus(traffic, config)]
         for axis in (name for name, settings in config.axis.items() if settings.drive.bus == bus):

@@ -145,6 +145,7 @@ def scan_bus(name: str, config: MachineConfig, descriptions: Sequence[Descriptio
     axes = {config.node_id(axis): axis for axis, settings in config.axis.items() if settings.drive.bus == name}
     with BusScanner(name, config) as bus:
         bus.listen(LISTEN_S)
+        bus.require_readable()
         master = bus.traffic.master
         answering = set() if master else bus.answering()
         found = sorted(bus.traffic.nodes | answering)

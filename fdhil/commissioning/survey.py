@@ -12,12 +12,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from fdhil.cia402 import Mode, Object, State
+from fdhil.commissioning.bus_listener import UNREADABLE
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import SOFTWARE_LIMIT_KEYS
 from fdhil.config import CorrectionLimits
 from fdhil.drivers.can.sdo import NO_OBJECT, NO_SUB_INDEX
 from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
-from fdhil.errors import ConnectError, DriveFault, ProtocolError, SdoAbort
+from fdhil.errors import ConnectError, DeviceTimeout, DriveFault, ProtocolError, SdoAbort
 
 LISTEN_S = 2.0
 INVALID_COB_ID = 1 << 31
@@ -81,15 +82,29 @@ def read_optional(master: Master, index: int, sub: int = 0, *, signed: bool = Fa
 
 
 def listen(master: Master) -> None:
-    """Listen without sending: on a silent bus nothing is sent, and beside an NC we are not the master."""
+    """Listen without sending, and beside an NC leave it at that: we are not the master then.
+
+    On a silent bus the drive is asked what it is: with the NC off, one that sends no heartbeat (0x1017 = 0) is silent.
+    """
     end = time.monotonic() + LISTEN_S
     while time.monotonic() < end and master.heard.sync == 0:
         master.check()
         time.sleep(0.01)
     require_alone(master)
     if master.heard.frames == 0:
-        text = "there is no drive on the bus; check the drives' supply, wiring and bit rate"
-        raise ConnectError(f"bus {master.bus.name}", text)
+        _ask_alone(master)
+
+
+def _ask_alone(master: Master) -> None:
+    """Read the device type on a bus where nothing is heard; ConnectError when nothing can be read."""
+    bus = f"bus {master.bus.name}"
+    if master.heard.errors:
+        raise ConnectError(bus, UNREADABLE)
+    try:
+        read_optional(master, Object.DEVICE_TYPE)
+    except (DeviceTimeout, ProtocolError):
+        text = f"nothing was heard on the bus and node-ID {master.node_id} did not answer"
+        raise ConnectError(bus, f"{text}; check the drive's supply, wiring, bit rate and node_id") from None
 
 
 def require_alone(master: Master) -> None:

@@ -134,7 +134,7 @@ class SyncGrid:
         return self._advance(ahead, counter, t_ns)
 
     def _learn_range(self, counter: int, t_ns: int) -> None:
-        """Where the counter begins again at 1 it went as far as 0x1019 says: told at once by time, else by the second."""
+        """Where the counter begins again at 1 it went as far as 0x1019 says: by time or at the second turn."""
         last = self._last_counter
         if counter > self._range:
             self._range = COUNTER_RANGE
