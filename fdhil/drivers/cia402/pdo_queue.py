@@ -36,13 +36,17 @@ class DecoderCounters:
 
 @dataclass(slots=True)
 class PdoQueue:
-    """Frames of one PDO that wait until their ticks are complete; ``tick`` (m,) never falls."""
+    """Frames of one PDO that wait until their ticks are complete; ``tick`` (m,) never falls.
+
+    ``first_tick`` is that of the first one ever, None before it: what does not come yet is not lost.
+    """
 
     spec: PdoSpec
     cob_id: int
     tick: Int = field(default_factory=lambda: np.empty(0, np.int64))
     data: Words = field(default_factory=lambda: np.empty(0, np.uint64))
     length: int = field(init=False)
+    first_tick: int | None = None
 
     def __post_init__(self) -> None:
         self.length = self.spec.length
@@ -52,6 +56,8 @@ class PdoQueue:
         mine = (ticked.can_id == self.cob_id).nonzero()[0]
         if mine.size == 0:
             return
+        if self.first_tick is None:
+            self.first_tick = int(ticked.tick[mine[0]])
         length = ticked.length[mine]
         if (length != self.length).any():
             whole = length >= self.length
