@@ -122,7 +122,8 @@ def _node_row(node: Node) -> list[str]:
     if node.answers is None:
         return [*heard, "not asked", "", "", ""]
     said, who = node.answers, node.answers.identity
-    profile = "CiA 402" if said.is_drive else str(said.device_type & 0xFFFF or "none")
+    number = said.device_type & 0xFFFF
+    profile = f"CiA {number}" if number else "none"
     eds = f"{said.eds.file}\n({said.eds.fit})" if said.eds else "none fits"
     ids = (f"{who.vendor_id:08X}\n{who.product_code:08X}", f"{who.revision:08X}\n{who.serial}")
     return [*heard, f"{said.name or 'unnamed'}\n{profile}", *ids, eds]
@@ -228,9 +229,20 @@ def _show_check(found: Sequence[Place]) -> None:
     for place, finding in found:
         if finding.ok is False:
             out.print(Text(f"{place}: {finding.cause}; {finding.advice}"), soft_wrap=True)
+    for (place, cause, advice), points in _open_points(found).items():
+        out.print(Text(f"{place}: {', '.join(points)} not compared: {cause}; {advice}"), soft_wrap=True)
     differ, open_ = (sum(finding.ok is state for _, finding in found) for state in (False, None))
-    rest = f", {open_} could not be compared beside the NC" if open_ else ""
+    rest = f", {open_} could not be compared" if open_ else ""
     out.print(f"{len(found) - differ - open_} points ok, {differ} differ{rest}")
+
+
+def _open_points(found: Sequence[Place]) -> dict[tuple[str, str, str], list[str]]:
+    """The points that could not be compared, by place and reason."""
+    points: dict[tuple[str, str, str], list[str]] = {}
+    for place, finding in found:
+        if finding.ok is None:
+            points.setdefault((place, finding.cause, finding.advice), []).append(finding.point)
+    return points
 
 
 @click.command()
