@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import uuid
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import can
@@ -242,7 +243,8 @@ def test_a_drive_says_so_itself_or_as_the_first_of_several_devices(
     drive, settings = peer
     lacking(drive, 0x67FF)
     if first is not None:
-        drive.drive.dictionary.entries[0x67FF00] = drive.drive.dictionary.entries[0x100000]
+        own = drive.drive.dictionary.entries[0x100000]
+        drive.drive.dictionary.entries[0x67FF00] = replace(own, index=0x67FF)
         drive.drive.set_object(0x67FF, 0, first)
     drive.drive.set_object(0x1000, 0, device_type)
     (finding,) = [finding for _, finding in check_machine(settings) if finding.point == "device"]
