@@ -31,7 +31,8 @@ STATES: Mapping[bool | None, tuple[str, str]] = {
     None: ("not compared", "yellow"),
 }
 STEPS: Mapping[str, str] = {
-    "listen": "Listening: the NC must be off and the drive must be heard. Nothing is sent yet.",
+    "listen": "Listening: the NC must be off. A bus on which nothing is heard is asked whether the drive is there; "
+    "nothing else is sent.",
     "compare": "Reading identity, PDO mapping, scale, option codes and following-error window, and comparing them with "
     "the config. Nothing moves.",
     "enable": "Starting SYNC and switching the drive on, held where it stands.",

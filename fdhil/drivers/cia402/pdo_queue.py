@@ -38,7 +38,7 @@ class DecoderCounters:
 class PdoQueue:
     """Frames of one PDO that wait until their ticks are complete; ``tick`` (m,) never falls.
 
-    ``first_tick`` is that of the first one ever, None before it: what does not come yet is not lost.
+    ``first_tick`` is that of the first whole one ever, None before it: what does not come yet is not lost.
     """
 
     spec: PdoSpec
@@ -56,14 +56,14 @@ class PdoQueue:
         mine = (ticked.can_id == self.cob_id).nonzero()[0]
         if mine.size == 0:
             return
-        if self.first_tick is None:
-            self.first_tick = int(ticked.tick[mine[0]])
         length = ticked.length[mine]
         if (length != self.length).any():
             whole = length >= self.length
             counters.short += int(mine.size - np.count_nonzero(whole))
             counters.long += int(np.count_nonzero(length > self.length))
             mine = mine[whole]
+        if self.first_tick is None and mine.size:
+            self.first_tick = int(ticked.tick[mine[0]])
         self.tick = np.concatenate([self.tick, ticked.tick[mine]])
         self.data = np.concatenate([self.data, ticked.data[mine]])
 
