@@ -108,20 +108,20 @@ def _show_scans(scans: Sequence[BusScan]) -> None:
         out.print(Text(f"bus {found.bus}: {nc}{period}; {len(found.nodes)} nodes"))
         table = Table(*SCAN_HEAD, box=box.SIMPLE_HEAD, pad_edge=False)
         for node in found.nodes:
-            table.add_row(*map(Text, _node_row(node)))
+            table.add_row(*map(Text, _node_row(node, "not asked" if found.master else "no answer")))
         out.print(table)
         for node in found.nodes:
             for emergency in node.emergencies:
                 out.print(Text(f"node {node.node_id} reports {emergency}"), soft_wrap=True)
 
 
-def _node_row(node: Node) -> list[str]:
+def _node_row(node: Node, unanswered: str) -> list[str]:
     """Return the cells of a node, two figures above each other in most, so that a row fits 80 columns."""
     period = node.heartbeat_s or (node.answers.heartbeat_s if node.answers else None)
     beat = f"{period * 1e3:.0f} ms" if period else "none"
     heard = [f"{node.node_id}\n{node.axis or ''}", f"{node.nmt or 'unknown'}\n{beat}"]
     if node.answers is None:
-        return [*heard, "not asked", "", "", ""]
+        return [*heard, unanswered, "", "", ""]
     said, who = node.answers, node.answers.identity
     number = said.device_type & 0xFFFF
     profile = f"CiA {number}" if number else "none"

@@ -9,9 +9,11 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Self
 
+import numpy as np
+
 from fdhil.cia402 import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SDO_RESPONSE, COB_SYNC, Nmt
 from fdhil.drivers.can.bus import CanBus
-from fdhil.drivers.can.frames import ERROR_FLAG, Frames
+from fdhil.drivers.can.frames import ERROR_FLAG, REMOTE_FLAG, Frames
 from fdhil.errors import ConnectError
 
 LISTEN_S = 2.5  # a heartbeat of one second comes twice
@@ -20,6 +22,7 @@ UNREADABLE = (
     "set the bit rate of the bus on the interface, and check termination and wiring"
 )
 _TURN_S = 0.002
+_LSS_MASTER = 0x7E5
 _MASTER_FUNCTIONS = {0x200: "set-points", 0x300: "set-points", 0x400: "set-points", 0x500: "set-points"} | {
     COB_SDO_REQUEST: "SDO requests"
 }
@@ -28,7 +31,10 @@ _NODE_FUNCTIONS = (0x080, 0x180, 0x280, 0x380, 0x480, COB_SDO_RESPONSE, COB_HEAR
 
 @dataclass(slots=True)
 class Traffic:
-    """The frames heard: per COB-ID those counted, the newest length and data; heartbeats and EMCY per node; errors."""
+    """The frames heard: per COB-ID those counted, the newest length and data; heartbeats and EMCY per node; errors.
+
+    ``requests`` are the COB-IDs of remote frames.
+    """
 
     count: dict[int, int] = field(default_factory=dict)
     length: dict[int, int] = field(default_factory=dict)
@@ -37,10 +43,12 @@ class Traffic:
     emergencies: dict[int, set[int]] = field(default_factory=dict)
     sync_ns: list[int] = field(default_factory=list)
     errors: int = 0
+    requests: set[int] = field(default_factory=set)
 
     def take(self, frames: Frames) -> None:
         """Take a block of frames; those with 29 bit identifiers are left aside, error frames counted."""
         self.errors += int((frames["id"] & ERROR_FLAG != 0).sum())
+        self.requests |= set((frames["id"][frames["id"] & ~np.uint32(0x7FF) == REMOTE_FLAG] & 0x7FF).tolist())
         for frame in frames[frames["id"] <= 0x7FF]:
             can_id, stamp, data = int(frame["id"]), int(frame["t_ns"]), int(frame["data"])
             function, node = can_id & 0x780, can_id & 0x7F
@@ -60,6 +68,10 @@ class Traffic:
             return "SYNC"
         if COB_NMT in self.count:
             return "NMT commands"
+        if _LSS_MASTER in self.count:
+            return "LSS commands"
+        if self.requests:
+            return "node guarding" if max(self.requests) > COB_HEARTBEAT else "requests for PDOs"
         return next((_MASTER_FUNCTIONS[i & 0x780] for i in self.count if i & 0x780 in _MASTER_FUNCTIONS), None)
 
     @property

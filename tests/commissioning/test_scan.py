@@ -18,7 +18,7 @@ from fdhil.commissioning.scan import BusScanner, Description, EdsMatch, printabl
 from fdhil.commissioning.steps import check_axis
 from fdhil.commissioning.survey import Finding, Identity
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, frames_of
+from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, frames_of
 from fdhil.errors import ConnectError, DriveFault, ProtocolError
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import Row, Wire, machine
@@ -56,6 +56,10 @@ def traffic(*rows: Row) -> Traffic:
         (0x205, bytes(6), "set-points"),
         (0x509, bytes(8), "set-points"),
         (0x601, bytes(8), "SDO requests"),
+        (0x7E5, bytes(8), "LSS commands"),
+        (0x701 | REMOTE_FLAG, b"", "node guarding"),
+        (0x181 | REMOTE_FLAG, b"", "requests for PDOs"),
+        (0x701 | REMOTE_FLAG | EXTENDED_FLAG, b"", None),
         (0x701, b"\x05", None),
         (0x181, bytes(8), None),
         (0x581, bytes(8), None),

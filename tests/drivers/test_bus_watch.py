@@ -274,3 +274,11 @@ def test_bounds_enclose_the_truth_though_some_stamps_are_late(
     low, high = clock.bounds(round(asked * pace * MS), round((asked + takes) * pace * MS)) or (0.0, 300.0)
     assert low <= asked + 0.01
     assert high >= asked + takes - 0.01
+
+
+def test_a_drive_that_answers_to_node_guarding_is_not_missed_when_it_is_not_asked() -> None:
+    watch = NodeWatch("X", 1)
+    rows = [(t * MS, 0x701, bytes([0x05 | (t // 100 % 2) << 7])) for t in range(0, 2000, 100)]
+    assert watch.feed(frames_of(rows), 2000 * MS) == []
+    assert watch.feed(frames_of([]), 60_000 * MS) == []
+    assert watch.nmt == 5
