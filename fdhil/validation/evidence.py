@@ -214,10 +214,10 @@ class Evidence:
         """Whether the model explains the rapid at the table, and nothing it surely lacks makes a next one worse."""
         if self.weight is None or not self.weight.believed or (self.fit is not None and self.late_s):
             return False
-        late = self.breakaway if self.weight.through != "replay" else None  # which has the move's beginning
-        if late is not None and not self.weight.allows(self.breakaway_um(late)):
+        # a load that is held at rest may pass for it in a replay, and then waits for the next move the other way
+        if self.breakaway is not None and not self.weight.allows(self.breakaway_um(self.breakaway)):
             return False
-        return all(self.weight.allows(self.cost_um(lack) / _known(lack)) for lack in self.lacks)
+        return all(self.weight.allows(self.cost_um(it) / _known(it)) for lack in self.lacks for it in lack.with_rivals)
 
     def with_cost(self, reason: Reason, um: float) -> Reason:
         """Return a reason with what it costs at the table."""

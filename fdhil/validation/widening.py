@@ -24,8 +24,15 @@ def widened(estimate: Estimate, fit: Fit, lacks: Sequence[Lacking]) -> Estimate:
     """Return the estimate with the shifts by all that the model surely lacks added to its covariance."""
     if not lacks:
         return estimate
-    doubts = np.column_stack([_of_names(estimate, fit, lack.shift) for lack in lacks])
+    doubts = np.column_stack([_worst(estimate, fit, lack) for lack in lacks])
     return replace(estimate, covariance=frozen(estimate.covariance + doubts @ doubts.T))
+
+
+def _worst(estimate: Estimate, fit: Fit, lack: Lacking) -> Float:
+    """Return the shift (k,) by what is lacked or by a rival, whichever moves a parameter by more deviations."""
+    shifts = [_of_names(estimate, fit, each.shift) for each in lack.with_rivals]
+    deviations = np.sqrt(np.maximum(np.diag(estimate.covariance), np.finfo(np.float64).tiny))
+    return max(shifts, key=lambda shift: float(np.abs(shift / deviations).max()))
 
 
 def _of_names(estimate: Estimate, fit: Fit, shift: Float) -> Float:
