@@ -15,6 +15,7 @@ import numpy as np
 from fdhil.config import MachineConfig, Noise, SimAxis
 from fdhil.records import PARAMETERS, Parameters
 from fdhil.sim.drive.dictionary import Dictionary
+from fdhil.sim.drive.dress import dress
 from fdhil.sim.drive.emergency_and_heartbeat import (
     FOLLOWING_ERROR,
     HEARTBEAT_LOST,
@@ -28,7 +29,7 @@ from fdhil.sim.drive.emergency_and_heartbeat import (
 from fdhil.sim.drive.feedback import INT16, Feedback, clip
 from fdhil.sim.drive.motion import Motion
 from fdhil.sim.drive.object_write_rules import StoredParameters, register_write_rules
-from fdhil.sim.drive.objects import NO_WINDOW, Ratings, drive_objects
+from fdhil.sim.drive.objects import NO_WINDOW, Ratings
 from fdhil.sim.drive.pdo import PdoEngine
 from fdhil.sim.drive.physics import Physics, check_structure, true_parameters
 from fdhil.sim.drive.power import PowerStage, State
@@ -83,7 +84,8 @@ class Drive:
         self._per_kelvin = (twin.ft_per_kelvin, twin.Cd_per_kelvin)
         self._parameters = true_parameters(section.nominal, twin)
         self.physics = _physics(self._parameters, config, axis, twin, 1 / self._mm_per_rad)
-        self.dictionary = Dictionary(drive_objects(config, axis))
+        self.dress = dress(config, axis)
+        self.dictionary = Dictionary(self.dress.objects, self.dress.within)
         self.power = PowerStage(self.dictionary.number)
         self.motion = Motion(
             self.dictionary,
@@ -102,6 +104,7 @@ class Drive:
             self.power,
             self.motion,
             Sensors(_noise(config, twin), self.faults, rng),
+            self.dress.gauges,
         )
         self._attach()
 
@@ -358,7 +361,8 @@ class Drive:
 
     def set_object(self, index: int, sub: int, value: int) -> None:
         """Write an object past all access rules, as another tool or a wrong set-up would have; KeyError if unknown."""
-        self.dictionary.numbers[self.dictionary.entries[index << 8 | sub].key] = value
+        entry = self.dictionary.entries[index << 8 | sub]
+        self.dictionary.numbers[entry.place] = entry.number(value)
 
     def remap(self, index: int, entries: list[tuple[int, int, int]]) -> None:
         """Change a mapping parameter (0x1600 to 0x1603, 0x1A00 to 0x1A03) past all rules, even in operational."""
