@@ -47,10 +47,7 @@ def mapping(drive: Drive) -> dict[str, Any]:
                 {
                     "cob_id": pdo.cob_id,
                     "type": pdo.kind,
-                    "entries": [
-                        [entry.index, entry.sub, 8 * (entry.size or 0), *unit(entry)]
-                        for entry in entries
-                    ],
+                    "entries": [[entry.index, entry.sub, 8 * (entry.size or 0), *unit(entry)] for entry in entries],
                 }
             )
         return listed

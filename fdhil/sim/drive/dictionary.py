@@ -87,8 +87,8 @@ Value = int | bytes
 class Entry:
     """One sub-index. ``access`` is ro, wo, rw, rww, rwr or const; ``node_relative``: $NODEID in the EDS.
 
-    Its value is kept under ``home``, where that is not its own key, in the drive's own units: ``scale`` of them make one
-    count on the wire.
+    Its value is kept under ``home``, where that is not its own key, in the drive's own units: ``scale`` of them make
+    one count on the wire.
     """
 
     index: int
@@ -190,8 +190,8 @@ class Dictionary:
 
     ``numbers`` and ``texts`` (strings and domains) are kept by each entry's place, for ``within`` too: entries that the
     drive needs and does not show. ``check`` and ``written`` are called before and after an SDO write of the places they
-    are registered for; ``check`` refuses by raising TransferAbort. ``read_hooks`` give what is computed when it is asked
-    for.
+    are registered for; ``check`` refuses by raising TransferAbort. ``read_hooks`` give what is computed when it is
+    asked for.
     """
 
     def __init__(self, objects: tuple[Object, ...], within: tuple[Entry, ...] = ()) -> None:

@@ -33,8 +33,10 @@ _CODE = {
 # dummy entries that an RPDO may map to skip bytes (CiA 301, 7.4.7.1)
 _DUMMIES = {int(kind): (_CODE[kind], 8 * struct.calcsize(_CODE[kind])) for kind in (I8, I16, I32, U8, U16, U32)}
 _RECEIVED, _SENT = frozenset({"rw", "rww", "wo"}), frozenset({"ro", "rw", "rww", "rwr", "const"})
-# places of the two parameters of a PDO, and how many PDOs a device may have in a direction
-_RPDO, _TPDO, _MOST_PDOS = (0x1400, 0x1600), (0x1800, 0x1A00), 512
+# places of the two parameters of the first PDO
+_PLACES = {"rpdo": (0x1400, 0x1600), "tpdo": (0x1800, 0x1A00)}
+_MOST_PDOS = 512  # in a direction
+_POSITION_OFFSET = 0x60B000
 _ID_BITS = 0x1FFFFFFF
 _EXTENDED = 1 << 29
 _RESTRICTED = (
@@ -73,7 +75,8 @@ class Pdo:
 class PdoEngine:
     """All PDOs of one device. ``drop`` maps TPDO numbers to how many frames are still to be lost, -1 for all.
 
-    ``heard`` has the numbers of the RPDOs received since the last SYNC, ``heard_before`` those of the cycle before.
+    ``heard`` has the numbers of the RPDOs received since the last SYNC, ``heard_before`` those of the cycle before;
+    ``offset_rpdos`` are those that carry the position offset.
     """
 
     def __init__(self, dictionary: Dictionary, changeable: Callable[[], bool], drop: dict[int, int]) -> None:
@@ -84,12 +87,14 @@ class PdoEngine:
         self._tpdos: list[Pdo] = []
         self.heard: set[int] = set()
         self.heard_before: set[int] = set()
+        self.offset_rpdos: frozenset[int] = frozenset()
         self._register_checks()
 
     def configure(self) -> None:
         """Start all PDOs from the object dictionary's parameters: OPERATIONAL was entered or the mapping changed."""
         self._rpdos = {pdo.cob_id: pdo for pdo in self.configured("rpdo")}
         self._tpdos = list(self.configured("tpdo"))
+        self.offset_rpdos = frozenset(p.number for p in self._rpdos.values() if _POSITION_OFFSET in p.keys)
         self.heard, self.heard_before = set(), set()
 
     def stop(self) -> None:
@@ -99,16 +104,17 @@ class PdoEngine:
 
     def configured(self, direction: str) -> Iterator[Pdo]:
         """Yield the PDOs of a direction (``rpdo`` or ``tpdo``) as the dictionary describes them."""
-        communication, mapping = _RPDO if direction == "rpdo" else _TPDO
+        communication, mapping = _PLACES[direction]
         sends = direction == "tpdo"
-        for n in self._present(communication, mapping):
+        for number in self.numbers(direction):
+            n = number - 1
             cob_id = self._dictionary.number(communication + n, 1)
             entries = self._mapped(mapping + n)
             if cob_id & INVALID or not entries:
                 continue
             found = [entry for entry, _ in entries if entry is not None]
             yield Pdo(
-                number=n + 1,
+                number=number,
                 cob_id=cob_id & _ID_BITS,
                 kind=self._parameter(communication + n, 2),
                 codec=struct.Struct("<" + "".join(code for _, code in entries)),
@@ -122,15 +128,15 @@ class PdoEngine:
 
     def mapped(self, direction: str, number: int) -> list[Entry]:
         """Return the objects that a PDO carries."""
-        mapping = _RPDO[1] if direction == "rpdo" else _TPDO[1]
-        return [entry for entry, _ in self._mapped(mapping + number - 1) if entry is not None]
+        return [entry for entry, _ in self._mapped(_PLACES[direction][1] + number - 1) if entry is not None]
 
-    def _present(self, communication: int, mapping: int) -> Iterator[int]:
-        """Yield the PDOs (from 0) that have a COB-ID and a mapping."""
+    def numbers(self, direction: str) -> Iterator[int]:
+        """Yield the PDOs that the device has: with a COB-ID and a mapping."""
+        communication, mapping = _PLACES[direction]
         entries = self._dictionary.entries
         for n in range(_MOST_PDOS):
             if communication + n << 8 | 1 in entries and mapping + n << 8 in entries:
-                yield n
+                yield n + 1
 
     def _parameter(self, index: int, sub: int) -> int:
         """A communication parameter, 0 where the device does not have it."""
@@ -255,8 +261,8 @@ class PdoEngine:
     def _register_checks(self) -> None:
         rules = {1: self._check_cob_id, 2: self._check_kind, 3: self._check_invalid, 6: self._check_invalid}
         entries = self._dictionary.entries
-        for communication, mapping in (_RPDO, _TPDO):
-            for n in self._present(communication, mapping):
+        for direction, (communication, mapping) in _PLACES.items():
+            for n in (number - 1 for number in self.numbers(direction)):
                 for sub in (1, 2, 3, 5, 6):
                     if (key := communication + n << 8 | sub) in entries:
                         self._dictionary.check[key] = rules.get(sub, self._check_state)
