@@ -75,8 +75,8 @@ class Machine:
         )
 
     def _wiring(self, axis: str) -> Wiring:
-        pdo = self.units[axis].drive.pdo
-        return Wiring.of(pdo.configured("rpdo"), pdo.configured("tpdo"))
+        drive = self.units[axis].drive
+        return Wiring.of(drive.pdo.configured("rpdo"), drive.pdo.configured("tpdo"), drive.dress.mode)
 
     @property
     def buses(self) -> tuple[str, ...]:

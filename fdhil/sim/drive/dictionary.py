@@ -88,7 +88,7 @@ class Entry:
     """One sub-index. ``access`` is ro, wo, rw, rww, rwr or const; ``node_relative``: $NODEID in the EDS.
 
     Its value is kept under ``home``, where that is not its own key, in the drive's own units: ``scale`` of them make
-    one count on the wire.
+    one count on the wire, and the number ``renamed[1]`` is ``renamed[0]`` there. ``choice`` are the counts it takes.
     """
 
     index: int
@@ -103,6 +103,8 @@ class Entry:
     node_relative: bool = False
     home: int | None = None
     scale: float = 1.0
+    renamed: tuple[int, int] | None = None
+    choice: frozenset[int] | None = None
 
     @property
     def key(self) -> int:
@@ -124,6 +126,11 @@ class Entry:
         """Whether it is an INTEGER type."""
         return self.type in SIGNED
 
+    @property
+    def limited(self) -> bool:
+        """Whether it takes some numbers of its type only."""
+        return (self.low, self.high, self.choice) != (None, None, None)
+
     def encode(self, value: Value) -> bytes:
         """Return the little-endian bytes of ``value``."""
         if isinstance(value, bytes):
@@ -134,6 +141,8 @@ class Entry:
 
     def counts(self, number: int) -> int:
         """Return a kept number as the wire shows it: in the entry's own unit, at most the end of its type's range."""
+        if self.renamed is not None and number == self.renamed[1]:
+            return self.renamed[0]
         counts = number if self.scale == 1.0 else round(number / self.scale)
         bits = 8 * (self.size or 8)
         low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if self.signed else (0, (1 << bits) - 1)
@@ -141,6 +150,8 @@ class Entry:
 
     def number(self, counts: int) -> int:
         """Return what is kept of a number on the wire."""
+        if self.renamed is not None and counts == self.renamed[0]:
+            return self.renamed[1]
         return counts if self.scale == 1.0 else round(counts * self.scale)
 
     def decode(self, data: bytes) -> Value:
@@ -152,7 +163,9 @@ class Entry:
         return int.from_bytes(data, "little", signed=self.signed)
 
     def check_range(self, value: Value) -> None:
-        """TransferAbort when a number is outside the entry's limits."""
+        """TransferAbort when a number is outside the entry's limits, or none of those that it takes."""
+        if self.choice is not None and value not in self.choice:
+            raise TransferAbort(AbortCode.RANGE)
         if isinstance(value, int) and (
             (self.low is not None and value < self.low) or (self.high is not None and value > self.high)
         ):
@@ -258,7 +271,7 @@ class Dictionary:
         entry.check_range(value)
         check = self.check.get(entry.place)
         if check is not None and isinstance(value, int):
-            check(entry, value)
+            check(entry, entry.number(value))
         self._store(entry, value)
         written = self.written.get(entry.place)
         if written is not None and isinstance(value, int):

@@ -16,9 +16,20 @@ from typing import Any
 
 from fdhil.config import MachineConfig, SimAxis
 from fdhil.sim.drive.dictionary import Entry, Object, Value
-from fdhil.sim.drive.objects import DEVICE_NAME, PRODUCT_CODE, REVISION, VENDOR_ID, Ratings, drive_objects
+from fdhil.sim.drive.objects import (
+    CYCLIC_POSITION,
+    DEVICE_NAME,
+    PRODUCT_CODE,
+    REVISION,
+    SUPPORTED_MODES,
+    VENDOR_ID,
+    Ratings,
+    drive_objects,
+)
 from fdhil.sim.drive.sheet import Sheet, read_sheet
 
+_MODES, _TARGET, _INTERPOLATION = 0x650200, 0x607A00, 0x60C101
+_INTERPOLATED = 7
 _VENDORS = range(0x2000, 0x6000)
 _APART = 1 << 24  # the vendor's values are kept apart from those of the twin's own vendor objects
 # a drive without these has no such service: no heartbeat, no SYNC counter, no reaction to a lost connection
@@ -42,7 +53,7 @@ _SPEED_UNITS = {
     "millirpm": (1 / 60e3, 0.0),
     "increments_per_ms_16": (0.0, 1e3 / 65536),
 }
-_UNITS = {"current_a": "A", "voltage_v": "V", "dc_link_v": "V", "duty": ""}
+_UNITS = {"current_a": "A", "current_share": "", "voltage_v": "V", "dc_link_v": "V", "duty": ""}
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +80,8 @@ class Dress:
     """What the wire sees of a drive; without an EDS its own objects.
 
     ``within``: entries that the drive needs and does not show. ``gauges``: what shows a signal in the vendor's way.
+    ``mode``: in which it follows set-points that come with every SYNC; its number is the vendor's where there is no
+    cyclic synchronous position.
     """
 
     objects: tuple[Object, ...]
@@ -78,13 +91,15 @@ class Dress:
     name: str = DEVICE_NAME.decode()
     within: tuple[Entry, ...] = ()
     gauges: tuple[Gauge, ...] = ()
+    mode: int = CYCLIC_POSITION
 
 
 @dataclass(frozen=True, slots=True)
 class Tailoring:
     """A file of ``dresses``: in what a vendor's drives count, and which objects show what is measured.
 
-    ``rated_torque_nm``: a count of 0x6076. ``rated_current``: the vendor's own object of it.
+    ``rated_torque_nm``: a count of 0x6076. ``rated_current``: the vendor's own object of it. ``setpoint``: the object
+    and the mode of cyclic set-points, of drives that have no cyclic synchronous position.
     """
 
     vendor: int = 0
@@ -92,6 +107,7 @@ class Tailoring:
     rated_torque_nm: float = 1e-3
     measured: tuple[Mapping[str, Any], ...] = ()
     rated_current: Mapping[str, Any] | None = None
+    setpoint: Mapping[str, Any] | None = None
 
     def speed_increments_per_count(self, increments_per_rev: int) -> float:
         """Increments per second to a count of the drive's speed objects."""
@@ -128,6 +144,30 @@ class _Tailor:
         self._sheet, self._ratings, self._cut = sheet, ratings, cut
         self._own = {entry.key: entry for item in own for entry in item.entries}
         self._identity = {0x101801: sheet.vendor, 0x101802: sheet.product, 0x101803: sheet.revision, 0x101804: serial}
+        self._entries = {entry.key: entry for item in sheet.objects for entry in item.entries}
+        self._setpoint, self._mode = self._stream()
+        self._modes = self._offered()
+
+    def _stream(self) -> tuple[int | None, int]:
+        """The object of cyclic set-points where it is not 0x607A, and their mode."""
+        said = self._cut.setpoint
+        if said is not None and (said["object"][0] << 8 | said["object"][1]) in self._entries:
+            return said["object"][0] << 8 | said["object"][1], said["mode"]
+        bits = self._entries[_MODES].default if _MODES in self._sheet.given else 1 << CYCLIC_POSITION - 1
+        assert isinstance(bits, int)
+        interpolated = bits >> _INTERPOLATED - 1 & 1 and not bits >> CYCLIC_POSITION - 1 & 1
+        return (_INTERPOLATION, _INTERPOLATED) if interpolated and _INTERPOLATION in self._entries else (None, 8)
+
+    def _offered(self) -> int:
+        """Bits of the modes that it has, as in 0x6502: those of the file, or those that the twin can do."""
+        if _MODES in self._sheet.given:
+            bits = self._entries[_MODES].default
+            assert isinstance(bits, int)
+            return bits
+        if self._setpoint is None:
+            return SUPPORTED_MODES
+        cyclic = 0b111 << CYCLIC_POSITION - 1
+        return SUPPORTED_MODES & ~cyclic | (1 << self._mode - 1 if self._mode > 0 else 0)
 
     def dress(self) -> Dress:
         objects = tuple(replace(item, entries=tuple(map(self._fit, item.entries))) for item in self._sheet.objects)
@@ -136,16 +176,26 @@ class _Tailor:
         return Dress(
             objects, self._sheet.vendor, self._sheet.product, self._sheet.revision, self._sheet.name,
             tuple(self._unshown(entry) for key, entry in self._own.items() if key not in worn),
-            tuple(self._gauges(entries)),
+            tuple(self._gauges(entries)), self._mode,
         )  # fmt: skip
 
     def _fit(self, entry: Entry) -> Entry:
+        if entry.key == self._setpoint:
+            return replace(entry, home=_TARGET, default=0, low=None, high=None)
         if entry.index in _VENDORS:
             return self._fit_apart(entry)
+        if entry.index in (0x6060, 0x6061):
+            entry = self._fit_mode(entry)
         own = self._own.get(entry.key)
         scale = self._scale(entry) if own is not None else 1.0
         entry = replace(entry, scale=scale, default=self._default(entry, own, scale))
         return replace(entry, low=None, high=None) if entry.key in _SET_UP else entry
+
+    def _fit_mode(self, entry: Entry) -> Entry:
+        """Only what it has can be chosen; its mode of cyclic set-points is the twin's cyclic synchronous position."""
+        modes = {mode for mode in range(1, 33) if self._modes & SUPPORTED_MODES >> mode - 1 & 1}
+        renamed = None if self._mode == CYCLIC_POSITION else (self._mode, CYCLIC_POSITION)
+        return replace(entry, choice=frozenset(modes | {0} | ({self._mode} if renamed else set())), renamed=renamed)
 
     def _fit_apart(self, entry: Entry) -> Entry:
         entry = replace(entry, home=entry.key | _APART)
@@ -156,6 +206,8 @@ class _Tailor:
 
     def _default(self, entry: Entry, own: Entry | None, scale: float) -> Value:
         given = entry.key in self._sheet.given
+        if entry.key == _MODES:
+            return self._modes
         if entry.key in self._identity and not (given and entry.default):
             return self._identity[entry.key]
         if entry.index == 0x1008 and not given:

@@ -93,7 +93,13 @@ class Feedback:
 
     def _show(self, current_a: float, voltage_v: float, bus_v: float) -> None:
         """Let the vendor's own objects show what is measured."""
-        signals = {"current_a": current_a, "voltage_v": voltage_v, "dc_link_v": bus_v, "duty": voltage_v / bus_v}
+        signals = {
+            "current_a": current_a,
+            "current_share": current_a * self._counts_per_a * 1e-3,
+            "voltage_v": voltage_v,
+            "dc_link_v": bus_v,
+            "duty": voltage_v / bus_v,
+        }
         for gauge in self._gauges:
             self._numbers[gauge.entry.place] = gauge.counts(signals[gauge.signal])
 

@@ -122,7 +122,7 @@ class PdoEngine:
                 inhibit_s=self._parameter(communication + n, 3) * 1e-4 if sends else 0.0,
                 event_s=self._parameter(communication + n, 5) * 1e-3,
                 start_value=self._parameter(communication + n, 6) if sends else 0,
-                checked=tuple(e for e in found if (e.low, e.high) != (None, None) or e.place in self._dictionary.check),
+                checked=tuple(entry for entry in found if entry.limited or entry.place in self._dictionary.check),
                 entries=tuple(entry for entry, _ in entries) if self._dictionary.foreign else None,
             )
 
@@ -189,7 +189,7 @@ class PdoEngine:
             try:
                 entry.check_range(received[entry.place])
                 if check := self._dictionary.check.get(entry.place):
-                    check(entry, received[entry.place])
+                    check(entry, entry.number(received[entry.place]))
             except TransferAbort:
                 del received[entry.place]
         for mapped in pdo.entries or ():

@@ -6,12 +6,12 @@ import struct
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
+from fdhil.sim.drive.objects import CYCLIC_POSITION
 from fdhil.sim.drive.pdo import Pdo
 from fdhil.sim.drive.power import State
 from fdhil.sim.frame import BusFrame
 
 CONTROLWORD, STATUSWORD, TARGET, POSITION, MODE = 0x604000, 0x604100, 0x607A00, 0x606400, 0x606000
-CYCLIC_POSITION = 8
 _OFFSETS = frozenset({0x60B000, 0x60B100, 0x60B200})
 _SILENCE_CYCLES = 5
 ENABLED = 0x0F
@@ -37,14 +37,18 @@ def power_state(statusword: int) -> State:
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """The PDOs by which the NC leads a drive; ``missing`` are the objects that it needs and no valid PDO carries."""
+    """The PDOs by which the NC leads a drive, and its ``mode`` of cyclic set-points.
+
+    ``missing`` are the objects that the NC needs and no valid PDO carries.
+    """
 
     setpoints: tuple[Pdo, ...] = ()
     answers: tuple[Pdo, ...] = ()
     missing: tuple[str, ...] = ()
+    mode: int = CYCLIC_POSITION
 
     @classmethod
-    def of(cls, rpdos: Iterable[Pdo], tpdos: Iterable[Pdo]) -> Wiring:
+    def of(cls, rpdos: Iterable[Pdo], tpdos: Iterable[Pdo], mode: int) -> Wiring:
         """Choose among a drive's PDOs: as few as do, and none that carries an offset where another does."""
         received = sorted(rpdos, key=lambda pdo: (CONTROLWORD not in pdo.keys, not _OFFSETS.isdisjoint(pdo.keys)))
         received.sort(key=lambda pdo: not {CONTROLWORD, TARGET}.issubset(pdo.keys))
@@ -57,6 +61,7 @@ class Wiring:
             tuple(pdo for pdo in used.values() if pdo in received),
             tuple(pdo for pdo in used.values() if pdo in sent),
             tuple(f"{key >> 8:04X}" for key, pdo in chosen.items() if pdo is None),
+            mode,
         )
 
     @property
@@ -91,7 +96,7 @@ class DriveLink:
 
     def set_point(self, target: int) -> list[BusFrame]:
         """Controlword and target position; what else those RPDOs carry stays at rest."""
-        values = {CONTROLWORD: self.word, TARGET: target, MODE: CYCLIC_POSITION}
+        values = {CONTROLWORD: self.word, TARGET: target, MODE: self.wiring.mode}
         return [
             (self.bus, (pdo.cob_id, pdo.codec.pack(*[0 if key is None else values.get(key, 0) for key in pdo.keys])))
             for pdo in self.wiring.setpoints
@@ -133,5 +138,5 @@ class SdoWrite:
     @property
     def frame(self) -> BusFrame:
         """The expedited download (CiA 301, 7.2.4.3.3)."""
-        write = struct.pack("<BHBI", 0x2F, self.index, 0, self.value)
+        write = struct.pack("<BHBB3x", 0x2F, self.index, 0, self.value & 0xFF)
         return self.link.bus, (0x600 + self.link.node_id, write)
