@@ -37,6 +37,15 @@ class SimAxis(Section):
     eds: Path | None = Field(
         None, description="EDS or DCF file that the simulated drive wears, from the config's folder; left out: its own"
     )
+    boot_s: NotNegative = Field(
+        0.0, le=60.0, description="from a reset, or the supply's return, to the boot-up message"
+    )
+    limit_switches_mm: tuple[Finite, Finite] | None = Field(
+        None, description="where the limit switches are, for homing; left out: there are none"
+    )
+    home_switch_mm: Finite | None = Field(
+        None, description="from where on, in the drive's positive direction, the home switch is active"
+    )
     reality: Reality = Reality()
 
 

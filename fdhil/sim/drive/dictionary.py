@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
 
@@ -16,6 +16,8 @@ class AbortCode(IntEnum):
     TOGGLE = 0x05030000
     COMMAND = 0x05040001
     BLOCK_SIZE = 0x05040002
+    SEQUENCE = 0x05040003
+    CRC = 0x05040004
     READ_WRITE_ONLY = 0x06010001
     WRITE_READ_ONLY = 0x06010002
     NO_OBJECT = 0x06020000
@@ -126,6 +128,12 @@ class Entry:
         """Whether it is an INTEGER type."""
         return self.type in SIGNED
 
+    def renumbered(self, by: int) -> Entry:
+        """Return it with another node-ID, that many higher."""
+        if not self.node_relative or not isinstance(self.default, int):
+            return self
+        return replace(self, default=self.default + by)
+
     @property
     def limited(self) -> bool:
         """Whether it takes some numbers of its type only."""
@@ -225,6 +233,11 @@ class Dictionary:
         for entry in (*self._within, *self.entries.values()):
             if which(entry):
                 self._store(entry, entry.default)
+
+    def renumber(self, by: int) -> None:
+        """The node-ID has changed: shift the defaults that are relative to it."""
+        self.entries = {key: entry.renumbered(by) for key, entry in self.entries.items()}
+        self._within = tuple(entry.renumbered(by) for entry in self._within)
 
     def _store(self, entry: Entry, value: Value) -> None:
         if isinstance(value, int):

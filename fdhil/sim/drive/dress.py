@@ -16,16 +16,8 @@ from typing import Any
 
 from fdhil.config import MachineConfig, SimAxis
 from fdhil.sim.drive.dictionary import Entry, Object, Value
-from fdhil.sim.drive.objects import (
-    CYCLIC_POSITION,
-    DEVICE_NAME,
-    PRODUCT_CODE,
-    REVISION,
-    SUPPORTED_MODES,
-    VENDOR_ID,
-    Ratings,
-    drive_objects,
-)
+from fdhil.sim.drive.modes import CYCLIC, CYCLIC_POSITION, SUPPORTED_MODES
+from fdhil.sim.drive.objects import DEVICE_NAME, PRODUCT_CODE, REVISION, VENDOR_ID, Ratings, drive_objects
 from fdhil.sim.drive.sheet import Sheet, read_sheet
 
 _MODES, _TARGET, _INTERPOLATION = 0x650200, 0x607A00, 0x60C101
@@ -166,8 +158,8 @@ class _Tailor:
             return bits
         if self._setpoint is None:
             return SUPPORTED_MODES
-        cyclic = 0b111 << CYCLIC_POSITION - 1
-        return SUPPORTED_MODES & ~cyclic | (1 << self._mode - 1 if self._mode > 0 else 0)
+        own = SUPPORTED_MODES & ~sum(1 << mode - 1 for mode in CYCLIC)
+        return own | (1 << self._mode - 1 if self._mode > 0 else 0)
 
     def dress(self) -> Dress:
         objects = tuple(replace(item, entries=tuple(map(self._fit, item.entries))) for item in self._sheet.objects)
@@ -184,8 +176,10 @@ class _Tailor:
             return replace(entry, home=_TARGET, default=0, low=None, high=None)
         if entry.index in _VENDORS:
             return self._fit_apart(entry)
-        if entry.index in (0x6060, 0x6061):
+        if entry.key in (0x606000, 0x606100):
             entry = self._fit_mode(entry)
+        if entry.key == _MODES and self._mode != CYCLIC_POSITION:
+            entry = replace(entry, renamed=(self._modes, self._modes | 1 << CYCLIC_POSITION - 1))
         own = self._own.get(entry.key)
         scale = self._scale(entry) if own is not None else 1.0
         entry = replace(entry, scale=scale, default=self._default(entry, own, scale))

@@ -1,4 +1,4 @@
-"""Handles the errors of a CANopen device: emergency messages, error history, heartbeats both ways."""
+"""Handles the errors of a CANopen device: emergency messages, error history, heartbeats both ways, node guarding."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from fdhil.sim.frame import Frame
 
 # error codes (CiA 301 table 26, CiA 402-2)
 NO_ERROR = 0x0000
-HEARTBEAT_LOST = 0x8130
+HEARTBEAT_LOST = 0x8130  # and a guarding that has ended
 PDO_TOO_SHORT = 0x8210
 SYNC_LENGTH = 0x8240
 RPDO_TIMEOUT = 0x8250
@@ -139,3 +139,34 @@ class HeartbeatProducer:
         late = self._next_s is None or now_s - self._next_s > period_s
         self._next_s = now_s + period_s if late or self._next_s is None else self._next_s + period_s
         return [(self._cob_id, bytes([state]))]
+
+
+class NodeGuarding:
+    """Answers the guard's remote frames and watches that they go on: 0x100C milliseconds times 0x100D (CiA 301)."""
+
+    def __init__(self, dictionary: Dictionary) -> None:
+        self._dictionary = dictionary
+        self.reset()
+
+    def reset(self) -> None:
+        """The node boots: the toggle bit begins anew, and life guarding with the first request."""
+        self._toggle = 0
+        self._asked_s: float | None = None
+
+    def request(self, state: int, now_s: float) -> bytes:
+        """Return the answer to a remote frame."""
+        self._asked_s = now_s
+        answer = bytes([self._toggle | state])
+        self._toggle ^= 0x80
+        return answer
+
+    def expired(self, now_s: float) -> bool:
+        """Whether the guard has just missed its life time."""
+        life_s = self._number(0x100C) * self._number(0x100D) * 1e-3
+        if not life_s or self._asked_s is None or now_s - self._asked_s <= life_s:
+            return False
+        self._asked_s = None
+        return True
+
+    def _number(self, index: int) -> int:
+        return self._dictionary.numbers.get(index << 8, 0)

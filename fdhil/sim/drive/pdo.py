@@ -23,7 +23,7 @@ from fdhil.sim.drive.dictionary import (
     Entry,
     TransferAbort,
 )
-from fdhil.sim.drive.objects import INVALID
+from fdhil.sim.drive.objects import INVALID, NO_RTR
 from fdhil.sim.frame import Frame
 
 _CODE = {
@@ -59,6 +59,7 @@ class Pdo:
     inhibit_s: float = 0.0
     event_s: float = 0.0
     start_value: int = 0
+    on_request: bool = False  # TPDO: answers remote frames
     pending: bytes | None = None  # RPDO: waits for the SYNC
     sent: bytes | None = None  # TPDO: what the master knows
     count: int = 0
@@ -122,6 +123,7 @@ class PdoEngine:
                 inhibit_s=self._parameter(communication + n, 3) * 1e-4 if sends else 0.0,
                 event_s=self._parameter(communication + n, 5) * 1e-3,
                 start_value=self._parameter(communication + n, 6) if sends else 0,
+                on_request=sends and not cob_id & NO_RTR,
                 checked=tuple(entry for entry in found if entry.limited or entry.place in self._dictionary.check),
                 entries=tuple(entry for entry, _ in entries) if self._dictionary.foreign else None,
             )
@@ -234,6 +236,10 @@ class PdoEngine:
             if pdo.kind > 240:
                 self._on_event(pdo, now_s, frames)
         return frames
+
+    def requested(self, can_id: int) -> list[Frame]:
+        """Return the TPDO that a remote frame asks for, where bit 30 of its COB-ID lets it."""
+        return [(can_id, self._content(pdo)) for pdo in self._tpdos if pdo.cob_id == can_id and pdo.on_request]
 
     def _on_event(self, pdo: Pdo, now_s: float, frames: list[Frame]) -> None:
         content = self._content(pdo)

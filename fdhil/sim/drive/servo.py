@@ -1,19 +1,20 @@
-"""Simulates a CiA 402 servo drive on a CANopen bus, sans-I/O: frames in, frames out, physics by SYNC.
+"""Simulates a CiA 402 servo drive on a CANopen bus, sans-I/O: frames in, frames out.
 
 At SYNC k the drive latches the RPDOs it received since SYNC k-1, samples all objects at t_k, sends the TPDOs that are
 due, and integrates [t_k, t_k+1). The 0x607A and 0x60B0 latched at SYNC k are what it follows at t_k+delay. Heartbeats
-and time-outs run on the wall time that :meth:`Drive.wall_clock` is given.
+and time-outs run on the time that :meth:`Drive.wall_clock` is given, and where no SYNC leads so does the motion.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from fdhil.config import MachineConfig, Noise, SimAxis
-from fdhil.records import PARAMETERS, Parameters
+from fdhil.config import MachineConfig, SimAxis
+from fdhil.sim.drive import lss
+from fdhil.sim.drive.axis_plant import AxisPlant, sensor_noise, switches
 from fdhil.sim.drive.dictionary import Dictionary
 from fdhil.sim.drive.dress import dress
 from fdhil.sim.drive.emergency_and_heartbeat import (
@@ -25,49 +26,36 @@ from fdhil.sim.drive.emergency_and_heartbeat import (
     Emergencies,
     HeartbeatConsumer,
     HeartbeatProducer,
+    NodeGuarding,
 )
 from fdhil.sim.drive.feedback import INT16, Feedback, clip
 from fdhil.sim.drive.motion import Motion
+from fdhil.sim.drive.motion_objects import NO_WINDOW
 from fdhil.sim.drive.object_write_rules import StoredParameters, register_write_rules
-from fdhil.sim.drive.objects import NO_WINDOW, Ratings
+from fdhil.sim.drive.objects import Ratings
+from fdhil.sim.drive.own_clock import OwnClock
 from fdhil.sim.drive.pdo import PdoEngine
-from fdhil.sim.drive.physics import Physics, check_structure, true_parameters
+from fdhil.sim.drive.physics import Loops, Physics, check_structure
 from fdhil.sim.drive.power import PowerStage, State
-from fdhil.sim.drive.reality import RealPhysics, is_plain, real_loops
+from fdhil.sim.drive.reality import real_loops
 from fdhil.sim.drive.sdo import SdoServer
 from fdhil.sim.drive.sensors import DriveFaults, Sensors
+from fdhil.sim.drive.service_objects import KEEP_STATE
 from fdhil.sim.drive.setpoints import CyclicSetpoints
 from fdhil.sim.frame import Frame
 
-OFF, STOPPED, OPERATIONAL, PRE_OPERATIONAL = -1, 0x04, 0x05, 0x7F
-
-
-def _physics(parameters: Parameters, config: MachineConfig, axis: str, twin: SimAxis, rad_per_mm: float) -> Physics:
-    """Make the axis' mechanics and loops: the paper's, or a real machine's where the configuration names any of it."""
-    section = config.axis[axis]
-    increments, period_s = section.drive.increments_per_rev, config.machine.sync_period_s
-    start_rad, backlash_rad = twin.start_mm * rad_per_mm, abs(twin.backlash_um * 1e-3 * rad_per_mm)
-    loops = section.regulators
-    if is_plain(twin.reality, loops):
-        return Physics(parameters, loops, period_s, increments, angle_rad=start_rad, backlash_rad=backlash_rad)
-    return RealPhysics(
-        parameters, loops, period_s, increments, twin.reality,
-        rad_per_mm=rad_per_mm, angle_rad=start_rad, backlash_rad=backlash_rad,
-    )  # fmt: skip
-
-
-def _noise(config: MachineConfig, twin: SimAxis) -> Noise:
-    """Return the sensors' white noise: a speed that is made of encoder positions has none of its own."""
-    white = twin.reality.speed_object == "shaft"
-    return config.sim.noise if white else config.sim.noise.model_copy(update={"speed_rad_s": 0.0})
+OFF, INITIALISING, STOPPED, OPERATIONAL, PRE_OPERATIONAL = -1, 0x00, 0x04, 0x05, 0x7F
+_AFTER_ERROR = {0: PRE_OPERATIONAL, 2: STOPPED}  # 0x1029: the NMT state after a communication error; 1: as it is
+_CREEP_RAD_S = 1e-6  # slower than this an axis without power stands
 
 
 class Drive:
     """One axis' drive with its motor and table.
 
-    ``faults`` may be changed at any time. ``table_mm`` is the true table position at the last SYNC, in the axis'
-    direction; ``physics`` holds the true current, speed and voltage after the cycle that was integrated.
-    ``nmt`` is the NMT state as a heartbeat shows it, -1 while the drive is without supply.
+    ``faults`` may be changed at any time. ``table_mm`` is the true table position at the start of the cycle, in the
+    axis' direction; ``physics`` holds the true current, speed and voltage after the cycle that was integrated.
+    ``nmt`` is the NMT state as a heartbeat shows it, -1 while the drive is without supply. ``cycle_ended`` is called
+    after each cycle, with the mean voltage of the one before it.
     """
 
     def __init__(self, axis: str, config: MachineConfig, rng: np.random.Generator) -> None:
@@ -78,12 +66,9 @@ class Drive:
         self.ratings = Ratings.of(config, axis)
         self.node_id = self.ratings.node_id
         self.faults = DriveFaults()
-        self._mm_per_rad = self.ratings.sign * section.screw_pitch_mm / (2 * math.pi)
+        self._boot_s = twin.boot_s
+        self._plant = AxisPlant(config, axis, twin)
         real = real_loops(twin.reality, section.regulators)
-        self._reference_c = self._celsius = config.sim.thermal.ambient_c
-        self._per_kelvin = (twin.ft_per_kelvin, twin.Cd_per_kelvin)
-        self._parameters = true_parameters(section.nominal, twin)
-        self.physics = _physics(self._parameters, config, axis, twin, 1 / self._mm_per_rad)
         self.dress = dress(config, axis)
         self.dictionary = Dictionary(self.dress.objects, self.dress.within)
         self.power = PowerStage(self.dictionary.number)
@@ -95,6 +80,8 @@ class Drive:
             CyclicSetpoints(
                 section.drive.setpoint_delay_cycles, config.machine.sync_period_s, twin.offset_in_feedforward
             ),
+            switches(twin, self.ratings),
+            (real.position_gain_per_s, real.speed_feedforward),
         )
         self.feedback = Feedback(
             self.dictionary,
@@ -103,7 +90,7 @@ class Drive:
             self.physics,
             self.power,
             self.motion,
-            Sensors(_noise(config, twin), self.faults, rng),
+            Sensors(sensor_noise(config, twin), self.faults, rng),
             self.dress.gauges,
         )
         self._attach()
@@ -112,7 +99,14 @@ class Drive:
         """Make the communication side on top of the object dictionary."""
         self.nmt = OFF
         self.tick = 0
-        self.table_mm = self.physics.table_rad * self._mm_per_rad
+        self.table_mm = self._true_table_mm
+        self.cycle_ended: Callable[[float], None] | None = None
+        self._clock = OwnClock(self.ratings.sync_period_s)
+        self._loops = Loops.POSITION
+        self._current_limit = self._limit_objects
+        self._boot_due_s: float | None = None
+        self._has_booted = False
+        self._told_s: float | None = None
         self._sync_id = 0x80
         self._sync_refused = False
         self._now_s = 0.0
@@ -124,10 +118,13 @@ class Drive:
         self._emergencies = Emergencies(self.dictionary)
         self._consumer = HeartbeatConsumer(self.dictionary)
         self._producer = HeartbeatProducer(self.dictionary, self.node_id)
+        self._guarding = NodeGuarding(self.dictionary)
+        self._lss = lss.LssSlave(self.node_id, self._identity)
         self._stored = StoredParameters(self.dictionary)
         register_write_rules(
             self.dictionary,
             changeable=self._is_pre_operational,
+            powered=lambda: self.power.powered,
             stored=self._stored,
             trace=self.feedback.trace,
             on_controlword=self._controlword_written,
@@ -137,17 +134,34 @@ class Drive:
     def _is_pre_operational(self) -> bool:
         return self.nmt == PRE_OPERATIONAL
 
+    def _identity(self) -> tuple[int, int, int, int]:
+        vendor, product, revision, serial = (self.dictionary.numbers.get(0x101800 | sub, 0) for sub in (1, 2, 3, 4))
+        return vendor, product, revision, serial
+
+    @property
+    def physics(self) -> Physics:
+        """The axis' mechanics and loops."""
+        return self._plant.physics
+
+    @property
+    def _mute(self) -> bool:
+        """Without supply, or not yet booted."""
+        return self.nmt in (OFF, INITIALISING)
+
     # -- life
 
     def power_on(self) -> list[Frame]:
-        """Boot, or boot again: the power-on values, pre-operational; returns the boot-up message."""
+        """Boot, or boot again: the power-on values, pre-operational; returns the boot-up message, if it comes at once.
+
+        The very first time it does: nobody waits for a machine that was switched on before.
+        """
+        self._take_node_id()
         self._stored.restore(lambda _: True)
         self.power.start()
         self.motion.reset(self.feedback.true_position)
         self.feedback.following_error = False
         self._over_window = self._last_offset = 0
-        self._outgoing = []
-        self.set_temperature(self._celsius)
+        self.set_temperature(self._plant.celsius)
         self.feedback.sample(self.tick)
         self.feedback.show_state()
         self.feedback.trace.clear()
@@ -156,30 +170,63 @@ class Drive:
     def power_off(self) -> None:
         """Cut the supply: no frame is sent or answered, the axis coasts; :meth:`power_on` ends it."""
         self.nmt = OFF
+        self._boot_due_s = None
         self.pdo.stop()
         self.power.start()
+        self._lss.power_on()
 
     def _boot_up(self) -> list[Frame]:
-        self.nmt = PRE_OPERATIONAL
+        self.nmt = INITIALISING
         self.pdo.stop()
         self._sdo.reset()
+        self._outgoing = []
         self._consumer.configure()
         self._producer.restart()
+        self._guarding.reset()
+        self._lss.reset()
         self._communication_changed()
+        if self.node_id == lss.UNCONFIGURED:
+            return []
+        if self._boot_s and self._has_booted:
+            self._boot_due_s = self._now_s + self._boot_s
+            return []
+        return self._booted()
+
+    def _booted(self) -> list[Frame]:
+        self.nmt = PRE_OPERATIONAL
+        self._boot_due_s, self._has_booted = None, True
         return [(0x700 + self.node_id, b"\0")]
+
+    def _take_node_id(self) -> None:
+        """Take over the node-ID that LSS has given."""
+        new, old = self._lss.pending, self.node_id
+        if new == old:
+            return
+        self.dictionary.renumber(new - old)
+        self.node_id = self._lss.node_id = new
+        self.ratings = replace(self.ratings, node_id=new)
+        self._producer = HeartbeatProducer(self.dictionary, new)
 
     def _communication_changed(self) -> None:
         self._sync_id = self.dictionary.number(0x1005) & 0x7FF
 
-    def wall_clock(self, now_s: float) -> list[Frame]:
-        """Run what depends on time and not on SYNC: heartbeats both ways, RPDO time-outs, event-driven TPDOs."""
+    def wall_clock(self, now_s: float, *, alone: bool = True) -> list[Frame]:
+        """Run what depends on time and not on SYNC: heartbeats both ways, time-outs, event-driven TPDOs, own motion.
+
+        ``alone`` is False where SYNC is the only clock of the machine.
+        """
         self._now_s = now_s
-        if self.nmt == OFF:
+        self.dictionary.numbers[0x101300] = round(now_s * 1e6) & 0xFFFFFFFF
+        self._move_alone(now_s, alone)
+        frames = self._booted() if self._boot_due_s is not None and now_s >= self._boot_due_s else []
+        if self._mute:
             return []
-        frames = self._producer.due(now_s, self.nmt)
+        frames += self._producer.due(now_s, self.nmt)
         if not self.faults.no_heartbeat_consumer:
             for node in self._consumer.expired(now_s):
                 self._connection_lost(HEARTBEAT_LOST, bytes([node]))
+        if self._guarding.expired(now_s):
+            self._connection_lost(HEARTBEAT_LOST, b"")
         for number in self.pdo.overdue(now_s):
             self._connection_lost(RPDO_TIMEOUT, bytes([number]))
         return frames + self._take_outgoing() + self.pdo.on_events(now_s)
@@ -187,19 +234,27 @@ class Drive:
     # -- frames
 
     def receive(self, can_id: int, data: bytes) -> list[Frame]:
-        """Take one frame from the bus and return what the drive sends because of it."""
+        """Take one frame from the bus and return what the drive sends because of it; one without data asks for one."""
         if can_id == self._sync_id:
             return self._sync(data)
-        if self.nmt == OFF:
+        if can_id == lss.REQUEST and self.nmt not in (OFF, OPERATIONAL):
+            answer = self._lss.receive(data)
+            return [] if answer is None else [(lss.RESPONSE, answer)]
+        if self._mute:
             return []
         if can_id == 0x600 + self.node_id:
             return self._sdo_request(data)
         if can_id == 0x000:
             return self._nmt(data)
+        if can_id == 0x700 + self.node_id:
+            return [] if data else [(can_id, self._guarding.request(self.nmt, self._now_s))]
         if can_id > 0x700:
-            back = len(data) == 1 and self._consumer.receive(can_id - 0x700, self._now_s)
-            return self._emergencies.clear(in_fault=self.power.faulty) if back else []
-        return self._rpdo(can_id, data) if self.nmt == OPERATIONAL else []
+            if len(data) == 1 and self._consumer.receive(can_id - 0x700, self._now_s):
+                self._outgoing += self._emergencies.clear(in_fault=self.power.faulty)
+            return self._take_outgoing()
+        if self.nmt != OPERATIONAL:
+            return []
+        return self._rpdo(can_id, data) if data else self.pdo.requested(can_id)
 
     def _sdo_request(self, data: bytes) -> list[Frame]:
         if self.nmt == STOPPED:
@@ -215,19 +270,22 @@ class Drive:
                 self.nmt = OPERATIONAL
                 self.pdo.configure()
             case 0x02:
-                self.pdo.stop()
-                self.nmt = STOPPED
+                self._leave_operational(STOPPED)
                 self._abort_connection()
             case 0x80:
-                self.pdo.stop()
-                self.nmt = PRE_OPERATIONAL
+                self._leave_operational(PRE_OPERATIONAL)
             case 0x81:
                 return self.power_on()
             case 0x82:
                 self._abort_connection()
+                self._take_node_id()
                 self._stored.restore(lambda entry: entry.index < 0x2000)
-                return self._boot_up() + self._take_outgoing()
+                return self._boot_up()
         return self._take_outgoing()
+
+    def _leave_operational(self, state: int) -> None:
+        self.pdo.stop()
+        self.nmt = state
 
     def _rpdo(self, can_id: int, data: bytes) -> list[Frame]:
         try:
@@ -235,44 +293,117 @@ class Drive:
         except LookupError:
             return []
         except ValueError:
-            return self._emergencies.report(PDO_TOO_SHORT)
+            self._outgoing += self._emergencies.report(PDO_TOO_SHORT)
+            return self._take_outgoing()
         if at_once is not None:
             self.pdo.apply(at_once)
             self._controlword_written()
         return self._take_outgoing()
 
     def _take_outgoing(self) -> list[Frame]:
-        frames, self._outgoing = self._outgoing, []
-        return frames
+        """Return the EMCY frames that may leave now: none in NMT stopped, and none within the inhibit time 0x1015."""
+        if not self._outgoing:
+            return []
+        if self.nmt == STOPPED or self._mute:
+            self._outgoing = []
+            return []
+        inhibit_s = self.dictionary.numbers.get(0x101500, 0) * 1e-4
+        if not inhibit_s:
+            frames, self._outgoing = self._outgoing, []
+            return frames
+        if self._told_s is not None and self._now_s - self._told_s < inhibit_s:
+            return []
+        self._told_s = self._now_s
+        return [self._outgoing.pop(0)]
 
-    # -- the SYNC cycle
+    # -- the cycle
 
     def _sync(self, data: bytes) -> list[Frame]:
-        if self.nmt == OFF:
-            self._integrate()
+        leads = self._clock.sync() or self._stands
+        if self._mute:
+            if leads:
+                self._integrate()
             return []
         counter = data[0] if data else None
         if counter is None and self.dictionary.numbers[0x101900]:
             told, self._sync_refused = self._sync_refused, True
-            return [] if told else self._emergencies.report(SYNC_LENGTH)
+            self._outgoing += [] if told else self._emergencies.report(SYNC_LENGTH)
+            return self._take_outgoing()
         self._sync_refused = False
         operational = self.nmt == OPERATIONAL
         if operational:
             self.pdo.latch()
-        self._keep_offset()
-        self._control()
-        self.motion.at_sync(self.feedback.true_position)
-        self._supervise(self.feedback.sample(self.tick))
-        self.feedback.show_state()
-        self.table_mm = self.physics.table_rad * self._mm_per_rad
+        if leads:
+            self._begin_cycle()
+        else:
+            self._controlword_written()
         frames = self.pdo.at_sync(counter, self._now_s) if operational else []
-        self._integrate()
+        if leads:
+            self._integrate()
         return frames + self._take_outgoing() if self._outgoing else frames
 
+    @property
+    def _stands(self) -> bool:
+        """Whether nothing can move: no current flows, and the axis is at rest."""
+        return not self.power.powered and abs(self.physics.speed_rad_s) < _CREEP_RAD_S
+
+    @property
+    def moves_alone(self) -> bool:
+        """Whether the drive moves by its own clock."""
+        return self._clock.leads and not self._stands
+
+    def _move_alone(self, now_s: float, alone: bool) -> None:
+        """Run the cycles that no SYNC has begun; a drive that stands needs none."""
+        if not alone:
+            self._clock.stop()
+            return
+        declared_us = self.dictionary.numbers.get(0x100600, 0)
+        bound = self.motion.bound and declared_us in (0, round(self.ratings.sync_period_s * 1e6))
+        for _ in range(self._clock.due(now_s, bound=bound)):
+            if self._stands:
+                return
+            if not self._mute:
+                self._begin_cycle()
+            self._integrate()
+
+    def _begin_cycle(self) -> None:
+        """Take the set-points as they are, sample all objects, and supervise."""
+        self._keep_offset()
+        self._control()
+        self.motion.begin_cycle(self.feedback.actual)
+        self._supervise(self.feedback.sample(self.tick))
+        self.feedback.show_state()
+        self.table_mm = self._true_table_mm
+
+    @property
+    def _true_table_mm(self) -> float:
+        place = self.physics.table_rad * self._plant.mm_per_rad
+        shift = self.motion.shift
+        return place - self.ratings.sign * shift / self.ratings.increments_per_mm if shift else place
+
     def _integrate(self) -> None:
-        self.physics.load_torque_nm = float(self.faults.load_torque_nm)
-        self.physics.cycle(self.power.powered, self.motion.command)
+        physics, motion = self.physics, self.motion
+        ended_v = physics.voltage_mean_v
+        if motion.loops is not self._loops:
+            self._loops = motion.loops
+            physics.close_loops(motion.loops)
+        if self._limit_objects != self._current_limit:
+            self._current_limit = self._limit_objects
+            physics.limit_current(min(self._current_limit) * 1e-3 * self.ratings.rated_current_a)
+        command = motion.command
+        if motion.shift:
+            command = (command[0] + motion.shift, command[1] + motion.shift, *command[2:])
+        physics.load_torque_nm = float(self.faults.load_torque_nm)
+        physics.cycle(self.power.powered, command)
         self.tick += 1
+        if self.cycle_ended is not None:
+            self.cycle_ended(ended_v)
+
+    @property
+    def _limit_objects(self) -> tuple[int, int]:
+        """Max torque and max current, 0.1 % of the rated ones."""
+        numbers = self.dictionary.numbers
+        return numbers.get(0x607200, 0xFFFF), numbers.get(0x607300, 0xFFFF)
 
     def _keep_offset(self) -> None:
         """With the fault ``ignore_offset`` what was written to 0x60B0 is lost."""
@@ -319,6 +450,9 @@ class Drive:
         if self.dictionary.number(0x6007) == 1:
             self.dictionary.numbers[0x603F00] = code
             self.power.fault()
+        state = _AFTER_ERROR.get(self.dictionary.numbers.get(0x102901, KEEP_STATE))
+        if state is not None and self.nmt == OPERATIONAL:
+            self._leave_operational(state)
         self._abort_connection()
 
     def _abort_connection(self) -> None:
@@ -335,29 +469,12 @@ class Drive:
 
         TypeError for another name, ValueError for a value that no plant has.
         """
-        unknown = [name for name in values if name not in PARAMETERS]
-        if unknown:
-            raise TypeError(f"{', '.join(unknown)} is no parameter of a drive")
-        changed = self._parameters.changed(**values)
-        for name, value in changed.as_dict().items():
-            if not (math.isfinite(value) and value >= 0 and (value > 0 or name in ("ft", "Cd"))):
-                raise ValueError(f"{name} = {value} is no value of a feed drive; it must be finite and above 0")
-        self._parameters = changed
-        self._apply_parameters()
+        self._plant.set_parameters(**values)
 
     def set_temperature(self, celsius: float) -> None:
         """Set the slide-way's temperature: 0x2110 shows it, ft and Cd follow it."""
-        self._celsius = celsius
         self.dictionary.numbers[0x211001] = clip(celsius * 100, INT16)
-        self._apply_parameters()
-
-    def _apply_parameters(self) -> None:
-        rise = self._celsius - self._reference_c
-        ft, Cd = (max(1 + rate * rise, 0.0) for rate in self._per_kelvin)
-        base = self._parameters
-        now = replace(base, ft=base.ft * ft, Cd=base.Cd * Cd)
-        if now != self.physics.parameters:
-            self.physics.set_parameters(now)
+        self._plant.warm(celsius)
 
     def set_object(self, index: int, sub: int, value: int) -> None:
         """Write an object past all access rules, as another tool or a wrong set-up would have; KeyError if unknown."""

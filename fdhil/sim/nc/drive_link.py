@@ -6,7 +6,7 @@ import struct
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from fdhil.sim.drive.objects import CYCLIC_POSITION
+from fdhil.sim.drive.modes import CYCLIC_POSITION
 from fdhil.sim.drive.pdo import Pdo
 from fdhil.sim.drive.power import State
 from fdhil.sim.frame import BusFrame
