@@ -12,8 +12,10 @@ from fdhil.config.axis import (
     CEILING_SPEED_MM_S,
     Axis,
     CorrectionLimits,
+    Drive,
     FeedforwardLimits,
     Nominal,
+    SpeedUnit,
     Thermometer,
 )
 from fdhil.config.controller import Identification, Nc
@@ -34,6 +36,7 @@ __all__ = [
     "Axis",
     "CanBus",
     "CorrectionLimits",
+    "Drive",
     "FeedforwardLimits",
     "Identification",
     "MachineConfig",
@@ -46,6 +49,7 @@ __all__ = [
     "Regulators",
     "Section",
     "SimAxis",
+    "SpeedUnit",
     "Thermal",
     "Thermometer",
     "load",

@@ -53,8 +53,9 @@ class MachineConfig(Section):
             found = [] if (info.context or {}).get("made_up") else doubts(axis)
             faults += [f"axis.{name}.{doubt.key}: {doubt.text}" for doubt in found if limits or not doubt.possible]
             faults += limits
-        ids = [self.node_id(name) for name in self.axis]
-        if len({(self.axis[n].drive.bus, i) for n, i in zip(self.axis, ids, strict=True)}) < len(ids):
+        # the PDOs of a device's second axis are those of the next node-ID
+        ids = {(axis.drive.bus, self.node_id(name) + axis.drive.logical_axis) for name, axis in self.axis.items()}
+        if len(ids) < len(self.axis):
             faults.append("axis: two drives of one bus have the same node_id")
         faults += [f"sim.axis.{name}: there is no [axis.{name}]" for name in self.sim.axis if name not in self.axis]
         if faults:
