@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from fdhil.config import Axis, Identification
+from fdhil.identification.compliance import beside_the_config, compliance, joined
 from fdhil.identification.estimators import chosen, maximum_likelihood
 from fdhil.identification.identifiability import empty_estimate
 from fdhil.identification.signals import mended
@@ -31,7 +32,20 @@ def analyse(
     """
     at_instants = mended(window, settings.speed_source)
     signals = Evidence(at_instants, settings, axis=own(window, axis), sync_period_s=sync_period_s, recorded=window)
-    return replace(_analysed(signals), window=window)
+    return replace(_with_table(_analysed(signals), signals), window=window)
+
+
+def _with_table(outcome: WindowOutcome, signals: Evidence) -> WindowOutcome:
+    """Return the outcome with the resonance that sensors at the table show, where there are such."""
+    window, estimate = signals.window, outcome.estimate
+    if estimate is None or (window.table_mm is None and window.table_m_s2 is None):
+        return outcome
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        found = compliance(window, estimate.parameters())
+    if found is None:
+        return outcome
+    warnings = (*outcome.verdict.warnings, *beside_the_config(found, signals.axis))
+    return replace(outcome, estimate=joined(estimate, found), verdict=replace(outcome.verdict, warnings=warnings))
 
 
 def _analysed(signals: Evidence) -> WindowOutcome:

@@ -115,9 +115,11 @@ class Window:
     value at t_k; ``voltage_delay_s`` (what is left after alignment by counters, None when not known) has not been
     taken out. ``slow_voltage`` stands in its place where a sensor samples more slowly than the drive.
     ``speed_late_s`` is how late the recorded speed was, which has been taken out (None: nothing was), with its standard
-    deviation. ``start_s`` is the time of row 0 in its recording or since the first tick. ``offset_mm`` is the position
-    offset in force, None where it was 0 throughout or is not known. ``torque_constant_nm_per_a`` is the K that the
-    recording itself tells. Two windows are equal when they are the same one.
+    deviation. ``table_mm`` is the place and ``table_m_s2`` the acceleration that sensors at the table tell, NaN in rows
+    that they do not, None without them. ``start_s`` is the time of row 0 in its recording or since the first tick.
+    ``offset_mm`` is the position offset in force, None where it was 0 throughout or is not known.
+    ``torque_constant_nm_per_a`` is the K that the recording itself tells. Two windows are equal when they are the same
+    one.
     """
 
     axis: str
@@ -143,6 +145,8 @@ class Window:
     speed_late_s: float | None = None
     speed_late_std_s: float = 0.0
     torque_constant_nm_per_a: float | None = None
+    table_mm: Float | None = None
+    table_m_s2: Float | None = None
 
     @property
     def n(self) -> int:
@@ -178,3 +182,5 @@ class Recording:
     offset_mm: Float | None = None
     source: str = ""
     torque_constant_nm_per_a: float | None = None
+    table_mm: Float | None = None
+    table_m_s2: Float | None = None
