@@ -14,7 +14,6 @@ from fdhil.config.axis import (
     CorrectionLimits,
     FeedforwardLimits,
     Nominal,
-    Thermometer,
 )
 from fdhil.config.controller import Identification, Nc
 from fdhil.config.machine import MachineConfig
@@ -23,6 +22,7 @@ from fdhil.config.reading import load, parse, toml_document, unlikely
 from fdhil.config.reality import Reality
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import Section
+from fdhil.config.sensors import Thermometer, Voltage
 from fdhil.config.service import CanBus, Maintenance
 from fdhil.config.simulation import Noise, SimAxis, Thermal
 
@@ -48,6 +48,7 @@ __all__ = [
     "SimAxis",
     "Thermal",
     "Thermometer",
+    "Voltage",
     "load",
     "parse",
     "share_fault",

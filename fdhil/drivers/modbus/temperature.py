@@ -6,7 +6,8 @@ import asyncio
 
 from fdhil.config import Thermometer
 from fdhil.drivers.can.tick_clock import TickClock
-from fdhil.drivers.modbus.link import PLAUSIBLE_C, ModbusLink, float32
+from fdhil.drivers.modbus.link import PLAUSIBLE_C, ModbusLink
+from fdhil.drivers.modbus.values import float32
 from fdhil.errors import ProtocolError
 from fdhil.records import Temperature
 
@@ -19,7 +20,7 @@ class ModbusTemperature:
     def __init__(self, axis: str, settings: Thermometer) -> None:
         self.axis = axis
         self.name = f"thermometer {axis}"
-        self.link = ModbusLink(self.name, settings.host, settings.port, settings.unit, settings.timeout_s)
+        self.link = ModbusLink(self.name, settings)
         self.samples = 0
         self._address = settings.address
         self._period_s = settings.period_s
