@@ -25,12 +25,14 @@ from fdhil.config.section import Section
 from fdhil.config.sensors import Thermometer, Voltage
 from fdhil.config.service import CanBus, Maintenance
 from fdhil.config.simulation import Noise, SimAxis, Thermal
+from fdhil.config.table import Accelerometer, TableEncoder
 
 __all__ = [
     "CEILING_ACCELERATION_MM_S2",
     "CEILING_OFFSET_UM",
     "CEILING_SPEED_MM_S",
     "VARIATION_MM",
+    "Accelerometer",
     "Axis",
     "CanBus",
     "CorrectionLimits",
@@ -46,6 +48,7 @@ __all__ = [
     "Regulators",
     "Section",
     "SimAxis",
+    "TableEncoder",
     "Thermal",
     "Thermometer",
     "Voltage",

@@ -6,8 +6,8 @@ table's place t follow the motor's place a as a linear system, with w and z thos
     (s^2 + 2 z w s + w^2) t = (2 z w s + w^2) a - friction / inertia of the table
 
 The answer to the measured a is made at its frequencies. What swings since the table broke loose, offsets of sensors,
-the screw's pitch and what friction bends are linear in it and fitted beside it. Of the motor's torque, what the swinging
-table takes tells its share of the inertia, and so the resonance with the motor free, w / sqrt(1 - share).
+the screw's pitch and what friction bends are linear in it and fitted beside it. What the swinging table takes of the
+motor's torque tells its share of the inertia, and so the resonance with the motor free, w / sqrt(1 - share).
 """
 
 from __future__ import annotations

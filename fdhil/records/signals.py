@@ -9,6 +9,7 @@ from typing import Literal
 
 from fdhil.records.values import Float, Int
 
+TableSignal = Literal["table_mm", "table_m_s2"]
 VoltageSampling = Literal["interval_mean", "instant"]
 
 
@@ -59,6 +60,22 @@ class SlowVoltage:
     period_s: float
     error_s: float
     voltage_v: Float
+
+
+@dataclass(frozen=True, slots=True)
+class TableSamples:
+    """Samples of a sensor at an axis' table: ``values`` (n,) in the unit of ``signal`` at ``tick`` (n,), which rises.
+
+    A tick between two SYNCs has a fraction; ``tick_error`` is how far off all of them may be, 0 where they were sampled
+    at the SYNC. Samples of an acceleration come ``rate_per_tick``; a longer step is a lost one.
+    """
+
+    axis: str
+    signal: TableSignal
+    tick: Float
+    tick_error: float
+    values: Float
+    rate_per_tick: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from fdhil.sim.fault_script import FaultSchedule
 from fdhil.sim.frame import BusFrame, Frame
 from fdhil.sim.nc.controller import Event, NcController, Row
 from fdhil.sim.recorder import Recorder
+from fdhil.sim.table_sensors import TableSensors
 from fdhil.sim.thermal import SlideWay
 from fdhil.sim.wire.modbus_sensor import VoltageSensor
 
@@ -41,6 +42,7 @@ class Machine:
         self.units = {
             axis: self._unit(axis, seeds[2 * place], seeds[2 * place + 1]) for place, axis in enumerate(config.axis)
         }
+        self.tables = TableSensors(config)
         self._of_bus: dict[str, list[AxisUnit]] = {}
         for unit in self.units.values():
             self._of_bus.setdefault(unit.bus, []).append(unit)
@@ -103,7 +105,7 @@ class Machine:
         for unit in self.units.values():
             unit.drive.physics.rehearse()
             unit.power(True)
-        return self._take_outbox()
+        return self._take_outbox() + self.tables.power_on()
 
     def receive(self, bus: str, frame: Frame) -> list[Frame]:
         """Take a frame that another party sent and return what the drives of that bus send because of it."""
@@ -113,6 +115,7 @@ class Machine:
         answers: list[Frame] = []
         for unit in self._of_bus.get(bus, ()):
             answers += unit.drive.receive(can_id, data)
+        answers += self.tables.receive(bus, frame)
         if self.nc.on:
             self.nc.hear(bus, frame)
             for answer in answers:
@@ -142,7 +145,7 @@ class Machine:
 
     def wall_clock(self, now_s: float) -> list[BusFrame]:
         """Run what depends on time and not on SYNC: heartbeats and their monitoring."""
-        frames: list[BusFrame] = []
+        frames = self.tables.wall_clock(now_s)
         for unit in self.units.values():
             for frame in unit.drive.wall_clock(now_s):
                 frames.append((unit.bus, frame))
@@ -185,9 +188,11 @@ class Machine:
         drive = unit.drive
         before = drive.tick
         ended_v = drive.physics.voltage_mean_v  # of the period that this SYNC ends: no sensor knows it earlier
+        table_rad_s = drive.physics.table_speed_rad_s
         frames = drive.receive(SYNC, data)
         if drive.tick == before:
             return frames
+        frames += self.tables.at_sync(drive, table_rad_s)
         heard = drive.pdo.heard_before
         unit.offsets.step(OFFSET_RPDO in heard)
         for key in self._listed:

@@ -7,7 +7,8 @@ from fdhil.drivers.can.frames import Frames, error_notices
 from fdhil.drivers.can.node_watch import NodeWatch
 from fdhil.drivers.can.sync_grid import SyncGrid
 from fdhil.drivers.cia402.drive import Cia402Decoder, InputSamples
-from fdhil.records import AxisSamples, Notice, TickTimes
+from fdhil.drivers.table.tpdo_encoder import TpdoEncoder
+from fdhil.records import AxisSamples, Notice, TableSamples, TickTimes
 
 _SYNC_SILENCE_NS = 1_000_000_000
 
@@ -21,13 +22,18 @@ class BusDecoder:
         self.axes = [axis for axis, settings in config.axis.items() if settings.drive.bus == bus]
         self.decoders = {axis: Cia402Decoder(axis, config) for axis in self.axes}
         self.watches = {axis: NodeWatch(axis, config.node_id(axis)) for axis in self.axes}
+        tables = {axis: config.axis[axis].table for axis in self.axes}
+        self.tables = [TpdoEncoder(axis, t) for axis, t in tables.items() if t is not None and t.source == "canopen"]
         self._last_sync_ns: int | None = None
         self._sync_lost = False
 
-    def feed(self, frames: Frames, now_ns: int) -> list[TickTimes | AxisSamples | InputSamples | Notice]:
+    def feed(self, frames: Frames, now_ns: int) -> list[TickTimes | AxisSamples | InputSamples | TableSamples | Notice]:
         """Take a block of frames; return times of the ticks, samples, inputs and notices."""
         ticked = self.grid.feed(frames)
-        out: list[TickTimes | AxisSamples | InputSamples | Notice] = [*error_notices(frames), *ticked.notices]
+        out: list[TickTimes | AxisSamples | InputSamples | TableSamples | Notice] = [
+            *error_notices(frames),
+            *ticked.notices,
+        ]
         if ticked.syncs.tick.size:
             out.append(ticked.syncs)
             self._last_sync_ns = int(ticked.syncs.t_ns[-1])
@@ -35,6 +41,8 @@ class BusDecoder:
         for axis in self.axes:
             out += self.decoders[axis].feed(ticked)
             out += self.watches[axis].feed(frames, now_ns)
+        for encoder in self.tables:
+            out += encoder.feed(ticked)
         return out
 
     def _sync_silence(self, now_ns: int) -> list[Notice]:

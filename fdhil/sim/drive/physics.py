@@ -229,6 +229,11 @@ class Physics:
         self._plant = np.array(list(parameters.as_dict().values()))
         self._phi = discretise(self._plant, self.step_s)
 
+    @property
+    def table_speed_rad_s(self) -> float:
+        """The table's speed, as that of a shaft that it follows."""
+        return self.speed_rad_s
+
     def rehearse(self) -> None:
         """Run one cycle on a copy of the state: when this returns the kernels are compiled, which takes seconds."""
         self._run(self._state.copy(), self.voltage_v.copy(), False, (0.0,) * 8)
