@@ -76,7 +76,7 @@ class _Motor:
         if np.count_nonzero(known) < LEAST_ROWS or known.mean() < 0.9:
             return None
         speed = bridged(window.speed_rad_s) * mm_per_rad
-        size = quick_size(2 * speed.size)
+        size = 2 * quick_size(speed.size)  # even, as the inverse transform takes it
         place, noise = _place(bridged(window.position_mm), speed, dt, size)
         slow = smooth(speed, dt)
         moving = window.direction * slow > MOVING * np.abs(slow).max()
@@ -219,8 +219,8 @@ def _eyes(window: Window, motor: _Motor) -> list[_Eye]:
             continue
         rows = motor.rows & np.isfinite(values)
         if np.count_nonzero(rows) >= max(LEAST_ROWS, 0.8 * np.count_nonzero(motor.rows)):
-            seen = values[rows] / unit
-            own = max(noise_of(seen), resolution(seen) / math.sqrt(12.0), 1e-9)
+            seen, step = values[rows] / unit, resolution(values[np.isfinite(values)]) / unit
+            own = max(noise_of(seen), step / math.sqrt(12.0), 1e-9)
             found.append(_Eye(motor, name, seen, rows, own))
     return found
 
