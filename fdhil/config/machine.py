@@ -14,6 +14,7 @@ from fdhil.config.offset_bounds import limit_faults
 from fdhil.config.plausible import doubts
 from fdhil.config.regulators import period_faults
 from fdhil.config.section import AxisName, Positive, Section
+from fdhil.config.sensors import Thermometer, Voltage, line_faults
 from fdhil.config.service import CanBus, Guard, Maintenance, Store
 from fdhil.config.simulation import Sim
 
@@ -53,6 +54,7 @@ class MachineConfig(Section):
             found = [] if (info.context or {}).get("made_up") else doubts(axis)
             faults += [f"axis.{name}.{doubt.key}: {doubt.text}" for doubt in found if limits or not doubt.possible]
             faults += limits
+        faults += line_faults(self.sensors)
         ids = [self.node_id(name) for name in self.axis]
         if len({(self.axis[n].drive.bus, i) for n, i in zip(self.axis, ids, strict=True)}) < len(ids):
             faults.append("axis: two drives of one bus have the same node_id")
@@ -60,6 +62,16 @@ class MachineConfig(Section):
         if faults:
             raise ValueError("\n".join(faults))
         return self
+
+    @property
+    def sensors(self) -> dict[str, Voltage | Thermometer]:
+        """The sections of all sensors, by their path."""
+        found: dict[str, Voltage | Thermometer] = {}
+        for name, axis in self.axis.items():
+            found[f"axis.{name}.voltage"] = axis.voltage
+            if axis.temperature is not None:
+                found[f"axis.{name}.temperature"] = axis.temperature
+        return found
 
     def node_id(self, axis: str) -> int:
         """Return the CANopen node-ID of an axis' drive."""

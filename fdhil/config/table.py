@@ -7,12 +7,12 @@ from typing import Literal
 from pydantic import Field, model_validator
 
 from fdhil.config.section import Finite, Positive
-from fdhil.config.sensors import ModbusPlace, ModbusValue, SerialPlace, ValueType
+from fdhil.config.sensors import ModbusPlace, ModbusValue, Scaled, SerialPlace, ValueType
 
 IN_A_FRAME = {"int16": 16, "uint16": 16, "int32": 32, "uint32": 32}  # bits
 
 
-class TableEncoder(ModbusPlace, ModbusValue):
+class TableEncoder(Scaled, ModbusValue, ModbusPlace):
     """[axis.X.table]: an encoder at the table. Without this section what the screw hides is not seen.
 
     In a TPDO of the axis' bus that is sent after every SYNC it sees how the table swings; asked over Modbus, a few

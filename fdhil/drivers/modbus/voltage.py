@@ -22,6 +22,7 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.meter import BEYOND_LIMIT, SYNC_LATENESS_NS
 from fdhil.drivers.modbus.counter_clock import CounterClock, Line
 from fdhil.drivers.modbus.link import PLAUSIBLE_C, ModbusLink
 from fdhil.drivers.modbus.values import float32, uint32
@@ -34,7 +35,6 @@ BLOCK_SAMPLES = 100
 ALL_REGISTERS = FIRST_SAMPLE + BLOCK_SAMPLES
 STATUS_LOST = 2
 STUCK_POLLS = 20
-SYNC_LATENESS_NS = 200_000  # how late the stamp of a SYNC may be on a busy computer
 _SETTLE_STEPS = 8
 _SETTLE_STEP_S = 0.01
 _SETTLED_NS = 50_000_000  # a query is placed when so many later SYNCs have shown which stamps around it were late
@@ -87,6 +87,7 @@ class ModbusVoltage:
         self.axis = axis
         self.name = f"voltage sensor {axis}"
         self._sign = config.axis[axis].drive.sign
+        self.limit_v = BEYOND_LIMIT * config.axis[axis].regulators.voltage_limit_v
         self._period_s = config.machine.sync_period_s
         self.link = ModbusLink(self.name, settings)
         self._host_clock: CounterClock | None = None

@@ -7,30 +7,35 @@ import asyncio
 from fdhil.config import TableEncoder
 from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.modbus.link import ModbusLink
-from fdhil.drivers.modbus.values import numbers, registers_of
+from fdhil.drivers.modbus.meter import ModbusMeter
 from fdhil.records import TableSamples, frozen
 
 SETTLE_STEPS, SETTLE_STEP_S = 8, 0.01  # until the SYNCs about the answer have been drained
 
 
 class ModbusEncoder:
-    """The table encoder of one axis; ``link`` is its connection, ``samples`` counts readings, none can be ``lost``."""
+    """The table encoder of one axis; ``samples`` counts readings, none can be ``lost``."""
 
     lost = 0
 
     def __init__(self, axis: str, settings: TableEncoder) -> None:
         self.axis = axis
         self.name = f"table encoder {axis}"
-        self.link = ModbusLink(self.name, settings)
         self.samples = 0
-        self._settings = settings
+        self._meter = ModbusMeter(self.name, settings, settings, settings.type)
+        self._period_s = settings.period_s
+
+    @property
+    def link(self) -> ModbusLink:
+        """The module's connection."""
+        return self._meter.link
 
     async def poll(self, ticks: TickClock) -> list[TableSamples]:
         """Rest for the period and read once; it was read between question and answer. Errors of the link pass."""
-        await asyncio.sleep(self._settings.period_s)
-        value = await self._place_mm()
+        await asyncio.sleep(self._period_s)
+        value = await self._meter.value()
         self.samples += 1
-        asked_ns, answered_ns = self.link.asked_ns, self.link.answered_ns
+        asked_ns, answered_ns = self._meter.asked_ns, self._meter.answered_ns
         for _ in range(SETTLE_STEPS):
             if not ticks.running or ticks.covers(answered_ns):
                 break
@@ -43,9 +48,4 @@ class ModbusEncoder:
 
     async def reading(self) -> str:
         """Read once, for people."""
-        return f"{await self._place_mm():.4f} mm"
-
-    async def _place_mm(self) -> float:
-        s = self._settings
-        registers = await self.link.read(s.function, s.address, registers_of(s.type))
-        return float(numbers(registers, s.type, s.word_order)[0]) * s.scale + s.offset
+        return f"{await self._meter.value():.4f} mm"
