@@ -55,6 +55,7 @@ class Accelerometer(SerialPlace):
     ADXL345 boards, as printers have them, do; the defaults are of one that sends ``count,x,y,z`` in counts of 3.9 mg.
     """
 
+    device: str = Field(min_length=1, description="the serial device, as /dev/ttyACM0 or /dev/serial/by-id/...")
     baud_rate: int = Field(115200, ge=1200, le=4_000_000, description="serial: bits per second; a USB port knows none")
     parity: Literal["even", "odd", "none"] = Field("none", description="serial: parity")
     rate_hz: Positive = Field(800.0, ge=50, le=5000, description="samples per second, as far as it is known")
@@ -67,8 +68,6 @@ class Accelerometer(SerialPlace):
 
     @model_validator(mode="after")
     def _told(self) -> Accelerometer:
-        if not self.device:
-            raise ValueError("device: is needed; it is the serial device, as /dev/ttyACM0")
         if self.scale == 0:
             raise ValueError("scale: a count must be worth something; give m/s2 per count")
         if self.column == self.count_column:

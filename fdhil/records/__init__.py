@@ -37,7 +37,17 @@ from fdhil.records.values import (
     rms,
     unit_of,
 )
-from fdhil.records.verdicts import Estimate, LoopEstimate, Notice, ParameterSet, Reason, Result, Verdict, WindowOutcome
+from fdhil.records.verdicts import (
+    AtTable,
+    Estimate,
+    LoopEstimate,
+    Notice,
+    ParameterSet,
+    Reason,
+    Result,
+    Verdict,
+    WindowOutcome,
+)
 
 Outcome = WindowOutcome | ParameterSet | Skill | Notice | LoopEstimate
 
@@ -46,6 +56,7 @@ __all__ = [
     "PARAMETERS",
     "RATIOS",
     "UNITS",
+    "AtTable",
     "AxisSamples",
     "Bool",
     "Correction",

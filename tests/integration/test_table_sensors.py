@@ -45,8 +45,24 @@ def test_the_resonance_is_found_in_rapids(bench: Bench, tmp_path: Path) -> None:
         outcomes = digested(AxisPipeline(axis, bench.config), records)
         for o in outcomes:
             if isinstance(o, WindowOutcome):
-                print(axis, o.verdict.accepted, o.verdict.reasons, o.window.table_mm is not None, o.window.table_m_s2 is not None, o.estimate and o.estimate.terms, o.estimate and [(n, o.estimate.value(n), o.estimate.std(n)) for n in o.estimate.terms])
-                np.savez(f"/tmp/eyes/{axis}-{o.window.start_tick}.npz", **{k: getattr(o.window,k) for k in ("speed_rad_s","position_mm","table_mm","table_m_s2","demand_mm", "current_a") if getattr(o.window,k) is not None})
+                print(o.at_table)
+                print(
+                    axis,
+                    o.verdict.accepted,
+                    o.verdict.reasons,
+                    o.window.table_mm is not None,
+                    o.window.table_m_s2 is not None,
+                    o.estimate and o.estimate.terms,
+                    o.estimate and [(n, o.estimate.value(n), o.estimate.std(n)) for n in o.estimate.terms],
+                )
+                np.savez(
+                    f"/tmp/eyes/{axis}-{o.window.start_tick}.npz",
+                    **{
+                        k: getattr(o.window, k)
+                        for k in ("speed_rad_s", "position_mm", "table_mm", "table_m_s2", "demand_mm", "current_a")
+                        if getattr(o.window, k) is not None
+                    },
+                )
             if isinstance(o, ParameterSet):
                 print(o.parameters)
     print(counters)
