@@ -12,10 +12,12 @@ from fdhil.config.axis import (
     CEILING_SPEED_MM_S,
     Axis,
     CorrectionLimits,
+    Drive,
     FeedforwardLimits,
     Nominal,
-    Thermometer,
+    SpeedUnit,
 )
+from fdhil.config.bus import CanBus
 from fdhil.config.controller import Identification, Nc
 from fdhil.config.machine import MachineConfig
 from fdhil.config.offset_bounds import VARIATION_MM, OffsetBounds, share_fault
@@ -23,17 +25,21 @@ from fdhil.config.reading import load, parse, toml_document, unlikely
 from fdhil.config.reality import Reality
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import Section
-from fdhil.config.service import CanBus, Maintenance
+from fdhil.config.sensors import Thermometer, Voltage
+from fdhil.config.service import Maintenance
 from fdhil.config.simulation import Noise, SimAxis, Thermal
+from fdhil.config.table import Accelerometer, TableEncoder
 
 __all__ = [
     "CEILING_ACCELERATION_MM_S2",
     "CEILING_OFFSET_UM",
     "CEILING_SPEED_MM_S",
     "VARIATION_MM",
+    "Accelerometer",
     "Axis",
     "CanBus",
     "CorrectionLimits",
+    "Drive",
     "FeedforwardLimits",
     "Identification",
     "MachineConfig",
@@ -46,8 +52,11 @@ __all__ = [
     "Regulators",
     "Section",
     "SimAxis",
+    "SpeedUnit",
+    "TableEncoder",
     "Thermal",
     "Thermometer",
+    "Voltage",
     "load",
     "parse",
     "share_fault",

@@ -10,36 +10,19 @@ from typing import Protocol
 from fdhil import tables
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.tick_clock import TickClock
-from fdhil.drivers.modbus.temperature import ModbusTemperature
+from fdhil.drivers.link import Link
+from fdhil.drivers.table.accelerometer import StreamedAccelerometer
+from fdhil.drivers.table.modbus_encoder import ModbusEncoder
+from fdhil.drivers.thermometer import SlidewayThermometer
 from fdhil.errors import DeviceError
-from fdhil.records import AxisSamples, MoveEvent, Notice, Temperature, TickTimes, VoltageSamples
+from fdhil.records import AxisSamples, MoveEvent, Notice, TableSamples, Temperature, TickTimes, VoltageSamples
 
-Record = AxisSamples | VoltageSamples | TickTimes | MoveEvent | Temperature | Notice
+Record = AxisSamples | VoltageSamples | TableSamples | TickTimes | MoveEvent | Temperature | Notice
 Take = Callable[[Record], None]
 """Takes a source's records; it never waits, for nothing may hold a source up."""
 
 POLL_S = 0.05
 BACK_OFF_S = (0.1, 5.0)
-
-
-class Link(Protocol):
-    """The connection to a sensor; ``wire`` names its kind, ``place`` tells people where it leads."""
-
-    wire: str
-    place: str
-
-    @property
-    def connected(self) -> bool:
-        """Whether it stands."""
-
-    async def connect(self) -> None:
-        """Connect anew; ConnectError when nobody answers there."""
-
-    def fault_code(self, error: DeviceError) -> str | None:
-        """Return the class under which ``error`` is told; None for what passes by itself."""
-
-    def close(self) -> None:
-        """End the connection."""
 
 
 class Sensor(Protocol):
@@ -62,12 +45,16 @@ class Sensor(Protocol):
 
 
 def sensors_of(axis: str, config: MachineConfig) -> dict[str, Sensor]:
-    """Return the sensors of their own that an axis has, by what they tell: ``voltage``, ``temperature``."""
+    """Return the sensors of their own that an axis has, by what they tell."""
     settings, found = config.axis[axis], {}
     if settings.voltage.separate:
         found["voltage"] = tables.load(tables.VOLTAGE_SOURCES, settings.voltage.source)(axis, config)
     if settings.temperature is not None:
-        found["temperature"] = ModbusTemperature(axis, settings.temperature)
+        found["temperature"] = SlidewayThermometer(axis, settings.temperature)
+    if settings.table is not None and settings.table.source == "modbus":
+        found["table"] = ModbusEncoder(axis, settings.table)
+    if settings.accelerometer is not None:
+        found["acceleration"] = StreamedAccelerometer(axis, settings.accelerometer, config.machine.sync_period_s)
     return found
 
 
