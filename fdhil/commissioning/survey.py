@@ -95,7 +95,7 @@ def listen(master: Master) -> None:
     On a silent bus the drive is asked what it is: with the NC off, one that sends no heartbeat (0x1017 = 0) is silent.
     """
     end = time.monotonic() + LISTEN_S
-    while time.monotonic() < end and master.heard.sync == 0:
+    while time.monotonic() < end and master.heard.master is None:
         master.check()
         time.sleep(0.01)
     require_alone(master)
@@ -117,8 +117,10 @@ def _ask_alone(master: Master) -> None:
 
 def require_alone(master: Master) -> None:
     """ProtocolError when another master was heard; to be asked before our own SYNC starts."""
-    if master.heard.sync or master.heard.foreign_rpdo:
-        text = "an NC is sending SYNC or set-points; switch it off while an axis is commissioned"
+    sign = master.heard.master
+    if sign is not None:
+        what = "SYNC or set-points" if sign in ("SYNC", "set-points") else sign
+        text = f"an NC is sending {what}; switch it off while an axis is commissioned"
         raise ProtocolError(f"bus {master.bus.name}", text)
 
 
