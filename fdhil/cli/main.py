@@ -18,6 +18,7 @@ __all__ = ["COMMANDS", "cli", "main", "run_safely"]
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "demo": ("fdhil.cli.demo:demo", "Run the whole loop on the simulated machine and write a report."),
     "scan": ("fdhil.cli.commissioning:scan", "List what is on the bus: nodes, identity, state, heartbeat."),
+    "eds": ("fdhil.cli.eds:eds", "Tell from a drive's EDS or DCF file what fdhil can and cannot do with it."),
     "check": ("fdhil.cli.commissioning:check", "Check that the machine on the bus is the one in the config."),
     "commission": ("fdhil.cli.commissioning:commission", "Commission the drives, step by step."),
     "run": ("fdhil.cli.service:run", "Run the daemon: listen, identify, predict; correct only when armed."),

@@ -15,7 +15,8 @@ from fdhil.commissioning.record import load_record
 from fdhil.commissioning.survey import Finding, Survey, read_optional, survey
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.bus import CanBus
-from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec, load_profile
+from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
+from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.drivers.moves import load_event_source
 from fdhil.drivers.sensor_source import Sensor, sensors_of
 from fdhil.errors import DeviceError, StoreError
@@ -167,16 +168,21 @@ def _voltage_object(config: MachineConfig, axis: str, profile: DriveProfile, mas
         cause = f"profile {profile.name} has no object of the terminal voltage"
         yield Finding("voltage", "from the drive", "none", False, cause, "set voltage.source = 'modbus'")
         return
-    raw = read_optional(master, *profile.voltage, signed=True)
+    scale = profile.terminal_v_per_count(config.axis[axis])
+    if not scale:
+        cause = f"profile {profile.name} tells the duty of the PWM, and the DC link is not known"
+        yield Finding("voltage", "from the drive", "a duty", False, cause, "set drive.dc_link_v, or use a sensor")
+        return
     index, sub = profile.voltage
+    raw = read_optional(master, index, sub, signed=not profile.voltage_magnitude)
     cause = f"it has no terminal voltage (0x{index:04X}:{sub:02X})"
-    shown = "none" if raw is None else f"{raw * profile.voltage_v_per_count:.2f} V"
+    shown = "none" if raw is None else f"{raw * abs(scale):.2f} V"
     yield Finding("voltage", "from the drive", shown, raw is not None, cause, "choose another profile or sensor")
 
 
 def compare_heard(traffic: Traffic, config: MachineConfig, axis: str) -> Iterator[Finding]:
     """Compare the traffic of a running NC as far as it shows one drive; nothing is sent."""
-    profile, node_id = load_profile(config.axis[axis].drive.profile), config.node_id(axis)
+    profile, node_id = load_profile(config.axis[axis].drive), config.node_id(axis)
     nmt = traffic.nmt(node_id)
     cause = f"nothing was heard of node-ID {node_id}"
     shown = f"{cause}" if node_id not in traffic.nodes else f"node-ID {node_id}, {nmt or 'no heartbeat'}"
