@@ -34,6 +34,7 @@ Loader = Callable[[Path, MachineConfig], Trajectory]
 Emit = Callable[[dict[str, Any]], None]
 
 WALL_CLOCK_S = 0.004  # how often heartbeats and their time-outs are looked at
+ALONE_S = 0.001  # the same while a drive moves by its own clock
 IDLE_PERIODS = 4  # in lockstep, of a machine that stands: whoever listens is not kept busy for nothing
 LOCKSTEP_WAIT_S = 0.5
 LOCKSTEP_HOLDING_WAIT_S = 8.0  # a listener takes ten seconds without SYNC for a bus that is dead
@@ -94,7 +95,7 @@ class SimService:
         self._line = b""
         self._ending = False
         self._drive_time_s = 0.0
-        self._wall_s = 0.0
+        self._wall_s = self._told_s = 0.0
         self._loads: list[tuple[Path, Future[Trajectory]]] = []
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="ThreadPoolExecutor-sim")
         self._pipe = WakePipe()
@@ -245,10 +246,11 @@ class SimService:
 
     def _wall_clock(self, now_s: float) -> None:
         """Let the drives' own time pass. When the host was late it passes slower: a drive has no such pauses."""
-        late = now_s - self._wall_s if self._wall_s else 0.0
-        self._drive_time_s += min(WALL_CLOCK_S + late, 2 * WALL_CLOCK_S)
-        self._wall_s = now_s + WALL_CLOCK_S
+        passed_s = now_s - self._told_s if self._told_s else WALL_CLOCK_S
+        self._told_s = now_s
+        self._drive_time_s += min(passed_s, 2 * WALL_CLOCK_S)
         frames = self.machine.wall_clock(self._drive_time_s)
+        self._wall_s = now_s + (ALONE_S if self.machine.moves_alone else WALL_CLOCK_S)
         if frames:
             self._send(frames)
 
