@@ -80,13 +80,20 @@ class Survey:
 
 
 def read_optional(master: Master, index: int, sub: int = 0, *, signed: bool = False) -> int | None:
-    """Read an integer object, None when the drive does not have it."""
+    """Read an integer object, None when the drive does not have it, or refuses to tell it."""
     try:
         return master.sdo.read_int(index, sub, signed=signed)
+    except SdoAbort:
+        return None
+
+
+def _has(master: Master, index: int) -> bool:
+    """Whether the drive has an object, also one that it refuses to tell."""
+    try:
+        master.sdo.read(index)
     except SdoAbort as abort:
-        if abort.code in (NO_OBJECT, NO_SUB_INDEX):
-            return None
-        raise
+        return abort.code not in (NO_OBJECT, NO_SUB_INDEX)
+    return True
 
 
 def listen(master: Master) -> None:
@@ -165,9 +172,10 @@ def compare_device(master: Master) -> Finding:
         return Finding("device", expected, expected)
     found = describe(own)
     if own is None or own & 0xFFFF == 0:  # some drives follow CiA 402 and do not say so
-        has_power_state = read_optional(master, 0x6041) is not None
-        cause = "it names no device profile (0x1000)" + ("" if has_power_state else " and has no statusword (0x6041)")
-        return Finding("device", expected, found, None if has_power_state else False, cause, advice)
+        cause = "it names no device profile (0x1000)"
+        if _has(master, Object.STATUSWORD):
+            return Finding("device", expected, found, None, cause, "see in its manual that it follows CiA 402")
+        return Finding("device", expected, found, False, f"{cause} and has no statusword (0x6041)", advice)
     return Finding("device", expected, found, False, f"it is no CiA 402 drive: 0x1000 says {found}", advice)
 
 
@@ -176,9 +184,15 @@ def compare_identity(profile: DriveProfile, identity: Identity) -> Finding:
     wanted = ((profile.vendor_id, identity.vendor_id), (profile.product_code, identity.product_code))
     shown = f"vendor {identity.vendor_id:08X}, product {identity.product_code:08X}"
     vendor, product = ("any" if number is None else f"{number:08X}" for number, _ in wanted)
+    expected = f"vendor {vendor}, product {product}"
+    if all(found in (number, 0) or number is None for number, found in wanted) and (
+        any(number and not found for number, found in wanted)
+    ):
+        cause = f"it does not tell who it is: {shown} (0x1018)"
+        return Finding("identity", expected, shown, None, cause, "see by its label that the profile is the right one")
     same = all(number in (None, found) for number, found in wanted)
     cause = f"it is {shown}, which profile {profile.name} is not made for"
-    return Finding("identity", f"vendor {vendor}, product {product}", shown, same, cause, "choose another profile")
+    return Finding("identity", expected, shown, same, cause, "choose another profile")
 
 
 @dataclass(frozen=True, slots=True)
@@ -214,8 +228,9 @@ def _read_pdo(master: Master, parameter: int, mapping: int) -> PdoFound:
     cob_id = read_optional(master, parameter, 1)
     if cob_id is None:
         return PdoFound(parameter, mapping, INVALID_COB_ID, 0, ())
-    mapped = tuple(master.sdo.read_int(mapping, sub) for sub in range(1, master.sdo.read_int(mapping, 0) + 1))
-    return PdoFound(parameter, mapping, cob_id, master.sdo.read_int(parameter, 2), mapped)
+    count = read_optional(master, mapping, 0) or 0
+    mapped = tuple(read_optional(master, mapping, sub) or 0 for sub in range(1, count + 1))
+    return PdoFound(parameter, mapping, cob_id, read_optional(master, parameter, 2) or 0, mapped)
 
 
 def compare_pdo(spec: PdoSpec, found: PdoFound, node_id: int) -> Finding:
@@ -251,7 +266,7 @@ def _lacks(point: str, expected: str, *objects: str, needed: bool = False) -> Fi
     """A point that cannot be compared, for the drive has no such object."""
     shown = " and ".join(objects)
     advice = "its manual says what it does instead"
-    return Finding(point, expected, f"no {shown}", None, f"it has no {shown}", advice, needed)
+    return Finding(point, expected, f"no {shown}", None, f"it has no {shown} that can be read", advice, needed)
 
 
 def compare_mode(master: Master) -> Iterator[Finding]:
