@@ -16,10 +16,11 @@ from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import SOFTWARE_LIMIT_KEYS
 from fdhil.config import CorrectionLimits
 from fdhil.drivers.can.sdo import NO_OBJECT, NO_SUB_INDEX
-from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
+from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec, speed_unit_of
 from fdhil.errors import ConnectError, DriveFault, ProtocolError, SdoAbort
 
 LISTEN_S = 2.0
+DC_LINK_TOLERANCE = 0.05
 INVALID_COB_ID = 1 << 31
 NO_WINDOW = 0xFFFFFFFF
 SOFTWARE_LIMIT = 0x607D
@@ -110,6 +111,8 @@ def survey(master: Master) -> Survey:
         *compare_mode(master),
         *compare_scale(master),
         *compare_rating(master),
+        *compare_speed_unit(master),
+        *compare_dc_link(master),
         *compare_window(master, options, window_um),
     )
     fingerprint = hashlib.sha256(repr([found.words for _, found in pdos]).encode()).hexdigest()[:16]
@@ -192,7 +195,7 @@ def compare_pdo(spec: PdoSpec, found: PdoFound, node_id: int) -> Finding:
         _pdo_text(found.cob_id & 0x7FF, not found.cob_id & INVALID_COB_ID, found.kind, found.mapped),
         not cause,
         cause,
-        f"write 0x{found.parameter:04X} and 0x{found.mapping:04X} with the drive's tool, or choose another profile",
+        f"set 0x{found.parameter:04X} and 0x{found.mapping:04X} by `fdhil commission --set-pdos`, or take another profile",
     )
 
 
@@ -206,12 +209,13 @@ def _pdo_text(cob_id: int, valid: bool, kind: int, mapped: tuple[int, ...]) -> s
 
 def compare_mode(master: Master) -> Iterator[Finding]:
     """The drive must offer cyclic synchronous position and interpolate at the machine's SYNC period."""
-    modes = read_optional(master, Object.SUPPORTED_MODES)
-    if modes is not None:
-        offered = bool(modes >> (Mode.CYCLIC_SYNC_POSITION - 1) & 1)
-        cause = "it has no cyclic synchronous position mode (0x6502)"
+    modes, mode = read_optional(master, Object.SUPPORTED_MODES), master.profile.mode
+    if modes is not None and mode > 0:
+        offered = bool(modes >> (mode - 1) & 1)
+        name = "cyclic synchronous position" if mode == Mode.CYCLIC_SYNC_POSITION else f"mode {mode}"
+        cause = f"it has no {name}{' mode' if mode == Mode.CYCLIC_SYNC_POSITION else ''} (0x6502)"
         shown = f"0x6502 = {modes:08X}"
-        yield Finding("mode", "cyclic synchronous position", shown, offered, cause, "it cannot be corrected")
+        yield Finding("mode", name, shown, offered, cause, "it cannot be corrected")
     value = read_optional(master, Object.INTERPOLATION_PERIOD, 1)
     exponent = read_optional(master, Object.INTERPOLATION_PERIOD, 2, signed=True)
     if value is None or exponent is None:
@@ -247,17 +251,51 @@ def _ratio(master: Master, index: int) -> float | None:
 
 
 def compare_rating(master: Master) -> Iterator[Finding]:
-    """0x6075 is what 0x6078 counts in: it must be the configured rated current."""
-    if master.profile.current_unit != "permille_of_rated":
+    """What the current is counted in, 0x6075 or 0x6076 (both in thousandths), must be what the config has."""
+    drive, unit = master.config.axis[master.axis].drive, master.profile.current_unit
+    if unit == "permille_of_rated":
+        place, what, expected, symbol = Object.RATED_CURRENT, "rated current", drive.rated_current_a, "A"
+    elif unit == "permille_of_rated_torque":
+        place, what, expected, symbol = Object.RATED_TORQUE, "rated torque", drive.rated_torque_nm, "N.m"
+    else:
         return
-    milliamps = read_optional(master, Object.RATED_CURRENT)
-    expected = master.config.axis[master.axis].drive.rated_current_a
-    if milliamps is None:
+    told = read_optional(master, place)
+    if told is None:
         return
-    wanted, found = f"{expected:g} A", f"{milliamps / 1e3:g} A"
-    same = abs(milliamps / 1e3 - expected) <= 0.01 * expected
-    cause = f"its rated current is {found} (0x6075) where the config has {wanted}"
-    yield Finding("rated current", wanted, found, same, cause, "correct drive.rated_current_a")
+    wanted, found = f"{expected:g} {symbol}", f"{told / 1e3:g} {symbol}"
+    same = abs(told / 1e3 - expected) <= 0.01 * expected
+    cause = f"its {what} is {found} (0x{place:04X}) where the config has {wanted}"
+    yield Finding(
+        what, wanted, found, same, cause, f"correct drive.{what.replace(' ', '_')}_{symbol.lower().replace('.', '')}"
+    )
+
+
+def compare_speed_unit(master: Master) -> Iterator[Finding]:
+    """0x60A9 is what the speed counts in, where the drive has it."""
+    word = read_optional(master, Object.VELOCITY_UNIT)
+    if word is None:
+        return
+    wanted = master.config.axis[master.axis].drive.speed_unit or master.profile.speed_unit
+    found = speed_unit_of(word)
+    shown = f"0x60A9 = {word:08X}{f', {found}' if found else ''}"
+    cause = f"its speed counts in another unit ({shown}) than {wanted}"
+    advice = f"set drive.speed_unit = '{found}'" if found else "set 0x60A9 to 00B44700 (rpm) or FDB44700 (millirpm)"
+    yield Finding("speed unit", wanted, shown, found == wanted, cause, f"{advice}, or 0x60A9 with the drive's tool")
+
+
+def compare_dc_link(master: Master) -> Iterator[Finding]:
+    """The volts that a duty is multiplied by must be what the drive measures, where SDO alone tells."""
+    profile, drive = master.profile, master.config.axis[master.axis].drive
+    if not profile.duty_per_count or profile.dc_link is None or len(profile.voltage_objects) != 1:
+        return
+    counts = read_optional(master, *profile.dc_link)
+    if counts is None:
+        return
+    told = counts * profile.dc_link_v_per_count
+    found, wanted = f"{told:.1f} V", "not said" if drive.dc_link_v is None else f"{drive.dc_link_v:g} V"
+    same = drive.dc_link_v is not None and abs(told - drive.dc_link_v) <= DC_LINK_TOLERANCE * drive.dc_link_v
+    cause = f"its DC link has {found} where the config has {wanted}"
+    yield Finding("DC link", wanted, found, same, cause, f"set drive.dc_link_v = {told:.1f}")
 
 
 def read_options(master: Master) -> dict[str, int]:
