@@ -22,8 +22,7 @@ pytestmark = pytest.mark.usefixtures("quick_commissioning")
 
 
 def config(**sections: Any) -> MachineConfig:
-    bus = {"interface": "virtual", "channel": uuid.uuid4().hex}
-    return machine(bus=bus, guard={"clock": "sync"}, **sections)
+    return machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex}, guard={"clock": "sync"}, **sections)
 
 
 @pytest.fixture
