@@ -195,7 +195,7 @@ def compare_pdo(spec: PdoSpec, found: PdoFound, node_id: int) -> Finding:
         _pdo_text(found.cob_id & 0x7FF, not found.cob_id & INVALID_COB_ID, found.kind, found.mapped),
         not cause,
         cause,
-        f"write 0x{found.parameter:04X} and 0x{found.mapping:04X} (fdhil commission --set-pdos), or take another profile",
+        f"write 0x{found.parameter:04X} and 0x{found.mapping:04X} (fdhil commission --set-pdos), or change the profile",
     )
 
 
