@@ -42,6 +42,7 @@ EXAMPLES: Mapping[str, Any] = {  # of keys without a default: the bench machine
     "eds": "drive.eds", "dc_link_v": 300.0, "speed_unit": "millirpm", "run_directory": "/run/fdhil",
     "guard.run_directory": "/run/fdhil-guard", "daemon_user": "fdhil",
     "commissioning_key": "/etc/fdhil/commissioning.key",
+    "axis.X.voltage.type": "float32", "count_address": 42, "trigger_address": 43,
 }  # fmt: skip
 NAMES = {"axis": "X", "bus": "can0"}  # the user's own names in the template
 

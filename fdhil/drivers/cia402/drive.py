@@ -110,6 +110,11 @@ class Cia402Decoder:
         spec, entry = found
         return Setpoint(PdoQueue(spec, spec.cob_base + self.node_id), entry, self._delay)
 
+    @property
+    def cob_ids(self) -> frozenset[int]:
+        """The PDOs of this drive, by its profile."""
+        return frozenset(spec.cob_base + self.node_id for spec in (*self.profile.tpdos, *self.profile.rpdos))
+
     def feed(self, ticked: Ticked) -> list[AxisSamples | InputSamples | Notice]:
         """Take a block of ticked frames; return the rows that became complete, and what must be told."""
         for queue in (*self._queues.values(), *(setpoint.queue for setpoint in self._setpoints)):
