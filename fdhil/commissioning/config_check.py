@@ -151,7 +151,7 @@ def _rapid(config: MachineConfig, profile: DriveProfile, read: Callable[[], int 
 def _voltage_object(config: MachineConfig, axis: str, profile: DriveProfile, master: Master) -> Iterator[Finding]:
     if config.axis[axis].voltage.separate:
         return
-    if profile.voltage is None:
+    if profile.voltage is None or not profile.voltage_objects:
         cause = f"profile {profile.name} has no object of the terminal voltage"
         yield Finding("voltage", "from the drive", "none", False, cause, "set voltage.source = 'modbus'")
         return
