@@ -9,8 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from fdhil.cia402 import NmtCommand, Object, State, state_of
+from fdhil.commissioning.finding import read_optional
 from fdhil.commissioning.master import Master
-from fdhil.commissioning.survey import INVALID_COB_ID, PdoFound, compare_pdo, listen, read_optional, read_pdos
+from fdhil.commissioning.survey import INVALID_COB_ID, PdoFound, compare_pdo, listen, read_pdos
 from fdhil.drivers.cia402.profile import PdoSpec
 from fdhil.errors import DeviceError, DriveFault, ProtocolError, SdoAbort
 

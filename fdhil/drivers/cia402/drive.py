@@ -76,6 +76,8 @@ def _as_shown(row: Int, shown: Int, n: int) -> SetpointRows:
 class Cia402Decoder:
     """Decodes one axis; ``feed`` takes ticked frames of its bus, ``counters`` tells what was lost.
 
+    ``required`` names the TPDOs of which every sample is made.
+
     ValueError when the profile maps a needed object in no PDO.
     """
 
@@ -90,7 +92,7 @@ class Cia402Decoder:
         needed = [self.profile.position, self.profile.speed, self.profile.current, self.profile.statusword]
         self._places = {key: self._place(key) for key in (*needed, *self._voltage.keys)}
         self._every_sync = {spec.name for spec in self.profile.tpdos if spec.every_sync == 1}
-        self._required = list(dict.fromkeys(name for name, _ in self._places.values()))
+        self.required = list(dict.fromkeys(name for name, _ in self._places.values()))
         shown = (self.profile.position_demand, self.profile.offset, self.profile.digital_inputs)
         self._shown_places = {key: self._place(key) for key in shown if self.profile.find_tpdo(key)}
         self._mm_per_increment = self._settings.scaling.sign / self._settings.scaling.increments_per_mm
@@ -163,8 +165,8 @@ class Cia402Decoder:
     ) -> list[AxisSamples]:
         """Rows [first, stop); nothing while the demand is not known."""
         heard = self._heard(first, stop)
-        grids = {name: dense(self._queues[name], first, stop + 1) for name in self._required}
-        lost = self._count(grids, heard)
+        grids = {name: dense(self._queues[name], first, stop + 1) for name in self.required}
+        lost = self._count(grids, heard, first)
         if demand is None:
             return []
         lost += demand.lost + int(np.count_nonzero(~heard))
@@ -177,10 +179,15 @@ class Cia402Decoder:
         self.counters.lost += demand.lost
         return [self._record(np.flatnonzero(certain), first, grids, demand, offset, lost)]
 
-    def _count(self, grids: Mapping[str, Dense], heard: Bool) -> int:
+    def _count(self, grids: Mapping[str, Dense], heard: Bool, first: int) -> int:
         """Count what is wrong with the frames of the rows' own ticks; returns the number lost."""
         rows = heard.size
-        lost = sum(int(np.count_nonzero(grid.missing[:rows] & heard)) for grid in grids.values())
+        lost = 0
+        for name, grid in grids.items():
+            begun = self._queues[name].first_tick
+            if begun is not None:
+                start = max(0, begun - first)
+                lost += int(np.count_nonzero((grid.missing[:rows] & heard)[start:]))
         ambiguous = np.zeros(rows, np.bool_)
         for grid in grids.values():
             self.counters.duplicates += int(grid.duplicates[:rows].sum())
