@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from fdhil import tables
-from fdhil.cia402 import Mode, Object
+from fdhil.cia402 import Object
 from fdhil.drivers.cia402.device import Device, DeviceObject, PdoPlace
 from fdhil.drivers.cia402.profile import DriveProfile, ObjectKey, PdoSpec
 from fdhil.drivers.cia402.profile_file import read_profile
@@ -181,12 +181,13 @@ def _demand(device: Device, profile: DriveProfile) -> Ability:
             what, "no", f"no RPDO carries its target ({shown(profile.target)})", "it can be identified alone"
         )
     modes = device.default(Object.SUPPORTED_MODES)
-    streamed = Mode.CYCLIC_SYNC_POSITION if profile.target[0] == Object.TARGET_POSITION else 7
+    if profile.mode < 1:
+        return Ability(what, "perhaps", f"set-points are streamed in the maker's mode {profile.mode}")
     if modes is None:
         return Ability(what, "perhaps", "its EDS does not say its modes (6502); ask the drive with `fdhil check`")
-    if modes >> (streamed - 1) & 1:
+    if modes >> (profile.mode - 1) & 1:
         return Ability(what, "yes", f"set-points are streamed to {shown(profile.target)} (6502 = {modes:08X})")
-    why = f"it has no mode {streamed} (6502 = {modes:08X}): set-points cannot be streamed"
+    why = f"it has no mode {profile.mode} (6502 = {modes:08X}): set-points cannot be streamed"
     return Ability(what, "no", why, "it can be identified, its path is not the NC's")
 
 
