@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from fdhil.commissioning.record import axis_digest
 from fdhil.config import Drive
 from fdhil.drivers.cia402.profile_file import load_profile, read_profile, require_offset
 from fdhil.errors import ConfigError, EdsError
@@ -53,6 +54,20 @@ def test_a_path_counts_from_the_folder_of_the_configuration(tmp_path: Path) -> N
     own(tmp_path, PDOS)
     drive = machine(folder=tmp_path, drive={"profile": "own.toml"}).axis["X"].drive
     assert load_profile(drive).name == "own"
+
+
+def test_what_a_file_says_is_a_part_of_the_configuration(tmp_path: Path) -> None:
+    """A model that was identified in one unit is not of the machine in another."""
+    digests, records = [], []
+    for text in (PDOS, 'speed_unit = "rpm"\n' + PDOS, PDOS):
+        own(tmp_path, text)
+        read_profile.cache_clear()
+        config = machine(folder=tmp_path, drive={"profile": "own.toml"})
+        digests.append(config.digest)
+        records.append(axis_digest(config, "X"))
+    assert digests[0] == digests[2] != digests[1]
+    assert records[0] == records[2] != records[1]
+    assert machine().axis["X"].drive.files_digest == ""
 
 
 WRONG = {
