@@ -82,9 +82,9 @@ def test_the_second_axis_of_a_device_is_heard_at_the_next_node_id() -> None:
     per_mm = config.axis["X"].scaling.increments_per_mm
     np.testing.assert_allclose(got.position_mm * per_mm, [ramp((0x6864, 0), int(k)) for k in got.tick])
     assert profile.takes_offset
-    settings = settings_of(
-        machine(drive={"logical_axis": 2, "node_id": 1}, correction={"max_offset_um": 50.0}), "can0", Path(), ""
-    )
+    document = bench_document("X")
+    document["axis"]["X"]["drive"] = {"logical_axis": 2, "node_id": 1}
+    settings = settings_of(parse(document), "can0", Path(), "")
     axis = settings.axes[0]
     assert (axis.node_id, axis.target.cob_id, axis.offset.cob_id) == (1, 0x202, 0x302)
     assert axis.offset.layout == ((0x60B0, 0, 32, True),)
