@@ -61,10 +61,11 @@ def require_offset(profile: DriveProfile, axis: str) -> None:
 
 def no_offset(profile: DriveProfile) -> str:
     """Return why nothing can be added to the set-points of this drive."""
+    if profile.find_rpdo(profile.offset) is not None and profile.unshown:
+        unseen = ", ".join(f"{index:04X}:{sub:02X}" for index, sub in profile.unshown)
+        return f"profile {profile.name} maps {unseen} into no TPDO, and no offset is sent that cannot be seen"
     index, sub = profile.offset
-    return (
-        f"profile {profile.name} maps no offset ({index:04X}:{sub:02X}) into a valid RPDO: nothing can be added on line"
-    )
+    return f"profile {profile.name} maps no offset ({index:04X}:{sub:02X}) into a valid RPDO: none can be sent"
 
 
 @cache
