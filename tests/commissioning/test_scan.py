@@ -13,10 +13,11 @@ import pytest
 
 from fdhil.commissioning.bus_listener import Traffic
 from fdhil.commissioning.config_check import check_machine, compare_heard
+from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.scan import BusScanner, Description, EdsMatch, printable, read_descriptions, scan_bus
 from fdhil.commissioning.steps import check_axis
-from fdhil.commissioning.survey import Finding, Identity
+from fdhil.commissioning.survey import Identity
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, frames_of
 from fdhil.errors import ConnectError, DriveFault, ProtocolError
