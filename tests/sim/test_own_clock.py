@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -30,7 +32,7 @@ def let_pass(rig: Rig, seconds: float, sync_s: float | None = None, step_s: floa
     return places
 
 
-def by_sdo(mode: int, **sim_axis: object) -> Rig:
+def by_sdo(mode: int, **sim_axis: Any) -> Rig:
     """A drive that was enabled by SDO alone; nobody sends SYNC."""
     rig = Rig(machine(**sim_axis))
     let_pass(rig, 0.004)
