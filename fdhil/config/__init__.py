@@ -12,10 +12,12 @@ from fdhil.config.axis import (
     CEILING_SPEED_MM_S,
     Axis,
     CorrectionLimits,
+    Drive,
     FeedforwardLimits,
     Nominal,
-    Thermometer,
+    SpeedUnit,
 )
+from fdhil.config.bus import CanBus
 from fdhil.config.controller import Identification, Nc
 from fdhil.config.machine import MachineConfig
 from fdhil.config.offset_bounds import VARIATION_MM, OffsetBounds, share_fault
@@ -23,7 +25,8 @@ from fdhil.config.reading import load, parse, toml_document, unlikely
 from fdhil.config.reality import Reality
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import Section
-from fdhil.config.service import CanBus, Maintenance
+from fdhil.config.sensors import Thermometer, Voltage
+from fdhil.config.service import Maintenance
 from fdhil.config.simulation import Noise, SimAxis, Thermal
 
 __all__ = [
@@ -34,6 +37,7 @@ __all__ = [
     "Axis",
     "CanBus",
     "CorrectionLimits",
+    "Drive",
     "FeedforwardLimits",
     "Identification",
     "MachineConfig",
@@ -46,8 +50,10 @@ __all__ = [
     "Regulators",
     "Section",
     "SimAxis",
+    "SpeedUnit",
     "Thermal",
     "Thermometer",
+    "Voltage",
     "load",
     "parse",
     "share_fault",

@@ -19,12 +19,12 @@ from fdhil.sim.drive.servo import Drive
 from fdhil.sim.fault_script import FaultSchedule
 from fdhil.sim.frame import BusFrame, Frame
 from fdhil.sim.nc.controller import Event, NcController, Row
+from fdhil.sim.nc.drive_link import Wiring
 from fdhil.sim.recorder import Recorder
 from fdhil.sim.thermal import SlideWay
 from fdhil.sim.wire.modbus_sensor import VoltageSensor
 
 SYNC = 0x80
-OFFSET_RPDO = 2
 OFFSET_OBJECTS = (0x60B0, 0x60B1, 0x60B2)
 
 
@@ -34,7 +34,7 @@ class Machine:
     def __init__(self, config: MachineConfig) -> None:
         self.config = config
         self.period_s = config.machine.sync_period_s
-        self.nc = NcController(config)
+        self.nc = NcController(config, self._wiring)
         self.events: list[Event] = []
         self.tick = 0
         self._outbox: list[BusFrame] = []
@@ -76,6 +76,10 @@ class Machine:
             self._outbox,
             self._injected,
         )
+
+    def _wiring(self, axis: str) -> Wiring:
+        drive = self.units[axis].drive
+        return Wiring.of(drive.pdo.configured("rpdo"), drive.pdo.configured("tpdo"), drive.dress.mode)
 
     @property
     def buses(self) -> tuple[str, ...]:
@@ -197,7 +201,7 @@ class Machine:
         if drive.tick == before:
             return frames
         heard = drive.pdo.heard_before
-        unit.offsets.step(OFFSET_RPDO in heard)
+        unit.offsets.step(not heard.isdisjoint(drive.pdo.offset_rpdos))
         for key in self._listed:
             if key[0] == unit.axis:
                 self._streams[key].step(key[1] in heard)
@@ -307,7 +311,7 @@ class Machine:
 
 def _listed_rpdo(text: str, units: Mapping[str, AxisUnit]) -> tuple[str, int]:
     axis, _, number = text.partition(":")
-    if axis not in units or number not in ("1", "2", "3", "4"):
+    if axis not in units or number not in map(str, units[axis].drive.pdo.numbers("rpdo")):
         fault = ConfigFault("sim.lockstep_rpdo", f"{text!r} names no RPDO", "write axis and number, such as X:2")
         raise ConfigError("config", [fault])
     return axis, int(number)
