@@ -7,8 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fdhil import config
 from fdhil.sim.drive.own_clock import OwnClock
-from tests.sim.rig import Rig, emergencies, machine
+from tests.bench import bench_document
+from tests.sim.rig import Abort, Rig, emergencies, machine
 
 INC_PER_MM = 3276.8
 MS = 1e-3
@@ -157,3 +159,45 @@ def test_a_pause_of_the_sync_is_made_up_for_or_lasts(late_s: float) -> None:
         now += MS
         own += clock.due(now, bound=False)
     assert own == (0 if late_s < 0.02 else pytest.approx(late_s / MS, abs=2))
+
+
+def test_set_points_that_come_every_tenth_cycle_are_joined_by_straight_lines() -> None:
+    """0x60C2 says so; the speed demand has no stairs, and the set-point acts an interval and the delay late."""
+    rig = Rig()
+    rig.write(0x60C2, 1, 10, 1)
+    rig.write(0x1006, 0, 10_000, 4)
+    rig.enable()
+    tick = rig.drive.tick
+    demands, shown = [], []
+    for n in range(60):
+        rig.cycle(1000 * n)
+        demands.append(rig.read(0x606B, signed=True))
+        shown.append(rig.read(0x6062, signed=True))
+    assert rig.drive.tick - tick == 600
+    assert demands[20:] == pytest.approx([100_000] * 40, abs=60)
+    assert shown[10:] == [1000 * n - 200 for n in range(10, 60)]  # in the last of the ten cycles, two late
+
+
+@pytest.mark.parametrize("mode", [8, 9])
+def test_a_slow_sync_that_the_drive_was_told_of_leads_it(mode: int) -> None:
+    rig = Rig()
+    rig.write(0x60C2, 1, 10, 1)
+    rig.enable(mode=mode)
+    let_pass(rig, 1.0, 10 * MS)
+    before = rig.drive.tick
+    rig.write(0x60FF, 0, 65536, 4)
+    let_pass(rig, 1.0, 10.1 * MS)
+    assert rig.drive.tick - before == 1000
+    turned = rig.drive.physics.table_rad / (2 * np.pi)
+    assert turned == pytest.approx(1.0 if mode == 9 else 0.0, abs=0.05)
+
+
+def test_the_interpolation_time_is_whole_cycles_of_the_drive() -> None:
+    document = bench_document("X")
+    document["machine"]["sync_period_s"] = 0.0005
+    rig = Rig(config.parse(document))
+    rig.write(0x60C2, 1, 20, 1)
+    for value in (0, 7):
+        with pytest.raises(Abort) as abort:
+            rig.write(0x60C2, 1, value, 1)
+        assert abort.value.code == 0x06090030
