@@ -119,6 +119,16 @@ def test_quick_stop_in_the_middle_of_a_profile_without_sync() -> None:
     assert rig.read(0x6041) & 0x6F == 0x40
 
 
+def test_homing_without_sync() -> None:
+    rig = by_sdo(6, limit_switches_mm=(-20.0, 60.0))
+    rig.write(0x6098, 0, 1, 1)
+    rig.write(0x6040, 0, 0x1F, 2)
+    let_pass(rig, 8.0)
+    assert rig.read(0x6041) & (1 << 10 | 1 << 12 | 1 << 13) == 1 << 10 | 1 << 12
+    assert rig.read(0x6064) == pytest.approx(0, abs=400)  # the first pulse beyond the switch
+    assert rig.drive.physics.table_rad == pytest.approx(0, abs=0.05)
+
+
 def test_a_jam_without_sync_is_told_by_emcy() -> None:
     rig = by_sdo(1)
     rig.write(0x6065, 0, 1000, 4)

@@ -87,6 +87,16 @@ def test_a_download_that_ends_wrongly_writes_nothing(end: bytes, code: AbortCode
     assert sdo.request(head(0x40, 0x2000) + bytes(4))[0][4:] == bytes(4)
 
 
+def test_a_client_that_has_gone_within_a_block_blocks_nobody() -> None:
+    rig = Rig()
+    rig.drive.wall_clock(1.0)
+    rig.sdo(head(0xC2, 0x2122) + (700).to_bytes(4, "little"))
+    rig.drive.wall_clock(1.9)
+    assert rig.send(0x601, bytes([0x40, 0, 0x10, 0]) + bytes(4)) == []
+    rig.drive.wall_clock(3.0)
+    assert rig.read(0x1000) == 0x00020192
+
+
 def test_a_download_that_is_too_long_or_out_of_order_is_given_up() -> None:
     sdo = server()
     assert abort_code(sdo.request(head(0xC2, 0x2000) + (1 << 20).to_bytes(4, "little"))) == AbortCode.LENGTH
@@ -313,7 +323,7 @@ def test_a_lost_heartbeat_changes_the_nmt_state_by_1029(behaviour: int, state: i
     rig.nmt(0x01)
     rig.drive.wall_clock(1.0)
     rig.send(0x764, b"\x05")
-    rig.drive.wall_clock(1.1)
+    assert emergencies(rig.drive.wall_clock(1.1)) == [0x8130]
     assert rig.drive.nmt == state
 
 

@@ -197,8 +197,10 @@ class Motion:
         self._position = actual.position
         if source is not Source.PROFILE and source is not Source.STOP:
             self._target = self._pending = None
-        if source is not Source.HOMING and self.source is Source.HOMING and self.homing.state is Homing.RUNNING:
-            self.homing.reset()
+        if source is not Source.HOMING:
+            self._homing_asked = False
+            if self.homing.state is Homing.RUNNING:
+                self.homing.reset()
         if self._numbers[0x606000] == modes.PROFILE_VELOCITY:
             self._open.watch(actual)
         self._loops_before, self.loops = self.loops, Loops.POSITION
