@@ -9,7 +9,9 @@ import pytest
 
 from fdhil import config
 from fdhil.sim.drive.own_clock import OwnClock
+from fdhil.sim.fault_kinds import FaultEntry
 from tests.bench import bench_document
+from tests.sim.bench_twin import TwinInHand, corner, twin_config
 from tests.sim.rig import Abort, Rig, emergencies, machine
 
 INC_PER_MM = 3276.8
@@ -169,6 +171,22 @@ def test_a_pause_of_the_sync_is_made_up_for_or_lasts(late_s: float) -> None:
         now += MS
         own += clock.due(now, bound=False)
     assert own == (0 if late_s < 0.02 else pytest.approx(late_s / MS, abs=2))
+
+
+def test_while_the_nc_s_sync_fails_the_axes_go_on_to_their_last_set_point() -> None:
+    twin = TwinInHand(twin_config())
+    twin.switch_on()
+    twin.play(corner() + 5.0)
+    twin.run_until("playing")
+    twin.run(100)
+    drive = twin.machine.units["Y"].drive
+    tick, target = drive.tick, drive.dictionary.number(0x607A) / INC_PER_MM
+    assert abs(target - drive.table_mm) > 0.1
+    twin.machine.faults.add(FaultEntry(fault="sync_lost", at_sync=0, duration_s=0.2))
+    twin.run(150)
+    assert drive.tick == tick + 150
+    assert drive.table_mm == pytest.approx(target, abs=1.0)
+    assert abs(drive.physics.speed_rad_s) < 1.0
 
 
 def test_set_points_that_come_every_tenth_cycle_are_joined_by_straight_lines() -> None:

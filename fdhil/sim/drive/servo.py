@@ -180,7 +180,7 @@ class Drive(CanopenNode):
         return self._clock.leads and not self._cycle.stands
 
     def _move_alone(self, now_s: float, alone: bool) -> None:
-        """Run the cycles that no SYNC has begun; a drive that stands needs none."""
+        """Run the cycles that no SYNC has begun."""
         if not alone:
             self._clock.stop()
             return
@@ -188,11 +188,15 @@ class Drive(CanopenNode):
         cycles = self._cycles_per_sync()
         bound = self.motion.bound and declared_us in (0, round(cycles * self.ratings.sync_period_s * 1e6))
         for _ in range(self._clock.due(now_s, bound=bound, cycles=cycles)):
-            if self._cycle.stands:
-                return
-            if not self._mute:
-                self._begin_cycle()
-            self._cycle.integrate()
+            self.cycle_without_sync()
+
+    def cycle_without_sync(self) -> None:
+        """Run a cycle on what was latched last; a drive that stands needs none."""
+        if self._cycle.stands:
+            return
+        if not self._mute:
+            self._begin_cycle()
+        self._cycle.integrate()
 
     def _begin_cycle(self) -> None:
         """Take the set-points as they are, sample all objects, and supervise."""
