@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import binascii
+import socket
+import struct
 from typing import Any
 
 import can
@@ -13,6 +15,7 @@ from hypothesis import strategies as st
 
 from fdhil.sim.drive.dictionary import AbortCode, DataType, Dictionary, var
 from fdhil.sim.drive.sdo import SdoServer
+from fdhil.sim.wire.attach import SocketCan
 from tests.sim.canopen_peer import direct, over_virtual_bus
 from tests.sim.rig import Abort, Rig, emergencies, machine
 from tests.sim.test_sdo import abort_code, head
@@ -285,6 +288,19 @@ def test_a_tpdo_answers_a_remote_frame_where_bit_30_lets_it() -> None:
     assert rig.send(0x181, b"") == []
     ((can_id, data),) = rig.send(0x281, b"")
     assert (can_id, len(data)) == (0x281, 6)
+
+
+def test_remote_frames_of_the_kernel_come_as_frames_without_data() -> None:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, theirs:
+        ours.setblocking(False)
+        attached = SocketCan.__new__(SocketCan)
+        attached._socket = ours
+        for can_id, length in ((0x701 | 1 << 30, 1), (0x123 | 1 << 29, 8), (0x601, 2)):
+            theirs.send(struct.pack("=IB3x8s", can_id, length, b"\x05\x06" + bytes(6)))
+        heard: list[tuple[int, bytes]] = []
+        attached.pump([ours], heard.append)
+        assert heard == [(0x701, b""), (0x601, b"\x05\x06")]  # the second was an error frame
 
 
 def test_nothing_but_heartbeats_leaves_in_nmt_stopped() -> None:
