@@ -220,7 +220,7 @@ def test_a_raw_socket_whose_interface_is_back_begins_anew(monkeypatch: pytest.Mo
     raw, flags = Raw(), 0x40
     monkeypatch.setattr("fcntl.ioctl", lambda _file, _request, asked: struct.pack("@16sH22x", asked[:16], flags))
     can = RawCan(raw, {0x301}, {0x080})  # type: ignore[arg-type] # this host has no CAN
-    frame = (struct.pack("=IB3x8s", 0x080, 1, b"\x05"), [])
+    frame: tuple[bytes, list[tuple[int, int, bytes]]] = (struct.pack("=IB3x8s", 0x080, 1, b"\x05"), [])
     raw.is_there = False
     assert not can.restored()
     raw.is_there = True
