@@ -12,9 +12,10 @@ from fdhil.config.axis import (
     CEILING_SPEED_MM_S,
     Axis,
     CorrectionLimits,
+    Drive,
     FeedforwardLimits,
     Nominal,
-    Thermometer,
+    SpeedUnit,
 )
 from fdhil.config.bus import CanBus
 from fdhil.config.controller import Identification, Nc
@@ -24,6 +25,7 @@ from fdhil.config.reading import load, parse, toml_document, unlikely
 from fdhil.config.reality import Reality
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import Section
+from fdhil.config.sensors import Thermometer, Voltage
 from fdhil.config.service import Maintenance
 from fdhil.config.simulation import Noise, SimAxis, Thermal
 
@@ -35,6 +37,7 @@ __all__ = [
     "Axis",
     "CanBus",
     "CorrectionLimits",
+    "Drive",
     "FeedforwardLimits",
     "Identification",
     "MachineConfig",
@@ -47,8 +50,10 @@ __all__ = [
     "Regulators",
     "Section",
     "SimAxis",
+    "SpeedUnit",
     "Thermal",
     "Thermometer",
+    "Voltage",
     "load",
     "parse",
     "share_fault",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -11,11 +12,16 @@ from fdhil import tables
 from fdhil.cia402 import Scaling
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import NotNegative, Positive, Section, one_of
+from fdhil.config.sensors import Thermometer, Voltage
 
 # the built-in ceilings of what may ever be added to a set-point; a config can only lower them
 CEILING_OFFSET_UM = 250.0
 CEILING_SPEED_MM_S = 20.0
 CEILING_ACCELERATION_MM_S2 = 2000.0
+
+
+SpeedUnit = Literal["increments_per_s", "rpm", "millirpm"]
+"""What a drive's speed object can count in."""
 
 
 class Nominal(Section):
@@ -55,14 +61,29 @@ class Drive(Section):
     node_id: int | None = Field(
         None, ge=1, le=127, description="CANopen node-ID; left out: 1 for the first axis, 2 for the next"
     )
-    profile: Annotated[str, one_of(tables.DRIVE_PROFILES)] = Field(
-        "fdhil_twin", description=f"the vendor profile: {', '.join(tables.DRIVE_PROFILES)}"
+    profile: Annotated[str, one_of(tables.DRIVE_PROFILES, or_suffix=".toml")] = Field(
+        "fdhil_twin",
+        description=f"the drive's profile: {', '.join(tables.DRIVE_PROFILES)}, "
+        "or the path of a TOML file, from this file's folder",
+    )
+    eds: Path | None = Field(None, description="the drive's EDS or DCF file, from this file's folder")
+    logical_axis: int = Field(
+        1, ge=1, le=8, description="which axis of a device with several: its objects are 0x800 higher for each"
     )
     increments_per_rev: int = Field(
         65536, ge=4, le=2**31 - 1, description="encoder and set-point increments per revolution"
     )
+    speed_unit: SpeedUnit | None = Field(
+        None, description="what 0x606C counts in, where the drive was set to another unit (0x60A9) than its profile's"
+    )
     sign: Literal[1, -1] = Field(1, description="-1 where the drive counts against the axis")
     rated_current_a: Positive = Field(50.0, ge=1e-3, le=1e5, description="0x6075; 0x6078 counts in 0.1 % of it")
+    rated_torque_nm: Positive = Field(
+        1.0, ge=1e-4, le=1e6, description="0x6076, where the profile takes the current from the torque (0x6077)"
+    )
+    dc_link_v: Positive | None = Field(
+        None, ge=1.0, le=2000.0, description="DC link, where the profile takes the voltage from the duty of the PWM"
+    )
     setpoint_delay_cycles: int = Field(
         2, ge=0, le=16, description="SYNC cycles by which the drive runs its set-point late"
     )
@@ -70,38 +91,6 @@ class Drive(Section):
     speed_limit_mm_s: Positive | None = Field(
         None, ge=1e-3, le=1e5, description="the axis maximum; left out: the rapid speed"
     )
-
-
-class Voltage(Section):
-    """[axis.X.voltage]: where the motor's terminal voltage comes from."""
-
-    source: Annotated[str, one_of(tables.VOLTAGE_SOURCES)] = Field(
-        tables.DRIVE_VOLTAGE,
-        description=f"{', '.join(tables.VOLTAGE_SOURCES)}; drive: a vendor object in a TPDO, else a separate sensor",
-    )
-    sampling: Literal["interval_mean", "instant"] = Field(
-        "interval_mean", description="the drive's value is the mean since the last sample, or an instant"
-    )
-    host: str = Field("127.0.0.1", description="modbus: address of the sensor")
-    port: int = Field(0, ge=0, le=65535, description="modbus: TCP port; 0 lets the simulator choose one")
-    unit: int = Field(1, ge=0, le=247, description="modbus: unit identifier")
-    timeout_s: Positive = Field(0.5, ge=1e-3, le=60, description="modbus: how long an answer may take")
-
-    @property
-    def separate(self) -> bool:
-        """Whether a sensor of its own tells the voltage; else the drive does, with its other samples."""
-        return self.source != tables.DRIVE_VOLTAGE
-
-
-class Thermometer(Section):
-    """[axis.X.temperature]: the slide-way's thermometer (Modbus). Without this section drift is told by time alone."""
-
-    host: str = Field("127.0.0.1", description="address of the thermometer")
-    port: int = Field(502, ge=1, le=65535, description="TCP port")
-    unit: int = Field(1, ge=0, le=247, description="unit identifier")
-    address: int = Field(8, ge=0, le=65534, description="first of its two input registers (float32, high word first)")
-    period_s: Positive = Field(1.0, ge=1e-2, le=3600, description="how often it is asked")
-    timeout_s: Positive = Field(0.5, ge=1e-3, le=60, description="how long an answer may take")
 
 
 class Axis(Section):

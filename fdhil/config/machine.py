@@ -15,6 +15,7 @@ from fdhil.config.offset_bounds import limit_faults
 from fdhil.config.plausible import doubts
 from fdhil.config.regulators import period_faults
 from fdhil.config.section import AxisName, Positive, Section
+from fdhil.config.sensors import Thermometer, Voltage, line_faults
 from fdhil.config.service import Guard, Maintenance, Store
 from fdhil.config.simulation import Sim
 
@@ -56,13 +57,25 @@ class MachineConfig(Section):
             found = [] if (info.context or {}).get("made_up") else doubts(axis)
             faults += [f"axis.{name}.{doubt.key}: {doubt.text}" for doubt in found if limits or not doubt.possible]
             faults += limits
-        ids = [self.node_id(name) for name in self.axis]
-        if len({(self.axis[n].drive.bus, i) for n, i in zip(self.axis, ids, strict=True)}) < len(ids):
+        faults += line_faults(self.sensors)
+        # the PDOs of a device's second axis are those of the next node-ID
+        ids = {(axis.drive.bus, self.node_id(name) + axis.drive.logical_axis) for name, axis in self.axis.items()}
+        if len(ids) < len(self.axis):
             faults.append("axis: two drives of one bus have the same node_id")
         faults += [f"sim.axis.{name}: there is no [axis.{name}]" for name in self.sim.axis if name not in self.axis]
         if faults:
             raise ValueError("\n".join(faults))
         return self
+
+    @property
+    def sensors(self) -> dict[str, Voltage | Thermometer]:
+        """The sections of all sensors, by their path."""
+        found: dict[str, Voltage | Thermometer] = {}
+        for name, axis in self.axis.items():
+            found[f"axis.{name}.voltage"] = axis.voltage
+            if axis.temperature is not None:
+                found[f"axis.{name}.temperature"] = axis.temperature
+        return found
 
     def _listening(self, bus: str) -> str:
         interface = self.bus[bus].interface

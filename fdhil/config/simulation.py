@@ -33,6 +33,15 @@ class SimAxis(Section):
     backlash_um: NotNegative = Field(0.0, description="lost motion between screw and table")
     start_mm: Finite = Field(0.0, description="position at power-on")
     offset_in_feedforward: bool = Field(True, description="whether 0x60B0 is seen by the speed feed-forward")
+    boot_s: NotNegative = Field(
+        0.0, le=60.0, description="from a reset, or the supply's return, to the boot-up message"
+    )
+    limit_switches_mm: tuple[Finite, Finite] | None = Field(
+        None, description="where the limit switches are, for homing; left out: there are none"
+    )
+    home_switch_mm: Finite | None = Field(
+        None, description="from where on, in the drive's positive direction, the home switch is active"
+    )
     reality: Reality = Reality()
 
 

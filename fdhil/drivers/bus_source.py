@@ -43,11 +43,6 @@ class BusSource:
         filters = self.decoder.filters() if settings.frames == "drives" else ()
         self._bus = CanBus(self.name, settings, filters=filters)
 
-    @property
-    def heard(self) -> bool:
-        """Whether any frame was received."""
-        return self._bus is not None and self._bus.counters()["frames"] > 0
-
     def step(self, now_ns: int) -> list[Record]:
         """Drain and decode once."""
         bus = self._bus
@@ -78,7 +73,10 @@ class BusSource:
         silent = now_ns - bus.last_frame_ns > SILENCE_S * 1e9
         was, self._silent = self._silent, silent
         if silent and not was:
-            text = f"Nothing is heard on bus {self.name}; check the drives' supply, the wiring and the bit rate."
+            text = (
+                f"Nothing is heard on bus {self.name}: so it is while the NC is off and no drive sends a heartbeat "
+                "(0x1017); else check the drives' supply, the wiring and the bit rate. fdhil scan asks the drives."
+            )
             return [Notice("BusSilent", "MAJOR", text)]
         return [Notice("BusSilent", "info", f"Bus {self.name} is heard again.")] if was and not silent else []
 

@@ -1,4 +1,7 @@
-"""Moves the simulated machine by SYNC and by nothing else, sans-I/O: drives, slide-ways, sensors and NC."""
+"""Moves the simulated machine, sans-I/O: drives, slide-ways, sensors and NC.
+
+SYNC is the machine's clock. In real time and without its own NC, each drive has a clock of its own besides.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,6 @@ from fdhil.sim.wire.modbus_sensor import VoltageSensor
 SYNC = 0x80
 OFFSET_RPDO = 2
 OFFSET_OBJECTS = (0x60B0, 0x60B1, 0x60B2)
-_THERMAL_CYCLES = 100  # the temperature moves slowly: the drive learns of it this often
 
 
 class Machine:
@@ -45,6 +47,7 @@ class Machine:
         for unit in self.units.values():
             self._of_bus.setdefault(unit.bus, []).append(unit)
         self._first_bus = next(iter(self._of_bus))
+        self._realtime = config.sim.pace == "realtime"
         self.faults = FaultSchedule(self.units, self.period_s)
         self._listed = [_listed_rpdo(text, self.units) for text in config.sim.lockstep_rpdo]
         self._streams = {key: RpdoStream() for key in self._listed}
@@ -140,11 +143,17 @@ class Machine:
         self._complete_events()
         return frames + self._take_outbox() if self._outbox else frames
 
+    @property
+    def moves_alone(self) -> bool:
+        """Whether a drive moves by its own clock: time is to be told often."""
+        return any(unit.drive.moves_alone for unit in self.units.values())
+
     def wall_clock(self, now_s: float) -> list[BusFrame]:
-        """Run what depends on time and not on SYNC: heartbeats and their monitoring."""
+        """Run what depends on time and not on SYNC: heartbeats and their monitoring, and motion without SYNC."""
         frames: list[BusFrame] = []
+        alone = self._realtime and not self.nc.on
         for unit in self.units.values():
-            for frame in unit.drive.wall_clock(now_s):
+            for frame in unit.drive.wall_clock(now_s, alone=alone):
                 frames.append((unit.bus, frame))
                 for other in self._of_bus[unit.bus]:
                     if other is not unit and frame[0] > 0x700:
@@ -181,10 +190,9 @@ class Machine:
         return frames
 
     def _advance(self, unit: AxisUnit, data: bytes) -> list[Frame]:
-        """One SYNC for one axis; its sensor and slide-way go with it when the drive accepted the SYNC."""
+        """One SYNC for one axis."""
         drive = unit.drive
         before = drive.tick
-        ended_v = drive.physics.voltage_mean_v  # of the period that this SYNC ends: no sensor knows it earlier
         frames = drive.receive(SYNC, data)
         if drive.tick == before:
             return frames
@@ -193,10 +201,6 @@ class Machine:
         for key in self._listed:
             if key[0] == unit.axis:
                 self._streams[key].step(key[1] in heard)
-        celsius = unit.slide_way.step(drive.physics.speed_rad_s)
-        unit.sensor.feed(drive.ratings.sign * ended_v)
-        if drive.tick % _THERMAL_CYCLES == 0:
-            unit.warm(celsius)
         return frames
 
     def _foreign(self, bus: str) -> list[Frame]:

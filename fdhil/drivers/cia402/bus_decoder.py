@@ -11,6 +11,7 @@ from fdhil.drivers.can.node_watch import NodeWatch
 from fdhil.drivers.can.port import Filter
 from fdhil.drivers.can.sync_grid import SyncGrid
 from fdhil.drivers.cia402.drive import Cia402Decoder, InputSamples
+from fdhil.drivers.cia402.pdo_watch import PdoWatch
 from fdhil.records import AxisSamples, Notice, TickTimes
 
 _SYNC_SILENCE_NS = 1_000_000_000
@@ -27,6 +28,10 @@ class BusDecoder:
         self.decoders = {axis: Cia402Decoder(axis, config) for axis in self.axes}
         self.watches = {axis: NodeWatch(axis, config.node_id(axis)) for axis in self.axes}
         self._guard_heartbeat = COB_HEARTBEAT + config.guard.node_id
+        self._pdos = {
+            axis: PdoWatch(axis, each.node_id, each.profile.tpdos, each.required, config.machine.sync_period_s)
+            for axis, each in self.decoders.items()
+        }
         self._last_sync_ns: int | None = None
         self._sync_lost = False
 
@@ -44,6 +49,7 @@ class BusDecoder:
         for axis in self.axes:
             out += self.decoders[axis].feed(ticked)
             out += self.watches[axis].feed(frames, now_ns)
+            out += self._pdos[axis].feed(ticked, self.watches[axis].nmt)
         return out
 
     def _sync_silence(self, now_ns: int) -> list[Notice]:

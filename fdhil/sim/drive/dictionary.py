@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
 
@@ -16,6 +16,8 @@ class AbortCode(IntEnum):
     TOGGLE = 0x05030000
     COMMAND = 0x05040001
     BLOCK_SIZE = 0x05040002
+    SEQUENCE = 0x05040003
+    CRC = 0x05040004
     READ_WRITE_ONLY = 0x06010001
     WRITE_READ_ONLY = 0x06010002
     NO_OBJECT = 0x06020000
@@ -163,6 +165,12 @@ class Dictionary:
         for key, entry in self.entries.items():
             if which(entry):
                 self._store(key, entry.default)
+
+    def renumber(self, by: int) -> None:
+        """The node-ID has changed: shift the defaults that are relative to it."""
+        for key, entry in self.entries.items():
+            if entry.node_relative and isinstance(entry.default, int):
+                self.entries[key] = replace(entry, default=entry.default + by)
 
     def _store(self, key: int, value: Value) -> None:
         if isinstance(value, int):

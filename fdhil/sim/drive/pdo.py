@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from fdhil.sim.drive.dictionary import I8, I16, I32, U8, U16, U32, AbortCode, Dictionary, Entry, TransferAbort
-from fdhil.sim.drive.objects import INVALID, PDO_ENTRIES, PDOS
+from fdhil.sim.drive.objects import INVALID, NO_RTR, PDO_ENTRIES, PDOS
 from fdhil.sim.frame import Frame
 
 _CODE = {I8: "b", I16: "h", I32: "i", U8: "B", U16: "H", U32: "I"}
@@ -36,6 +36,7 @@ class Pdo:
     inhibit_s: float = 0.0
     event_s: float = 0.0
     start_value: int = 0
+    on_request: bool = False  # TPDO: answers remote frames
     pending: bytes | None = None  # RPDO: waits for the SYNC
     sent: bytes | None = None  # TPDO: what the master knows
     count: int = 0
@@ -94,6 +95,7 @@ class PdoEngine:
                 inhibit_s=number(communication + n, 3) * 1e-4 if direction == "tpdo" else 0.0,
                 event_s=number(communication + n, 5) * 1e-3,
                 start_value=number(communication + n, 6) if direction == "tpdo" else 0,
+                on_request=direction == "tpdo" and not cob_id & NO_RTR,
                 checked=entries,
             )
 
@@ -187,6 +189,10 @@ class PdoEngine:
             if pdo.kind > 240:
                 self._on_event(pdo, now_s, frames)
         return frames
+
+    def requested(self, can_id: int) -> list[Frame]:
+        """Return the TPDO that a remote frame asks for, where bit 30 of its COB-ID lets it."""
+        return [(can_id, self._content(pdo)) for pdo in self._tpdos if pdo.cob_id == can_id and pdo.on_request]
 
     def _on_event(self, pdo: Pdo, now_s: float, frames: list[Frame]) -> None:
         content = self._content(pdo)
