@@ -136,15 +136,15 @@ async def test_values_are_on_a_grid_and_their_stamps_enclose_when_they_were_true
         after_ns = time.monotonic_ns()
         sensor.link.close()
     counter = np.concatenate([b.counter for b in blocks])
-    true_ns = np.concatenate([b.t_ns for b in blocks]) + 0.022e9
+    due_ns = np.concatenate([b.t_ns for b in blocks]) + 0.022e9
     error_ns = np.concatenate([b.t_error_ns for b in blocks])
     assert {b.sample_rate_hz for b in blocks} == {100.0}
     assert (np.diff(counter) >= 1).all()
-    assert counter[-1] + 1 == counter.size + sensor.lost
+    assert counter[-1] - counter[0] + 1 <= counter.size + sensor.lost
+    assert sensor.samples == counter.size
     assert (error_ns >= 0.002e9).all()
-    assert before_ns <= true_ns[0] <= true_ns[-1] <= after_ns
-    grid_ns = true_ns - counter * 1e7
-    assert (np.abs(grid_ns - grid_ns.min()) <= error_ns).all()
+    assert before_ns - 2e6 <= due_ns[0] <= due_ns[-1] <= after_ns
+    np.testing.assert_allclose(due_ns - due_ns[0], (counter - counter[0]) * 1e7, atol=1e3)
 
 
 @pytest.mark.parametrize("query", ["READ?\n", ""])
