@@ -16,14 +16,16 @@ from typing import Self
 from fdhil import cia402
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import MachineConfig
+from fdhil.drivers.can.frames import ERROR_FLAG
 from fdhil.drivers.can.sdo import SdoLink
-from fdhil.drivers.cia402.profile import DriveProfile, load_profile
+from fdhil.drivers.cia402.profile import DriveProfile
+from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.errors import DeviceError, DeviceTimeout
 
 
 @dataclass(slots=True)
 class Heard:
-    """The drive's newest: mapped objects by key, EMCY frames, and its NMT state."""
+    """The drive's newest: mapped objects by key, EMCY frames, its NMT state; and frames and error frames of the bus."""
 
     objects: dict[tuple[int, int], int] = field(default_factory=dict)
     cycle: dict[tuple[int, int], int] = field(default_factory=dict)
@@ -32,10 +34,25 @@ class Heard:
     sync: int = 0
     foreign_rpdo: int = 0
     frames: int = 0
+    errors: int = 0
 
 
 LOCKSTEP_WAIT_S = 8.0
 LOCKSTEP_PATIENCE = 20.0  # times as long as on a real machine: a simulated one shares its computer
+
+
+class AxisSdo(SdoLink):
+    """The SDO channel of one axis of a node: objects of CiA 402 are named as the first axis has them."""
+
+    profile: DriveProfile
+
+    def read(self, index: int, sub: int = 0) -> bytes:
+        """Read an object; SdoAbort, DeviceTimeout or ProtocolError."""
+        return super().read(self.profile.object_index(index), sub)
+
+    def write_int(self, index: int, sub: int, value: int, length: int) -> None:
+        """Write an integer of ``length`` bytes."""
+        super().write_int(self.profile.object_index(index), sub, value, length)
 
 
 class Master:
@@ -45,14 +62,15 @@ class Master:
         settings = config.axis[axis]
         self.config, self.axis = config, axis
         self.node_id = config.node_id(axis)
-        profile = load_profile(settings.drive.profile)
+        profile = load_profile(settings.drive)
         self.profile: DriveProfile = profile.with_feedforward() if settings.feedforward else profile
         self.period_s = config.machine.sync_period_s
         self.device = f"drive {axis}"
         self.bus = TransmitBus(settings.drive.bus, config.bus[settings.drive.bus])
         self._lockstep = config.guard.clock == "sync"
         self._patience = LOCKSTEP_PATIENCE if self._lockstep else 1.0
-        self.sdo = SdoLink(self.device, self.node_id, self.bus.send, self._patience)
+        self.sdo = AxisSdo(self.device, self.node_id, self.bus.send, self._patience)
+        self.sdo.profile = self.profile
         self.heard = Heard()
         self.cycle = 0
         self.controlword = 0
@@ -115,10 +133,11 @@ class Master:
             target, offset, controlword, fed = self.target, self.offset, self.controlword, self.fed
         if target is None:
             return
-        values = {self.profile.target: target, self.profile.offset: offset, (0x6040, 0): controlword}
+        profile = self.profile
+        values = {profile.target: target, profile.offset: offset, profile.controlword: controlword}
         if fed is not None:
-            values |= zip((self.profile.speed_offset, self.profile.torque_offset), fed, strict=True)
-        for spec in self.profile.rpdos:
+            values |= zip((profile.speed_offset, profile.torque_offset), fed, strict=True)
+        for spec in profile.rpdos:
             if spec.valid and all((e.index, e.sub) in values for e in spec.entries):
                 data = cia402.pack(spec.entries, [values[e.index, e.sub] for e in spec.entries])
                 self.bus.send(spec.cob_base + self.node_id, data)
@@ -130,7 +149,8 @@ class Master:
         for frame in self.bus.drain():
             can_id, length = int(frame["id"]), int(frame["dlc"])
             data = int(frame["data"]).to_bytes(8, "little")[:length]
-            heard.frames += 1
+            error = bool(can_id & ERROR_FLAG)
+            heard.errors, heard.frames = heard.errors + error, heard.frames + (not error)
             if can_id == cia402.COB_SYNC:
                 heard.sync += 1
             elif can_id in tpdos and length >= tpdos[can_id].length:

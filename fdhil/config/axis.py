@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -12,11 +13,16 @@ from fdhil.cia402 import Scaling
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import NotNegative, Positive, Section, one_of
 from fdhil.config.sensors import Thermometer, Voltage
+from fdhil.config.table import Accelerometer, TableEncoder
 
 # the built-in ceilings of what may ever be added to a set-point; a config can only lower them
 CEILING_OFFSET_UM = 250.0
 CEILING_SPEED_MM_S = 20.0
 CEILING_ACCELERATION_MM_S2 = 2000.0
+
+
+SpeedUnit = Literal["increments_per_s", "rpm", "millirpm"]
+"""What a drive's speed object can count in."""
 
 
 class Nominal(Section):
@@ -56,14 +62,29 @@ class Drive(Section):
     node_id: int | None = Field(
         None, ge=1, le=127, description="CANopen node-ID; left out: 1 for the first axis, 2 for the next"
     )
-    profile: Annotated[str, one_of(tables.DRIVE_PROFILES)] = Field(
-        "fdhil_twin", description=f"the vendor profile: {', '.join(tables.DRIVE_PROFILES)}"
+    profile: Annotated[str, one_of(tables.DRIVE_PROFILES, or_suffix=".toml")] = Field(
+        "fdhil_twin",
+        description=f"the drive's profile: {', '.join(tables.DRIVE_PROFILES)}, "
+        "or the path of a TOML file, from this file's folder",
+    )
+    eds: Path | None = Field(None, description="the drive's EDS or DCF file, from this file's folder")
+    logical_axis: int = Field(
+        1, ge=1, le=8, description="which axis of a device with several: its objects are 0x800 higher for each"
     )
     increments_per_rev: int = Field(
         65536, ge=4, le=2**31 - 1, description="encoder and set-point increments per revolution"
     )
+    speed_unit: SpeedUnit | None = Field(
+        None, description="what 0x606C counts in, where the drive was set to another unit (0x60A9) than its profile's"
+    )
     sign: Literal[1, -1] = Field(1, description="-1 where the drive counts against the axis")
     rated_current_a: Positive = Field(50.0, ge=1e-3, le=1e5, description="0x6075; 0x6078 counts in 0.1 % of it")
+    rated_torque_nm: Positive = Field(
+        1.0, ge=1e-4, le=1e6, description="0x6076, where the profile takes the current from the torque (0x6077)"
+    )
+    dc_link_v: Positive | None = Field(
+        None, ge=1.0, le=2000.0, description="DC link, where the profile takes the voltage from the duty of the PWM"
+    )
     setpoint_delay_cycles: int = Field(
         2, ge=0, le=16, description="SYNC cycles by which the drive runs its set-point late"
     )
@@ -100,6 +121,8 @@ class Axis(Section):
     drive: Drive = Drive()
     voltage: Voltage = Voltage()
     temperature: Thermometer | None = None
+    table: TableEncoder | None = None
+    accelerometer: Accelerometer | None = None
 
     @property
     def jerk_mm_s3(self) -> float:

@@ -11,10 +11,12 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from fdhil.config.axis import Drive
 from fdhil.config.machine import MachineConfig
 from fdhil.config.plausible import doubts
 from fdhil.config.section import LARGEST, Section
 from fdhil.errors import ConfigError, ConfigFault
+from fdhil.tables import DRIVE_PROFILES
 
 MAX_CONFIG_BYTES = 256 * 1024
 MOST_FAULTS = 50
@@ -58,7 +60,7 @@ def toml_document(raw: bytes, source: str) -> dict[str, Any]:
 def parse(
     document: Mapping[str, Any], source: str = "config", folder: Path = Path(), *, made_up: bool = False
 ) -> MachineConfig:
-    """Check a parsed TOML document; relative directories of [store] are taken from ``folder``.
+    """Check a parsed TOML document; relative paths are taken from ``folder``.
 
     ``made_up``: its axes need not be those of a machine that can be.
     """
@@ -77,7 +79,19 @@ def parse(
     )
     guard_run = config.guard.run_directory
     guard = config.guard.model_copy(update={"run_directory": folder / guard_run if guard_run else None})
-    return config.model_copy(update={"store": store, "guard": guard})
+    worn = {
+        name: axis.model_copy(update={"eds": folder / axis.eds if axis.eds else None})
+        for name, axis in config.sim.axis.items()
+    }
+    sim = config.sim.model_copy(update={"axis": worn})
+    axes = {name: axis.model_copy(update={"drive": _placed(axis.drive, folder)}) for name, axis in config.axis.items()}
+    return config.model_copy(update={"store": store, "guard": guard, "axis": axes, "sim": sim})
+
+
+def _placed(drive: Drive, folder: Path) -> Drive:
+    """Return the drive with the paths of its files taken from ``folder``."""
+    profile = drive.profile if drive.profile in DRIVE_PROFILES else str(folder / drive.profile)
+    return drive.model_copy(update={"profile": profile, "eds": folder / drive.eds if drive.eds else None})
 
 
 def unlikely(config: MachineConfig) -> list[str]:

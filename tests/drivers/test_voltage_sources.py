@@ -13,7 +13,7 @@ from fdhil import tables
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.cia402.drive import VoltageObject
-from fdhil.drivers.cia402.profile import load_profile
+from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.drivers.machine import MachineSource
 from fdhil.drivers.modbus.voltage import ModbusVoltage
 from fdhil.drivers.sensor_source import sensors_of
@@ -69,7 +69,7 @@ class Teller(SerialPeer):
 def test_the_voltage_comes_from_one_place_alone(name: str) -> None:
     """``drive`` is an object in a TPDO; every other is a sensor of its own, which the machine reaches and polls."""
     config = config_of(name)
-    profile = load_profile(config.axis["X"].drive.profile)
+    profile = load_profile(config.axis["X"].drive)
     source = tables.load(tables.VOLTAGE_SOURCES, name)("X", config)
     separate = name in SEPARATE
     assert config.axis["X"].voltage.separate == separate

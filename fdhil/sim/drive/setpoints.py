@@ -1,7 +1,7 @@
 """Computes what the loops follow: the cyclic set-points with their delay, and the drive's own ramps and profiles.
 
-Both give, for the cycle that begins, the demand at its start, at its end and one cycle later (increments), because the
-feed-forward runs linearly from the slope of this cycle to the slope of the next.
+The cyclic set-points and the profile give, for the cycle that begins, the demand at its start, at its end and one cycle
+later (increments), because the feed-forward runs linearly from the slope of this cycle to the slope of the next.
 """
 
 from __future__ import annotations
@@ -69,6 +69,25 @@ class CyclicSetpoints:
         return slope + second.offset - first.offset if self._offset_in_feedforward else slope
 
 
+class Ramp:
+    """A speed or a torque on its way to a target: ``before`` at the start of a cycle, ``now`` at its end."""
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        self.start(0.0)
+
+    def start(self, value: float) -> None:
+        """Go on from a value."""
+        self.before = self.now = float(value)
+
+    def advance(self, target: float, rising: float, falling: float) -> None:
+        """Go one cycle on; ``rising`` is the rate (1/s) at which the magnitude grows, ``falling`` that of its fall."""
+        self.before = self.now
+        grows = abs(target) > abs(self.now) and target * self.now >= 0
+        step = (rising if grows else falling) * self._period_s
+        self.now += min(max(target - self.now, -step), step)
+
+
 class Profile:
     """The drive's own motion: a trapezoid toward a target, or a ramp to standstill. Increments and seconds."""
 
@@ -91,7 +110,7 @@ class Profile:
 
     @property
     def now(self) -> float:
-        """The demand at the SYNC that was advanced to last."""
+        """The demand at the cycle that was advanced to last."""
         return self._points[0]
 
     def advance(self, target: float | None, speed: float, acceleration: float, deceleration: float) -> None:
