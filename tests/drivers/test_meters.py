@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import math
+import re
 import time
+import tomllib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -332,3 +334,15 @@ def test_what_cannot_be_is_refused_with_its_key(axes: dict[str, dict[str, Any]],
 def test_what_is_left_out_follows_from_what_is_given(given: dict[str, Any], kind: str | None, sampling: str) -> None:
     voltage = Voltage.model_validate(given)
     assert (voltage.type, voltage.sampling) == (kind, sampling)
+
+
+def pieces() -> list[str]:
+    page = Path(__file__).parents[2] / "docs" / "reference" / "instruments.md"
+    return re.findall(r"^```toml\n(.*?)^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("text", pieces())
+def test_what_is_told_of_an_instrument_is_a_sensor(text: str) -> None:
+    axis = bench_axis(corrected=False) | tomllib.loads(text)["axis"]["X"]
+    found = sensors_of("X", parse({"machine": {"name": "bench"}, "axis": {"X": axis}}))
+    assert len(found) == 1
