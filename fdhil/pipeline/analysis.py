@@ -11,6 +11,7 @@ from fdhil.identification.compliance import beside_the_config, compliance, joine
 from fdhil.identification.estimators import chosen, maximum_likelihood
 from fdhil.identification.identifiability import empty_estimate
 from fdhil.identification.signals import mended
+from fdhil.identification.spring import sprung
 from fdhil.identification.without_voltage import told
 from fdhil.records import Estimate, Reason, Result, Verdict, Window, WindowOutcome
 from fdhil.validation import BEFORE_ANY_FIT, LEAST_ROWS, OF_THE_FIT, WEIGHED, Evidence, Findings, ask
@@ -91,8 +92,21 @@ def estimated(signals: Evidence) -> Evidence:
     if fit is not None and axis is not None:
         fit = maximum_likelihood.with_loops(fit, window, settings, axis, signals.sync_period_s)
     if name == maximum_likelihood.NAME and fit is not None:
-        return replace(signals, estimate=maximum_likelihood.finish(fit), fit=fit)
+        return _with_spring(replace(signals, estimate=maximum_likelihood.finish(fit), fit=fit))
     return replace(signals, estimate=estimator([window], settings), fit=fit)
+
+
+def _with_spring(stiff: Evidence) -> Evidence:
+    """Return the evidence with a spring between motor and table, where there is one that explains the rapid as well."""
+    assert stiff.fit is not None
+    found = sprung(stiff.fit, stiff.axis)
+    if found is None or stiff.weight is None:
+        return stiff
+    soft = replace(stiff, estimate=maximum_likelihood.finish(found), fit=found)
+    explains = soft.weight is not None and (
+        soft.weight.believed or soft.weight.unexplained_um < stiff.weight.unexplained_um
+    )
+    return soft if explains else stiff
 
 
 def gave_up(error: BaseException, advice: str) -> Reason:
