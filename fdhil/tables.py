@@ -29,7 +29,8 @@ REGULATORS: Mapping[str, str] = {
 DRIVE_VOLTAGE = "drive"  # comes with the drive's samples; every other source is a sensor of its own
 VOLTAGE_SOURCES: Mapping[str, str] = {
     "drive": "fdhil.drivers.cia402.drive:VoltageObject",
-    "modbus": "fdhil.drivers.modbus.voltage:ModbusVoltage",
+    "modbus": "fdhil.drivers.modbus.sources:modbus_voltage",
+    "serial": "fdhil.drivers.serial.instrument:serial_voltage",
 }
 EVENT_SOURCES: Mapping[str, str] = {
     "inferred": "fdhil.drivers.moves.inferred:InferredG0",

@@ -31,7 +31,8 @@ STATES: Mapping[bool | None, tuple[str, str]] = {
     None: ("not compared", "yellow"),
 }
 STEPS: Mapping[str, str] = {
-    "listen": "Listening: the NC must be off and the drive must be heard. Nothing is sent yet.",
+    "listen": "Listening: the NC must be off. A bus on which nothing is heard is asked whether the drive is there; "
+    "nothing else is sent.",
     "compare": "Reading identity, PDO mapping, scale, option codes and following-error window, and comparing them with "
     "the config. Nothing moves.",
     "enable": "Starting SYNC and switching the drive on, held where it stands.",
@@ -107,22 +108,23 @@ def _show_scans(scans: Sequence[BusScan]) -> None:
         out.print(Text(f"bus {found.bus}: {nc}{period}; {len(found.nodes)} nodes"))
         table = Table(*SCAN_HEAD, box=box.SIMPLE_HEAD, pad_edge=False)
         for node in found.nodes:
-            table.add_row(*map(Text, _node_row(node)))
+            table.add_row(*map(Text, _node_row(node, "not asked" if found.master else "no answer")))
         out.print(table)
         for node in found.nodes:
             for emergency in node.emergencies:
                 out.print(Text(f"node {node.node_id} reports {emergency}"), soft_wrap=True)
 
 
-def _node_row(node: Node) -> list[str]:
+def _node_row(node: Node, unanswered: str) -> list[str]:
     """Return the cells of a node, two figures above each other in most, so that a row fits 80 columns."""
     period = node.heartbeat_s or (node.answers.heartbeat_s if node.answers else None)
     beat = f"{period * 1e3:.0f} ms" if period else "none"
     heard = [f"{node.node_id}\n{node.axis or ''}", f"{node.nmt or 'unknown'}\n{beat}"]
     if node.answers is None:
-        return [*heard, "not asked", "", "", ""]
+        return [*heard, unanswered, "", "", ""]
     said, who = node.answers, node.answers.identity
-    profile = "CiA 402" if said.is_drive else str(said.device_type & 0xFFFF or "none")
+    number = said.device_type & 0xFFFF
+    profile = f"CiA {number}" if number else "none"
     eds = f"{said.eds.file}\n({said.eds.fit})" if said.eds else "none fits"
     ids = (f"{who.vendor_id:08X}\n{who.product_code:08X}", f"{who.revision:08X}\n{who.serial}")
     return [*heard, f"{said.name or 'unnamed'}\n{profile}", *ids, eds]
@@ -228,9 +230,20 @@ def _show_check(found: Sequence[Place]) -> None:
     for place, finding in found:
         if finding.ok is False:
             out.print(Text(f"{place}: {finding.cause}; {finding.advice}"), soft_wrap=True)
+    for (place, cause, advice), points in _open_points(found).items():
+        out.print(Text(f"{place}: {', '.join(points)} not compared: {cause}; {advice}"), soft_wrap=True)
     differ, open_ = (sum(finding.ok is state for _, finding in found) for state in (False, None))
-    rest = f", {open_} could not be compared beside the NC" if open_ else ""
+    rest = f", {open_} could not be compared" if open_ else ""
     out.print(f"{len(found) - differ - open_} points ok, {differ} differ{rest}")
+
+
+def _open_points(found: Sequence[Place]) -> dict[tuple[str, str, str], list[str]]:
+    """The points that could not be compared, by place and reason."""
+    points: dict[tuple[str, str, str], list[str]] = {}
+    for place, finding in found:
+        if finding.ok is None:
+            points.setdefault((place, finding.cause, finding.advice), []).append(finding.point)
+    return points
 
 
 @click.command()

@@ -9,13 +9,20 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Self
 
+import numpy as np
+
 from fdhil.cia402 import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SDO_RESPONSE, COB_SYNC, Nmt
 from fdhil.drivers.can.bus import CanBus
-from fdhil.drivers.can.frames import Frames
+from fdhil.drivers.can.frames import ERROR_FLAG, REMOTE_FLAG, Frames
 from fdhil.errors import ConnectError
 
 LISTEN_S = 2.5  # a heartbeat of one second comes twice
+UNREADABLE = (
+    "only frames in error are heard; nothing was sent, for it would disturb whoever talks there; "
+    "set the bit rate of the bus on the interface, and check termination and wiring"
+)
 _TURN_S = 0.002
+_LSS_MASTER = 0x7E5
 _MASTER_FUNCTIONS = {0x200: "set-points", 0x300: "set-points", 0x400: "set-points", 0x500: "set-points"} | {
     COB_SDO_REQUEST: "SDO requests"
 }
@@ -24,7 +31,10 @@ _NODE_FUNCTIONS = (0x080, 0x180, 0x280, 0x380, 0x480, COB_SDO_RESPONSE, COB_HEAR
 
 @dataclass(slots=True)
 class Traffic:
-    """The frames heard: per COB-ID those counted, the newest length and data; heartbeats and EMCY per node."""
+    """The frames heard: per COB-ID those counted, the newest length and data; heartbeats and EMCY per node; errors.
+
+    ``requests`` are the COB-IDs of remote frames.
+    """
 
     count: dict[int, int] = field(default_factory=dict)
     length: dict[int, int] = field(default_factory=dict)
@@ -32,9 +42,13 @@ class Traffic:
     beats: dict[int, list[int]] = field(default_factory=dict)
     emergencies: dict[int, set[int]] = field(default_factory=dict)
     sync_ns: list[int] = field(default_factory=list)
+    errors: int = 0
+    requests: set[int] = field(default_factory=set)
 
     def take(self, frames: Frames) -> None:
-        """Take a block of frames; those with 29 bit identifiers and error frames are left aside."""
+        """Take a block of frames; those with 29 bit identifiers are left aside, error frames counted."""
+        self.errors += int((frames["id"] & ERROR_FLAG != 0).sum())
+        self.requests |= set((frames["id"][frames["id"] & ~np.uint32(0x7FF) == REMOTE_FLAG] & 0x7FF).tolist())
         for frame in frames[frames["id"] <= 0x7FF]:
             can_id, stamp, data = int(frame["id"]), int(frame["t_ns"]), int(frame["data"])
             function, node = can_id & 0x780, can_id & 0x7F
@@ -54,6 +68,10 @@ class Traffic:
             return "SYNC"
         if COB_NMT in self.count:
             return "NMT commands"
+        if _LSS_MASTER in self.count:
+            return "LSS commands"
+        if self.requests:
+            return "node guarding" if max(self.requests) > COB_HEARTBEAT else "requests for PDOs"
         return next((_MASTER_FUNCTIONS[i & 0x780] for i in self.count if i & 0x780 in _MASTER_FUNCTIONS), None)
 
     @property
@@ -104,6 +122,11 @@ class BusListener:
             if self._bus.ended is not None:
                 raise ConnectError(f"bus {self.name}", f"{self._bus.ended}; try again when the bus is back")
             time.sleep(0.01)
+
+    def require_readable(self) -> None:
+        """ConnectError where frames in error are all that is heard: the bus talks at another bit rate."""
+        if self.traffic.errors and not self.traffic.count:
+            raise ConnectError(f"bus {self.name}", UNREADABLE)
 
     def close(self) -> None:
         """Stop listening and release the bus."""

@@ -6,7 +6,7 @@ Where an NC runs the bus nothing is sent: what its own traffic shows is compared
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 from fdhil.commissioning.bus_listener import LISTEN_S, BusListener, Traffic
 from fdhil.commissioning.compare import POINT, compare_record
@@ -27,6 +27,7 @@ RATE_TOLERANCE = 0.1
 PERIOD_TOLERANCE = 0.02
 SDO_POINTS = ("identity", "cycle", "scale", "rated current", "communication lost", "stop by a ramp", "following error")
 NC_OFF = "switch the NC off and check again"
+FIND = "find the drive's node-ID and check again"
 
 Place = tuple[str, Finding]
 """The place of a finding (``bus can0``, ``axis X``) and the finding."""
@@ -39,6 +40,7 @@ def check_machine(config: MachineConfig, say: Callable[[str], None] = lambda _te
         say(f"listening on bus {bus}")
         with BusListener(CanBus(bus, config.bus[bus])) as listener:
             listener.listen(LISTEN_S)
+            listener.require_readable()
             traffic = listener.traffic
         found += [(f"bus {bus}", finding) for finding in compare_bus(traffic, config)]
         for axis in (name for name, settings in config.axis.items() if settings.drive.bus == bus):
@@ -75,6 +77,12 @@ def compare_asked(config: MachineConfig, axis: str) -> list[Finding]:
         try:
             found = survey(master)
             seen = f"{node}, serial number {found.identity.serial}"
+            if not found.is_drive:
+                return [
+                    Finding("drive", node, seen),
+                    *found.findings,
+                    *_not_compared(SDO_POINTS, "it is no drive", FIND),
+                ]
             return [
                 Finding("drive", node, seen),
                 *found.findings,
@@ -85,6 +93,11 @@ def compare_asked(config: MachineConfig, axis: str) -> list[Finding]:
             ]
         except DeviceError as error:
             return [_unreachable("drive", node, error)]
+
+
+def _not_compared(points: Sequence[str], cause: str, advice: str) -> list[Finding]:
+    """What is left to compare by SDO, and why it was not."""
+    return [Finding(point, "the config's", "not asked", None, cause, advice) for point in points]
 
 
 def _record(config: MachineConfig, axis: str, found: Survey) -> Iterator[Finding]:
@@ -183,8 +196,7 @@ def compare_heard(traffic: Traffic, config: MachineConfig, axis: str) -> Iterato
     if target is not None:
         yield _heard_pdo(traffic, target[0], node_id)
     yield from _rapid(config, profile, lambda: _heard_value(traffic, profile, node_id))
-    for point in SDO_POINTS:
-        yield Finding(point, "the config's", "not asked", None, "SDO belongs to the NC now", NC_OFF)
+    yield from _not_compared(("device", *SDO_POINTS), "SDO belongs to the NC now", NC_OFF)
 
 
 def _heard_pdo(traffic: Traffic, spec: PdoSpec, node_id: int) -> Finding:

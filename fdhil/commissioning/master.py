@@ -16,6 +16,7 @@ from typing import Self
 from fdhil import cia402
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import MachineConfig
+from fdhil.drivers.can.frames import ERROR_FLAG
 from fdhil.drivers.can.sdo import SdoLink
 from fdhil.drivers.cia402.profile import DriveProfile
 from fdhil.drivers.cia402.profile_file import load_profile
@@ -24,7 +25,7 @@ from fdhil.errors import DeviceError, DeviceTimeout
 
 @dataclass(slots=True)
 class Heard:
-    """The drive's newest: mapped objects by key, EMCY frames, and its NMT state."""
+    """The drive's newest: mapped objects by key, EMCY frames, its NMT state; and frames and error frames of the bus."""
 
     objects: dict[tuple[int, int], int] = field(default_factory=dict)
     cycle: dict[tuple[int, int], int] = field(default_factory=dict)
@@ -33,6 +34,7 @@ class Heard:
     sync: int = 0
     foreign_rpdo: int = 0
     frames: int = 0
+    errors: int = 0
 
 
 LOCKSTEP_WAIT_S = 8.0
@@ -147,7 +149,8 @@ class Master:
         for frame in self.bus.drain():
             can_id, length = int(frame["id"]), int(frame["dlc"])
             data = int(frame["data"]).to_bytes(8, "little")[:length]
-            heard.frames += 1
+            error = bool(can_id & ERROR_FLAG)
+            heard.errors, heard.frames = heard.errors + error, heard.frames + (not error)
             if can_id == cia402.COB_SYNC:
                 heard.sync += 1
             elif can_id in tpdos and length >= tpdos[can_id].length:

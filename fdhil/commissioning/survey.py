@@ -12,17 +12,20 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from fdhil.cia402 import Mode, Object, State
+from fdhil.commissioning.bus_listener import UNREADABLE
+from fdhil.commissioning.device_type import describe, is_drive
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import SOFTWARE_LIMIT_KEYS
 from fdhil.config import CorrectionLimits
 from fdhil.drivers.can.sdo import NO_OBJECT, NO_SUB_INDEX
 from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
-from fdhil.errors import ConnectError, DriveFault, ProtocolError, SdoAbort
+from fdhil.errors import ConnectError, DeviceTimeout, DriveFault, ProtocolError, SdoAbort
 
 LISTEN_S = 2.0
 INVALID_COB_ID = 1 << 31
 NO_WINDOW = 0xFFFFFFFF
 SOFTWARE_LIMIT = 0x607D
+FIRST_DEVICE_TYPE = 0x67FF  # of the first of several devices behind one node
 NO_SOFTWARE_LIMIT = (-(2**31), 2**31 - 1)
 OPTIONS = (
     (Object.ABORT_CONNECTION_OPTION, True),
@@ -48,7 +51,8 @@ class Identity:
 class Finding:
     """One point of the set-up, expected and found; ``ok`` None: it could not be compared.
 
-    ``cause`` and ``advice`` are the halves of the sentence that tells what is wrong and what to do next.
+    ``cause`` and ``advice`` are the halves of the sentence that tells what is wrong, or why it was not compared, and
+    what to do next. ``needed``: what cannot be compared here ends a commissioning.
     """
 
     point: str
@@ -57,17 +61,22 @@ class Finding:
     ok: bool | None = True
     cause: str = ""
     advice: str = ""
+    needed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """A drive as it was read: its identity, the mapping's fingerprint, its options, and every point compared."""
+    """A drive as it was read: its identity, the mapping's fingerprint, its options, and every point compared.
+
+    Of a device that is no drive nothing else is read.
+    """
 
     identity: Identity
     fingerprint: str
     options: Mapping[str, int]
     window_um: float
     findings: tuple[Finding, ...]
+    is_drive: bool = True
 
 
 def read_optional(master: Master, index: int, sub: int = 0, *, signed: bool = False) -> int | None:
@@ -81,15 +90,29 @@ def read_optional(master: Master, index: int, sub: int = 0, *, signed: bool = Fa
 
 
 def listen(master: Master) -> None:
-    """Listen without sending: on a silent bus nothing is sent, and beside an NC we are not the master."""
+    """Listen without sending, and beside an NC leave it at that: we are not the master then.
+
+    On a silent bus the drive is asked what it is: with the NC off, one that sends no heartbeat (0x1017 = 0) is silent.
+    """
     end = time.monotonic() + LISTEN_S
     while time.monotonic() < end and master.heard.sync == 0:
         master.check()
         time.sleep(0.01)
     require_alone(master)
     if master.heard.frames == 0:
-        text = "there is no drive on the bus; check the drives' supply, wiring and bit rate"
-        raise ConnectError(f"bus {master.bus.name}", text)
+        _ask_alone(master)
+
+
+def _ask_alone(master: Master) -> None:
+    """Read the device type on a bus where nothing is heard; ConnectError when nothing can be read."""
+    bus = f"bus {master.bus.name}"
+    if master.heard.errors:
+        raise ConnectError(bus, UNREADABLE)
+    try:
+        read_optional(master, Object.DEVICE_TYPE)
+    except (DeviceTimeout, ProtocolError):
+        text = f"nothing was heard on the bus and node-ID {master.node_id} did not answer"
+        raise ConnectError(bus, f"{text}; check the drive's supply, wiring, bit rate and node_id") from None
 
 
 def require_alone(master: Master) -> None:
@@ -101,9 +124,13 @@ def require_alone(master: Master) -> None:
 
 def survey(master: Master) -> Survey:
     """Read everything that can be compared while the drive rests, and compare it."""
-    identity, pdos, options = read_identity(master), read_pdos(master), read_options(master)
+    identity, device = read_identity(master), compare_device(master)
+    if device.ok is False:
+        return Survey(identity, "", {}, 0.0, (device,), is_drive=False)
+    pdos, options = read_pdos(master), read_options(master)
     window_um = options.get("6065", 0) / master.config.axis[master.axis].scaling.increments_per_mm * 1e3
     findings = (
+        device,
         compare_identity(master.profile, identity),
         *(compare_pdo(spec, found, master.node_id) for spec, found in pdos),
         *compare_options(master, options),
@@ -117,15 +144,29 @@ def survey(master: Master) -> Survey:
 
 
 def require(master: Master, findings: Iterable[Finding]) -> None:
-    """DriveFault with cause and advice of the first point that differs."""
+    """DriveFault with cause and advice of the first point that differs, or is needed and could not be compared."""
     for finding in findings:
-        if finding.ok is False:
+        if finding.ok is False or (finding.ok is None and finding.needed):
             raise DriveFault(master.device, f"{finding.cause}; {finding.advice}")
 
 
 def read_identity(master: Master) -> Identity:
     """Read 0x1018; a number that the drive does not give is 0."""
     return Identity(*(read_optional(master, Object.IDENTITY, sub) or 0 for sub in (1, 2, 3, 4)))
+
+
+def compare_device(master: Master) -> Finding:
+    """The node must be a CiA 402 drive, or one of the devices behind it (0x67FF)."""
+    own, first = (read_optional(master, index) for index in (Object.DEVICE_TYPE, FIRST_DEVICE_TYPE))
+    expected, advice = "CiA 402, a drive", "correct drive.node_id; fdhil scan lists what is on the bus"
+    if is_drive(own) or is_drive(first):
+        return Finding("device", expected, expected)
+    found = describe(own)
+    if own is None or own & 0xFFFF == 0:  # some drives follow CiA 402 and do not say so
+        has_power_state = read_optional(master, 0x6041) is not None
+        cause = "it names no device profile (0x1000)" + ("" if has_power_state else " and has no statusword (0x6041)")
+        return Finding("device", expected, found, None if has_power_state else False, cause, advice)
+    return Finding("device", expected, found, False, f"it is no CiA 402 drive: 0x1000 says {found}", advice)
 
 
 def compare_identity(profile: DriveProfile, identity: Identity) -> Finding:
@@ -204,20 +245,31 @@ def _pdo_text(cob_id: int, valid: bool, kind: int, mapped: tuple[int, ...]) -> s
     return f"{cob_id:03X}, type {kind}: {_mapping(mapped)}" if valid else f"not valid: {_mapping(mapped)}"
 
 
+def _lacks(point: str, expected: str, *objects: str, needed: bool = False) -> Finding:
+    """A point that cannot be compared, for the drive has no such object."""
+    shown = " and ".join(objects)
+    advice = "its manual says what it does instead"
+    return Finding(point, expected, f"no {shown}", None, f"it has no {shown}", advice, needed)
+
+
 def compare_mode(master: Master) -> Iterator[Finding]:
     """The drive must offer cyclic synchronous position and interpolate at the machine's SYNC period."""
     modes = read_optional(master, Object.SUPPORTED_MODES)
-    if modes is not None:
+    if modes is None:
+        yield _lacks("mode", "cyclic synchronous position", "0x6502")
+    else:
         offered = bool(modes >> (Mode.CYCLIC_SYNC_POSITION - 1) & 1)
         cause = "it has no cyclic synchronous position mode (0x6502)"
         shown = f"0x6502 = {modes:08X}"
         yield Finding("mode", "cyclic synchronous position", shown, offered, cause, "it cannot be corrected")
     value = read_optional(master, Object.INTERPOLATION_PERIOD, 1)
     exponent = read_optional(master, Object.INTERPOLATION_PERIOD, 2, signed=True)
+    wanted = f"{master.period_s * 1e3:g} ms"
     if value is None or exponent is None:
+        yield _lacks("cycle", wanted, "0x60C2")
         return
     period_s = value * 10.0**exponent
-    found, wanted = f"{period_s * 1e3:g} ms", f"{master.period_s * 1e3:g} ms"
+    found = f"{period_s * 1e3:g} ms"
     same = abs(period_s - master.period_s) <= 1e-6
     cause = f"it interpolates over {found} (0x60C2) while SYNC comes every {wanted}"
     yield Finding("cycle", wanted, found, same, cause, "set 0x60C2 or machine.sync_period_s")
@@ -272,23 +324,21 @@ def read_options(master: Master) -> dict[str, int]:
 def compare_options(master: Master, options: Mapping[str, int]) -> Iterator[Finding]:
     """The drive must stop, and by a ramp, when communication is lost."""
     strict = " or ".join(map(str, master.profile.strict_abort_options))
-    abort = str(options.get("6007", "missing"))
-    yield Finding(
-        "communication lost",
-        f"0x6007 = {strict}",
-        f"0x6007 = {abort}",
-        options.get("6007") in master.profile.strict_abort_options,
-        f"0x6007 is {abort}: it goes on when communication is lost",
-        f"set it to {strict}",
-    )
-    yield Finding(
-        "stop by a ramp",
-        "0x605A and 0x605E not 0",
-        ", ".join(f"0x{key} = {options.get(key, 'missing')}" for key in ("605A", "605E")),
-        options.get("605E", 2) != 0 and options.get("605A", 2) != 0,
-        "0x605E or 0x605A is 0: it coasts instead of stopping by a ramp",
-        "set both to 2",
-    )
+    point, expected, abort = "communication lost", f"0x6007 = {strict}", options.get("6007")
+    if abort is None:  # the watchdog test of the commissioning shows what it does
+        yield _lacks(point, expected, "0x6007")
+    else:
+        stops = abort in master.profile.strict_abort_options
+        cause = f"0x6007 is {abort}: it goes on when communication is lost"
+        yield Finding(point, expected, f"0x6007 = {abort}", stops, cause, f"set it to {strict}")
+    point, expected = "stop by a ramp", "0x605A and 0x605E not 0"
+    found = {f"0x{key}": options.get(key) for key in ("605A", "605E")}
+    if missing := [key for key, value in found.items() if value is None and 0 not in found.values()]:
+        yield _lacks(point, expected, *missing)
+        return
+    shown = ", ".join(f"{key} = {'missing' if value is None else value}" for key, value in found.items())
+    cause = "0x605E or 0x605A is 0: it coasts instead of stopping by a ramp"
+    yield Finding(point, expected, shown, 0 not in found.values(), cause, "set both to 2")
 
 
 def compare_window(master: Master, options: Mapping[str, int], window_um: float) -> Iterator[Finding]:
@@ -297,7 +347,10 @@ def compare_window(master: Master, options: Mapping[str, int], window_um: float)
     largest = (settings.correction or CorrectionLimits()).max_offset_um
     wanted = settings.drive.following_error_window_mm * 1e3
     point, expected = "following error", f"{wanted:g} um"
-    if options.get("6065", NO_WINDOW) in (0, NO_WINDOW):
+    if "6065" not in options:
+        yield _lacks(point, expected, "0x6065", needed=True)
+        return
+    if options["6065"] in (0, NO_WINDOW):
         cause = "0x6065 is off: it never notices a following error"
         yield Finding(point, expected, "off", False, cause, "set a window")
         return

@@ -16,8 +16,8 @@ from fdhil.config.axis import (
     FeedforwardLimits,
     Nominal,
     SpeedUnit,
-    Thermometer,
 )
+from fdhil.config.bus import CanBus
 from fdhil.config.controller import Identification, Nc
 from fdhil.config.machine import MachineConfig
 from fdhil.config.offset_bounds import VARIATION_MM, OffsetBounds, share_fault
@@ -25,7 +25,8 @@ from fdhil.config.reading import load, parse, toml_document, unlikely
 from fdhil.config.reality import Reality
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import Section
-from fdhil.config.service import CanBus, Maintenance
+from fdhil.config.sensors import Thermometer, Voltage
+from fdhil.config.service import Maintenance
 from fdhil.config.simulation import Noise, SimAxis, Thermal
 
 __all__ = [
@@ -52,6 +53,7 @@ __all__ = [
     "SpeedUnit",
     "Thermal",
     "Thermometer",
+    "Voltage",
     "load",
     "parse",
     "share_fault",

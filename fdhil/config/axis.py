@@ -12,6 +12,7 @@ from fdhil import tables
 from fdhil.cia402 import Scaling
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import NotNegative, Positive, Section, one_of
+from fdhil.config.sensors import Thermometer, Voltage
 
 # the built-in ceilings of what may ever be added to a set-point; a config can only lower them
 CEILING_OFFSET_UM = 250.0
@@ -90,38 +91,6 @@ class Drive(Section):
     speed_limit_mm_s: Positive | None = Field(
         None, ge=1e-3, le=1e5, description="the axis maximum; left out: the rapid speed"
     )
-
-
-class Voltage(Section):
-    """[axis.X.voltage]: where the motor's terminal voltage comes from."""
-
-    source: Annotated[str, one_of(tables.VOLTAGE_SOURCES)] = Field(
-        tables.DRIVE_VOLTAGE,
-        description=f"{', '.join(tables.VOLTAGE_SOURCES)}; drive: a vendor object in a TPDO, else a separate sensor",
-    )
-    sampling: Literal["interval_mean", "instant"] = Field(
-        "interval_mean", description="the drive's value is the mean since the last sample, or an instant"
-    )
-    host: str = Field("127.0.0.1", description="modbus: address of the sensor")
-    port: int = Field(0, ge=0, le=65535, description="modbus: TCP port; 0 lets the simulator choose one")
-    unit: int = Field(1, ge=0, le=247, description="modbus: unit identifier")
-    timeout_s: Positive = Field(0.5, ge=1e-3, le=60, description="modbus: how long an answer may take")
-
-    @property
-    def separate(self) -> bool:
-        """Whether a sensor of its own tells the voltage; else the drive does, with its other samples."""
-        return self.source != tables.DRIVE_VOLTAGE
-
-
-class Thermometer(Section):
-    """[axis.X.temperature]: the slide-way's thermometer (Modbus). Without this section drift is told by time alone."""
-
-    host: str = Field("127.0.0.1", description="address of the thermometer")
-    port: int = Field(502, ge=1, le=65535, description="TCP port")
-    unit: int = Field(1, ge=0, le=247, description="unit identifier")
-    address: int = Field(8, ge=0, le=65534, description="first of its two input registers (float32, high word first)")
-    period_s: Positive = Field(1.0, ge=1e-2, le=3600, description="how often it is asked")
-    timeout_s: Positive = Field(0.5, ge=1e-3, le=60, description="how long an answer may take")
 
 
 class Axis(Section):

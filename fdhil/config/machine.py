@@ -9,12 +9,14 @@ from pathlib import Path
 from pydantic import Field, ValidationInfo, model_validator
 
 from fdhil.config.axis import Axis
+from fdhil.config.bus import CanBus
 from fdhil.config.controller import G0, Correction, Identification, Nc
 from fdhil.config.offset_bounds import limit_faults
 from fdhil.config.plausible import doubts
 from fdhil.config.regulators import period_faults
 from fdhil.config.section import AxisName, Positive, Section
-from fdhil.config.service import CanBus, Guard, Maintenance, Store
+from fdhil.config.sensors import Thermometer, Voltage, line_faults
+from fdhil.config.service import Guard, Maintenance, Store
 from fdhil.config.simulation import Sim
 
 
@@ -47,12 +49,15 @@ class MachineConfig(Section):
         for name, axis in self.axis.items():
             if axis.drive.bus not in self.bus:
                 faults.append(f"axis.{name}.drive.bus: there is no [bus.{axis.drive.bus}]")
+            elif axis.correction is not None and not self.bus[axis.drive.bus].may_send:
+                faults.append(f"axis.{name}.correction: {self._listening(axis.drive.bus)}")
             faults += [f"axis.{name}.regulators.{fault}" for fault in period_faults(axis.regulators, period)]
             limits = [f"axis.{name}.correction: {fault}" for fault in limit_faults(axis, period)]
             # a number in another unit makes limits wrong too, and says so better
             found = [] if (info.context or {}).get("made_up") else doubts(axis)
             faults += [f"axis.{name}.{doubt.key}: {doubt.text}" for doubt in found if limits or not doubt.possible]
             faults += limits
+        faults += line_faults(self.sensors)
         # the PDOs of a device's second axis are those of the next node-ID
         ids = {(axis.drive.bus, self.node_id(name) + axis.drive.logical_axis) for name, axis in self.axis.items()}
         if len(ids) < len(self.axis):
@@ -61,6 +66,20 @@ class MachineConfig(Section):
         if faults:
             raise ValueError("\n".join(faults))
         return self
+
+    @property
+    def sensors(self) -> dict[str, Voltage | Thermometer]:
+        """The sections of all sensors, by their path."""
+        found: dict[str, Voltage | Thermometer] = {}
+        for name, axis in self.axis.items():
+            found[f"axis.{name}.voltage"] = axis.voltage
+            if axis.temperature is not None:
+                found[f"axis.{name}.temperature"] = axis.temperature
+        return found
+
+    def _listening(self, bus: str) -> str:
+        interface = self.bus[bus].interface
+        return f"bus {bus} is only listened to ({interface}); use SocketCAN there, or leave this section out"
 
     def node_id(self, axis: str) -> int:
         """Return the CANopen node-ID of an axis' drive."""

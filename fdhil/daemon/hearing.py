@@ -79,7 +79,8 @@ class Hearing:
             self._sync.extend(zip(record.tick.tolist(), record.t_ns.tolist(), strict=True))
             self._sync_s = now_s
         elif isinstance(record, AxisSamples) and record.axis in self.moves:
-            self._samples_s[record.axis] = now_s
+            if record.tick.size:  # else none is whole: a TPDO of the mapping does not come
+                self._samples_s[record.axis] = now_s
             self.moves[record.axis].feed(record, now_s)
         elif isinstance(record, Notice) and record.code in SILENCES:
             if record.severity == "info":

@@ -10,7 +10,8 @@ from typing import Protocol
 from fdhil import tables
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.tick_clock import TickClock
-from fdhil.drivers.modbus.temperature import ModbusTemperature
+from fdhil.drivers.link import Link
+from fdhil.drivers.thermometer import SlidewayThermometer
 from fdhil.errors import DeviceError
 from fdhil.records import AxisSamples, MoveEvent, Notice, Temperature, TickTimes, VoltageSamples
 
@@ -20,26 +21,6 @@ Take = Callable[[Record], None]
 
 POLL_S = 0.05
 BACK_OFF_S = (0.1, 5.0)
-
-
-class Link(Protocol):
-    """The connection to a sensor; ``wire`` names its kind, ``place`` tells people where it leads."""
-
-    wire: str
-    place: str
-
-    @property
-    def connected(self) -> bool:
-        """Whether it stands."""
-
-    async def connect(self) -> None:
-        """Connect anew; ConnectError when nobody answers there."""
-
-    def fault_code(self, error: DeviceError) -> str | None:
-        """Return the class under which ``error`` is told; None for what passes by itself."""
-
-    def close(self) -> None:
-        """End the connection."""
 
 
 class Sensor(Protocol):
@@ -67,7 +48,7 @@ def sensors_of(axis: str, config: MachineConfig) -> dict[str, Sensor]:
     if settings.voltage.separate:
         found["voltage"] = tables.load(tables.VOLTAGE_SOURCES, settings.voltage.source)(axis, config)
     if settings.temperature is not None:
-        found["temperature"] = ModbusTemperature(axis, settings.temperature)
+        found["temperature"] = SlidewayThermometer(axis, settings.temperature)
     return found
 
 

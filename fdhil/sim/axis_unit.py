@@ -58,7 +58,7 @@ class AxisUnit:
     _before: dict[tuple[int, int], int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self.drive.cycle_ended = self.cycle_ended
+        self.drive.on_cycle(self.cycle_ended)
 
     def power(self, on: bool) -> None:
         """Cut or restore the drive's supply."""

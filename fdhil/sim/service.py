@@ -28,7 +28,7 @@ from fdhil.sim.machine import Machine
 from fdhil.sim.operator_commands import MAX_LINE, CommandError, OperatorCommands
 from fdhil.sim.wire.attach import attach
 from fdhil.sim.wire.attachment import Attachment, Selectable, WakePipe
-from fdhil.sim.wire.modbus_sensor import SensorServers
+from fdhil.sim.wire.sensor_wires import SensorWires
 
 Loader = Callable[[Path, MachineConfig], Trajectory]
 Emit = Callable[[dict[str, Any]], None]
@@ -102,7 +102,7 @@ class SimService:
         self._left = 0
         self._pace = Pace(config.machine.sync_period_s, lockstep=config.sim.pace == "lockstep")
         self._buses: dict[str, Attachment] = {}
-        self._servers: SensorServers | None = None
+        self._sensors: SensorWires | None = None
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         try:
             for entry in faults:
@@ -118,11 +118,9 @@ class SimService:
         for name in self.machine.buses:
             self._buses[name] = attach(name, self.config.bus[name])
         if self.config.sim.modbus:
-            sensors = {axis: unit.sensor for axis, unit in self.machine.units.items()}
-            addresses = {axis: (a.voltage.host, a.voltage.port) for axis, a in self.config.axis.items()}
-            servers = SensorServers(sensors, addresses)
-            servers.start()
-            self._servers = servers
+            sensors = SensorWires(self.config, {axis: unit.sensor for axis, unit in self.machine.units.items()})
+            sensors.start()
+            self._sensors = sensors
 
     def _take(self, bus: str, frame: Frame) -> None:
         answers = self.machine.receive(bus, frame)
@@ -131,15 +129,10 @@ class SimService:
 
     def ready_event(self) -> dict[str, Any]:
         """Return the ready event; the EDS files it names are written now."""
-        modbus = {}
-        if self._servers is not None:
-            for axis, port in self._servers.ports.items():
-                voltage = self.config.axis[axis].voltage
-                modbus[axis] = {"host": voltage.host, "port": port, "unit": voltage.unit}
         return {
             "event": "ready",
             "buses": {name: bus.settings for name, bus in self._buses.items()},
-            "modbus": modbus,
+            "modbus": self._sensors.ready if self._sensors is not None else {},
             **self.machine.describe(self._write_eds()),
             "pace": self.config.sim.pace,
             "sync_period_s": self.config.machine.sync_period_s,
@@ -161,9 +154,9 @@ class SimService:
     def close(self) -> None:
         """Close every port and end every thread; what is being recorded is given up."""
         self._pool.shutdown(wait=True, cancel_futures=True)
-        if self._servers is not None:
-            self._servers.stop()
-            self._servers = None
+        if self._sensors is not None:
+            self._sensors.stop()
+            self._sensors = None
         for bus in self._buses.values():
             bus.close()
         self._buses.clear()

@@ -23,6 +23,7 @@ from fdhil.records import PARAMETERS, Bool, Float, Parameters, Reason, Window, r
 from fdhil.validation.replay import Replay, replay_window
 from fdhil.validation.table_error import TableError
 
+MOST_SHARE = 0.25  # of what all torque makes: a model that leaves more of it is none, however much the axis lags
 NEXT_SPEED = 0.3  # of the rapid speed: that of a program that is cut
 SCATTER = 3.0  # deviations by which the power of noise may lie above what is expected
 BEGINNING_S = 0.060  # before the drive surely moves
@@ -185,7 +186,7 @@ def weigh(
     if told is None and axis is not None:
         return Weight(left, tolerance_um(settings, whole), whole, left, "own loop")
     if told is None:
-        limit = TOLERANCE_SHARE * max(whole, _followed_um(window))
+        limit = min(TOLERANCE_SHARE * max(whole, _followed_um(window)), MOST_SHARE * whole)
         return Weight(left, limit, whole, left, "ordinary loop")
     return Weight(told.unexplained_um, tolerance_um(settings, told.measured_um), told.measured_um, left, "replay")
 

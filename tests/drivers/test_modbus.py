@@ -12,9 +12,12 @@ from hypothesis import strategies as st
 from pymodbus.pdu.register_message import ReadInputRegistersResponse
 
 from fdhil.config import MachineConfig
+from fdhil.config.sensors import ModbusPlace
 from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.modbus.counter_clock import CounterClock
+from fdhil.drivers.modbus.line import Request
 from fdhil.drivers.modbus.link import ModbusLink
+from fdhil.drivers.modbus.tcp_line import TcpLine
 from fdhil.drivers.modbus.voltage import ModbusVoltage, SensorBlock, parse_block
 from fdhil.drivers.sensor_source import Record, SensorSource
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
@@ -94,9 +97,10 @@ async def test_each_misbehaviour_is_one_error(mode: str, error: type[DeviceError
 
 
 async def test_a_source_that_is_stopped_just_as_the_answer_comes_ends() -> None:
-    link = ModbusLink("voltage sensor X", "127.0.0.1", 502, 1, 10.0)
+    line = TcpLine("127.0.0.1", 502)
+    request = Request("voltage sensor X", 1, 4, 0, 1, 10.0)
     answer = asyncio.get_running_loop().create_future()
-    asking = asyncio.create_task(link._request(asyncio.wait_for(answer, 10.0), 0))
+    asking = asyncio.create_task(line.answered(asyncio.wait_for(answer, 10.0), request))
     for _ in range(3):
         await asyncio.sleep(0)
     answer.set_result(ReadInputRegistersResponse(registers=[1]))
@@ -109,7 +113,7 @@ async def test_nobody_there_is_said() -> None:
     async with sensor_peer() as peer:
         port = peer.port
     with pytest.raises(ConnectError, match="cannot be reached"):
-        await ModbusLink("voltage sensor X", "127.0.0.1", port, 1, 0.2).connect()
+        await ModbusLink("voltage sensor X", ModbusPlace(port=port, timeout_s=0.2)).connect()
 
 
 async def test_a_source_survives_and_tells_both_edges(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -69,6 +69,8 @@ class VoltageObject:
 class Cia402Decoder:
     """Decodes one axis; ``feed`` takes ticked frames of its bus, ``counters`` tells what was lost.
 
+    ``required`` names the TPDOs of which every sample is made.
+
     ValueError when the profile maps a needed object in no PDO.
     """
 
@@ -82,7 +84,7 @@ class Cia402Decoder:
         self._queues = {s.name: PdoQueue(s, s.cob_base + self.node_id) for s in self.profile.tpdos}
         needed = [self.profile.position, self.profile.speed, self.profile.current, self.profile.statusword]
         self._places = {key: self._place(key) for key in (*needed, *self._voltage.keys)}
-        self._required = list(dict.fromkeys(name for name, _ in self._places.values()))
+        self.required = list(dict.fromkeys(name for name, _ in self._places.values()))
         shown = (self.profile.position_demand, self.profile.offset, self.profile.digital_inputs)
         self._shown_places = {key: self._place(key) for key in shown if self.profile.find_tpdo(key)}
         self._mm_per_increment = self._settings.scaling.sign / self._settings.scaling.increments_per_mm
@@ -109,6 +111,11 @@ class Cia402Decoder:
             raise ValueError(f"profile {self.profile.name} maps {key[0]:04X}:{key[1]:02X} in no RPDO")
         spec, entry = found
         return Setpoint(PdoQueue(spec, spec.cob_base + self.node_id), entry, self._delay)
+
+    @property
+    def cob_ids(self) -> frozenset[int]:
+        """The PDOs of this drive, by its profile."""
+        return frozenset(spec.cob_base + self.node_id for spec in (*self.profile.tpdos, *self.profile.rpdos))
 
     def feed(self, ticked: Ticked) -> list[AxisSamples | InputSamples | Notice]:
         """Take a block of ticked frames; return the rows that became complete, and what must be told."""
@@ -150,8 +157,8 @@ class Cia402Decoder:
     ) -> list[AxisSamples]:
         """Rows [first, stop); nothing while the demand is not known."""
         heard = self._heard(first, stop)
-        grids = {name: dense(self._queues[name], first, stop + 1) for name in self._required}
-        lost = self._count(grids, heard)
+        grids = {name: dense(self._queues[name], first, stop + 1) for name in self.required}
+        lost = self._count(grids, heard, first)
         if demand is None:
             return []
         lost += demand.lost + int(np.count_nonzero(~heard))
@@ -164,10 +171,15 @@ class Cia402Decoder:
         self.counters.lost += demand.lost
         return [self._record(np.flatnonzero(certain), first, grids, demand, offset, lost)]
 
-    def _count(self, grids: Mapping[str, Dense], heard: Bool) -> int:
+    def _count(self, grids: Mapping[str, Dense], heard: Bool, first: int) -> int:
         """Count what is wrong with the frames of the rows' own ticks; returns the number lost."""
         rows = heard.size
-        lost = sum(int(np.count_nonzero(grid.missing[:rows] & heard)) for grid in grids.values())
+        lost = 0
+        for name, grid in grids.items():
+            begun = self._queues[name].first_tick
+            if begun is not None:
+                start = max(0, begun - first)
+                lost += int(np.count_nonzero((grid.missing[:rows] & heard)[start:]))
         ambiguous = np.zeros(rows, np.bool_)
         for grid in grids.values():
             self.counters.duplicates += int(grid.duplicates[:rows].sum())

@@ -56,6 +56,8 @@ class _Section:
 
 def load_eds(path: Path, node_id: int | None = None) -> ObjectDictionary:
     """Read an EDS or DCF file; ``node_id`` resolves $NODEID. EdsError when it cannot be read or is no EDS."""
+    if path.exists() and not path.is_file() and not path.is_dir():  # a pipe would be waited for without end
+        raise EdsError(path.name, "it is no plain file; check the path")
     try:
         with path.open("rb") as file:
             raw = file.read(MAX_BYTES + 1)

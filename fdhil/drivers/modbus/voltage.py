@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import asyncio
 import math
-import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,8 +22,10 @@ import numpy as np
 
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.meter import BEYOND_LIMIT, SYNC_LATENESS_NS
 from fdhil.drivers.modbus.counter_clock import CounterClock, Line
-from fdhil.drivers.modbus.link import PLAUSIBLE_C, ModbusLink, float32, uint32
+from fdhil.drivers.modbus.link import PLAUSIBLE_C, ModbusLink
+from fdhil.drivers.modbus.values import float32, uint32
 from fdhil.errors import ProtocolError
 from fdhil.records import Float, Notice, Temperature, VoltageSamples, frozen, frozen_ints
 
@@ -34,7 +35,6 @@ BLOCK_SAMPLES = 100
 ALL_REGISTERS = FIRST_SAMPLE + BLOCK_SAMPLES
 STATUS_LOST = 2
 STUCK_POLLS = 20
-SYNC_LATENESS_NS = 200_000  # how late the stamp of a SYNC may be on a busy computer
 _SETTLE_STEPS = 8
 _SETTLE_STEP_S = 0.01
 _SETTLED_NS = 50_000_000  # a query is placed when so many later SYNCs have shown which stamps around it were late
@@ -87,8 +87,9 @@ class ModbusVoltage:
         self.axis = axis
         self.name = f"voltage sensor {axis}"
         self._sign = config.axis[axis].drive.sign
+        self.limit_v = BEYOND_LIMIT * config.axis[axis].regulators.voltage_limit_v
         self._period_s = config.machine.sync_period_s
-        self.link = ModbusLink(self.name, settings.host, settings.port, settings.unit, settings.timeout_s)
+        self.link = ModbusLink(self.name, settings)
         self._host_clock: CounterClock | None = None
         self._tick_clock: CounterClock | None = None
         self._rate_hz = 0.0
@@ -101,9 +102,8 @@ class ModbusVoltage:
     async def poll(self, ticks: TickClock) -> list[VoltageSamples | Temperature | Notice]:
         """Latch and read once; errors of the link pass through."""
         await self.latch()
-        asked_ns = time.monotonic_ns()
         block = await self.block()
-        answered_ns = time.monotonic_ns()
+        asked_ns, answered_ns = self.link.asked_ns, self.link.answered_ns
         for _ in range(_SETTLE_STEPS):  # the SYNCs around the query must have been drained before it can be placed
             if not ticks.running or ticks.covers(answered_ns):
                 break

@@ -31,7 +31,12 @@ def attach(name: str, bus: CanBus) -> Attachment:
     """Attach to the bus ``[bus.name]``; ConnectError when it cannot be had."""
     if bus.interface == "socketcand":
         return Hub(bus.channel, bus.host, bus.port)
-    return SocketCan(name, bus) if bus.interface == "socketcan" else VirtualBus(bus)
+    if bus.interface == "socketcan":
+        return SocketCan(name, bus)
+    if bus.interface == "virtual":
+        return VirtualBus(bus)
+    text = f"the simulated drives cannot be behind a {bus.interface} adapter; set interface to socketcand or socketcan"
+    raise ConnectError(f"bus {name}", text)
 
 
 def _no_bus(name: str, bus: CanBus, error: OSError) -> ConnectError:

@@ -1,4 +1,4 @@
-"""Reads a slide-way thermometer behind Modbus TCP now and then: one float32 in two input registers."""
+"""Reads a slide-way's thermometer now and then, behind Modbus or on a serial line."""
 
 from __future__ import annotations
 
@@ -6,27 +6,40 @@ import asyncio
 
 from fdhil.config import Thermometer
 from fdhil.drivers.can.tick_clock import TickClock
-from fdhil.drivers.modbus.link import PLAUSIBLE_C, ModbusLink, float32
+from fdhil.drivers.link import Link
+from fdhil.drivers.meter import Meter
+from fdhil.drivers.modbus.link import PLAUSIBLE_C
+from fdhil.drivers.modbus.meter import ModbusMeter
+from fdhil.drivers.serial.instrument import TextMeter
 from fdhil.errors import ProtocolError
 from fdhil.records import Temperature
 
 
-class ModbusTemperature:
-    """The thermometer of one axis; ``link`` is its connection, ``samples`` counts readings, none can be ``lost``."""
+class SlidewayThermometer:
+    """The thermometer of one axis; ``samples`` counts readings, none can be ``lost``."""
 
     lost = 0
 
     def __init__(self, axis: str, settings: Thermometer) -> None:
         self.axis = axis
         self.name = f"thermometer {axis}"
-        self.link = ModbusLink(self.name, settings.host, settings.port, settings.unit, settings.timeout_s)
         self.samples = 0
-        self._address = settings.address
         self._period_s = settings.period_s
+        self._meter: Meter
+        if settings.source == "serial":
+            self._meter = TextMeter(self.name, settings, settings, settings.period_s)
+        else:
+            self._meter = ModbusMeter(self.name, settings, settings, settings.type)
+
+    @property
+    def link(self) -> Link:
+        """Its connection."""
+        return self._meter.link
 
     async def poll(self, ticks: TickClock) -> list[Temperature]:
         """Rest for the period and read once; errors of the link pass through, ProtocolError for no temperature."""
-        await asyncio.sleep(self._period_s)
+        if not self._meter.tells_by_itself:
+            await asyncio.sleep(self._period_s)
         celsius = await self._celsius()
         self.samples += 1
         return [Temperature(self.axis, ticks.newest_tick, celsius, "slideway")]
@@ -36,8 +49,7 @@ class ModbusTemperature:
         return f"{await self._celsius():.2f} degC"
 
     async def _celsius(self) -> float:
-        celsius = float32(await self.link.read_input(self._address, 2))
+        celsius = await self._meter.value()
         if not PLAUSIBLE_C[0] < celsius < PLAUSIBLE_C[1]:  # nor is it NaN
-            text = f"register {self._address} gives {celsius:g} degC; compare the register map with the config"
-            raise ProtocolError(self.name, text)
+            raise ProtocolError(self.name, self._meter.doubt(f"{celsius:g} degC"))
         return celsius

@@ -1,0 +1,250 @@
+"""[axis.X.voltage], [axis.X.temperature]: sensors of their own, on Modbus (TCP or RTU) or on a serial line.
+
+What kinds of sensor have in common is a class here: where a device is, and how its value is read.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from fdhil import tables
+from fdhil.config.section import Finite, NotNegative, Positive, Section, one_of
+
+BAUD_RATES = (1200, 2400, 4800, 9600, 14400, 19200, 28800, 38400, 57600, 115200, 230400, 460800, 921600)
+ValueType = Literal["int16", "uint16", "int32", "uint32", "float32", "float64"]
+NO_DEVICE = ""
+
+
+def _of_a_line(rate: int) -> int:
+    if rate not in BAUD_RATES:
+        raise ValueError(f"must be one of {', '.join(map(str, BAUD_RATES))}")
+    return rate
+
+
+def _regular(pattern: str) -> str:
+    if not pattern:
+        return pattern
+    try:
+        groups = re.compile(pattern).groups
+    except re.error as error:
+        raise ValueError(f"is no regular expression ({error})") from None
+    if groups != 1:
+        raise ValueError("must have one group, around the number, as in 'U=([-+.0-9]+)'")
+    return pattern
+
+
+class Sourced(Section):
+    """Which kind of sensor it is."""
+
+    source: str = Field("modbus", description="modbus, serial")
+
+
+class SerialPlace(Section):
+    """A serial line, and how it is set."""
+
+    device: str = Field(NO_DEVICE, description="the serial device, as /dev/ttyUSB0 or /dev/serial/by-id/...")
+    baud_rate: Annotated[int, AfterValidator(_of_a_line)] = Field(
+        19200, ge=BAUD_RATES[0], le=BAUD_RATES[-1], description="serial: bits per second"
+    )
+    parity: Literal["even", "odd", "none"] = Field(
+        "even", description="serial: even is what Modbus devices have, none what others have"
+    )
+    stop_bits: Literal[1, 2] = Field(1, description="serial: stop bits; Modbus has 2 where there is no parity")
+    timeout_s: Positive = Field(0.5, ge=1e-3, le=60, description="how long an answer may take")
+
+
+class ModbusPlace(SerialPlace):
+    """A Modbus unit: RTU on a serial device, else TCP."""
+
+    device: str = Field(
+        NO_DEVICE, description="serial: the device, as /dev/ttyUSB0, for Modbus RTU or text; left out: Modbus TCP"
+    )
+    host: str = Field("127.0.0.1", description="modbus: address of the device")
+    port: int = Field(0, ge=0, le=65535, description="modbus: TCP port; 0 lets the simulator choose one")
+    unit: int = Field(1, ge=0, le=255, description="modbus: unit identifier; on a serial device 1 to 247")
+
+    @model_validator(mode="after")
+    def _answers(self) -> ModbusPlace:
+        if self.device and not 1 <= self.unit <= 247:
+            raise ValueError("unit: a unit on a serial line has a number from 1 to 247")
+        return self
+
+
+class ModbusValue(Section):
+    """A value in the registers of a Modbus unit."""
+
+    function: Literal[3, 4] = Field(4, description="modbus: 4 reads input registers, 3 holding registers")
+    address: int = Field(
+        0, ge=0, le=65535, description="modbus: first register, counted from 0 (register 30001 or 40001 is 0)"
+    )
+    type: ValueType = Field("float32", description="modbus: int16, uint16, int32, uint32, float32, float64")
+    word_order: Literal["big", "little"] = Field(
+        "big", description="modbus: big has the high word of a value in its first register, little the low word"
+    )
+
+
+class TextValue(Section):
+    """A number in a line of text of an instrument on a serial line."""
+
+    query: str = Field(
+        "",
+        max_length=200,
+        description="serial: what an instrument is asked with, as 'READ?\\n'; left out: it tells lines by itself",
+    )
+    pattern: Annotated[str, AfterValidator(_regular)] = Field(
+        "",
+        description="serial: where a line has the value, as 'U=([-+.0-9]+)'; left out: its first number",
+    )
+
+
+class Scaled(Section):
+    """From a value as it is read to one in the unit of the key."""
+
+    scale: Finite = Field(1.0, description="what a value is multiplied with; negative where the wires are swapped")
+    offset: Finite = Field(0.0, description="what is added then")
+
+
+class VoltageBlock(Section):
+    """[axis.X.voltage.block]: where a Modbus device keeps its newest samples by number: voltage.address is the first
+    of them, voltage.type what each is. Without this section a device shows one value, its newest."""
+
+    samples: int = Field(32, ge=1, le=124, description="samples in the block")
+    rate_hz: Positive = Field(1000.0, ge=0.1, le=1e6, description="samples in a second")
+    counter_address: int = Field(
+        40, ge=0, le=65534, description="register of the count of samples (with the block in at most 125 registers)"
+    )
+    counter_type: Literal["uint16", "uint32"] = Field("uint32", description="of that count: uint16, uint32")
+    counter_of: Literal["newest", "oldest"] = Field(
+        "newest", description="newest: the count is the number of the block's newest sample; oldest: of its oldest"
+    )
+    count_address: int | None = Field(
+        None, ge=0, le=65535, description="register of how many samples there are; left out: the block is always full"
+    )
+    newest_first: bool = Field(False, description="whether the block's first sample is its newest")
+    trigger_address: int | None = Field(
+        None, ge=0, le=65535, description="register to which 1 is written to have new samples put into the block"
+    )
+
+
+_SAYS_WHERE = ("function", "address", "word_order", "block")
+
+
+class Voltage(Scaled, TextValue, ModbusValue, ModbusPlace, Sourced):
+    """[axis.X.voltage]: where the motor's terminal voltage comes from."""
+
+    source: Annotated[str, one_of(tables.VOLTAGE_SOURCES)] = Field(
+        tables.DRIVE_VOLTAGE,
+        description=f"{', '.join(tables.VOLTAGE_SOURCES)}; drive: a vendor object in a TPDO, else a separate sensor",
+    )
+    sampling: Literal["interval_mean", "instant"] = Field(
+        "interval_mean",
+        description="a value is the mean since the last one, or an instant; left out for one value alone: an instant",
+    )
+    type: ValueType | None = Field(  # type: ignore[assignment]
+        None,
+        description="modbus: int16, uint16, int32, uint32, float32, float64; left out: float32 (int16 in a block) "
+        "where function, address, word_order or a block is given, else the registers of fdhil's simulated sensor",
+    )
+    period_s: Positive = Field(
+        0.02, ge=1e-3, le=10.0, description="how often a sensor that shows one value is asked, or tells by itself"
+    )
+    delay_s: NotNegative = Field(0.0, le=10.0, description="how late that value is, for its filter")
+    renewed_s: NotNegative = Field(0.0, le=10.0, description="how often the sensor renews it; 0: whenever it is asked")
+    block: VoltageBlock | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_it_shows(cls, given: Any) -> Any:
+        """Fill in what follows from the keys that are given."""
+        if not isinstance(given, Mapping):
+            return given
+        filled = dict(given)
+        if any(key in given for key in _SAYS_WHERE):
+            filled.setdefault("type", "int16" if given.get("block") is not None else "float32")
+        one_value = given.get("source") == "serial" or filled.get("type") is not None
+        if one_value and given.get("block") is None:
+            filled.setdefault("sampling", "instant")
+        return filled
+
+    @model_validator(mode="after")
+    def _complete(self) -> Voltage:
+        if self.source == "serial" and not self.device:
+            raise ValueError("device: a sensor on a serial line has one, as device = '/dev/ttyUSB0'")
+        if self.block is not None and block_registers(self)[1] > MOST_REGISTERS:
+            raise ValueError("block: its samples and its count lie in more than 125 registers, which no request reads")
+        return self
+
+    @property
+    def separate(self) -> bool:
+        """Whether a sensor of its own tells the voltage; else the drive does, with its other samples."""
+        return self.source != tables.DRIVE_VOLTAGE
+
+
+class Thermometer(Scaled, TextValue, ModbusValue, ModbusPlace, Sourced):
+    """[axis.X.temperature]: the slide-way's thermometer. Without this section drift is told by time alone."""
+
+    source: Literal["modbus", "serial"] = Field("modbus", description="modbus, serial")
+    port: int = Field(502, ge=1, le=65535, description="modbus: TCP port")
+    address: int = Field(8, ge=0, le=65535, description="modbus: first register, counted from 0")
+    period_s: Positive = Field(1.0, ge=1e-2, le=3600, description="how often it is asked")
+
+    @model_validator(mode="after")
+    def _complete(self) -> Thermometer:
+        if self.source == "serial" and not self.device:
+            raise ValueError("device: a thermometer on a serial line has one, as device = '/dev/ttyUSB0'")
+        return self
+
+
+WORDS = {"int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "float32": 2, "float64": 4}
+MOST_REGISTERS = 125  # of one request
+
+
+def block_registers(voltage: Voltage) -> tuple[int, int]:
+    """Return the first register of the request that reads a device's block, and how many it reads."""
+    block, kind = voltage.block, voltage.type
+    assert block is not None
+    assert kind is not None
+    places = [(voltage.address, block.samples * WORDS[kind]), (block.counter_address, WORDS[block.counter_type])]
+    if block.count_address is not None:
+        places.append((block.count_address, 1))
+    first = min(address for address, _ in places)
+    return first, max(address + words for address, words in places) - first
+
+
+Sensors = Mapping[str, Voltage | Thermometer]
+"""The sensors of a machine by the path of their section."""
+_LINE_KEYS = ("baud_rate", "parity", "stop_bits")
+_REQUEST_CHARACTERS, _ANSWER_CHARACTERS, _SILENT_CHARACTERS = 8, 5, 7.0
+
+
+def line_faults(sensors: Sensors) -> Iterator[str]:
+    """Yield what cannot be of sensors on one serial device: other settings, text beside others, too much to ask."""
+    lines: dict[str, dict[str, Voltage | Thermometer]] = {}
+    for path, sensor in sensors.items():
+        if sensor.device and sensor.source != tables.DRIVE_VOLTAGE:
+            lines.setdefault(sensor.device, {})[path] = sensor
+    for device, members in lines.items():
+        (first, one), *others = members.items()
+        for path, other in others:
+            for key in _LINE_KEYS:
+                if getattr(other, key) != getattr(one, key):
+                    yield f"{path}.{key}: {first} sets the same device {device} to {getattr(one, key)}"
+            if "serial" in (one.source, other.source):
+                yield f"{path}.device: {first} has the device {device}, and an instrument that tells by text is alone"
+        share = sum(_share(sensor) for sensor in members.values())
+        if share > 1.0:
+            text = f"{', '.join(members)} take {share:.0%} of the time of {device} at {one.baud_rate} baud"
+            yield f"{first}.period_s: {text}; ask more rarely or raise baud_rate"
+
+
+def _share(sensor: Voltage | Thermometer) -> float:
+    """Return which share of its line's time a sensor takes that is asked for its newest value."""
+    if sensor.source != "modbus" or sensor.type is None or getattr(sensor, "block", None) is not None:
+        return 0.0
+    bits = 1 + 8 + (sensor.parity != "none") + sensor.stop_bits
+    characters = _REQUEST_CHARACTERS + _ANSWER_CHARACTERS + 2 * WORDS[sensor.type] + _SILENT_CHARACTERS
+    return characters * bits / sensor.baud_rate / sensor.period_s

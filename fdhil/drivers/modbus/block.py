@@ -1,0 +1,67 @@
+"""Reads a voltage sensor that keeps its newest samples by number, at the registers that the configuration names."""
+
+from __future__ import annotations
+
+import math
+
+from fdhil.config import MachineConfig
+from fdhil.config.sensors import block_registers
+from fdhil.drivers.modbus.values import numbers, registers_of
+from fdhil.drivers.modbus.voltage import ModbusVoltage, SensorBlock
+from fdhil.errors import ProtocolError
+from fdhil.records import frozen
+
+
+class BlockVoltage(ModbusVoltage):
+    """The voltage source ``modbus`` with a section ``block``: samples and count come with one request."""
+
+    def __init__(self, axis: str, config: MachineConfig) -> None:
+        super().__init__(axis, config)
+        settings = config.axis[axis].voltage
+        assert settings.block is not None
+        assert settings.type is not None
+        self._settings, self._map, self._kind = settings, settings.block, settings.type
+        self._first, self._registers = block_registers(settings)
+        self._modulus = 1 << 16 * registers_of(self._map.counter_type)
+        self._newest: int | None = None
+
+    async def latch(self) -> None:
+        """Have the newest samples put into the registers, where the sensor must be told."""
+        if self._map.trigger_address is not None:
+            await self.link.write(self._map.trigger_address, 1)
+
+    async def block(self) -> SensorBlock:
+        """Read samples and count with one request; ProtocolError when they cannot be."""
+        settings, block = self._settings, self._map
+        registers = await self.link.read(settings.function, self._first, self._registers)
+
+        def words(address: int, count: int) -> list[int]:
+            return registers[address - self._first : address - self._first + count]
+
+        held = block.samples if block.count_address is None else words(block.count_address, 1)[0]
+        if held > block.samples:
+            text = f"register {block.count_address} tells {held} samples in a block of {block.samples}"
+            raise ProtocolError(self.name, f"{text}; compare voltage.block with the sensor's register map")
+        raw = numbers(words(settings.address, held * registers_of(self._kind)), self._kind, settings.word_order)
+        raw = raw[::-1] if block.newest_first else raw
+        volts = settings.scale * raw + settings.offset
+        if not all(math.isfinite(v) and abs(v) <= self.limit_v for v in volts):
+            text = f"registers {settings.address} on give {float(volts[0]):g} V as {self._kind}"
+            raise ProtocolError(self.name, f"{text}; compare type, word_order and scale with its register map")
+        count = registers_of(block.counter_type)
+        told = int(numbers(words(block.counter_address, count), block.counter_type, settings.word_order)[0])
+        newest = self._unwrapped(told + (held - 1 if block.counter_of == "oldest" else 0))
+        if block.count_address is not None and newest + 1 < held:  # it had begun anew before it was first asked
+            self._newest = newest = newest + self._modulus
+        held = min(held, newest + 1)  # fewer, just switched on
+        volts = volts[volts.size - held :]
+        shown = float(volts[-1]) if held else 0.0
+        return SensorBlock(newest, block.rate_hz, math.nan, False, newest + 1 - held, frozen(volts), shown)
+
+    def _unwrapped(self, newest: int) -> int:
+        """Go on counting where the sensor's count begins anew at 0; one that fell otherwise was restarted."""
+        if self._newest is not None:
+            ahead = (newest - self._newest) % self._modulus
+            newest = self._newest + ahead if ahead < self._modulus // 2 else newest
+        self._newest = newest
+        return newest

@@ -1,0 +1,95 @@
+"""What a line to one or more Modbus units is, what it is asked, and what can go wrong with the answer."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import MutableSet
+from dataclasses import dataclass
+from typing import Protocol
+
+from fdhil.drivers.modbus.rtu import WRITE_REGISTER
+from fdhil.errors import DeviceTimeout, ProtocolError
+
+BUSY = 6
+EXCEPTIONS = {
+    1: "illegal function",
+    2: "illegal register address",
+    3: "illegal value",
+    4: "device failure",
+    5: "acknowledge",
+    6: "busy",
+    8: "memory parity error",
+    10: "gateway path unavailable",
+    11: "gateway target does not answer",
+}
+
+
+class ModbusRefused(ProtocolError):
+    """The unit answered with an exception; ``code`` is its number."""
+
+    def __init__(self, device: str, address: int, code: int) -> None:
+        self.code = code
+        what = EXCEPTIONS.get(code, f"exception {code}")
+        super().__init__(device, f"register {address} is refused ({what}); compare the register map with the config")
+
+
+class DamagedAnswer(ProtocolError):
+    """What came is not the answer; ``kind`` is the class that the operator sees."""
+
+    def __init__(self, device: str, kind: str, text: str) -> None:
+        self.kind = kind
+        super().__init__(device, text)
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """``value`` registers to read from ``address`` on (functions 3 and 4), or the value to write there (6)."""
+
+    name: str
+    unit: int
+    function: int
+    address: int
+    value: int
+    timeout_s: float
+
+    @property
+    def count(self) -> int:
+        """How many registers the answer must have."""
+        return 0 if self.function == WRITE_REGISTER else self.value
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The registers of an answer, read by the unit between ``asked_ns`` and ``answered_ns`` (host-monotonic)."""
+
+    registers: tuple[int, ...]
+    asked_ns: int
+    answered_ns: int
+
+
+def no_answer(request: Request) -> DeviceTimeout:
+    """Return the error of a unit that said nothing."""
+    text = f"register {request.address} was not answered within {request.timeout_s:g} s; check the sensor and its line"
+    return DeviceTimeout(request.name, text)
+
+
+class Line(Protocol):
+    """A way to units: one request at a time, whoever asks. ``users`` are the links that want it to stand; ``counted``
+    counts the faults by class that it got over by itself."""
+
+    place: str
+    users: MutableSet[object]
+    counted: Counter[str]
+
+    @property
+    def connected(self) -> bool:
+        """Whether it stands."""
+
+    async def connect(self, name: str, timeout_s: float) -> None:
+        """Connect where it does not stand; ConnectError with what ``name`` lacks."""
+
+    async def ask(self, request: Request) -> Answer:
+        """Wait for the line, ask and return the answer; DeviceError."""
+
+    def close(self) -> None:
+        """End the connection."""

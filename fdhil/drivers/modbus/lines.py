@@ -1,0 +1,32 @@
+"""One line per device: two sensors on it must wait for each other, wherever they were made."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Hashable
+from weakref import WeakValueDictionary
+
+from fdhil.config.sensors import ModbusPlace
+from fdhil.drivers.modbus.line import Line
+from fdhil.drivers.modbus.rtu_line import RtuLine
+from fdhil.drivers.modbus.tcp_line import TcpLine
+
+_IN_USE: WeakValueDictionary[Hashable, Line] = WeakValueDictionary()
+
+
+def line_to(place: ModbusPlace) -> Line:
+    """Return the line to a device: the one that is in use, else a new one, not yet connected."""
+    where = (place.device, place.baud_rate, place.parity, place.stop_bits) if place.device else (place.host, place.port)
+    key = (_running_loop(), where)  # a line waits within one event loop
+    line = _IN_USE.get(key)
+    if line is None:
+        line = RtuLine(place) if place.device else TcpLine(place.host, place.port)
+        _IN_USE[key] = line
+    return line
+
+
+def _running_loop() -> asyncio.AbstractEventLoop | None:
+    try:
+        return asyncio.get_running_loop()
+    except RuntimeError:
+        return None

@@ -1,0 +1,78 @@
+"""The frames of Modbus RTU: what is asked, and what of the bytes that came is the answer. Pure.
+
+Source: MODBUS over serial line, specification and implementation guide V1.02, 2.5.1.
+"""
+
+from __future__ import annotations
+
+import struct
+
+READ_HOLDING, READ_INPUT, WRITE_REGISTER = 3, 4, 6
+ERROR = 0x80
+_READS = (READ_HOLDING, READ_INPUT)
+_ECHO_BYTES, _EXCEPTION_BYTES, _LEAST_BYTES = 8, 5, 5
+
+
+def crc16(data: bytes) -> int:
+    """Return the checksum; over a frame with its own behind it is 0.
+
+    >>> hex(crc16(bytes.fromhex("01 04 00 00 00 02")))
+    '0xcb71'
+    """
+    crc = 0xFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
+    return crc
+
+
+def framed(unit: int, body: bytes) -> bytes:
+    """Return a frame: unit, function and data, checksum with its low byte first."""
+    frame = bytes([unit]) + body
+    return frame + struct.pack("<H", crc16(frame))
+
+
+def answer_bytes(function: int, count: int) -> int:
+    """Return how long the answer to a request for ``count`` registers, or to a write, must be."""
+    return 5 + 2 * count if function in _READS else _ECHO_BYTES
+
+
+def find_answer(data: bytes, unit: int, function: int, count: int) -> bytes | None:
+    """Return function and data of the unit's answer, wherever it begins; None while it is not all there.
+
+    An adapter that hears its own request, and the noise of a driver that is switched on, come before it.
+    """
+    wanted = answer_bytes(function, count)
+    for at in range(len(data) - _EXCEPTION_BYTES + 1):
+        if data[at] != unit:
+            continue
+        refused = data[at : at + _EXCEPTION_BYTES]
+        if refused[1] == function | ERROR and not crc16(refused):
+            return refused[1:-2]
+        frame = data[at : at + wanted]
+        fits = function not in _READS or frame[2] == 2 * count
+        if len(frame) == wanted and frame[1] == function and fits and not crc16(frame):
+            return frame[1:-2]
+    return None
+
+
+def fault_in(data: bytes, unit: int, function: int, count: int) -> tuple[str, str]:
+    """Return class and words of what is wrong with bytes in which there is no answer."""
+    whole = _whole_frame(data)
+    if whole and data[0] != unit:
+        return "ModbusUnit", f"unit {data[0]} answers where unit {unit} was asked; check that no two have one number"
+    if whole and data[1] == function and function in _READS and data[2] != 2 * count:
+        return "ModbusShape", f"{data[2] // 2} registers came for {count} asked; check that one client asks at a time"
+    if len(data) >= answer_bytes(function, count) and data[:2] == bytes([unit, function]):
+        return "ModbusCrc", "an answer came damaged; check shield, termination and the baud rate of the line"
+    text = f"{len(data)} bytes came that are no answer; check baud rate, parity and that one client asks at a time"
+    return "ModbusShape", text
+
+
+def _whole_frame(data: bytes) -> bool:
+    """Whether the bytes are one frame of whichever unit."""
+    if len(data) < _LEAST_BYTES:
+        return False
+    size = 5 + data[2] if data[1] in _READS else _EXCEPTION_BYTES if data[1] & ERROR else _ECHO_BYTES
+    return len(data) == size and not crc16(data)

@@ -1,0 +1,137 @@
+"""A serial line with Modbus RTU units: one request at a time, silent intervals kept, late and foreign answers told.
+
+An answer names its unit and function but not what was asked. So what comes unasked is thrown away before the next
+request, and after a request that was not answered in time the line is heard for as long again before anybody asks.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+import time
+from collections import Counter
+from collections.abc import MutableSet
+from weakref import WeakSet
+
+from fdhil.config.sensors import ModbusPlace
+from fdhil.drivers.modbus.line import Answer, DamagedAnswer, ModbusRefused, Request, no_answer
+from fdhil.drivers.modbus.rtu import ERROR, WRITE_REGISTER, answer_bytes, fault_in, find_answer, framed
+from fdhil.drivers.serial.port import SerialPort
+from fdhil.errors import DeviceTimeout
+
+RETRIES = 2
+SILENT_CHARACTERS = 3.5
+SILENT_ABOVE_19200_S = 1.75e-3  # fixed there, "MODBUS over serial line" 2.5.1.1
+FASTEST_BY_CHARACTERS = 19200
+ADAPTER_S = 0.02  # bytes of one frame may come so far apart: a USB adapter hands them over every 16 ms
+_REQUEST_BYTES = 8
+
+
+class RtuLine:
+    """The units on one serial device."""
+
+    def __init__(self, place: ModbusPlace) -> None:
+        self._port = SerialPort(place)
+        self.place = f"Modbus RTU {place.device}"
+        self.users: MutableSet[object] = WeakSet()
+        self.counted: Counter[str] = Counter()
+        self._turn = asyncio.Lock()
+        fast = place.baud_rate > FASTEST_BY_CHARACTERS
+        self.silence_s = SILENT_ABOVE_19200_S if fast else SILENT_CHARACTERS * self._port.character_s
+        self._busy_until_ns = 0
+        self._late_until_ns = 0
+
+    @property
+    def connected(self) -> bool:
+        """Whether the device is open."""
+        return self._port.is_open
+
+    async def connect(self, name: str, timeout_s: float) -> None:
+        """Open the device where it is not; ConnectError."""
+        async with self._turn:
+            if not self._port.is_open:
+                self._port.open(name)
+
+    async def ask(self, request: Request) -> Answer:
+        """Ask and return the answer; what came damaged is asked for again, what did not come is not."""
+        async with self._turn:
+            for left in range(RETRIES, -1, -1):
+                try:
+                    return await self._exchange(request)
+                except DamagedAnswer as error:
+                    self.counted[error.kind] += 1
+                    if not left:
+                        raise
+        raise AssertionError("unreachable")
+
+    async def _exchange(self, request: Request) -> Answer:
+        await self._late_answers(request)
+        await self._fall_silent()
+        body = struct.pack(">BHH", request.function, request.address, request.value)
+        frame = framed(request.unit, body)
+        sent_ns = self._port.send(request.name, frame)
+        self._busy_until_ns = asked_ns = sent_ns + self._port.wire_ns(_REQUEST_BYTES)
+        try:
+            answer, answered_ns = await self._answer(
+                request, asked_ns, b"" if request.function == WRITE_REGISTER else frame
+            )
+        except DeviceTimeout:
+            self._late_until_ns = time.monotonic_ns() + round(request.timeout_s * 1e9)
+            raise
+        if answer[0] == request.function | ERROR:
+            raise ModbusRefused(request.name, request.address, answer[1])
+        count = request.count
+        registers = struct.unpack(f">{count}H", answer[2:]) if count else ()
+        return Answer(registers, min(asked_ns, answered_ns), answered_ns)
+
+    async def _late_answers(self, request: Request) -> None:
+        """Hear the line after a request that was not answered, until the late answer is through or time is up."""
+        self.counted["ModbusStale"] += bool(self._port.discard())
+        while time.monotonic_ns() < self._late_until_ns:
+            if await self._port.receive(request.name, self._late_until_ns) is not None:
+                self.counted["ModbusStale"] += 1
+                self._late_until_ns = 0
+        self._late_until_ns = 0
+
+    async def _fall_silent(self) -> None:
+        """Wait until nothing was on the line for 3.5 characters, and forget what was."""
+        while True:
+            last_ns = max(self._busy_until_ns, self._port.last_ns)
+            left_ns = last_ns + round(self.silence_s * 1e9) - time.monotonic_ns()
+            if left_ns <= 0:
+                break
+            await asyncio.sleep(left_ns / 1e9)
+        self._port.discard()
+
+    async def _answer(self, request: Request, asked_ns: int, echo: bytes) -> tuple[bytes, int]:
+        """Return the answer and when its first character came; DamagedAnswer, DeviceTimeout.
+
+        ``echo``: what an adapter may hear of the request itself, and is no answer.
+        """
+        port, unit, function, count = self._port, request.unit, request.function, request.count
+        data, first_ns = b"", 0
+        deadline_ns = asked_ns + round(request.timeout_s * 1e9) + port.wire_ns(answer_bytes(function, count))
+        pause_ns = round((self.silence_s + ADAPTER_S) * 1e9)
+        while True:
+            until_ns = min(deadline_ns, time.monotonic_ns() + pause_ns) if data else deadline_ns
+            chunk = await port.receive(request.name, until_ns)
+            if chunk is not None:
+                first_ns = first_ns or chunk.t_ns - port.wire_ns(len(chunk.data))
+                data = (data + chunk.data).removeprefix(echo)
+                found = find_answer(data, unit, function, count)
+                if found is not None:
+                    return found, first_ns
+                continue
+            if not data:
+                raise no_answer(request)
+            kind, text = fault_in(data, unit, function, count)
+            if kind != "ModbusUnit":
+                raise DamagedAnswer(request.name, kind, text)
+            self.counted[kind] += 1  # it may have been asked by another master: ours may still come
+            if time.monotonic_ns() >= deadline_ns:
+                raise no_answer(request)
+            data, first_ns = b"", 0
+
+    def close(self) -> None:
+        """Release the device."""
+        self._port.close()

@@ -1,0 +1,19 @@
+"""Chooses how a voltage sensor on Modbus is read, by what its section says of its registers."""
+
+from __future__ import annotations
+
+from fdhil.config import MachineConfig
+from fdhil.drivers.meter import MeterVoltage
+from fdhil.drivers.modbus.block import BlockVoltage
+from fdhil.drivers.modbus.meter import ModbusMeter
+from fdhil.drivers.modbus.voltage import ModbusVoltage
+
+
+def modbus_voltage(axis: str, config: MachineConfig) -> ModbusVoltage | MeterVoltage:
+    """Return the voltage source ``modbus``: a block of samples, one value, or the simulated sensor's registers."""
+    settings = config.axis[axis].voltage
+    if settings.type is None:
+        return ModbusVoltage(axis, config)
+    if settings.block is not None:
+        return BlockVoltage(axis, config)
+    return MeterVoltage(axis, config, ModbusMeter(f"voltage sensor {axis}", settings, settings, settings.type))

@@ -1,0 +1,118 @@
+"""A Modbus TCP connection through pymodbus: our own deadline, one error per fault.
+
+pymodbus repeats a request by itself (12 s of silence by default), logs every fault at ERROR and closes the line after
+a few silent requests; none of it suits a sensor that is asked 20 times a second, so ``retries`` is 0 and its logger is
+quiet, and what an answer must be is checked here.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import Counter
+from collections.abc import Awaitable, MutableSet
+from weakref import WeakSet
+
+from pymodbus import ModbusException
+from pymodbus.client import AsyncModbusTcpClient
+from pymodbus.pdu import ModbusPDU
+
+from fdhil.drivers.modbus.line import Answer, DamagedAnswer, ModbusRefused, Request, no_answer
+from fdhil.drivers.modbus.rtu import READ_INPUT, WRITE_REGISTER
+from fdhil.errors import ConnectError, DeviceError
+
+CONNECT_S = 2.0  # beyond the time an answer may take
+LIBRARYS_OWN_S = 100.0  # its one time-out for everything is longer than any of ours
+
+logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
+
+
+class TcpLine:
+    """A connection to ``host``:``port``, a sensor or a gateway to several."""
+
+    def __init__(self, host: str, port: int) -> None:
+        self._host, self._port = host, port
+        self._where = f"{host}:{port}"
+        self.place = f"Modbus {host}:{port}"
+        self.users: MutableSet[object] = WeakSet()
+        self.counted: Counter[str] = Counter()
+        self._client: AsyncModbusTcpClient | None = None
+        self._turn = asyncio.Lock()
+
+    @property
+    def connected(self) -> bool:
+        """Whether the TCP connection stands."""
+        return self._client is not None and bool(self._client.connected)
+
+    async def connect(self, name: str, timeout_s: float) -> None:
+        """Connect where it does not stand; ConnectError when nobody answers there."""
+        async with self._turn:
+            if self.connected:
+                return
+            self.close()
+            connected = False
+            self._client = AsyncModbusTcpClient(
+                self._host, port=self._port, timeout=LIBRARYS_OWN_S, retries=0, reconnect_delay=0
+            )
+            try:
+                async with asyncio.timeout(timeout_s + CONNECT_S):
+                    connected = await self._client.connect()
+            except TimeoutError:
+                pass
+            if not connected:
+                text = f"the Modbus sensor {self._where} cannot be reached; check its supply, host and port"
+                raise ConnectError(name, text)
+
+    async def ask(self, request: Request) -> Answer:
+        """Ask and return the answer; DeviceError."""
+        async with self._turn:
+            asked_ns = time.monotonic_ns()
+            answer = await self.answered(self._call(request), request)
+            answered_ns = time.monotonic_ns()
+        registers = tuple(answer.registers) if request.count else ()
+        if len(registers) != request.count:
+            text = f"{len(registers)} registers came for {request.count} asked; check that one client asks at a time"
+            raise DamagedAnswer(request.name, "ModbusShape", text)
+        return Answer(registers, asked_ns, answered_ns)
+
+    def _call(self, request: Request) -> Awaitable[ModbusPDU]:
+        if self._client is None:
+            raise ConnectError(request.name, f"the Modbus sensor {self._where} is not connected; connect first")
+        if request.function == WRITE_REGISTER:
+            return self._client.write_register(request.address, request.value, device_id=request.unit)
+        read = self._client.read_input_registers
+        if request.function != READ_INPUT:
+            read = self._client.read_holding_registers
+        return read(request.address, count=request.value, device_id=request.unit)
+
+    async def answered(self, call: Awaitable[ModbusPDU], request: Request) -> ModbusPDU:
+        """Wait for the library's answer until the request's deadline."""
+        try:
+            async with asyncio.timeout(request.timeout_s):
+                answer = await call
+        except TimeoutError:
+            raise self._silent(request) from None
+        except ModbusException as error:
+            if not self.connected:
+                text = f"the connection to the Modbus sensor {self._where} is gone; check its supply and cable"
+                raise ConnectError(request.name, text) from error
+            raise self._silent(request) from error
+        task = asyncio.current_task()
+        if task is not None and task.cancelling():
+            # the library waits by wait_for, which in Python 3.11 forgets a cancellation that meets the answer
+            raise asyncio.CancelledError
+        if answer.isError():
+            raise ModbusRefused(request.name, request.address, int(answer.exception_code))
+        return answer
+
+    def _silent(self, request: Request) -> DeviceError:
+        # a late answer must not be taken for the next one's: the connection is made anew
+        self.close()
+        return no_answer(request)
+
+    def close(self) -> None:
+        """End the connection."""
+        if self._client is not None:
+            self._client.close()
+            self._client = None

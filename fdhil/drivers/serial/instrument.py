@@ -1,0 +1,119 @@
+"""Reads an instrument that tells its value in lines of text over a serial line: asked, or by itself."""
+
+from __future__ import annotations
+
+import re
+import time
+from typing import Protocol
+
+from fdhil.config import MachineConfig
+from fdhil.config.sensors import SerialPlace
+from fdhil.drivers.meter import MeterVoltage
+from fdhil.drivers.serial.lines import LineReader, TextLine
+from fdhil.drivers.serial.port import SerialPort
+from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
+
+FIRST_NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
+SHOWN = 40  # characters of a line in a message
+
+
+class TextPlace(Protocol):
+    """What an instrument is asked and where its number is: the keys of :class:`fdhil.config.sensors.TextValue`."""
+
+    @property
+    def query(self) -> str: ...
+    @property
+    def pattern(self) -> str: ...
+    @property
+    def scale(self) -> float: ...
+    @property
+    def offset(self) -> float: ...
+
+
+class SerialLink:
+    """The serial line to one instrument; ``name`` is used in messages."""
+
+    wire = "serial"
+
+    def __init__(self, name: str, place: SerialPlace) -> None:
+        self.name = name
+        self.place = f"serial line {place.device}"
+        self.port = SerialPort(place)
+
+    @property
+    def connected(self) -> bool:
+        """Whether the device is open."""
+        return self.port.is_open
+
+    async def connect(self) -> None:
+        """Open the device; ConnectError."""
+        self.port.open(self.name)
+
+    def fault_code(self, error: DeviceError) -> str | None:
+        """Return the class under which ``error`` is told."""
+        if isinstance(error, DeviceTimeout):
+            return "SerialTimeout"
+        return "SerialPortGone" if isinstance(error, ConnectError) else "SerialShape"
+
+    def close(self) -> None:
+        """Release the device."""
+        self.port.close()
+
+
+class TextMeter:
+    """One number of an instrument's line."""
+
+    def __init__(self, name: str, place: SerialPlace, text: TextPlace, period_s: float) -> None:
+        self.name = name
+        self.link = SerialLink(name, place)
+        self._lines = LineReader(self.link.port, name)
+        self._text, self._timeout_s = text, place.timeout_s
+        self._number = re.compile(text.pattern or FIRST_NUMBER)
+        self.tells_by_itself = not text.query
+        self._wait_s = place.timeout_s + (period_s if self.tells_by_itself else 0.0)
+        self.asked_ns = self.answered_ns = 0
+        self._line = ""
+
+    async def value(self) -> float:
+        """Return the next number that is told, scaled; DeviceTimeout, ConnectError, ProtocolError for another text."""
+        asked_ns = self._ask() if self._text.query else 0
+        line = await self._lines.next_line(time.monotonic_ns() + round(self._wait_s * 1e9))
+        if line is None:
+            what = f"{self._text.query.strip()!r} was not answered" if self._text.query else "no line came"
+            text = f"{what} within {self._wait_s:g} s; check the instrument, the baud rate and the line's end"
+            raise DeviceTimeout(self.name, text)
+        self.answered_ns = self._begun_ns(line)
+        self.asked_ns = min(asked_ns or self.answered_ns, self.answered_ns)
+        return self._number_in(line.text)
+
+    def _ask(self) -> int:
+        """Ask, and return when the question was through; an answer that came too late is forgotten before."""
+        query = self._text.query.encode()
+        self._lines.discard()
+        return self.link.port.send(self.name, query) + self.link.port.wire_ns(len(query))
+
+    def _begun_ns(self, line: TextLine) -> int:
+        return line.t_ns - self.link.port.wire_ns(len(line.text) + 1)
+
+    def _number_in(self, line: str) -> float:
+        self._line = line
+        found = self._number.search(line)
+        try:
+            raw = float(found[1]) if found else None
+        except (ValueError, TypeError):
+            raw = None
+        if raw is None:
+            text = f"the line {line[:SHOWN]!r} has no number where pattern looks for it; compare pattern and baud_rate"
+            raise ProtocolError(self.name, text)
+        return self._text.scale * raw + self._text.offset
+
+    def doubt(self, shown: str) -> str:
+        """Return what is to be told of a value that cannot be."""
+        return f"the line {self._line[:SHOWN]!r} gives {shown}; compare pattern, scale and unit with the instrument"
+
+
+def serial_voltage(axis: str, config: MachineConfig) -> MeterVoltage:
+    """Return the voltage source ``serial``."""
+    settings = config.axis[axis].voltage
+    meter = TextMeter(f"voltage sensor {axis}", settings, settings, settings.period_s)
+    return MeterVoltage(axis, config, meter)

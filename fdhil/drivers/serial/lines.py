@@ -1,0 +1,57 @@
+"""Lines of text that come over a serial port, each with the time at which its end had come."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from fdhil.drivers.serial.port import Chunk, SerialPort
+
+LONGEST = 512  # characters; what is longer without an end is no line of an instrument
+
+
+@dataclass(frozen=True, slots=True)
+class TextLine:
+    """A line without its end; its last character had come at ``t_ns`` (host-monotonic) at the latest."""
+
+    text: str
+    t_ns: int
+
+
+class LineReader:
+    """Cuts what a port receives into lines; carriage return, line feed and both end one. ``name`` is for messages."""
+
+    def __init__(self, port: SerialPort, name: str) -> None:
+        self._port = port
+        self._name = name
+        self._lines: deque[TextLine] = deque()
+        self._begun = b""
+        self.overlong = 0
+
+    async def next_line(self, until_ns: int) -> TextLine | None:
+        """Return the next line that is not empty, None when none has come by ``until_ns``; ConnectError."""
+        while not self._lines:
+            chunk = await self._port.receive(self._name, until_ns)
+            if chunk is None:
+                return None
+            self._cut(chunk)
+        return self._lines.popleft()
+
+    def _cut(self, chunk: Chunk) -> None:
+        *whole, self._begun = (self._begun + chunk.data.replace(b"\r", b"\n")).split(b"\n")
+        left = len(self._begun) + sum(len(line) + 1 for line in whole)
+        for line in whole:
+            left -= len(line) + 1
+            text = line.decode("ascii", "replace").strip()
+            if len(line) > LONGEST:
+                self.overlong += 1
+            elif text:  # what came after it in the same read was on the wire after it
+                self._lines.append(TextLine(text, chunk.t_ns - self._port.wire_ns(left)))
+        if len(self._begun) > LONGEST:
+            self._begun, self.overlong = b"", self.overlong + 1
+
+    def discard(self) -> None:
+        """Forget what has come so far."""
+        self._port.discard()
+        self._lines.clear()
+        self._begun = b""

@@ -1,0 +1,107 @@
+"""The far end of a serial line, on a pseudo terminal: Modbus RTU units, or an instrument that tells by lines of text.
+
+Whatever leaves it can be spoilt on the way. Its checksum is pymodbus', not ours.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import struct
+import time
+import tty
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+from pymodbus.framer import FramerRTU
+
+Spoil = Callable[[bytes], list[bytes]]
+"""What really comes on the line instead of an answer: pieces, one after the other."""
+
+
+def framed(unit: int, body: bytes) -> bytes:
+    """Return a frame with its checksum."""
+    frame = bytes([unit]) + body
+    return frame + struct.pack(">H", FramerRTU.compute_CRC(frame))
+
+
+class SerialPeer:
+    """The master's side of a pseudo terminal; ``device`` is what a program opens."""
+
+    def __init__(self) -> None:
+        self.fd, self._far = os.openpty()
+        tty.setraw(self._far)
+        self.device = os.ttyname(self._far)
+        self.requests: list[bytes] = []
+        self.came_ns: list[int] = []
+        self.left_ns: list[int] = []
+        self.heard = asyncio.Event()
+        asyncio.get_running_loop().add_reader(self.fd, self._read)
+        self._closed = False
+
+    def _read(self) -> None:
+        with contextlib.suppress(OSError):
+            data = os.read(self.fd, 4096)
+            self.requests.append(data)
+            self.came_ns.append(time.monotonic_ns())
+            self.take(data)
+            self.heard.set()
+
+    def take(self, data: bytes) -> None:
+        """Do something with what came."""
+
+    def put(self, data: bytes) -> None:
+        """Put bytes on the line."""
+        self.left_ns.append(time.monotonic_ns())
+        os.write(self.fd, data)
+
+    def unplug(self) -> None:
+        """Take the adapter away."""
+        if not self._closed:
+            asyncio.get_running_loop().remove_reader(self.fd)
+            os.close(self.fd)
+            os.close(self._far)
+        self._closed = True
+
+
+class RtuPeer(SerialPeer):
+    """Units by number, each with its registers from 0 on; functions 3, 4 and 6.
+
+    ``spoil`` spoils answers, the first of the list the next one; ``busy`` answers with exception 6 so often.
+    """
+
+    def __init__(self, units: dict[int, list[int]]) -> None:
+        super().__init__()
+        self.units = units
+        self.spoil: list[Spoil] = []
+        self.pause_s = 0.0
+        self.written: list[tuple[int, int]] = []
+
+    def take(self, data: bytes) -> None:
+        """Answer as the unit that is asked."""
+        unit = data[0]
+        if unit not in self.units:
+            return
+        assert framed(unit, data[1:-2]) == data
+        function, address, value = struct.unpack(">BHH", data[1:6])
+        if function == 6:
+            self.written.append((address, value))
+            body = data[1:-2]
+        elif address + value > len(self.units[unit]):
+            body = bytes([function | 0x80, 2])
+        else:
+            body = struct.pack(f">BB{value}H", function, 2 * value, *self.units[unit][address : address + value])
+        pieces = self.spoil.pop(0)(framed(unit, body)) if self.spoil else [framed(unit, body)]
+        for piece in pieces:
+            self.put(piece)
+
+
+@asynccontextmanager
+async def rtu_peer(**units: list[int]) -> AsyncIterator[RtuPeer]:
+    """Serve units ``u1``, ``u2``... on a pseudo terminal."""
+    peer = RtuPeer({int(name[1:]): registers for name, registers in units.items()})
+    try:
+        yield peer
+    finally:
+        peer.unplug()

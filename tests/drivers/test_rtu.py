@@ -1,0 +1,206 @@
+"""Modbus RTU on a pseudo terminal: frames, silent intervals, units on one line, and each way to spoil an answer."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fdhil.config.sensors import ModbusPlace
+from fdhil.drivers.modbus.link import ModbusLink
+from fdhil.drivers.modbus.rtu import crc16, fault_in, find_answer, framed
+from fdhil.drivers.modbus.rtu_line import RtuLine
+from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
+from tests.drivers import serial_peer
+from tests.drivers.serial_peer import RtuPeer, rtu_peer
+
+
+def link_to(peer: RtuPeer, unit: int = 1, timeout_s: float = 0.3, baud_rate: int = 115200) -> ModbusLink:
+    place = ModbusPlace(device=peer.device, unit=unit, timeout_s=timeout_s, baud_rate=baud_rate)
+    return ModbusLink(f"sensor {unit}", place)
+
+
+@given(st.integers(1, 247), st.binary(max_size=40))
+def test_the_checksum_is_that_of_others(unit: int, body: bytes) -> None:
+    assert framed(unit, body) == serial_peer.framed(unit, body)
+    assert crc16(framed(unit, body)) == 0
+
+
+def answer(unit: int, *registers: int) -> bytes:
+    return framed(unit, struct.pack(f">BB{len(registers)}H", 4, 2 * len(registers), *registers))
+
+
+@given(st.binary(max_size=12), st.binary(max_size=6))
+def test_an_answer_is_found_within_noise(before: bytes, after: bytes) -> None:
+    found = find_answer(before + answer(1, 7, 9) + after, 1, 4, 2)
+    assert found is not None
+    assert found[0] in (4, 0x84)
+
+
+@given(st.data())
+def test_one_damaged_bit_is_never_an_answer(data: st.DataObject) -> None:
+    frame = bytearray(answer(1, 0x4248, 0))
+    at = data.draw(st.integers(0, 8 * len(frame) - 1))
+    frame[at // 8] ^= 1 << at % 8
+    assert find_answer(bytes(frame), 1, 4, 2) is None
+    assert fault_in(bytes(frame), 1, 4, 2)[0] in ("ModbusCrc", "ModbusShape", "ModbusUnit")
+
+
+async def test_two_units_on_one_line_wait_for_each_other() -> None:
+    async with rtu_peer(u1=[10, 11], u2=[20, 21]) as peer:
+        links = [link_to(peer, unit) for unit in (1, 2)]
+        assert links[0].line is links[1].line
+        for link in links:
+            await link.connect()
+        read = await asyncio.gather(*(links[k % 2].read(3 + k % 2, 0, 2) for k in range(20)))
+        assert read == [[10, 11], [20, 21]] * 10
+        assert [request[0] for request in peer.requests].count(1) == 10
+        links[0].close()
+        assert not links[0].connected
+        assert links[1].connected
+        assert await links[1].read_input(1, 1) == [21]
+        links[1].close()
+
+
+@pytest.mark.parametrize(
+    ("baud_rate", "silence_s"), [(9600, 3.5 * 11 / 9600), (19200, 3.5 * 11 / 19200), (115200, 1.75e-3)]
+)
+async def test_the_line_is_silent_between_frames(baud_rate: int, silence_s: float) -> None:
+    async with rtu_peer(u1=[1]) as peer:
+        link = link_to(peer, baud_rate=baud_rate)
+        await link.connect()
+        for _ in range(10):
+            await link.read_input(0, 1)
+        link.close()
+    assert isinstance(link.line, RtuLine)
+    assert link.line.silence_s == pytest.approx(silence_s)
+    gaps = [came - left for left, came in zip(peer.left_ns, peer.came_ns[1:], strict=False)]
+    assert min(gaps) >= silence_s * 1e9
+
+
+async def test_stamps_enclose_the_reading() -> None:
+    async with rtu_peer(u1=[1]) as peer:
+        link = link_to(peer)
+        await link.connect()
+        await link.read_input(0, 1)
+        link.close()
+    assert link.asked_ns <= peer.came_ns[0] + 200_000
+    assert link.answered_ns >= peer.left_ns[0]
+
+
+SPOILT: dict[str, serial_peer.Spoil] = {
+    "ModbusCrc": lambda frame: [frame[:-3] + bytes([frame[-3] ^ 4]) + frame[-2:]],
+    "ModbusShape": lambda frame: [frame[:-4]],
+    "noise": lambda frame: [b"\xff\x00\x13\x37\x80"],
+    "too many": lambda frame: [serial_peer.framed(1, b"\x04\x06\x00\x01\x00\x02\x00\x03")],
+}
+
+
+@pytest.mark.parametrize("what", SPOILT)
+async def test_a_damaged_answer_is_asked_for_again_and_counted(what: str) -> None:
+    kind = what if what.startswith("Modbus") else "ModbusShape"
+    async with rtu_peer(u1=[7, 8]) as peer:
+        link = link_to(peer)
+        await link.connect()
+        peer.spoil = [SPOILT[what]] * 2
+        assert await link.read_input(0, 2) == [7, 8]
+        assert link.line.counted[kind] == 2
+        peer.spoil = [SPOILT[what]] * 3
+        with pytest.raises(ProtocolError) as caught:
+            await link.read_input(0, 2)
+        assert link.fault_code(caught.value) == kind
+        assert len(peer.requests) == 6
+        assert await link.read_input(0, 2) == [7, 8]
+        link.close()
+
+
+@pytest.mark.parametrize(
+    "pieces",
+    [
+        lambda frame: [b"\x00", frame],
+        lambda frame: [frame[:3], frame[3:]],
+        lambda frame: [serial_peer.framed(1, bytes.fromhex("0400000002")), frame],  # an adapter that hears itself
+    ],
+)
+async def test_noise_before_an_answer_and_pieces_of_it_are_got_over(pieces: serial_peer.Spoil) -> None:
+    async with rtu_peer(u1=[7, 8]) as peer:
+        link = link_to(peer)
+        await link.connect()
+        peer.spoil = [pieces]
+        assert await link.read_input(0, 2) == [7, 8]
+        assert len(peer.requests) == 1
+        link.close()
+
+
+async def test_the_answer_of_another_unit_is_not_taken_and_ours_is_waited_for() -> None:
+    async with rtu_peer(u1=[7, 8]) as peer:
+        link = link_to(peer)
+        await link.connect()
+        peer.spoil = [lambda frame: [serial_peer.framed(2, b"\x04\x04\x00\x63\x00\x63")]]
+        asking = asyncio.create_task(link.read_input(0, 2))
+        await peer.heard.wait()
+        await asyncio.sleep(0.05)
+        peer.put(answer(1, 7, 8))
+        assert await asking == [7, 8]
+        assert link.line.counted["ModbusUnit"] == 1
+        link.close()
+
+
+async def test_a_late_answer_is_not_taken_for_the_next() -> None:
+    async with rtu_peer(u1=[7, 8]) as peer:
+        link = link_to(peer, timeout_s=0.1)
+        await link.connect()
+        peer.spoil = [lambda frame: []]
+        with pytest.raises(DeviceTimeout, match=r"was not answered within 0\.1 s"):
+            await link.read_input(0, 2)
+        asking = asyncio.create_task(link.read_input(0, 2))
+        await asyncio.sleep(0.01)
+        assert len(peer.requests) == 1  # the line is heard before anybody asks again
+        peer.put(answer(1, 1, 1))
+        assert await asking == [7, 8]
+        assert link.line.counted["ModbusStale"] == 1
+        peer.put(answer(1, 2, 2))  # and later still
+        await asyncio.sleep(0.01)
+        assert await link.read_input(0, 2) == [7, 8]
+        assert link.line.counted["ModbusStale"] == 2
+        link.close()
+
+
+async def test_what_a_unit_refuses_names_the_register() -> None:
+    async with rtu_peer(u1=[7]) as peer:
+        link = link_to(peer)
+        await link.connect()
+        with pytest.raises(ProtocolError, match=r"register 5 is refused \(illegal register address\)"):
+            await link.read_input(5, 2)
+        await link.write(3, 9)
+        assert peer.written == [(3, 9)]
+        link.close()
+
+
+async def test_an_adapter_that_is_pulled_out_is_gone_until_it_is_back() -> None:
+    async with rtu_peer(u1=[7]) as peer:
+        link = link_to(peer, timeout_s=5.0)
+        await link.connect()
+        asking = asyncio.create_task(link.read(3, 0, 1))
+        peer.spoil = [lambda frame: []]
+        await peer.heard.wait()
+        peer.unplug()
+        with pytest.raises(ConnectError, match=r"the serial device /dev/pts/\d+ is gone"):
+            await asking
+        assert not link.connected
+        with pytest.raises(DeviceError, match="there is no serial device"):
+            await link.connect()
+        link.close()
+
+
+async def test_a_device_in_use_by_another_is_told() -> None:
+    async with rtu_peer(u1=[7]) as peer:
+        link = link_to(peer)
+        await link.connect()
+        other = ModbusLink("sensor 2", ModbusPlace(device=peer.device, baud_rate=9600))
+        with pytest.raises(ConnectError, match="is used by another program"):
+            await other.connect()
+        link.close()
