@@ -25,9 +25,7 @@ def started(outfit: Outfit, folder: Path) -> TwinInHand:
     config = dressed(outfit, folder, "XY")
     twin = TwinInHand(config)
     for axis, unit in twin.machine.units.items():
-        rig = Rig.__new__(Rig)
-        rig.drive, rig.node = unit.drive, unit.drive.node_id
-        set_up(config, axis, lambda index, drive=unit.drive: index in drive.dictionary.indices, rig.write)
+        set_up(config, axis, unit.drive.dictionary.indices.__contains__, Rig.of(unit.drive).write)
     twin.switch_on()
     return twin
 

@@ -99,7 +99,6 @@ class Tailoring:
     setpoint: Mapping[str, Any] | None = None
 
 
-
 def dress(config: MachineConfig, axis: str) -> Dress:
     """Return what the axis' drive wears; EdsError when its EDS cannot be read."""
     own = drive_objects(config, axis)
