@@ -5,29 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from fdhil import correction
 from fdhil.arming.guard_settings import settings_of
 from fdhil.cia402 import pack
 from fdhil.prediction.contour import contour_error_um
 from fdhil.records import Float, Parameters, Trajectory, frozen, rms
-from tests.dressed.wardrobe import OUTFITS, Outfit, dressed, set_up
+from tests.dressed.wardrobe import LED, Outfit, dressed, started
 from tests.sim.bench_twin import PERIOD_S, TwinInHand, corner, trajectory
-from tests.sim.rig import Rig
 
 DELAY = 2
-LED = [outfit for outfit in OUTFITS if outfit.led]
-
-
-def started(outfit: Outfit, folder: Path) -> TwinInHand:
-    """The machine with its drives set up and enabled."""
-    config = dressed(outfit, folder, "XY")
-    twin = TwinInHand(config)
-    for axis, unit in twin.machine.units.items():
-        set_up(config, axis, unit.drive.dictionary.indices.__contains__, Rig.of(unit.drive).write)
-    twin.switch_on()
-    return twin
 
 
 def played(twin: TwinInHand, demand: Trajectory, path: Float, offset_um: dict[str, Float] | None = None) -> float:
@@ -55,10 +42,10 @@ def played(twin: TwinInHand, demand: Trajectory, path: Float, offset_um: dict[st
     return rms(contour_error_um(path, actual, PERIOD_S))
 
 
-@pytest.mark.parametrize("outfit", LED, ids=lambda outfit: outfit.name)
+@LED
 def test_a_corrected_cut_is_better(outfit: Outfit, tmp_path: Path) -> None:
-    twin = started(outfit, tmp_path)
-    config = twin.machine.config
+    config = dressed(outfit, tmp_path, "XY")
+    twin = started(config)
     path = np.vstack([np.zeros((40, 2)), corner(), np.tile(corner()[-1:], (100, 1))])
     demand = trajectory(path)
     models = {axis: Parameters(**settings.nominal.model_dump()) for axis, settings in config.axis.items()}

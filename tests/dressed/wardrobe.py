@@ -7,13 +7,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from fdhil import config as machine_config
 from fdhil.config import MachineConfig
 from fdhil.drivers.cia402.profile import PdoSpec
 from fdhil.drivers.cia402.profile_file import load_profile
 from tests.bench import bench_axis
 from tests.eds import write_eds
-from tests.sim.rig import NO_NOISE
+from tests.sim.bench_twin import TwinInHand
+from tests.sim.rig import NO_NOISE, Rig
 
 INVALID = 1 << 31
 Write = Callable[[int, int, int, int], None]
@@ -30,6 +33,7 @@ class Outfit:
     drive: Mapping[str, Any] = field(default_factory=dict)
     lacks: tuple[str, ...] = ()  # the points of a check that such a drive cannot meet
     led: bool = True  # whether an NC can stream set-points to it
+    narrow: bool = False  # whether its current does not reach what the bench's rapid takes
 
     @property
     def name(self) -> str:
@@ -37,40 +41,47 @@ class Outfit:
         return self.profile if self.profile == self.sheet else f"{self.profile}-{self.sheet}"
 
 
-NO_CSP = ("mode",)
-NO_VOLTAGE = ("voltage",)
-UNWATCHED = ("communication lost",)
+NO_CSP, NO_VOLTAGE = ("mode",), ("voltage",)
 OUTFITS = (
     Outfit("epos4", "epos4", on_line=True, drive={"dc_link_v": 300.0}),
-    Outfit("epos2", "epos2", lacks=(*NO_CSP, *NO_VOLTAGE)),
-    Outfit("nanotec", "nanotec", on_line=True, lacks=(*UNWATCHED, *NO_VOLTAGE)),
+    Outfit("epos2", "epos2", narrow=True, lacks=(*NO_CSP, *NO_VOLTAGE)),
+    Outfit("nanotec", "nanotec", on_line=True, lacks=NO_VOLTAGE),
     Outfit("elmo", "elmo", on_line=True, lacks=NO_VOLTAGE),
-    Outfit("technosoft", "technosoft", lacks=NO_VOLTAGE),
-    Outfit("trinamic", "trinamic", lacks=(*UNWATCHED, *NO_VOLTAGE)),
-    Outfit(
-        "faulhaber", "faulhaber", drive={"dc_link_v": 300.0}, led=False,
-        lacks=(*NO_CSP, *UNWATCHED, "following error"),
-    ),
-    Outfit("schunk", "schunk", lacks=(*NO_CSP, *UNWATCHED, *NO_VOLTAGE)),
-    Outfit("infranor", "infranor", lacks=(*NO_CSP, *UNWATCHED, *NO_VOLTAGE, "heartbeat")),
-    Outfit("roboteq", "roboteq", led=False, lacks=(*NO_CSP, *UNWATCHED, "following error")),
+    Outfit("technosoft", "technosoft", narrow=True, lacks=NO_VOLTAGE),
+    Outfit("trinamic", "trinamic", narrow=True, lacks=NO_VOLTAGE),
+    Outfit("faulhaber", "faulhaber", drive={"dc_link_v": 300.0}, led=False, lacks=NO_CSP),
+    Outfit("schunk", "schunk", lacks=(*NO_CSP, *NO_VOLTAGE)),
+    Outfit("infranor", "infranor", lacks=(*NO_CSP, *NO_VOLTAGE, "heartbeat")),
+    Outfit("roboteq", "roboteq", led=False, lacks=NO_CSP),
     Outfit("cia402", "elmo", on_line=True, lacks=NO_VOLTAGE),
-    Outfit("cia402", "ingenia", lacks=(*UNWATCHED, *NO_VOLTAGE)),
-)  # fmt: skip
+    Outfit("cia402", "ingenia", lacks=NO_VOLTAGE),
+)
+LED = pytest.mark.parametrize("outfit", [o for o in OUTFITS if o.led], ids=lambda outfit: outfit.name)
+GENTLE_MM_S2 = 400.0
 
 
-def dressed(outfit: Outfit, folder: Path, axes: str = "X", **sections: Any) -> MachineConfig:
+def dressed(outfit: Outfit, folder: Path, axes: str = "X", *, noise: bool = False, **sections: Any) -> MachineConfig:
     """Return the bench with drives of this make, simulated in their dress."""
     eds = write_eds(outfit.sheet, folder)
     drive = {"profile": outfit.profile, **outfit.drive} | ({"eds": str(eds)} if outfit.profile == "cia402" else {})
+    rapid: dict[str, Any] = {"max_acceleration_mm_s2": GENTLE_MM_S2} if outfit.narrow else {}
     document: dict[str, Any] = {
         "machine": {"name": "bench"},
-        "axis": {axis: bench_axis(drive=dict(drive)) for axis in axes},
-        "sim": {"axis": {axis: {"eds": str(eds)} for axis in axes}, "noise": NO_NOISE},
+        "axis": {axis: bench_axis(drive=dict(drive), **rapid) for axis in axes},
+        "sim": {"axis": {axis: {"eds": str(eds)} for axis in axes}} | ({} if noise else {"noise": NO_NOISE}),
         "guard": {"clock": "sync"},
         **sections,
     }
     return machine_config.parse(document, folder=folder)
+
+
+def started(config: MachineConfig) -> TwinInHand:
+    """Return the machine with its drives set up and enabled."""
+    twin = TwinInHand(config)
+    for axis, unit in twin.machine.units.items():
+        set_up(config, axis, unit.drive.dictionary.indices.__contains__, Rig.of(unit.drive).write)
+    twin.switch_on()
+    return twin
 
 
 def set_up(config: MachineConfig, axis: str, has: Callable[[int], bool], write: Write) -> None:

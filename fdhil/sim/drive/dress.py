@@ -24,8 +24,9 @@ _MODES, _TARGET, _INTERPOLATION, _SPEED_UNIT = 0x650200, 0x607A00, 0x60C101, 0x6
 _INTERPOLATED = 7
 _VENDORS = range(0x2000, 0x6000)
 _APART = 1 << 24  # the vendor's values are kept apart from those of the twin's own vendor objects
-# a drive without these has no such service: no heartbeat, no SYNC counter, no reaction to a lost connection
-_NO_SERVICE = {0x101700: 0, 0x101900: 0, 0x600700: 0}
+# A drive without these has no such service: no heartbeat, no SYNC counter. One without 0x6007 falls into fault when it
+# loses its master, as most do: no file says it.
+_NO_SERVICE = {0x101700: 0, 0x101900: 0}
 # what whoever sets a drive up for this machine must have entered: no default of a file fits it
 _SET_UP = frozenset(
     index << 8 | sub
