@@ -18,6 +18,8 @@ class Noise(Section):
     voltage_v: NotNegative = Field(0.06, description="terminal voltage")
     current_a: NotNegative = Field(0.05, description="motor current")
     speed_rad_s: NotNegative = Field(0.15, description="shaft speed")
+    table_um: NotNegative = Field(0.05, description="place of the encoder at the table, where there is one")
+    table_m_s2: NotNegative = Field(0.05, description="acceleration of the accelerometer at the table")
 
 
 class SimAxis(Section):

@@ -21,6 +21,7 @@ from fdhil.sim.frame import BusFrame, Frame
 from fdhil.sim.nc.controller import Event, NcController, Row
 from fdhil.sim.nc.drive_link import Wiring
 from fdhil.sim.recorder import Recorder
+from fdhil.sim.table_sensors import TableSensors
 from fdhil.sim.thermal import SlideWay
 from fdhil.sim.wire.modbus_sensor import VoltageSensor
 
@@ -43,6 +44,7 @@ class Machine:
         self.units = {
             axis: self._unit(axis, seeds[2 * place], seeds[2 * place + 1]) for place, axis in enumerate(config.axis)
         }
+        self.tables = TableSensors(config)
         self._of_bus: dict[str, list[AxisUnit]] = {}
         for unit in self.units.values():
             self._of_bus.setdefault(unit.bus, []).append(unit)
@@ -110,7 +112,7 @@ class Machine:
         for unit in self.units.values():
             unit.drive.physics.rehearse()
             unit.power(True)
-        return self._take_outbox()
+        return self._take_outbox() + self.tables.power_on()
 
     def receive(self, bus: str, frame: Frame) -> list[Frame]:
         """Take a frame that another party sent and return what the drives of that bus send because of it."""
@@ -120,6 +122,7 @@ class Machine:
         answers: list[Frame] = []
         for unit in self._of_bus.get(bus, ()):
             answers += unit.drive.receive(can_id, data)
+        answers += self.tables.receive(bus, frame)
         if self.nc.on:
             self.nc.hear(bus, frame)
             for answer in answers:
@@ -154,7 +157,7 @@ class Machine:
 
     def wall_clock(self, now_s: float) -> list[BusFrame]:
         """Run what depends on time and not on SYNC: heartbeats and their monitoring, and motion without SYNC."""
-        frames: list[BusFrame] = []
+        frames = self.tables.wall_clock(now_s)
         alone = self._realtime and not self.nc.on
         for unit in self.units.values():
             for frame in unit.drive.wall_clock(now_s, alone=alone):
@@ -197,9 +200,11 @@ class Machine:
         """One SYNC for one axis."""
         drive = unit.drive
         before = drive.tick
+        table_rad_s = drive.physics.table_speed_rad_s
         frames = drive.receive(SYNC, data)
         if drive.tick == before:
             return frames
+        frames += self.tables.at_sync(drive, table_rad_s)
         heard = drive.pdo.heard_before
         unit.offsets.step(not heard.isdisjoint(drive.pdo.offset_rpdos))
         for key in self._listed:
