@@ -1,10 +1,11 @@
-"""The EDS that the simulated drive writes, of itself and of what it wears, as a CANopen stack of another make reads it."""
+"""The EDS that the simulated drive writes, of itself and of what it wears, as another CANopen stack reads it."""
 
 from __future__ import annotations
 
 import json
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,7 +21,7 @@ pytestmark = pytest.mark.debian
 
 @pytest.mark.parametrize("sheet", [None, *SHEETS])
 def test_it_is_read_as_it_is_meant(sheet: str | None, tmp_path: Path) -> None:
-    worn = {} if sheet is None else {"eds": str(write_sheet(sheet, tmp_path))}
+    worn: dict[str, Any] = {} if sheet is None else {"eds": str(write_sheet(sheet, tmp_path))}
     drive = Rig(machine(**worn)).drive
     path = write_eds(drive, tmp_path / "drive.eds")
     command = [NODE, str(FOLDER / "read_eds.js"), json.dumps({"file": str(path)})]
