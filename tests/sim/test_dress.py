@@ -249,7 +249,7 @@ def test_the_eds_it_writes_is_of_what_it_wears(wear: Callable[[str], Rig], sheet
 
 @pytest.mark.parametrize("sheet", [None, *SHEETS])
 def test_the_eds_it_writes_keeps_the_rules(tmp_path: Path, sheet: str | None) -> None:
-    """CiA 306, as strict readers hold it: no DOMAIN has a mapping, no default is outside its limits, counts are right."""
+    """CiA 306, as strict readers hold it: no DOMAIN has a mapping, each default is in its limits, counts are right."""
     rig = Rig(dressed(write_eds(sheet, tmp_path))) if sheet else Rig()
     eds = configparser.ConfigParser(strict=True, interpolation=None)
     eds.read_string(own_eds_text(rig.drive))
