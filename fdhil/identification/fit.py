@@ -93,7 +93,8 @@ class Fit:
     """The end of a fit: ``theta`` (7 + terms,), information (k, k) of the ``free`` entries, innovations (m,), noises.
 
     ``delay_doubt_s`` is how much of a delay may be the voltage's course within its samples, or the other way round.
-    ``prior`` (k,) is what of the information on the diagonal was known before the data; no rows: nothing was.
+    ``prior`` (k,) is what of the information on the diagonal was known before the data, and ``prior_std`` (k,) how far
+    that may be off; no rows: nothing was.
     """
 
     theta: Float
@@ -105,6 +106,7 @@ class Fit:
     converged: bool
     delay_doubt_s: float = 0.0
     prior: Float = field(default_factory=lambda: np.zeros(0))
+    prior_std: Float = field(default_factory=lambda: np.zeros(0))
 
     @property
     def but_delay(self) -> Float:
