@@ -194,16 +194,11 @@ def _demand(device: Device, profile: DriveProfile) -> Ability:
 def _correct(device: Device, profile: DriveProfile) -> Iterator[Ability]:
     what, advice = "correct on line", "let the NC play the corrected demand of `fdhil correct --out`"
     offset = device.find(profile.offset)
-    if not profile.takes_offset:
+    if offset is None or profile.find_rpdo(profile.offset) is None:
         why = "it has no position offset (60B0)" if offset is None else "no RPDO can carry its 60B0"
         yield Ability(what, "no", why, advice)
-        return
-    if offset is None or not offset.in_rpdo:
-        yield Ability(what, "no", "its 60B0 is not there, or for no RPDO", advice)
-        return
-    lacking = [key for key in (profile.offset, (int(Object.MODE_DISPLAY), 0)) if profile.find_tpdo(key) is None]
-    if lacking:
-        why = f"no TPDO shows its {', '.join(map(shown, lacking))}, and the guard sends nothing that it cannot see"
+    elif profile.unshown:
+        why = f"no TPDO shows its {', '.join(map(shown, profile.unshown))}, and no offset is sent that cannot be seen"
         yield Ability(what, "no", why, advice)
     elif not offset.in_tpdo:
         why = "its EDS gives 60B0 to RPDOs alone (rww): whether a TPDO takes it for the read-back, only the drive tells"

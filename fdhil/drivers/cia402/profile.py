@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from fdhil.cia402 import LOGICAL_AXIS_STEP, Mode, PdoEntry, pdo_length
+from fdhil.cia402 import LOGICAL_AXIS_STEP, Mode, Object, PdoEntry, pdo_length
 from fdhil.config import Axis, SpeedUnit
 
 ObjectKey = tuple[int, int]
@@ -102,9 +102,15 @@ class DriveProfile:
 
     @property
     def takes_offset(self) -> bool:
-        """Whether an offset can be sent to it in an RPDO of its own; else a correction can only go through the NC."""
+        """Whether an offset can be sent to it, and be seen; else a correction can only go through the NC."""
         found = self.find_rpdo(self.offset)
-        return found is not None and found[0].valid
+        return found is not None and found[0].valid and not self.unshown
+
+    @property
+    def unshown(self) -> tuple[ObjectKey, ...]:
+        """What no TPDO carries of offset, mode and demand: nothing is sent whose effect is not seen."""
+        keys = (self.offset, (self.object_index(Object.MODE_DISPLAY), 0), self.position_demand)
+        return tuple(key for key in keys if self.find_tpdo(key) is None)
 
     def find_tpdo(self, key: ObjectKey) -> tuple[PdoSpec, PdoEntry] | None:
         """Return the TPDO and entry that carry ``key``, or None."""

@@ -5,19 +5,23 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fdhil import tables
+from fdhil.arming.guard_settings import settings_of
 from fdhil.cia402 import pack
-from fdhil.config import MachineConfig
+from fdhil.config import MachineConfig, parse
 from fdhil.drivers.can.frames import frames_of
 from fdhil.drivers.can.sync_grid import SyncGrid
 from fdhil.drivers.cia402.drive import Cia402Decoder
 from fdhil.drivers.cia402.profile import DriveProfile, ObjectKey
 from fdhil.drivers.cia402.profile_file import load_profile
+from fdhil.errors import ConfigError
 from fdhil.records import AxisSamples
+from tests.bench import bench_document
 from tests.drivers.wire import Row, machine
 
 N = 60
@@ -49,7 +53,7 @@ def decoded(
 
 def ramp(key: ObjectKey, k: int) -> int:
     """Counts that tell the objects apart, and fit 16 bits."""
-    return 8 if key == (0x6061, 0) else (key[0] + 3 * key[1]) % 97 + 5 * k
+    return 8 if key[0] in (0x6061, 0x6861) else (key[0] + 3 * key[1]) % 97 + 5 * k
 
 
 @pytest.mark.parametrize("name", [name for name in tables.DRIVE_PROFILES if name != "cia402"])
@@ -69,6 +73,31 @@ def test_every_profile_puts_its_signals_on_their_rows(name: str) -> None:
     late = axis.drive.setpoint_delay_cycles + 1
     per_mm = axis.scaling.increments_per_mm
     np.testing.assert_allclose(got.demand_mm * per_mm, [ramp(profile.target, int(k) - late) for k in got.tick])
+
+
+def test_the_second_axis_of_a_device_is_heard_at_the_next_node_id() -> None:
+    config = machine(drive={"logical_axis": 2, "node_id": 1})
+    profile = load_profile(config.axis["X"].drive)
+    got = decoded(config, ramp)
+    per_mm = config.axis["X"].scaling.increments_per_mm
+    np.testing.assert_allclose(got.position_mm * per_mm, [ramp((0x6864, 0), int(k)) for k in got.tick])
+    assert profile.takes_offset
+    document = bench_document("X")
+    document["axis"]["X"]["drive"] = {"logical_axis": 2, "node_id": 1}
+    settings = settings_of(parse(document), "can0", Path(), "")
+    axis = settings.axes[0]
+    assert (axis.node_id, axis.target.cob_id, axis.offset.cob_id) == (1, 0x202, 0x302)
+    assert axis.offset.layout == ((0x60B0, 0, 32, True),)
+
+
+def test_two_axes_may_share_a_node_but_not_its_pdos() -> None:
+    document = bench_document("XY")
+    document["axis"]["X"]["drive"] = {"node_id": 5}
+    document["axis"]["Y"]["drive"] = {"node_id": 5, "logical_axis": 2}
+    assert parse(document).node_id("Y") == 5
+    document["axis"]["Y"]["drive"]["node_id"] = 4
+    with pytest.raises(ConfigError, match="the same node_id"):
+        parse(document)
 
 
 def test_a_duty_without_a_sign_gets_that_of_the_loop() -> None:

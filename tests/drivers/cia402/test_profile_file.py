@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from fdhil.commissioning.record import axis_digest
 from fdhil.config import Drive
 from fdhil.drivers.cia402.profile_file import load_profile, read_profile, require_offset
 from fdhil.errors import ConfigError, EdsError
@@ -55,6 +56,20 @@ def test_a_path_counts_from_the_folder_of_the_configuration(tmp_path: Path) -> N
     assert load_profile(drive).name == "own"
 
 
+def test_what_a_file_says_is_a_part_of_the_configuration(tmp_path: Path) -> None:
+    """A model that was identified in one unit is not of the machine in another."""
+    digests, records = [], []
+    for text in (PDOS, 'speed_unit = "rpm"\n' + PDOS, PDOS):
+        own(tmp_path, text)
+        read_profile.cache_clear()
+        config = machine(folder=tmp_path, drive={"profile": "own.toml"})
+        digests.append(config.digest)
+        records.append(axis_digest(config, "X"))
+    assert digests[0] == digests[2] != digests[1]
+    assert records[0] == records[2] != records[1]
+    assert machine().axis["X"].drive.files_digest == ""
+
+
 WRONG = {
     "title = 3\n" + PDOS: "title: Input should be a valid string",
     "speed_units = 'rpm'\n" + PDOS: "speed_units: is no key of a profile",
@@ -71,6 +86,7 @@ WRONG = {
     "rpdos = 3\n": "tpdos: is missing",
     "base = 'epos5'": "base: is no profile: 'epos5'",
     "base = 'own.toml'": "its bases have no end",
+    "logical_axis = 2\n" + PDOS: "logical_axis: it is of axis 2 of its device, the configuration has 1",
     "base = 3": "base: is no profile",
     "a = ": "is no TOML",
     "title = 'no PDOs'": "there is no EDS to take them from",
@@ -160,6 +176,19 @@ def test_what_the_eds_does_not_have_is_left_out_of_a_packaged_profile(tmp_path: 
     found = profile.find_tpdo((0x30D1, 2))
     assert found is not None
     assert [f"{e.index:04X}" for e in found[0].entries] == ["6041", "30D1"]
+
+
+def test_a_profile_may_be_written_for_a_second_axis(tmp_path: Path) -> None:
+    """Of a device whose axes share the first PDOs: what the file says is taken as it is."""
+    second = {"607A": "687A", "6064": "6864", "606C": "686C", "6041": "6841", "6040": "6840", "6078, 0": "2100, 2"}
+    text = 'base = "roboteq"\nlogical_axis = 2\ntarget = [0x607A, 0]\ncurrent = [0x6078, 0]\nposition = [0x6064, 0]\n'
+    text += "speed = [0x606C, 0]\nstatusword = [0x6041, 0]\n" + PDOS
+    for old, new in (*second.items(), ("TPDO2", "TPDO4"), ("TPDO1", "TPDO3"), ("0x280", "0x480"), ("0x180", "0x380")):
+        text = text.replace(old, new)
+    drive = own(tmp_path, text).model_copy(update={"logical_axis": 2})
+    profile = load_profile(drive)
+    assert [(s.name, s.cob_base) for s in profile.tpdos] == [("TPDO3", 0x380), ("TPDO4", 0x480)]
+    assert profile.object_index(0x6060) == 0x6860
 
 
 def test_a_second_axis_lies_0x800_and_64_pdos_higher() -> None:
