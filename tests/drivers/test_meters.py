@@ -152,7 +152,7 @@ async def test_values_are_on_a_grid_and_their_stamps_enclose_when_they_were_true
     assert sensor.samples == counter.size
     assert (error_ns >= 0.002e9).all()
     assert before_ns - 2e6 <= due_ns[0] <= due_ns[-1] <= after_ns
-    np.testing.assert_allclose(due_ns - due_ns[0], (counter - counter[0]) * 1e7, atol=1e3)
+    assert (np.abs(due_ns - counter * 1e7) < 0.5e7).all()  # each near its own instant
 
 
 @pytest.mark.parametrize("query", ["READ?\n", ""])
