@@ -100,4 +100,5 @@ class MachineConfig(Section):
     @property
     def digest(self) -> str:
         """SHA-256 of the configuration's meaning (not of its text), 16 hexadecimal digits."""
-        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
+        files = "".join(axis.drive.files_digest for axis in self.axis.values())
+        return hashlib.sha256(f"{self.model_dump_json()}{files}".encode()).hexdigest()[:16]
