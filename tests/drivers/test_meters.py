@@ -219,7 +219,10 @@ async def test_a_block_of_samples_by_number(block: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("read_as", "says"),
     [
-        ({"type": "float32", "word_order": "little"}, "compare address, function, type, word_order and scale"),
+        (
+            {"type": "float32", "word_order": "little"},
+            r"\(with word_order = 'big' it would be -12\.34\); compare address",
+        ),
         ({"type": "int32"}, "register 0 gives"),
         ({"type": "float32", "address": 1}, r"register 1 is refused \(illegal register address\)"),
     ],
