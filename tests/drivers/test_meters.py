@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import re
+import socket
 import time
 import tomllib
 from collections.abc import AsyncIterator
@@ -17,6 +18,7 @@ import pytest
 
 from fdhil.config import MachineConfig, Voltage, parse
 from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.modbus.link import ModbusLink
 from fdhil.drivers.sensor_source import Record, Sensor, SensorSource, sensors_of
 from fdhil.errors import ConfigError, DeviceTimeout, ProtocolError
 from fdhil.records import Notice, Temperature, VoltageSamples
@@ -349,3 +351,26 @@ def test_what_is_told_of_an_instrument_is_a_sensor(text: str) -> None:
     axis = bench_axis(corrected=False) | tomllib.loads(text)["axis"]["X"]
     found = sensors_of("X", parse({"machine": {"name": "bench"}, "axis": {"X": axis}}))
     assert len(found) == 1
+
+
+async def test_units_behind_one_gateway_share_its_connection() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as chosen:
+        port = int(chosen.getsockname()[1])
+    value = {"source": "modbus", "type": "float32", "port": port}
+    async with shop({**value, "unit": 1}, {**value, "unit": 2}) as served:
+        served.memory["Y"].feed(45.6)
+        config = served.config()
+        x, y = (sensors_of(axis, config)["voltage"] for axis in "XY")
+        assert isinstance(x.link, ModbusLink)
+        assert isinstance(y.link, ModbusLink)
+        assert x.link.line is y.link.line
+        for sensor in (x, y):
+            await sensor.link.connect()
+        assert [await x.reading(), await y.reading()] == ["-12.34 V at 50 Hz", "45.60 V at 50 Hz"]
+        served.memory["X"].faults.silent = True
+        with pytest.raises(DeviceTimeout):
+            await x.reading()
+        await y.link.connect()  # the connection was given up, for an answer that may still come
+        assert await y.reading() == "45.60 V at 50 Hz"
+        for sensor in (x, y):
+            sensor.link.close()
