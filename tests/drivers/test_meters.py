@@ -26,6 +26,7 @@ from fdhil.sim.wire.modbus_sensor import VoltageSensor
 from fdhil.sim.wire.sensor_wires import SensorWires
 from tests.bench import bench_axis
 
+PATIENCE_S = 10.0  # with a busy computer
 TYPES = {"int16": 0.01, "uint16": 0.01, "int32": 1e-4, "uint32": 1e-4, "float32": 1.0, "float64": 1.0}
 
 
@@ -60,9 +61,9 @@ def _memory(made: MachineConfig, axis: str) -> VoltageSensor:
 async def shop(*voltages: dict[str, Any], temperature: dict[str, Any] | None = None) -> AsyncIterator[Shop]:
     axes = {}
     for name, voltage in zip("XYZ", voltages, strict=False):
-        axes[name] = bench_axis(corrected=False, voltage=voltage)
+        axes[name] = bench_axis(corrected=False, voltage={"timeout_s": PATIENCE_S} | voltage)
         if temperature is not None:
-            axes[name]["temperature"] = temperature
+            axes[name]["temperature"] = {"timeout_s": PATIENCE_S} | temperature
     served = Shop({"machine": {"name": "bench"}, "axis": axes})
     served.wires.start()
     try:
@@ -160,7 +161,7 @@ async def test_values_are_on_a_grid_and_their_stamps_enclose_when_they_were_true
 @pytest.mark.parametrize("query", ["READ?\n", ""])
 async def test_an_instrument_that_tells_lines(query: str, tmp_path: Path) -> None:
     voltage = {"source": "serial", "device": str(tmp_path / "dmm"), "baud_rate": 115200, "parity": "none"}
-    async with shop({**voltage, "query": query, "period_s": 0.01, "scale": 2.0}) as served:
+    async with shop({**voltage, "query": query, "period_s": 0.01, "scale": 2.0, "timeout_s": 1.0}) as served:
         sensor = served.sensors()["voltage"]
         volts = await volts_of(sensor, 2)
         assert volts.size
@@ -356,7 +357,7 @@ def test_what_is_told_of_an_instrument_is_a_sensor(text: str) -> None:
 async def test_units_behind_one_gateway_share_its_connection() -> None:
     with socket.create_server(("127.0.0.1", 0)) as chosen:
         port = int(chosen.getsockname()[1])
-    value = {"source": "modbus", "type": "float32", "port": port}
+    value = {"source": "modbus", "type": "float32", "port": port, "timeout_s": 1.0}
     async with shop({**value, "unit": 1}, {**value, "unit": 2}) as served:
         served.memory["Y"].feed(45.6)
         config = served.config()

@@ -142,7 +142,7 @@ class _TcpUnit:
         return None
 
     def device(self, unit: int) -> SimDevice:
-        """Return the device for pymodbus: only the trigger may be written, other addresses do not exist. Unit 0 is any."""
+        """Return the device for pymodbus: only the trigger may be written, other addresses do not exist."""
         parts, trigger = [], self._registers.trigger
         for first, count in _stretches(sorted(self._registers.words()), trigger):
             own = first == trigger
