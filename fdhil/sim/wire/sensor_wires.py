@@ -36,7 +36,8 @@ class SensorWires:
             if thermometer is not None and here and thermometer.source == "modbus" and not thermometer.device:
                 registers = Joined(registers, thermometer_map(thermometer, sensor))
             maps[axis], addresses[axis] = registers, (voltage.host, voltage.port)
-        self._tcp = SensorServers(sensors, addresses, maps)
+        units = {axis: config.axis[axis].voltage.unit for axis in addresses}
+        self._tcp = SensorServers(sensors, addresses, maps, units)
         self._lines = SerialLines(self._parties) if self._parties else None
         self.ready: dict[str, dict[str, Any]] = {}
 
