@@ -44,6 +44,7 @@ EXAMPLES: Mapping[str, Any] = {  # of keys without a default: the bench machine
     "run_directory": "/run/fdhil",
     "guard.run_directory": "/run/fdhil-guard", "daemon_user": "fdhil",
     "commissioning_key": "/etc/fdhil/commissioning.key",
+    "cob_id": 0x2A0, "axis.X.accelerometer.device": "/dev/ttyACM0",
     "axis.X.voltage.type": "float32", "count_address": 42, "trigger_address": 43,
 }  # fmt: skip
 NAMES = {"axis": "X", "bus": "can0"}  # the user's own names in the template

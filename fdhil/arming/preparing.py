@@ -22,8 +22,8 @@ from fdhil.config import MachineConfig
 from fdhil.correction import gate, online
 from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.identification.loops import regulators_of
+from fdhil.model.terms import with_resonance
 from fdhil.prediction.gain import Gain, skill_of
-from fdhil.prediction.model_terms import with_resonance
 from fdhil.prediction.models import with_loops
 from fdhil.program import program_digest
 from fdhil.records import Parameters, Reason, Skill

@@ -6,6 +6,7 @@ import json
 import math
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -158,7 +159,9 @@ def _window_document(outcome: WindowOutcome) -> dict[str, Any]:
         "validated": outcome.verdict.accepted,
         "fit_percent": outcome.verdict.fit_percent,
         **_verdict(outcome.verdict),
-    } | ({"delay_s": delay} if delay is not None else {})
+        **({"delay_s": delay} if delay is not None else {}),
+        **({"at_table": asdict(outcome.at_table)} if outcome.at_table is not None else {}),
+    }
 
 
 def _verdict(verdict: Verdict) -> dict[str, Any]:
@@ -245,6 +248,7 @@ def _show(results: Sequence[FileResult], axes: Mapping[str, Axis], with_loops: b
         table.add_row(f"all {_used(result)}", *_cells(result.pooled, result.verdict, weighed), style="bold")
         console.print(table)
         _show_terms(console, result)
+        _show_table(console, result)
         _show_reasons(console, result)
         if with_loops or result.loops is not None:
             show_loops(result, axes.get(result.axis or ""), console)
@@ -276,6 +280,19 @@ def _show_terms(console: Any, result: FileResult) -> None:
             told = (cell(n, estimate.value(n), INTERVAL_95 * estimate.std(n), " ") for n in estimate.terms)
             named = (f"{n} {value} {unit_of(n)}" for n, value in zip(estimate.terms, told, strict=True))
             console.print(f"  terms of {who}: {', '.join(named)}", highlight=False, markup=False)
+
+
+def _show_table(console: Any, result: FileResult) -> None:
+    """Write what an encoder at the table saw of each rapid."""
+    for outcome in result.outcomes:
+        if (seen := outcome.at_table) is not None:
+            left = "" if seen.left_rms_um is None else f"; {seen.left_rms_um:.3g} um RMS of it not predicted"
+            console.print(
+                f"  table from {outcome.window.start_s:.2f} s: error {seen.error_rms_um:.3g} um RMS, at most "
+                f"{seen.error_max_um:.3g}; {seen.unseen_rms_um:.3g} um RMS of it unseen by the drive's encoder{left}",
+                highlight=False,
+                markup=False,
+            )
 
 
 def _show_reasons(console: Any, result: FileResult) -> None:

@@ -156,8 +156,9 @@ def believed(axis: Mapping[str, Any]) -> str:
         f"{name} {cell(name, told['value'], half_of(told), ' ')} {told['unit']}"
         for name, told in (axis.get("terms") or {}).items()
     )
-    left = axis.get("unexplained_um")
-    parts = [terms, "" if left is None else f"{left:.2g} um of a rapid unexplained", *axis.get("warnings", [])]
+    left, table = axis.get("unexplained_um"), (axis.get("last_window") or {}).get("at_table")
+    seen = f"the table was {table['error_rms_um']:.3g} um RMS off in the last rapid" if table else ""
+    parts = [terms, "" if left is None else f"{left:.2g} um of a rapid unexplained", seen, *axis.get("warnings", [])]
     return "; ".join(part for part in parts if part)
 
 

@@ -28,12 +28,14 @@ from fdhil.config.section import Section
 from fdhil.config.sensors import Thermometer, Voltage
 from fdhil.config.service import Maintenance
 from fdhil.config.simulation import Noise, SimAxis, Thermal
+from fdhil.config.table import Accelerometer, TableEncoder
 
 __all__ = [
     "CEILING_ACCELERATION_MM_S2",
     "CEILING_OFFSET_UM",
     "CEILING_SPEED_MM_S",
     "VARIATION_MM",
+    "Accelerometer",
     "Axis",
     "CanBus",
     "CorrectionLimits",
@@ -51,6 +53,7 @@ __all__ = [
     "Section",
     "SimAxis",
     "SpeedUnit",
+    "TableEncoder",
     "Thermal",
     "Thermometer",
     "Voltage",

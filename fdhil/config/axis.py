@@ -13,6 +13,7 @@ from fdhil.cia402 import Scaling
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import NotNegative, Positive, Section, one_of
 from fdhil.config.sensors import Thermometer, Voltage
+from fdhil.config.table import Accelerometer, TableEncoder
 
 # the built-in ceilings of what may ever be added to a set-point; a config can only lower them
 CEILING_OFFSET_UM = 250.0
@@ -120,6 +121,8 @@ class Axis(Section):
     drive: Drive = Drive()
     voltage: Voltage = Voltage()
     temperature: Thermometer | None = None
+    table: TableEncoder | None = None
+    accelerometer: Accelerometer | None = None
 
     @property
     def jerk_mm_s3(self) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
@@ -17,6 +18,8 @@ class Noise(Section):
     voltage_v: NotNegative = Field(0.06, description="terminal voltage")
     current_a: NotNegative = Field(0.05, description="motor current")
     speed_rad_s: NotNegative = Field(0.15, description="shaft speed")
+    table_um: NotNegative = Field(0.05, description="place of the encoder at the table, where there is one")
+    table_m_s2: NotNegative = Field(0.05, description="acceleration of the accelerometer at the table")
 
 
 class SimAxis(Section):
@@ -33,6 +36,9 @@ class SimAxis(Section):
     backlash_um: NotNegative = Field(0.0, description="lost motion between screw and table")
     start_mm: Finite = Field(0.0, description="position at power-on")
     offset_in_feedforward: bool = Field(True, description="whether 0x60B0 is seen by the speed feed-forward")
+    eds: Path | None = Field(
+        None, description="EDS or DCF file that the simulated drive wears, from the config's folder; left out: its own"
+    )
     boot_s: NotNegative = Field(
         0.0, le=60.0, description="from a reset, or the supply's return, to the boot-up message"
     )

@@ -120,6 +120,7 @@ def _window(outcome: WindowOutcome) -> dict[str, Any]:
         "terms": {name: figures for name, figures in told.items() if name in terms},
         "friction_at_rapid": friction_of(outcome),
         "delay_s": _delay(outcome),
+        "at_table": None if outcome.at_table is None else asdict(outcome.at_table),
     }
 
 

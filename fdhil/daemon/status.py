@@ -124,4 +124,5 @@ def _window_status(outcome: WindowOutcome) -> dict[str, Any]:
         "reasons": [str(reason) for reason in outcome.verdict.reasons],
         "unexplained_um": outcome.verdict.unexplained_um,
         "warnings": [str(warning) for warning in outcome.verdict.warnings],
+        "at_table": None if outcome.at_table is None else asdict(outcome.at_table),
     }

@@ -11,11 +11,13 @@ from fdhil import tables
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.link import Link
+from fdhil.drivers.table.accelerometer import StreamedAccelerometer
+from fdhil.drivers.table.modbus_encoder import ModbusEncoder
 from fdhil.drivers.thermometer import SlidewayThermometer
 from fdhil.errors import DeviceError
-from fdhil.records import AxisSamples, MoveEvent, Notice, Temperature, TickTimes, VoltageSamples
+from fdhil.records import AxisSamples, MoveEvent, Notice, TableSamples, Temperature, TickTimes, VoltageSamples
 
-Record = AxisSamples | VoltageSamples | TickTimes | MoveEvent | Temperature | Notice
+Record = AxisSamples | VoltageSamples | TableSamples | TickTimes | MoveEvent | Temperature | Notice
 Take = Callable[[Record], None]
 """Takes a source's records; it never waits, for nothing may hold a source up."""
 
@@ -43,12 +45,16 @@ class Sensor(Protocol):
 
 
 def sensors_of(axis: str, config: MachineConfig) -> dict[str, Sensor]:
-    """Return the sensors of their own that an axis has, by what they tell: ``voltage``, ``temperature``."""
+    """Return the sensors of their own that an axis has, by what they tell."""
     settings, found = config.axis[axis], {}
     if settings.voltage.separate:
         found["voltage"] = tables.load(tables.VOLTAGE_SOURCES, settings.voltage.source)(axis, config)
     if settings.temperature is not None:
         found["temperature"] = SlidewayThermometer(axis, settings.temperature)
+    if settings.table is not None and settings.table.source == "modbus":
+        found["table"] = ModbusEncoder(axis, settings.table)
+    if settings.accelerometer is not None:
+        found["acceleration"] = StreamedAccelerometer(axis, settings.accelerometer, config.machine.sync_period_s)
     return found
 
 

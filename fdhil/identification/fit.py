@@ -7,7 +7,7 @@ voltage in which the innovations are linear, for a term that joined the six.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -93,6 +93,7 @@ class Fit:
     """The end of a fit: ``theta`` (7 + terms,), information (k, k) of the ``free`` entries, innovations (m,), noises.
 
     ``delay_doubt_s`` is how much of a delay may be the voltage's course within its samples, or the other way round.
+    ``prior`` (k,) is what of the information on the diagonal was known before the data; no rows: nothing was.
     """
 
     theta: Float
@@ -103,6 +104,7 @@ class Fit:
     problem: Problem
     converged: bool
     delay_doubt_s: float = 0.0
+    prior: Float = field(default_factory=lambda: np.zeros(0))
 
     @property
     def but_delay(self) -> Float:

@@ -15,6 +15,7 @@ from fdhil.identification.fit import Fit
 from fdhil.identification.kalman import DELAY, SPEED
 from fdhil.identification.motion import Course
 from fdhil.identification.ripple_parts import as_amplitude
+from fdhil.identification.spring import DAMPING, DAMPING_DOUBT
 from fdhil.records import PARAMETERS, Estimate, Float
 
 
@@ -25,7 +26,8 @@ def told_terms(six: Estimate, result: Fit, values: Float, beyond: Float) -> tupl
     """
     names = (*PARAMETERS, *(course.name for course in result.problem.motions[0].courses))
     assert six.systematic is not None
-    covariance, systematic, told = six.covariance, six.systematic, values
+    covariance, systematic, told = six.covariance, six.systematic, values.copy()
+    told[len(PARAMETERS) :] += [course.about for course in result.problem.motions[0].courses]
     for name, value, own, effect in _chosen_before(result):
         moved = np.pad(effect, (0, told.size - effect.size))
         wider = np.empty((told.size + 1, told.size + 1))
@@ -48,6 +50,7 @@ def _chosen_before(result: Fit) -> list[tuple[str, float, float, Float]]:
     if low is not None:
         _, own, effect = friction_speed.marginal(result, *friction_speed.slope(result, low))
         found.append(("stribeck_speed", motions[0].courses[low].speed_rad_s, own, effect[kept]))
+    found += [(c.name, c.about, DAMPING_DOUBT, np.zeros(0)) for c in motions[0].known if c.name == DAMPING]
     late = motions[0].speed_late
     if late is not None:
         slopes = [[Course("speed_delay", SPEED, -np.gradient(m.speed, m.dt_s))] for m in motions]

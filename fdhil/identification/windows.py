@@ -153,7 +153,14 @@ def _cut(recording: Recording, speed: Float, run: Run, floor: int, ceiling: int,
         offset_mm=read_only(offset[part]) if offset is not None and np.any(np.abs(offset[part]) > 0) else None,
         slow_voltage=_slow_part(recording, a, b),
         torque_constant_nm_per_a=recording.torque_constant_nm_per_a,
+        table_mm=_seen(recording.table_mm, part),
+        table_m_s2=_seen(recording.table_m_s2, part),
     )
+
+
+def _seen(values: Float | None, part: slice) -> Float | None:
+    """Return the rows of a sensor that may be missing; None where it tells none of them."""
+    return None if values is None or not np.isfinite(values[part]).any() else read_only(values[part])
 
 
 def _slow_part(recording: Recording, a: int, b: int) -> SlowVoltage | None:

@@ -7,12 +7,15 @@ from dataclasses import replace
 import numpy as np
 
 from fdhil.config import Axis, Identification
+from fdhil.identification.compliance import beside_the_config, compliance, joined
 from fdhil.identification.estimators import chosen, maximum_likelihood
 from fdhil.identification.identifiability import empty_estimate
 from fdhil.identification.signals import mended
+from fdhil.identification.spring import sprung
 from fdhil.identification.without_voltage import told
 from fdhil.records import Estimate, Reason, Result, Verdict, Window, WindowOutcome
 from fdhil.validation import BEFORE_ANY_FIT, LEAST_ROWS, OF_THE_FIT, WEIGHED, Evidence, Findings, ask
+from fdhil.validation.at_the_table import at_the_table
 
 GAVE_UP = (np.linalg.LinAlgError, FloatingPointError, ZeroDivisionError, OverflowError)
 SAME_PITCH = 0.01  # to which a recording and the section of its axis agree
@@ -31,7 +34,22 @@ def analyse(
     """
     at_instants = mended(window, settings.speed_source)
     signals = Evidence(at_instants, settings, axis=own(window, axis), sync_period_s=sync_period_s, recorded=window)
-    return replace(_analysed(signals), window=window)
+    return replace(_with_table(_analysed(signals), signals), window=window)
+
+
+def _with_table(outcome: WindowOutcome, signals: Evidence) -> WindowOutcome:
+    """Return the outcome with what sensors at the table show: the resonance, and the table's true error."""
+    window, estimate, axis = signals.window, outcome.estimate, signals.axis
+    if estimate is None or (window.table_mm is None and window.table_m_s2 is None):
+        return outcome
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        found = compliance(window, estimate.parameters())
+    if found is not None:
+        warnings = (*outcome.verdict.warnings, *beside_the_config(found, axis))
+        estimate = joined(estimate, found)
+        outcome = replace(outcome, estimate=estimate, verdict=replace(outcome.verdict, warnings=warnings))
+    seen = at_the_table(window, estimate.parameters(), axis, signals.sync_period_s)
+    return outcome if seen is None else replace(outcome, at_table=seen)
 
 
 def _analysed(signals: Evidence) -> WindowOutcome:
@@ -74,8 +92,21 @@ def estimated(signals: Evidence) -> Evidence:
     if fit is not None and axis is not None:
         fit = maximum_likelihood.with_loops(fit, window, settings, axis, signals.sync_period_s)
     if name == maximum_likelihood.NAME and fit is not None:
-        return replace(signals, estimate=maximum_likelihood.finish(fit), fit=fit)
+        return _with_spring(replace(signals, estimate=maximum_likelihood.finish(fit), fit=fit))
     return replace(signals, estimate=estimator([window], settings), fit=fit)
+
+
+def _with_spring(stiff: Evidence) -> Evidence:
+    """Return the evidence with a spring between motor and table, where there is one that explains the rapid as well."""
+    assert stiff.fit is not None
+    found = sprung(stiff.fit, stiff.axis)
+    if found is None or stiff.weight is None:
+        return stiff
+    soft = replace(stiff, estimate=maximum_likelihood.finish(found), fit=found)
+    explains = soft.weight is not None and (
+        soft.weight.believed or soft.weight.unexplained_um < stiff.weight.unexplained_um
+    )
+    return soft if explains else stiff
 
 
 def gave_up(error: BaseException, advice: str) -> Reason:

@@ -31,6 +31,7 @@ from fdhil.records import (
     Parameters,
     ParameterSet,
     Skill,
+    TableSamples,
     Temperature,
     TickTimes,
     Verdict,
@@ -48,7 +49,7 @@ POOL_WINDOWS = 4  # both directions twice: enough to tell viscous from dry frict
 
 JUMPS = {"LoadChanged", "ParameterJump"}
 
-Record = AxisSamples | VoltageSamples | TickTimes | MoveEvent | Temperature | Window
+Record = AxisSamples | VoltageSamples | TableSamples | TickTimes | MoveEvent | Temperature | Window
 
 
 @dataclass(frozen=True, slots=True)

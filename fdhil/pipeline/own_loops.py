@@ -1,13 +1,17 @@
-"""Seeks a drive's own loops where the configured ones do not explain its rapids, for the analysis to go on with."""
+"""Seeks a drive's own loops where the configured ones do not explain its rapids, for the analysis to go on with.
+
+Where other loops do not explain them, a resonance between motor and table may.
+"""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from fdhil.config import Axis, Identification
 from fdhil.identification.loops import better_loops, identify_loops, with_loops
 from fdhil.pipeline.analysis import analyse, own
+from fdhil.pipeline.own_resonance import softer_axis
 from fdhil.records import LoopEstimate, Parameters, Window, WindowOutcome
 from fdhil.validation.weight import LOOPS_DIFFER
 
@@ -64,6 +68,34 @@ def better_axis(axis: Axis | None, found: LoopEstimate | None) -> Axis | None:
     return with_loops(axis, found) if axis is not None and found is not None and better_loops(found) else None
 
 
+def softened(outcomes: Sequence[WindowOutcome], axis: Axis | None, sync_period_s: float | None) -> Axis | None:
+    """Return the axis with the resonance that explains those of the outcomes that its loops do not; else None."""
+    refused = [o for o in outcomes if suspected([o])]
+    if axis is None or sync_period_s is None or not refused or own(refused[0].window, axis) is None:
+        return None
+    told = [(o.window, mechanics_of(o, axis)) for o in refused]
+    return softer_axis([(w, plant) for w, plant in told if plant is not None], axis, sync_period_s)
+
+
+def explained(
+    outcomes: Sequence[WindowOutcome],
+    axis: Axis | None,
+    settings: Identification,
+    sync_period_s: float | None,
+    again: Callable[[Axis], Sequence[WindowOutcome]],
+) -> tuple[Sequence[WindowOutcome], LoopEstimate | None]:
+    """Return the outcomes by the best that a recording shows of its drive, and its loops where they were sought.
+
+    ``again`` analyses its windows with another section of the axis.
+    """
+    loops = loops_of(outcomes, axis, settings, sync_period_s) if suspected(outcomes) else None
+    better = better_axis(axis, loops)
+    if better is not None:
+        outcomes = again(better)
+    softer = softened(outcomes, better or axis, sync_period_s)
+    return (outcomes if softer is None else again(softer)), loops
+
+
 class OwnLoops:
     """An axis' own loops as its rapids come one by one: each is analysed through the best that are known.
 
@@ -102,6 +134,11 @@ class OwnLoops:
         found = loops_of(tuple(self._outcomes), self._configured, self._settings, self._period_s, growing=wanted)
         better = better_axis(self._configured, found)
         if better is not None:
-            self.axis = better
-            outcome = analyse(window, self._settings, better, self._period_s) if wanted else outcome
+            known = self.axis.resonance_hz if self.axis is not None else None
+            self.axis = better.model_copy(update={"resonance_hz": known})
+            outcome = analyse(window, self._settings, self.axis, self._period_s) if wanted else outcome
+        softer = softened([*self._outcomes, outcome], self.axis, self._period_s) if suspected([outcome]) else None
+        if wanted and softer is not None:
+            self.axis = softer
+            outcome = analyse(window, self._settings, softer, self._period_s)
         return outcome, found

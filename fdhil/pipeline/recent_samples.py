@@ -7,6 +7,7 @@ came over the bus to the stretch that is cut; its windows are views of it.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -16,7 +17,19 @@ import numpy as np
 
 from fdhil.config import Axis
 from fdhil.identification.windows import spans
-from fdhil.records import AxisSamples, Float, Int, Recording, SlowVoltage, TickTimes, VoltageSamples, frozen, read_only
+from fdhil.pipeline.table_samples import Motion, RecentTable
+from fdhil.records import (
+    AxisSamples,
+    Float,
+    Int,
+    Recording,
+    SlowVoltage,
+    TableSamples,
+    TickTimes,
+    VoltageSamples,
+    frozen,
+    read_only,
+)
 
 PLACING_BLOCKS = 40  # some 2 s of a sensor that is asked every 50 ms
 CLOCK_TOLERANCE = 500e-6  # two quartz clocks
@@ -43,6 +56,7 @@ class RecentSamples:
         self._samples: deque[AxisSamples] = deque()
         self._voltage: deque[VoltageSamples] = deque()
         self._times: deque[TickTimes] = deque()
+        self._table = RecentTable(capacity)
 
     @property
     def newest_tick(self) -> int | None:
@@ -55,9 +69,13 @@ class RecentSamples:
         self._samples.clear()
         self._voltage.clear()
         self._times.clear()
+        self._table.clear()
 
-    def add(self, block: AxisSamples | VoltageSamples | TickTimes) -> None:
+    def add(self, block: AxisSamples | VoltageSamples | TableSamples | TickTimes) -> None:
         """Append a block and let go what is older than the capacity; an empty block is nothing."""
+        if isinstance(block, TableSamples):
+            self._table.add(block)
+            return
         if isinstance(block, AxisSamples):
             if block.tick.size:
                 self._first_tick = int(block.tick[0]) if self._first_tick is None else self._first_tick
@@ -93,6 +111,9 @@ class RecentSamples:
             voltage, delay = self._separate(start, n)
         elif blocks and all(b.voltage_v is not None for b in blocks):
             voltage = _placed(((b.tick, b.voltage_v) for b in blocks if b.voltage_v is not None), start, n)
+        position = _placed(((b.tick, b.position_mm) for b in blocks), start, n)
+        mm_per_tick = self._section.screw_pitch_mm / (2 * math.pi) * self._period_s
+        motion = Motion(start, position, speed * mm_per_tick)
         return Recording(
             axis=self._axis,
             dt_s=self._period_s,
@@ -100,7 +121,7 @@ class RecentSamples:
             voltage_v=voltage,
             current_a=_placed(((b.tick, b.current_a) for b in blocks), start, n),
             speed_rad_s=speed,
-            position_mm=_placed(((b.tick, b.position_mm) for b in blocks), start, n),
+            position_mm=position,
             demand_mm=_placed(((b.tick, b.demand_mm) for b in blocks), start, n),
             voltage_sampling=self._section.voltage.sampling,
             pitch_mm=self._section.screw_pitch_mm,
@@ -110,6 +131,8 @@ class RecentSamples:
             start_tick=start,
             voltage_delay_s=delay,
             offset_mm=_placed(((b.tick, b.offset_mm) for b in blocks), start, n),
+            table_mm=self._table.places(motion),
+            table_m_s2=self._table.accelerations(motion),
         )
 
     def _is_slow(self) -> bool:

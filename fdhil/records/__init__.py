@@ -14,6 +14,8 @@ from fdhil.records.signals import (
     Recording,
     SlowVoltage,
     Stages,
+    TableSamples,
+    TableSignal,
     Temperature,
     TickTimes,
     VoltageSamples,
@@ -35,7 +37,17 @@ from fdhil.records.values import (
     rms,
     unit_of,
 )
-from fdhil.records.verdicts import Estimate, LoopEstimate, Notice, ParameterSet, Reason, Result, Verdict, WindowOutcome
+from fdhil.records.verdicts import (
+    AtTable,
+    Estimate,
+    LoopEstimate,
+    Notice,
+    ParameterSet,
+    Reason,
+    Result,
+    Verdict,
+    WindowOutcome,
+)
 
 Outcome = WindowOutcome | ParameterSet | Skill | Notice | LoopEstimate
 
@@ -44,6 +56,7 @@ __all__ = [
     "PARAMETERS",
     "RATIOS",
     "UNITS",
+    "AtTable",
     "AxisSamples",
     "Bool",
     "Correction",
@@ -64,6 +77,8 @@ __all__ = [
     "Skill",
     "SlowVoltage",
     "Stages",
+    "TableSamples",
+    "TableSignal",
     "Temperature",
     "TickTimes",
     "Trajectory",

@@ -9,6 +9,7 @@ from typing import Literal
 
 from fdhil.records.values import Float, Int
 
+TableSignal = Literal["table_mm", "table_m_s2"]
 VoltageSampling = Literal["interval_mean", "instant"]
 
 
@@ -59,6 +60,22 @@ class SlowVoltage:
     period_s: float
     error_s: float
     voltage_v: Float
+
+
+@dataclass(frozen=True, slots=True)
+class TableSamples:
+    """Samples of a sensor at an axis' table: ``values`` (n,) in the unit of ``signal`` at ``tick`` (n,), which rises.
+
+    A tick between two SYNCs has a fraction; ``tick_error`` is how far off all of them may be, 0 where they were sampled
+    at the SYNC. Samples of an acceleration come ``rate_per_tick``; a longer step is a lost one.
+    """
+
+    axis: str
+    signal: TableSignal
+    tick: Float
+    tick_error: float
+    values: Float
+    rate_per_tick: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,9 +132,11 @@ class Window:
     value at t_k; ``voltage_delay_s`` (what is left after alignment by counters, None when not known) has not been
     taken out. ``slow_voltage`` stands in its place where a sensor samples more slowly than the drive.
     ``speed_late_s`` is how late the recorded speed was, which has been taken out (None: nothing was), with its standard
-    deviation. ``start_s`` is the time of row 0 in its recording or since the first tick. ``offset_mm`` is the position
-    offset in force, None where it was 0 throughout or is not known. ``torque_constant_nm_per_a`` is the K that the
-    recording itself tells. Two windows are equal when they are the same one.
+    deviation. ``table_mm`` is the place and ``table_m_s2`` the acceleration that sensors at the table tell, NaN in rows
+    that they do not, None without them. ``start_s`` is the time of row 0 in its recording or since the first tick.
+    ``offset_mm`` is the position offset in force, None where it was 0 throughout or is not known.
+    ``torque_constant_nm_per_a`` is the K that the recording itself tells. Two windows are equal when they are the same
+    one.
     """
 
     axis: str
@@ -143,6 +162,8 @@ class Window:
     speed_late_s: float | None = None
     speed_late_std_s: float = 0.0
     torque_constant_nm_per_a: float | None = None
+    table_mm: Float | None = None
+    table_m_s2: Float | None = None
 
     @property
     def n(self) -> int:
@@ -178,3 +199,5 @@ class Recording:
     offset_mm: Float | None = None
     source: str = ""
     torque_constant_nm_per_a: float | None = None
+    table_mm: Float | None = None
+    table_m_s2: Float | None = None

@@ -96,12 +96,28 @@ class Verdict:
 
 
 @dataclass(frozen=True, slots=True)
+class AtTable:
+    """What an encoder at the table tells of a move, um: its error against the demand, RMS and at most.
+
+    ``unseen`` is the part of it that the drive's encoder does not see. ``left_rms_um`` is what is left of the error
+    beside that which the window's own model predicts at the table, None where the regulators are not known.
+    """
+
+    error_rms_um: float
+    error_max_um: float
+    unseen_rms_um: float
+    unseen_max_um: float
+    left_rms_um: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class WindowOutcome:
-    """One window that was analysed: what was estimated, and whether it is believed."""
+    """One window that was analysed: what was estimated, and whether it is believed; what the table's encoder tells."""
 
     window: Window
     estimate: Estimate | None
     verdict: Verdict
+    at_table: AtTable | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -87,7 +87,7 @@ class AxisUnit:
         """Write an object past all access rules, and give it its value back."""
         drive = self.drive
         if on:
-            self._before.setdefault((index, sub), drive.dictionary.number(index, sub))
+            self._before.setdefault((index, sub), drive.dictionary.shown(drive.dictionary.entry(index, sub)))
             drive.set_object(index, sub, value)
         elif (index, sub) in self._before:
             drive.set_object(index, sub, self._before.pop((index, sub)))

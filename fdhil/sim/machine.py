@@ -19,12 +19,13 @@ from fdhil.sim.drive.servo import Drive
 from fdhil.sim.fault_script import FaultSchedule
 from fdhil.sim.frame import BusFrame, Frame
 from fdhil.sim.nc.controller import Event, NcController, Row
+from fdhil.sim.nc.drive_link import Wiring
 from fdhil.sim.recorder import Recorder
+from fdhil.sim.table_sensors import TableSensors
 from fdhil.sim.thermal import SlideWay
 from fdhil.sim.wire.modbus_sensor import VoltageSensor
 
 SYNC = 0x80
-OFFSET_RPDO = 2
 OFFSET_OBJECTS = (0x60B0, 0x60B1, 0x60B2)
 
 
@@ -34,7 +35,7 @@ class Machine:
     def __init__(self, config: MachineConfig) -> None:
         self.config = config
         self.period_s = config.machine.sync_period_s
-        self.nc = NcController(config)
+        self.nc = NcController(config, self._wiring)
         self.events: list[Event] = []
         self.tick = 0
         self._outbox: list[BusFrame] = []
@@ -43,6 +44,7 @@ class Machine:
         self.units = {
             axis: self._unit(axis, seeds[2 * place], seeds[2 * place + 1]) for place, axis in enumerate(config.axis)
         }
+        self.tables = TableSensors(config)
         self._of_bus: dict[str, list[AxisUnit]] = {}
         for unit in self.units.values():
             self._of_bus.setdefault(unit.bus, []).append(unit)
@@ -77,6 +79,10 @@ class Machine:
             self._injected,
         )
 
+    def _wiring(self, axis: str) -> Wiring:
+        drive = self.units[axis].drive
+        return Wiring.of(drive.pdo.configured("rpdo"), drive.pdo.configured("tpdo"), drive.dress.mode)
+
     @property
     def buses(self) -> tuple[str, ...]:
         """The buses that have drives."""
@@ -106,7 +112,7 @@ class Machine:
         for unit in self.units.values():
             unit.drive.physics.rehearse()
             unit.power(True)
-        return self._take_outbox()
+        return self._take_outbox() + self.tables.power_on()
 
     def receive(self, bus: str, frame: Frame) -> list[Frame]:
         """Take a frame that another party sent and return what the drives of that bus send because of it."""
@@ -116,6 +122,7 @@ class Machine:
         answers: list[Frame] = []
         for unit in self._of_bus.get(bus, ()):
             answers += unit.drive.receive(can_id, data)
+        answers += self.tables.receive(bus, frame)
         if self.nc.on:
             self.nc.hear(bus, frame)
             for answer in answers:
@@ -150,7 +157,7 @@ class Machine:
 
     def wall_clock(self, now_s: float) -> list[BusFrame]:
         """Run what depends on time and not on SYNC: heartbeats and their monitoring, and motion without SYNC."""
-        frames: list[BusFrame] = []
+        frames = self.tables.wall_clock(now_s)
         alone = self._realtime and not self.nc.on
         for unit in self.units.values():
             for frame in unit.drive.wall_clock(now_s, alone=alone):
@@ -193,11 +200,13 @@ class Machine:
         """One SYNC for one axis."""
         drive = unit.drive
         before = drive.tick
+        table_rad_s = drive.physics.table_speed_rad_s
         frames = drive.receive(SYNC, data)
         if drive.tick == before:
             return frames
+        frames += self.tables.at_sync(drive, table_rad_s)
         heard = drive.pdo.heard_before
-        unit.offsets.step(OFFSET_RPDO in heard)
+        unit.offsets.step(not heard.isdisjoint(drive.pdo.offset_rpdos))
         for key in self._listed:
             if key[0] == unit.axis:
                 self._streams[key].step(key[1] in heard)
@@ -307,7 +316,7 @@ class Machine:
 
 def _listed_rpdo(text: str, units: Mapping[str, AxisUnit]) -> tuple[str, int]:
     axis, _, number = text.partition(":")
-    if axis not in units or number not in ("1", "2", "3", "4"):
+    if axis not in units or number not in map(str, units[axis].drive.pdo.numbers("rpdo")):
         fault = ConfigFault("sim.lockstep_rpdo", f"{text!r} names no RPDO", "write axis and number, such as X:2")
         raise ConfigError("config", [fault])
     return axis, int(number)

@@ -29,6 +29,7 @@ from fdhil.sim.operator_commands import MAX_LINE, CommandError, OperatorCommands
 from fdhil.sim.wire.attach import attach
 from fdhil.sim.wire.attachment import Attachment, Selectable, WakePipe
 from fdhil.sim.wire.sensor_wires import SensorWires
+from fdhil.sim.wire.stream_port import StreamPort
 
 Loader = Callable[[Path, MachineConfig], Trajectory]
 Emit = Callable[[dict[str, Any]], None]
@@ -103,6 +104,7 @@ class SimService:
         self._pace = Pace(config.machine.sync_period_s, lockstep=config.sim.pace == "lockstep")
         self._buses: dict[str, Attachment] = {}
         self._sensors: SensorWires | None = None
+        self._streams: dict[str, StreamPort] = {}
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         try:
             for entry in faults:
@@ -121,6 +123,10 @@ class SimService:
             sensors = SensorWires(self.config, {axis: unit.sensor for axis, unit in self.machine.units.items()})
             sensors.start()
             self._sensors = sensors
+        for axis in self.machine.tables.accelerometers:
+            section = self.config.axis[axis].accelerometer
+            assert section is not None
+            self._streams[axis] = StreamPort(f"accelerometer {axis}", section.device)
 
     def _take(self, bus: str, frame: Frame) -> None:
         answers = self.machine.receive(bus, frame)
@@ -133,6 +139,7 @@ class SimService:
             "event": "ready",
             "buses": {name: bus.settings for name, bus in self._buses.items()},
             "modbus": self._sensors.ready if self._sensors is not None else {},
+            "accelerometers": {axis: port.path for axis, port in self._streams.items()},
             **self.machine.describe(self._write_eds()),
             "pace": self.config.sim.pace,
             "sync_period_s": self.config.machine.sync_period_s,
@@ -157,6 +164,9 @@ class SimService:
         if self._sensors is not None:
             self._sensors.stop()
             self._sensors = None
+        for stream in self._streams.values():
+            stream.close()
+        self._streams.clear()
         for bus in self._buses.values():
             bus.close()
         self._buses.clear()
@@ -213,6 +223,8 @@ class SimService:
             self._pace.sent(now_s)
             self._left = self._senders_left()
             self._send(self.machine.cycle())
+            for axis, stream in self._streams.items():
+                stream.send(self.machine.tables.accelerometers[axis].take())
         for event in self.machine.take_events():
             self._emit(event)
         for bus in buses:

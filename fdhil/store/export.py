@@ -12,6 +12,7 @@ from fdhil.errors import RecordingError
 from fdhil.records import Float, SlowVoltage, Window
 from fdhil.store.output import open_output
 
+TABLE = ("table_mm", "table_m_s2")
 TIME, VOLTAGE, OTHERS = "time_s", "voltage_V", "current_A,speed_rad_per_s,position_m,demand_m"
 
 
@@ -19,7 +20,8 @@ def csv_lines(window: Window) -> Iterator[str]:
     """Yield the lines of a recording without line ends; a lost sample is a missing row, which readers see as a gap.
 
     The samples of a voltage sensor slower than the rows stand in headers, on their own grid and to the last bit; their
-    column holds the sample under way, for programs that know no other. Without a voltage there is no such column.
+    column holds the sample under way, for programs that know no other. Without a voltage there is no such column, nor
+    without sensors at the table; a row that these did not tell has ``nan`` there.
     """
     slow = window.slow_voltage
     voltage = _held(window, slow) if slow is not None else window.voltage_v
@@ -39,11 +41,14 @@ def csv_lines(window: Window) -> Iterator[str]:
     } | (_samples(slow) if slow is not None else {})
     left_out = () if voltage is not None else ("voltage_sampling", "voltage_delay_s")
     yield from (f"# {key}: {value}" for key, value in headers.items() if value is not None and key not in left_out)
-    yield ",".join((TIME, OTHERS) if voltage is None else (TIME, VOLTAGE, OTHERS))
+    seen = {name: values for name in TABLE if (values := getattr(window, name)) is not None}
+    yield ",".join((*((TIME, OTHERS) if voltage is None else (TIME, VOLTAGE, OTHERS)), *seen))
     path_m = (window.position_mm / 1000, window.demand_mm / 1000)
     signals = (window.current_a, window.speed_rad_s, *path_m)
     rows = np.column_stack(signals if voltage is None else (voltage, *signals))
-    for k in np.flatnonzero(np.isfinite(rows).all(axis=1)):
+    whole = np.isfinite(rows).all(axis=1)
+    rows = np.column_stack([rows, *seen.values()])  # of which a row may lack what the table's sensors tell
+    for k in np.flatnonzero(whole):
         yield f"{k * window.dt_s:.9g}," + ",".join(repr(float(value)) for value in rows[k])
 
 

@@ -18,6 +18,7 @@ from fdhil.records import Float, Recording, SlowVoltage, VoltageSampling, frozen
 FORMAT = "fdhil-recording-1"
 COLUMNS = ("time_s", "current_A", "speed_rad_per_s", "position_m", "demand_m")
 VOLTAGE = "voltage_V"
+TABLE = ("table_mm", "table_m_s2")  # sensors at the table, which may have lost rows
 REQUIRED = ("format", "sample_rate_hz", "axis", "pitch_m_per_rev")
 SAMPLING = "voltage_sampling"  # required where there is a voltage
 SOURCES: Mapping[str, tuple[str, ...]] = {
@@ -48,10 +49,9 @@ def parse_recording(text: str, source: str = "recording") -> Recording:
         raise RecordingError(
             f"{source} is truncated: line {len(lines)} has no end of line, so its last number may be cut; copy it again"
         )
-    table = _numbers(lines, first_row, source)
+    names, table = _numbers(lines, first_row, source)
     rows, gaps = _place(table[:, 0], dt, source)
     columns = _spread(table, rows)
-    has_voltage = columns.shape[1] > len(COLUMNS)
     sampling = _sampling(headers, source) if SAMPLING in headers else "interval_mean"
     _check_sources(headers, source)
     pitch_m = _within(headers, "pitch_m_per_rev", PITCH_M, source)
@@ -60,7 +60,7 @@ def parse_recording(text: str, source: str = "recording") -> Recording:
         axis=headers["axis"],
         dt_s=dt,
         time_s=frozen(table[0, 0] + dt * np.arange(columns.shape[0])),
-        voltage_v=frozen(columns[:, len(COLUMNS)]) if has_voltage else None,
+        voltage_v=_told(VOLTAGE, names, columns),
         current_a=frozen(columns[:, 1]),
         speed_rad_s=frozen(columns[:, 2]),
         position_mm=frozen(columns[:, 3] * 1e3),
@@ -73,7 +73,13 @@ def parse_recording(text: str, source: str = "recording") -> Recording:
         headers=headers,
         slow_voltage=_slow_voltage(headers, float(table[0, 0]), dt, source),
         torque_constant_nm_per_a=_torque_constant(headers, source),
+        table_mm=_told("table_mm", names, columns),
+        table_m_s2=_told("table_m_s2", names, columns),
     )
+
+
+def _told(name: str, names: list[str], columns: Float) -> Float | None:
+    return frozen(columns[:, names.index(name)]) if name in names else None
 
 
 def _slow_voltage(headers: dict[str, str], start_s: float, dt_s: float, source: str) -> SlowVoltage | None:
@@ -131,8 +137,8 @@ def _split(text: str, source: str) -> tuple[dict[str, str], int, list[str]]:
     return headers, k + 1, lines
 
 
-def _numbers(lines: list[str], first_row: int, source: str) -> Float:
-    """Return the rows (n, 5) in the order of ``COLUMNS``, or (n, 6) with the voltage last; all of them finite."""
+def _numbers(lines: list[str], first_row: int, source: str) -> tuple[list[str], Float]:
+    """Return the columns there are, ``COLUMNS`` first, and their rows (n, k): all finite but what the table tells."""
     names = [name.strip() for name in lines[first_row - 1].split(",")]
     rows = [line for line in lines[first_row:] if line.strip()]
     if len(rows) < MIN_ROWS:
@@ -140,15 +146,16 @@ def _numbers(lines: list[str], first_row: int, source: str) -> Float:
     try:
         table = np.loadtxt(rows, delimiter=",", comments=None, ndmin=2)
     except ValueError:
-        raise _bad_row(lines, first_row, len(names), source) from None
-    if table.shape[1] != len(names) or not np.isfinite(table).all():
-        raise _bad_row(lines, first_row, len(names), source)
-    wanted = (*COLUMNS, VOLTAGE) if VOLTAGE in names else COLUMNS
-    return table[:, [names.index(name) for name in wanted]]
+        raise _bad_row(lines, first_row, names, source) from None
+    if table.shape[1] != len(names) or not (np.isfinite(table) | (np.isnan(table) & np.isin(names, TABLE))).all():
+        raise _bad_row(lines, first_row, names, source)
+    wanted = [name for name in (*COLUMNS, VOLTAGE, *TABLE) if name in names]
+    return wanted, table[:, [names.index(name) for name in wanted]]
 
 
-def _bad_row(lines: list[str], first_row: int, width: int, source: str) -> RecordingError:
+def _bad_row(lines: list[str], first_row: int, names: list[str], source: str) -> RecordingError:
     """Return the error that names the first row at fault."""
+    width = len(names)
     last = max(k for k, line in enumerate(lines) if line.strip())
     for k, line in enumerate(lines[first_row:], start=first_row):
         if not line.strip():
@@ -157,14 +164,14 @@ def _bad_row(lines: list[str], first_row: int, width: int, source: str) -> Recor
         if len(cells) != width:
             what = "is truncated" if k == last else "is damaged"
             return RecordingError(f"{source} {what}: line {k + 1} has {len(cells)} of {width} values; copy it again")
-        for cell in cells:
+        for name, cell in zip(names, cells, strict=True):
             try:
                 value = float(cell)
             except ValueError:
                 return RecordingError(
                     f"{source} line {k + 1} has {shown(cell.strip())} where a number belongs: correct it"
                 )
-            if not math.isfinite(value):
+            if not (math.isfinite(value) or (math.isnan(value) and name in TABLE)):
                 what = f"{source} line {k + 1} has the non-finite value {shown(cell.strip())}"
                 return RecordingError(f"{what}: leave a lost sample's row out")
     return RecordingError(f"{source} cannot be read as numbers: export it again")

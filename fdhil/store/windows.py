@@ -38,8 +38,11 @@ COLUMNS: Mapping[str, str] = {
     "current_a": "A",
     "voltage_v": "V",
     "offset_mm": "mm",
+    "table_mm": "mm",
+    "table_m_s2": "m/s2",
 }
-OPTIONAL = {"voltage_v", "offset_mm"}
+AT_THE_TABLE = {"table_mm", "table_m_s2"}  # in no window of before there were such sensors: its digest stays
+OPTIONAL = {"voltage_v", "offset_mm", *AT_THE_TABLE}
 _NAME = re.compile(r"w(\d{8,12})-([A-Z])\.parquet")
 _META = b"fdhil"
 REFUSED = (
@@ -139,6 +142,8 @@ def _digest(window: Window) -> str:
     digest = hashlib.sha256(json.dumps(_head(window), sort_keys=True).encode())
     for name in COLUMNS:
         values = getattr(window, name)
+        if values is None and name in AT_THE_TABLE:
+            continue
         digest.update(name.encode() + (b"-" if values is None else _bits(values).tobytes()))
     if window.slow_voltage is not None:
         digest.update(_bits(window.slow_voltage.voltage_v).tobytes())

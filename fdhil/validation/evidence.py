@@ -227,8 +227,11 @@ class Evidence:
         """Whether the model explains the rapid at the table, and nothing it surely lacks makes a next one worse."""
         if self.weight is None or not self.weight.believed or (self.fit is not None and self.late_s):
             return False
-        # a load that is held at rest may pass for it in a replay, and then waits for the next move the other way
-        if self.breakaway is not None and not self.weight.allows(self.breakaway_um(self.breakaway)):
+        late = self.breakaway
+        # a replay has the move's beginning, where a load that is held at rest may pass for friction that holds more
+        if late is not None and self.weight.through == "replay" and not late.more:
+            late = None
+        if late is not None and not self.weight.allows(self.breakaway_um(late)):
             return False
         return all(self.weight.allows(self.cost_um(it) / _known(it)) for lack in self.lacks for it in lack.with_rivals)
 

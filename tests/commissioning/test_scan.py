@@ -229,6 +229,7 @@ def test_a_drive_without_a_following_error_window_is_not_commissioned(peer: tupl
 
 def test_a_device_that_is_no_drive_is_told_as_such(peer: tuple[DrivePeer, MachineConfig]) -> None:
     drive, settings = peer
+    lacking(drive, 0x67FF)
     drive.drive.set_object(0x1000, 0, 0x00030191)
     found = {finding.point: finding for place, finding in check_machine(settings) if place == "axis X"}
     assert {point for point, finding in found.items() if finding.ok is False} == {"device"}

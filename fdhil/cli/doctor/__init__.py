@@ -56,19 +56,21 @@ def _examined(path: Path, offline: bool) -> list[Trouble]:
 
 
 def _in_order(config: MachineConfig, offline: bool) -> Iterator[Trouble]:
-    """Examine from the cause to what depends on it: this PC, its interfaces, the devices behind them, the records."""
+    """Examine from the cause to what depends on it: this PC, its interfaces, the devices behind them, the guard."""
     from fdhil.cli.doctor import computer, devices, storage  # late: --help imports nothing heavy
 
     yield from storage.examine_store(config)
     yield from computer.examine_clock(storage.newest_record_s(config.store.directory))
     yield from computer.examine_processors()
+    secrets = list(storage.examine_secrets(config))
+    yield from secrets
     buses = computer.examine_buses(config)
     for troubles in buses.values():
         yield from troubles
     if not offline:
         heard = {name for name, troubles in buses.items() if not any(trouble.grave for trouble in troubles)}
-        yield from devices.examine_devices(config, heard, _progress)
-    yield from storage.examine_secrets(config)
+        recorded = {trouble.place for trouble in secrets if trouble.code == storage.RECORD_BAD}
+        yield from devices.examine_devices(config, heard, recorded, _progress)
     yield from devices.examine_guard(config)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 
 from fdhil.arming.guard_client import GuardClient
 from fdhil.cli.doctor.trouble import Trouble
+from fdhil.commissioning.compare import POINT
 from fdhil.commissioning.config_check import Place, check_machine
 from fdhil.config import MachineConfig
 from fdhil.errors import DeviceError
@@ -23,8 +24,13 @@ WITHOUT = "what this drive tells is misread or missing"
 HARMLESS = frozenset({"heartbeat", "temperature", "loops"})
 
 
-def examine_devices(config: MachineConfig, buses: Collection[str], say: Callable[[str], None]) -> Iterator[Trouble]:
-    """Compare the devices of the axes on ``buses`` with the config; they are only listened to, or read with no NC."""
+def examine_devices(
+    config: MachineConfig, buses: Collection[str], recorded: Collection[str], say: Callable[[str], None]
+) -> Iterator[Trouble]:
+    """Compare the devices of the axes on ``buses`` with the config; they are only listened to, or read with no NC.
+
+    Of the places in ``recorded`` it is known that their commissioning record is bad.
+    """
     axes = {name: axis for name, axis in config.axis.items() if axis.drive.bus in buses}
     if not axes:
         return
@@ -34,7 +40,7 @@ def examine_devices(config: MachineConfig, buses: Collection[str], say: Callable
         what, _, mend = str(error).partition("; ")
         yield Trouble(type(error).__name__, error.device, what, "no drive can be heard", mend)
         return
-    yield from troubles_of(found)
+    yield from troubles_of([each for each in found if each[0] not in recorded or each[1].point != POINT])
 
 
 def troubles_of(found: Sequence[Place]) -> list[Trouble]:

@@ -21,6 +21,7 @@ from fdhil.store.history import History
 LEAST_FREE_BYTES = 256 << 20
 WINDOW_BYTES = 100_000  # of one recorded rapid, about
 LONGEST_SOCKET_PATH = 107  # sun_path without its closing zero
+RECORD_BAD = "RecordBad"
 COMMISSION = "run `fdhil commission`"
 
 
@@ -33,7 +34,7 @@ def examine_store(config: MachineConfig) -> Iterator[Trouble]:
         what, mend = f"{base} is a file where [store] wants a folder", "move it away or correct [store] directory"
         yield Trouble("StoreNoFolder", "store", what, means, mend)
         return
-    if not os.access(base, os.W_OK | os.X_OK):
+    if not may_write(base):
         mend = f"give this user ({_user()}) the right to write there, or correct [store] directory"
         yield Trouble("StoreReadOnly", "store", f"{base} may not be written", means, mend)
     free = shutil.disk_usage(base).free
@@ -41,6 +42,11 @@ def examine_store(config: MachineConfig) -> Iterator[Trouble]:
         what = f"{free / 1e6:.0f} MB are free on the disk of {base}, which is {free // WINDOW_BYTES} rapids"
         yield Trouble("DiskFull", "store", what, means, "free space, or lower keep_windows in [store]")
     yield from _history(folder)
+
+
+def may_write(folder: Path) -> bool:
+    """Return whether this user may make files in a folder."""
+    return os.access(folder, os.W_OK | os.X_OK)
 
 
 def _history(folder: Path) -> Iterator[Trouble]:
@@ -100,7 +106,7 @@ def _record(config: MachineConfig, axis: str) -> Iterator[Trouble]:
         record = load_record(directory, axis, config.store.commissioning_key, may_lack_key=True)
     except StoreError as error:
         what, _, mend = str(error).partition("; ")
-        yield Trouble("RecordBad", place, what, means, mend)
+        yield Trouble(RECORD_BAD, place, what, means, mend)
         return
     if record is None:
         mend = f"{COMMISSION} with the NC off and the axis free to move"

@@ -12,7 +12,8 @@ from fdhil.drivers.can.port import Filter
 from fdhil.drivers.can.sync_grid import SyncGrid
 from fdhil.drivers.cia402.drive import Cia402Decoder, InputSamples
 from fdhil.drivers.cia402.pdo_watch import PdoWatch
-from fdhil.records import AxisSamples, Notice, TickTimes
+from fdhil.drivers.table.tpdo_encoder import TpdoEncoder
+from fdhil.records import AxisSamples, Notice, TableSamples, TickTimes
 
 _SYNC_SILENCE_NS = 1_000_000_000
 
@@ -32,13 +33,15 @@ class BusDecoder:
             axis: PdoWatch(axis, each.node_id, each.profile.tpdos, each.required, config.machine.sync_period_s)
             for axis, each in self.decoders.items()
         }
+        tables = {axis: config.axis[axis].table for axis in self.axes}
+        self.tables = [TpdoEncoder(axis, t) for axis, t in tables.items() if t is not None and t.source == "canopen"]
         self._last_sync_ns: int | None = None
         self._sync_lost = False
 
-    def feed(self, frames: Frames, now_ns: int) -> list[TickTimes | AxisSamples | InputSamples | Notice]:
+    def feed(self, frames: Frames, now_ns: int) -> list[TickTimes | AxisSamples | InputSamples | TableSamples | Notice]:
         """Take a block of frames; return times of the ticks, samples, inputs and notices."""
         ticked = self.grid.feed(frames)
-        out: list[TickTimes | AxisSamples | InputSamples | Notice] = [
+        out: list[TickTimes | AxisSamples | InputSamples | TableSamples | Notice] = [
             *self._errors.feed(frames, now_ns),
             *ticked.notices,
         ]
@@ -50,6 +53,8 @@ class BusDecoder:
             out += self.decoders[axis].feed(ticked)
             out += self.watches[axis].feed(frames, now_ns)
             out += self._pdos[axis].feed(ticked, self.watches[axis].nmt)
+        for encoder in self.tables:
+            out += encoder.feed(ticked)
         return out
 
     def _sync_silence(self, now_ns: int) -> list[Notice]:

@@ -218,10 +218,20 @@ def doubts(result: Fit, inverse: Float) -> Float:
     free = list(result.free)
     columns[free, 0] = inverse @ (result.jacobian.T @ effects[:, 0])
     columns[free, 2:] = inverse @ (result.jacobian.T @ effects[:, 1:])
+    if result.prior.size:
+        columns = np.column_stack([columns, _known_before(result, inverse)])
     if result.delay_doubt_s > 0.0:
         others = but_delay(free)
         columns[others, 1] = -result.delay_doubt_s * solve(result.but_delay, delay_direction(result))[0]
         columns[DELAY, 1] = result.delay_doubt_s
+    return columns
+
+
+def _known_before(result: Fit, inverse: Float) -> Float:
+    """Return (k, q) what one standard deviation of each thing known before the data makes of the entries of theta."""
+    asked = np.flatnonzero(result.prior)
+    columns = np.zeros((result.theta.size, asked.size))
+    columns[list(result.free)] = inverse[:, asked] * np.sqrt(result.prior[asked])
     return columns
 
 
@@ -273,6 +283,9 @@ def finish(result: Fit) -> Estimate:
     at = result.free.index(DELAY) if late else 0
     chance, beyond = (part[np.ix_(kept, kept)] for part in (inverse, held - inverse))
     own = systematic[told]
+    if result.prior.size:  # its share is among the doubts that windows have in common
+        before = _known_before(result, inverse)[told]
+        chance = chance - before @ before.T
     values = result.theta[told]
     answer = Estimate(
         method=NAME,

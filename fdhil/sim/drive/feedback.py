@@ -6,6 +6,7 @@ import math
 
 from fdhil.config import Regulators
 from fdhil.sim.drive.dictionary import Dictionary
+from fdhil.sim.drive.dress import Gauge
 from fdhil.sim.drive.motion import Motion, Source
 from fdhil.sim.drive.objects import VOLTAGE_V_PER_COUNT, Ratings
 from fdhil.sim.drive.physics import Physics
@@ -43,12 +44,14 @@ class Feedback:
         power: PowerStage,
         motion: Motion,
         sensors: Sensors,
+        gauges: tuple[Gauge, ...] = (),
     ) -> None:
         self._numbers = dictionary.numbers
         self._physics = physics
         self._power = power
         self._motion = motion
         self._sensors = sensors
+        self._gauges = gauges
         self.trace = TraceBuffer()
         self._inc_per_rad = ratings.increments_per_rev / (2 * math.pi)
         self._counts_per_a = 1e3 / ratings.rated_current_a
@@ -97,8 +100,22 @@ class Feedback:
         numbers[0x210100] = voltage_counts
         numbers[0x60F400] = clip(demand - true_position, INT32)
         numbers[0x60FD00] = self.inputs
+        if self._gauges:
+            self._show(current, voltage, seen.bus * self._bus_mv * 1e-3)
         self.trace.append(tick, demand, shown, speed_counts, current_counts, voltage_counts)
         return demand - true_position
+
+    def _show(self, current_a: float, voltage_v: float, bus_v: float) -> None:
+        """Let the vendor's own objects show what is measured."""
+        signals = {
+            "current_a": current_a,
+            "current_share": current_a * self._counts_per_a * 1e-3,
+            "voltage_v": voltage_v,
+            "dc_link_v": bus_v,
+            "duty": voltage_v / bus_v,
+        }
+        for gauge in self._gauges:
+            self._numbers[gauge.entry.place] = gauge.counts(signals[gauge.signal])
 
     def _speed_demand(self, position: int) -> int:
         """Output of the position loop at t_k, increments/s."""

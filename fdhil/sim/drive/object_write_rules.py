@@ -20,20 +20,19 @@ class StoredParameters:
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
-        self._values: dict[int, int] = {}
+        self._values: dict[Entry, int] = {}
 
     def restore(self, which: Callable[[Entry], bool]) -> None:
         """Give the chosen entries their defaults, or what was saved."""
         self._dictionary.reset(which)
-        entries = self._dictionary.entries
-        self._dictionary.numbers.update({k: v for k, v in self._values.items() if which(entries[k])})
+        self._dictionary.numbers.update({e.place: v for e, v in self._values.items() if which(e)})
 
     def save(self) -> None:
         """Keep all parameters; set-points and the controlword are none."""
         self._values = {
-            key: self._dictionary.numbers[key]
-            for key, entry in self._dictionary.entries.items()
-            if entry.access in ("rw", "rww") and entry.size is not None and entry.index not in _NOT_STORED
+            entry: self._dictionary.numbers[entry.place]
+            for entry in self._dictionary.entries.values()
+            if entry.access in ("rw", "rww", "rwr") and entry.size is not None and entry.index not in _NOT_STORED
         }
 
     def forget(self) -> None:

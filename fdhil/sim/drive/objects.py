@@ -169,7 +169,7 @@ def _vendor() -> list[Object]:
         var(0x2101, "Terminal voltage, mean of the SYNC period", I16, "ro", mappable=True),
         record(0x2110, "Temperatures", Entry(0x2110, 1, "Slide-way temperature", I16, "ro", 2000, mappable=True)),
         var(0x2120, "Trace buffer", DataType.DOMAIN, "ro", b""),
-        var(0x2121, "Trace buffer clear", U8, "wo", low=1, high=1),
+        var(0x2121, "Trace buffer clear", U8, "wo", 1, low=1, high=1),
     ]
 
 

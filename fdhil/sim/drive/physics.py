@@ -260,6 +260,11 @@ class Physics:
         """Limit the current demand below the configured limit."""
         self._loops[I_MAX] = min(limit_a, self._current_limit_a)
 
+    @property
+    def table_speed_rad_s(self) -> float:
+        """The table's speed, as that of a shaft that it follows."""
+        return self.speed_rad_s
+
     def rehearse(self) -> None:
         """Run one cycle on a copy of the state: when this returns the kernels are compiled, which takes seconds."""
         self._run(self._state.copy(), self.voltage_v.copy(), False, (0.0,) * 8)

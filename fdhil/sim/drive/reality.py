@@ -74,6 +74,12 @@ class RealPhysics(Physics):
     def limit_current(self, limit_a: float) -> None:
         self._g[cycle.I_MAX] = min(limit_a, self._regulators.current_limit_a)
 
+    @property
+    def table_speed_rad_s(self) -> float:
+        """The table's speed, as that of a shaft that it follows."""
+        p, angle = self._p, float(self._x[cycle.TABLE])
+        return float(self._x[cycle.TABLE_SPEED] * (1.0 + p[cycle.PITCH] * math.cos(angle) + p[cycle.PITCH_RATE]))
+
     def rehearse(self) -> None:
         """Run one cycle on a copy of the state: when this returns the kernels are compiled."""
         self._run_real(self._x.copy(), self.voltage_v.copy(), False, (0.0,) * 8)

@@ -14,13 +14,14 @@ import numpy as np
 from fdhil.config import MachineConfig, SimAxis
 from fdhil.sim.drive.axis_plant import AxisPlant, sensor_noise, switches
 from fdhil.sim.drive.dictionary import Dictionary
+from fdhil.sim.drive.dress import dress
 from fdhil.sim.drive.drive_cycle import DriveCycle
 from fdhil.sim.drive.emergency_and_heartbeat import FOLLOWING_ERROR
 from fdhil.sim.drive.feedback import INT16, Feedback, clip
 from fdhil.sim.drive.motion import Motion
 from fdhil.sim.drive.node import OPERATIONAL, CanopenNode
 from fdhil.sim.drive.object_write_rules import register_write_rules
-from fdhil.sim.drive.objects import Ratings, drive_objects
+from fdhil.sim.drive.objects import Ratings
 from fdhil.sim.drive.own_clock import OwnClock
 from fdhil.sim.drive.physics import Physics, check_structure
 from fdhil.sim.drive.power import PowerStage
@@ -45,9 +46,9 @@ class Drive(CanopenNode):
         self.ratings = Ratings.of(config, axis)
         self._plant = AxisPlant(config, axis, twin)
         real = real_loops(twin.reality, section.regulators)
-        super().__init__(
-            Dictionary(drive_objects(config, axis)), self.ratings.node_id, DriveFaults(), boot_s=twin.boot_s
-        )
+        self.dress = dress(config, axis)
+        objects = Dictionary(self.dress.objects, self.dress.within)
+        super().__init__(objects, self.ratings.node_id, DriveFaults(), boot_s=twin.boot_s)
         self.power = PowerStage(self.dictionary.number)
         self.motion = Motion(
             self.dictionary,
@@ -68,6 +69,7 @@ class Drive(CanopenNode):
             self.power,
             self.motion,
             Sensors(sensor_noise(config, twin), self.faults, rng),
+            self.dress.gauges,
         )
         self._cycle = DriveCycle(
             self.dictionary, self.ratings, self._plant, self.power, self.motion, self.feedback, self.faults
@@ -237,7 +239,8 @@ class Drive(CanopenNode):
 
     def set_object(self, index: int, sub: int, value: int) -> None:
         """Write an object past all access rules, as another tool or a wrong set-up would have; KeyError if unknown."""
-        self.dictionary.numbers[self.dictionary.entries[index << 8 | sub].key] = value
+        entry = self.dictionary.entries[index << 8 | sub]
+        self.dictionary.numbers[entry.place] = entry.number(value)
 
     def remap(self, index: int, entries: list[tuple[int, int, int]]) -> None:
         """Change a mapping parameter (0x1600 to 0x1603, 0x1A00 to 0x1A03) past all rules, even in operational."""

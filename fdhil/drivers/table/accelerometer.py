@@ -1,0 +1,168 @@
+"""Reads an accelerometer at the table that streams a line of text per sample over a serial port."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections import deque
+
+import numpy as np
+
+from fdhil.config import Accelerometer
+from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.serial.lines import LineReader, TextLine
+from fdhil.drivers.serial.port import SerialPort
+from fdhil.drivers.table.arrivals import Arrivals
+from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
+from fdhil.records import Notice, TableSamples, frozen
+
+SILENCE_NS = 1_000_000_000
+SETTLED_NS = 50_000_000  # an arrival is placed when so many later SYNCs have shown which stamps about it were late
+WRAPS = (1 << 8, 1 << 16, 1 << 24, 1 << 32)  # where counts of devices begin anew
+LARGEST_GAP = 5000  # samples that may be lost in one go; a larger step is another count
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+
+
+class SerialStream:
+    """The connection to a device that talks by itself."""
+
+    wire = "serial"
+
+    def __init__(self, name: str, settings: Accelerometer) -> None:
+        self.name, self.place = name, settings.device
+        self._port = SerialPort(settings)
+        self._reader = LineReader(self._port, name)
+        self._heard_ns = 0
+
+    @property
+    def connected(self) -> bool:
+        """Whether the port is open."""
+        return self._port.is_open
+
+    async def connect(self) -> None:
+        """Open the port; ConnectError when it cannot be had."""
+        self._port.open(self.name)
+        self._heard_ns = time.monotonic_ns()
+
+    async def lines(self) -> list[TextLine]:
+        """Return the lines that have come; DeviceTimeout when none has for a second, ConnectError."""
+        found = []
+        while (line := await self._reader.next_line(time.monotonic_ns())) is not None:
+            found.append(line)
+        if found:
+            self._heard_ns = found[-1].t_ns
+        elif time.monotonic_ns() - self._heard_ns > SILENCE_NS:
+            self._heard_ns = time.monotonic_ns()
+            raise DeviceTimeout(
+                self.name, f"nothing comes from {self.place}; check that the sensor streams, and its rate"
+            )
+        return found
+
+    def fault_code(self, error: DeviceError) -> str | None:
+        """Return the class under which ``error`` is told."""
+        if isinstance(error, DeviceTimeout):
+            return "TableSilent"
+        return "SerialPortGone" if isinstance(error, ConnectError) else "SerialShape"
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()
+
+
+class StreamedAccelerometer:
+    """The accelerometer of one axis: ``samples`` came, ``lost`` are missing by the sensor's own count."""
+
+    def __init__(self, axis: str, settings: Accelerometer, period_s: float) -> None:
+        self.axis = axis
+        self.name = f"accelerometer {axis}"
+        self.link = SerialStream(self.name, settings)
+        self.samples = self.lost = 0
+        self._settings = settings
+        self._period_s = period_s
+        self._arrivals = Arrivals(settings.rate_hz, period_s)
+        self._waiting: deque[tuple[int, int]] = deque(maxlen=1000)
+        self._held: list[tuple[int, float]] = []
+        self._newest: int | None = None
+        self._told: int | None = None
+
+    async def poll(self, ticks: TickClock) -> list[TableSamples | Notice]:
+        """Return what has come since the last time; errors of the link pass, ProtocolError where none is a sample."""
+        return self.accept(await self.link.lines(), ticks)
+
+    async def reading(self) -> str:
+        """Return the newest sample, for people."""
+        until_ns = time.monotonic_ns() + SILENCE_NS
+        while not (found := await self.link.lines()):
+            if time.monotonic_ns() > until_ns:
+                raise DeviceTimeout(self.name, f"nothing comes from {self.link.place}; check that the sensor streams")
+        return f"{self._numbers(found[-1].text)[1]:.2f} m/s2"
+
+    def accept(self, lines: list[TextLine], ticks: TickClock) -> list[TableSamples | Notice]:
+        """Place lines on the SYNC count. Pure but for this object's own memory."""
+        lost_before = self.lost
+        for line in lines:
+            try:
+                told = self._numbers(line.text)
+            except ProtocolError:  # the first line was under way when the port was opened; others are damaged
+                if line is lines[-1] and len(lines) > 1 and not self._held:
+                    raise
+                continue
+            self._held.append(self._counted(*told))
+            self.samples += 1
+            self._waiting.append((self._held[-1][0], line.t_ns))
+        while self._waiting and ticks.covers(self._waiting[0][1] + SETTLED_NS):
+            count, t_ns = self._waiting.popleft()
+            if (between := ticks.bounds(t_ns, t_ns)) is not None:
+                self._arrivals.add(count, sum(between) / 2)
+        out: list[TableSamples | Notice] = [*self._placed()]
+        if self.lost > lost_before:
+            text = f"The {self.name} lost {self.lost - lost_before} samples, moves in them are seen without it."
+            out.append(Notice("SampleTiming", "minor", text, self.axis))
+        return out
+
+    def _numbers(self, text: str) -> tuple[int | None, float]:
+        """Return count and value of a line; ProtocolError where it has none."""
+        s = self._settings
+        numbers = _NUMBER.findall(text)
+        if len(numbers) < max(s.column, s.count_column):
+            wanted = max(s.column, s.count_column)
+            told = f"the line {text[:40]!r} has {len(numbers)} numbers, and number {wanted} is asked for"
+            raise ProtocolError(self.name, f"{told}; compare column and count_column with what the sensor sends")
+        count = int(float(numbers[s.count_column - 1])) if s.count_column else None
+        return count, float(numbers[s.column - 1]) * s.scale
+
+    def _counted(self, told: int | None, value: float) -> tuple[int, float]:
+        """Return the count without its beginnings anew; a count of another kind begins another stream."""
+        before = self._newest
+        step = 1 if told is None or self._told is None else _step(self._told, told)
+        if before is None or not 1 <= step <= LARGEST_GAP:
+            self._held.clear()
+            self._waiting.clear()
+            self._arrivals = Arrivals(self._settings.rate_hz, self._period_s)
+            self._newest = told or 0
+        else:
+            self.lost += step - 1
+            self._newest = before + step
+        self._told = told
+        return self._newest, value
+
+    def _placed(self) -> list[TableSamples]:
+        """Return the samples that wait as one record, once it is known where they are."""
+        line = self._arrivals.line()
+        if line is None or not self._held:
+            return []
+        counts, values = (np.array(column) for column in zip(*self._held, strict=True))
+        self._held.clear()
+        late = self._settings.late_s / self._period_s
+        tick = line.start + line.step * (counts - line.origin) - late
+        return [
+            TableSamples(
+                self.axis, "table_m_s2", frozen(tick), line.error, frozen(values), rate_per_tick=1.0 / line.step
+            )
+        ]
+
+
+def _step(before: int, told: int) -> int:
+    """Return by how much a count rose, which may have begun anew at the next place where counts do."""
+    wrap = next((w for w in WRAPS if w > before), WRAPS[-1])
+    return told - before if told > before else told - before + wrap

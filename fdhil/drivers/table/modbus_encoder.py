@@ -1,0 +1,51 @@
+"""Asks an encoder at the table behind Modbus: an SSI or EnDat module, which tells where the table stands."""
+
+from __future__ import annotations
+
+import asyncio
+
+from fdhil.config import TableEncoder
+from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.modbus.link import ModbusLink
+from fdhil.drivers.modbus.meter import ModbusMeter
+from fdhil.records import TableSamples, frozen
+
+SETTLE_STEPS, SETTLE_STEP_S = 8, 0.01  # until the SYNCs about the answer have been drained
+
+
+class ModbusEncoder:
+    """The table encoder of one axis; ``samples`` counts readings, none can be ``lost``."""
+
+    lost = 0
+
+    def __init__(self, axis: str, settings: TableEncoder) -> None:
+        self.axis = axis
+        self.name = f"table encoder {axis}"
+        self.samples = 0
+        self._meter = ModbusMeter(self.name, settings, settings, settings.type)
+        self._period_s = settings.period_s
+
+    @property
+    def link(self) -> ModbusLink:
+        """The module's connection."""
+        return self._meter.link
+
+    async def poll(self, ticks: TickClock) -> list[TableSamples]:
+        """Rest for the period and read once; it was read between question and answer. Errors of the link pass."""
+        await asyncio.sleep(self._period_s)
+        value = await self._meter.value()
+        self.samples += 1
+        asked_ns, answered_ns = self._meter.asked_ns, self._meter.answered_ns
+        for _ in range(SETTLE_STEPS):
+            if not ticks.running or ticks.covers(answered_ns):
+                break
+            await asyncio.sleep(SETTLE_STEP_S)
+        between = ticks.bounds(asked_ns, answered_ns)
+        if between is None:
+            return []
+        tick = frozen([(between[0] + between[1]) / 2])
+        return [TableSamples(self.axis, "table_mm", tick, (between[1] - between[0]) / 2, frozen([value]))]
+
+    async def reading(self) -> str:
+        """Read once, for people."""
+        return f"{await self._meter.value():.4f} mm"

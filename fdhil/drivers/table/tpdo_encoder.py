@@ -1,0 +1,63 @@
+"""Decodes the TPDO of an encoder at the table: a second axis' place, or that of an encoder node. Pure."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fdhil.cia402 import PdoEntry
+from fdhil.config import TableEncoder
+from fdhil.config.table import IN_A_FRAME
+from fdhil.drivers.can.sync_grid import Ticked
+from fdhil.drivers.cia402.pdo_queue import decode
+from fdhil.records import Notice, TableSamples, frozen
+
+SILENT_TICKS = 3000  # of SYNC without that TPDO: then it is told
+
+
+class TpdoEncoder:
+    """The table encoder of one axis; ``feed`` takes ticked frames of its bus, ``short`` counts frames too short."""
+
+    def __init__(self, axis: str, settings: TableEncoder) -> None:
+        assert settings.cob_id is not None  # the configuration has seen to it
+        self.axis = axis
+        self.short = 0
+        self._settings = settings
+        self._cob_id = settings.cob_id
+        bits = IN_A_FRAME[settings.type]
+        self._entry = PdoEntry(0, 0, bits, settings.type.startswith("int"), 8 * settings.byte)
+        self._newest = -1
+        self._heard_at: int | None = None
+        self._silent = False
+
+    def feed(self, ticked: Ticked) -> list[TableSamples | Notice]:
+        """Return the samples of a block, and what must be told. Of two frames after one SYNC neither is sure."""
+        out: list[TableSamples | Notice] = []
+        mine = (ticked.can_id == self._cob_id).nonzero()[0]
+        long_enough = ticked.length[mine].astype(np.int64) * 8 >= self._entry.bit_offset + self._entry.bits
+        self.short += int(np.count_nonzero(~long_enough))
+        mine = mine[long_enough & (ticked.tick[mine] >= 0)]
+        tick, first, count = np.unique(ticked.tick[mine], return_index=True, return_counts=True)
+        sure = (count == 1) & (tick > self._newest)
+        if tick.size:
+            self._newest = self._heard_at = int(tick[-1])
+        if sure.any():
+            counts = decode(self._entry, ticked.data[mine[first[sure]]])
+            values = frozen(counts * self._settings.scale + self._settings.offset)
+            out.append(TableSamples(self.axis, "table_mm", frozen(tick[sure]), 0.0, values))
+        return out + self._silence(ticked.last_tick)
+
+    def _silence(self, last_tick: int) -> list[Notice]:
+        if self._heard_at is None:
+            self._heard_at = last_tick
+        was, self._silent = self._silent, last_tick - self._heard_at > SILENT_TICKS
+        if self._silent and not was:
+            text = (
+                f"No TPDO {self._cob_id:#x} with the place of table {self.axis} comes, its compliance is not seen; "
+                "check that its node is started, that the TPDO is synchronous, and cob_id."
+            )
+            return [Notice("TableSilent", "minor", text, self.axis)]
+        return (
+            [Notice("TableSilent", "info", "The table encoder is heard.", self.axis)]
+            if was and not self._silent
+            else []
+        )

@@ -1,0 +1,116 @@
+"""Keeps the recent samples of the sensors at one axis' table, and lays them on the rows of a stretch. Pure."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdhil.records import Float, TableSamples, TableSignal, frozen
+
+UNSURE_MM = 2e-3  # a place whose instant is so uncertain that the table may have gone further is not used
+LONGEST_STEP = 1.5  # samples of an acceleration; beyond it one was lost
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """What the motor does from tick ``start`` on: ``position_mm`` and ``speed_mm_tick`` (n,), lost ones NaN."""
+
+    start: int
+    position_mm: Float
+    speed_mm_tick: Float
+
+    @property
+    def tick(self) -> Float:
+        """The rows' ticks (n,)."""
+        return self.start + np.arange(self.position_mm.size, dtype=np.float64)
+
+
+class RecentTable:
+    """The newest ``capacity`` ticks of what an axis' table encoder and accelerometer said."""
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._blocks: dict[TableSignal, deque[TableSamples]] = {"table_mm": deque(), "table_m_s2": deque()}
+
+    def clear(self) -> None:
+        """Forget everything."""
+        for blocks in self._blocks.values():
+            blocks.clear()
+
+    def add(self, block: TableSamples) -> None:
+        """Append a block and let go what is older than the capacity; a count that fell began anew."""
+        if block.tick.size == 0:
+            return
+        blocks = self._blocks[block.signal]
+        if blocks and block.tick[0] < blocks[-1].tick[-1] - 1.0:
+            blocks.clear()
+        blocks.append(block)
+        while blocks[-1].tick[-1] - blocks[0].tick[-1] > self._capacity:
+            blocks.popleft()
+
+    def places(self, motion: Motion) -> Float | None:
+        """Return the table's place (n,) in the rows whose instant is known well enough, NaN in others; None if none is.
+
+        A place between two rows counts for the nearer one, less what the motor goes between both.
+        """
+        values = np.full(motion.position_mm.size, np.nan)
+        known = np.isfinite(motion.position_mm)
+        if not known.any():
+            return None
+        at = motion.tick[known]
+        for block in self._blocks["table_mm"]:
+            row = np.rint(block.tick).astype(np.int64) - motion.start
+            inside = (row >= 0) & (row < values.size)
+            row, tick, told = row[inside], block.tick[inside], block.values[inside]
+            further = np.interp(tick, at, motion.position_mm[known]) - motion.position_mm[row]
+            sure = np.abs(motion.speed_mm_tick[row]) * block.tick_error <= UNSURE_MM
+            values[row[sure]] = (told - further)[sure]
+        return frozen(values) if np.isfinite(values).any() else None
+
+    def accelerations(self, motion: Motion) -> Float | None:
+        """Return the table's acceleration (n,) at the rows, NaN where a sample is lost; None without any.
+
+        From a sensor as quick as the rows it is the mean of what lies about a row, else a cubic through its samples.
+        """
+        blocks = [b for b in self._blocks["table_m_s2"] if b.tick[-1] >= motion.start - 4]
+        n = motion.position_mm.size
+        if not blocks or not n:
+            return None
+        tick, told = (np.concatenate([getattr(b, name) for b in blocks]) for name in ("tick", "values"))
+        rising = np.concatenate([[True], np.diff(tick) > 0])
+        tick, told, rate = tick[rising], told[rising], blocks[-1].rate_per_tick
+        values = _means(tick - motion.start, told, n) if rate >= 1.0 else _cubic(tick - motion.start, told, n, 1 / rate)
+        return frozen(values) if np.isfinite(values).any() else None
+
+
+def _means(place: Float, told: Float, n: int) -> Float:
+    """Return (n,) the mean of the samples within half a row about each row."""
+    row = np.rint(place).astype(np.int64)
+    inside = (row >= 0) & (row < n)
+    count = np.bincount(row[inside], minlength=n)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        means: Float = np.bincount(row[inside], told[inside], minlength=n) / count
+    return means
+
+
+def _cubic(place: Float, told: Float, n: int, step: float) -> Float:
+    """Return (n,) the values at rows 0.. of the cubic through the two samples to either side; NaN over a lost one."""
+    values = np.full(n, np.nan)
+    if place.size < 4:
+        return values
+    rows = np.arange(n, dtype=np.float64)
+    k = np.searchsorted(place, rows, side="right") - 1
+    whole = (k >= 1) & (k < place.size - 2)
+    rows, k = rows[whole], k[whole]
+    close = np.max([np.diff(place)[k + shift] for shift in (-1, 0, 1)], axis=0) < LONGEST_STEP * step
+    rows, k = rows[close], k[close]
+    u = (rows - place[k]) / (place[k + 1] - place[k])
+    before, left, right, after = (told[k + shift] for shift in (-1, 0, 1, 2))
+    # Catmull and Rom's: the slope at a sample is that between its neighbours
+    slope, slope_after = (right - before) / 2, (after - left) / 2
+    values[np.flatnonzero(whole)[close]] = left + u * (
+        slope + u * (3 * (right - left) - 2 * slope - slope_after + u * (slope + slope_after - 2 * (right - left)))
+    )
+    return values

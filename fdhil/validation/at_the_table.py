@@ -1,0 +1,56 @@
+"""Tells what an encoder at the table saw of a move: its true error, and what of it the motor's encoder does not see."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fdhil.config import Axis
+from fdhil.identification.windows import moving_range
+from fdhil.model import closed_loop
+from fdhil.records import AtTable, Float, Parameters, Window, rms
+
+LEAST_ROWS = 20
+STANDSTILL_S = 0.05  # before the move, in which the zero of the table's encoder is taken
+
+
+def at_the_table(
+    window: Window, parameters: Parameters | None, axis: Axis | None, sync_period_s: float | None = None
+) -> AtTable | None:
+    """Return what the table's encoder saw of a move; None without one, or where it saw little of it.
+
+    Its zero is the drive's where the axis stands before the move. With the ``axis`` the closed loop of ``parameters``
+    is run along the demand, which comes every ``sync_period_s``; a constant is not left of it, since friction holds the
+    screw bent where the axis stands.
+    """
+    if window.table_mm is None:
+        return None
+    table = window.table_mm - _zero(window)
+    rows = np.isfinite(table) & np.isfinite(window.demand_mm) & np.isfinite(window.position_mm)
+    first, last = moving_range(window)
+    rows[:first] = rows[last:] = False
+    if np.count_nonzero(rows) < LEAST_ROWS:
+        return None
+    error, unseen = (1e3 * (table - other)[rows] for other in (window.demand_mm, window.position_mm))
+    predicted = _predicted(window, parameters, axis, sync_period_s or window.dt_s)
+    left = None if predicted is None else float(np.std(1e3 * (table - predicted)[rows]))
+    return AtTable(rms(error), float(np.abs(error).max()), rms(unseen), float(np.abs(unseen).max()), left)
+
+
+def _zero(window: Window) -> float:
+    """Return by how much the table's encoder counts more than the drive's where the axis stands before the move."""
+    assert window.table_mm is not None
+    apart = window.table_mm - window.position_mm
+    first = moving_range(window)[0]
+    known = apart[max(0, first - round(STANDSTILL_S / window.dt_s)) : first]
+    known = known[np.isfinite(known)] if np.isfinite(known).any() else apart[np.isfinite(apart)][:1]
+    return float(np.median(known))
+
+
+def _predicted(window: Window, parameters: Parameters | None, axis: Axis | None, sync_period_s: float) -> Float | None:
+    """Return the table's place (n,) as the model has it; None where model or loops are not known."""
+    told = parameters is not None and np.isfinite(list(parameters.as_dict().values())).all()
+    same_grid = abs(sync_period_s - window.dt_s) < 1e-3 * window.dt_s
+    if parameters is None or axis is None or not told or not same_grid or not np.isfinite(window.demand_mm).all():
+        return None
+    offset = None if window.offset_mm is None else np.nan_to_num(window.offset_mm)
+    return closed_loop.simulate(parameters, axis, sync_period_s, window.demand_mm, offset).table_mm
