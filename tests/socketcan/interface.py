@@ -15,7 +15,7 @@ import pytest
 CAN_FRAME = struct.Struct("=IB3x8s")
 _IFREQ = struct.Struct("@16sh22x")
 _SIOCGIFFLAGS, _SIOCSIFFLAGS, _SIOCGIFNAME = 0x8913, 0x8914, 0x8910
-_TIOCSETD, _N_TTY, _N_SLCAN = 0x5423, 0, 17
+_TIOCSETD, _N_SLCAN = 0x5423, 17
 _IFF_UP = 1
 
 
