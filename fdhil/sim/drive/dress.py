@@ -188,7 +188,10 @@ class _Tailor:
         own = self._own.get(entry.key)
         scale = self._scale(entry) if own is not None else 1.0
         entry = replace(entry, scale=scale, default=self._default(entry, own, scale))
-        return replace(entry, low=None, high=None) if entry.key in _SET_UP else entry
+        if entry.key in _SET_UP:
+            return replace(entry, low=None, high=None)
+        # what CiA 301 defines has the limits that it says; real files forbid what their devices must take
+        return replace(entry, low=own.low, high=own.high) if own is not None and entry.index < 0x2000 else entry
 
     def _fit_mode(self, entry: Entry) -> Entry:
         """Only what it has can be chosen; its mode of cyclic set-points is the twin's cyclic synchronous position."""
