@@ -15,7 +15,7 @@ from importlib.resources import files
 from typing import Any
 
 from fdhil.config import MachineConfig, SimAxis
-from fdhil.sim.drive.dictionary import Entry, Object, Value
+from fdhil.sim.drive.dictionary import DataType, Entry, Object, Value
 from fdhil.sim.drive.modes import CYCLIC, CYCLIC_POSITION, SUPPORTED_MODES
 from fdhil.sim.drive.objects import DEVICE_NAME, PRODUCT_CODE, REVISION, VENDOR_ID, Ratings, drive_objects
 from fdhil.sim.drive.sheet import Sheet, read_sheet
@@ -179,13 +179,13 @@ class _Tailor:
     def _fit(self, entry: Entry) -> Entry:
         if entry.key == self._setpoint:
             return replace(entry, home=_TARGET, default=0, low=None, high=None)
-        if entry.index in _VENDORS:
+        own = self._own.get(entry.key)
+        if entry.index in _VENDORS or (own is not None and not _alike(entry, own)):
             return self._fit_apart(entry)
         if entry.key in (0x606000, 0x606100):
             entry = self._fit_mode(entry)
         if entry.key == _MODES and self._mode != CYCLIC_POSITION:
             entry = replace(entry, renamed=(self._modes, self._modes | 1 << CYCLIC_POSITION - 1))
-        own = self._own.get(entry.key)
         scale = self._scale(entry) if own is not None else 1.0
         entry = replace(entry, scale=scale, default=self._default(entry, own, scale))
         if entry.key in _SET_UP:
@@ -216,7 +216,7 @@ class _Tailor:
             return self._sheet.name.encode("latin-1", "replace")
         if entry.index in range(0x1600, 0x1800) or entry.index in range(0x1A00, 0x1C00):
             return entry.default if given or entry.sub else self._mapped(entry.index)
-        if own is None or type(own.default) is not type(entry.default):
+        if own is None:
             return entry.default
         if given and entry.key not in _SET_UP:
             return entry.default
@@ -243,3 +243,9 @@ class _Tailor:
             entry = entries.get(index << 8 | sub)
             if entry is not None:
                 yield Gauge(entry, said["signal"], said["per_count"], said.get("magnitude", False))
+
+
+def _alike(entry: Entry, own: Entry) -> bool:
+    """Whether both are texts or both integers, so that one can stand for the other."""
+    reals = (DataType.REAL32, DataType.REAL64)
+    return entry.type not in reals and (entry.size is None) == (own.size is None)
