@@ -31,16 +31,30 @@ _NO_SERVICE = {0x101700: 0, 0x101900: 0}
 _SET_UP = frozenset(
     index << 8 | sub
     for indices, subs in (
-        ((0x1006, 0x6065, 0x6075, 0x6076, 0x6081, 0x6083, 0x6084, 0x6085), (0,)),
-        ((0x607D, 0x608F, 0x6091, 0x6092, 0x60C2), (1, 2)),
+        (
+            (0x1006, 0x6065, 0x6067, 0x606D, 0x606F, 0x6072, 0x6073, 0x6075, 0x6076, 0x607F, 0x6080, 0x6081, 0x6083),
+            (0,),
+        ),
+        ((0x6084, 0x6085, 0x6087, 0x609A, 0x60C5, 0x60C6), (0,)),
+        ((0x607D, 0x608F, 0x6091, 0x6092, 0x6099, 0x60C2), (1, 2)),
     )
     for index in indices
     for sub in subs
 )
 # speeds and accelerations count alike: in a speed unit, and that per second
-_SPEEDS = frozenset({0x606B, 0x606C, 0x607F, 0x6081, 0x6083, 0x6084, 0x6085, 0x60B1, 0x60C5, 0x60C6, 0x60FF})
+_SPEEDS = frozenset(
+    {
+        0x606B, 0x606C, 0x606D, 0x606F, 0x607F, 0x6081, 0x6083, 0x6084, 0x6085, 0x6099, 0x609A, 0x60B1, 0x60C5, 0x60C6,
+        0x60FF,
+    }
+)  # fmt: skip
 # revolutions/s and increments/s to a count; a millisecond's increments come as 16.16 fixed-point numbers
-_SPEED_UNITS = {"increments_per_s": (0.0, 1.0), "rpm": (1 / 60, 0.0), "increments_per_ms_16": (0.0, 1e3 / 65536)}
+_SPEED_UNITS = {
+    "increments_per_s": (0.0, 1.0),
+    "rpm": (1 / 60, 0.0),
+    "millirpm": (1 / 60e3, 0.0),
+    "increments_per_ms_16": (0.0, 1e3 / 65536),
+}
 # unit codes of 0x60A9 (CiA 303-2): revolutions, increments; seconds, minutes
 _REVOLUTIONS, _INCREMENTS, _PER = 0xB4, 0xB5, {0x03: 1.0, 0x47: 1 / 60}
 _UNITS = {"current_a": "A", "current_share": "", "voltage_v": "V", "dc_link_v": "V", "duty": ""}
