@@ -49,12 +49,7 @@ _SPEEDS = frozenset(
     }
 )  # fmt: skip
 # revolutions/s and increments/s to a count; a millisecond's increments come as 16.16 fixed-point numbers
-_SPEED_UNITS = {
-    "increments_per_s": (0.0, 1.0),
-    "rpm": (1 / 60, 0.0),
-    "millirpm": (1 / 60e3, 0.0),
-    "increments_per_ms_16": (0.0, 1e3 / 65536),
-}
+_SPEED_UNITS = {"increments_per_s": (0.0, 1.0), "rpm": (1 / 60, 0.0), "increments_per_ms_16": (0.0, 1e3 / 65536)}
 # unit codes of 0x60A9 (CiA 303-2): revolutions, increments; seconds, minutes
 _REVOLUTIONS, _INCREMENTS, _PER = 0xB4, 0xB5, {0x03: 1.0, 0x47: 1 / 60}
 _UNITS = {"current_a": "A", "current_share": "", "voltage_v": "V", "dc_link_v": "V", "duty": ""}
@@ -244,6 +239,8 @@ class _Tailor:
         return sum(1 for entry in item.entries if entry.sub and entry.default)
 
     def _scale(self, entry: Entry) -> float:
+        if entry.sub == 0 and entry.key | 1 in self._entries:  # a number of entries
+            return 1.0
         if entry.index in _SPEEDS:
             return self._speed
         return self._cut.rated_torque_nm * 1e3 if entry.index == 0x6076 else 1.0
