@@ -27,17 +27,24 @@ class Finding:
 
 
 def read_optional(master: Master, index: int, sub: int = 0, *, signed: bool = False) -> int | None:
-    """Read an integer object, None when the drive does not have it."""
+    """Read an integer object, None when the drive does not have it, or refuses to tell it."""
     try:
         return master.sdo.read_int(index, sub, signed=signed)
+    except SdoAbort:
+        return None
+
+
+def has_object(master: Master, index: int) -> bool:
+    """Whether the drive has an object, also one that it refuses to tell."""
+    try:
+        master.sdo.read(index)
     except SdoAbort as abort:
-        if abort.code in (NO_OBJECT, NO_SUB_INDEX):
-            return None
-        raise
+        return abort.code not in (NO_OBJECT, NO_SUB_INDEX)
+    return True
 
 
 def lacks(point: str, expected: str, *objects: str, needed: bool = False) -> Finding:
     """A point that cannot be compared, for the drive has no such object."""
     shown = " and ".join(objects)
     advice = "its manual says what it does instead"
-    return Finding(point, expected, f"no {shown}", None, f"it has no {shown}", advice, needed)
+    return Finding(point, expected, f"no {shown}", None, f"it has no {shown} that can be read", advice, needed)

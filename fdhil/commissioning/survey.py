@@ -1,6 +1,6 @@
 """Reads a drive by SDO and compares it with its configuration, the first half of commissioning. Nothing moves.
 
-``survey`` reads and compares everything and raises only for a drive that does not answer (SdoAbort, DeviceTimeout,
+``survey`` reads and compares everything and raises only for a drive that does not answer (DeviceTimeout,
 ProtocolError); ``require`` turns the first point that differs into a DriveFault.
 """
 
@@ -15,7 +15,7 @@ from fdhil.cia402 import Mode, Object, State
 from fdhil.commissioning.bus_listener import UNREADABLE
 from fdhil.commissioning.compare_scales import compare_scales
 from fdhil.commissioning.device_type import describe, is_drive
-from fdhil.commissioning.finding import Finding, lacks, read_optional
+from fdhil.commissioning.finding import Finding, has_object, lacks, read_optional
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import SOFTWARE_LIMIT_KEYS
 from fdhil.config import CorrectionLimits
@@ -69,7 +69,7 @@ def listen(master: Master) -> None:
     On a silent bus the drive is asked what it is: with the NC off, one that sends no heartbeat (0x1017 = 0) is silent.
     """
     end = time.monotonic() + LISTEN_S
-    while time.monotonic() < end and master.heard.sync == 0:
+    while time.monotonic() < end and master.heard.master is None:
         master.check()
         time.sleep(0.01)
     require_alone(master)
@@ -91,8 +91,10 @@ def _ask_alone(master: Master) -> None:
 
 def require_alone(master: Master) -> None:
     """ProtocolError when another master was heard; to be asked before our own SYNC starts."""
-    if master.heard.sync or master.heard.foreign_rpdo:
-        text = "an NC is sending SYNC or set-points; switch it off while an axis is commissioned"
+    sign = master.heard.master
+    if sign is not None:
+        what = "SYNC or set-points" if sign in ("SYNC", "set-points") else sign
+        text = f"an NC is sending {what}; switch it off while an axis is commissioned"
         raise ProtocolError(f"bus {master.bus.name}", text)
 
 
@@ -136,9 +138,10 @@ def compare_device(master: Master) -> Finding:
         return Finding("device", expected, expected)
     found = describe(own)
     if own is None or own & 0xFFFF == 0:  # some drives follow CiA 402 and do not say so
-        has_power_state = read_optional(master, 0x6041) is not None
-        cause = "it names no device profile (0x1000)" + ("" if has_power_state else " and has no statusword (0x6041)")
-        return Finding("device", expected, found, None if has_power_state else False, cause, advice)
+        cause = "it names no device profile (0x1000)"
+        if has_object(master, Object.STATUSWORD):
+            return Finding("device", expected, found, None, cause, "see in its manual that it follows CiA 402")
+        return Finding("device", expected, found, False, f"{cause} and has no statusword (0x6041)", advice)
     return Finding("device", expected, found, False, f"it is no CiA 402 drive: 0x1000 says {found}", advice)
 
 
@@ -147,9 +150,15 @@ def compare_identity(profile: DriveProfile, identity: Identity) -> Finding:
     wanted = ((profile.vendor_id, identity.vendor_id), (profile.product_code, identity.product_code))
     shown = f"vendor {identity.vendor_id:08X}, product {identity.product_code:08X}"
     vendor, product = ("any" if number is None else f"{number:08X}" for number, _ in wanted)
+    expected = f"vendor {vendor}, product {product}"
+    if all(found in (number, 0) or number is None for number, found in wanted) and (
+        any(number and not found for number, found in wanted)
+    ):
+        cause = f"it does not tell who it is: {shown} (0x1018)"
+        return Finding("identity", expected, shown, None, cause, "see by its label that the profile is the right one")
     same = all(number in (None, found) for number, found in wanted)
     cause = f"it is {shown}, which profile {profile.name} is not made for"
-    return Finding("identity", f"vendor {vendor}, product {product}", shown, same, cause, "choose another profile")
+    return Finding("identity", expected, shown, same, cause, "choose another profile")
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,8 +194,9 @@ def _read_pdo(master: Master, parameter: int, mapping: int) -> PdoFound:
     cob_id = read_optional(master, parameter, 1)
     if cob_id is None:
         return PdoFound(parameter, mapping, INVALID_COB_ID, 0, ())
-    mapped = tuple(master.sdo.read_int(mapping, sub) for sub in range(1, master.sdo.read_int(mapping, 0) + 1))
-    return PdoFound(parameter, mapping, cob_id, master.sdo.read_int(parameter, 2), mapped)
+    count = read_optional(master, mapping, 0) or 0
+    mapped = tuple(read_optional(master, mapping, sub) or 0 for sub in range(1, count + 1))
+    return PdoFound(parameter, mapping, cob_id, read_optional(master, parameter, 2) or 0, mapped)
 
 
 def compare_pdo(spec: PdoSpec, found: PdoFound, node_id: int) -> Finding:

@@ -17,7 +17,7 @@ from fdhil.identification.innovations import whiten
 from fdhil.identification.kalman import LOAD
 from fdhil.identification.motion import BROKEN, UNKNOWN, Course, Modes, Motion
 from fdhil.identification.normal import inverse_of
-from fdhil.identification.spring_torques import MOST_OF_ROWS, Spring, Torques
+from fdhil.identification.spring_torques import LEAST_SHARE, MOST_OF_ROWS, MOST_SHARE, Spring, Torques
 from fdhil.records import Float
 
 RESONANCE, SHARE, DAMPING = "resonance", "resonance_share", "resonance_damping"
@@ -27,6 +27,7 @@ TOLD_DOUBT = 0.05  # relative, of a resonance that is configured
 FOUND_DOUBT = 1.0  # relative, of one that is sought
 GRID = np.geomspace(40.0, 320.0, 24)  # Hz, where one is sought
 AROUND = np.array([0.92, 0.96, 1.0, 1.04, 1.08])  # of a configured resonance, where it may begin
+FAR, FIRM = 0.35, 1e4  # relative, of a resonance from the configured one; of the prior's information, to hold it
 TURNS = 4
 SETTLED = np.array([0.005, 0.01])  # relative in f, and in s
 STEP = 0.02  # of f and s, over which their derivatives are taken
@@ -42,10 +43,22 @@ class Told:
     hertz: float
     hertz_std: float
     damping: float = USUAL_DAMPING
+    firm: bool = False
+    """Whether the data are not asked for f and s."""
+
+    @property
+    def std(self) -> Float:
+        """The standard deviations (2,) of f and s."""
+        return np.array([self.hertz_std, SHARE_DOUBT])
 
     def precision(self) -> Float:
-        """Return (2,) the inverse variances of f and s."""
-        return np.array([self.hertz_std, SHARE_DOUBT]) ** -2.0
+        """Return (2,) the information about f and s."""
+        return self.std**-2.0 * (FIRM if self.firm else 1.0)
+
+    def allows(self, spring: Spring) -> bool:
+        """Return whether data may tell such a spring: what they put far from it is something else."""
+        near = abs(spring.hertz / self.hertz - 1.0) < (FAR if self.hertz_std < self.hertz else FOUND_DOUBT)
+        return near and LEAST_SHARE < spring.share < MOST_SHARE
 
     def away(self, spring: Spring) -> Float:
         """Return (2,) how far f and s should move from ``spring`` by what is known alone."""
@@ -78,10 +91,11 @@ def sprung(base: Fit, axis: Axis | None) -> Fit | None:
         return None
     known = told or Told(best, FOUND_DOUBT * best)
     found = _turned(base, Spring(best, USUAL_SHARE, known.damping), known)
-    if found is None:
-        return None
-    result, cost = found
-    return result if told is not None or _cost(base) - cost > SURE else None
+    if told is not None:
+        if found is None:
+            found = _turned(base, Spring(told.hertz, USUAL_SHARE, told.damping), replace(told, firm=True))
+        return None if found is None else found[0]
+    return found[0] if found is not None and _cost(base) - found[1] > SURE else None
 
 
 def _scores(base: Fit, grid: Float) -> Float:
@@ -89,7 +103,7 @@ def _scores(base: Fit, grid: Float) -> Float:
     motion, theta = base.problem.motions[0], base.theta
     torques = Torques.of(motion, theta)
     springs = [Spring(float(hertz), USUAL_SHARE, USUAL_DAMPING) for hertz in grid]
-    columns = base.problem.answer(theta, [[Course(RESONANCE, LOAD, torques.begun(one)) for one in springs]])
+    columns = base.problem.answer(theta, [[Course(RESONANCE, LOAD, values) for values in torques.begun(springs)]])
     jacobian, inverse = base.jacobian, inverse_of(base.information)[0]
     beyond = columns - jacobian @ (inverse @ (jacobian.T @ columns))
     powers = np.maximum(np.einsum("mg,mg->g", beyond, beyond), 1e-12)
@@ -98,7 +112,7 @@ def _scores(base: Fit, grid: Float) -> Float:
 
 
 def _turned(base: Fit, spring: Spring, told: Told) -> tuple[Fit, float] | None:
-    """Return the fit with the spring, and minus twice its log likelihood; None where there is none."""
+    """Return the fit with the spring, and minus twice its log likelihood; None where it tells none."""
     plain, theta = base.problem.motions[0], base.theta
     free = (*base.free, theta.size, theta.size + 1)
     for _ in range(TURNS):
@@ -108,6 +122,8 @@ def _turned(base: Fit, spring: Spring, told: Told) -> tuple[Fit, float] | None:
         made = _with_prior(made, spring, told)
         theta, before = made.theta[:-2], spring
         spring = spring.moved(*made.theta[-2:])
+        if not told.allows(spring):
+            return None
         if (np.abs([spring.hertz / before.hertz - 1, spring.share - before.share]) < SETTLED).all():
             break
     torques = Torques.of(plain, theta)
@@ -150,16 +166,16 @@ def _surely(motion: Motion) -> Modes:
 
 def _with_prior(made: Fit, spring: Spring, told: Told) -> Fit:
     """Return the fit with what is known of f and s beforehand, as one more observation of each."""
-    prior = np.zeros(len(made.free))
-    prior[-2:] = told.precision()
+    prior, std = np.zeros((2, len(made.free)))
+    prior[-2:], std[-2:] = told.precision(), told.std
     information = made.information + np.diag(prior)
     theta, pull = made.theta.copy(), np.zeros(len(made.free))
     pull[-2:] = prior[-2:] * (told.away(spring) - theta[-2:])
     theta[list(made.free)] += inverse_of(information)[0] @ pull
     problem = pose(made.problem.motions, theta, made.problem.noises)
-    return replace(
-        made, theta=theta, information=information, residuals=problem.residuals(theta), problem=problem, prior=prior
-    )
+    residuals = problem.residuals(theta)
+    made = replace(made, theta=theta, information=information, residuals=residuals, problem=problem)
+    return replace(made, prior=prior, prior_std=std)
 
 
 def _cost(made: Fit) -> float:

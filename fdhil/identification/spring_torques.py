@@ -12,6 +12,7 @@ means over intervals: what is linear makes of means the means of what it makes.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -130,21 +131,29 @@ class Torques:
 
     def answer(self, spring: Spring) -> Answer:
         """Return what a spring makes of torques."""
-        w, ratio = 2 * math.pi * spring.hertz, spring.share / (1.0 - spring.share)
-        swing = self.seen * self.p**2 / (self.p**2 + 2 * spring.damping * w * self.p + w**2)
+        ratio, swing = spring.share / (1.0 - spring.share), self._swing(spring)
         motor = 1.0 + ratio * swing
         told = np.square(np.abs(motor)) * self.noise_current
         return Answer(ratio, swing, motor, self.noise_speed / np.maximum(self.noise_speed + told, 1e-300))
+
+    def _swing(self, spring: Spring) -> Spectrum:
+        w, square = 2 * math.pi * spring.hertz, self.p**2
+        return self.seen * square / (square + (2 * spring.damping * w) * self.p + w**2)
 
     def best(self, answer: Answer) -> Spectrum:
         """Return the torque on the motor as current and acceleration tell it together."""
         by_motion = (self.inertial + self.table_whole * (1.0 - answer.swing)) / answer.motor
         return by_motion + answer.of_current * (self.motor_whole - by_motion)
 
-    def begun(self, spring: Spring) -> Float:
-        """Return the torque (n,) that a spring would add to what so far is one stiff mass."""
-        stiff = self.answer(replace(spring, share=0.0))
-        return self.back(self.answer(spring).added(self.best(stiff), self.table_whole))
+    def begun(self, springs: Sequence[Spring]) -> list[Float]:
+        """Return the torque (n,) that each spring would add to what so far is one stiff mass."""
+        still = Spring(springs[0].hertz, 0.0, springs[0].damping)
+        motor = self.best(self.answer(still))
+        ratios = [one.share / (1.0 - one.share) for one in springs]
+        return [
+            self.back(-self._swing(one) * (ratio * motor + self.table_whole))
+            for one, ratio in zip(springs, ratios, strict=True)
+        ]
 
     def felt(self, answer: Answer) -> Float:
         """Return the torque (n,) that the spring adds by the six alone: the terms' own courses have theirs."""

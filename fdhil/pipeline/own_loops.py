@@ -6,7 +6,7 @@ Where other loops do not explain them, a resonance between motor and table may.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 from fdhil.config import Axis, Identification
 from fdhil.identification.loops import better_loops, identify_loops, with_loops
@@ -68,12 +68,12 @@ def better_axis(axis: Axis | None, found: LoopEstimate | None) -> Axis | None:
     return with_loops(axis, found) if axis is not None and found is not None and better_loops(found) else None
 
 
-def softened(outcomes: Sequence[WindowOutcome], axis: Axis | None, sync_period_s: float | None) -> Axis | None:
-    """Return the axis with the resonance that explains those of the outcomes that its loops do not; else None."""
-    refused = [o for o in outcomes if suspected([o])]
-    if axis is None or sync_period_s is None or not refused or own(refused[0].window, axis) is None:
+def softened(outcomes: Collection[WindowOutcome], axis: Axis | None, sync_period_s: float | None) -> Axis | None:
+    """Return the axis with the resonance that explains outcomes that its loops do not, or all; else None."""
+    left = [o for o in outcomes if suspected([o])] or [o for o in outcomes if o.verdict.accepted]
+    if axis is None or sync_period_s is None or not left or own(left[0].window, axis) is None:
         return None
-    told = [(o.window, mechanics_of(o, axis)) for o in refused]
+    told = [(o.window, mechanics_of(o, axis)) for o in left]
     return softer_axis([(w, plant) for w, plant in told if plant is not None], axis, sync_period_s)
 
 
@@ -88,11 +88,17 @@ def explained(
 
     ``again`` analyses its windows with another section of the axis.
     """
+    softer = softened(outcomes, axis, sync_period_s)
+    if softer is not None:
+        soft = again(softer)
+        if not suspected(soft):
+            return soft, None
     loops = loops_of(outcomes, axis, settings, sync_period_s) if suspected(outcomes) else None
     better = better_axis(axis, loops)
-    if better is not None:
-        outcomes = again(better)
-    softer = softened(outcomes, better or axis, sync_period_s)
+    if better is None:
+        return outcomes, loops
+    outcomes = again(better)
+    softer = softened(outcomes, better, sync_period_s)
     return (outcomes if softer is None else again(softer)), loops
 
 
@@ -131,14 +137,22 @@ class OwnLoops:
             self._refused, self._due = 0, 2 * self._due
         elif self._seen != ENOUGH:
             return outcome, None
-        found = loops_of(tuple(self._outcomes), self._configured, self._settings, self._period_s, growing=wanted)
+        softer = softened(self._outcomes, self.axis, self._period_s)
+        if softer is not None:
+            soft = analyse(window, self._settings, softer, self._period_s)
+            if not suspected([soft]):
+                self.axis, outcome, wanted = softer, soft, False
+        if suspected([outcome]) or self._seen == ENOUGH:
+            return self._through_loops(window, outcome, growing=wanted)
+        return outcome, None
+
+    def _through_loops(
+        self, window: Window, outcome: WindowOutcome, *, growing: bool
+    ) -> tuple[WindowOutcome, LoopEstimate | None]:
+        """Return the outcome of a window by the loops that the newest rapids show, and those loops."""
+        found = loops_of(tuple(self._outcomes), self._configured, self._settings, self._period_s, growing=growing)
         better = better_axis(self._configured, found)
-        if better is not None:
-            known = self.axis.resonance_hz if self.axis is not None else None
-            self.axis = better.model_copy(update={"resonance_hz": known})
-            outcome = analyse(window, self._settings, self.axis, self._period_s) if wanted else outcome
-        softer = softened([*self._outcomes, outcome], self.axis, self._period_s) if suspected([outcome]) else None
-        if wanted and softer is not None:
-            self.axis = softer
-            outcome = analyse(window, self._settings, softer, self._period_s)
-        return outcome, found
+        if better is None or self.axis is None:
+            return outcome, found
+        self.axis = better.model_copy(update={"resonance_hz": self.axis.resonance_hz})
+        return (analyse(window, self._settings, self.axis, self._period_s) if growing else outcome), found

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import can
 import pytest
 
 from fdhil import config as machine_config
+from fdhil.cli.demo.processes import Process
 from fdhil.drivers.bus_source import BusSource
 from fdhil.records import AxisSamples, Notice
 from fdhil.sim.wire.hub import Hub
@@ -142,3 +144,25 @@ def test_a_foreign_drive_without_the_profiles_tpdos_is_told_and_loses_nothing(
     assert "never sent TPDO3 (385), TPDO4 (485) though SYNC runs" in told["PdoMissing"]
     assert source.decoder.counters()["pdo_lost"] == 0
     assert sum(record.tick.size for record in out if isinstance(record, AxisSamples)) == 0
+
+
+@pytest.mark.debian
+def test_the_daemon_waits_for_a_foreign_drive_that_says_nothing(hub: Hub, machine: Path, tmp_path: Path) -> None:
+    """With the NC off a drive without a heartbeat is silent: the daemon listens on, and hears it when the NC comes."""
+    log = tmp_path / "daemon.log"
+    with slave("slave.js", hub, DRIVE) as peer, joined(hub) as (master,):
+        peer.event("ready")
+        with Process("daemon", ["fdhil", "run", str(machine)], log) as daemon:
+            _wait(daemon, lambda: "BusSilent: Nothing is heard on bus can0" in log.read_text())
+            master.send(can.Message(arbitration_id=0, data=[1, NODE], is_extended_id=False))
+            for _ in range(20):
+                master.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+            _wait(daemon, lambda: "BusSilent: Bus can0 is heard again" in log.read_text())
+            assert daemon.stop() == 0
+    assert "ready: bench, axes X; listening, sending nothing" in log.read_text()
+
+
+def _wait(process: Process, done: Callable[[], bool]) -> None:
+    while not done():
+        process.check()
+        time.sleep(0.05)

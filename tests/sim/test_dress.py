@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import configparser
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -223,8 +224,7 @@ def test_the_nc_leads_a_drive_by_the_mapping_that_it_has(tmp_path: Path) -> None
     twin.run(20)
     (error,) = [event["text"] for event in twin.events if event["event"] == "error"]
     assert error.startswith("drive X has 6064 in no PDO")
-    rig = Rig(twin.machine.config)
-    rig.drive = twin.machine.units["X"].drive
+    rig = Rig.of(twin.machine.units["X"].drive)
     remap(rig, 0x1800, 0x181, 255, 0x60410010)
     remap(rig, 0x1802, 0x381, 2, 0x30D10220, 0x60640020)
     twin.switch_on()
@@ -245,3 +245,30 @@ def test_the_eds_it_writes_is_of_what_it_wears(wear: Callable[[str], Rig], sheet
             assert int.from_bytes(node.sdo.upload(entry.index, entry.sub), "little") >= 0, f"{key:06X}"
     assert isinstance(node.object_dictionary[0x6041], canopen.objectdictionary.ODVariable)
     assert f"VendorNumber=0x{rig.drive.dress.vendor:08X}" in own_eds_text(rig.drive)
+
+
+@pytest.mark.parametrize("sheet", [None, *SHEETS])
+def test_the_eds_it_writes_keeps_the_rules(tmp_path: Path, sheet: str | None) -> None:
+    """CiA 306, as strict readers hold it: no DOMAIN has a mapping, each default is in its limits, counts are right."""
+    rig = Rig(dressed(write_eds(sheet, tmp_path))) if sheet else Rig()
+    eds = configparser.ConfigParser(strict=True, interpolation=None)
+    eds.read_string(own_eds_text(rig.drive))
+    listed = [
+        int(index, 0)
+        for group in ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects")
+        for key, index in eds[group].items()
+        if key != "supportedobjects"
+    ]
+    assert sorted(listed) == [item.index for item in rig.drive.dictionary]
+    for title in eds.sections():
+        section = eds[title]
+        if "ObjectType" not in section:
+            continue
+        if section["ObjectType"] == "0x2":
+            assert "PDOMapping" not in section
+        if "SubNumber" in section:
+            assert section.getint("SubNumber") == sum(name.startswith(f"{title}sub") for name in eds.sections())
+        default = section.get("DefaultValue", "")
+        for key, sign in (("LowLimit", 1), ("HighLimit", -1)):
+            if key in section:
+                assert sign * int(default) >= sign * int(section[key]), title

@@ -7,8 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fdhil import config
 from fdhil.sim.drive.own_clock import OwnClock
-from tests.sim.rig import Rig, emergencies, machine
+from fdhil.sim.fault_kinds import FaultEntry
+from tests.bench import bench_document
+from tests.sim.bench_twin import TwinInHand, corner, twin_config
+from tests.sim.rig import Abort, Rig, emergencies, machine
 
 INC_PER_MM = 3276.8
 MS = 1e-3
@@ -117,6 +121,16 @@ def test_quick_stop_in_the_middle_of_a_profile_without_sync() -> None:
     assert rig.read(0x6041) & 0x6F == 0x40
 
 
+def test_homing_without_sync() -> None:
+    rig = by_sdo(6, limit_switches_mm=(-20.0, 60.0))
+    rig.write(0x6098, 0, 1, 1)
+    rig.write(0x6040, 0, 0x1F, 2)
+    let_pass(rig, 8.0)
+    assert rig.read(0x6041) & (1 << 10 | 1 << 12 | 1 << 13) == 1 << 10 | 1 << 12
+    assert rig.read(0x6064) == pytest.approx(0, abs=400)  # the first pulse beyond the switch
+    assert rig.drive.physics.table_rad == pytest.approx(0, abs=0.05)
+
+
 def test_a_jam_without_sync_is_told_by_emcy() -> None:
     rig = by_sdo(1)
     rig.write(0x6065, 0, 1000, 4)
@@ -157,3 +171,61 @@ def test_a_pause_of_the_sync_is_made_up_for_or_lasts(late_s: float) -> None:
         now += MS
         own += clock.due(now, bound=False)
     assert own == (0 if late_s < 0.02 else pytest.approx(late_s / MS, abs=2))
+
+
+def test_while_the_nc_s_sync_fails_the_axes_go_on_to_their_last_set_point() -> None:
+    twin = TwinInHand(twin_config())
+    twin.switch_on()
+    twin.play(corner() + 5.0)
+    twin.run_until("playing")
+    twin.run(100)
+    drive = twin.machine.units["Y"].drive
+    tick, target = drive.tick, drive.dictionary.number(0x607A) / INC_PER_MM
+    assert abs(target - drive.table_mm) > 0.1
+    twin.machine.faults.add(FaultEntry(fault="sync_lost", at_sync=0, duration_s=0.2))
+    twin.run(150)
+    assert drive.tick == tick + 150
+    assert drive.table_mm == pytest.approx(target, abs=1.0)
+    assert abs(drive.physics.speed_rad_s) < 1.0
+
+
+def test_set_points_that_come_every_tenth_cycle_are_joined_by_straight_lines() -> None:
+    """0x60C2 says so; the speed demand has no stairs, and the set-point acts an interval and the delay late."""
+    rig = Rig()
+    rig.write(0x60C2, 1, 10, 1)
+    rig.write(0x1006, 0, 10_000, 4)
+    rig.enable()
+    tick = rig.drive.tick
+    demands, shown = [], []
+    for n in range(60):
+        rig.cycle(1000 * n)
+        demands.append(rig.read(0x606B, signed=True))
+        shown.append(rig.read(0x6062, signed=True))
+    assert rig.drive.tick - tick == 600
+    assert demands[20:] == pytest.approx([100_000] * 40, abs=60)
+    assert shown[10:] == [1000 * n - 200 for n in range(10, 60)]  # in the last of the ten cycles, two late
+
+
+@pytest.mark.parametrize("mode", [8, 9])
+def test_a_slow_sync_that_the_drive_was_told_of_leads_it(mode: int) -> None:
+    rig = Rig()
+    rig.write(0x60C2, 1, 10, 1)
+    rig.enable(mode=mode)
+    let_pass(rig, 1.0, 10 * MS)
+    before = rig.drive.tick
+    rig.write(0x60FF, 0, 65536, 4)
+    let_pass(rig, 1.0, 10.1 * MS)
+    assert rig.drive.tick - before == 1000
+    turned = rig.drive.physics.table_rad / (2 * np.pi)
+    assert turned == pytest.approx(1.0 if mode == 9 else 0.0, abs=0.05)
+
+
+def test_the_interpolation_time_is_whole_cycles_of_the_drive() -> None:
+    document = bench_document("X")
+    document["machine"]["sync_period_s"] = 0.0005
+    rig = Rig(config.parse(document))
+    rig.write(0x60C2, 1, 20, 1)
+    for value in (0, 7):
+        with pytest.raises(Abort) as abort:
+            rig.write(0x60C2, 1, value, 1)
+        assert abort.value.code == 0x06090030

@@ -136,7 +136,7 @@ def _with_terms(base: Fit, command: bool, searched: bool) -> Fit:
         return result
     if DELAY in result.free:
         motions, free = result.problem.motions, but_delay(result.free)
-        result = fit(motions, with_delay(result.theta, 0.0), free)
+        result = fit(motions, with_delay(result.theta, 0.0), free, result.problem.noises)
     return _delay_told(result)
 
 
@@ -231,7 +231,7 @@ def _known_before(result: Fit, inverse: Float) -> Float:
     """Return (k, q) what one standard deviation of each thing known before the data makes of the entries of theta."""
     asked = np.flatnonzero(result.prior)
     columns = np.zeros((result.theta.size, asked.size))
-    columns[list(result.free)] = inverse[:, asked] * np.sqrt(result.prior[asked])
+    columns[list(result.free)] = inverse[:, asked] * (result.prior * result.prior_std)[asked]
     return columns
 
 
@@ -284,8 +284,7 @@ def finish(result: Fit) -> Estimate:
     chance, beyond = (part[np.ix_(kept, kept)] for part in (inverse, held - inverse))
     own = systematic[told]
     if result.prior.size:  # its share is among the doubts that windows have in common
-        before = _known_before(result, inverse)[told]
-        chance = chance - before @ before.T
+        chance = chance - inverse[kept] @ np.diag(result.prior) @ inverse[:, kept]
     values = result.theta[told]
     answer = Estimate(
         method=NAME,

@@ -20,31 +20,43 @@ from fdhil.sim.drive.modes import CYCLIC, CYCLIC_POSITION, SUPPORTED_MODES
 from fdhil.sim.drive.objects import DEVICE_NAME, PRODUCT_CODE, REVISION, VENDOR_ID, Ratings, drive_objects
 from fdhil.sim.drive.sheet import Sheet, read_sheet
 
-_MODES, _TARGET, _INTERPOLATION = 0x650200, 0x607A00, 0x60C101
+_MODES, _TARGET, _INTERPOLATION, _SPEED_UNIT = 0x650200, 0x607A00, 0x60C101, 0x60A900
 _INTERPOLATED = 7
 _VENDORS = range(0x2000, 0x6000)
 _APART = 1 << 24  # the vendor's values are kept apart from those of the twin's own vendor objects
-# a drive without these has no such service: no heartbeat, no SYNC counter, no reaction to a lost connection
-_NO_SERVICE = {0x101700: 0, 0x101900: 0, 0x600700: 0}
+# A drive without these has no such service: no heartbeat, no SYNC counter. One without 0x6007 falls into fault when it
+# loses its master, as most do: no file says it.
+_NO_SERVICE = {0x101700: 0, 0x101900: 0}
 # what whoever sets a drive up for this machine must have entered: no default of a file fits it
 _SET_UP = frozenset(
     index << 8 | sub
     for indices, subs in (
-        ((0x1006, 0x6065, 0x6075, 0x6076, 0x6081, 0x6083, 0x6084, 0x6085), (0,)),
-        ((0x607D, 0x608F, 0x6091, 0x6092, 0x60C2), (1, 2)),
+        (
+            (0x1006, 0x6065, 0x6067, 0x606D, 0x606F, 0x6072, 0x6073, 0x6075, 0x6076, 0x607F, 0x6080, 0x6081, 0x6083),
+            (0,),
+        ),
+        ((0x6084, 0x6085, 0x6087, 0x609A, 0x60C5, 0x60C6), (0,)),
+        ((0x607D, 0x608F, 0x6091, 0x6092, 0x6099, 0x60C2), (1, 2)),
     )
     for index in indices
     for sub in subs
 )
 # speeds and accelerations count alike: in a speed unit, and that per second
-_SPEEDS = frozenset({0x606B, 0x606C, 0x607F, 0x6081, 0x6083, 0x6084, 0x6085, 0x60B1, 0x60C5, 0x60C6, 0x60FF})
-# revolutions and increments that make a count of one; a millisecond's increments come as 16.16 fixed-point numbers
+_SPEEDS = frozenset(
+    {
+        0x606B, 0x606C, 0x606D, 0x606F, 0x607F, 0x6081, 0x6083, 0x6084, 0x6085, 0x6099, 0x609A, 0x60B1, 0x60C5, 0x60C6,
+        0x60FF,
+    }
+)  # fmt: skip
+# revolutions/s and increments/s to a count; a millisecond's increments come as 16.16 fixed-point numbers
 _SPEED_UNITS = {
     "increments_per_s": (0.0, 1.0),
     "rpm": (1 / 60, 0.0),
     "millirpm": (1 / 60e3, 0.0),
     "increments_per_ms_16": (0.0, 1e3 / 65536),
 }
+# unit codes of 0x60A9 (CiA 303-2): revolutions, increments; seconds, minutes
+_REVOLUTIONS, _INCREMENTS, _PER = 0xB4, 0xB5, {0x03: 1.0, 0x47: 1 / 60}
 _UNITS = {"current_a": "A", "current_share": "", "voltage_v": "V", "dc_link_v": "V", "duty": ""}
 
 
@@ -101,11 +113,6 @@ class Tailoring:
     rated_current: Mapping[str, Any] | None = None
     setpoint: Mapping[str, Any] | None = None
 
-    def speed_increments_per_count(self, increments_per_rev: int) -> float:
-        """Increments per second to a count of the drive's speed objects."""
-        revolutions, increments = _SPEED_UNITS[self.speed]
-        return revolutions * increments_per_rev + increments
-
 
 def dress(config: MachineConfig, axis: str) -> Dress:
     """Return what the axis' drive wears; EdsError when its EDS cannot be read."""
@@ -137,8 +144,20 @@ class _Tailor:
         self._own = {entry.key: entry for item in own for entry in item.entries}
         self._identity = {0x101801: sheet.vendor, 0x101802: sheet.product, 0x101803: sheet.revision, 0x101804: serial}
         self._entries = {entry.key: entry for item in sheet.objects for entry in item.entries}
+        self._speed = self._increments_per_s()
         self._setpoint, self._mode = self._stream()
         self._modes = self._offered()
+
+    def _increments_per_s(self) -> float:
+        """What a count of its speeds is: by its own unit object, else as the vendor has it."""
+        revolutions, increments = _SPEED_UNITS[self._cut.speed]
+        unit = self._entries[_SPEED_UNIT].default if _SPEED_UNIT in self._sheet.given else 0
+        assert isinstance(unit, int)
+        kind, per, power = unit >> 16 & 0xFF, unit >> 8 & 0xFF, (unit >> 24 ^ 0x80) - 0x80
+        if kind in (_REVOLUTIONS, _INCREMENTS) and per in _PER:
+            share = _PER[per] * 10.0**power
+            revolutions, increments = (share, 0.0) if kind == _REVOLUTIONS else (0.0, share)
+        return revolutions * self._ratings.increments_per_rev + increments
 
     def _stream(self) -> tuple[int | None, int]:
         """The object of cyclic set-points where it is not 0x607A, and their mode."""
@@ -223,7 +242,7 @@ class _Tailor:
 
     def _scale(self, entry: Entry) -> float:
         if entry.index in _SPEEDS:
-            return self._cut.speed_increments_per_count(self._ratings.increments_per_rev)
+            return self._speed
         return self._cut.rated_torque_nm * 1e3 if entry.index == 0x6076 else 1.0
 
     def _unshown(self, entry: Entry) -> Entry:
