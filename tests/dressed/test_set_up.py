@@ -11,9 +11,9 @@ import canopen
 import pytest
 
 from fdhil.commissioning.config_check import check_machine
+from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.scan import read_descriptions, scan_bus
 from fdhil.commissioning.steps import commission
-from fdhil.commissioning.survey import Finding
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, DriveFault
 from tests.dressed.wardrobe import OUTFITS, Outfit, dressed, set_up
