@@ -129,7 +129,7 @@ class Axis(Section):
         ge=5.0,
         le=2000.0,
         description="resonance of motor and table against each other, the motor free to turn, as the drive's frequency "
-        "response has it; left out, it is sought where replays of rapids leave much, else the table is where the motor is",
+        "response has it; left out: sought where replays of rapids leave much, else the table is where the motor is",
     )
     resonance_damping: NotNegative = Field(0.03, le=0.7, description="damping ratio of that resonance")
     nominal: Nominal
