@@ -41,8 +41,11 @@ def _with_table(outcome: WindowOutcome, signals: Evidence) -> WindowOutcome:
     window, estimate, axis = signals.window, outcome.estimate, signals.axis
     if estimate is None or (window.table_mm is None and window.table_m_s2 is None):
         return outcome
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        found = compliance(window, estimate.parameters())
+    try:
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            found = compliance(window, estimate.parameters())
+    except GAVE_UP:  # signals that no table has
+        found = None
     if found is not None:
         warnings = (*outcome.verdict.warnings, *beside_the_config(found, axis))
         estimate = joined(estimate, found)
