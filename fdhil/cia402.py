@@ -93,9 +93,24 @@ class Object(IntEnum):
     VELOCITY_OFFSET = 0x60B1
     TORQUE_OFFSET = 0x60B2
     INTERPOLATION_PERIOD = 0x60C2
+    VELOCITY_UNIT = 0x60A9
     FOLLOWING_ERROR = 0x60F4
     DIGITAL_INPUTS = 0x60FD
     SUPPORTED_MODES = 0x6502
+
+
+LOGICAL_AXIS_STEP = 0x800
+"""The objects of the next axis of one device lie so much higher (CiA 402-2; 0x6000 to 0x67FF are the first axis')."""
+LOGICAL_AXES = range(1, 9)
+
+
+def first_axis_index(index: int) -> int:
+    """Return the index of the same object on the first axis of its device.
+
+    >>> hex(first_axis_index(0x68B0))
+    '0x60b0'
+    """
+    return 0x6000 + (index - 0x6000) % LOGICAL_AXIS_STEP if 0x6000 <= index < 0xA000 else index
 
 
 class State(Enum):

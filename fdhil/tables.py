@@ -38,6 +38,17 @@ EVENT_SOURCES: Mapping[str, str] = {
 }
 DRIVE_PROFILES: Mapping[str, str] = {
     "fdhil_twin": "fdhil.drivers.cia402.profiles:fdhil_twin.toml",
+    "cia402": "fdhil.drivers.cia402.profiles:cia402.toml",
+    "epos4": "fdhil.drivers.cia402.profiles:epos4.toml",
+    "epos2": "fdhil.drivers.cia402.profiles:epos2.toml",
+    "nanotec": "fdhil.drivers.cia402.profiles:nanotec.toml",
+    "elmo": "fdhil.drivers.cia402.profiles:elmo.toml",
+    "technosoft": "fdhil.drivers.cia402.profiles:technosoft.toml",
+    "trinamic": "fdhil.drivers.cia402.profiles:trinamic.toml",
+    "faulhaber": "fdhil.drivers.cia402.profiles:faulhaber.toml",
+    "schunk": "fdhil.drivers.cia402.profiles:schunk.toml",
+    "infranor": "fdhil.drivers.cia402.profiles:infranor.toml",
+    "roboteq": "fdhil.drivers.cia402.profiles:roboteq.toml",
 }
 
 

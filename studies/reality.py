@@ -17,17 +17,17 @@ from typing import Any
 
 import numpy as np
 
-from fdhil.config import MachineConfig, parse
+from fdhil.config import Axis, MachineConfig, parse
 from fdhil.correction.learning import Lesson, learn
 from fdhil.correction.limits import fit_all
 from fdhil.correction.planning import plan
 from fdhil.identification.loops import with_loops
 from fdhil.identification.windows import find_windows
+from fdhil.model.terms import with_resonance
 from fdhil.pipeline import analyse, pool
-from fdhil.pipeline.own_loops import better_axis, loops_of, suspected
+from fdhil.pipeline.own_loops import better_axis, explained
 from fdhil.prediction.behind_motor import ahead_of_motor_mm
 from fdhil.prediction.contour import contour_error_um
-from fdhil.prediction.model_terms import with_resonance
 from fdhil.program.loading import load_trajectory
 from fdhil.records import PARAMETERS, Estimate, LoopEstimate, Parameters, Trajectory, WindowOutcome, rms
 from studies import pages
@@ -234,11 +234,13 @@ def outcomes_of(machine: Machine, seed: int) -> tuple[list[WindowOutcome], float
         ]
         following.append(rms((moved.motor_m - moved.demand) * 1e6))
     settings, axis, period_s = config.identification, config.axis["X"], config.machine.sync_period_s
-    loops = loops_of(outcomes, axis, settings, period_s) if suspected(outcomes) else None
-    better = better_axis(axis, loops)
-    if better is not None:
-        outcomes = [analyse(o.window, settings, better, period_s) for o in outcomes]
-    return outcomes, float(np.mean(following)), loops if better is not None else None
+    windows = [o.window for o in outcomes]
+
+    def again(own: Axis) -> list[WindowOutcome]:
+        return [analyse(window, settings, own, period_s) for window in windows]
+
+    found, loops = explained(outcomes, axis, settings, period_s, again)
+    return list(found), float(np.mean(following)), loops if better_axis(axis, loops) is not None else None
 
 
 def cut(machine: Machine, reference: Trajectory, offset_um: Mapping[str, Array] | None = None) -> tuple[Array, Array]:

@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from fdhil.arming.token import given_credential
+from fdhil.cia402 import first_axis_index
 from fdhil.commissioning.record import KEY_NAME, CommissioningRecord, holds, load_record
 from fdhil.commissioning.void import is_void
 from fdhil.config import Axis, MachineConfig, OffsetBounds, share_fault
-from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec, load_profile
+from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
+from fdhil.drivers.cia402.profile_file import load_profile, require_offset
 from fdhil.errors import ConfigError, ConfigFault, StoreError
 from fdhil.guard.feedforward import FeedforwardLimits
 from fdhil.guard.limits import OffsetLimits
@@ -78,9 +80,10 @@ def limits_of(axis: Axis, sync_period_s: float) -> OffsetLimits:
 
 
 def _axis(machine: MachineConfig, name: str, axis: Axis) -> AxisSettings:
-    profile = load_profile(axis.drive.profile)
+    profile = load_profile(axis.drive)
     node_id, period_s = machine.node_id(name), machine.machine.sync_period_s
     per_rad = axis.drive.increments_per_rev / (2 * math.pi)
+    require_offset(profile, name)
     target, offset = _rpdo(profile, profile.target, name), _rpdo(profile, profile.offset, name)
     if len(offset.entries) != 1:
         fault = ConfigFault(
@@ -176,5 +179,6 @@ def _rpdo(profile: DriveProfile, key: tuple[int, int], axis: str) -> PdoSpec:
 
 
 def _pdo(spec: PdoSpec, node_id: int) -> Pdo:
-    layout = tuple((entry.index, entry.sub, entry.bits, entry.signed) for entry in spec.entries)
+    """A PDO as the guard has it, which knows the objects of a device's second axis by the names of the first's."""
+    layout = tuple((first_axis_index(entry.index), entry.sub, entry.bits, entry.signed) for entry in spec.entries)
     return Pdo(spec.cob_base + node_id, layout, spec.every_sync)

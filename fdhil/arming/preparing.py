@@ -20,10 +20,10 @@ from fdhil.commissioning.feedforward import feedforward_object
 from fdhil.commissioning.record import CommissioningRecord, holds, load_record
 from fdhil.config import MachineConfig
 from fdhil.correction import gate, online
-from fdhil.drivers.cia402.profile import load_profile
+from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.identification.loops import regulators_of
+from fdhil.model.terms import with_resonance
 from fdhil.prediction.gain import Gain, skill_of
-from fdhil.prediction.model_terms import with_resonance
 from fdhil.prediction.models import with_loops
 from fdhil.program import program_digest
 from fdhil.records import Parameters, Reason, Skill
@@ -242,7 +242,7 @@ def feeding_facts(axes: Sequence[str], config: MachineConfig, known: Mapping[str
 
 def _feeds(record: CommissioningRecord | None, config: MachineConfig, axis: str) -> bool:
     """Whether the record shows that the drive's RPDO of speed and torque offset was made valid."""
-    profile = load_profile(config.axis[axis].drive.profile)
+    profile = load_profile(config.axis[axis].drive)
     found = profile.find_rpdo(profile.speed_offset)
     if record is None or found is None:
         return False

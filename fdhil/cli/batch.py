@@ -17,7 +17,7 @@ from fdhil.config import Identification, MachineConfig
 from fdhil.errors import FdhilError
 from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
-from fdhil.pipeline.own_loops import better_axis, loops_of, suspected
+from fdhil.pipeline.own_loops import explained
 from fdhil.records import Estimate, LoopEstimate, Reason, Recording, Verdict, Window, WindowOutcome
 from fdhil.store.recording_csv import SOURCES, read_recording
 
@@ -83,19 +83,18 @@ def analyse_file(
         return FileResult(str(path), None, (), None, Verdict(False, None, (reason,)), error_document(error))
     if multiprocessing.parent_process() is None:
         forewarn("identify")
-    outcomes = []
+    first = []
     axis = None if machine is None else machine.axis.get(recording.axis)
     settings = told_by(recording, settings)
     windows = find_windows(recording, None if axis is None else axis.rapid_speed_rad_s)
     period_s = None if machine is None else machine.machine.sync_period_s
     work = partial(analyse, settings=settings, axis=axis, sync_period_s=period_s)
     for outcome in _outcomes(windows, work):
-        outcomes.append(outcome)
+        first.append(outcome)
         progress(1.0 / (len(windows) + 1))
-    loops = loops_of(outcomes, axis, settings, period_s) if suspected(outcomes) else None
-    own_axis = better_axis(axis, loops)
-    if own_axis is not None:
-        outcomes = list(_outcomes(windows, partial(work, axis=own_axis)))
+    outcomes, loops = explained(
+        first, axis, settings, period_s, lambda own: list(_outcomes(windows, partial(work, axis=own)))
+    )
     estimate, verdict = pool(outcomes, settings)
     progress(1.0 / (len(windows) + 1))
     return FileResult(str(path), recording.axis, tuple(outcomes), estimate, verdict, loops=loops)

@@ -31,7 +31,8 @@ STATES: Mapping[bool | None, tuple[str, str]] = {
     None: ("not compared", "yellow"),
 }
 STEPS: Mapping[str, str] = {
-    "listen": "Listening: the NC must be off and the drive must be heard. Nothing is sent yet.",
+    "listen": "Listening: the NC must be off. A bus on which nothing is heard is asked whether the drive is there; "
+    "nothing else is sent.",
     "compare": "Reading identity, PDO mapping, scale, option codes and following-error window, and comparing them with "
     "the config. Nothing moves.",
     "enable": "Starting SYNC and switching the drive on, held where it stands.",
@@ -107,22 +108,23 @@ def _show_scans(scans: Sequence[BusScan]) -> None:
         out.print(Text(f"bus {found.bus}: {nc}{period}; {len(found.nodes)} nodes"))
         table = Table(*SCAN_HEAD, box=box.SIMPLE_HEAD, pad_edge=False)
         for node in found.nodes:
-            table.add_row(*map(Text, _node_row(node)))
+            table.add_row(*map(Text, _node_row(node, "not asked" if found.master else "no answer")))
         out.print(table)
         for node in found.nodes:
             for emergency in node.emergencies:
                 out.print(Text(f"node {node.node_id} reports {emergency}"), soft_wrap=True)
 
 
-def _node_row(node: Node) -> list[str]:
+def _node_row(node: Node, unanswered: str) -> list[str]:
     """Return the cells of a node, two figures above each other in most, so that a row fits 80 columns."""
     period = node.heartbeat_s or (node.answers.heartbeat_s if node.answers else None)
     beat = f"{period * 1e3:.0f} ms" if period else "none"
     heard = [f"{node.node_id}\n{node.axis or ''}", f"{node.nmt or 'unknown'}\n{beat}"]
     if node.answers is None:
-        return [*heard, "not asked", "", "", ""]
+        return [*heard, unanswered, "", "", ""]
     said, who = node.answers, node.answers.identity
-    profile = "CiA 402" if said.is_drive else str(said.device_type & 0xFFFF or "none")
+    number = said.device_type & 0xFFFF
+    profile = f"CiA {number}" if number else "none"
     eds = f"{said.eds.file}\n({said.eds.fit})" if said.eds else "none fits"
     ids = (f"{who.vendor_id:08X}\n{who.product_code:08X}", f"{who.revision:08X}\n{who.serial}")
     return [*heard, f"{said.name or 'unnamed'}\n{profile}", *ids, eds]
@@ -228,24 +230,40 @@ def _show_check(found: Sequence[Place]) -> None:
     for place, finding in found:
         if finding.ok is False:
             out.print(Text(f"{place}: {finding.cause}; {finding.advice}"), soft_wrap=True)
+    for (place, cause, advice), points in _open_points(found).items():
+        out.print(Text(f"{place}: {', '.join(points)} not compared: {cause}; {advice}"), soft_wrap=True)
     differ, open_ = (sum(finding.ok is state for _, finding in found) for state in (False, None))
-    rest = f", {open_} could not be compared beside the NC" if open_ else ""
+    rest = f", {open_} could not be compared" if open_ else ""
     out.print(f"{len(found) - differ - open_} points ok, {differ} differ{rest}")
+
+
+def _open_points(found: Sequence[Place]) -> dict[tuple[str, str, str], list[str]]:
+    """The points that could not be compared, by place and reason."""
+    points: dict[tuple[str, str, str], list[str]] = {}
+    for place, finding in found:
+        if finding.ok is None:
+            points.setdefault((place, finding.cause, finding.advice), []).append(finding.point)
+    return points
 
 
 @click.command()
 @CONFIG
 @click.option("--axis", "only", help="Commission this axis; left out: all, one after the other.")
-@click.option("--yes", is_flag=True, help="Do not ask before an axis moves.")
+@click.option(
+    "--set-pdos", is_flag=True, help="Write the PDOs of the drives' profiles, save them in the drives; no more."
+)
+@click.option("--yes", is_flag=True, help="Do not ask before an axis moves, or PDOs are written.")
 @AS_JSON
-def commission(config: Path, only: str | None, yes: bool, as_json: bool) -> int:
+def commission(config: Path, only: str | None, set_pdos: bool, yes: bool, as_json: bool) -> int:
     """Commission the drives of CONFIG, step by step: what arming a correction asks for.
 
     The NC must be off, the axis free to move a tenth of a millimetre, and the machine's own safety functions effective.
     Reads and compares the drive's set-up, asks, switches the drive on, moves the axis by 10 um, finds out where the
     offset acts, proves the drive's watchdog, and writes the signed record into the store. Whatever fails, also Ctrl-C,
-    the offset goes back to zero and the drive is switched off. Exit codes: 0 commissioned, 1 refused, by you or because
-    the drive is not set up as it must be, 2 wrong option or configuration, 3 the drive or the bus cannot be reached.
+    the offset goes back to zero and the drive is switched off. With --set-pdos nothing moves: what differs from the
+    profile in the drive's PDOs is written and saved, and that is all. Exit codes: 0 commissioned, 1 refused, by you or
+    because the drive is not set up as it must be, 2 wrong option or configuration, 3 the drive or the bus cannot be
+    reached.
     """
     machine = machine_config.load(config)
     axes = [only] if only else list(machine.axis)
@@ -257,7 +275,8 @@ def commission(config: Path, only: str | None, yes: bool, as_json: bool) -> int:
     with _stopped_like_ctrl_c():
         for axis in axes:
             try:
-                done[axis] = _commission_axis(machine, axis, yes, as_json)
+                step = _set_pdos if set_pdos else _commission_axis
+                done[axis] = step(machine, axis, yes, as_json)
             except DriveFault as fault_found:
                 refused = str(fault_found)
                 break
@@ -296,6 +315,25 @@ def _commission_axis(machine: MachineConfig, axis: str, yes: bool, quiet: bool) 
     return {**asdict(record), "record": str(path), "digest": record.digest}
 
 
+def _set_pdos(machine: MachineConfig, axis: str, yes: bool, quiet: bool) -> dict[str, Any]:
+    """Set the PDOs of one drive up; DriveFault when it refuses, or the operator does."""
+    from fdhil.cli.bus_lock import lock_bus
+    from fdhil.commissioning.master import Master
+    from fdhil.commissioning.pdo_setup import set_up_pdos
+
+    profile = machine.axis[axis].drive.profile
+    if not yes:
+        question = f"The PDOs of drive {axis} will be written as profile {profile} has them, and saved in it. May they?"
+        _confirm(axis, question, "nothing was written; start again with --yes where nobody can be asked")
+    with lock_bus(machine.bus[machine.axis[axis].drive.bus]), Master(machine, axis) as master:
+        done = set_up_pdos(master)
+    written = ", ".join(done.written) or "none, all were right"
+    kept = {True: ", saved in the drive", False: ", NOT saved: lost when the drive is off", None: ""}[done.saved]
+    if not quiet:
+        click.echo(f"axis {axis}: PDOs written: {written}{kept}")
+    return {"pdos_written": list(done.written), "saved": done.saved}
+
+
 def _guide(machine: MachineConfig, axis: str, yes: bool, quiet: bool) -> Callable[[str], None]:
     """Return the function that tells, and asks, before each step."""
     numbers = {step: number for number, step in enumerate(STEPS, 1)}
@@ -321,6 +359,10 @@ def _ask(machine: MachineConfig, axis: str) -> None:
         f"then up to {largest_move_um(machine, axis):.0f} um to and fro. Is it free to move, and may it?"
     )
     advice = "nothing was moved or written; start again when it may move, with --yes where nobody can be asked"
+    _confirm(axis, question, advice)
+
+
+def _confirm(axis: str, question: str, advice: str) -> None:
     try:
         agreed = click.confirm(question, err=True)
     except click.Abort:

@@ -119,5 +119,7 @@ def _ready_lines(event: dict[str, Any]) -> list[str]:
         lines.append(f"  bus load of {name}: {load:.0%} at this SYNC period ({worst:.0%} with the most stuff bits)")
     for axis, drive in event["drives"].items():
         lines.append(f"  drive {axis}: node {drive['node_id']}, {drive['eds']}")
-    lines += [f"  voltage sensor {axis}: Modbus TCP {m['host']}:{m['port']}" for axis, m in event["modbus"].items()]
+    for axis, m in event["modbus"].items():
+        where = f"Modbus TCP {m['host']}:{m['port']}" if "port" in m else f"serial line {m['device']}"
+        lines.append(f"  voltage sensor {axis}: {where}")
     return lines

@@ -24,6 +24,7 @@ COUNTED = {
     "records_dropped": "records dropped",
     "ring_overflow": "not read in time",
     "kernel_drops": "dropped by the kernel",
+    "error_frames": "error frames",
     "sync_missed": "SYNC missed",
     "sync_duplicates": "SYNC doubled",
     "sync_out_of_order": "SYNC out of order",

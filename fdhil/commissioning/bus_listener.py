@@ -9,22 +9,46 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Self
 
+import numpy as np
+
 from fdhil.cia402 import COB_EMCY, COB_HEARTBEAT, COB_NMT, COB_SDO_REQUEST, COB_SDO_RESPONSE, COB_SYNC, Nmt
 from fdhil.drivers.can.bus import CanBus
-from fdhil.drivers.can.frames import Frames
+from fdhil.drivers.can.frames import ERROR_FLAG, REMOTE_FLAG, Frames
 from fdhil.errors import ConnectError
 
 LISTEN_S = 2.5  # a heartbeat of one second comes twice
+UNREADABLE = (
+    "only frames in error are heard; nothing was sent, for it would disturb whoever talks there; "
+    "set the bit rate of the bus on the interface, and check termination and wiring"
+)
 _TURN_S = 0.002
+_MASTER_FRAMES = {COB_SYNC: "SYNC", COB_NMT: "NMT commands", 0x7E5: "LSS commands"}
 _MASTER_FUNCTIONS = {0x200: "set-points", 0x300: "set-points", 0x400: "set-points", 0x500: "set-points"} | {
     COB_SDO_REQUEST: "SDO requests"
 }
+_REQUESTS = {COB_HEARTBEAT: "node guarding"}
 _NODE_FUNCTIONS = (0x080, 0x180, 0x280, 0x380, 0x480, COB_SDO_RESPONSE, COB_HEARTBEAT)
+
+
+def shows_master(can_id: int) -> str | None:
+    """What a frame with this id, its flags included, shows that only a master sends; None when a node may send it.
+
+    >>> shows_master(0x205)
+    'set-points'
+    """
+    if can_id & ~0x7FF == REMOTE_FLAG:
+        return _REQUESTS.get(can_id & 0x780, "requests for PDOs")
+    if can_id > 0x7FF:
+        return None
+    return _MASTER_FRAMES.get(can_id) or _MASTER_FUNCTIONS.get(can_id & 0x780)
 
 
 @dataclass(slots=True)
 class Traffic:
-    """The frames heard: per COB-ID those counted, the newest length and data; heartbeats and EMCY per node."""
+    """The frames heard: per COB-ID those counted, the newest length and data; heartbeats and EMCY per node; errors.
+
+    ``requests`` are the COB-IDs of remote frames, with their flag.
+    """
 
     count: dict[int, int] = field(default_factory=dict)
     length: dict[int, int] = field(default_factory=dict)
@@ -32,9 +56,13 @@ class Traffic:
     beats: dict[int, list[int]] = field(default_factory=dict)
     emergencies: dict[int, set[int]] = field(default_factory=dict)
     sync_ns: list[int] = field(default_factory=list)
+    errors: int = 0
+    requests: set[int] = field(default_factory=set)
 
     def take(self, frames: Frames) -> None:
-        """Take a block of frames; those with 29 bit identifiers and error frames are left aside."""
+        """Take a block of frames; those with 29 bit identifiers are left aside, error frames counted."""
+        self.errors += int((frames["id"] & ERROR_FLAG != 0).sum())
+        self.requests |= set(frames["id"][frames["id"] & ~np.uint32(0x7FF) == REMOTE_FLAG].tolist())
         for frame in frames[frames["id"] <= 0x7FF]:
             can_id, stamp, data = int(frame["id"]), int(frame["t_ns"]), int(frame["data"])
             function, node = can_id & 0x780, can_id & 0x7F
@@ -50,11 +78,8 @@ class Traffic:
     @property
     def master(self) -> str | None:
         """What shows that a master runs the bus, None when nothing does."""
-        if self.sync_ns:
-            return "SYNC"
-        if COB_NMT in self.count:
-            return "NMT commands"
-        return next((_MASTER_FUNCTIONS[i & 0x780] for i in self.count if i & 0x780 in _MASTER_FUNCTIONS), None)
+        signs = [shows_master(can_id) for can_id in (*self.count, *self.requests)]
+        return "SYNC" if self.sync_ns else next((sign for sign in signs if sign), None)
 
     @property
     def nodes(self) -> set[int]:
@@ -104,6 +129,11 @@ class BusListener:
             if self._bus.ended is not None:
                 raise ConnectError(f"bus {self.name}", f"{self._bus.ended}; try again when the bus is back")
             time.sleep(0.01)
+
+    def require_readable(self) -> None:
+        """ConnectError where frames in error are all that is heard: the bus talks at another bit rate."""
+        if self.traffic.errors and not self.traffic.count:
+            raise ConnectError(f"bus {self.name}", UNREADABLE)
 
     def close(self) -> None:
         """Stop listening and release the bus."""

@@ -6,16 +6,18 @@ Where an NC runs the bus nothing is sent: what its own traffic shows is compared
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 from fdhil.commissioning.bus_listener import LISTEN_S, BusListener, Traffic
 from fdhil.commissioning.compare import POINT, compare_record
+from fdhil.commissioning.finding import Finding, read_optional
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import load_record
-from fdhil.commissioning.survey import Finding, Survey, read_optional, survey
+from fdhil.commissioning.survey import Survey, survey
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.bus import CanBus
-from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec, load_profile
+from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
+from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.drivers.moves import load_event_source
 from fdhil.drivers.sensor_source import Sensor, sensors_of
 from fdhil.errors import DeviceError, StoreError
@@ -26,6 +28,7 @@ RATE_TOLERANCE = 0.1
 PERIOD_TOLERANCE = 0.02
 SDO_POINTS = ("identity", "cycle", "scale", "rated current", "communication lost", "stop by a ramp", "following error")
 NC_OFF = "switch the NC off and check again"
+FIND = "find the drive's node-ID and check again"
 
 Place = tuple[str, Finding]
 """The place of a finding (``bus can0``, ``axis X``) and the finding."""
@@ -38,6 +41,7 @@ def check_machine(config: MachineConfig, say: Callable[[str], None] = lambda _te
         say(f"listening on bus {bus}")
         with BusListener(CanBus(bus, config.bus[bus])) as listener:
             listener.listen(LISTEN_S)
+            listener.require_readable()
             traffic = listener.traffic
         found += [(f"bus {bus}", finding) for finding in compare_bus(traffic, config)]
         for axis in (name for name, settings in config.axis.items() if settings.drive.bus == bus):
@@ -74,6 +78,12 @@ def compare_asked(config: MachineConfig, axis: str) -> list[Finding]:
         try:
             found = survey(master)
             seen = f"{node}, serial number {found.identity.serial}"
+            if not found.is_drive:
+                return [
+                    Finding("drive", node, seen),
+                    *found.findings,
+                    *_not_compared(SDO_POINTS, "it is no drive", FIND),
+                ]
             return [
                 Finding("drive", node, seen),
                 *found.findings,
@@ -84,6 +94,11 @@ def compare_asked(config: MachineConfig, axis: str) -> list[Finding]:
             ]
         except DeviceError as error:
             return [_unreachable("drive", node, error)]
+
+
+def _not_compared(points: Sequence[str], cause: str, advice: str) -> list[Finding]:
+    """What is left to compare by SDO, and why it was not."""
+    return [Finding(point, "the config's", "not asked", None, cause, advice) for point in points]
 
 
 def _record(config: MachineConfig, axis: str, found: Survey) -> Iterator[Finding]:
@@ -150,20 +165,25 @@ def _rapid(config: MachineConfig, profile: DriveProfile, read: Callable[[], int 
 def _voltage_object(config: MachineConfig, axis: str, profile: DriveProfile, master: Master) -> Iterator[Finding]:
     if config.axis[axis].voltage.separate:
         return
-    if profile.voltage is None:
+    if profile.voltage is None or not profile.voltage_objects:
         cause = f"profile {profile.name} has no object of the terminal voltage"
         yield Finding("voltage", "from the drive", "none", False, cause, "set voltage.source = 'modbus'")
         return
-    raw = read_optional(master, *profile.voltage, signed=True)
+    scale = profile.terminal_v_per_count(config.axis[axis])
+    if not scale:
+        cause = f"profile {profile.name} tells the duty of the PWM, and the DC link is not known"
+        yield Finding("voltage", "from the drive", "a duty", False, cause, "set drive.dc_link_v, or use a sensor")
+        return
     index, sub = profile.voltage
+    raw = read_optional(master, index, sub, signed=not profile.voltage_magnitude)
     cause = f"it has no terminal voltage (0x{index:04X}:{sub:02X})"
-    shown = "none" if raw is None else f"{raw * profile.voltage_v_per_count:.2f} V"
+    shown = "none" if raw is None else f"{raw * abs(scale):.2f} V"
     yield Finding("voltage", "from the drive", shown, raw is not None, cause, "choose another profile or sensor")
 
 
 def compare_heard(traffic: Traffic, config: MachineConfig, axis: str) -> Iterator[Finding]:
     """Compare the traffic of a running NC as far as it shows one drive; nothing is sent."""
-    profile, node_id = load_profile(config.axis[axis].drive.profile), config.node_id(axis)
+    profile, node_id = load_profile(config.axis[axis].drive), config.node_id(axis)
     nmt = traffic.nmt(node_id)
     cause = f"nothing was heard of node-ID {node_id}"
     shown = f"{cause}" if node_id not in traffic.nodes else f"node-ID {node_id}, {nmt or 'no heartbeat'}"
@@ -177,8 +197,7 @@ def compare_heard(traffic: Traffic, config: MachineConfig, axis: str) -> Iterato
     if target is not None:
         yield _heard_pdo(traffic, target[0], node_id)
     yield from _rapid(config, profile, lambda: _heard_value(traffic, profile, node_id))
-    for point in SDO_POINTS:
-        yield Finding(point, "the config's", "not asked", None, "SDO belongs to the NC now", NC_OFF)
+    yield from _not_compared(("device", *SDO_POINTS), "SDO belongs to the NC now", NC_OFF)
 
 
 def _heard_pdo(traffic: Traffic, spec: PdoSpec, node_id: int) -> Finding:

@@ -14,28 +14,48 @@ from dataclasses import dataclass, field
 from typing import Self
 
 from fdhil import cia402
+from fdhil.commissioning.bus_listener import shows_master
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import MachineConfig
+from fdhil.drivers.can.frames import ERROR_FLAG
 from fdhil.drivers.can.sdo import SdoLink
-from fdhil.drivers.cia402.profile import DriveProfile, load_profile
+from fdhil.drivers.cia402.profile import DriveProfile
+from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.errors import DeviceError, DeviceTimeout
 
 
 @dataclass(slots=True)
 class Heard:
-    """The drive's newest: mapped objects by key, EMCY frames, and its NMT state."""
+    """The drive's newest: mapped objects by key, EMCY frames, its NMT state; and frames and error frames of the bus.
+
+    ``master`` is what shows that another master runs the bus, None while nothing does.
+    """
 
     objects: dict[tuple[int, int], int] = field(default_factory=dict)
     cycle: dict[tuple[int, int], int] = field(default_factory=dict)
     emergencies: list[bytes] = field(default_factory=list)
     nmt: int | None = None
-    sync: int = 0
-    foreign_rpdo: int = 0
+    master: str | None = None
     frames: int = 0
+    errors: int = 0
 
 
 LOCKSTEP_WAIT_S = 8.0
 LOCKSTEP_PATIENCE = 20.0  # times as long as on a real machine: a simulated one shares its computer
+
+
+class AxisSdo(SdoLink):
+    """The SDO channel of one axis of a node: objects of CiA 402 are named as the first axis has them."""
+
+    profile: DriveProfile
+
+    def read(self, index: int, sub: int = 0) -> bytes:
+        """Read an object; SdoAbort, DeviceTimeout or ProtocolError."""
+        return super().read(self.profile.object_index(index), sub)
+
+    def write_int(self, index: int, sub: int, value: int, length: int) -> None:
+        """Write an integer of ``length`` bytes."""
+        super().write_int(self.profile.object_index(index), sub, value, length)
 
 
 class Master:
@@ -45,14 +65,15 @@ class Master:
         settings = config.axis[axis]
         self.config, self.axis = config, axis
         self.node_id = config.node_id(axis)
-        profile = load_profile(settings.drive.profile)
+        profile = load_profile(settings.drive)
         self.profile: DriveProfile = profile.with_feedforward() if settings.feedforward else profile
         self.period_s = config.machine.sync_period_s
         self.device = f"drive {axis}"
         self.bus = TransmitBus(settings.drive.bus, config.bus[settings.drive.bus])
         self._lockstep = config.guard.clock == "sync"
         self._patience = LOCKSTEP_PATIENCE if self._lockstep else 1.0
-        self.sdo = SdoLink(self.device, self.node_id, self.bus.send, self._patience)
+        self.sdo = AxisSdo(self.device, self.node_id, self.bus.send, self._patience)
+        self.sdo.profile = self.profile
         self.heard = Heard()
         self.cycle = 0
         self.controlword = 0
@@ -115,10 +136,11 @@ class Master:
             target, offset, controlword, fed = self.target, self.offset, self.controlword, self.fed
         if target is None:
             return
-        values = {self.profile.target: target, self.profile.offset: offset, (0x6040, 0): controlword}
+        profile = self.profile
+        values = {profile.target: target, profile.offset: offset, profile.controlword: controlword}
         if fed is not None:
-            values |= zip((self.profile.speed_offset, self.profile.torque_offset), fed, strict=True)
-        for spec in self.profile.rpdos:
+            values |= zip((profile.speed_offset, profile.torque_offset), fed, strict=True)
+        for spec in profile.rpdos:
             if spec.valid and all((e.index, e.sub) in values for e in spec.entries):
                 data = cia402.pack(spec.entries, [values[e.index, e.sub] for e in spec.entries])
                 self.bus.send(spec.cob_base + self.node_id, data)
@@ -126,13 +148,13 @@ class Master:
     def _receive(self) -> None:
         node, heard = self.node_id, self.heard
         tpdos = {spec.cob_base + node: spec for spec in self.profile.tpdos}
-        rpdos = {spec.cob_base + node for spec in self.profile.rpdos}
         for frame in self.bus.drain():
             can_id, length = int(frame["id"]), int(frame["dlc"])
             data = int(frame["data"]).to_bytes(8, "little")[:length]
-            heard.frames += 1
-            if can_id == cia402.COB_SYNC:
-                heard.sync += 1
+            error = bool(can_id & ERROR_FLAG)
+            heard.errors, heard.frames = heard.errors + error, heard.frames + (not error)
+            if (sign := shows_master(can_id)) is not None:
+                heard.master = heard.master or sign
             elif can_id in tpdos and length >= tpdos[can_id].length:
                 spec, self._answered = tpdos[can_id], self.cycle
                 for entry, value in zip(spec.entries, cia402.unpack(spec.entries, data), strict=True):
@@ -144,8 +166,6 @@ class Master:
                 heard.emergencies.append(data)
             elif can_id == cia402.COB_HEARTBEAT + node and data:
                 heard.nmt = data[0] & 0x7F
-            elif can_id in rpdos:
-                heard.foreign_rpdo += 1
 
     # what the steps use ---------------------------------------------------------------------------------------
 

@@ -18,8 +18,10 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from fdhil import tables
 from fdhil.commissioning.void import confirm_record
-from fdhil.config import MachineConfig
+from fdhil.config import Drive, MachineConfig
+from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.errors import StoreError
 
 SCHEMA = "fdhil-commissioning-2"
@@ -100,9 +102,20 @@ def axis_digest(config: MachineConfig, axis: str) -> str:
     settings = config.axis[axis].model_dump(mode="json", exclude={"voltage", "nominal", "regulators"})
     if settings["feedforward"] is None:
         del settings["feedforward"]
+    settings["drive"] = _described(config.axis[axis].drive)
     guard = config.guard.model_dump(mode="json", include={"node_id", "heartbeat_s"})
     text = json.dumps([settings, guard, config.machine.sync_period_s, config.node_id(axis)], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _described(drive: Drive) -> dict[str, Any]:
+    """Return what the configuration says of the drive; a file by what it says, wherever it lies."""
+    said = drive.model_dump(mode="json", exclude={"eds"})
+    new = {"logical_axis": 1, "rated_torque_nm": 1.0, "dc_link_v": None, "speed_unit": None}
+    said = {key: value for key, value in said.items() if key not in new or value != new[key]}
+    if drive.profile not in tables.DRIVE_PROFILES or drive.eds is not None:
+        said["profile"] = repr(load_profile(drive))
+    return said
 
 
 def record_path(directory: Path, axis: str) -> Path:

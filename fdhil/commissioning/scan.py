@@ -13,6 +13,7 @@ from pathlib import Path
 
 from fdhil.cia402 import COB_SDO_REQUEST, COB_SDO_RESPONSE, Object
 from fdhil.commissioning.bus_listener import LISTEN_S, BusListener, Traffic
+from fdhil.commissioning.device_type import is_drive
 from fdhil.commissioning.survey import Identity
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import MachineConfig
@@ -24,7 +25,8 @@ from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, EdsError, Pro
 
 ANSWER_S = 0.3
 PACE_S = 0.001
-PROFILE_402 = 402
+FITS = ("exact", "other revision", "any product")
+_ANY_NUMBER = 0xFFFFFFFF  # how some EDS say that they are for all products of the vendor; others say nothing
 _READ_DEVICE_TYPE = bytes([0x40, 0x00, 0x10, 0, 0, 0, 0, 0])
 
 
@@ -85,15 +87,19 @@ class Description:
     revision: int | None
 
     def fits(self, identity: Identity) -> str | None:
-        """``exact``, ``other revision``, or None when it is for another device."""
-        if (self.vendor_id, self.product_code) != (identity.vendor_id, identity.product_code):
+        """One of ``FITS``, the best first, or None when it is for another device."""
+        if not self.vendor_id or self.vendor_id != identity.vendor_id:
             return None
-        return "exact" if self.revision in (None, identity.revision) else "other revision"
+        if self.product_code in (None, 0, _ANY_NUMBER):
+            return "any product"
+        if self.product_code != identity.product_code:
+            return None
+        return "exact" if self.revision in (None, _ANY_NUMBER, identity.revision) else "other revision"
 
 
 @dataclass(frozen=True, slots=True)
 class EdsMatch:
-    """The description that fits a node best; ``fit`` is ``exact`` or ``other revision``."""
+    """The description that fits a node best, and how it does: one of ``FITS``."""
 
     file: str
     fit: str
@@ -115,7 +121,7 @@ class Answers:
     @property
     def is_drive(self) -> bool:
         """Whether its device profile is CiA 402."""
-        return self.device_type & 0xFFFF == PROFILE_402
+        return is_drive(self.device_type)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +151,7 @@ def scan_bus(name: str, config: MachineConfig, descriptions: Sequence[Descriptio
     axes = {config.node_id(axis): axis for axis, settings in config.axis.items() if settings.drive.bus == name}
     with BusScanner(name, config) as bus:
         bus.listen(LISTEN_S)
+        bus.require_readable()
         master = bus.traffic.master
         answering = set() if master else bus.answering()
         found = sorted(bus.traffic.nodes | answering)
@@ -173,7 +180,8 @@ def _ask(bus: BusScanner, node_id: int, descriptions: Sequence[Description]) -> 
 
     identity = Identity(*(number(Object.IDENTITY, sub) or 0 for sub in (1, 2, 3, 4)))
     fits = [(description.fits(identity), description.path.name) for description in descriptions]
-    best = min((EdsMatch(name, fit) for fit, name in fits if fit is not None), key=lambda m: m.fit, default=None)
+    matches = [EdsMatch(name, fit) for fit, name in fits if fit is not None]
+    best = min(matches, key=lambda match: FITS.index(match.fit), default=None)
     period_ms = number(Object.PRODUCER_HEARTBEAT)
     return Answers(
         identity=identity,

@@ -16,13 +16,13 @@ from datetime import UTC, datetime
 from fdhil import cia402
 from fdhil.cia402 import Mode, NmtCommand, Object, State
 from fdhil.commissioning.feedforward import feedforward_open, prove_feedforward
+from fdhil.commissioning.finding import read_optional
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import CommissioningRecord, axis_digest
 from fdhil.commissioning.survey import (
     Survey,
     faulted,
     listen,
-    read_optional,
     require,
     require_alone,
     require_enabled,
@@ -30,6 +30,7 @@ from fdhil.commissioning.survey import (
 )
 from fdhil.commissioning.watchdog import watchdog_test
 from fdhil.config import CorrectionLimits, MachineConfig
+from fdhil.drivers.cia402.profile_file import NO_OFFSET_ADVICE, load_profile, no_offset
 from fdhil.errors import DeviceError, DriveFault, ProtocolError
 
 SIGN_TEST_UM = 10.0
@@ -75,7 +76,7 @@ def enable(master: Master) -> None:
             master.hold_here()
             master.controlword = word
         master.wait_cycles(10)
-    mode = (0x6061, 0)
+    mode = (master.profile.object_index(Object.MODE_DISPLAY), 0)
     if mode in master.heard.objects:
         master.wait(
             lambda: master.heard.objects[mode] == Mode.CYCLIC_SYNC_POSITION,
@@ -250,8 +251,12 @@ def commission(
     Nothing moves before ``report`` returns from ``enable``, and nothing is written but the RPDO of the feed-forward,
     which is given back: what ``report`` raises there ends it with no trace.
 
-    DriveFault, ProtocolError, DeviceTimeout or ConnectError, one sentence each, after everything was rolled back.
+    DriveFault (also for a drive that takes no offset), ProtocolError, DeviceTimeout or ConnectError, one sentence each,
+    after everything was rolled back.
     """
+    profile = load_profile(config.axis[axis].drive)
+    if not profile.takes_offset:
+        raise DriveFault(f"drive {axis}", f"{no_offset(profile)}; {NO_OFFSET_ADVICE}")
     with Master(config, axis) as master:
         report("listen")
         listen(master)

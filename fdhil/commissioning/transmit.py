@@ -6,16 +6,22 @@ a dead program look alive.
 
 from __future__ import annotations
 
+import errno
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import can
 
 from fdhil import config
 from fdhil.drivers.can.bus import CanBus
-from fdhil.drivers.can.ports import CAN_FRAME, CONNECT_TIMEOUT_S, Port, SocketcandPort, SocketCanPort, VirtualPort
-from fdhil.errors import DeviceError
+from fdhil.drivers.can.port import Filter, Port
+from fdhil.drivers.can.python_can import VirtualPort
+from fdhil.drivers.can.socketcan import CAN_FRAME, SocketCanPort
+from fdhil.drivers.can.socketcand import CONNECT_TIMEOUT_S, SocketcandPort
+from fdhil.errors import ConnectError, DeviceError
+
+QUEUE_FULL = "the transmit queue is full: no other node acknowledges, check the drives' supply, wiring and bit rate"
 
 
 class SendingPort(Port, Protocol):
@@ -33,7 +39,11 @@ class SocketCanSender(SocketCanPort):
         try:
             self._socket.send(CAN_FRAME.pack(can_id, len(data), data))
         except OSError as error:
-            raise DeviceError(self._name, f"the frame {can_id:03X} was not sent ({error.strerror})") from None
+            full = (
+                "the transmit queue is full: no other node acknowledges what is sent, check supply, wiring and bit rate"
+            )
+            why = full if error.errno in (errno.ENOBUFS, errno.EAGAIN) else error.strerror
+            raise DeviceError(self._name, f"the frame {can_id:03X} was not sent ({why})") from None
 
 
 class SocketcandSender(SocketcandPort):
@@ -72,7 +82,10 @@ class TransmitBus(CanBus):
 
     batch_s = 0.0
 
-    def _open(self, settings: config.CanBus) -> Port:
+    def _open(self, settings: config.CanBus, filters: Sequence[Filter]) -> Port:
+        if not settings.may_send:
+            text = f"{settings.interface} adapters are only listened to, and this has to send; use SocketCAN for it"
+            raise ConnectError(self.name, text)
         self._send_lock = threading.Lock()
         self._sender = SENDERS[settings.interface](self.name, settings)
         return self._sender

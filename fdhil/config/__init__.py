@@ -12,9 +12,12 @@ from fdhil.config.axis import (
     CEILING_SPEED_MM_S,
     Axis,
     CorrectionLimits,
+    Drive,
     FeedforwardLimits,
     Nominal,
+    SpeedUnit,
 )
+from fdhil.config.bus import CanBus
 from fdhil.config.controller import Identification, Nc
 from fdhil.config.machine import MachineConfig
 from fdhil.config.offset_bounds import VARIATION_MM, OffsetBounds, share_fault
@@ -23,7 +26,7 @@ from fdhil.config.reality import Reality
 from fdhil.config.regulators import Regulators
 from fdhil.config.section import Section
 from fdhil.config.sensors import Thermometer, Voltage
-from fdhil.config.service import CanBus, Maintenance
+from fdhil.config.service import Maintenance
 from fdhil.config.simulation import Noise, SimAxis, Thermal
 from fdhil.config.table import Accelerometer, TableEncoder
 
@@ -36,6 +39,7 @@ __all__ = [
     "Axis",
     "CanBus",
     "CorrectionLimits",
+    "Drive",
     "FeedforwardLimits",
     "Identification",
     "MachineConfig",
@@ -48,6 +52,7 @@ __all__ = [
     "Regulators",
     "Section",
     "SimAxis",
+    "SpeedUnit",
     "TableEncoder",
     "Thermal",
     "Thermometer",

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
 from fdhil import tables
 from fdhil.cia402 import Scaling
@@ -18,6 +20,10 @@ from fdhil.config.table import Accelerometer, TableEncoder
 CEILING_OFFSET_UM = 250.0
 CEILING_SPEED_MM_S = 20.0
 CEILING_ACCELERATION_MM_S2 = 2000.0
+
+
+SpeedUnit = Literal["increments_per_s", "rpm", "millirpm"]
+"""What a drive's speed object can count in."""
 
 
 class Nominal(Section):
@@ -53,18 +59,50 @@ class FeedforwardLimits(Section):
 class Drive(Section):
     """[axis.X.drive]: how the drive is reached and scaled."""
 
+    _files: str = PrivateAttr("")
+
+    def placed(self, folder: Path) -> Drive:
+        """Return it with the paths of its files taken from ``folder``, and these files' digest."""
+        own = [] if self.profile in tables.DRIVE_PROFILES else [folder / self.profile]
+        eds = [] if self.eds is None else [folder / self.eds]
+        changes: dict[str, Any] = {"profile": str(own[0]) if own else self.profile, "eds": eds[0] if eds else None}
+        drive = self.model_copy(update=changes)
+        told = b"".join(path.read_bytes() for path in (*own, *eds) if path.is_file())
+        drive._files = hashlib.sha256(told).hexdigest() if own or eds else ""
+        return drive
+
+    @property
+    def files_digest(self) -> str:
+        """Of what its own profile and its EDS say, a part of what the configuration means; empty without such files."""
+        return self._files
+
     bus: str = Field("can0", description="the [bus.*] it is on")
     node_id: int | None = Field(
         None, ge=1, le=127, description="CANopen node-ID; left out: 1 for the first axis, 2 for the next"
     )
-    profile: Annotated[str, one_of(tables.DRIVE_PROFILES)] = Field(
-        "fdhil_twin", description=f"the vendor profile: {', '.join(tables.DRIVE_PROFILES)}"
+    profile: Annotated[str, one_of(tables.DRIVE_PROFILES, or_suffix=".toml")] = Field(
+        "fdhil_twin",
+        description=f"the drive's profile: {', '.join(tables.DRIVE_PROFILES)}, "
+        "or the path of a TOML file, from this file's folder",
+    )
+    eds: Path | None = Field(None, description="the drive's EDS or DCF file, from this file's folder")
+    logical_axis: int = Field(
+        1, ge=1, le=8, description="which axis of a device with several: its objects are 0x800 higher for each"
     )
     increments_per_rev: int = Field(
         65536, ge=4, le=2**31 - 1, description="encoder and set-point increments per revolution"
     )
+    speed_unit: SpeedUnit | None = Field(
+        None, description="what 0x606C counts in, where the drive was set to another unit (0x60A9) than its profile's"
+    )
     sign: Literal[1, -1] = Field(1, description="-1 where the drive counts against the axis")
     rated_current_a: Positive = Field(50.0, ge=1e-3, le=1e5, description="0x6075; 0x6078 counts in 0.1 % of it")
+    rated_torque_nm: Positive = Field(
+        1.0, ge=1e-4, le=1e6, description="0x6076, where the profile takes the current from the torque (0x6077)"
+    )
+    dc_link_v: Positive | None = Field(
+        None, ge=1.0, le=2000.0, description="DC link, where the profile takes the voltage from the duty of the PWM"
+    )
     setpoint_delay_cycles: int = Field(
         2, ge=0, le=16, description="SYNC cycles by which the drive runs its set-point late"
     )
@@ -91,7 +129,7 @@ class Axis(Section):
         ge=5.0,
         le=2000.0,
         description="resonance of motor and table against each other, the motor free to turn, as the drive's frequency "
-        "response has it; the motor's encoder cannot see what the table does then: left out, the table is where it is",
+        "response has it; left out: sought where replays of rapids leave much, else the table is where the motor is",
     )
     resonance_damping: NotNegative = Field(0.03, le=0.7, description="damping ratio of that resonance")
     nominal: Nominal

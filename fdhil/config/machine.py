@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from pydantic import Field, ValidationInfo, model_validator
 
 from fdhil.config.axis import Axis
+from fdhil.config.bus import CanBus
 from fdhil.config.controller import G0, Correction, Identification, Nc
 from fdhil.config.offset_bounds import limit_faults
 from fdhil.config.plausible import doubts
 from fdhil.config.regulators import period_faults
 from fdhil.config.section import AxisName, Positive, Section
-from fdhil.config.sensors import Thermometer, Voltage, line_faults
-from fdhil.config.service import CanBus, Guard, Maintenance, Store
+from fdhil.config.sensors import WORDS, LineUser, line_faults, line_user
+from fdhil.config.service import Guard, Maintenance, Store
 from fdhil.config.simulation import Sim
 
 
@@ -48,30 +49,39 @@ class MachineConfig(Section):
         for name, axis in self.axis.items():
             if axis.drive.bus not in self.bus:
                 faults.append(f"axis.{name}.drive.bus: there is no [bus.{axis.drive.bus}]")
+            elif axis.correction is not None and not self.bus[axis.drive.bus].may_send:
+                faults.append(f"axis.{name}.correction: {self._listening(axis.drive.bus)}")
             faults += [f"axis.{name}.regulators.{fault}" for fault in period_faults(axis.regulators, period)]
             limits = [f"axis.{name}.correction: {fault}" for fault in limit_faults(axis, period)]
             # a number in another unit makes limits wrong too, and says so better
             found = [] if (info.context or {}).get("made_up") else doubts(axis)
             faults += [f"axis.{name}.{doubt.key}: {doubt.text}" for doubt in found if limits or not doubt.possible]
             faults += limits
-        faults += line_faults(self.sensors)
-        ids = [self.node_id(name) for name in self.axis]
-        if len({(self.axis[n].drive.bus, i) for n, i in zip(self.axis, ids, strict=True)}) < len(ids):
+        faults += line_faults(self._line_users())
+        # the PDOs of a device's second axis are those of the next node-ID
+        ids = {(axis.drive.bus, self.node_id(name) + axis.drive.logical_axis) for name, axis in self.axis.items()}
+        if len(ids) < len(self.axis):
             faults.append("axis: two drives of one bus have the same node_id")
         faults += [f"sim.axis.{name}: there is no [axis.{name}]" for name in self.sim.axis if name not in self.axis]
         if faults:
             raise ValueError("\n".join(faults))
         return self
 
-    @property
-    def sensors(self) -> dict[str, Voltage | Thermometer]:
-        """The sections of all sensors, by their path."""
-        found: dict[str, Voltage | Thermometer] = {}
+    def _line_users(self) -> Iterator[LineUser]:
+        """Yield the sensors on serial devices."""
         for name, axis in self.axis.items():
-            found[f"axis.{name}.voltage"] = axis.voltage
+            yield from filter(None, [line_user(f"axis.{name}.voltage", axis.voltage)])
             if axis.temperature is not None:
-                found[f"axis.{name}.temperature"] = axis.temperature
-        return found
+                yield from filter(None, [line_user(f"axis.{name}.temperature", axis.temperature)])
+            table, accelerometer = axis.table, axis.accelerometer
+            if table is not None and table.source == "modbus" and table.device:
+                yield LineUser(f"axis.{name}.table", table, WORDS[table.type], table.period_s, False)
+            if accelerometer is not None:
+                yield LineUser(f"axis.{name}.accelerometer", accelerometer, 0, 1.0, True)
+
+    def _listening(self, bus: str) -> str:
+        interface = self.bus[bus].interface
+        return f"bus {bus} is only listened to ({interface}); use SocketCAN there, or leave this section out"
 
     def node_id(self, axis: str) -> int:
         """Return the CANopen node-ID of an axis' drive."""
@@ -90,4 +100,5 @@ class MachineConfig(Section):
     @property
     def digest(self) -> str:
         """SHA-256 of the configuration's meaning (not of its text), 16 hexadecimal digits."""
-        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
+        files = "".join(axis.drive.files_digest for axis in self.axis.values())
+        return hashlib.sha256(f"{self.model_dump_json()}{files}".encode()).hexdigest()[:16]

@@ -58,7 +58,7 @@ def toml_document(raw: bytes, source: str) -> dict[str, Any]:
 def parse(
     document: Mapping[str, Any], source: str = "config", folder: Path = Path(), *, made_up: bool = False
 ) -> MachineConfig:
-    """Check a parsed TOML document; relative directories of [store] are taken from ``folder``.
+    """Check a parsed TOML document; relative paths are taken from ``folder``.
 
     ``made_up``: its axes need not be those of a machine that can be.
     """
@@ -77,7 +77,13 @@ def parse(
     )
     guard_run = config.guard.run_directory
     guard = config.guard.model_copy(update={"run_directory": folder / guard_run if guard_run else None})
-    return config.model_copy(update={"store": store, "guard": guard})
+    worn = {
+        name: axis.model_copy(update={"eds": folder / axis.eds if axis.eds else None})
+        for name, axis in config.sim.axis.items()
+    }
+    sim = config.sim.model_copy(update={"axis": worn})
+    axes = {name: axis.model_copy(update={"drive": axis.drive.placed(folder)}) for name, axis in config.axis.items()}
+    return config.model_copy(update={"store": store, "guard": guard, "axis": axes, "sim": sim})
 
 
 def unlikely(config: MachineConfig) -> list[str]:

@@ -31,11 +31,11 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
 
 
-def one_of(table: Mapping[str, str]) -> AfterValidator:
-    """Return the check that a name is of a table."""
+def one_of(table: Mapping[str, str], or_suffix: str | None = None) -> AfterValidator:
+    """Return the check that a name is of a table, or a path that ends in ``or_suffix``."""
 
     def check(name: str) -> str:
-        if name not in table:
+        if name not in table and not (or_suffix and name.endswith(or_suffix)):
             near = difflib.get_close_matches(name, table, n=1)
             raise ValueError(f"must be one of {', '.join(table)}" + (f"; did you mean {near[0]!r}?" if near else ""))
         return name

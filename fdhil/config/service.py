@@ -10,16 +10,6 @@ from pydantic import Field
 from fdhil.config.section import Positive, Section
 
 
-class CanBus(Section):
-    """[bus.NAME]: a CAN bus."""
-
-    interface: Literal["socketcan", "socketcand", "virtual"] = Field("socketcand", description="python-can interface")
-    channel: str = Field("can0", description="socketcan: the network interface; socketcand: the bus behind the hub")
-    host: str = Field("127.0.0.1", description="socketcand: address of the hub")
-    port: int = Field(0, ge=0, le=65535, description="socketcand: TCP port of the hub; 0 lets the simulator choose one")
-    bitrate: int = Field(1_000_000, ge=10_000, le=1_000_000, description="bit/s, for the bus load")
-
-
 class Store(Section):
     """[store]"""
 

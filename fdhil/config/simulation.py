@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Literal
 
 from pydantic import Field
@@ -35,6 +36,18 @@ class SimAxis(Section):
     backlash_um: NotNegative = Field(0.0, description="lost motion between screw and table")
     start_mm: Finite = Field(0.0, description="position at power-on")
     offset_in_feedforward: bool = Field(True, description="whether 0x60B0 is seen by the speed feed-forward")
+    eds: Path | None = Field(
+        None, description="EDS or DCF file that the simulated drive wears, from the config's folder; left out: its own"
+    )
+    boot_s: NotNegative = Field(
+        0.0, le=60.0, description="from a reset, or the supply's return, to the boot-up message"
+    )
+    limit_switches_mm: tuple[Finite, Finite] | None = Field(
+        None, description="where the limit switches are, for homing; left out: there are none"
+    )
+    home_switch_mm: Finite | None = Field(
+        None, description="from where on, in the drive's positive direction, the home switch is active"
+    )
     reality: Reality = Reality()
 
 

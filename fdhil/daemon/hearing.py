@@ -79,7 +79,8 @@ class Hearing:
             self._sync.extend(zip(record.tick.tolist(), record.t_ns.tolist(), strict=True))
             self._sync_s = now_s
         elif isinstance(record, AxisSamples) and record.axis in self.moves:
-            self._samples_s[record.axis] = now_s
+            if record.tick.size:  # else none is whole: a TPDO of the mapping does not come
+                self._samples_s[record.axis] = now_s
             self.moves[record.axis].feed(record, now_s)
         elif isinstance(record, Notice) and record.code in SILENCES:
             if record.severity == "info":
@@ -170,6 +171,9 @@ class Hearing:
         node = f"node {self._config.node_id(axis)} on {bus}"
         if self._counters.get(f"{bus}.{axis}.heard") == 0:
             text = f"the drive ({node}) was never heard, nothing is known of its axis"
+            if not synced:
+                text += "; without SYNC that is so where it sends no heartbeat (0x1017), else"
+                return "NodeNeverHeard", f"{text} check node_id in the config, its supply and its wiring"
             return "NodeNeverHeard", f"{text}; check node_id in the config, its supply and its wiring"
         age_s = self.samples_s_ago(axis, now_s)
         if synced and (age_s is None or age_s > LIVE_S):

@@ -31,7 +31,8 @@ def warm(config: MachineConfig, method: str | None = None) -> None:
     models = {name: Parameters(**axis.nominal.model_dump()) for name, axis in config.axis.items()}
     correction.plan(reference, models, config)
     for name, model in models.items():
-        closed_loop.simulate(model.changed(load=0.0), config.axis[name], dt_s, demand[name][:8])
+        for more in ({"load": 0.0}, {"resonance": 100.0}):
+            closed_loop.simulate(model.changed(**more), config.axis[name], dt_s, demand[name][:8])
     _warm_what_is_rare()
 
 

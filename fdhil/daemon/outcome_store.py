@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Sequence
 
 from fdhil.config import MachineConfig
-from fdhil.drivers.cia402.profile import load_profile
+from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.errors import StoreError
 from fdhil.identification.between import HISTORY, Member
 from fdhil.identification.drift import Point
@@ -36,9 +36,9 @@ SKILLS = 3
 def raw_scales(config: MachineConfig, axis: str) -> Scales:
     """Return how the drive's integers of each column become values: the drivers' own scales, in their own order."""
     settings = config.axis[axis]
-    profile = load_profile(settings.drive.profile)
+    profile = load_profile(settings.drive)
     position = (RawScale(settings.scaling.sign / settings.scaling.increments_per_mm),)
-    voltage = profile.voltage_v_per_count
+    voltage = abs(profile.terminal_v_per_count(settings))
     return {
         "demand_mm": position,
         "position_mm": position,

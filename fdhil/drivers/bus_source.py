@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections import Counter
+from collections.abc import Mapping
 
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.bus import CanBus
 from fdhil.drivers.can.frame_history import FrameHistory
+from fdhil.drivers.can.port import Stamps
 from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.cia402.bus_decoder import BusDecoder
 from fdhil.drivers.cia402.drive import InputSamples
@@ -18,6 +21,10 @@ from fdhil.records import AxisSamples, Notice, TickTimes
 
 DRAIN_S = 0.05
 SILENCE_S = 2.0
+STAMPS_COST: Mapping[Stamps, str] = {
+    "adapter": "the adapter's own clock, and are late by what its quickest frames are: about 1 ms over USB",
+    "host": "this program when it reads them: some 10 ms late and in bursts, more on a busy computer",
+}
 
 
 class BusSource:
@@ -33,17 +40,15 @@ class BusSource:
         self._events = [event_source(axis, config) for axis in self.decoder.axes]
         self.history = FrameHistory()
         self._silent = False
-        self._frames_before = 0
+        self._before: Counter[str] = Counter()
         self._overflow_told = 0
+        self._stamping_told = False
 
     def open(self) -> None:
         """Open the bus; ConnectError when it cannot be reached."""
-        self._bus = CanBus(self.name, self._config.bus[self.name])
-
-    @property
-    def heard(self) -> bool:
-        """Whether any frame was received."""
-        return self._bus is not None and self._bus.counters()["frames"] > 0
+        settings = self._config.bus[self.name]
+        filters = self.decoder.filters() if settings.frames == "drives" else ()
+        self._bus = CanBus(self.name, settings, filters=filters)
 
     def step(self, now_ns: int) -> list[Record]:
         """Drain and decode once."""
@@ -61,7 +66,18 @@ class BusSource:
                     out += source.feed(record)
             if not isinstance(record, InputSamples):
                 out.append(record)
-        return [*out, *self._overflow(bus), *self._silence(bus, now_ns)]
+        return [*out, *self._stamping(bus), *self._overflow(bus), *self._silence(bus, now_ns)]
+
+    def _stamping(self, bus: CanBus) -> list[Notice]:
+        """Say once what the time stamps of this way onto the bus are worth, where that is less than the kernel's."""
+        cost = STAMPS_COST.get(bus.stamps)
+        if cost is None or self._stamping_told or not bus.counters()["frames"]:
+            return []
+        self._stamping_told = True
+        text = (
+            f"Frames of bus {self.name} are stamped by {cost}. Samples follow SYNC and lose nothing; a voltage sensor"
+        )
+        return [Notice("CoarseStamps", "info", f"{text} of its own is placed no better, so that L is less certain.")]
 
     def _overflow(self, bus: CanBus) -> list[Notice]:
         lost = bus.counters()["lost"]
@@ -75,7 +91,10 @@ class BusSource:
         silent = now_ns - bus.last_frame_ns > SILENCE_S * 1e9
         was, self._silent = self._silent, silent
         if silent and not was:
-            text = f"Nothing is heard on bus {self.name}; check the drives' supply, the wiring and the bit rate."
+            text = (
+                f"Nothing is heard on bus {self.name}: so it is while the NC is off and no drive sends a heartbeat "
+                "(0x1017); else check the drives' supply, the wiring and the bit rate. fdhil scan asks the drives."
+            )
             return [Notice("BusSilent", "MAJOR", text)]
         return [Notice("BusSilent", "info", f"Bus {self.name} is heard again.")] if was and not silent else []
 
@@ -112,14 +131,13 @@ class BusSource:
         """Frames received and lost on this bus."""
         own = self._bus.counters() if self._bus else {"frames": 0, "ring_overflow": 0, "kernel_drops": 0, "lost": 0}
         decoded = self.decoder.counters()
-        own["frames"] += self._frames_before
+        own = {key: count + self._before[key] for key, count in own.items()}
         own["lost"] += decoded["pdo_lost"] + decoded["sync_missed"]
         return own | decoded
 
     def close(self) -> None:
-        """Close the bus; its frames stay counted."""
+        """Close the bus; its frames, and those that were lost, stay counted."""
         if self._bus is not None:
-            counters = self._bus.counters()
-            self._frames_before += counters["frames"]
+            self._before.update(self._bus.counters())
             self._bus.close()
             self._bus = None

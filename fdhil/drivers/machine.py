@@ -1,9 +1,10 @@
 """Opens the whole machine as one source of records: buses, sensors and event sources of a configuration.
 
-At the start everything must be there, else one ConnectError names all that is not. Later nothing ends the source: a
-bus or a sensor that goes away is a notice and a gap, and is tried again with growing pauses. Nothing is queued here:
-what came waits in the bus' ring and in the sensor, both of which count what they had no room for, and a fault of a
-source's own leaves ``run`` as the exception that it is.
+At the start every bus and sensor must be there, else one ConnectError names all that are not. A bus on which nothing
+is heard is told, and listened to all the same: with the NC off, drives that send no heartbeat are silent. Later nothing
+ends the source: a bus or a sensor that goes away is a notice and a gap, and is tried again with growing pauses. Nothing
+is queued here: what came waits in the bus' ring and in the sensor, both of which count what they had no room for, and a
+fault of a source's own leaves ``run`` as the exception that it is.
 """
 
 from __future__ import annotations
@@ -13,14 +14,12 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from fdhil.config import MachineConfig
-from fdhil.drivers.bus_source import DRAIN_S, BusSource
+from fdhil.drivers.bus_source import BusSource
 from fdhil.drivers.can.frame_history import candump
 from fdhil.drivers.sensor_source import Record, SensorSource, Take, sensors_of
 from fdhil.errors import ConnectError, DeviceError
 
 __all__ = ["MachineSource", "Record", "open_machine"]
-
-LISTEN_S = 2.0
 
 
 class MachineSource:
@@ -46,21 +45,8 @@ class MachineSource:
         for result in results:
             if isinstance(result, BaseException) and not isinstance(result, DeviceError):
                 raise result
-        faults += await self._listen() if not faults else []
         if faults:
             raise ConnectError("machine", "; ".join(str(fault) for fault in faults)) if len(faults) > 1 else faults[0]
-
-    async def _listen(self) -> list[DeviceError]:
-        """Give each bus two seconds to be heard: heartbeats come even while nothing moves."""
-        for _ in range(round(LISTEN_S / DRAIN_S)):
-            if all(bus.heard for bus in self._buses.values()):
-                break
-            await asyncio.sleep(DRAIN_S)
-        return [
-            ConnectError(f"bus {name}", "there is no drive on the bus; check the drives' supply, wiring and bit rate")
-            for name, bus in self._buses.items()
-            if not bus.heard
-        ]
 
     async def run(self, take: Take) -> None:
         """Hand every record over for ever; an exception in one source ends all of them, and goes on to the caller."""

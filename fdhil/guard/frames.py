@@ -20,6 +20,7 @@ from fdhil.cia402 import (
     Nmt,
     NmtCommand,
     Object,
+    first_axis_index,
     pdo_length,
     unpack,
 )
@@ -112,7 +113,8 @@ class Listener:
             self._pdos[axis.target.cob_id] = target
             self._pdos.update(zip([pdo.cob_id for pdo in axis.tpdos], tpdos, strict=True))
         self._nodes = [_Node() for _ in settings.axes]
-        self._node_of = {axis.node_id: k for k, axis in enumerate(settings.axes)}
+        nodes = [axis.node_id for axis in settings.axes]
+        self._axes_of = {node: [k for k, of in enumerate(nodes) if of == node] for node in nodes}  # one or more
         self._alarms: dict[tuple[str, str], Alarm] = {}
         self._counter: int | None = None
         self._last_sync_s: tuple[float, float] | None = None
@@ -120,9 +122,8 @@ class Listener:
 
     def wanted_ids(self) -> tuple[int, ...]:
         """All COB-IDs that the guard must hear, for a receive filter."""
-        nodes = list(self._node_of)
-        ids = {COB_NMT, COB_SYNC, *self._pdos, *self._sent_ids}
-        return tuple(sorted(ids | {base + n for n in nodes for base in (COB_EMCY, COB_HEARTBEAT, COB_SDO_REQUEST)}))
+        ids = {base + node for node in self._axes_of for base in (COB_EMCY, COB_HEARTBEAT, COB_SDO_REQUEST)}
+        return tuple(sorted(ids | {COB_NMT, COB_SYNC, *self._pdos, *self._sent_ids}))
 
     def take(self, cob_id: int, data: bytes, now_s: float) -> None:
         """Take any frame but SYNC; ``now_s`` is monotonic time."""
@@ -134,12 +135,17 @@ class Listener:
             self._alarm(Alarm(code, detail=f"{cob_id:03X} {data.hex()}"))
         elif cob_id == COB_NMT:
             self._nmt_command(data)
-        elif COB_SDO_REQUEST < cob_id <= COB_SDO_REQUEST + 127 and cob_id - COB_SDO_REQUEST in self._node_of:
-            self._sdo_request(self._node_of[cob_id - COB_SDO_REQUEST], data)
-        elif cob_id > COB_HEARTBEAT and cob_id - COB_HEARTBEAT in self._node_of:
-            self._heartbeat(self._node_of[cob_id - COB_HEARTBEAT], data, now_s)
-        elif COB_EMCY < cob_id <= COB_EMCY + 127 and cob_id - COB_EMCY in self._node_of:
-            self._emergency(self._node_of[cob_id - COB_EMCY], data)
+        else:
+            for axis in self._axes_of.get(cob_id & 0x7F, ()):
+                self._of_node(cob_id & 0x780, axis, data, now_s)
+
+    def _of_node(self, service: int, axis: int, data: bytes, now_s: float) -> None:
+        if service == COB_SDO_REQUEST:
+            self._sdo_request(axis, data)
+        elif service == COB_HEARTBEAT:
+            self._heartbeat(axis, data, now_s)
+        elif service == COB_EMCY:
+            self._emergency(axis, data)
 
     def error(self, state: str) -> None:
         """The controller reported its error state: active, warning, passive, off, down or restarted."""
@@ -154,9 +160,9 @@ class Listener:
     def _nmt_command(self, data: bytes) -> None:
         if len(data) < 2 or data[0] == NmtCommand.START:
             return
-        for node, axis in self._node_of.items():
-            if data[1] in (0, node):
-                self._alarm(Alarm("NmtStateWrong", self.settings.axes[axis].name, f"NMT command {data[0]:02X}"))
+        for axis in self.settings.axes:
+            if data[1] in (0, axis.node_id):
+                self._alarm(Alarm("NmtStateWrong", axis.name, f"NMT command {data[0]:02X}"))
 
     def _heartbeat(self, axis: int, data: bytes, now_s: float) -> None:
         if len(data) != 1:
@@ -171,7 +177,7 @@ class Listener:
         """Any master's write to the drive (CiA 301 7.2.4, initiate download, plain or block): it may be another now."""
         if len(data) < 4 or not (data[0] >> 5 == 1 or data[0] & 0xE1 == 0xC0):
             return
-        index, name = int.from_bytes(data[1:3], "little"), self.settings.axes[axis].name
+        index, name = first_axis_index(int.from_bytes(data[1:3], "little")), self.settings.axes[axis].name
         if index == Object.POSITION_OFFSET:
             self._alarm(Alarm("OffsetHijack", name, f"by SDO, {data.hex()}"))
         elif index in SET_UP or index in PDO_SET_UP:

@@ -16,7 +16,7 @@ class BusPlace(Protocol):
 
     @property
     def interface(self) -> str:
-        """``socketcan`` or ``socketcand``."""
+        """``socketcan`` or ``socketcand``; there are others, on which nothing can be sent."""
 
     @property
     def channel(self) -> str:
@@ -41,7 +41,8 @@ def connect_bus(name: str, bus: BusPlace) -> socket.socket:
         except OSError as error:
             text = f"no hub answers at {bus.host} port {bus.port} ({error.strerror or error}); start the hub first"
             raise ConnectError(f"bus {name}", text) from None
-    text = f"the interface {bus.interface!r} lives inside one process; set socketcan or socketcand"
+    why = "lives inside one process" if bus.interface == "virtual" else "is for listening only"
+    text = f"the interface {bus.interface!r} {why}; set socketcan or socketcand"
     raise ConnectError(f"bus {name}", text)
 
 

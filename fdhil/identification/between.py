@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdhil.model.compiled import compiled
-from fdhil.records import Float
+from fdhil.records import PARAMETERS, Float
 
 HISTORY = 24  # windows: what came before says little of how fast the drive warms now
 FOR_BOTH_SLOPES = 3  # windows in either direction from which on viscous friction may differ by it
@@ -120,7 +120,22 @@ def between(members: Sequence[Member]) -> Between:
         surely = surely or float(likely.max() - likely[0]) > SURELY
         for name, size in zip(kind.names, typical, strict=True):
             sizes[name], walk[name], scatter[name] = float(size), float(found[0]), float(found[1])
+    for name in dict.fromkeys(name for m in newest for name in m.names if name not in PARAMETERS):
+        sizes[name], scatter[name] = 1.0, _excess([m.part([name]) for m in newest if name in m.names])
     return Between(sizes, walk, scatter, surely)
+
+
+def _excess(told: Sequence[tuple[Float, Float]]) -> float:
+    """Return the variance by which values of one term differ beyond their own (DerSimonian, Laird 1986).
+
+    Where windows tell a ripple or a resonance each in its own way, none of them may bend what else they tell.
+    """
+    values = np.array([value[0] for value, _ in told])
+    weights = 1.0 / np.maximum([own[0, 0] for _, own in told], np.finfo(np.float64).tiny)
+    whole = float(weights.sum())
+    apart = float(weights @ np.square(values - weights @ values / whole)) - (values.size - 1)
+    spread = whole - float(weights @ weights) / whole
+    return max(0.0, apart / spread) if spread > 0.0 else 0.0
 
 
 def _weighed(members: Sequence[Member], kind: Kind) -> tuple[Float, Float, Float, Float]:

@@ -7,7 +7,7 @@ voltage in which the innovations are linear, for a term that joined the six.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -93,6 +93,8 @@ class Fit:
     """The end of a fit: ``theta`` (7 + terms,), information (k, k) of the ``free`` entries, innovations (m,), noises.
 
     ``delay_doubt_s`` is how much of a delay may be the voltage's course within its samples, or the other way round.
+    ``prior`` (k,) is what of the information on the diagonal was known before the data, and ``prior_std`` (k,) how far
+    that may be off; no rows: nothing was.
     """
 
     theta: Float
@@ -103,6 +105,8 @@ class Fit:
     problem: Problem
     converged: bool
     delay_doubt_s: float = 0.0
+    prior: Float = field(default_factory=lambda: np.zeros(0))
+    prior_std: Float = field(default_factory=lambda: np.zeros(0))
 
     @property
     def but_delay(self) -> Float:
@@ -234,9 +238,9 @@ def _slopes(problem: Problem, theta: Float, residuals: Float, free: Sequence[int
     return j, inverse_of(gram)[0], np.sqrt(np.diag(gram))
 
 
-def fit(motions: Sequence[Motion], start: Float, free: Sequence[int]) -> Fit:
-    """Alternate between the parameters and the noise levels, from ``start`` (k,)."""
-    theta, noises = start.copy(), [m.noise for m in motions]
+def fit(motions: Sequence[Motion], start: Float, free: Sequence[int], known: Sequence[Noise] = ()) -> Fit:
+    """Alternate between the parameters and the noise levels, from ``start`` (k,) and the ``known`` levels of a fit."""
+    theta, noises = start.copy(), list(known) or [m.noise for m in motions]
     for turn in range(RENEWALS):
         problem = Problem(tuple(motions), tuple(noises), ())
         before = theta
@@ -244,10 +248,10 @@ def fit(motions: Sequence[Motion], start: Float, free: Sequence[int]) -> Fit:
             likelihood = Likelihood(problem.motions, problem.noises)
             theta, residuals, j, converged = ascend(likelihood, theta, free, typical(theta, motions))
         else:
-            theta, residuals, j, converged = descend(problem, theta, free, CONVERGED if turn else ROUGH)
+            theta, residuals, j, converged = descend(problem, theta, free, CONVERGED if turn or known else ROUGH)
         information = j.T @ j
         moved = theta[list(free)] - before[list(free)]
-        if turn and float(moved @ information @ moved) < SETTLED:
+        if (turn or known) and float(moved @ information @ moved) < SETTLED:
             break
         noises = [fit_noise(m, theta, s) for m, s in zip(motions, noises, strict=True)]
     return Fit(theta, information, tuple(free), residuals, j, pose(motions, theta, problem.noises), converged)

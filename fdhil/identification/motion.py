@@ -41,13 +41,15 @@ class Course:
     """What one unit of a term is over each interval of a window, ``values`` (n,), in which all is linear.
 
     Its ``kind`` is the signal that it adds to, as :mod:`fdhil.identification.courses` has them.
-    Friction at low speed falls off with ``speed_rad_s``.
+    Friction at low speed falls off with ``speed_rad_s``. The term is the amplitude and what it is counted from,
+    ``about``.
     """
 
     name: str
     kind: int
     values: Float
     speed_rad_s: float = 0.0
+    about: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +73,7 @@ class Motion:
     the terms that joined, in the order of the last entries of theta;
     ``angle_rad`` (n,) is the shaft's as its place tells, or has no rows;
     ``within`` is what is open within long rows, ``known`` are courses whose size is;
+    below ``noise_floor`` of what its readings show no noise level is sought: it has no effect that could be seen;
     ``speed_late`` is by how many seconds the recorded speed was late, and the standard deviation of that.
     """
 
@@ -92,6 +95,7 @@ class Motion:
     speed_late: tuple[float, float] | None = None
     within: Within | None = None
     known: tuple[Course, ...] = ()
+    noise_floor: float = 1e-3
 
     @property
     def n(self) -> int:

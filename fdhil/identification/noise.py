@@ -14,7 +14,6 @@ ITERATIONS = 12
 STEP = 0.05
 LARGEST = 1.0
 ENOUGH = 0.15  # what such a step leaves is less than the data can tell
-FLOOR = 1e-3  # of a level's own start: below it a noise has no effect that could be seen
 
 
 def fit_noise(motion: Motion, theta: Float, start: Noise) -> Noise:
@@ -22,7 +21,7 @@ def fit_noise(motion: Motion, theta: Float, start: Noise) -> Noise:
 
     ``theta`` (7,) is [R, L, K, Jt, ft, Cd, delay].
     """
-    lower = np.log(motion.noise.vector()) + np.log(FLOOR)
+    lower = np.log(motion.noise.vector()) + np.log(motion.noise_floor)
     x = np.log(start.vector())
 
     def costs(logs: Float) -> Float:

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from fdhil.identification.covariance import SUMMED_LAGS
 from fdhil.identification.fit import Fit, fit
+from fdhil.identification.friction_speed import sharpened
 from fdhil.identification.kalman import DELAY, LOAD
 from fdhil.identification.motion import Course, Motion
 from fdhil.identification.normal import inverse_of
@@ -94,7 +95,7 @@ def _with(base: Fit, chosen: Sequence[Candidate]) -> Fit:
     added = sum(len(candidate.courses[0]) for candidate in chosen)
     start = np.append(base.theta, np.zeros(added))
     free = (*base.free, *range(base.theta.size, base.theta.size + added))
-    return replace(fit(motions, start, free), delay_doubt_s=base.delay_doubt_s)
+    return sharpened(replace(fit(motions, start, free), delay_doubt_s=base.delay_doubt_s))
 
 
 def _chosen(base: Fit, left: Sequence[Candidate]) -> list[Candidate]:

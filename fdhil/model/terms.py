@@ -80,6 +80,13 @@ def packed(parameters: Parameters) -> Float:
     return read_only(np.concatenate([values, *ripples]))
 
 
+def with_resonance(parameters: Parameters, axis: Axis) -> Parameters:
+    """Return the model with the resonance of the axis' section, unless it has its own."""
+    if axis.resonance_hz is None or "resonance" in dict(parameters.terms):
+        return parameters
+    return parameters.changed(resonance=axis.resonance_hz, resonance_damping=axis.resonance_damping)
+
+
 def spring(parameters: Parameters) -> tuple[float, float]:
     """Return stiffness in N.m/rad and damping in N.m.s of what is between motor and table; 0 where they are one.
 

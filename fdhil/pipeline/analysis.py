@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from fdhil.identification.compliance import beside_the_config, compliance, joine
 from fdhil.identification.estimators import chosen, maximum_likelihood
 from fdhil.identification.identifiability import empty_estimate
 from fdhil.identification.signals import mended
+from fdhil.identification.spring import sprung
 from fdhil.identification.without_voltage import told
 from fdhil.records import Estimate, Reason, Result, Verdict, Window, WindowOutcome
 from fdhil.validation import BEFORE_ANY_FIT, LEAST_ROWS, OF_THE_FIT, WEIGHED, Evidence, Findings, ask
@@ -19,6 +21,7 @@ from fdhil.validation.at_the_table import at_the_table
 GAVE_UP = (np.linalg.LinAlgError, FloatingPointError, ZeroDivisionError, OverflowError)
 SAME_PITCH = 0.01  # to which a recording and the section of its axis agree
 OVERRIDE = 2.0  # by which their rapid speeds may differ: an override slows what is recorded
+NOTICED = 0.2  # of what a model may leave: with less left no resonance is sought
 UNFIT = "NotFinite"
 
 
@@ -94,8 +97,28 @@ def estimated(signals: Evidence) -> Evidence:
     if fit is not None and axis is not None:
         fit = maximum_likelihood.with_loops(fit, window, settings, axis, signals.sync_period_s)
     if name == maximum_likelihood.NAME and fit is not None:
-        return replace(signals, estimate=maximum_likelihood.finish(fit), fit=fit)
+        return _with_spring(replace(signals, estimate=maximum_likelihood.finish(fit), fit=fit))
     return replace(signals, estimate=estimator([window], settings), fit=fit)
+
+
+def _with_spring(stiff: Evidence) -> Evidence:
+    """Return the evidence with a spring between motor and table, where there is one that explains the rapid as well.
+
+    One that nobody told is sought where no regulators are known; else replays of rapids find it, better than one
+    window's speed.
+    """
+    assert stiff.fit is not None
+    axis, weight = stiff.axis, stiff.weight
+    if weight is None or (axis is not None and axis.resonance_hz is None):
+        return stiff
+    if axis is None and weight.unexplained_um < NOTICED * weight.limit_um:
+        return stiff
+    found = sprung(stiff.fit, axis)
+    if found is None:
+        return stiff
+    soft = replace(stiff, estimate=maximum_likelihood.finish(found), fit=found)
+    left = math.inf if soft.weight is None else soft.weight.unexplained_um
+    return soft if left < max(weight.limit_um, weight.unexplained_um) else stiff
 
 
 def gave_up(error: BaseException, advice: str) -> Reason:

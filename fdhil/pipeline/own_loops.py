@@ -1,13 +1,17 @@
-"""Seeks a drive's own loops where the configured ones do not explain its rapids, for the analysis to go on with."""
+"""Seeks a drive's own loops where the configured ones do not explain its rapids, for the analysis to go on with.
+
+Where other loops do not explain them, a resonance between motor and table may.
+"""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 
 from fdhil.config import Axis, Identification
 from fdhil.identification.loops import better_loops, identify_loops, with_loops
 from fdhil.pipeline.analysis import analyse, own
+from fdhil.pipeline.own_resonance import softer_axis
 from fdhil.records import LoopEstimate, Parameters, Window, WindowOutcome
 from fdhil.validation.weight import LOOPS_DIFFER
 
@@ -64,6 +68,40 @@ def better_axis(axis: Axis | None, found: LoopEstimate | None) -> Axis | None:
     return with_loops(axis, found) if axis is not None and found is not None and better_loops(found) else None
 
 
+def softened(outcomes: Collection[WindowOutcome], axis: Axis | None, sync_period_s: float | None) -> Axis | None:
+    """Return the axis with the resonance that explains outcomes that its loops do not, or all; else None."""
+    left = [o for o in outcomes if suspected([o])] or [o for o in outcomes if o.verdict.accepted]
+    if axis is None or sync_period_s is None or not left or own(left[0].window, axis) is None:
+        return None
+    told = [(o.window, mechanics_of(o, axis)) for o in left]
+    return softer_axis([(w, plant) for w, plant in told if plant is not None], axis, sync_period_s)
+
+
+def explained(
+    outcomes: Sequence[WindowOutcome],
+    axis: Axis | None,
+    settings: Identification,
+    sync_period_s: float | None,
+    again: Callable[[Axis], Sequence[WindowOutcome]],
+) -> tuple[Sequence[WindowOutcome], LoopEstimate | None]:
+    """Return the outcomes by the best that a recording shows of its drive, and its loops where they were sought.
+
+    ``again`` analyses its windows with another section of the axis.
+    """
+    softer = softened(outcomes, axis, sync_period_s)
+    if softer is not None:
+        soft = again(softer)
+        if not suspected(soft):
+            return soft, None
+    loops = loops_of(outcomes, axis, settings, sync_period_s) if suspected(outcomes) else None
+    better = better_axis(axis, loops)
+    if better is None:
+        return outcomes, loops
+    outcomes = again(better)
+    softer = softened(outcomes, better, sync_period_s)
+    return (outcomes if softer is None else again(softer)), loops
+
+
 class OwnLoops:
     """An axis' own loops as its rapids come one by one: each is analysed through the best that are known.
 
@@ -99,9 +137,22 @@ class OwnLoops:
             self._refused, self._due = 0, 2 * self._due
         elif self._seen != ENOUGH:
             return outcome, None
-        found = loops_of(tuple(self._outcomes), self._configured, self._settings, self._period_s, growing=wanted)
+        softer = softened(self._outcomes, self.axis, self._period_s)
+        if softer is not None:
+            soft = analyse(window, self._settings, softer, self._period_s)
+            if not suspected([soft]):
+                self.axis, outcome, wanted = softer, soft, False
+        if suspected([outcome]) or self._seen == ENOUGH:
+            return self._through_loops(window, outcome, growing=wanted)
+        return outcome, None
+
+    def _through_loops(
+        self, window: Window, outcome: WindowOutcome, *, growing: bool
+    ) -> tuple[WindowOutcome, LoopEstimate | None]:
+        """Return the outcome of a window by the loops that the newest rapids show, and those loops."""
+        found = loops_of(tuple(self._outcomes), self._configured, self._settings, self._period_s, growing=growing)
         better = better_axis(self._configured, found)
-        if better is not None:
-            self.axis = better
-            outcome = analyse(window, self._settings, better, self._period_s) if wanted else outcome
-        return outcome, found
+        if better is None or self.axis is None:
+            return outcome, found
+        self.axis = better.model_copy(update={"resonance_hz": self.axis.resonance_hz})
+        return (analyse(window, self._settings, self.axis, self._period_s) if growing else outcome), found

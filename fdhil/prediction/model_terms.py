@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdhil.config import Axis
 from fdhil.model import terms
 from fdhil.records import PARAMETERS, Bool, Float, Parameters
 
@@ -44,13 +43,6 @@ def mean_friction(parameters: Parameters) -> Parameters:
     dry = 0.5 * (p.term("coulomb_positive", p.Cd) + p.term("coulomb_negative", p.Cd))
     left = tuple(pair for pair in p.terms if pair[0] not in (*DRY, "viscous_positive", "viscous_negative"))
     return replace(p, ft=viscous, Cd=dry, terms=left)
-
-
-def with_resonance(parameters: Parameters, axis: Axis) -> Parameters:
-    """Return the model with the resonance of the axis' section, unless it has its own."""
-    if axis.resonance_hz is None or "resonance" in dict(parameters.terms):
-        return parameters
-    return parameters.changed(resonance=axis.resonance_hz, resonance_damping=axis.resonance_damping)
 
 
 class Band(NamedTuple):

@@ -18,7 +18,8 @@ import numpy as np
 from fdhil import config as configuration
 from fdhil.config import MachineConfig
 from fdhil.errors import ConfigError, ConfigFault
-from fdhil.prediction.model_terms import families, with_resonance
+from fdhil.model.terms import with_resonance
+from fdhil.prediction.model_terms import families
 from fdhil.records import PARAMETERS, UNITS, Parameters, Trajectory, unit_of
 
 MAX_BYTES = 64 * 1024

@@ -10,6 +10,7 @@ from fdhil.sim.thermal import SlideWay
 from fdhil.sim.wire.modbus_sensor import VoltageSensor
 
 _GAP_CYCLES = 50  # a longer silence is the end of a stream, not a late frame
+_THERMAL_CYCLES = 100  # the temperature moves slowly: the drive learns of it this often
 _PATIENCE_CYCLES = 3  # a listed RPDO that was missing this often is not waited for any more
 
 
@@ -56,6 +57,9 @@ class AxisUnit:
     sync_on: bool = True
     _before: dict[tuple[int, int], int] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        self.drive.on_cycle(self.cycle_ended)
+
     def power(self, on: bool) -> None:
         """Cut or restore the drive's supply."""
         if on:
@@ -83,7 +87,7 @@ class AxisUnit:
         """Write an object past all access rules, and give it its value back."""
         drive = self.drive
         if on:
-            self._before.setdefault((index, sub), drive.dictionary.number(index, sub))
+            self._before.setdefault((index, sub), drive.dictionary.shown(drive.dictionary.entry(index, sub)))
             drive.set_object(index, sub, value)
         elif (index, sub) in self._before:
             drive.set_object(index, sub, self._before.pop((index, sub)))
@@ -94,6 +98,14 @@ class AxisUnit:
         count = self.drive.dictionary.number(index, 0)
         words = [self.drive.dictionary.number(index, sub) for sub in range(count, 0, -1)]
         self.drive.remap(index, [(word >> 16, word >> 8 & 0xFF, word & 0xFF) for word in words])
+
+    def cycle_ended(self, voltage_v: float) -> None:
+        """The drive has run a cycle; at its start the voltage's mean of the cycle before was known to the sensor."""
+        drive = self.drive
+        celsius = self.slide_way.step(drive.physics.speed_rad_s)
+        self.sensor.feed(drive.ratings.sign * voltage_v)
+        if drive.tick % _THERMAL_CYCLES == 0:
+            self.warm(celsius)
 
     def warm(self, celsius: float) -> None:
         """Set the slide-way's temperature everywhere it is felt."""

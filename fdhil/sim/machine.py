@@ -1,4 +1,7 @@
-"""Moves the simulated machine by SYNC and by nothing else, sans-I/O: drives, slide-ways, sensors and NC."""
+"""Moves the simulated machine, sans-I/O: drives, slide-ways, sensors and NC.
+
+SYNC is the machine's clock. In real time and without its own NC, each drive has a clock of its own besides.
+"""
 
 from __future__ import annotations
 
@@ -16,15 +19,14 @@ from fdhil.sim.drive.servo import Drive
 from fdhil.sim.fault_script import FaultSchedule
 from fdhil.sim.frame import BusFrame, Frame
 from fdhil.sim.nc.controller import Event, NcController, Row
+from fdhil.sim.nc.drive_link import Wiring
 from fdhil.sim.recorder import Recorder
 from fdhil.sim.table_sensors import TableSensors
 from fdhil.sim.thermal import SlideWay
 from fdhil.sim.wire.modbus_sensor import VoltageSensor
 
 SYNC = 0x80
-OFFSET_RPDO = 2
 OFFSET_OBJECTS = (0x60B0, 0x60B1, 0x60B2)
-_THERMAL_CYCLES = 100  # the temperature moves slowly: the drive learns of it this often
 
 
 class Machine:
@@ -33,7 +35,7 @@ class Machine:
     def __init__(self, config: MachineConfig) -> None:
         self.config = config
         self.period_s = config.machine.sync_period_s
-        self.nc = NcController(config)
+        self.nc = NcController(config, self._wiring)
         self.events: list[Event] = []
         self.tick = 0
         self._outbox: list[BusFrame] = []
@@ -47,6 +49,7 @@ class Machine:
         for unit in self.units.values():
             self._of_bus.setdefault(unit.bus, []).append(unit)
         self._first_bus = next(iter(self._of_bus))
+        self._realtime = config.sim.pace == "realtime"
         self.faults = FaultSchedule(self.units, self.period_s)
         self._listed = [_listed_rpdo(text, self.units) for text in config.sim.lockstep_rpdo]
         self._streams = {key: RpdoStream() for key in self._listed}
@@ -75,6 +78,10 @@ class Machine:
             self._outbox,
             self._injected,
         )
+
+    def _wiring(self, axis: str) -> Wiring:
+        drive = self.units[axis].drive
+        return Wiring.of(drive.pdo.configured("rpdo"), drive.pdo.configured("tpdo"), drive.dress.mode)
 
     @property
     def buses(self) -> tuple[str, ...]:
@@ -131,7 +138,10 @@ class Machine:
             if all(unit.sync_on for unit in self._of_bus[bus]):
                 frames.append((bus, frame))
                 frames += [(bus, answer) for answer in self._sync(bus, frame[1])]
-            elif bus == self._first_bus:  # the SYNC is lost by a fault, whose end must come all the same
+                continue
+            for unit in self._of_bus[bus]:
+                unit.drive.cycle_without_sync()
+            if bus == self._first_bus:  # the SYNC is lost by a fault, whose end must come all the same
                 self._run_faults(None)
                 self.tick += 1
         for bus, frame in self.nc.end():
@@ -143,11 +153,17 @@ class Machine:
         self._complete_events()
         return frames + self._take_outbox() if self._outbox else frames
 
+    @property
+    def moves_alone(self) -> bool:
+        """Whether a drive moves by its own clock: time is to be told often."""
+        return any(unit.drive.moves_alone for unit in self.units.values())
+
     def wall_clock(self, now_s: float) -> list[BusFrame]:
-        """Run what depends on time and not on SYNC: heartbeats and their monitoring."""
+        """Run what depends on time and not on SYNC: heartbeats and their monitoring, and motion without SYNC."""
         frames = self.tables.wall_clock(now_s)
+        alone = self._realtime and not self.nc.on
         for unit in self.units.values():
-            for frame in unit.drive.wall_clock(now_s):
+            for frame in unit.drive.wall_clock(now_s, alone=alone):
                 frames.append((unit.bus, frame))
                 for other in self._of_bus[unit.bus]:
                     if other is not unit and frame[0] > 0x700:
@@ -184,24 +200,19 @@ class Machine:
         return frames
 
     def _advance(self, unit: AxisUnit, data: bytes) -> list[Frame]:
-        """One SYNC for one axis; its sensor and slide-way go with it when the drive accepted the SYNC."""
+        """One SYNC for one axis."""
         drive = unit.drive
         before = drive.tick
-        ended_v = drive.physics.voltage_mean_v  # of the period that this SYNC ends: no sensor knows it earlier
         table_rad_s = drive.physics.table_speed_rad_s
         frames = drive.receive(SYNC, data)
         if drive.tick == before:
             return frames
         frames += self.tables.at_sync(drive, table_rad_s)
         heard = drive.pdo.heard_before
-        unit.offsets.step(OFFSET_RPDO in heard)
+        unit.offsets.step(not heard.isdisjoint(drive.pdo.offset_rpdos))
         for key in self._listed:
             if key[0] == unit.axis:
                 self._streams[key].step(key[1] in heard)
-        celsius = unit.slide_way.step(drive.physics.speed_rad_s)
-        unit.sensor.feed(drive.ratings.sign * ended_v)
-        if drive.tick % _THERMAL_CYCLES == 0:
-            unit.warm(celsius)
         return frames
 
     def _foreign(self, bus: str) -> list[Frame]:
@@ -308,7 +319,7 @@ class Machine:
 
 def _listed_rpdo(text: str, units: Mapping[str, AxisUnit]) -> tuple[str, int]:
     axis, _, number = text.partition(":")
-    if axis not in units or number not in ("1", "2", "3", "4"):
+    if axis not in units or number not in map(str, units[axis].drive.pdo.numbers("rpdo")):
         fault = ConfigFault("sim.lockstep_rpdo", f"{text!r} names no RPDO", "write axis and number, such as X:2")
         raise ConfigError("config", [fault])
     return axis, int(number)

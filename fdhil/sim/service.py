@@ -28,13 +28,14 @@ from fdhil.sim.machine import Machine
 from fdhil.sim.operator_commands import MAX_LINE, CommandError, OperatorCommands
 from fdhil.sim.wire.attach import attach
 from fdhil.sim.wire.attachment import Attachment, Selectable, WakePipe
-from fdhil.sim.wire.modbus_sensor import SensorServers
+from fdhil.sim.wire.sensor_wires import SensorWires
 from fdhil.sim.wire.stream_port import StreamPort
 
 Loader = Callable[[Path, MachineConfig], Trajectory]
 Emit = Callable[[dict[str, Any]], None]
 
 WALL_CLOCK_S = 0.004  # how often heartbeats and their time-outs are looked at
+ALONE_S = 0.001  # the same while a drive moves by its own clock
 IDLE_PERIODS = 4  # in lockstep, of a machine that stands: whoever listens is not kept busy for nothing
 LOCKSTEP_WAIT_S = 0.5
 LOCKSTEP_HOLDING_WAIT_S = 8.0  # a listener takes ten seconds without SYNC for a bus that is dead
@@ -95,14 +96,14 @@ class SimService:
         self._line = b""
         self._ending = False
         self._drive_time_s = 0.0
-        self._wall_s = 0.0
+        self._wall_s = self._told_s = 0.0
         self._loads: list[tuple[Path, Future[Trajectory]]] = []
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="ThreadPoolExecutor-sim")
         self._pipe = WakePipe()
         self._left = 0
         self._pace = Pace(config.machine.sync_period_s, lockstep=config.sim.pace == "lockstep")
         self._buses: dict[str, Attachment] = {}
-        self._servers: SensorServers | None = None
+        self._sensors: SensorWires | None = None
         self._streams: dict[str, StreamPort] = {}
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         try:
@@ -119,11 +120,9 @@ class SimService:
         for name in self.machine.buses:
             self._buses[name] = attach(name, self.config.bus[name])
         if self.config.sim.modbus:
-            sensors = {axis: unit.sensor for axis, unit in self.machine.units.items()}
-            addresses = {axis: (a.voltage.host, a.voltage.port) for axis, a in self.config.axis.items()}
-            servers = SensorServers(sensors, addresses)
-            servers.start()
-            self._servers = servers
+            sensors = SensorWires(self.config, {axis: unit.sensor for axis, unit in self.machine.units.items()})
+            sensors.start()
+            self._sensors = sensors
         for axis in self.machine.tables.accelerometers:
             section = self.config.axis[axis].accelerometer
             assert section is not None
@@ -136,15 +135,10 @@ class SimService:
 
     def ready_event(self) -> dict[str, Any]:
         """Return the ready event; the EDS files it names are written now."""
-        modbus = {}
-        if self._servers is not None:
-            for axis, port in self._servers.ports.items():
-                voltage = self.config.axis[axis].voltage
-                modbus[axis] = {"host": voltage.host, "port": port, "unit": voltage.unit}
         return {
             "event": "ready",
             "buses": {name: bus.settings for name, bus in self._buses.items()},
-            "modbus": modbus,
+            "modbus": self._sensors.ready if self._sensors is not None else {},
             "accelerometers": {axis: port.path for axis, port in self._streams.items()},
             **self.machine.describe(self._write_eds()),
             "pace": self.config.sim.pace,
@@ -167,9 +161,9 @@ class SimService:
     def close(self) -> None:
         """Close every port and end every thread; what is being recorded is given up."""
         self._pool.shutdown(wait=True, cancel_futures=True)
-        if self._servers is not None:
-            self._servers.stop()
-            self._servers = None
+        if self._sensors is not None:
+            self._sensors.stop()
+            self._sensors = None
         for stream in self._streams.values():
             stream.close()
         self._streams.clear()
@@ -264,10 +258,11 @@ class SimService:
 
     def _wall_clock(self, now_s: float) -> None:
         """Let the drives' own time pass. When the host was late it passes slower: a drive has no such pauses."""
-        late = now_s - self._wall_s if self._wall_s else 0.0
-        self._drive_time_s += min(WALL_CLOCK_S + late, 2 * WALL_CLOCK_S)
-        self._wall_s = now_s + WALL_CLOCK_S
+        passed_s = now_s - self._told_s if self._told_s else WALL_CLOCK_S
+        self._told_s = now_s
+        self._drive_time_s += min(passed_s, 2 * WALL_CLOCK_S)
         frames = self.machine.wall_clock(self._drive_time_s)
+        self._wall_s = now_s + (ALONE_S if self.machine.moves_alone else WALL_CLOCK_S)
         if frames:
             self._send(frames)
 

@@ -20,7 +20,6 @@ from fdhil.validation.slow_readings import slow_voltage_faults
 from fdhil.validation.slow_timing import current_late
 from fdhil.validation.stuck import clipped_peaks, stuck_values
 from fdhil.validation.timing import timing_faults, voltage_late
-from fdhil.validation.whiteness import excess_noise, whiteness
 from fdhil.validation.without_voltage import load_comes_and_goes, torque_late, torque_unexplained
 
 NEVER_NEGATIVE = ("dead_time",)
@@ -137,6 +136,14 @@ def _structure(evidence: Evidence) -> Iterator[Reason]:
             yield evidence.with_cost(lack.finding.reason(), evidence.cost_um(lack))
 
 
+def _whiteness(evidence: Evidence) -> Iterable[Reason]:
+    return [reason for _, reason in evidence.colour]
+
+
+def _excess_noise(evidence: Evidence) -> Iterable[Reason]:
+    return [reason for _, reason in evidence.excess]
+
+
 def _late(evidence: Evidence) -> Iterable[Reason]:
     if evidence.late_s:  # by what else the model lacks, where there is such
         return voltage_late(evidence) if not evidence.lacks else ()
@@ -193,8 +200,8 @@ OF_THE_FIT: Sequence[Check] = (
     Check("late voltage", _electrically_late, _fitted),
     Check("late current", _current_late, _sound, ("late voltage",)),
     Check("structure", _structure, _sound, ("late voltage", "late current"), weighed=True),
-    Check("whiteness", whiteness, _sound, ("late voltage", "late current", "structure"), weighed=True),
-    Check("excess noise", excess_noise, _sound, ("late voltage", "late current", "structure"), weighed=True),
+    Check("whiteness", _whiteness, _sound, ("late voltage", "late current", "structure"), weighed=True),
+    Check("excess noise", _excess_noise, _sound, ("late voltage", "late current", "structure"), weighed=True),
     # a late current seems to move a shaft at rest
     Check("standstill", rest_faults, _sound, ("late voltage", "late current")),
     Check("friction at rest", friction_at_rest, _sound, ("late voltage", "late current"), weighed=True),

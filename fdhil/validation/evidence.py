@@ -27,6 +27,7 @@ from fdhil.validation.simulation import fit_percent
 from fdhil.validation.structure import DEAD_TIME, FRICTION, OFFSET_CURRENT, Finding, findings
 from fdhil.validation.table_error import TableError
 from fdhil.validation.weight import NEXT_SPEED, Move, Weight, completed, to_and_fro, weigh
+from fdhil.validation.whiteness import coloured, noisy
 from fdhil.validation.widening import widened
 
 STILL_MM = 0.004  # of the table at rest
@@ -191,9 +192,21 @@ class Evidence:
     @cached_property
     def told(self) -> Estimate | None:
         """The estimate with the intervals that hold although the model lacks what was found."""
-        if self.estimate is None or not self.lacks:
+        if self.estimate is None or not self.sound:
             return self.estimate
-        return widened(self.estimate, self.on_time, self.lacks)
+        named = any(lack.finding.matters for lack in self.lacks)
+        nameless = set() if named else {name for name, _ in (*self.colour, *self.excess)}
+        return widened(self.estimate, self.on_time, self.lacks, nameless)
+
+    @cached_property
+    def colour(self) -> list[tuple[str, Reason]]:
+        """The signals whose innovations hang together, each with its reason."""
+        return list(coloured(self.on_time))
+
+    @cached_property
+    def excess(self) -> list[tuple[str, Reason]]:
+        """The signals of which the fit needs more noise than they scatter, each with its reason."""
+        return list(noisy(self.on_time, self.window))
 
     @cached_property
     def sound(self) -> bool:
@@ -214,10 +227,13 @@ class Evidence:
         """Whether the model explains the rapid at the table, and nothing it surely lacks makes a next one worse."""
         if self.weight is None or not self.weight.believed or (self.fit is not None and self.late_s):
             return False
-        late = self.breakaway if self.weight.through != "replay" else None  # which has the move's beginning
+        late = self.breakaway
+        # a replay has the move's beginning, where a load that is held at rest may pass for friction that holds more
+        if late is not None and self.weight.through == "replay" and not late.more:
+            late = None
         if late is not None and not self.weight.allows(self.breakaway_um(late)):
             return False
-        return all(self.weight.allows(self.cost_um(lack) / _known(lack)) for lack in self.lacks)
+        return all(self.weight.allows(self.cost_um(it) / _known(it)) for lack in self.lacks for it in lack.with_rivals)
 
     def with_cost(self, reason: Reason, um: float) -> Reason:
         """Return a reason with what it costs at the table."""

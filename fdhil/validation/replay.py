@@ -11,6 +11,7 @@ from fdhil.config import Axis
 from fdhil.identification.motion import resolution
 from fdhil.identification.windows import moving_range
 from fdhil.model import closed_loop
+from fdhil.model.terms import with_resonance
 from fdhil.records import Float, Int, Parameters, Window, rms
 
 LEAST_ROWS = 20
@@ -66,10 +67,12 @@ def replay(
 ) -> Replay:
     """Run a move from rest, rows (n,) on the SYNC grid, through the closed loop and compare it with the measured one.
 
+    A resonance that the axis' section tells of is the model's, as it is where it predicts.
     ``demand_mm`` is r[k], what the drive follows at row k; lost rows are NaN and not compared. ``standstill_a`` is what
     the regulators hold before the move (None: what they need). ValueError when fewer than ``LEAST_ROWS`` rows can be
     compared.
     """
+    parameters = with_resonance(parameters, axis)
     demand = _filled(demand_mm, "demand")
     offset = None if offset_mm is None else np.nan_to_num(offset_mm)
     start = closed_loop.standing(parameters, axis, float(_filled(position_mm, "position")[0]), standstill_a)

@@ -11,23 +11,33 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.normal import inverse_gram, solve
 from fdhil.records import Float
 from fdhil.validation.structure import Bench, Finding
 
+NO_WORSE = 3.0  # standard deviations by which what explains less may do so by chance
+
 
 @dataclass(frozen=True, slots=True)
 class Lacking:
     """What a model lacks: a finding, by how much it moves the parameters (k,), and its torque (n,), N.m, or none.
 
-    The parameters are those of the fit's jacobian, in its order.
+    The parameters are those of the fit's jacobian, in its order. ``rivals`` are what explains the same nearly as well,
+    and may be there instead.
     """
 
     finding: Finding
     shift: Float
     load_nm: Float | None
+    rivals: tuple[Lacking, ...] = ()
+
+    @property
+    def with_rivals(self) -> tuple[Lacking, ...]:
+        """The finding, and what may be there in its place."""
+        return (self, *self.rivals)
 
 
 def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
@@ -42,6 +52,7 @@ def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
     others = others - jacobian @ (bench.inverse @ (jacobian.T @ others))
     whole = np.einsum("mq,mq->q", directions, directions)
     taken: list[int] = []
+    alike: list[npt.NDArray[np.intp]] = []
     while len(taken) < len(findings):
         rest = _beside(beyond[:, taken], beyond)
         seen = rest.T @ others
@@ -51,8 +62,19 @@ def lacking(fit: Fit, findings: Sequence[Finding]) -> list[Lacking]:
         if not replace(findings[best], statistic=float(statistic[best])).sure:
             break
         taken.append(best)
-    amplitudes, _ = solve(beyond[:, taken], others[:, 0])
-    return [_lacking(findings[k], float(a), shared[:, k]) for k, a in zip(taken, amplitudes, strict=True)]
+        alike.append(np.flatnonzero(np.square(statistic) > statistic[best] ** 2 - NO_WORSE**2))
+
+    def beside_others(n: int, k: int) -> Lacking:
+        """Return alternative ``k`` at the place of the ``n``-th that was taken."""
+        places = [*taken[:n], k, *taken[n + 1 :]]
+        amplitude = float(solve(beyond[:, places], others[:, 0])[0][n])
+        return _lacking(findings[k], amplitude, shared[:, k])
+
+    found = []
+    for n, k in enumerate(taken):
+        rivals = tuple(beside_others(n, int(other)) for other in alike[n] if other not in taken)
+        found.append(replace(beside_others(n, k), rivals=rivals))
+    return found
 
 
 def _beside(basis: Float, directions: Float) -> Float:

@@ -33,7 +33,9 @@ LAGS = 25
 SLOPE_S = 0.005  # over which the acceleration is taken
 _KINDS = {"current": CURRENT, "speed": SPEED}
 STRIBECK_SPEEDS = (0.01, 0.03, 0.06, 0.12, 0.25)  # of the rapid speed
-DEAD_TIME, OFFSET_CURRENT, FRICTION = "dead_time", "current offset", "friction"
+DEAD_TIME, OFFSET_CURRENT, FRICTION, WARMING = "dead_time", "current offset", "friction", "warming"
+QUICKEST_PER_S = 0.035  # of the resistance: copper under 40 A/mm2 that gives no heat away, 8.8 K/s
+CHANCE = 3.0  # standard deviations
 SATURATED = 0.02  # of the peak current, at which an inverter's dead time has its whole effect
 
 
@@ -360,7 +362,7 @@ def _of_the_voltage(bench: Bench, drift: Float) -> list[Finding]:
             LEAST_GAIN,
         ),
         (
-            "warming",
+            WARMING,
             drift * current,
             ("ParameterJump", "the resistance changes by {:+.3g} ohm over the move (the winding warms)"),
             "let the motor reach its temperature before identifying",
@@ -372,8 +374,17 @@ def _of_the_voltage(bench: Bench, drift: Float) -> list[Finding]:
     for name, course, (code, text), advice, least in tried:
         if name not in joined:
             _, statistic, amplitude, direction = bench.best(bench.offset_answers("voltage", course[None]))
-            found.append(Finding(code, text, advice, least, statistic, -amplitude, direction, name=name))
+            finding = Finding(code, text, advice, least, statistic, -amplitude, direction, name=name)
+            found += [finding] if name != WARMING or _warms(finding, bench, drift) else []
     return found
+
+
+def _warms(finding: Finding, bench: Bench, drift: Float) -> bool:
+    """Return whether a winding can have changed so: copper under a current warms, and no faster than it can."""
+    lasted_s = float(np.count_nonzero((drift > 0.0) & (drift < 1.0))) * bench.motion.dt_s
+    most = QUICKEST_PER_S * lasted_s * float(bench.fit.theta[0])
+    chance = CHANCE * abs(finding.amplitude / finding.statistic) if finding.statistic else 0.0
+    return -chance <= finding.amplitude <= most + chance
 
 
 def _places(motion: Motion) -> tuple[Float, Float]:

@@ -23,6 +23,7 @@ from fdhil.records import PARAMETERS, Bool, Float, Parameters, Reason, Window, r
 from fdhil.validation.replay import Replay, replay_window
 from fdhil.validation.table_error import TableError
 
+MOST_SHARE = 0.25  # of what all torque makes: a model that leaves more of it is none, however much the axis lags
 NEXT_SPEED = 0.3  # of the rapid speed: that of a program that is cut
 SCATTER = 3.0  # deviations by which the power of noise may lie above what is expected
 BEGINNING_S = 0.060  # before the drive surely moves
@@ -49,6 +50,8 @@ class Weight:
     whole_um: float
     torque_um: float
     through: Literal["replay", "own loop", "ordinary loop"]
+    too_soft: bool = False
+    """Whether the replay explains the rapid without the configured resonance."""
 
     def allows(self, um: float) -> bool:
         """Return whether that much at the table does no harm."""
@@ -74,6 +77,10 @@ class Weight:
             f"the closed loop with this model leaves {self.unexplained_um:.3g} um RMS of a following error of "
             f"{self.whole_um:.3g} um unexplained, limit {self.limit_um:.3g} um"
         )
+        if self.too_soft:
+            return Reason(
+                "ValidationFailed", text, "without resonance_hz the model explains it: it is another, or none"
+            )
         if self.allows(self.torque_um):
             advice = "the torque is explained, so the drive's loops are not as configured: fdhil identify --loops"
             return Reason(LOOPS_DIFFER, text, advice)
@@ -185,9 +192,20 @@ def weigh(
     if told is None and axis is not None:
         return Weight(left, tolerance_um(settings, whole), whole, left, "own loop")
     if told is None:
-        limit = TOLERANCE_SHARE * max(whole, _followed_um(window))
+        limit = min(TOLERANCE_SHARE * max(whole, _followed_um(window)), MOST_SHARE * whole)
         return Weight(left, limit, whole, left, "ordinary loop")
-    return Weight(told.unexplained_um, tolerance_um(settings, told.measured_um), told.measured_um, left, "replay")
+    limit = tolerance_um(settings, told.measured_um)
+    soft = told.unexplained_um > limit and _stiff_um(window, parameters, axis, sync_period_s) <= limit
+    return Weight(told.unexplained_um, limit, told.measured_um, left, "replay", soft)
+
+
+def _stiff_um(window: Window, parameters: Parameters, axis: Axis | None, sync_period_s: float) -> float:
+    """Return what a replay leaves without the configured resonance; infinite where none is configured."""
+    if axis is None or axis.resonance_hz is None:
+        return math.inf
+    stiff = replace(parameters, terms=tuple(pair for pair in parameters.terms if not pair[0].startswith("resonance")))
+    told = _replayed(window, stiff, axis.model_copy(update={"resonance_hz": None}), sync_period_s)
+    return math.inf if told is None else told.unexplained_um
 
 
 def _followed_um(window: Window) -> float:

@@ -1,4 +1,4 @@
-"""Refuses what has no name of its own: innovations that hang together over lags, and noise that no sensor has."""
+"""Finds what has no name of its own: innovations that hang together over lags, and noise that no sensor has."""
 
 from __future__ import annotations
 
@@ -11,18 +11,17 @@ from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import left_open_v
 from fdhil.records import Float, Reason, Window
-from fdhil.validation.evidence import Evidence
 from fdhil.validation.significance import BUDGET
 from fdhil.validation.structure import LAGS, expected_correlation
 
 PRACTICAL_CORRELATION = 0.25  # smaller ones come from the voltage's course within a sample and do no harm
 NOISE_RATIO = 1.6
+LOOK = "the drive does what the model does not have: look at the residuals"
 _FIELDS = {"voltage": "voltage_v", "current": "current_a", "speed": "speed_rad_s"}
 
 
-def whiteness(evidence: Evidence) -> Iterator[Reason]:
-    """Yield a reason where an autocorrelation of the innovations is neither chance (over all lags) nor harmless."""
-    fit = evidence.on_time
+def coloured(fit: Fit) -> Iterator[tuple[str, Reason]]:
+    """Yield signal and reason where its innovations hang together: neither by chance, over all lags, nor by little."""
     motion = fit.problem.motions[0]
     rows = (np.abs(motion.mode) == 1) & motion.observed
     e = fit.residuals[: 2 * motion.n].reshape(-1, 2)[rows]
@@ -43,15 +42,14 @@ def whiteness(evidence: Evidence) -> Iterator[Reason]:
                 f"the innovations of {name} correlate by {correlations[worst]:+.2f} over {worst + 1} samples, "
                 f"limit {limit:.2f}"
             )
-            yield Reason("ValidationFailed", text, "the drive does what the model does not have: look at the residuals")
+            yield name, Reason("ValidationFailed", text, LOOK)
 
 
-def excess_noise(evidence: Evidence) -> Iterator[Reason]:
-    """Yield a reason where the fit needs more noise than the signal's own scatter from row to row shows.
+def noisy(fit: Fit, window: Window) -> Iterator[tuple[str, Reason]]:
+    """Yield signal and reason where the fit needs more noise than the signal's own scatter from row to row shows.
 
     What the voltage's course within its samples may add, and the parameters do not imitate, is no reason.
     """
-    fit, window = evidence.on_time, evidence.window
     fitted = fit.problem.noises[0]
     course = fit.problem.shape_effect(fit.theta)
     course = course - fit.jacobian @ (inverse_of(fit.information)[0] @ (fit.jacobian.T @ course))
@@ -71,7 +69,7 @@ def excess_noise(evidence: Evidence) -> Iterator[Reason]:
             wanted, seen = float(np.hypot(wanted, open_v)), float(np.hypot(seen, open_v))
         if wanted > NOISE_RATIO * seen:
             text = f"the model explains {name} to {wanted:.3g} {unit} only, while it scatters by {seen:.3g} {unit}"
-            yield Reason("ValidationFailed", text, "the drive does what the model does not have: look at the residuals")
+            yield name, Reason("ValidationFailed", text, LOOK)
 
 
 def _aliased_v(fit: Fit, window: Window) -> float:

@@ -7,25 +7,59 @@ lacks). What surely is there and was not fitted is taken as one standard deviati
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from fdhil.identification.courses import FIRST_COURSE
+from fdhil.identification.estimators.maximum_likelihood import delay_direction
 from fdhil.identification.fit import Fit
 from fdhil.identification.kalman import DELAY
+from fdhil.identification.normal import solve
 from fdhil.identification.terms import PHASE
 from fdhil.records import PARAMETERS, Estimate, Float, frozen
 from fdhil.validation.selection import Lacking
 
+UNKNOWN_WAY = 2.0  # times an interval
+LAG_ROWS = 2.0  # what a sensor may lag without being named: a lag looks like the winding's own
 
-def widened(estimate: Estimate, fit: Fit, lacks: Sequence[Lacking]) -> Estimate:
-    """Return the estimate with the shifts by all that the model surely lacks added to its covariance."""
-    if not lacks:
-        return estimate
-    doubts = np.column_stack([_of_names(estimate, fit, lack.shift) for lack in lacks])
-    return replace(estimate, covariance=frozen(estimate.covariance + doubts @ doubts.T))
+
+def widened(estimate: Estimate, fit: Fit, lacks: Sequence[Lacking], nameless: Collection[str] = ()) -> Estimate:
+    """Return the estimate with the shifts by all that the model surely lacks added to its covariance.
+
+    ``nameless`` are the signals that show something beyond the model that no finding names: nobody knows which way that
+    moves the parameters. Every interval is doubled then; and where it shows in voltage or current, a sensor may lag,
+    which looks like another winding.
+    """
+    covariance = estimate.covariance
+    for lack in lacks:
+        covariance = covariance + _square(_worst(estimate, fit, lack))
+    if nameless:
+        covariance = UNKNOWN_WAY**2 * covariance
+    if {"voltage", "current"} & set(nameless):
+        covariance = covariance + _square(_of_names(estimate, fit, _lag(fit)))
+    return replace(estimate, covariance=frozen(covariance))
+
+
+def _square(doubt: Float) -> Float:
+    return np.outer(doubt, doubt)
+
+
+def _lag(fit: Fit) -> Float:
+    """Return the shift (k,) of a fit's free entries by a voltage that lags ``LAG_ROWS`` rows behind the current."""
+    lag_s = LAG_ROWS * fit.problem.motions[0].dt_s
+    others = [k for k, j in enumerate(fit.free) if j != DELAY]
+    shift = np.zeros(len(fit.free))
+    shift[others] = -lag_s * solve(fit.but_delay, delay_direction(fit))[0]
+    return shift
+
+
+def _worst(estimate: Estimate, fit: Fit, lack: Lacking) -> Float:
+    """Return the shift (k,) by what is lacked or by a rival, whichever moves a parameter by more deviations."""
+    shifts = [_of_names(estimate, fit, each.shift) for each in lack.with_rivals]
+    deviations = np.sqrt(np.maximum(np.diag(estimate.covariance), np.finfo(np.float64).tiny))
+    return max(shifts, key=lambda shift: float(np.abs(shift / deviations).max()))
 
 
 def _of_names(estimate: Estimate, fit: Fit, shift: Float) -> Float:

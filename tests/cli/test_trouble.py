@@ -37,10 +37,16 @@ WITH_CONFIG = {
     "advise": ["part.ngc", "--config", "{config}", "--tolerance-um", "50"],
     "replay": ["shuttle.csv", "--config", "{config}"],
 }
-WITHOUT_CONFIG = {"demo": ["--out", "out"], "interpret": ["part.ngc"], "export": ["w.parquet", "--out", "out.csv"]}
+WITHOUT_CONFIG = {
+    "demo": ["--out", "out"],
+    "eds": ["drive.eds"],
+    "interpret": ["part.ngc"],
+    "export": ["w.parquet", "--out", "out.csv"],
+}
 # what a command is called with where the file that it works on is what is wrong
 WITH_FILE = {
     "arm": ["bench.toml", "{file}"],
+    "eds": ["{file}"],
     "identify": ["{file}"],
     "replay": ["{file}"],
     "export": ["{file}", "--out", "out.csv"],
@@ -51,6 +57,7 @@ WITH_FILE = {
 }
 SUFFIXES = {
     "arm": [".ngc"],
+    "eds": [".eds", ".dcf"],
     "identify": [".csv"],
     "replay": [".csv", ".parquet"],
     "export": [".parquet"],
@@ -77,7 +84,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     Path("part.ngc").write_text("G21 G90 G64\nG1 X10 F1000\nM2\n")
     Path("profile.toml").write_text(f'[machine]\nname = "m"\n{axis_toml("X")}[axis.X.drive]\nprofile = "maxon_epos4"\n')
     Path("key.toml").write_text(bench_toml().replace("screw_pitch_mm", "screw_pich_mm", 1))
-    for suffix in (".toml", ".csv", ".parquet", ".ngc"):
+    for suffix in (".toml", ".csv", ".parquet", ".ngc", ".eds", ".dcf"):
         Path(f"junk{suffix}").write_bytes(bytes(range(256)) * 8)
         Path(f"empty{suffix}").touch()
         Path(f"folder{suffix}").mkdir()

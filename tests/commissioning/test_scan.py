@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import uuid
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import can
@@ -11,11 +13,16 @@ import pytest
 
 from fdhil.commissioning.bus_listener import Traffic
 from fdhil.commissioning.config_check import check_machine, compare_heard
+from fdhil.commissioning.finding import Finding
+from fdhil.commissioning.master import Master
 from fdhil.commissioning.scan import BusScanner, Description, EdsMatch, printable, read_descriptions, scan_bus
-from fdhil.commissioning.survey import Finding, Identity
-from fdhil.config import MachineConfig
-from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, frames_of
-from fdhil.errors import ConnectError, ProtocolError
+from fdhil.commissioning.steps import check_axis
+from fdhil.commissioning.survey import Identity, compare_identity
+from fdhil.config import Drive, MachineConfig
+from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, frames_of
+from fdhil.drivers.cia402.profile_file import load_profile
+from fdhil.errors import ConnectError, DriveFault, ProtocolError
+from fdhil.sim.drive.dictionary import AbortCode, TransferAbort
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import Row, Wire, machine
 
@@ -52,6 +59,10 @@ def traffic(*rows: Row) -> Traffic:
         (0x205, bytes(6), "set-points"),
         (0x509, bytes(8), "set-points"),
         (0x601, bytes(8), "SDO requests"),
+        (0x7E5, bytes(8), "LSS commands"),
+        (0x701 | REMOTE_FLAG, b"", "node guarding"),
+        (0x181 | REMOTE_FLAG, b"", "requests for PDOs"),
+        (0x701 | REMOTE_FLAG | EXTENDED_FLAG, b"", None),
         (0x701, b"\x05", None),
         (0x181, bytes(8), None),
         (0x581, bytes(8), None),
@@ -89,10 +100,19 @@ def test_a_sync_that_was_late_once_does_not_change_the_period() -> None:
         ((1, 9, 3), None),
         ((9, 2, 3), None),
         ((None, None, None), None),
+        ((1, None, 3), "any product"),
+        ((1, 0, None), "any product"),
+        ((1, 0xFFFFFFFF, 0xFFFFFFFF), "any product"),
+        ((1, 2, 0xFFFFFFFF), "exact"),
+        ((9, None, None), None),
     ],
 )
 def test_an_eds_fits_by_vendor_product_and_revision(found: tuple[int | None, ...], fit: str | None) -> None:
     assert Description(Path("drive.eds"), *found).fits(WHO) == fit
+
+
+def test_a_node_that_does_not_say_who_it_is_fits_no_eds() -> None:
+    assert Description(Path("drive.eds"), 0, None, None).fits(Identity(0, 0, 0, 0)) is None
 
 
 def test_eds_files_are_read_and_others_are_left(tmp_path: Path) -> None:
@@ -115,7 +135,8 @@ def test_a_node_that_lacks_objects_is_listed_all_the_same(peer: tuple[DrivePeer,
     _, settings = peer
     exact = Description(Path("b.eds"), 0x46444849, 0x402, 0x10000)
     other = Description(Path("a.eds"), 0x46444849, 0x402, 7)
-    found = scan_bus("can0", settings, [other, exact])
+    vendors = Description(Path("0.eds"), 0x46444849, 0xFFFFFFFF, 7)
+    found = scan_bus("can0", settings, [vendors, other, exact])
     assert [(node.node_id, node.axis) for node in found.nodes] == [(1, "X")]
     answers = found.nodes[0].answers
     assert answers is not None
@@ -165,6 +186,127 @@ def test_a_drive_that_is_not_set_up_differs_in_that_point_alone(
     assert wrong[0].cause
     assert wrong[0].advice
     assert not {0x000, 0x080, 0x201, 0x301} & set(drive.heard)
+
+
+def lacking(drive: DrivePeer, *indices: int) -> None:
+    """Take objects out of the drive's dictionary."""
+    for index in indices:
+        for key in [key for key in drive.drive.dictionary.entries if key >> 8 == index]:
+            del drive.drive.dictionary.entries[key]
+
+
+LACKING = {
+    "mode": (0x6502,),
+    "cycle": (0x60C2,),
+    "communication lost": (0x6007,),
+    "stop by a ramp": (0x605A, 0x605E),
+    "following error": (0x6065,),
+}
+
+
+@pytest.mark.parametrize("point", LACKING)
+def test_what_the_drive_does_not_have_is_not_compared(point: str, peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    lacking(drive, *LACKING[point])
+    (finding,) = [finding for _, finding in check_machine(settings) if not finding.ok]
+    shown = " and ".join(f"0x{index:04X}" for index in LACKING[point])
+    assert (finding.point, finding.ok, finding.found) == (point, None, f"no {shown}")
+    assert finding.cause == f"it has no {shown} that can be read"
+
+
+@pytest.mark.parametrize("code", [AbortCode.NO_DATA, AbortCode.DEVICE_STATE, AbortCode.READ_WRITE_ONLY])
+def test_an_object_that_the_drive_refuses_to_tell_ends_no_check(
+    code: AbortCode, peer: tuple[DrivePeer, MachineConfig]
+) -> None:
+    """Some drives have objects without a value, and one refusal must not hide all else."""
+    drive, settings = peer
+
+    def refuse() -> int:
+        raise TransferAbort(code)
+
+    for key in (0x100000, 0x101804, 0x600700, 0x607D01):
+        if key in drive.drive.dictionary.entries:
+            drive.drive.dictionary.read_hooks[key] = refuse
+    lacking(drive, 0x67FF)
+    found = {finding.point: finding for _, finding in check_machine(settings)}
+    assert {point for point, finding in found.items() if not finding.ok} == {"device", "communication lost"}
+    assert found["device"].ok is found["communication lost"].ok is None
+    assert (found["TPDO1"].ok, found["following error"].ok) == (True, True)
+
+
+def test_a_drive_that_does_not_say_who_it_is_is_not_compared_with_a_makers_profile() -> None:
+    profile = replace(load_profile(Drive()), vendor_id=0xFB)
+    told = {vendor: compare_identity(profile, Identity(vendor, 2, 3, 4)).ok for vendor in (0xFB, 0xFC, 0)}
+    assert told == {0xFB: True, 0xFC: False, 0: None}
+
+
+def test_a_drive_that_coasts_is_told_though_the_other_object_is_missing(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    lacking(drive, 0x605A)
+    drive.drive.set_object(0x605E, 0, 0)
+    (finding,) = [finding for _, finding in check_machine(settings) if not finding.ok]
+    assert (finding.ok, finding.found) == (False, "0x605A = missing, 0x605E = 0")
+
+
+def test_a_drive_without_a_following_error_window_is_not_commissioned(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    """Nothing would stop it where it leaves its path, and no offset is small against a window that is not there."""
+    drive, settings = peer
+    lacking(drive, 0x6065)
+    with (
+        Master(settings, "X") as master,
+        pytest.raises(DriveFault, match=r"it has no 0x6065 that can be read; its manual"),
+    ):
+        check_axis(master)
+
+
+def test_a_device_that_is_no_drive_is_told_as_such(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    lacking(drive, 0x67FF)
+    drive.drive.set_object(0x1000, 0, 0x00030191)
+    found = {finding.point: finding for place, finding in check_machine(settings) if place == "axis X"}
+    assert {point for point, finding in found.items() if finding.ok is False} == {"device"}
+    assert found["device"].cause == "it is no CiA 402 drive: 0x1000 says CiA 401, an I/O module"
+    assert found["cycle"].ok is None
+    with Master(settings, "X") as master, pytest.raises(DriveFault, match="it is no CiA 402 drive"):
+        check_axis(master)
+
+
+@pytest.mark.parametrize(
+    ("device_type", "first", "ok"), [(0x192, None, True), (0xFFFF0191, 0x20192, True), (0, 0, None)]
+)
+def test_a_drive_says_so_itself_or_as_the_first_of_several_devices(
+    device_type: int, first: int | None, ok: bool | None, peer: tuple[DrivePeer, MachineConfig]
+) -> None:
+    drive, settings = peer
+    lacking(drive, 0x67FF)
+    if first is not None:
+        own = drive.drive.dictionary.entries[0x100000]
+        drive.drive.dictionary.entries[0x67FF00] = replace(own, index=0x67FF)
+        drive.drive.set_object(0x67FF, 0, first)
+    drive.drive.set_object(0x1000, 0, device_type)
+    (finding,) = [finding for _, finding in check_machine(settings) if finding.point == "device"]
+    assert finding.ok is ok
+
+
+def test_a_bus_of_another_bit_rate_is_not_asked() -> None:
+    settings = machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
+    with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as loud:
+        stop = threading.Event()
+
+        def disturb() -> None:
+            while not stop.wait(0.01):
+                loud.send(can.Message(arbitration_id=0x4, data=bytes(8), is_error_frame=True))
+
+        thread = threading.Thread(target=disturb)
+        thread.start()
+        try:
+            for ask in (lambda: scan_bus("can0", settings, []), lambda: check_machine(settings)):
+                with pytest.raises(ConnectError, match="only frames in error are heard; nothing was sent"):
+                    ask()
+        finally:
+            stop.set()
+            thread.join()
+        assert loud.recv(0) is None
 
 
 def heard(config: MachineConfig, wire: Wire, *more: Row) -> dict[str, Finding]:

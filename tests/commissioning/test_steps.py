@@ -321,21 +321,47 @@ def test_full_heartbeat_consumers_are_refused(peer: tuple[DrivePeer, MachineConf
         watchdog(master)
 
 
-def test_an_nc_on_the_bus_is_left_alone(peer: tuple[DrivePeer, MachineConfig]) -> None:
+@pytest.mark.parametrize(
+    ("can_id", "shown"), [(0x080, "SYNC or set-points"), (0x302, "SYNC or set-points"), (0x605, "SDO requests")]
+)
+def test_an_nc_on_the_bus_is_left_alone(can_id: int, shown: str, peer: tuple[DrivePeer, MachineConfig]) -> None:
+    """Whatever it is that only a master sends, also to another drive: its SDO channels are its own."""
     drive, settings = peer
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as nc, Master(settings, "X") as master:
-        nc.send(can.Message(arbitration_id=0x80, is_extended_id=False))
-        with pytest.raises(ProtocolError, match="an NC is sending"):
+        nc.send(can.Message(arbitration_id=can_id, is_extended_id=False))
+        with pytest.raises(ProtocolError, match=f"an NC is sending {shown}"):
             survey.listen(master)
-    assert drive.heard == [0x80]  # the NC's own
+    assert drive.heard == [can_id]  # the NC's own
 
 
-def test_a_silent_bus_gets_no_frame() -> None:
+def test_on_a_silent_bus_the_drive_alone_is_asked_what_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No SYNC, no NMT command, no set-point, and no frame to anybody else."""
+    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.01)  # nothing ever comes
     settings = config()
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as other:
-        with pytest.raises(ConnectError, match="there is no drive on the bus"):
+        with pytest.raises(ConnectError, match=r"nothing was heard on the bus and node-ID 1 did not answer; check"):
             commission(settings, "X")
+        sent = {(m.arbitration_id, bytes(m.data)) for m in iter(lambda: other.recv(0), None)}
+        read, given_up = b"\x40\x00\x10\0\0\0\0\0", b"\x80\0\0\0\0\0\x04\x05"
+        assert sent == {(0x601, read), (0x601, given_up)}
+
+
+def test_a_bus_of_another_bit_rate_gets_no_frame() -> None:
+    settings = config()
+    with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as other:
+        with Master(settings, "X") as master:
+            other.send(can.Message(arbitration_id=0x4, data=bytes(8), is_error_frame=True))
+            with pytest.raises(ConnectError, match=r"only frames in error are heard; nothing was sent"):
+                survey.listen(master)
         assert other.recv(0) is None
+
+
+def test_a_drive_without_a_heartbeat_is_commissioned(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    """0x1017 = 0 is what many drives come with: with the NC off such a drive says nothing until it is asked."""
+    drive, settings = peer
+    drive.drive.set_object(0x1017, 0, 0)
+    record = commission(settings, "X")
+    assert (record.watchdog, record.options["1017"]) == ("proven", 0)
 
 
 def test_a_drive_that_does_not_answer_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -156,13 +156,29 @@ def test_a_drive_that_answers_but_does_not_sample_is_told_once_and_its_end_too(t
         now_s, ticks = k * 0.25, np.arange(k * 250, k * 250 + 250)
         watch.hearing.record_came(TickTimes(frozen_ints(ticks), frozen_ints(ticks * 1_000_000)), now_s)
         watch.hearing.counted({"frames": k, "can0.frames": k, "can0.X.heard": k}, now_s)
-        if now_s > 20.0:
-            still, tick = frozen(np.zeros(250)), frozen_ints(ticks)
+        whole = 250 if now_s > 20.0 else 0  # before that a TPDO is missing, and no sample is whole
+        if now_s > 5.0:
+            still, tick = frozen(np.zeros(whole)), frozen_ints(ticks[:whole])
             samples = AxisSamples("X", tick, still, still, still, still, None, still, tick)
             watch.hearing.record_came(samples, now_s)
         told += [(now_s, notice) for notice in watch.troubles(now_s)]
     assert [(n.code, n.severity, n.axis) for _, n in told] == [("NoSamples", "MAJOR", "X"), ("NoSamples", "info", "X")]
     assert 10.0 <= told[0][0] <= 11.0
+
+
+@pytest.mark.parametrize(
+    ("synced", "words"), [(True, "axis; check node_id"), (False, "no heartbeat (0x1017), else check")]
+)
+def test_a_drive_that_is_never_heard_may_be_one_without_a_heartbeat(synced: bool, words: str, tmp_path: Path) -> None:
+    hearing = Hearing(config_of(tmp_path), 0.0)
+    hearing.source_opened(0.0)
+    for k in range(1, 20):
+        ticks = np.arange(k * 250, k * 250 + 250)
+        if synced:
+            hearing.record_came(TickTimes(frozen_ints(ticks), frozen_ints(ticks * 1_000_000)), k * 0.25)
+        hearing.counted({"frames": k, "can0.frames": k, "can0.X.heard": 0}, k * 0.25)
+        told = hearing.troubles({}, k * 0.25)
+    assert words in told["NodeNeverHeard", "X"]
 
 
 def fed(config: MachineConfig, records: list[Record], windows: int = 0) -> dict[tuple[str, str], str]:

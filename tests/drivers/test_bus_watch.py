@@ -78,12 +78,79 @@ def test_two_producers_are_noticed_once() -> None:
     assert [n.code for n in notices] == ["SyncCollision"]
 
 
-def test_two_producers_without_counters_are_noticed_by_their_rate() -> None:
+def uncounted(steps_ns: list[int]) -> list[Row]:
+    """SYNCs without a counter, these steps apart."""
+    return [(int(t), 0x80, b"") for t in np.cumsum(steps_ns)]
+
+
+def noticed(rows: list[Row], realtime: bool = True, block: int = 7) -> list[str]:
+    """Return the notices of a grid that is fed some SYNCs at a time."""
+    grid = SyncGrid(0.001, realtime)
+    blocks = [rows[start : start + block] for start in range(0, len(rows), block)]
+    return [notice.code for each in blocks for notice in grid.feed(frames_of(each)).notices]
+
+
+@pytest.mark.parametrize("early_us", [50, 300, 440])
+def test_two_producers_without_counters_are_noticed_by_their_rhythm(early_us: int) -> None:
+    random = np.random.default_rng(early_us)
+    steps = [early_us * 1000 + int(random.normal(0, 20_000)), (1000 - early_us) * 1000] * 100
+    assert noticed(uncounted(steps)) == ["SyncCollision"]
+    assert noticed(uncounted(steps), realtime=False) == []
+
+
+@pytest.mark.parametrize("period_us", [250, 500, 700, 1000, 1400, 4000])
+@pytest.mark.parametrize("jitter_us", [0, 60])
+def test_one_producer_of_another_period_is_no_second_one(period_us: int, jitter_us: int) -> None:
+    """Its rate is told as such: the daemon says which period it has."""
+    random = np.random.default_rng(period_us)
+    steps = [period_us * 1000 + int(random.normal(0, jitter_us * 1000)) for _ in range(2000)]
+    assert noticed(uncounted(steps)) == []
+
+
+def test_a_counter_beside_none_is_a_second_producer() -> None:
+    rows = [row for k in range(100) for row in (*syncs([k]), (k * MS + 300_000, 0x80, b""))]
+    assert noticed(rows) == ["SyncCollision"]
+
+
+@pytest.mark.parametrize("every", [2, 3, 5])
+def test_syncs_that_are_lost_are_no_second_producer(every: int) -> None:
     grid = SyncGrid(0.001)
-    notices = [n for k in range(200) for n in grid.feed(frames_of(syncs([k], False, MS // 2))).notices]
-    assert [n.code for n in notices] == ["SyncCollision"]
-    simulated = SyncGrid(0.001, realtime=False)
-    assert not [n for k in range(200) for n in simulated.feed(frames_of(syncs([k], False, MS // 2))).notices]
+    heard = [k for k in range(600) if k % every]
+    notices = [n for k in heard for n in grid.feed(frames_of(syncs([k]))).notices]
+    assert notices == []
+    assert grid.missed == heard[-1] - heard[0] + 1 - len(heard)
+
+
+@pytest.mark.parametrize("overflow", [2, 3, 10, 100, 200, 239, 240])
+@pytest.mark.parametrize("block", [1, 50])
+def test_a_counter_may_go_up_to_any_number(overflow: int, block: int) -> None:
+    """A master of another make counts to what it likes; no SYNC is missed, doubled or taken for another's."""
+    grid = SyncGrid(0.001)
+    rows: list[Row] = [(10**15 + k * MS, 0x80, bytes([(k + 1) % overflow + 1])) for k in range(1000)]
+    taken = [grid.feed(frames_of(rows[start : start + block])) for start in range(0, 1000, block)]
+    assert np.concatenate([each.syncs.tick for each in taken]).tolist() == list(range(1000))
+    assert (grid.missed, grid.duplicates, grid.out_of_order) == (0, 0, 0)
+    assert not [notice for each in taken for notice in each.notices]
+
+
+@pytest.mark.parametrize("overflow", [10, 200])
+def test_an_unsteady_counter_is_known_after_its_second_turn(overflow: int) -> None:
+    """A master on a busy computer: time tells nothing, the counter does."""
+    random = np.random.default_rng(overflow)
+    grid = SyncGrid(0.001)
+    times = np.cumsum(random.integers(MS // 10, 8 * MS, 1000))
+    rows: list[Row] = [(int(t), 0x80, bytes([k % overflow + 1])) for k, t in enumerate(times)]
+    ticks = np.concatenate([grid.feed(frames_of([row])).syncs.tick for row in rows])
+    assert np.all(np.diff(ticks[-2 * overflow :]) == 1)
+    assert np.all(np.diff(ticks) > 0)
+
+
+def test_a_master_without_a_counter_takes_over_from_one_that_counts() -> None:
+    grid = SyncGrid(0.001)
+    grid.feed(frames_of(syncs(list(range(50)))))
+    got = grid.feed(frames_of([(t + 500 * MS, i, b"") for t, i, _ in syncs(list(range(100)))]))
+    assert got.syncs.tick.size >= 90
+    assert not got.notices
 
 
 @pytest.mark.parametrize("data", [b"\x11\x86\x01\0\0\0\0\0", b"\x11\x86\x01", b"\x11\x86"])
@@ -207,3 +274,29 @@ def test_bounds_enclose_the_truth_though_some_stamps_are_late(
     low, high = clock.bounds(round(asked * pace * MS), round((asked + takes) * pace * MS)) or (0.0, 300.0)
     assert low <= asked + 0.01
     assert high >= asked + takes - 0.01
+
+
+def test_a_drive_that_answers_to_node_guarding_is_not_missed_when_it_is_not_asked() -> None:
+    watch = NodeWatch("X", 1)
+    rows = [(t * MS, 0x701, bytes([0x05 | (t // 100 % 2) << 7])) for t in range(0, 2000, 100)]
+    assert watch.feed(frames_of(rows), 2000 * MS) == []
+    assert watch.feed(frames_of([]), 60_000 * MS) == []
+    assert watch.nmt == 5
+
+
+def test_the_filters_let_all_through_that_is_read() -> None:
+    config = machine(axes="XY")
+    decoder = BusDecoder("can0", config)
+    read = {0x000, 0x080} | {pdo for each in decoder.decoders.values() for pdo in each.cob_ids}
+    for node in (1, 2, config.guard.node_id):
+        read |= {0x700 + node}
+    for node in (1, 2):
+        read |= {0x080 + node, 0x580 + node, 0x600 + node}
+    filters = decoder.filters()
+
+    def passes(can_id: int) -> bool:
+        return any(can_id & mask == wanted & mask for wanted, mask in filters)
+
+    assert [can_id for can_id in read if not passes(can_id)] == []
+    assert not any(passes(can_id) for can_id in (0x183, 0x703, 0x7FF, 0x80000001))
+    assert len(filters) < 10

@@ -1,21 +1,11 @@
-"""The ring loses nothing silently, and error frames become notices."""
+"""The ring loses nothing silently."""
 
 from __future__ import annotations
 
-import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fdhil.drivers.can.frames import (
-    ERROR_BUS_OFF,
-    ERROR_CONTROLLER,
-    ERROR_FLAG,
-    ERROR_RESTARTED,
-    FrameRing,
-    error_notices,
-    frames_of,
-)
+from fdhil.drivers.can.frames import FrameRing
 
 
 @given(st.lists(st.integers(0, 12), max_size=40))
@@ -46,25 +36,3 @@ def test_a_frame_survives_the_ring() -> None:
         assert int(frame["dlc"]) == length
         assert int(frame["data"]).to_bytes(8, "little")[:length] == bytes(range(length))
     assert ring.drain().size == 0
-
-
-@pytest.mark.parametrize(
-    ("can_id", "data", "expected"),
-    [
-        (ERROR_BUS_OFF, bytes(8), [("BusOff", "MAJOR")]),
-        (ERROR_RESTARTED, bytes(8), [("BusRestarted", "MAJOR")]),
-        (ERROR_CONTROLLER, bytes([0, 0x10]), [("ErrorPassive", "MAJOR")]),
-        (ERROR_CONTROLLER, bytes([0, 0x20]), [("ErrorPassive", "MAJOR")]),
-        (ERROR_CONTROLLER, bytes([0, 0x08]), [("ErrorPassive", "minor")]),
-        (ERROR_CONTROLLER, bytes([0, 0x40]), []),
-        (0x008, bytes(8), []),
-    ],
-)
-def test_error_frames_become_notices(can_id: int, data: bytes, expected: list[tuple[str, str]]) -> None:
-    frames = frames_of([(0, 0x181, bytes(8)), (1, ERROR_FLAG | can_id, data), (2, ERROR_FLAG | can_id, data)])
-    assert [(n.code, n.severity) for n in error_notices(frames)] == expected
-
-
-def test_no_error_frame_no_notice() -> None:
-    assert error_notices(frames_of([(0, 0x181, bytes(8))])) == []
-    assert error_notices(np.empty(0, frames_of([]).dtype)) == []

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import time
 import uuid
 
+import can
 import pytest
 
 from fdhil.drivers.bus_source import BusSource
-from fdhil.drivers.machine import MachineSource
+from fdhil.drivers.machine import MachineSource, open_machine
 from fdhil.drivers.sensor_source import Record, Take
 from fdhil.records import Notice
 from tests.drivers.wire import machine
@@ -50,3 +52,34 @@ async def test_a_taker_that_fails_is_told_at_once(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(ValueError, match="cannot be taken"):
         await source_of().run(take)
     assert len(taken) == 5000
+
+
+async def test_a_bus_on_which_nothing_is_heard_is_listened_to_and_gets_no_frame() -> None:
+    """With the NC off, drives without a heartbeat are silent."""
+    settings = machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
+    with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as drive:
+        async with open_machine(settings) as source:
+            assert source.counters()["frames"] == 0
+        assert drive.recv(0) is None
+
+
+def test_silence_from_the_start_is_told_and_so_is_its_end() -> None:
+    settings = machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex})
+    bus = BusSource("can0", settings)
+    bus.open()
+    try:
+        now_ns = time.monotonic_ns()
+        assert bus.step(now_ns + 1_900_000_000) == []
+        (silent,) = bus.step(now_ns + 2_500_000_000)
+        assert isinstance(silent, Notice)
+        assert (silent.code, silent.severity) == ("BusSilent", "MAJOR")
+        assert "no drive sends a heartbeat (0x1017)" in silent.text
+        with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as drive:
+            drive.send(can.Message(arbitration_id=0x181, data=bytes(8), is_extended_id=False))
+            while bus.counters()["frames"] == 0:
+                time.sleep(0.001)
+        (back,) = bus.step(time.monotonic_ns())
+        assert isinstance(back, Notice)
+        assert (back.code, back.severity) == ("BusSilent", "info")
+    finally:
+        bus.close()

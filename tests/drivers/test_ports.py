@@ -17,7 +17,8 @@ from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import CanBus as BusSettings
 from fdhil.drivers.can.bus import CanBus
 from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, FrameRing
-from fdhil.drivers.can.ports import PORTS, HubClock, SocketcandPort
+from fdhil.drivers.can.ports import PORTS
+from fdhil.drivers.can.socketcand import HubClock, SocketcandPort
 from fdhil.errors import ConnectError
 
 

@@ -3,25 +3,30 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
 from fdhil import tables
+from fdhil.config import Drive
 from fdhil.drivers.cia402.drive import Cia402Decoder
-from fdhil.drivers.cia402.profile import DriveProfile, load_profile
+from fdhil.drivers.cia402.profile import DriveProfile
+from fdhil.drivers.cia402.profile_file import load_profile
+from tests.drivers.cia402.eds_text import SERVO, eds_file
 from tests.drivers.wire import machine
 
 MAX_BITS = 64
 
 
 @pytest.fixture(params=list(tables.DRIVE_PROFILES))
-def profile(request: pytest.FixtureRequest) -> DriveProfile:
-    """A listed profile."""
-    return load_profile(str(request.param))
+def profile(request: pytest.FixtureRequest, tmp_path: Path) -> DriveProfile:
+    """A listed profile; the one that takes its PDOs from an EDS gets one."""
+    name = str(request.param)
+    return load_profile(Drive(profile=name, eds=eds_file(tmp_path, SERVO) if name == "cia402" else None))
 
 
 def test_it_is_listed_under_its_own_name(profile: DriveProfile) -> None:
-    assert load_profile(profile.name) is profile
+    assert profile.name in tables.DRIVE_PROFILES
 
 
 def test_what_must_be_heard_is_in_a_tpdo(profile: DriveProfile) -> None:
@@ -30,9 +35,10 @@ def test_what_must_be_heard_is_in_a_tpdo(profile: DriveProfile) -> None:
         assert found is not None
         assert found[0].valid
         assert found[0].every_sync == 1
+    assert profile.unheard == ()
     if profile.voltage is not None:
         assert profile.find_tpdo(profile.voltage) is not None
-        assert profile.voltage_v_per_count > 0
+        assert (profile.voltage_v_per_count > 0) != (profile.duty_per_count > 0)
     assert Cia402Decoder("X", machine(), profile).profile is profile
 
 
@@ -40,7 +46,9 @@ def test_the_offset_can_be_sent_and_read_back(profile: DriveProfile) -> None:
     """The NC's target and our offset never share an RPDO: who sends one would overwrite the other."""
     target, offset = profile.find_rpdo(profile.target), profile.find_rpdo(profile.offset)
     assert target is not None
-    assert offset is not None
+    assert profile.takes_offset == (offset is not None)
+    if offset is None:  # a correction leaves through the NC
+        return
     assert target[0].cob_base != offset[0].cob_base
     assert (offset[1].bits, offset[1].signed) == (32, True)
     read_back = profile.find_tpdo(profile.offset)
@@ -50,7 +58,7 @@ def test_the_offset_can_be_sent_and_read_back(profile: DriveProfile) -> None:
 
 def test_no_pdo_is_longer_than_a_frame_or_overlaps(profile: DriveProfile) -> None:
     pdos = [*profile.rpdos, *profile.tpdos]
-    assert len({spec.cob_base for spec in pdos}) == len(pdos)
+    assert len({(spec.name[0], spec.cob_base) for spec in pdos}) == len(pdos)
     for spec in pdos:
         assert spec.length * 8 <= MAX_BITS
         assert spec.cob_base % 0x80 == 0
@@ -59,9 +67,10 @@ def test_no_pdo_is_longer_than_a_frame_or_overlaps(profile: DriveProfile) -> Non
 
 
 def test_what_may_be_negative_is_signed(profile: DriveProfile) -> None:
-    """Read unsigned, a current of -1 count would be 65.5 times the rated one."""
+    """Read unsigned, a current of -1 count would be 65.5 times the rated one; a duty without a sign is told as such."""
     set_points = (profile.target, profile.offset, profile.speed_offset, profile.torque_offset)
-    signals = (profile.position, profile.position_demand, profile.speed, profile.current, profile.voltage or (0, 0))
+    signals = [profile.position, profile.position_demand, profile.speed, profile.current]
+    signals += [] if profile.voltage is None or profile.voltage_magnitude else [profile.voltage]
     places = [profile.find_rpdo(key) for key in set_points] + [profile.find_tpdo(key) for key in signals]
     assert [entry for _, entry in filter(None, places) if not entry.signed] == []
 

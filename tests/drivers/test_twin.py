@@ -167,12 +167,6 @@ async def test_the_voltage_sensor_is_read_and_its_silence_told(twin: Twin) -> No
         await gather(source, lambda rs: "ModbusTimeout" in {r.code for r in rs if isinstance(r, Notice)})
 
 
-async def test_a_bus_without_a_drive_is_refused() -> None:
-    with pytest.raises(ConnectError, match="there is no drive on the bus"):
-        async with open_machine(machine()):
-            pass
-
-
 async def test_a_machine_that_is_switched_off_is_told_and_not_fatal(twin: Twin) -> None:
     """The last one: it ends the process that the others share."""
     twin.tell(command="nc", on=True)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
 import numpy as np
 import pytest
 
@@ -9,27 +13,63 @@ from fdhil import tables
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.cia402.drive import VoltageObject
-from fdhil.drivers.cia402.profile import load_profile
+from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.drivers.machine import MachineSource
 from fdhil.drivers.modbus.voltage import ModbusVoltage
 from fdhil.drivers.sensor_source import sensors_of
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
 from fdhil.records import VoltageSamples
-from tests.drivers.modbus_peer import sensor_peer
+from tests.drivers.modbus_peer import SensorPeer, sensor_peer
+from tests.drivers.serial_peer import SerialPeer
 from tests.drivers.wire import machine
 
+TEXT = {"serial"}
 SEPARATE = [name for name in tables.VOLTAGE_SOURCES if name != tables.DRIVE_VOLTAGE]
 
 
-def config_of(name: str, port: int = 1) -> MachineConfig:
-    return machine(voltage={"source": name, "port": port, "timeout_s": 0.2})
+def config_of(name: str, port: int = 1, device: str = "/dev/fdhil-none") -> MachineConfig:
+    where = {"device": device, "parity": "none"} if name in TEXT else {"port": port}
+    return machine(voltage={"source": name, "timeout_s": 0.2, **where})
+
+
+@asynccontextmanager
+async def peer_of(name: str) -> AsyncIterator[tuple[SensorPeer | None, MachineConfig]]:
+    """Serve a sensor for the source: what its class names as an example, or the peer's own registers; or lines."""
+    if name in TEXT:
+        line = Teller()
+        try:
+            yield None, config_of(name, device=line.device)
+        finally:
+            line.unplug()
+        return
+    async with sensor_peer() as peer:
+        peer.served = getattr(tables.load(tables.VOLTAGE_SOURCES, name), "example_registers", ())
+        yield peer, config_of(name, peer.port)
+
+
+class Teller(SerialPeer):
+    """Tells a line every 20 ms."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._task = asyncio.create_task(self._tell())
+
+    async def _tell(self) -> None:
+        while True:
+            self.put(b"U = +12.5 V\r\n")
+            await asyncio.sleep(0.02)
+
+    def unplug(self) -> None:
+        """End telling, too."""
+        self._task.cancel()
+        super().unplug()
 
 
 @pytest.mark.parametrize("name", tables.VOLTAGE_SOURCES)
 def test_the_voltage_comes_from_one_place_alone(name: str) -> None:
     """``drive`` is an object in a TPDO; every other is a sensor of its own, which the machine reaches and polls."""
     config = config_of(name)
-    profile = load_profile(config.axis["X"].drive.profile)
+    profile = load_profile(config.axis["X"].drive)
     source = tables.load(tables.VOLTAGE_SOURCES, name)("X", config)
     separate = name in SEPARATE
     assert config.axis["X"].voltage.separate == separate
@@ -42,12 +82,9 @@ def test_the_voltage_comes_from_one_place_alone(name: str) -> None:
 
 @pytest.mark.parametrize("name", SEPARATE)
 async def test_a_sensor_is_polled_and_read(name: str) -> None:
-    """The peer serves what the sensor's class names as an example; to the map of ``modbus`` it samples as time goes."""
-    factory = tables.load(tables.VOLTAGE_SOURCES, name)
-    assert factory is ModbusVoltage or factory.example_registers
-    async with sensor_peer() as peer:
-        peer.served = factory.example_registers
-        sensor = sensors_of("X", config_of(name, peer.port))["voltage"]
+    """What it reads is finite, in order and counted; to be read for people takes nothing from a daemon."""
+    async with peer_of(name) as (peer, config):
+        sensor = sensors_of("X", config)["voltage"]
         await sensor.link.connect()
         before = sensor.samples
         shown = await sensor.reading()
@@ -58,7 +95,7 @@ async def test_a_sensor_is_polled_and_read(name: str) -> None:
         blocks = [record for record in records if isinstance(record, VoltageSamples)]
         assert blocks
         counter = np.concatenate([block.counter for block in blocks])
-        if peer.served and isinstance(sensor, ModbusVoltage):
+        if peer is not None and peer.served and isinstance(sensor, ModbusVoltage):
             assert counter[-1] == (await sensor.block()).newest
         sensor.link.close()
     assert all(np.isfinite(block.voltage_v).all() for block in blocks)
@@ -71,11 +108,11 @@ async def test_a_sensor_is_polled_and_read(name: str) -> None:
 
 @pytest.mark.parametrize("name", SEPARATE)
 async def test_a_sensor_that_is_not_there_is_told_with_its_place(name: str) -> None:
-    async with sensor_peer() as peer:
-        port = peer.port
-    sensor = sensors_of("X", config_of(name, port))["voltage"]
+    async with peer_of(name) as (_, config):
+        where = config.axis["X"].voltage
+    sensor = sensors_of("X", config)["voltage"]
     assert sensor.axis == "X"
-    assert str(port) in sensor.link.place
+    assert (where.device or str(where.port)) in sensor.link.place
     with pytest.raises(ConnectError, match=sensor.name):
         await sensor.link.connect()
 

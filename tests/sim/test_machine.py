@@ -15,7 +15,7 @@ from fdhil.sim.fault_kinds import FAULTS
 from fdhil.sim.machine import Machine
 from fdhil.sim.operator_commands import CommandError, OperatorCommands
 from fdhil.sim.service import Pace
-from fdhil.sim.wire.modbus_sensor import SensorFaults
+from fdhil.sim.wire.sensor_faults import SensorFaults
 from tests.guard.machine import settings
 from tests.sim.bench_twin import PERIOD_S, TwinInHand, corner, trajectory, twin_config
 

@@ -183,7 +183,7 @@ def test_rpdo_values_out_of_range_are_not_taken() -> None:
     configure(rig, 0x1403, 0x1603, 0x501, 255, [0x60600008])
     rig.nmt(0x01)
     rig.send(0x501, bytes([8]))
-    rig.send(0x501, bytes([9]))
+    rig.send(0x501, bytes([7]))
     assert rig.read(0x6060) == 8 == rig.read(0x6061)
 
 

@@ -143,11 +143,11 @@ def test_the_same_over_a_virtual_bus() -> None:
         (0x1018, 9, 1, 1, 0x06090011),
         (0x6040, 0, 1, 4, 0x06070010),
         (0x607A, 0, 1, 2, 0x06070010),
-        (0x6060, 0, 9, 1, 0x06090030),
+        (0x6060, 0, 7, 1, 0x06090030),
         (0x6060, 0, -1, 1, 0x06090030),
         (0x605A, 0, 3, 2, 0x06090030),
         (0x605E, 0, 3, 2, 0x06090030),
-        (0x60C2, 1, 2, 1, 0x06090030),
+        (0x60C2, 1, 0, 1, 0x06090030),
         (0x1019, 0, 241, 1, 0x06090030),
         (0x1005, 0, 0x40000080, 4, 0x06090030),
         (0x1014, 0, 0x20000081, 4, 0x06090030),
@@ -200,7 +200,7 @@ def test_protocol_errors_end_the_transfer() -> None:
     assert abort_code(sdo.request(bytes([0x60]) + bytes(7))) == AbortCode.COMMAND  # nothing goes on any more
     assert abort_code(sdo.request(bytes([0xE0]) + bytes(7))) == AbortCode.COMMAND
     assert abort_code(sdo.request(bytes([0x00]) + bytes(7))) == AbortCode.COMMAND
-    assert abort_code(sdo.request(head(0xC0, 0x2000) + bytes(4))) == AbortCode.COMMAND  # block download
+    assert abort_code(sdo.request(head(0xC1, 0x2000) + bytes(4))) == AbortCode.COMMAND  # the end of no block download
     assert abort_code(sdo.request(head(0xA4, 0x2000) + bytes(4))) == AbortCode.BLOCK_SIZE
     assert abort_code(sdo.request(bytes([0xA3]) + bytes(7))) == AbortCode.COMMAND
     sdo.request(head(0xA4, 0x2000) + bytes([5, 0, 0, 0]))

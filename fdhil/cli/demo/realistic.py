@@ -12,8 +12,8 @@ from fdhil.cli.demo.machines import REAL, machine_document
 from fdhil.cli.demo.report import Cut, Published
 from fdhil.config import MachineConfig
 from fdhil.errors import FdhilError
+from fdhil.model.terms import with_resonance
 from fdhil.prediction import predict
-from fdhil.prediction.model_terms import with_resonance
 from fdhil.program import load_trajectory
 from fdhil.records import Parameters, Prediction
 from fdhil.store.history import History

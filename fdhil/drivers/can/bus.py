@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Sequence
 from typing import Self
 
 from fdhil import config
 from fdhil.drivers.can.frames import DEFAULT_RING_FRAMES, FrameRing, Frames
-from fdhil.drivers.can.ports import PORTS, BusEnded, Port
+from fdhil.drivers.can.port import BusEnded, Filter, Port, Stamps
+from fdhil.drivers.can.ports import open_port
 
 POLL_S = 0.05
 # frames are read ten milliseconds at a time: a thread that wakes for every one costs more than all the decoding, the
@@ -28,10 +30,16 @@ class CanBus:
 
     batch_s = BATCH_S
 
-    def __init__(self, name: str, settings: config.CanBus, ring_frames: int = DEFAULT_RING_FRAMES) -> None:
+    def __init__(
+        self,
+        name: str,
+        settings: config.CanBus,
+        ring_frames: int = DEFAULT_RING_FRAMES,
+        filters: Sequence[Filter] = (),
+    ) -> None:
         self.name = name
         self.ended: str | None = None
-        self._port = self._open(settings)
+        self._port = self._open(settings, filters)
         self._ring_frames = ring_frames
         self._ring = FrameRing(ring_frames)
         self._stopping = threading.Event()
@@ -39,9 +47,14 @@ class CanBus:
         self._thread = threading.Thread(target=self._receive, name=f"fdhil-{name}", daemon=True)
         self._thread.start()
 
-    def _open(self, settings: config.CanBus) -> Port:
+    def _open(self, settings: config.CanBus, filters: Sequence[Filter]) -> Port:
         """Open the port that ``[bus.NAME]`` asks for; ConnectError with cause and next action."""
-        return PORTS[settings.interface](self.name, settings)
+        return open_port(self.name, settings, filters)
+
+    @property
+    def stamps(self) -> Stamps:
+        """Who stamped the newest frames."""
+        return self._port.stamps
 
     def _receive(self) -> None:
         """The receive thread: nothing but appending; its end is reported, never swallowed."""

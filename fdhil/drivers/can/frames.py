@@ -1,4 +1,4 @@
-"""Holds CAN frames in bulk: in a preallocated ring between receive thread and decoder; tells error frames as notices.
+"""Holds CAN frames in bulk, in a preallocated ring between receive thread and decoder.
 
 A frame is 24 bytes: ``t_ns`` host-monotonic receive stamp, ``id`` with the flags of SocketCAN (0x20000000 error,
 0x40000000 remote, 0x80000000 extended), ``dlc`` and ``data`` as a little-endian 64 bit word, so that a block is
@@ -13,8 +13,6 @@ from collections.abc import Iterable
 import numpy as np
 import numpy.typing as npt
 
-from fdhil.records import Notice
-
 FRAME = np.dtype([("t_ns", "<i8"), ("id", "<u4"), ("dlc", "u1"), ("pad", "u1", (3,)), ("data", "<u8")])
 Frames = npt.NDArray[np.void]
 _PACK = struct.Struct("<qIB3x8s")
@@ -22,13 +20,6 @@ _PACK = struct.Struct("<qIB3x8s")
 ERROR_FLAG = 0x20000000
 REMOTE_FLAG = 0x40000000
 EXTENDED_FLAG = 0x80000000
-# classes of an error frame's id, linux/can/error.h
-ERROR_CONTROLLER = 0x004
-ERROR_BUS_OFF = 0x040
-ERROR_RESTARTED = 0x100
-# data[1] of a controller error
-CONTROLLER_WARNING = 0x04 | 0x08
-CONTROLLER_PASSIVE = 0x10 | 0x20
 
 DEFAULT_RING_FRAMES = 1 << 16
 
@@ -86,31 +77,3 @@ class FrameRing:
             block = np.concatenate([self._frames[first:], self._frames[:last]])
         self._read = stop
         return block
-
-
-def error_notices(frames: Frames) -> list[Notice]:
-    """Translate error frames into notices: BusOff, ErrorPassive, BusRestarted, each at most once per block.
-
-    >>> [n.code for n in error_notices(frames_of([(0, ERROR_FLAG | ERROR_BUS_OFF, bytes(8))]))]
-    ['BusOff']
-    """
-    errors = frames[frames["id"] & ERROR_FLAG != 0]
-    if errors.size == 0:
-        return []
-    classes = int(np.bitwise_or.reduce(errors["id"] & 0x1FFFFFFF))
-    controller = errors[errors["id"] & ERROR_CONTROLLER != 0]
-    detail = int(np.bitwise_or.reduce(controller["data"] >> np.uint64(8) & np.uint64(0xFF))) if controller.size else 0
-    notices = []
-    if classes & ERROR_BUS_OFF:
-        text = "The CAN controller went bus-off, an offset in a drive cannot be changed; check the wiring and bit rate."
-        notices.append(Notice("BusOff", "MAJOR", text))
-    if classes & ERROR_RESTARTED:
-        text = "The CAN controller was restarted; what the drives hold must be read before anything is written."
-        notices.append(Notice("BusRestarted", "MAJOR", text))
-    if detail & CONTROLLER_PASSIVE:
-        text = "The CAN controller is error-passive, frames may be lost; check termination, shield and bit rate."
-        notices.append(Notice("ErrorPassive", "MAJOR", text))
-    elif detail & CONTROLLER_WARNING:
-        text = "The CAN controller counts errors (warning level); check termination and shield."
-        notices.append(Notice("ErrorPassive", "minor", text))
-    return notices

@@ -20,6 +20,7 @@ _HEARTBEATS_TO_LEARN = 3
 _BACK_NS = 2_000_000_000  # of regular heartbeats after which an outage is over: until then it is one and the same
 # what a node itself sends in CiA 301's predefined set: EMCY, TPDO1 to 4, SDO answers, heartbeat
 _OWN_COB_IDS = (0x080, 0x180, 0x280, 0x380, 0x480, 0x580, 0x700)
+_TOGGLE = 0x80  # of an answer to node guarding; in a heartbeat it is always 0
 _NMT_STATES = frozenset(int(state) for state in Nmt)
 
 # error classes of CiA 301, 7.2.7.1
@@ -74,6 +75,7 @@ class NodeWatch:
         self._lost = False
         self._period_ns = 0
         self._back_since_ns: int | None = None
+        self._guarded = False
         self._own_ids = np.array([cob_id + node_id for cob_id in _OWN_COB_IDS], dtype=np.uint32)
         self.heard = 0
 
@@ -84,6 +86,7 @@ class NodeWatch:
         for frame in frames[frames["id"] == COB_EMCY + self._node_id]:
             notices += self._emergency(int(frame["dlc"]), int(frame["data"]))
         for frame in frames[frames["id"] == COB_HEARTBEAT + self._node_id]:
+            self._guarded |= bool(int(frame["data"]) & _TOGGLE)
             notices += self._heartbeat(int(frame["data"]) & 0x7F, int(frame["t_ns"]))
         return notices + self._silence(now_ns)
 
@@ -135,8 +138,8 @@ class NodeWatch:
         return 3 * self._period_ns + 100_000_000
 
     def _silence(self, now_ns: int) -> list[Notice]:
-        """Tell a heartbeat that stops; a drive that sends none is not judged."""
-        if self._lost or len(self._beats) <= _HEARTBEATS_TO_LEARN:
+        """Tell a heartbeat that stops; a drive that sends none, or only when the NC asks it to, is not judged."""
+        if self._lost or self._guarded or len(self._beats) <= _HEARTBEATS_TO_LEARN:
             return []
         self._period_ns = max(b - a for a, b in pairwise(self._beats))
         if now_ns - self._beats[-1] <= self._longest_gap_ns():

@@ -1,7 +1,8 @@
 """Lays frames on the SYNC grid: each gets the tick of the last SYNC before it. Pure: no clock, no I/O.
 
-With a counter byte (0x1019, 1..240) lost SYNCs are counted and the grid stays right; without one a lost SYNC cannot
-be seen, and each SYNC is one tick. Arrival times serve one purpose only: to tell 1 from 241 periods.
+With a counter byte (0x1019, 1 to at most 240) lost SYNCs are counted and the grid stays right; without one a lost SYNC
+cannot be seen, and each SYNC is one tick. Arrival times serve two purposes only: to tell 1 from 241 periods, and to
+see at once where a counter begins again that does not go up to 240.
 """
 
 from __future__ import annotations
@@ -13,11 +14,12 @@ import numpy.typing as npt
 
 from fdhil.cia402 import COB_SYNC
 from fdhil.drivers.can.frames import Frames
+from fdhil.drivers.can.sync_producers import SyncProducers
 from fdhil.records import Int, Notice, TickTimes
 
 COUNTER_RANGE = 240
-_BACKWARD = COUNTER_RANGE // 2
-_HISTORY = 32
+_SHORT_RANGE = 16  # a counter that begins again so soon cannot tell back from forth
+_UNCOUNTED = 8  # SYNCs without a counter, one after the other, until the producer with one is gone
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +46,13 @@ class SyncGrid:
         self._realtime = realtime
         self._last_tick = -1
         self._last_counter: int | None = None
-        self._last_ns = 0
+        self._last_ns: int | None = None
         self._suspect: int | None = None  # the counter of a SYNC that went backwards
-        self._recent_odd: list[bool] = []
+        self._range = COUNTER_RANGE
+        self._wrapped_at: int | None = None
+        self._uncounted_run = 0
+        self._producers = SyncProducers(sync_period_s, realtime)
         self._collision = False
-        self._intervals_ns: list[int] = []
-        self._stamped_ns: int | None = None
         self.missed = 0
         self.duplicates = 0
         self.out_of_order = 0
@@ -78,12 +81,12 @@ class SyncGrid:
         counted = syncs["dlc"] > 0
         regular = np.arange(1, syncs.size + 1) + self._last_tick
         if self._last_tick < 0 and self._last_counter is None and counted[0]:
-            self._last_counter = (int(counters[0]) - 2) % COUNTER_RANGE + 1
+            self._last_counter = (int(counters[0]) - 2) % self._range + 1
         if self._last_counter is None and not counted.any():
             self._finish(regular, None, syncs)
             return regular
         if self._last_counter is not None and counted.all():
-            expected = (self._last_counter + np.arange(syncs.size)) % COUNTER_RANGE + 1
+            expected = (self._last_counter + np.arange(syncs.size)) % self._range + 1
             if np.array_equal(expected, counters) and not self._long_pause(syncs):
                 self._finish(regular, int(counters[-1]), syncs)
                 return regular
@@ -95,8 +98,9 @@ class SyncGrid:
 
     def _long_pause(self, syncs: Frames) -> bool:
         """Whether a whole turn of the counter may have gone by between two of these SYNCs."""
-        stamps = np.concatenate([[self._last_ns or syncs["t_ns"][0]], syncs["t_ns"]])
-        return self._realtime and bool(np.diff(stamps).max() > _BACKWARD * self._period_ns)
+        before = syncs["t_ns"][0] if self._last_ns is None else self._last_ns
+        stamps = np.concatenate([[before], syncs["t_ns"]])
+        return self._realtime and bool(np.diff(stamps).max() > self._range // 2 * self._period_ns)
 
     def _finish(self, ticks: Int, counter: int | None, syncs: Frames) -> None:
         """Take a block without any irregularity."""
@@ -104,33 +108,51 @@ class SyncGrid:
         self._last_counter = counter
         self._last_ns = int(syncs["t_ns"][-1])
         self._suspect = None
-        self._recent_odd = (self._recent_odd + [False] * min(syncs.size, _HISTORY))[-_HISTORY:]
+        self._uncounted_run = 0
+        self._producers.regular(syncs.size, counter)
 
     def _step(self, counter: int | None, t_ns: int) -> int:
         """One SYNC of an irregular block; returns its tick or -1."""
+        self._producers.irregular(counter, self._range)
         if counter is None or self._last_counter is None:
             return self._uncounted(counter, t_ns)
-        ahead = (counter - self._last_counter) % COUNTER_RANGE
+        self._uncounted_run = 0
+        self._learn_range(counter, t_ns)
+        ahead = (counter - self._last_counter) % self._range
         whole_turns = self._whole_turns(ahead, t_ns)
-        self._recent_odd = [*self._recent_odd, ahead != 1][-_HISTORY:]
         if ahead == 0 and whole_turns == 0:
             self.duplicates += 1
             return -1
-        if ahead > _BACKWARD and whole_turns == 0 and not self._continues(counter):
+        backward = self._range >= _SHORT_RANGE and ahead > self._range // 2
+        if backward and whole_turns == 0 and not self._continues(counter):
             self.out_of_order += 1
             self._suspect = counter
             return -1
         self._suspect = None
-        ahead += COUNTER_RANGE * whole_turns
+        ahead += self._range * whole_turns
         self.missed += ahead - 1
         return self._advance(ahead, counter, t_ns)
 
+    def _learn_range(self, counter: int, t_ns: int) -> None:
+        """Where the counter begins again at 1 it went as far as 0x1019 says: by time or at the second turn."""
+        last = self._last_counter
+        if counter > self._range:
+            self._range = COUNTER_RANGE
+        if counter != 1 or last is None or last < 2:
+            return
+        at_once = self._realtime and self._last_ns is not None and t_ns - self._last_ns < 1.5 * self._period_ns
+        if at_once or last == self._wrapped_at:
+            self._range = last
+        self._wrapped_at = last
+
     def _uncounted(self, counter: int | None, t_ns: int) -> int:
-        if counter is None and self._last_counter is not None:
+        self._uncounted_run = self._uncounted_run + 1 if counter is None else 0
+        if counter is None and self._last_counter is not None and self._uncounted_run < _UNCOUNTED:
             # a second producer without a counter beside the one that counts
             self.out_of_order += 1
-            self._recent_odd = [*self._recent_odd, True][-_HISTORY:]
             return -1
+        if counter is None:
+            self._producers.regular(1, None)
         return self._advance(1, counter, t_ns)
 
     def _advance(self, ahead: int, counter: int | None, t_ns: int) -> int:
@@ -141,7 +163,7 @@ class SyncGrid:
 
     def _continues(self, counter: int) -> bool:
         """A counter that went backwards and counts on from there was restarted by its producer."""
-        return self._suspect is not None and (counter - self._suspect) % COUNTER_RANGE == 1
+        return self._suspect is not None and (counter - self._suspect) % self._range == 1
 
     def _whole_turns(self, ahead: int, t_ns: int) -> int:
         """Whole turns of the counter that went by unheard.
@@ -149,27 +171,18 @@ class SyncGrid:
         The elapsed time must fit a whole number of turns within 2 %: a simulated machine that was held up and then
         goes on where it was fits none.
         """
-        if not self._realtime:
+        if not self._realtime or self._last_ns is None:
             return 0
         elapsed = (t_ns - self._last_ns) / self._period_ns
-        turns = round((elapsed - ahead) / COUNTER_RANGE)
-        return turns if turns > 0 and abs(elapsed - ahead - turns * COUNTER_RANGE) <= max(2.0, 0.02 * elapsed) else 0
+        turns = round((elapsed - ahead) / self._range)
+        fits = max(min(2.0, self._range / 8), 0.02 * elapsed)
+        return turns if turns > 0 and abs(elapsed - ahead - turns * self._range) <= fits else 0
 
     def _collisions(self, stamps: Int) -> tuple[Notice, ...]:
-        """Say once when two producers seem to send SYNC."""
-        if stamps.size:
-            before = [] if self._stamped_ns is None else [self._stamped_ns]
-            self._intervals_ns = (self._intervals_ns + np.diff([*before, *stamps]).tolist())[-_HISTORY:]
-            self._stamped_ns = int(stamps[-1])
-        twice = len(self._recent_odd) == _HISTORY and sum(self._recent_odd) > _HISTORY // 3
-        fast = (
-            self._realtime
-            and self._last_counter is None
-            and len(self._intervals_ns) == _HISTORY
-            and float(np.mean(self._intervals_ns)) < 0.75 * self._period_ns
-        )
-        was, self._collision = self._collision, twice or fast
+        """Say once when two nodes send SYNC."""
+        self._producers.stamped(stamps)
+        was, self._collision = self._collision, self._producers.two
         if not self._collision or was:
             return ()
-        text = "Two nodes seem to send SYNC, the sampling grid cannot be trusted; leave one SYNC producer on the bus."
+        text = "Two nodes send SYNC, the sampling grid cannot be trusted; leave one SYNC producer on the bus."
         return (Notice("SyncCollision", "MAJOR", text, tick=self._last_tick),)

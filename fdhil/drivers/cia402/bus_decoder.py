@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from fdhil.cia402 import COB_HEARTBEAT
 from fdhil.config import MachineConfig
-from fdhil.drivers.can.frames import Frames, error_notices
+from fdhil.drivers.can.error_frames import ErrorWatch
+from fdhil.drivers.can.filters import drive_filters
+from fdhil.drivers.can.frames import Frames
 from fdhil.drivers.can.node_watch import NodeWatch
+from fdhil.drivers.can.port import Filter
 from fdhil.drivers.can.sync_grid import SyncGrid
 from fdhil.drivers.cia402.drive import Cia402Decoder, InputSamples
+from fdhil.drivers.cia402.pdo_watch import PdoWatch
 from fdhil.drivers.table.tpdo_encoder import TpdoEncoder
 from fdhil.records import AxisSamples, Notice, TableSamples, TickTimes
 
@@ -18,10 +23,16 @@ class BusDecoder:
 
     def __init__(self, bus: str, config: MachineConfig) -> None:
         realtime = config.guard.clock == "monotonic" and config.sim.pace == "realtime"
+        self._errors = ErrorWatch()
         self.grid = SyncGrid(config.machine.sync_period_s, realtime)
         self.axes = [axis for axis, settings in config.axis.items() if settings.drive.bus == bus]
         self.decoders = {axis: Cia402Decoder(axis, config) for axis in self.axes}
         self.watches = {axis: NodeWatch(axis, config.node_id(axis)) for axis in self.axes}
+        self._guard_heartbeat = COB_HEARTBEAT + config.guard.node_id
+        self._pdos = {
+            axis: PdoWatch(axis, each.node_id, each.profile.tpdos, each.required, config.machine.sync_period_s)
+            for axis, each in self.decoders.items()
+        }
         tables = {axis: config.axis[axis].table for axis in self.axes}
         self.tables = [TpdoEncoder(axis, t) for axis, t in tables.items() if t is not None and t.source == "canopen"]
         self._last_sync_ns: int | None = None
@@ -31,7 +42,7 @@ class BusDecoder:
         """Take a block of frames; return times of the ticks, samples, inputs and notices."""
         ticked = self.grid.feed(frames)
         out: list[TickTimes | AxisSamples | InputSamples | TableSamples | Notice] = [
-            *error_notices(frames),
+            *self._errors.feed(frames, now_ns),
             *ticked.notices,
         ]
         if ticked.syncs.tick.size:
@@ -41,6 +52,7 @@ class BusDecoder:
         for axis in self.axes:
             out += self.decoders[axis].feed(ticked)
             out += self.watches[axis].feed(frames, now_ns)
+            out += self._pdos[axis].feed(ticked, self.watches[axis].nmt)
         for encoder in self.tables:
             out += encoder.feed(ticked)
         return out
@@ -53,10 +65,16 @@ class BusDecoder:
             return [Notice("SyncLost", "MAJOR", text)]
         return [Notice("SyncLost", "info", "SYNC is back.")] if was and not silent else []
 
+    def filters(self) -> list[Filter]:
+        """Return filters for the frames that are needed here, the guard's heartbeat among them."""
+        pdos = {cob_id for decoder in self.decoders.values() for cob_id in decoder.cob_ids}
+        return drive_filters([decoder.node_id for decoder in self.decoders.values()], pdos | {self._guard_heartbeat})
+
     def counters(self) -> dict[str, int]:
         """Count what was missed, duplicated or discarded on this bus, and the frames each drive sent."""
         counters = [decoder.counters for decoder in self.decoders.values()]
         return {
+            "error_frames": self._errors.count,
             "sync_missed": self.grid.missed,
             "sync_duplicates": self.grid.duplicates,
             "sync_out_of_order": self.grid.out_of_order,

@@ -9,7 +9,7 @@ out: a hole in ``tick``, counted in ``lost``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,7 +19,8 @@ from fdhil.cia402 import PdoEntry
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.sync_grid import Ticked
 from fdhil.drivers.cia402.pdo_queue import DecoderCounters, Dense, PdoQueue, Setpoint, SetpointRows, decode, dense
-from fdhil.drivers.cia402.profile import DriveProfile, ObjectKey, load_profile
+from fdhil.drivers.cia402.profile import DriveProfile, ObjectKey
+from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.records import AxisSamples, Bool, Float, Int, Notice, frozen, frozen_ints
 
 _FOREIGN_TICKS = 8
@@ -39,19 +40,43 @@ class InputSamples:
 class VoltageObject:
     """The voltage source ``drive``: a vendor object of the profile, decoded with the other TPDOs.
 
-    ``key`` None: the profile has none, or a sensor of its own tells the voltage.
+    ``keys`` are the objects whose product it is, ``key`` the first of them; None: the profile has none, the DC link is
+    not known, or a sensor of its own tells the voltage.
     """
 
     def __init__(self, axis: str, config: MachineConfig, profile: DriveProfile | None = None) -> None:
         settings = config.axis[axis]
-        profile = profile or load_profile(settings.drive.profile)
-        self.key = None if settings.voltage.separate else profile.voltage
-        self.v_per_count = settings.drive.sign * profile.voltage_v_per_count
+        profile = profile or load_profile(settings.drive)
+        self.v_per_count = profile.terminal_v_per_count(settings)
+        self.keys = () if settings.voltage.separate or not self.v_per_count else profile.voltage_objects
+        self.key = self.keys[0] if self.keys else None
         self.rows_back = 1 if settings.voltage.sampling == "interval_mean" else 0
+        self._magnitude = profile.voltage_magnitude
+        self._nominal = settings.nominal
+
+    def volts(self, counts: Sequence[Int], current_a: Float, speed_rad_s: Float) -> Float:
+        """Return the voltage (n,) of the objects' counts, each (n,).
+
+        One without a sign gets that of R i + K w, by the data sheet: it can be wrong only where the voltage is small.
+        """
+        product = np.prod(counts, axis=0)
+        if not self._magnitude:
+            return np.asarray(product * self.v_per_count, np.float64)
+        sense = np.sign(self._nominal.R * current_a + self._nominal.K * speed_rad_s)
+        return np.asarray(product * abs(self.v_per_count) * sense, np.float64)
+
+
+def _as_shown(row: Int, shown: Int, n: int) -> SetpointRows:
+    """The demand (n,) on the rows (m,) on which the drive showed it (m,)."""
+    value, certain = np.zeros(n, np.int64), np.zeros(n, np.bool_)
+    value[row], certain[row] = shown, True
+    return SetpointRows(value, certain, 0)
 
 
 class Cia402Decoder:
     """Decodes one axis; ``feed`` takes ticked frames of its bus, ``counters`` tells what was lost.
+
+    ``required`` names the TPDOs of which every sample is made.
 
     ValueError when the profile maps a needed object in no PDO.
     """
@@ -59,20 +84,22 @@ class Cia402Decoder:
     def __init__(self, axis: str, config: MachineConfig, profile: DriveProfile | None = None) -> None:
         self.axis = axis
         self._settings = config.axis[axis]
-        self.profile = profile or load_profile(self._settings.drive.profile)
+        self.profile = profile or load_profile(self._settings.drive)
         self.node_id = config.node_id(axis)
         self.counters = DecoderCounters()
         self._voltage = VoltageObject(axis, config, self.profile)
         self._queues = {s.name: PdoQueue(s, s.cob_base + self.node_id) for s in self.profile.tpdos}
         needed = [self.profile.position, self.profile.speed, self.profile.current, self.profile.statusword]
-        self._places = {key: self._place(key) for key in (*needed, *([self._voltage.key] if self._voltage.key else []))}
-        self._required = list(dict.fromkeys(name for name, _ in self._places.values()))
+        self._places = {key: self._place(key) for key in (*needed, *self._voltage.keys)}
+        self._every_sync = {spec.name for spec in self.profile.tpdos if spec.every_sync == 1}
+        self.required = list(dict.fromkeys(name for name, _ in self._places.values()))
         shown = (self.profile.position_demand, self.profile.offset, self.profile.digital_inputs)
         self._shown_places = {key: self._place(key) for key in shown if self.profile.find_tpdo(key)}
         self._mm_per_increment = self._settings.scaling.sign / self._settings.scaling.increments_per_mm
         self._delay = self._settings.drive.setpoint_delay_cycles
         self._target = self._sniffed(self.profile.target)
-        self._offset = self._sniffed(self.profile.offset)
+        self._offset = self._sniffed(self.profile.offset) if self.profile.find_rpdo(self.profile.offset) else None
+        self._setpoints = [self._target] if self._offset is None else [self._target, self._offset]
         self._syncs = np.empty(0, np.int64)
         self._next_row: int | None = None
         self._foreign_run = 0
@@ -93,9 +120,14 @@ class Cia402Decoder:
         spec, entry = found
         return Setpoint(PdoQueue(spec, spec.cob_base + self.node_id), entry, self._delay)
 
+    @property
+    def cob_ids(self) -> frozenset[int]:
+        """The PDOs of this drive, by its profile."""
+        return frozenset(spec.cob_base + self.node_id for spec in (*self.profile.tpdos, *self.profile.rpdos))
+
     def feed(self, ticked: Ticked) -> list[AxisSamples | InputSamples | Notice]:
         """Take a block of ticked frames; return the rows that became complete, and what must be told."""
-        for queue in (*self._queues.values(), self._target.queue, self._offset.queue):
+        for queue in (*self._queues.values(), *(setpoint.queue for setpoint in self._setpoints)):
             queue.add(ticked, self.counters)
         self._syncs = np.concatenate([self._syncs, ticked.syncs.tick])
         first, stop = self._next_row or 0, ticked.last_tick - 1
@@ -117,7 +149,7 @@ class Cia402Decoder:
     def _forget(self, row: int) -> None:
         for queue in self._queues.values():
             queue.forget(row)
-        for setpoint in (self._target, self._offset):
+        for setpoint in self._setpoints:
             setpoint.forget(row)
         self._syncs = self._syncs[np.searchsorted(self._syncs, row) :]
 
@@ -133,24 +165,29 @@ class Cia402Decoder:
     ) -> list[AxisSamples]:
         """Rows [first, stop); nothing while the demand is not known."""
         heard = self._heard(first, stop)
-        grids = {name: dense(self._queues[name], first, stop + 1) for name in self._required}
-        lost = self._count(grids, heard)
+        grids = {name: dense(self._queues[name], first, stop + 1) for name in self.required}
+        lost = self._count(grids, heard, first)
         if demand is None:
             return []
         lost += demand.lost + int(np.count_nonzero(~heard))
         certain = demand.certain & heard
         for key, (name, _) in self._places.items():
-            back = self._voltage.rows_back if key == self._voltage.key else 0
+            back = self._voltage.rows_back if key in self._voltage.keys else 0
             certain &= grids[name].present[back : back + stop - first]
         if offset is not None:
             certain &= offset.certain
         self.counters.lost += demand.lost
         return [self._record(np.flatnonzero(certain), first, grids, demand, offset, lost)]
 
-    def _count(self, grids: Mapping[str, Dense], heard: Bool) -> int:
+    def _count(self, grids: Mapping[str, Dense], heard: Bool, first: int) -> int:
         """Count what is wrong with the frames of the rows' own ticks; returns the number lost."""
         rows = heard.size
-        lost = sum(int(np.count_nonzero(grid.missing[:rows] & heard)) for grid in grids.values())
+        lost = 0
+        for name, grid in grids.items():
+            begun = self._queues[name].first_tick
+            if begun is not None:
+                start = max(0, begun - first)
+                lost += int(np.count_nonzero((grid.missing[:rows] & heard)[start:]))
         ambiguous = np.zeros(rows, np.bool_)
         for grid in grids.values():
             self.counters.duplicates += int(grid.duplicates[:rows].sum())
@@ -183,16 +220,19 @@ class Cia402Decoder:
             return decode(entry, grids[name].words[rows + back])
 
         mm = self._mm_per_increment
+        speed = frozen(raw(profile.speed) * profile.speed_rad_s_per_count(self._settings))
+        current = frozen(raw(profile.current) * profile.current_a_per_count(self._settings))
         voltage: Float | None = None
-        if self._voltage.key is not None:
-            voltage = frozen(raw(self._voltage.key, self._voltage.rows_back) * self._voltage.v_per_count)
+        if self._voltage.keys:
+            counts = [raw(key, self._voltage.rows_back) for key in self._voltage.keys]
+            voltage = frozen(self._voltage.volts(counts, current, speed))
         return AxisSamples(
             axis=self.axis,
             tick=frozen_ints(rows + first),
             demand_mm=frozen(demand.value[rows] * mm),
             position_mm=frozen(raw(profile.position) * mm),
-            speed_rad_s=frozen(raw(profile.speed) * profile.speed_rad_s_per_count(self._settings)),
-            current_a=frozen(raw(profile.current) * profile.current_a_per_count(self._settings)),
+            speed_rad_s=speed,
+            current_a=current,
             voltage_v=voltage,
             offset_mm=frozen(offset.value[rows] * mm if offset is not None else np.zeros(rows.size)),
             statusword=frozen_ints(raw(profile.statusword)),
@@ -208,10 +248,12 @@ class Cia402Decoder:
         return tick, decode(entry, words)
 
     def _read_back_offset(self, first: int, stop: int) -> SetpointRows | None:
-        """The offset in force on rows [first, stop): sniffed, else what the drive shows.
+        """The offset in force on rows [first, stop): sniffed, else what the drive shows; None: none, or unknown.
 
         0x60B0 at SYNC k is what was latched there, so it is in force at k + delay.
         """
+        if self._offset is None:
+            return None
         _, shown = self._shown(self.profile.offset, first, stop)
         if shown.size and self._offset.queue.tick.size == 0:
             self._offset.held = int(shown[-1])
@@ -220,12 +262,14 @@ class Cia402Decoder:
     def _read_back_demand(self, first: int, stop: int, offset: SetpointRows | None) -> SetpointRows | None:
         """The demand on rows [first, stop): sniffed and checked against what the drive shows, else what it shows.
 
-        0x6062 at SYNC k is r[k] + o[k].
+        0x6062 at SYNC k is r[k] + o[k]. A drive that makes its own path (profile position) may show it with every SYNC.
         """
         tick, shown = self._shown(self.profile.position_demand, first, stop)
         base = shown - (offset.value[tick - first] if offset is not None else 0)
         if self._target.queue.tick.size == 0 and shown.size:
             self._target.held = int(base[-1])
+            if self._shown_places[self.profile.position_demand][0] in self._every_sync:
+                return _as_shown(tick - first, base, stop - first)
         demand = self._target.rows(first, stop)
         if demand is not None and self._target.queue.tick.size and shown.size:
             sure = demand.certain[tick - first]

@@ -56,6 +56,8 @@ class _Section:
 
 def load_eds(path: Path, node_id: int | None = None) -> ObjectDictionary:
     """Read an EDS or DCF file; ``node_id`` resolves $NODEID. EdsError when it cannot be read or is no EDS."""
+    if path.exists() and not path.is_file() and not path.is_dir():  # a pipe would be waited for without end
+        raise EdsError(path.name, "it is no plain file; check the path")
     try:
         with path.open("rb") as file:
             raw = file.read(MAX_BYTES + 1)
@@ -116,6 +118,8 @@ def _sections(raw: bytes, name: str) -> list[_Section]:
             _store(current, key.strip(), value, number, name)
         if objects > MAX_OBJECTS:
             raise EdsError(name, f"line {number}: it has more than {MAX_OBJECTS} objects; this is no drive's EDS")
+    if raw.lstrip(b"\xef\xbb\xbf \r\n\t").startswith(b"<"):
+        raise EdsError(name, "line 1: it is XML (an XDD, or an ESI of EtherCAT); ask the drive's maker for its EDS")
     if not any(_OBJECT.match(title) for title in sections):
         raise EdsError(name, "line 1: it has no object at all; this is no EDS file")
     return _complete(sections)

@@ -36,13 +36,17 @@ class DecoderCounters:
 
 @dataclass(slots=True)
 class PdoQueue:
-    """Frames of one PDO that wait until their ticks are complete; ``tick`` (m,) never falls."""
+    """Frames of one PDO that wait until their ticks are complete; ``tick`` (m,) never falls.
+
+    ``first_tick`` is that of the first whole one ever, None before it: what does not come yet is not lost.
+    """
 
     spec: PdoSpec
     cob_id: int
     tick: Int = field(default_factory=lambda: np.empty(0, np.int64))
     data: Words = field(default_factory=lambda: np.empty(0, np.uint64))
     length: int = field(init=False)
+    first_tick: int | None = None
 
     def __post_init__(self) -> None:
         self.length = self.spec.length
@@ -58,6 +62,8 @@ class PdoQueue:
             counters.short += int(mine.size - np.count_nonzero(whole))
             counters.long += int(np.count_nonzero(length > self.length))
             mine = mine[whole]
+        if self.first_tick is None and mine.size:
+            self.first_tick = int(ticked.tick[mine[0]])
         self.tick = np.concatenate([self.tick, ticked.tick[mine]])
         self.data = np.concatenate([self.data, ticked.data[mine]])
 

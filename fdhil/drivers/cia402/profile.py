@@ -1,33 +1,32 @@
-"""Describes drive models as data: their PDOs, which object carries which signal, and in which unit.
+"""Describes a drive model as data: its PDOs, which object carries which signal, and in which unit.
 
-A new vendor is a new TOML file in ``profiles``, with the names of :class:`DriveProfile`, and a line in
-``tables.DRIVE_PROFILES``.
+A new vendor is a TOML file with the names of :class:`DriveProfile` (``profile_file`` reads it). What no PDO of the
+profile carries, the drive is not heard to have: without ``offset`` (0x60B0) it is listened to and never corrected on
+line, without ``voltage`` a sensor tells it, or nobody.
 """
 
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
-from importlib.resources import files
-from typing import Any, Literal
+from typing import Literal
 
-from fdhil import tables
-from fdhil.cia402 import PdoEntry, lay_out, pdo_length
-from fdhil.config import Axis
+from fdhil.cia402 import LOGICAL_AXIS_STEP, Mode, Object, PdoEntry, pdo_length
+from fdhil.config import Axis, SpeedUnit
 
 ObjectKey = tuple[int, int]
 """Index and sub-index."""
+LOGICAL_AXIS_PDOS = 64
+"""The PDOs of the next axis of one device lie so much higher (CiA 402-3)."""
 
 
 @dataclass(frozen=True, slots=True)
 class PdoSpec:
     """One PDO: its COB-ID is ``cob_base`` + node-ID; it comes with every ``every_sync``-th SYNC.
 
-    ``number`` is its place in the communication parameters (1 -> 0x1400/0x1800), in a profile's file the last character
-    of its name ("RPDO1"). ``valid`` is False when the drive's
+    ``number`` is its place in the communication parameters (1 -> 0x1400/0x1800), in a profile's file the digits at the
+    end of its name ("RPDO1"). ``valid`` is False when the drive's
     default has bit 31 of the COB-ID set: mapped, but not exchanged.
     """
 
@@ -52,14 +51,22 @@ class PdoSpec:
 class DriveProfile:
     """A drive model: mapping, signals and units.
 
-    ``voltage`` is the object of the terminal voltage, None when the drive has none; ``voltage_v_per_count`` its scale.
-    ``speed_unit`` and ``current_unit`` say what 606C and the current object count in. ``strict_abort_options`` are
-    the values of 0x6007 that stop the drive when communication is lost. ``vendor_id`` and ``product_code`` None: any.
+    ``speed_unit`` and ``current_unit`` say what the speed and the current object count in, ``speed_factor`` and
+    ``current_factor`` how many of these one count is. ``voltage`` is the TPDO object of the terminal voltage:
+    ``voltage_v_per_count`` is its scale, or, where it is the duty of the PWM, ``duty_per_count`` is its scale in shares
+    of the DC link, which a TPDO tells (``dc_link``, ``dc_link_v_per_count``) or else the configuration
+    (``drive.dc_link_v``). ``voltage_magnitude``: it has no sign of its own, that of R i + K w is taken.
+    ``mode`` is the one in which set-points are streamed to ``target``. ``strict_abort_options`` are the values of
+    0x6007 that stop the drive when communication is lost. ``vendor_id`` and ``product_code`` None: any.
+    ``logical_axis`` is the axis of a device with several of them. ``notes`` are told to whoever chooses the profile.
     """
 
     name: str
     rpdos: tuple[PdoSpec, ...]
     tpdos: tuple[PdoSpec, ...]
+    title: str = ""
+    notes: tuple[str, ...] = ()
+    controlword: ObjectKey = (0x6040, 0)
     target: ObjectKey = (0x607A, 0)
     offset: ObjectKey = (0x60B0, 0)
     speed_offset: ObjectKey = (0x60B1, 0)
@@ -68,15 +75,42 @@ class DriveProfile:
     speed: ObjectKey = (0x606C, 0)
     current: ObjectKey = (0x6078, 0)
     statusword: ObjectKey = (0x6041, 0)
+    mode: int = Mode.CYCLIC_SYNC_POSITION
     position_demand: ObjectKey = (0x6062, 0)
     digital_inputs: ObjectKey = (0x60FD, 0)
     voltage: ObjectKey | None = None
     voltage_v_per_count: float = 0.0
-    speed_unit: Literal["increments_per_s", "rpm", "millirpm"] = "increments_per_s"
-    current_unit: Literal["permille_of_rated", "mA"] = "permille_of_rated"
+    duty_per_count: float = 0.0
+    voltage_magnitude: bool = False
+    dc_link: ObjectKey | None = None
+    dc_link_v_per_count: float = 0.0
+    speed_unit: SpeedUnit = "increments_per_s"
+    speed_factor: float = 1.0
+    current_unit: Literal["permille_of_rated", "share_of_rated", "permille_of_rated_torque", "mA"] = "permille_of_rated"
+    current_factor: float = 1.0
     strict_abort_options: tuple[int, ...] = (1, 3)
     vendor_id: int | None = None
     product_code: int | None = None
+    logical_axis: int = 1
+
+    @property
+    def unheard(self) -> tuple[str, ...]:
+        """The signals that must come in a valid TPDO with every SYNC, and do not."""
+        names = ("position", "speed", "current", "statusword")
+        found = {name: self.find_tpdo(getattr(self, name)) for name in names}
+        return tuple(name for name, at in found.items() if at is None or not at[0].valid or at[0].every_sync != 1)
+
+    @property
+    def takes_offset(self) -> bool:
+        """Whether an offset can be sent to it, and be seen; else a correction can only go through the NC."""
+        found = self.find_rpdo(self.offset)
+        return found is not None and found[0].valid and not self.unshown
+
+    @property
+    def unshown(self) -> tuple[ObjectKey, ...]:
+        """What no TPDO carries of offset, mode and demand: nothing is sent whose effect is not seen."""
+        keys = (self.offset, (self.object_index(Object.MODE_DISPLAY), 0), self.position_demand)
+        return tuple(key for key in keys if self.find_tpdo(key) is None)
 
     def find_tpdo(self, key: ObjectKey) -> tuple[PdoSpec, PdoEntry] | None:
         """Return the TPDO and entry that carry ``key``, or None."""
@@ -86,6 +120,10 @@ class DriveProfile:
         """Return the RPDO and entry that carry ``key``, or None."""
         return _find(self.rpdos, key)
 
+    def object_index(self, index: int) -> int:
+        """Return where the object ``index`` of CiA 402 is on this axis of its device."""
+        return index + (self.logical_axis - 1) * LOGICAL_AXIS_STEP if 0x6000 <= index < 0x6800 else index
+
     def with_feedforward(self) -> DriveProfile:
         """Return the profile of a drive whose RPDO of speed and torque offset is exchanged."""
         found = self.find_rpdo(self.speed_offset)
@@ -94,17 +132,57 @@ class DriveProfile:
 
     def speed_rad_s_per_count(self, axis: Axis) -> float:
         """Scale of the speed object, the axis' sign included."""
-        per_count = {
+        per_unit = {
             "increments_per_s": 2 * math.pi / axis.drive.increments_per_rev,
             "rpm": 2 * math.pi / 60,
             "millirpm": 2 * math.pi / 60_000,
-        }[self.speed_unit]
-        return axis.drive.sign * per_count
+        }[axis.drive.speed_unit or self.speed_unit]
+        return axis.drive.sign * self.speed_factor * per_unit
 
     def current_a_per_count(self, axis: Axis) -> float:
-        """Scale of the current object, the axis' sign included."""
-        per_count = {"permille_of_rated": axis.drive.rated_current_a / 1000, "mA": 1e-3}[self.current_unit]
-        return axis.drive.sign * per_count
+        """Scale of the current object, the axis' sign included; a torque is divided by the data sheet's K."""
+        per_unit = {
+            "permille_of_rated": axis.drive.rated_current_a / 1000,
+            "share_of_rated": axis.drive.rated_current_a,
+            "permille_of_rated_torque": axis.drive.rated_torque_nm / axis.nominal.K / 1000,
+            "mA": 1e-3,
+        }[self.current_unit]
+        return axis.drive.sign * self.current_factor * per_unit
+
+    def terminal_v_per_count(self, axis: Axis) -> float:
+        """Scale of the voltage object, the axis' sign included; 0 where the drive does not tell its voltage.
+
+        Where a TPDO carries the DC link it is the scale of the product of both objects' counts.
+        """
+        if not self.voltage_objects:
+            return 0.0
+        link_v = self.dc_link_v_per_count if self._link_is_heard else axis.drive.dc_link_v or 0.0
+        return axis.drive.sign * (self.voltage_v_per_count or self.duty_per_count * link_v)
+
+    @property
+    def voltage_objects(self) -> tuple[ObjectKey, ...]:
+        """The TPDO objects whose product is the terminal voltage; empty where the drive does not tell it."""
+        if self.voltage is None or self.find_tpdo(self.voltage) is None:
+            return ()
+        return (self.voltage, self.dc_link) if self.dc_link is not None and self._link_is_heard else (self.voltage,)
+
+    @property
+    def _link_is_heard(self) -> bool:
+        return self.duty_per_count > 0 and self.dc_link is not None and self.find_tpdo(self.dc_link) is not None
+
+
+def speed_unit_of(word: int | None) -> SpeedUnit | None:
+    """Return the unit that 0x60A9 names: prefix, numerator and denominator of CiA 303-2; None for any other.
+
+    >>> speed_unit_of(0x00B44700), speed_unit_of(0xFDB44700), speed_unit_of(0x00B50300)
+    ('rpm', 'millirpm', 'increments_per_s')
+    """
+    units: dict[int | None, SpeedUnit] = {
+        0x00B44700: "rpm",
+        0xFDB44700: "millirpm",
+        0x00B50300: "increments_per_s",
+    }
+    return units.get(word)
 
 
 def _find(pdos: Sequence[PdoSpec], key: ObjectKey) -> tuple[PdoSpec, PdoEntry] | None:
@@ -113,20 +191,3 @@ def _find(pdos: Sequence[PdoSpec], key: ObjectKey) -> tuple[PdoSpec, PdoEntry] |
         if entry is not None:
             return spec, entry
     return None
-
-
-@cache
-def load_profile(name: str) -> DriveProfile:
-    """Read the file that ``tables.DRIVE_PROFILES`` lists under ``name``; TypeError for a key that no profile has."""
-    package, _, file = tables.DRIVE_PROFILES[name].partition(":")
-    document = tomllib.loads((files(package) / file).read_text("utf-8"))
-    values: dict[str, Any] = {
-        key: tuple(value) if isinstance(value, list) else value for key, value in document.items()
-    }
-    values |= {kind: tuple(_pdo(**each) for each in document[kind]) for kind in ("rpdos", "tpdos")}
-    return DriveProfile(name, **values)
-
-
-def _pdo(name: str, entries: Sequence[tuple[int, int, int, bool]], **said: Any) -> PdoSpec:
-    """Lay the entries (index, sub-index, bits, signed) out; the PDO's number is its name's last character."""
-    return PdoSpec(name, int(name[-1]), entries=lay_out(entries), **said)

@@ -136,7 +136,7 @@ def _with_terms(base: Fit, command: bool, searched: bool) -> Fit:
         return result
     if DELAY in result.free:
         motions, free = result.problem.motions, but_delay(result.free)
-        result = fit(motions, with_delay(result.theta, 0.0), free)
+        result = fit(motions, with_delay(result.theta, 0.0), free, result.problem.noises)
     return _delay_told(result)
 
 
@@ -218,10 +218,20 @@ def doubts(result: Fit, inverse: Float) -> Float:
     free = list(result.free)
     columns[free, 0] = inverse @ (result.jacobian.T @ effects[:, 0])
     columns[free, 2:] = inverse @ (result.jacobian.T @ effects[:, 1:])
+    if result.prior.size:
+        columns = np.column_stack([columns, _known_before(result, inverse)])
     if result.delay_doubt_s > 0.0:
         others = but_delay(free)
         columns[others, 1] = -result.delay_doubt_s * solve(result.but_delay, delay_direction(result))[0]
         columns[DELAY, 1] = result.delay_doubt_s
+    return columns
+
+
+def _known_before(result: Fit, inverse: Float) -> Float:
+    """Return (k, q) what one standard deviation of each thing known before the data makes of the entries of theta."""
+    asked = np.flatnonzero(result.prior)
+    columns = np.zeros((result.theta.size, asked.size))
+    columns[list(result.free)] = inverse[:, asked] * (result.prior * result.prior_std)[asked]
     return columns
 
 
@@ -273,6 +283,8 @@ def finish(result: Fit) -> Estimate:
     at = result.free.index(DELAY) if late else 0
     chance, beyond = (part[np.ix_(kept, kept)] for part in (inverse, held - inverse))
     own = systematic[told]
+    if result.prior.size:  # its share is among the doubts that windows have in common
+        chance = chance - inverse[kept] @ np.diag(result.prior) @ inverse[:, kept]
     values = result.theta[told]
     answer = Estimate(
         method=NAME,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+from fdhil.sim.drive.dictionary import Entry
 from fdhil.sim.drive.objects import VOLTAGE_V_PER_COUNT, Ratings
 
 if TYPE_CHECKING:
@@ -29,20 +30,24 @@ def units(ratings: Ratings) -> dict[int, tuple[str, float]]:
 
 def mapping(drive: Drive) -> dict[str, Any]:
     """Return the drive's entry of the ready event; ``eds`` is filled in by who writes the file."""
-    scales = units(drive.ratings)
+    own = units(drive.ratings)
+    shown = {gauge.entry.key: gauge.unit(drive.ratings.sign) for gauge in drive.dress.gauges}
+
+    def unit(entry: Entry) -> tuple[str, float]:
+        if entry.key in shown:
+            return shown[entry.key]
+        name, scale = own.get(entry.index, ("", 1)) if entry.home is None else ("", 1)
+        return name, scale if entry.scale == 1.0 else scale * entry.scale
 
     def pdos(direction: str) -> list[dict[str, Any]]:
         listed = []
         for pdo in drive.pdo.configured(direction):
-            entries = [drive.dictionary.entries[key] for key in pdo.keys if key is not None]
+            entries = drive.pdo.mapped(direction, pdo.number)
             listed.append(
                 {
                     "cob_id": pdo.cob_id,
                     "type": pdo.kind,
-                    "entries": [
-                        [entry.index, entry.sub, 8 * (entry.size or 0), *scales.get(entry.index, ("", 1))]
-                        for entry in entries
-                    ],
+                    "entries": [[entry.index, entry.sub, 8 * (entry.size or 0), *unit(entry)] for entry in entries],
                 }
             )
         return listed

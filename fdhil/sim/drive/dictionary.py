@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
 
@@ -16,6 +16,8 @@ class AbortCode(IntEnum):
     TOGGLE = 0x05030000
     COMMAND = 0x05040001
     BLOCK_SIZE = 0x05040002
+    SEQUENCE = 0x05040003
+    CRC = 0x05040004
     READ_WRITE_ONLY = 0x06010001
     WRITE_READ_ONLY = 0x06010002
     NO_OBJECT = 0x06020000
@@ -39,30 +41,57 @@ class TransferAbort(FdhilError):
 
 
 class DataType(IntEnum):
-    """CiA 301 data types that the drive uses."""
+    """CiA 301 data types (table 44)."""
 
+    BOOLEAN = 0x01
     INTEGER8 = 0x02
     INTEGER16 = 0x03
     INTEGER32 = 0x04
     UNSIGNED8 = 0x05
     UNSIGNED16 = 0x06
     UNSIGNED32 = 0x07
+    REAL32 = 0x08
     VISIBLE_STRING = 0x09
+    OCTET_STRING = 0x0A
+    UNICODE_STRING = 0x0B
+    TIME_OF_DAY = 0x0C
+    TIME_DIFFERENCE = 0x0D
     DOMAIN = 0x0F
+    INTEGER24 = 0x10
+    REAL64 = 0x11
+    INTEGER40 = 0x12
+    INTEGER48 = 0x13
+    INTEGER56 = 0x14
+    INTEGER64 = 0x15
+    UNSIGNED24 = 0x16
+    UNSIGNED40 = 0x18
+    UNSIGNED48 = 0x19
+    UNSIGNED56 = 0x1A
+    UNSIGNED64 = 0x1B
 
 
 I8, I16, I32 = DataType.INTEGER8, DataType.INTEGER16, DataType.INTEGER32
 U8, U16, U32 = DataType.UNSIGNED8, DataType.UNSIGNED16, DataType.UNSIGNED32
 
-_BYTES = {I8: 1, I16: 2, I32: 4, U8: 1, U16: 2, U32: 4}
-SIGNED = frozenset({I8, I16, I32})
+# a REAL is kept as the bits that travel
+_BYTES = {
+    DataType.BOOLEAN: 1, U8: 1, U16: 2, DataType.UNSIGNED24: 3, U32: 4, DataType.UNSIGNED40: 5, DataType.UNSIGNED48: 6,
+    DataType.UNSIGNED56: 7, DataType.UNSIGNED64: 8, DataType.REAL32: 4, DataType.REAL64: 8,
+    I8: 1, I16: 2, DataType.INTEGER24: 3, I32: 4, DataType.INTEGER40: 5, DataType.INTEGER48: 6, DataType.INTEGER56: 7,
+    DataType.INTEGER64: 8,
+}  # fmt: skip
+SIGNED = frozenset(kind for kind in DataType if kind.name.startswith("INTEGER"))
 
 Value = int | bytes
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One sub-index. ``access`` is ro, wo, rw, rww or const; ``node_relative``: $NODEID in the EDS."""
+    """One sub-index. ``access`` is ro, wo, rw, rww, rwr or const; ``node_relative``: $NODEID in the EDS.
+
+    Its value is kept under ``home``, where that is not its own key, in the drive's own units: ``scale`` of them make
+    one count on the wire, and the number ``renamed[1]`` is ``renamed[0]`` there. ``choice`` are the counts it takes.
+    """
 
     index: int
     sub: int
@@ -74,11 +103,20 @@ class Entry:
     low: int | None = None
     high: int | None = None
     node_relative: bool = False
+    home: int | None = None
+    scale: float = 1.0
+    renamed: tuple[int, int] | None = None
+    choice: frozenset[int] | None = None
 
     @property
     def key(self) -> int:
         """``index << 8 | sub``."""
         return self.index << 8 | self.sub
+
+    @property
+    def place(self) -> int:
+        """Where its value is kept."""
+        return self.key if self.home is None else self.home
 
     @property
     def size(self) -> int | None:
@@ -90,6 +128,17 @@ class Entry:
         """Whether it is an INTEGER type."""
         return self.type in SIGNED
 
+    def renumbered(self, by: int) -> Entry:
+        """Return it with another node-ID, that many higher."""
+        if not self.node_relative or not isinstance(self.default, int):
+            return self
+        return replace(self, default=self.default + by)
+
+    @property
+    def limited(self) -> bool:
+        """Whether it takes some numbers of its type only."""
+        return (self.low, self.high, self.choice) != (None, None, None)
+
     def encode(self, value: Value) -> bytes:
         """Return the little-endian bytes of ``value``."""
         if isinstance(value, bytes):
@@ -97,6 +146,21 @@ class Entry:
         size = self.size
         assert size is not None
         return value.to_bytes(size, "little", signed=self.signed)
+
+    def counts(self, number: int) -> int:
+        """Return a kept number as the wire shows it: in the entry's own unit, at most the end of its type's range."""
+        if self.renamed is not None and number == self.renamed[1]:
+            return self.renamed[0]
+        counts = number if self.scale == 1.0 else round(number / self.scale)
+        bits = 8 * (self.size or 8)
+        low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if self.signed else (0, (1 << bits) - 1)
+        return min(max(counts, low), high)
+
+    def number(self, counts: int) -> int:
+        """Return what is kept of a number on the wire."""
+        if self.renamed is not None and counts == self.renamed[0]:
+            return self.renamed[1]
+        return counts if self.scale == 1.0 else round(counts * self.scale)
 
     def decode(self, data: bytes) -> Value:
         """Return the value of ``data``; TransferAbort when its length is not the type's."""
@@ -107,7 +171,9 @@ class Entry:
         return int.from_bytes(data, "little", signed=self.signed)
 
     def check_range(self, value: Value) -> None:
-        """TransferAbort when a number is outside the entry's limits."""
+        """TransferAbort when a number is outside the entry's limits, or none of those that it takes."""
+        if self.choice is not None and value not in self.choice:
+            raise TransferAbort(AbortCode.RANGE)
         if isinstance(value, int) and (
             (self.low is not None and value < self.low) or (self.high is not None and value > self.high)
         ):
@@ -141,13 +207,15 @@ def record(index: int, name: str, *entries: Entry, kind: int = RECORD, count: En
 
 
 class Dictionary:
-    """Entries and their values, keyed ``index << 8 | sub``: ``numbers`` and ``texts`` (strings and domains).
+    """The entries that the wire sees, keyed ``index << 8 | sub``, and the values the drive works with.
 
-    ``check`` and ``written`` are called before and after an SDO write of the keys they are registered for; ``check``
-    refuses by raising TransferAbort. ``read_hooks`` give what is computed when it is asked for.
+    ``numbers`` and ``texts`` (strings and domains) are kept by each entry's place, for ``within`` too: entries that the
+    drive needs and does not show. ``check`` and ``written`` are called before and after an SDO write of the places they
+    are registered for; ``check`` refuses by raising TransferAbort. ``read_hooks`` give what is computed when it is
+    asked for.
     """
 
-    def __init__(self, objects: tuple[Object, ...]) -> None:
+    def __init__(self, objects: tuple[Object, ...], within: tuple[Entry, ...] = ()) -> None:
         self.objects = objects
         self.entries = {entry.key: entry for item in objects for entry in item.entries}
         self.indices = {item.index for item in objects}
@@ -156,19 +224,27 @@ class Dictionary:
         self.check: dict[int, Callable[[Entry, int], None]] = {}
         self.written: dict[int, Callable[[int], None]] = {}
         self.read_hooks: dict[int, Callable[[], Value]] = {}
+        self._within = within
+        self.foreign = bool(within)  # values may travel otherwise than they are kept
         self.reset(lambda _: True)
 
     def reset(self, which: Callable[[Entry], bool]) -> None:
         """Give the chosen entries their default values."""
-        for key, entry in self.entries.items():
+        for entry in (*self._within, *self.entries.values()):
             if which(entry):
-                self._store(key, entry.default)
+                self._store(entry, entry.default)
 
-    def _store(self, key: int, value: Value) -> None:
+    def renumber(self, by: int) -> None:
+        """The node-ID has changed: shift the defaults that are relative to it."""
+        self.objects = tuple(replace(o, entries=tuple(e.renumbered(by) for e in o.entries)) for o in self.objects)
+        self.entries = {entry.key: entry for item in self.objects for entry in item.entries}
+        self._within = tuple(entry.renumbered(by) for entry in self._within)
+
+    def _store(self, entry: Entry, value: Value) -> None:
         if isinstance(value, int):
-            self.numbers[key] = value
+            self.numbers[entry.place] = entry.number(value)
         else:
-            self.texts[key] = value
+            self.texts[entry.place] = value
 
     def entry(self, index: int, sub: int) -> Entry:
         """Return an entry; TransferAbort when there is no such object or sub-index."""
@@ -181,15 +257,19 @@ class Dictionary:
         """Return the value of a number."""
         return self.numbers[index << 8 | sub]
 
+    def shown(self, entry: Entry) -> int:
+        """Return the value of an entry as the wire shows it."""
+        return entry.counts(self.numbers[entry.place])
+
     def read(self, index: int, sub: int) -> bytes:
         """Return what an SDO upload gives; TransferAbort when it is refused."""
         entry = self.entry(index, sub)
         if entry.access == "wo":
             raise TransferAbort(AbortCode.READ_WRITE_ONLY)
-        hook = self.read_hooks.get(entry.key)
+        hook = self.read_hooks.get(entry.place)
         if hook is not None:
             return entry.encode(hook())
-        return entry.encode(self.texts[entry.key] if entry.size is None else self.numbers[entry.key])
+        return entry.encode(self.texts[entry.place] if entry.size is None else self.shown(entry))
 
     def writable(self, index: int, sub: int) -> Entry:
         """Return an entry that an SDO download may write; TransferAbort when it may not."""
@@ -203,11 +283,11 @@ class Dictionary:
         entry = self.writable(index, sub)
         value = entry.decode(data)
         entry.check_range(value)
-        check = self.check.get(entry.key)
+        check = self.check.get(entry.place)
         if check is not None and isinstance(value, int):
-            check(entry, value)
-        self._store(entry.key, value)
-        written = self.written.get(entry.key)
+            check(entry, entry.number(value))
+        self._store(entry, value)
+        written = self.written.get(entry.place)
         if written is not None and isinstance(value, int):
             written(value)
 

@@ -6,15 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fdhil.sim.drive.dictionary import DOMAIN_OBJECT, VAR, Entry, Object
-from fdhil.sim.drive.objects import DEVICE_NAME, PDOS, PRODUCT_CODE, REVISION, VENDOR_ID
 
 if TYPE_CHECKING:
     from fdhil.sim.drive.servo import Drive
 
 _MANDATORY = (0x1000, 0x1001, 0x1018)
-_HEAD = f"""\
+_HEAD = """\
 [FileInfo]
-FileName={{file}}
+FileName={file}
 FileVersion=1
 FileRevision=0
 EDSVersion=4.0
@@ -28,10 +27,10 @@ ModifiedBy=fdhil
 
 [DeviceInfo]
 VendorName=fdhil
-VendorNumber=0x{VENDOR_ID:08X}
-ProductName={DEVICE_NAME.decode()}
-ProductNumber=0x{PRODUCT_CODE:08X}
-RevisionNumber=0x{REVISION:08X}
+VendorNumber=0x{dress.vendor:08X}
+ProductName={dress.name}
+ProductNumber=0x{dress.product:08X}
+RevisionNumber=0x{dress.revision:08X}
 OrderCode=twin
 BaudRate_10=0
 BaudRate_20=0
@@ -47,9 +46,9 @@ Granularity=8
 DynamicChannelsSupported=0
 CompactPDO=0
 GroupMessaging=0
-NrOfRXPDO={PDOS}
-NrOfTXPDO={PDOS}
-LSS_Supported=0
+NrOfRXPDO={rpdos}
+NrOfTXPDO={tpdos}
+LSS_Supported=1
 
 [DummyUsage]
 Dummy0001=0
@@ -76,7 +75,8 @@ def eds_text(drive: Drive) -> str:
             groups["ManufacturerObjects"].append(item)
         else:
             groups["OptionalObjects"].append(item)
-    parts = [_HEAD.format(file=f"fdhil_twin_{drive.axis}.eds")]
+    rpdos, tpdos = (len(list(drive.pdo.numbers(direction))) for direction in ("rpdo", "tpdo"))
+    parts = [_HEAD.format(file=f"fdhil_twin_{drive.axis}.eds", dress=drive.dress, rpdos=rpdos, tpdos=tpdos)]
     for name, items in groups.items():
         numbered = "".join(f"{n}=0x{item.index:04X}\n" for n, item in enumerate(items, 1))
         parts.append(f"[{name}]\nSupportedObjects={len(items)}\n{numbered}")
@@ -87,7 +87,7 @@ def eds_text(drive: Drive) -> str:
 def write_eds(drive: Drive, path: Path) -> Path:
     """Write the drive's EDS to ``path`` and return it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(eds_text(drive), encoding="ascii")
+    path.write_text(eds_text(drive), encoding="utf-8")
     return path
 
 
@@ -106,11 +106,12 @@ def _entry(section: str, entry: Entry, kind: int, node_id: int) -> str:
         f"ObjectType=0x{kind:X}",
         f"DataType=0x{entry.type:04X}",
         f"AccessType={entry.access}",
-        f"PDOMapping={int(entry.mappable)}",
     ]
+    if kind != DOMAIN_OBJECT:
+        lines.append(f"PDOMapping={int(entry.mappable)}")
     if isinstance(entry.default, bytes):
         if kind == VAR:
-            lines.append(f"DefaultValue={entry.default.decode('ascii')}")
+            lines.append(f"DefaultValue={entry.default.decode('latin-1')}")
     elif entry.node_relative:
         lines.append(f"DefaultValue=$NODEID+0x{entry.default - node_id:X}")
     else:

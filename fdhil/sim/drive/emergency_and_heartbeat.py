@@ -1,4 +1,4 @@
-"""Handles the errors of a CANopen device: emergency messages, error history, heartbeats both ways."""
+"""Handles the errors of a CANopen device: emergency messages, error history, heartbeats both ways, node guarding."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from fdhil.sim.frame import Frame
 
 # error codes (CiA 301 table 26, CiA 402-2)
 NO_ERROR = 0x0000
-HEARTBEAT_LOST = 0x8130
+HEARTBEAT_LOST = 0x8130  # and a guarding that has ended
 PDO_TOO_SHORT = 0x8210
 SYNC_LENGTH = 0x8240
 RPDO_TIMEOUT = 0x8250
@@ -30,14 +30,16 @@ def _register_bits(code: int) -> int:
 
 
 class Emergencies:
-    """The error register, the history 0x1003, and the EMCY frames."""
+    """The error register, the history 0x1003, and the EMCY frames: ``waiting`` until they are taken."""
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
+        self.waiting: list[Frame] = []
+        self._sent_s: float | None = None
         dictionary.read_hooks.update({0x1003 << 8 | n: self._field(n) for n in range(1, ERROR_HISTORY + 1)})
 
-    def report(self, code: int, detail: bytes = b"") -> list[Frame]:
-        """Note an error and return its frame, 8 bytes: code, error register, 5 bytes of ``detail``."""
+    def report(self, code: int, detail: bytes = b"") -> None:
+        """Note an error and queue its frame, 8 bytes: code, error register, 5 bytes of ``detail``."""
         values = self._dictionary.numbers
         register = self._dictionary.number(0x1001) | _register_bits(code)
         values[0x1001 << 8] = register
@@ -46,23 +48,39 @@ class Emergencies:
             values[0x1003 << 8 | n] = values[0x1003 << 8 | n - 1]
         values[0x1003 << 8 | 1] = code | int.from_bytes(detail[:2], "little") << 16
         values[0x1003 << 8] = count
-        return self._frame(code, register, detail)
+        self._queue(code, register, detail)
 
-    def clear(self, *, in_fault: bool = False) -> list[Frame]:
+    def clear(self, *, in_fault: bool = False) -> None:
         """Errors were reset, or with ``in_fault`` only the communication works again.
 
-        When the error register becomes 0, return the frame "error reset" (code 0).
+        When the error register becomes 0, queue the frame "error reset" (code 0).
         """
         before = self._dictionary.number(0x1001)
         after = before & ~_COMMUNICATION if in_fault else 0
         self._dictionary.numbers[0x1001 << 8] = after
-        return self._frame(NO_ERROR, 0, b"") if before and not after else []
+        if before and not after:
+            self._queue(NO_ERROR, 0, b"")
 
-    def _frame(self, code: int, register: int, detail: bytes) -> list[Frame]:
-        cob_id = self._dictionary.number(0x1014)
-        if cob_id & INVALID:
+    def take(self, now_s: float) -> list[Frame]:
+        """Return the frames that may leave now: all, or with an inhibit time (0x1015) one after the other."""
+        inhibit_s = self._dictionary.numbers.get(0x101500, 0) * 1e-4
+        if not inhibit_s:
+            frames, self.waiting = self.waiting, []
+            return frames
+        if not self.waiting or (self._sent_s is not None and now_s - self._sent_s < inhibit_s):
             return []
-        return [(cob_id & 0x7FF, code.to_bytes(2, "little") + bytes([register]) + detail[:5].ljust(5, b"\0"))]
+        self._sent_s = now_s
+        return [self.waiting.pop(0)]
+
+    def drop(self) -> None:
+        """Nothing that waits will be sent."""
+        self.waiting = []
+
+    def _queue(self, code: int, register: int, detail: bytes) -> None:
+        cob_id = self._dictionary.number(0x1014)
+        if not cob_id & INVALID:
+            data = code.to_bytes(2, "little") + bytes([register]) + detail[:5].ljust(5, b"\0")
+            self.waiting.append((cob_id & 0x7FF, data))
 
     def _field(self, n: int) -> Callable[[], int]:
         def read() -> int:
@@ -139,3 +157,34 @@ class HeartbeatProducer:
         late = self._next_s is None or now_s - self._next_s > period_s
         self._next_s = now_s + period_s if late or self._next_s is None else self._next_s + period_s
         return [(self._cob_id, bytes([state]))]
+
+
+class NodeGuarding:
+    """Answers the guard's remote frames and watches that they go on: 0x100C milliseconds times 0x100D (CiA 301)."""
+
+    def __init__(self, dictionary: Dictionary) -> None:
+        self._dictionary = dictionary
+        self.reset()
+
+    def reset(self) -> None:
+        """The node boots: the toggle bit begins anew, and life guarding with the first request."""
+        self._toggle = 0
+        self._asked_s: float | None = None
+
+    def request(self, state: int, now_s: float) -> bytes:
+        """Return the answer to a remote frame."""
+        self._asked_s = now_s
+        answer = bytes([self._toggle | state])
+        self._toggle ^= 0x80
+        return answer
+
+    def expired(self, now_s: float) -> bool:
+        """Whether the guard has just missed its life time."""
+        life_s = self._number(0x100C) * self._number(0x100D) * 1e-3
+        if not life_s or self._asked_s is None or now_s - self._asked_s <= life_s:
+            return False
+        self._asked_s = None
+        return True
+
+    def _number(self, index: int) -> int:
+        return self._dictionary.numbers.get(index << 8, 0)

@@ -6,11 +6,13 @@ import math
 
 from fdhil.config import Regulators
 from fdhil.sim.drive.dictionary import Dictionary
+from fdhil.sim.drive.dress import Gauge
 from fdhil.sim.drive.motion import Motion, Source
 from fdhil.sim.drive.objects import VOLTAGE_V_PER_COUNT, Ratings
 from fdhil.sim.drive.physics import Physics
 from fdhil.sim.drive.power import PowerStage
 from fdhil.sim.drive.sensors import Sensors
+from fdhil.sim.drive.speed_and_torque import Actual
 from fdhil.sim.drive.trace import TraceBuffer
 
 _VOLTAGE_ENABLED, _REMOTE, _LIMIT, _FOLLOWING_ERROR = 1 << 4, 1 << 9, 1 << 11, 1 << 13
@@ -29,7 +31,8 @@ def clip(value: float, highest: int) -> int:
 class Feedback:
     """Samples a drive's objects and keeps them in ``trace``. ``following_error`` is bit 13 of the statusword.
 
-    ``digital_inputs`` is 0x60FD: bits 0 and 1 limit switches, 2 home, 16 the NC's rapid signal.
+    ``digital_inputs`` is 0x60FD: bits 0 and 1 limit switches, 2 home, 16 the NC's rapid signal; the machine's own
+    switches come on top.
     """
 
     def __init__(
@@ -41,12 +44,14 @@ class Feedback:
         power: PowerStage,
         motion: Motion,
         sensors: Sensors,
+        gauges: tuple[Gauge, ...] = (),
     ) -> None:
         self._numbers = dictionary.numbers
         self._physics = physics
         self._power = power
         self._motion = motion
         self._sensors = sensors
+        self._gauges = gauges
         self.trace = TraceBuffer()
         self._inc_per_rad = ratings.increments_per_rev / (2 * math.pi)
         self._counts_per_a = 1e3 / ratings.rated_current_a
@@ -58,7 +63,21 @@ class Feedback:
     @property
     def true_position(self) -> int:
         """What the position loop closes on, increments."""
-        return round(self._physics.seen.position_rad * self._inc_per_rad)
+        return round(self._physics.seen.position_rad * self._inc_per_rad) - self._motion.shift
+
+    @property
+    def inputs(self) -> int:
+        """0x60FD now."""
+        switches = self._motion.homing.switches
+        if not switches.mounted:
+            return self.digital_inputs
+        return self.digital_inputs | switches.inputs(self.true_position + self._motion.shift)
+
+    @property
+    def actual(self) -> Actual:
+        """What the drive knows without its sensors' noise."""
+        seen = self._physics.seen
+        return Actual(self.true_position, seen.speed_rad_s * self._inc_per_rad, seen.current_a, self.inputs)
 
     def sample(self, tick: int) -> int:
         """Sample all objects now; the voltage is the mean of the cycle that ended. Returns the following error."""
@@ -74,17 +93,32 @@ class Feedback:
         current_counts = clip(current * self._counts_per_a, INT16)
         voltage_counts = clip(voltage / VOLTAGE_V_PER_COUNT, INT16)
         numbers[0x606200] = numbers[0x60FC00] = demand
-        numbers[0x606300] = clip(physics.angle_rad * self._inc_per_rad, INT32)
+        numbers[0x606300] = clip(physics.angle_rad * self._inc_per_rad - self._motion.shift, INT32)
         numbers[0x606400] = shown
         numbers[0x606B00] = self._speed_demand(true_position)
         numbers[0x606C00] = speed_counts
+        numbers[0x607400] = clip(seen.current_a * self._counts_per_a, INT16)  # the current loop leaves no difference
         numbers[0x607700] = numbers[0x607800] = current_counts
         numbers[0x607900] = round(seen.bus * self._bus_mv)
         numbers[0x210100] = voltage_counts
         numbers[0x60F400] = clip(demand - true_position, INT32)
-        numbers[0x60FD00] = self.digital_inputs
+        numbers[0x60FD00] = self.inputs
+        if self._gauges:
+            self._show(current, voltage, seen.bus * self._bus_mv * 1e-3)
         self.trace.append(tick, demand, shown, speed_counts, current_counts, voltage_counts)
         return demand - true_position
+
+    def _show(self, current_a: float, voltage_v: float, bus_v: float) -> None:
+        """Let the vendor's own objects show what is measured."""
+        signals = {
+            "current_a": current_a,
+            "current_share": current_a * self._counts_per_a * 1e-3,
+            "voltage_v": voltage_v,
+            "dc_link_v": bus_v,
+            "duty": voltage_v / bus_v,
+        }
+        for gauge in self._gauges:
+            self._numbers[gauge.entry.place] = gauge.counts(signals[gauge.signal])
 
     def _speed_demand(self, position: int) -> int:
         """Output of the position loop at t_k, increments/s."""
@@ -100,7 +134,7 @@ class Feedback:
             word |= self._motion.status_bits
             if self._physics.current_limited or self._physics.voltage_limited or self._motion.limited:
                 word |= _LIMIT
-        if self.digital_inputs & _LIMIT_SWITCHES:
+        if self.inputs & _LIMIT_SWITCHES:
             word |= _LIMIT
         if self.following_error:
             word |= _FOLLOWING_ERROR

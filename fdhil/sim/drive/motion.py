@@ -6,18 +6,23 @@ import math
 from enum import Enum, auto
 from operator import itemgetter
 
+from fdhil.sim.drive import modes
 from fdhil.sim.drive.dictionary import Dictionary
-from fdhil.sim.drive.objects import CYCLIC_POSITION, PROFILE_POSITION, Ratings
-from fdhil.sim.drive.physics import Command
+from fdhil.sim.drive.homing import Homing, HomingRun, Switches
+from fdhil.sim.drive.motion_limits import MotionLimits, Window
+from fdhil.sim.drive.objects import Ratings
+from fdhil.sim.drive.physics import Command, Loops
 from fdhil.sim.drive.power import PowerStage, Ramp
 from fdhil.sim.drive.sensors import DriveFaults
-from fdhil.sim.drive.setpoints import CyclicSetpoints, Profile, Target
+from fdhil.sim.drive.setpoints import CyclicSetpoints, Interpolation, Profile, Target
+from fdhil.sim.drive.speed_and_torque import Actual, SpeedAndTorque
 
 _REST: Command = (0.0,) * 8
 _NEW_SETPOINT, _AT_ONCE, _RELATIVE, _HALT = 0x10, 0x20, 0x40, 0x100
 # target, position offset, velocity offset, torque offset, software limits
 _cyclic = itemgetter(0x607A00, 0x60B000, 0x60B100, 0x60B200, 0x607D01, 0x607D02)
-_TARGET_REACHED, _MODE_SPECIFIC = 1 << 10, 1 << 12
+_TARGET_REACHED, _MODE_SPECIFIC, _HOMING_ERROR = 1 << 10, 1 << 12, 1 << 13
+_FAR = 1e12  # increments: a search runs until it finds something
 
 
 class Source(Enum):
@@ -26,67 +31,136 @@ class Source(Enum):
     OFF = auto()
     CYCLIC = auto()
     PROFILE = auto()
+    VELOCITY = auto()
+    TORQUE = auto()
+    HOMING = auto()
     STOP = auto()
 
 
-_SOURCES = {CYCLIC_POSITION: Source.CYCLIC, PROFILE_POSITION: Source.PROFILE}
+_SOURCES = {
+    modes.PROFILE_POSITION: Source.PROFILE,
+    modes.PROFILE_VELOCITY: Source.VELOCITY,
+    modes.PROFILE_TORQUE: Source.TORQUE,
+    modes.HOMING: Source.HOMING,
+    **dict.fromkeys(modes.CYCLIC, Source.CYCLIC),
+}
+_LOOPS = {
+    modes.PROFILE_VELOCITY: Loops.SPEED,
+    modes.CYCLIC_VELOCITY: Loops.SPEED,
+    modes.PROFILE_TORQUE: Loops.CURRENT,
+    modes.CYCLIC_TORQUE: Loops.CURRENT,
+}
 
 
 class Motion:
-    """Set-point of each cycle, in increments. ``limited``: the software position limit cut it."""
+    """Set-point of each cycle, in increments. ``limited``: the software position limit cut it.
+
+    ``loops`` are those that ``command`` is for; ``synced``: a SYNC begins the next cycle. ``shift`` is where the
+    drive's zero is, raw increments: homing sets it.
+    """
 
     def __init__(
-        self, dictionary: Dictionary, power: PowerStage, ratings: Ratings, faults: DriveFaults, cyclic: CyclicSetpoints
+        self,
+        dictionary: Dictionary,
+        power: PowerStage,
+        ratings: Ratings,
+        faults: DriveFaults,
+        cyclic: CyclicSetpoints,
+        switches: Switches,
+        position_loop: tuple[float, float],
     ) -> None:
-        self._dictionary = dictionary
+        self._numbers = dictionary.numbers
         self._power = power
         self._faults = faults
         self._rad_per_increment = 2 * math.pi / ratings.increments_per_rev
         self._rated_current_a = ratings.rated_current_a
+        self._gain, self._feedforward = position_loop
         self.cyclic = cyclic
-        self._profile = Profile(ratings.sync_period_s)
+        self.interpolation = Interpolation()
+        self.synced = False
+        self.homing = HomingRun(switches, ratings.increments_per_rev)
+        self.shift = 0
+        self._limits = MotionLimits(self._numbers, ratings)
+        period_s = ratings.sync_period_s
+        self._profile = Profile(period_s)
+        self._open = SpeedAndTorque(self._numbers, self._limits, ratings)
+        self._arrived = Window(self._numbers, 0x606700, 0x606800, period_s)
         self.source = Source.OFF
+        self.loops = self._loops_before = Loops.POSITION
         self.command = _REST
         self.limited = False
         self.reset(0)
 
     def reset(self, position: int) -> None:
         """Power-on at ``position`` increments."""
-        self._dictionary.numbers[0x607A << 8] = position
-        self.cyclic.preset(Target(position, 0.0, 0.0, 0.0))
-        self.source, self.command = Source.OFF, _REST
+        self._numbers[0x607A << 8] = position
+        self._preset(Target(position, 0.0, 0.0, 0.0))
+        self.source, self.loops, self.command = Source.OFF, Loops.POSITION, _REST
+        self.homing.reset()
         self._target: float | None = None
         self._pending: float | None = None
         self._acknowledged = False
         self._position = float(position)
+        self._pushed_mode = modes.CYCLIC_POSITION
+        self._homing_asked = False
         self._last_word = 0
 
     @property
     def mode(self) -> int:
         """The mode in force, 0x6061."""
         if self._faults.not_csp:
-            return PROFILE_POSITION
-        return self._dictionary.numbers[0x606000]
+            return modes.PROFILE_POSITION
+        return self._numbers[0x606000]
+
+    @property
+    def bound(self) -> bool:
+        """Whether the set-points come with the SYNC."""
+        return self.source is Source.CYCLIC
+
+    # -- statusword and controlword
 
     @property
     def status_bits(self) -> int:
-        """Bits 10 and 12 of the statusword: in profile position target reached and acknowledge, in CSP following."""
+        """Bits 10, 12 and 13 of the statusword, as the mode has them; bit 13 in homing alone."""
         halted = self.source is Source.STOP and self._profile.at_rest
-        if self.mode == CYCLIC_POSITION:
-            if self.source is Source.CYCLIC:
-                return _MODE_SPECIFIC
-            return _TARGET_REACHED if halted and self._power.follows else 0
-        if self.mode == PROFILE_POSITION:
-            bits = _MODE_SPECIFIC if self._acknowledged else 0
-            reached = self._pending is None and self._profile.at_rest and self._target in (None, self._profile.now)
-            return bits | (_TARGET_REACHED if reached or halted else 0)
+        match self.mode:
+            case modes.PROFILE_POSITION:
+                return self._profile_position_bits(halted)
+            case modes.PROFILE_VELOCITY:
+                standing = _MODE_SPECIFIC if self._open.stands.reached else 0
+                following = self.source is Source.VELOCITY and self._open.at_speed.reached
+                return standing | (_TARGET_REACHED if following or halted else 0)
+            case modes.PROFILE_TORQUE:
+                following = self.source is Source.TORQUE and self._open.torque_reached
+                return _TARGET_REACHED if following or halted else 0
+            case modes.HOMING:
+                return self._homing_bits()
+            case modes.CYCLIC_POSITION | modes.CYCLIC_VELOCITY | modes.CYCLIC_TORQUE:
+                if self.source is Source.CYCLIC:
+                    return _MODE_SPECIFIC
+                return _TARGET_REACHED if halted and self._power.follows else 0
         return 0
 
+    def _profile_position_bits(self, halted: bool) -> int:
+        bits = _MODE_SPECIFIC if self._acknowledged else 0
+        reached = self._pending is None and self._profile.at_rest
+        if self._target is not None:
+            reached = reached and self._target == self._profile.now and self._arrived.reached
+        return bits | (_TARGET_REACHED if reached or halted else 0)
+
+    def _homing_bits(self) -> int:
+        bits = {Homing.DONE: _MODE_SPECIFIC, Homing.ERROR: _HOMING_ERROR}.get(self.homing.state, 0)
+        rests = self._profile.at_rest and self.homing.state is not Homing.RUNNING
+        return bits | (_TARGET_REACHED if rests else 0)
+
     def control(self, word: int) -> None:
-        """Evaluate the mode bits of a controlword: the handshake of profile position (CiA 402-2, 10.3)."""
+        """Evaluate bit 4 of a controlword: the handshake of profile position, the start of a homing (CiA 402-2)."""
         rising = word & _NEW_SETPOINT and not self._last_word & _NEW_SETPOINT
         self._last_word = word
-        if self.mode != PROFILE_POSITION or not self._power.follows:
+        mode = self.mode
+        if mode == modes.HOMING and rising and self._power.follows:
+            self._homing_asked = True
+        if mode != modes.PROFILE_POSITION or not self._power.follows:
             self._acknowledged = False
             return
         if rising and not self._acknowledged:
@@ -96,10 +170,11 @@ class Motion:
             self._acknowledged = False
 
     def _take_target(self, word: int) -> None:
-        target = float(self._dictionary.number(0x607A))
+        numbers = self._numbers
+        target = float(numbers[0x607A00])
         if word & _RELATIVE:
             target += self._base
-        low, high = self._dictionary.number(0x607D, 1), self._dictionary.number(0x607D, 2)
+        low, high = numbers.get(0x607D01, -(2**31)), numbers.get(0x607D02, 2**31 - 1)
         target = float(min(max(target, low), high))
         if word & _AT_ONCE or self._target is None or (self._profile.at_rest and self._profile.now == self._target):
             self._target, self._pending = target, None
@@ -113,63 +188,143 @@ class Motion:
             return self._target
         return self._profile.now if self.source in (Source.PROFILE, Source.STOP) else self._position
 
-    def at_sync(self, position: float) -> Command:
-        """A SYNC came: take the latched set-points and return the command of the cycle that begins.
+    # -- the cycle
 
-        ``position`` is the actual position in increments.
-        """
-        self._push()
+    def begin_cycle(self, actual: Actual) -> Command:
+        """A cycle begins: take the set-points as they are now and return its command."""
+        self._push(actual)
         source = self._choose()
-        self._position = position
-        if source is Source.CYCLIC or source is Source.OFF:
+        self._position = actual.position
+        if source is not Source.PROFILE and source is not Source.STOP:
             self._target = self._pending = None
-            self.command = self.cyclic.command() if source is Source.CYCLIC else _REST
+        if source is not Source.HOMING:
+            self._homing_asked = False
+            if self.homing.state is Homing.RUNNING:
+                self.homing.reset()
+        if self._numbers[0x606000] == modes.PROFILE_VELOCITY:
+            self._open.watch(actual)
+        self._loops_before, self.loops = self.loops, Loops.POSITION
+        if source is Source.OFF:
+            self.command = _REST
+        elif source is Source.CYCLIC:
+            self.command = self._cyclic_command(actual)
         else:
-            self._own_motion(source, position)
+            self.command = self._own_command(source, actual)
         self.source = source
         return self.command
 
     @property
     def demand(self) -> float:
-        """The position demand at the SYNC, increments."""
-        if self.source is Source.OFF or self.source is Source.CYCLIC:
+        """The position demand at the start of the cycle, increments; without a position loop where the axis is."""
+        if self.source is Source.OFF or (self.source is Source.CYCLIC and self.loops is Loops.POSITION):
             now = self.cyclic.now
             return now.position + now.offset
         return self.command[0]
 
-    def _push(self) -> None:
-        values = self._dictionary.numbers
-        position, offset, speed, torque, low, high = _cyclic(values)
+    def _push(self, actual: Actual) -> None:
+        mode = self._numbers[0x606000]
+        if mode in _LOOPS and mode in modes.CYCLIC:
+            if mode != self._pushed_mode:
+                self._preset(self._open.held(mode, actual))
+            self._pushed_mode = mode
+            self._spread(self._open.target(mode, actual))
+            return
+        self._pushed_mode = modes.CYCLIC_POSITION
+        position, offset, speed, torque, low, high = _cyclic(self._numbers)
         acting = offset * float(self._faults.offset_scale)
         self.limited = not low <= position + acting <= high
         target = min(max(position + acting, low), high) - acting if self.limited else position
-        self.cyclic.push(Target(target, acting, speed * self._rad_per_increment, torque * 1e-3 * self._rated_current_a))
+        self._spread(Target(target, acting, speed * self._rad_per_increment, torque * 1e-3 * self._rated_current_a))
+
+    def _spread(self, target: Target) -> None:
+        self.cyclic.push(self.interpolation.next(target, synced=self.synced))
+        self.synced = False
+
+    def _preset(self, target: Target) -> None:
+        self.cyclic.preset(target)
+        self.interpolation.preset(target)
 
     def _choose(self) -> Source:
         if not self._power.powered:
             return Source.OFF
-        numbers = self._dictionary.numbers
+        numbers = self._numbers
         if not self._power.follows or numbers[0x604000] & _HALT or self._faults.not_csp:
             return Source.STOP
         return _SOURCES.get(numbers[0x606000], Source.STOP)
 
-    def _own_motion(self, source: Source, position: float) -> None:
+    def _cyclic_command(self, actual: Actual) -> Command:
+        mode = self._pushed_mode
+        if mode == modes.CYCLIC_POSITION:
+            return self.cyclic.command()
+        self.loops = _LOOPS[mode]
+        return self._open.cyclic(mode, actual, self.cyclic.command())
+
+    def _own_command(self, source: Source, actual: Actual) -> Command:
+        if source is Source.VELOCITY or source is Source.TORQUE:
+            if self.source is not source:
+                self._open.start(actual)
+            self.loops = _LOOPS[self._numbers[0x606000]]
+            return self._open.velocity(actual) if source is Source.VELOCITY else self._open.torque(actual)
+        self._enter_profile(actual)
+        if source is Source.HOMING:
+            self._home(actual)
+        else:
+            self._run_profile(source, actual)
+        return self._profile.command()
+
+    def _enter_profile(self, actual: Actual) -> None:
+        """Start the profile where another source ends."""
         if self.source is Source.OFF:
-            self._profile.start(position, 0.0)
-        elif self.source is Source.CYCLIC:
+            self._profile.start(actual.position, 0.0)
+        elif self.source is Source.CYCLIC and self._loops_before is Loops.POSITION:
             # the demand that was in force, not where the new cycle's set-point would take it
             self._profile.start(self.command[1], self.command[3])
-        number = self._dictionary.number
-        ramp = self._power.ramp
-        deceleration = number(Ramp.QUICK_STOP.value if ramp is Ramp.QUICK_STOP else Ramp.SLOW_DOWN.value)
+        elif self.source in (Source.CYCLIC, Source.VELOCITY, Source.TORQUE):
+            # so far ahead that the position loop asks for the speed that is
+            ahead = (1 - self._feedforward) * actual.speed / self._gain
+            self._profile.start(actual.position + ahead, actual.speed)
+
+    def _run_profile(self, source: Source, actual: Actual) -> None:
+        limits = self._limits
         target = self._target if source is Source.PROFILE else None
-        if source is Source.STOP and ramp is not None:
+        if source is Source.STOP and self._power.ramp is not None:
             self._target = self._pending = None
-        self._profile.advance(target, number(0x6081), number(0x6083), deceleration)
-        self.command = self._profile.command()
+        self._profile.advance(
+            target, limits.speed_of(0x608100), limits.acceleration(0x608300), limits.deceleration(self._stop_ramp())
+        )
+        self._arrived.step(self._profile.now - actual.position if self._target is not None else 0.0)
         if not self._profile.at_rest:
             return
         if source is Source.PROFILE and self._pending is not None and self._profile.now == self._target:
             self._target, self._pending = self._pending, None
         if source is Source.STOP:
             self._power.at_rest()
+
+    def _stop_ramp(self) -> int:
+        """The key of the deceleration: 0x6085 in a quick stop, and in a halt whose option code says so."""
+        ramp = self._power.ramp
+        halt = ramp is None and self._numbers[0x604000] & _HALT and self._numbers.get(0x605D00, 1) == 2
+        index: int = (Ramp.QUICK_STOP if ramp is Ramp.QUICK_STOP or halt else Ramp.SLOW_DOWN).value
+        return index << 8
+
+    # -- homing
+
+    def _home(self, actual: Actual) -> None:
+        run, limits = self.homing, self._limits
+        raw = float(actual.position + self.shift)
+        if self._homing_asked and run.state is not Homing.RUNNING:
+            run.start(self._numbers.get(0x609800, 0), raw, actual.inputs)
+        self._homing_asked = False
+        run.step(raw, actual.inputs)
+        leg = run.leg
+        target = None if leg is None else leg.direction * _FAR
+        speed = limits.speed_of(0x609901 if leg is None or leg.fast else 0x609902)
+        self._profile.advance(target, speed, limits.acceleration(0x609A00), limits.deceleration(0x609A00))
+        if leg is None and self._profile.at_rest and run.rested():
+            self._set_zero(round(run.home) - self._numbers.get(0x607C00, 0))
+
+    def _set_zero(self, shift: int) -> None:
+        """Count from another place: the axis stays where it is and has other coordinates."""
+        self._profile.start(self._profile.now + self.shift - shift, 0.0)
+        self._preset(Target(self._profile.now, 0.0, 0.0, 0.0))
+        self.shift = shift

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from fdhil.sim.drive.dictionary import AbortCode, Dictionary, Entry, TransferAbort
-from fdhil.sim.drive.objects import ERROR_HISTORY, INVALID, SUPPORTED_MODES
+from fdhil.sim.drive.homing import METHODS
+from fdhil.sim.drive.modes import MODES, SUPPORTED_MODES
+from fdhil.sim.drive.objects import ERROR_HISTORY, INVALID
 from fdhil.sim.drive.power import QUICK_STOP_CODES
 from fdhil.sim.drive.trace import TraceBuffer
 
 _SAVE, _LOAD = 0x65766173, 0x64616F6C  # "save" and "load", little-endian
-_NOT_STORED = frozenset({0x1003, 0x1010, 0x1011, 0x6040, 0x6060, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x6071})
+_NOT_STORED = frozenset({0x1003, 0x1010, 0x1011, 0x6040, 0x6060, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x6071, 0x60FF})
 
 
 class StoredParameters:
@@ -18,20 +20,19 @@ class StoredParameters:
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
-        self._values: dict[int, int] = {}
+        self._values: dict[Entry, int] = {}
 
     def restore(self, which: Callable[[Entry], bool]) -> None:
         """Give the chosen entries their defaults, or what was saved."""
         self._dictionary.reset(which)
-        entries = self._dictionary.entries
-        self._dictionary.numbers.update({k: v for k, v in self._values.items() if which(entries[k])})
+        self._dictionary.numbers.update({e.place: v for e, v in self._values.items() if which(e)})
 
     def save(self) -> None:
         """Keep all parameters; set-points and the controlword are none."""
         self._values = {
-            key: self._dictionary.numbers[key]
-            for key, entry in self._dictionary.entries.items()
-            if entry.access in ("rw", "rww") and entry.index not in _NOT_STORED
+            entry: self._dictionary.numbers[entry.place]
+            for entry in self._dictionary.entries.values()
+            if entry.access in ("rw", "rww", "rwr") and entry.size is not None and entry.index not in _NOT_STORED
         }
 
     def forget(self) -> None:
@@ -43,13 +44,14 @@ def register_write_rules(
     dictionary: Dictionary,
     *,
     changeable: Callable[[], bool],
+    powered: Callable[[], bool],
     stored: StoredParameters,
     trace: TraceBuffer,
     on_controlword: Callable[[], None],
     on_communication: Callable[[], None],
 ) -> None:
-    """Attach the rules. ``changeable`` says whether the drive is pre-operational; ``on_controlword`` and
-    ``on_communication`` are called after a write of 0x6040 or 0x6060 and of 0x1005."""
+    """Attach the rules. ``changeable`` says whether the drive is pre-operational, ``powered`` whether current flows;
+    ``on_controlword`` and ``on_communication`` are called after a write of 0x6040 or 0x6060 and of 0x1005."""
 
     def at_rest(_entry: Entry, _value: int) -> None:
         if not changeable():
@@ -69,8 +71,30 @@ def register_write_rules(
         if value & ~(INVALID | 0x7FF) or value & 0x7FF == 0:
             raise TransferAbort(AbortCode.RANGE)
 
+    def without_power() -> None:
+        if powered():  # writing flash takes longer than the loops can wait
+            raise TransferAbort(AbortCode.DEVICE_STATE)
+
+    def save() -> None:
+        without_power()
+        stored.save()
+
+    def load() -> None:
+        without_power()
+        stored.forget()
+
     def mode(_entry: Entry, value: int) -> None:
-        if value and (value < 0 or not SUPPORTED_MODES >> (value - 1) & 1):
+        offered = dictionary.numbers.get(0x650200) or SUPPORTED_MODES
+        if value and (value not in MODES or not offered >> (value - 1) & 1):
+            raise TransferAbort(AbortCode.RANGE)
+
+    def interpolation_time(entry: Entry, value: int) -> None:
+        cycle = entry.default
+        if entry.low is not None and isinstance(cycle, int) and value % cycle:  # whole cycles of the drive
+            raise TransferAbort(AbortCode.RANGE)
+
+    def homing_method(_entry: Entry, value: int) -> None:
+        if value not in METHODS:
             raise TransferAbort(AbortCode.RANGE)
 
     def quick_stop(_entry: Entry, value: int) -> None:
@@ -80,12 +104,14 @@ def register_write_rules(
     dictionary.check.update(
         {
             0x100500: sync_id,
-            0x101001: _signature(_SAVE, stored.save),
-            0x101101: _signature(_LOAD, stored.forget),
+            0x101001: _signature(_SAVE, save),
+            0x101101: _signature(_LOAD, load),
             0x101400: emergency_id,
             0x101900: counter_overflow,
             0x605A00: quick_stop,
             0x606000: mode,
+            0x609800: homing_method,
+            0x60C201: interpolation_time,
         }
     )
     dictionary.written.update(

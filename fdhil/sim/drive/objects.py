@@ -10,6 +10,9 @@ from dataclasses import dataclass
 
 from fdhil.config import Axis, MachineConfig
 from fdhil.sim.drive.dictionary import ARRAY, I8, I16, I32, U8, U16, U32, DataType, Entry, Object, record, var
+from fdhil.sim.drive.modes import SUPPORTED_MODES
+from fdhil.sim.drive.motion_objects import NO_WINDOW, motion_objects
+from fdhil.sim.drive.service_objects import service_objects
 
 VENDOR_ID = 0x46444849
 PRODUCT_CODE = 0x0402
@@ -20,9 +23,6 @@ ERROR_HISTORY = 8
 HEARTBEAT_CONSUMERS = 4
 PDOS = 4
 PDO_ENTRIES = 8
-NO_WINDOW = 0xFFFFFFFF
-PROFILE_POSITION, CYCLIC_POSITION = 1, 8
-SUPPORTED_MODES = 1 << (PROFILE_POSITION - 1) | 1 << (CYCLIC_POSITION - 1)
 INVALID = 1 << 31
 NO_RTR = 1 << 30
 
@@ -80,6 +80,8 @@ def drive_objects(config: MachineConfig, axis: str) -> tuple[Object, ...]:
         *_states(),
         *_positions(config.axis[axis], ratings),
         *_motor(config.axis[axis], ratings),
+        *service_objects(),
+        *motion_objects(config.axis[axis], ratings.increments_per_mm),
     )
     return tuple(sorted(objects, key=lambda item: item.index))
 
@@ -167,7 +169,7 @@ def _vendor() -> list[Object]:
         var(0x2101, "Terminal voltage, mean of the SYNC period", I16, "ro", mappable=True),
         record(0x2110, "Temperatures", Entry(0x2110, 1, "Slide-way temperature", I16, "ro", 2000, mappable=True)),
         var(0x2120, "Trace buffer", DataType.DOMAIN, "ro", b""),
-        var(0x2121, "Trace buffer clear", U8, "wo", low=1, high=1),
+        var(0x2121, "Trace buffer clear", U8, "wo", 1, low=1, high=1),
     ]
 
 
@@ -228,7 +230,7 @@ def _ratio(index: int, name: str, upper: str, value: int, lower: str) -> Object:
 
 
 def _interpolation(sync_period_s: float) -> Object:
-    """0x60C2: value x 10^exponent seconds; the drive interpolates at the machine's SYNC period and no other."""
+    """0x60C2: value x 10^exponent seconds; set-points that come every so many SYNC periods of the machine."""
     exponent = -3
     while exponent > -6 and abs(sync_period_s / 10**exponent - round(sync_period_s / 10**exponent)) > 1e-9:
         exponent -= 1
@@ -236,7 +238,7 @@ def _interpolation(sync_period_s: float) -> Object:
     return record(
         0x60C2,
         "Interpolation time period",
-        Entry(0x60C2, 1, "Interpolation time period value", U8, "rw", value, low=value, high=value),
+        Entry(0x60C2, 1, "Interpolation time period value", U8, "rw", value, low=1),
         Entry(0x60C2, 2, "Interpolation time index", I8, "rw", exponent, low=exponent, high=exponent),
     )
 

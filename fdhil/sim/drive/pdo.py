@@ -10,13 +10,33 @@ import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-from fdhil.sim.drive.dictionary import I8, I16, I32, U8, U16, U32, AbortCode, Dictionary, Entry, TransferAbort
-from fdhil.sim.drive.objects import INVALID, PDO_ENTRIES, PDOS
+from fdhil.sim.drive.dictionary import (
+    I8,
+    I16,
+    I32,
+    U8,
+    U16,
+    U32,
+    AbortCode,
+    DataType,
+    Dictionary,
+    Entry,
+    TransferAbort,
+)
+from fdhil.sim.drive.objects import INVALID, NO_RTR
 from fdhil.sim.frame import Frame
 
-_CODE = {I8: "b", I16: "h", I32: "i", U8: "B", U16: "H", U32: "I"}
+_CODE = {
+    I8: "b", I16: "h", I32: "i", U8: "B", U16: "H", U32: "I", DataType.BOOLEAN: "B", DataType.REAL32: "I",
+    DataType.REAL64: "Q", DataType.INTEGER64: "q", DataType.UNSIGNED64: "Q",
+}  # fmt: skip
 # dummy entries that an RPDO may map to skip bytes (CiA 301, 7.4.7.1)
-_DUMMIES = {int(kind): (code, 8 * struct.calcsize(code)) for kind, code in _CODE.items()}
+_DUMMIES = {int(kind): (_CODE[kind], 8 * struct.calcsize(_CODE[kind])) for kind in (I8, I16, I32, U8, U16, U32)}
+_RECEIVED, _SENT = frozenset({"rw", "rww", "wo"}), frozenset({"ro", "rw", "rww", "rwr", "const"})
+# places of the two parameters of the first PDO
+_PLACES = {"rpdo": (0x1400, 0x1600), "tpdo": (0x1800, 0x1A00)}
+_MOST_PDOS = 512  # in a direction
+_POSITION_OFFSET = 0x60B000
 _ID_BITS = 0x1FFFFFFF
 _EXTENDED = 1 << 29
 _RESTRICTED = (
@@ -26,7 +46,10 @@ _RESTRICTED = (
 
 @dataclass(slots=True)
 class Pdo:
-    """A valid PDO as it runs; ``keys`` holds None for a dummy entry."""
+    """A valid PDO as it runs; ``keys`` are the places of its values, None for a dummy entry.
+
+    ``entries`` is None where the values travel as they are kept.
+    """
 
     number: int
     cob_id: int
@@ -36,11 +59,13 @@ class Pdo:
     inhibit_s: float = 0.0
     event_s: float = 0.0
     start_value: int = 0
+    on_request: bool = False  # TPDO: answers remote frames
     pending: bytes | None = None  # RPDO: waits for the SYNC
     sent: bytes | None = None  # TPDO: what the master knows
     count: int = 0
     last_s: float | None = None
     checked: tuple[Entry, ...] = field(default=())
+    entries: tuple[Entry | None, ...] | None = None
 
     @property
     def synchronous(self) -> bool:
@@ -51,7 +76,8 @@ class Pdo:
 class PdoEngine:
     """All PDOs of one device. ``drop`` maps TPDO numbers to how many frames are still to be lost, -1 for all.
 
-    ``heard`` has the numbers of the RPDOs received since the last SYNC, ``heard_before`` those of the cycle before.
+    ``heard`` has the numbers of the RPDOs received since the last SYNC, ``heard_before`` those of the cycle before;
+    ``offset_rpdos`` are those that carry the position offset.
     """
 
     def __init__(self, dictionary: Dictionary, changeable: Callable[[], bool], drop: dict[int, int]) -> None:
@@ -62,12 +88,14 @@ class PdoEngine:
         self._tpdos: list[Pdo] = []
         self.heard: set[int] = set()
         self.heard_before: set[int] = set()
+        self.offset_rpdos: frozenset[int] = frozenset()
         self._register_checks()
 
     def configure(self) -> None:
         """Start all PDOs from the object dictionary's parameters: OPERATIONAL was entered or the mapping changed."""
         self._rpdos = {pdo.cob_id: pdo for pdo in self.configured("rpdo")}
         self._tpdos = list(self.configured("tpdo"))
+        self.offset_rpdos = frozenset(p.number for p in self._rpdos.values() if _POSITION_OFFSET in p.keys)
         self.heard, self.heard_before = set(), set()
 
     def stop(self) -> None:
@@ -77,40 +105,58 @@ class PdoEngine:
 
     def configured(self, direction: str) -> Iterator[Pdo]:
         """Yield the PDOs of a direction (``rpdo`` or ``tpdo``) as the dictionary describes them."""
-        communication, mapping = (0x1400, 0x1600) if direction == "rpdo" else (0x1800, 0x1A00)
-        for n in range(PDOS):
-            number = self._dictionary.number
-            cob_id = number(communication + n, 1)
-            if cob_id & INVALID:
+        communication, mapping = _PLACES[direction]
+        sends = direction == "tpdo"
+        for number in self.numbers(direction):
+            n = number - 1
+            cob_id = self._dictionary.number(communication + n, 1)
+            entries = self._mapped(mapping + n)
+            if cob_id & INVALID or not entries:
                 continue
-            mapped = [number(mapping + n, sub + 1) for sub in range(number(mapping + n, 0))]
-            keys, codes, entries = self._resolve(mapped)
+            found = [entry for entry, _ in entries if entry is not None]
             yield Pdo(
-                number=n + 1,
+                number=number,
                 cob_id=cob_id & _ID_BITS,
-                kind=number(communication + n, 2),
-                codec=struct.Struct("<" + codes),
-                keys=keys,
-                inhibit_s=number(communication + n, 3) * 1e-4 if direction == "tpdo" else 0.0,
-                event_s=number(communication + n, 5) * 1e-3,
-                start_value=number(communication + n, 6) if direction == "tpdo" else 0,
-                checked=entries,
+                kind=self._parameter(communication + n, 2),
+                codec=struct.Struct("<" + "".join(code for _, code in entries)),
+                keys=tuple(None if entry is None else entry.place for entry, _ in entries),
+                inhibit_s=self._parameter(communication + n, 3) * 1e-4 if sends else 0.0,
+                event_s=self._parameter(communication + n, 5) * 1e-3,
+                start_value=self._parameter(communication + n, 6) if sends else 0,
+                on_request=sends and not cob_id & NO_RTR,
+                checked=tuple(entry for entry in found if entry.limited or entry.place in self._dictionary.check),
+                entries=tuple(entry for entry, _ in entries) if self._dictionary.foreign else None,
             )
 
-    def _resolve(self, mapped: list[int]) -> tuple[tuple[int | None, ...], str, tuple[Entry, ...]]:
-        keys: list[int | None] = []
-        codes, checked = "", []
-        for value in mapped:
-            entry = self._dictionary.entries.get(value >> 8)
-            if entry is None:
-                keys.append(None)
-                codes += _DUMMIES[value >> 16][0]
-                continue
-            keys.append(entry.key)
-            codes += _CODE[entry.type]
-            if entry.low is not None or entry.high is not None or entry.key in self._dictionary.check:
-                checked.append(entry)
-        return tuple(keys), codes, tuple(checked)
+    def mapped(self, direction: str, number: int) -> list[Entry]:
+        """Return the objects that a PDO carries."""
+        return [entry for entry, _ in self._mapped(_PLACES[direction][1] + number - 1) if entry is not None]
+
+    def numbers(self, direction: str) -> Iterator[int]:
+        """Yield the PDOs that the device has: with a COB-ID and a mapping."""
+        communication, mapping = _PLACES[direction]
+        entries = self._dictionary.entries
+        for n in range(_MOST_PDOS):
+            if communication + n << 8 | 1 in entries and mapping + n << 8 in entries:
+                yield n + 1
+
+    def _parameter(self, index: int, sub: int) -> int:
+        """A communication parameter, 0 where the device does not have it."""
+        return self._dictionary.numbers.get(index << 8 | sub, 0)
+
+    def _mapped(self, index: int) -> list[tuple[Entry | None, str]]:
+        """The mapped entries with their codes, None for a dummy; nothing where an object is mapped that cannot be."""
+        mapped: list[tuple[Entry | None, str]] = []
+        for sub in range(1, self._dictionary.number(index, 0) + 1):
+            word = self._parameter(index, sub)
+            entry = self._dictionary.entries.get(word >> 8)
+            if entry is not None and entry.type in _CODE:
+                mapped.append((entry, _CODE[entry.type]))
+            elif entry is None and word >> 16 in _DUMMIES:
+                mapped.append((None, _DUMMIES[word >> 16][0]))
+            else:
+                return []
+        return mapped
 
     # -- reception
 
@@ -143,11 +189,14 @@ class PdoEngine:
         pdo.pending = None
         for entry in pdo.checked:
             try:
-                entry.check_range(received[entry.key])
-                if check := self._dictionary.check.get(entry.key):
-                    check(entry, received[entry.key])
+                entry.check_range(received[entry.place])
+                if check := self._dictionary.check.get(entry.place):
+                    check(entry, entry.number(received[entry.place]))
             except TransferAbort:
-                del received[entry.key]
+                del received[entry.place]
+        for mapped in pdo.entries or ():
+            if mapped is not None and mapped.place in received:
+                received[mapped.place] = mapped.number(received[mapped.place])
         self._dictionary.numbers.update(received)
 
     def overdue(self, now_s: float) -> list[int]:
@@ -188,6 +237,10 @@ class PdoEngine:
                 self._on_event(pdo, now_s, frames)
         return frames
 
+    def requested(self, can_id: int) -> list[Frame]:
+        """Return the TPDO that a remote frame asks for, where bit 30 of its COB-ID lets it."""
+        return [(can_id, self._content(pdo)) for pdo in self._tpdos if pdo.cob_id == can_id and pdo.on_request]
+
     def _on_event(self, pdo: Pdo, now_s: float, frames: list[Frame]) -> None:
         content = self._content(pdo)
         since = None if pdo.last_s is None else now_s - pdo.last_s
@@ -197,6 +250,8 @@ class PdoEngine:
 
     def _content(self, pdo: Pdo) -> bytes:
         values = self._dictionary.numbers
+        if pdo.entries is not None:
+            return pdo.codec.pack(*[entry.counts(values[entry.place]) for entry in pdo.entries if entry is not None])
         return pdo.codec.pack(*[values[key] for key in pdo.keys if key is not None])
 
     def _send(self, pdo: Pdo, content: bytes, now_s: float, frames: list[Frame]) -> None:
@@ -211,14 +266,20 @@ class PdoEngine:
 
     def _register_checks(self) -> None:
         rules = {1: self._check_cob_id, 2: self._check_kind, 3: self._check_invalid, 6: self._check_invalid}
-        for communication, mapping in ((0x1400, 0x1600), (0x1800, 0x1A00)):
-            for n in range(PDOS):
+        entries = self._dictionary.entries
+        for direction, (communication, mapping) in _PLACES.items():
+            for n in (number - 1 for number in self.numbers(direction)):
                 for sub in (1, 2, 3, 5, 6):
-                    if (key := communication + n << 8 | sub) in self._dictionary.entries:
+                    if (key := communication + n << 8 | sub) in entries:
                         self._dictionary.check[key] = rules.get(sub, self._check_state)
                 self._dictionary.check[mapping + n << 8] = self._check_count
-                for sub in range(1, PDO_ENTRIES + 1):
+                for sub in range(1, self._places(mapping + n) + 1):
                     self._dictionary.check[mapping + n << 8 | sub] = self._check_mapping
+
+    def _places(self, index: int) -> int:
+        """How many objects a mapping parameter has room for."""
+        entries = self._dictionary.entries
+        return next(sub for sub in range(1, 256) if index << 8 | sub not in entries) - 1
 
     def _check_state(self, entry: Entry, value: int) -> None:
         if not self._changeable():
@@ -248,7 +309,7 @@ class PdoEngine:
 
     def _check_count(self, entry: Entry, value: int) -> None:
         self._check_invalid(entry, value)
-        if value > PDO_ENTRIES:
+        if value > self._places(entry.index):
             raise TransferAbort(AbortCode.PDO_LENGTH)
         mapped = [self._dictionary.number(entry.index, sub) for sub in range(1, value + 1)]
         for word in mapped:
@@ -268,7 +329,7 @@ class PdoEngine:
         if receives and word >> 16 in _DUMMIES and word >> 8 & 0xFF == 0 and word & 0xFF == _DUMMIES[word >> 16][1]:
             return
         entry = self._dictionary.entries.get(word >> 8)
-        if entry is None or not entry.mappable or entry.size is None or word & 0xFF != 8 * entry.size:
+        if entry is None or not entry.mappable or entry.type not in _CODE or word & 0xFF != 8 * (entry.size or 0):
             raise TransferAbort(AbortCode.NOT_MAPPABLE)
-        if entry.access not in (("rw", "rww", "wo") if receives else ("ro", "rw", "rww")):
+        if entry.access not in (_RECEIVED if receives else _SENT):
             raise TransferAbort(AbortCode.NOT_MAPPABLE)

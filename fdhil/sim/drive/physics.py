@@ -13,6 +13,7 @@ direction; position is the shaft's angle, the table follows it through the backl
 from __future__ import annotations
 
 import math
+from enum import Enum, auto
 from typing import NamedTuple
 
 import numba
@@ -164,6 +165,25 @@ def run_cycle(
     return total / index, limits
 
 
+class Loops(Enum):
+    """The outermost loop that is closed; those within it are closed, too."""
+
+    POSITION = auto()
+    SPEED = auto()
+    CURRENT = auto()
+
+
+def gains_of(gains: Float, loops: Loops) -> Float:
+    """Return the gains (4,) KV, KFF, KPS, KIS with those of the open loops at zero.
+
+    >>> gains_of(np.array([50.0, 1.0, 23.0, 1184.0]), Loops.SPEED).tolist()
+    [0.0, 0.0, 23.0, 1184.0]
+    """
+    position, speed = loops is Loops.POSITION, loops is not Loops.CURRENT
+    closed: Float = np.array([position, position, speed, speed], dtype=np.float64)
+    return gains * closed
+
+
 class Seen(NamedTuple):
     """What the drive's own sensors see at a SYNC, without their noise; the position is that of the position loop.
 
@@ -212,6 +232,8 @@ class Physics:
                 n_current,
             ]
         )
+        self._gains = self._loops[: KIS + 1].copy()
+        self._current_limit_a = regulators.current_limit_a
         self._state = np.zeros(6)
         self._half_backlash = backlash_rad / 2
         self._state[ANGLE] = self._state[TABLE] = angle_rad
@@ -228,6 +250,15 @@ class Physics:
         self.parameters = parameters
         self._plant = np.array(list(parameters.as_dict().values()))
         self._phi = discretise(self._plant, self.step_s)
+
+    def close_loops(self, loops: Loops) -> None:
+        """Close the loops from this one inward; a speed loop that closes goes on from the current that flows."""
+        self._loops[: KIS + 1] = gains_of(self._gains, loops)
+        self._state[SPEED_INTEGRAL] = 0.0 if loops is Loops.CURRENT else self._state[CURRENT]
+
+    def limit_current(self, limit_a: float) -> None:
+        """Limit the current demand below the configured limit."""
+        self._loops[I_MAX] = min(limit_a, self._current_limit_a)
 
     @property
     def table_speed_rad_s(self) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from fdhil.config import Reality, Regulators
 from fdhil.records import Float, Parameters
 from fdhil.sim.drive import real_cycle as cycle
-from fdhil.sim.drive.physics import CURRENT_LIMIT, VOLTAGE_LIMIT, Command, Physics, Seen
+from fdhil.sim.drive.physics import CURRENT_LIMIT, VOLTAGE_LIMIT, Command, Loops, Physics, Seen, gains_of
 
 BRISTLE_DAMPING = 1.0  # of the bristles' critical one, halved: they ring once
 
@@ -54,6 +54,7 @@ class RealPhysics(Physics):
         self._x[[cycle.ANGLE, cycle.TABLE]] = angle_rad
         self._x[cycle.BUS] = 1.0
         self._g = self._loops_vector(sync_period_s, increments_per_rev)
+        self._real_gains = self._g[: cycle.KIS + 1].copy()
         self._was_enabled = False
         self._encoder_rad: float | None = None
         self._shown_speed = 0.0
@@ -65,6 +66,13 @@ class RealPhysics(Physics):
         """Change the plant from the next cycle on; what reality adds stays in its proportion."""
         self.parameters = parameters
         self._p = self._plant_vector(parameters)
+
+    def close_loops(self, loops: Loops) -> None:
+        self._g[: cycle.KIS + 1] = gains_of(self._real_gains, loops)
+        self._x[cycle.SPEED_INTEGRAL] = 0.0 if loops is Loops.CURRENT else self._x[cycle.CURRENT]
+
+    def limit_current(self, limit_a: float) -> None:
+        self._g[cycle.I_MAX] = min(limit_a, self._regulators.current_limit_a)
 
     @property
     def table_speed_rad_s(self) -> float:

@@ -1,4 +1,4 @@
-"""Answers SDO requests (CiA 301, 7.2.4): expedited and segmented transfers both ways, block upload with CRC.
+"""Answers SDO requests (CiA 301, 7.2.4): expedited, segmented and block transfers both ways, blocks with CRC.
 
 Sans-I/O: a request of 8 bytes in, the answers out. One client, one transfer at a time; a new request to initiate
 drops the transfer that was going on, as the standard has it.
@@ -9,9 +9,10 @@ from __future__ import annotations
 import binascii
 from dataclasses import dataclass, field
 
-from fdhil.sim.drive.dictionary import AbortCode, Dictionary, TransferAbort
+from fdhil.sim.drive.dictionary import AbortCode, Dictionary, Entry, TransferAbort
 
-MAX_DOWNLOAD_BYTES = 1024  # no object that can be written is longer
+MAX_DOWNLOAD_BYTES = 1 << 16  # no object that can be written is longer
+BLOCK_SEGMENTS = 127
 
 
 @dataclass(slots=True)
@@ -44,12 +45,28 @@ class _BlockUpload:
     ended: bool = False
 
 
+@dataclass(slots=True)
+class _BlockDownload:
+    index: int
+    sub: int
+    size: int | None
+    with_crc: bool
+    data: bytearray = field(default_factory=bytearray)
+    received: int = 0  # segments of this block, in their order
+    complete: bool = False
+
+
 class SdoServer:
     """Answers the SDO requests of one client from an object dictionary."""
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
-        self._transfer: _Upload | _Download | _BlockUpload | None = None
+        self._transfer: _Upload | _Download | _BlockUpload | _BlockDownload | None = None
+
+    @property
+    def in_block(self) -> bool:
+        """Whether a block download waits for segments: every request is taken for one."""
+        return isinstance(self._transfer, _BlockDownload) and not self._transfer.complete
 
     def reset(self) -> None:
         """Forget the transfer that is going on."""
@@ -60,7 +77,8 @@ class SdoServer:
         if len(data) != 8:
             return []
         index, sub = int.from_bytes(data[1:3], "little"), data[3]
-        goes_on = data[0] >> 5 in (0, 3, 5) and data[0] & 0xE3 != 0xA0
+        goes_on = (data[0] >> 5 in (0, 3, 5) and data[0] & 0xE3 != 0xA0) or data[0] & 0xE1 == 0xC1
+        goes_on |= self.in_block
         if goes_on and self._transfer is not None:  # such a request does not repeat what it is about
             index, sub = self._transfer.index, self._transfer.sub
         try:
@@ -70,6 +88,9 @@ class SdoServer:
             return [_head(0x80, index, sub) + abort.code.to_bytes(4, "little")]
 
     def _dispatch(self, data: bytes, index: int, sub: int) -> list[bytes]:
+        transfer = self._transfer
+        if isinstance(transfer, _BlockDownload) and not transfer.complete and data[0] != 0x80:
+            return self._block_segment(transfer, data)
         match data[0] >> 5:
             case 0:
                 return self._download_segment(data)
@@ -84,6 +105,8 @@ class SdoServer:
                 return []
             case 5:
                 return self._block_upload(data, index, sub)
+            case 6:
+                return self._block_download(data, index, sub)
             case _:
                 raise TransferAbort(AbortCode.COMMAND)
 
@@ -114,9 +137,7 @@ class SdoServer:
             length = 4 - (data[0] >> 2 & 3) if sized else min(entry.size or 4, 4)
             self._dictionary.write(index, sub, data[4 : 4 + length])
         else:
-            size = int.from_bytes(data[4:8], "little") if sized else None
-            if size is not None and (size > MAX_DOWNLOAD_BYTES or (entry.size is not None and size != entry.size)):
-                raise TransferAbort(AbortCode.LENGTH)
+            size = _announced(entry, data) if sized else None
             self._transfer = _Download(index, sub, size)
         return [_head(0x60, index, sub) + bytes(4)]
 
@@ -134,6 +155,43 @@ class SdoServer:
             self._transfer = None
             self._dictionary.write(transfer.index, transfer.sub, bytes(transfer.data))
         return [bytes([0x20 | toggle << 4]) + bytes(7)]
+
+    def _block_download(self, data: bytes, index: int, sub: int) -> list[bytes]:
+        if data[0] & 1:
+            return self._end_block_download(data)
+        self._transfer = None
+        entry = self._dictionary.writable(index, sub)
+        size = _announced(entry, data) if data[0] & 2 else None
+        self._transfer = _BlockDownload(index, sub, size, bool(data[0] & 4))
+        return [_head(0xA4, index, sub) + bytes([BLOCK_SEGMENTS, 0, 0, 0])]
+
+    def _block_segment(self, transfer: _BlockDownload, data: bytes) -> list[bytes]:
+        """Take a segment in its order; what is out of it comes again after the block's acknowledge."""
+        number, last = data[0] & 0x7F, bool(data[0] & 0x80)
+        if number == 0:
+            raise TransferAbort(AbortCode.SEQUENCE)
+        if number == transfer.received + 1:
+            transfer.data += data[1:]
+            transfer.received = number
+            transfer.complete = last
+            if len(transfer.data) > (transfer.size or MAX_DOWNLOAD_BYTES) + 6:
+                raise TransferAbort(AbortCode.LENGTH)
+        if not last and number < BLOCK_SEGMENTS:
+            return []
+        acknowledged, transfer.received = transfer.received, 0
+        return [bytes([0xA2, acknowledged, BLOCK_SEGMENTS]) + bytes(5)]
+
+    def _end_block_download(self, data: bytes) -> list[bytes]:
+        transfer, self._transfer = self._transfer, None
+        if not isinstance(transfer, _BlockDownload):
+            raise TransferAbort(AbortCode.COMMAND)
+        content = bytes(transfer.data[: len(transfer.data) - (data[0] >> 2 & 7)])
+        if transfer.size is not None and len(content) != transfer.size:
+            raise TransferAbort(AbortCode.LENGTH)
+        if transfer.with_crc and int.from_bytes(data[1:3], "little") != binascii.crc_hqx(content, 0):
+            raise TransferAbort(AbortCode.CRC)
+        self._dictionary.write(transfer.index, transfer.sub, content)
+        return [bytes([0xA1]) + bytes(7)]
 
     def _block_upload(self, data: bytes, index: int, sub: int) -> list[bytes]:
         command = data[0] & 3
@@ -189,6 +247,14 @@ class SdoServer:
         unused = -len(transfer.data) % 7 if transfer.data else 7
         crc = binascii.crc_hqx(transfer.data, 0) if transfer.with_crc else 0
         return [bytes([0xC1 | unused << 2]) + crc.to_bytes(2, "little") + bytes(5)]
+
+
+def _announced(entry: Entry, data: bytes) -> int:
+    """Return the size that a request to initiate a download tells; TransferAbort when the object has another."""
+    size = int.from_bytes(data[4:8], "little")
+    if size > MAX_DOWNLOAD_BYTES or (entry.size is not None and size != entry.size):
+        raise TransferAbort(AbortCode.LENGTH)
+    return size
 
 
 def _turned(transfer: _Upload | _Download, data: bytes) -> int:

@@ -1,7 +1,7 @@
 """Computes what the loops follow: the cyclic set-points with their delay, and the drive's own ramps and profiles.
 
-Both give, for the cycle that begins, the demand at its start, at its end and one cycle later (increments), because the
-feed-forward runs linearly from the slope of this cycle to the slope of the next.
+The cyclic set-points and the profile give, for the cycle that begins, the demand at its start, at its end and one cycle
+later (increments), because the feed-forward runs linearly from the slope of this cycle to the slope of the next.
 """
 
 from __future__ import annotations
@@ -69,6 +69,55 @@ class CyclicSetpoints:
         return slope + second.offset - first.offset if self._offset_in_feedforward else slope
 
 
+class Interpolation:
+    """Spreads set-points that come every ``cycles`` cycles (0x60C2) over these: straight, one interval late."""
+
+    def __init__(self) -> None:
+        self.cycles = 1
+        self._step = 0
+        self._from = self._to = Target(0.0, 0.0, 0.0, 0.0)
+
+    def preset(self, target: Target) -> None:
+        """Rest at a target."""
+        self._from = self._to = target
+        self._step = 0
+
+    def next(self, target: Target, *, synced: bool) -> Target:
+        """Return this cycle's set-point; ``target`` is what was received last, ``synced``: a SYNC begins the cycle."""
+        if self.cycles == 1:
+            self.preset(target)
+            return target
+        if synced or self._step >= self.cycles:
+            self._from, self._to, self._step = self._at(), target, 0
+        self._step += 1
+        return self._at()
+
+    def _at(self) -> Target:
+        if not 0 < self._step < self.cycles:
+            return self._to if self._step else self._from
+        part = self._step / self.cycles
+        return Target(*(a + (b - a) * part for a, b in zip(self._from, self._to, strict=True)))
+
+
+class Ramp:
+    """A speed or a torque on its way to a target: ``before`` at the start of a cycle, ``now`` at its end."""
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        self.start(0.0)
+
+    def start(self, value: float) -> None:
+        """Go on from a value."""
+        self.before = self.now = float(value)
+
+    def advance(self, target: float, rising: float, falling: float) -> None:
+        """Go one cycle on; ``rising`` is the rate (1/s) at which the magnitude grows, ``falling`` that of its fall."""
+        self.before = self.now
+        grows = abs(target) > abs(self.now) and target * self.now >= 0
+        step = (rising if grows else falling) * self._period_s
+        self.now += min(max(target - self.now, -step), step)
+
+
 class Profile:
     """The drive's own motion: a trapezoid toward a target, or a ramp to standstill. Increments and seconds."""
 
@@ -91,7 +140,7 @@ class Profile:
 
     @property
     def now(self) -> float:
-        """The demand at the SYNC that was advanced to last."""
+        """The demand at the cycle that was advanced to last."""
         return self._points[0]
 
     def advance(self, target: float | None, speed: float, acceleration: float, deceleration: float) -> None:

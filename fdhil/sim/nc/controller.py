@@ -1,12 +1,13 @@
 """Simulates the NC, sans-I/O: it produces SYNC, is the NMT master, enables the drives and streams set-points.
 
-After SYNC k-1 and before SYNC k it sends r[k+delay] by RPDO1 (controlword, target position), so that the drive, which
+After SYNC k-1 and before SYNC k it sends r[k+delay] by RPDO (controlword, target position), so that the drive, which
 runs its set-point ``delay`` cycles late, follows r[k] at SYNC k. All its times are counted in SYNC cycles.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from enum import Enum, auto
 from typing import Any, NamedTuple
 
@@ -16,7 +17,7 @@ from fdhil.config import MachineConfig
 from fdhil.records import Trajectory
 from fdhil.sim.drive.power import State
 from fdhil.sim.frame import BusFrame, Frame
-from fdhil.sim.nc.drive_link import ENABLED, SHUTDOWN, DriveLink, SdoWrite
+from fdhil.sim.nc.drive_link import ENABLED, SHUTDOWN, DriveLink, SdoWrite, Wiring
 from fdhil.sim.nc.path import Job, PathRate, Pause, RowPlayer, Stage, rapid_rows
 
 Event = dict[str, Any]
@@ -26,7 +27,6 @@ TAIL_S = 0.3  # rest after the last row that still belongs to the played file
 _SETTLE_S = 0.3  # rest between the rapid to the start and the first row
 _ANSWER_S = 1.0
 _ENABLE_S = 3.0
-_SILENCE_CYCLES = 5
 _RELEASE_CYCLES = 3
 _MAX_OVERRIDE = 1.5
 
@@ -54,10 +54,11 @@ class NcController:
     """The NC of one machine. ``events`` collects what it has to say; who runs it takes them out.
 
     Each period: send the frames of :meth:`begin`, give it what the drives answer by :meth:`hear`, then send the frames
-    of :meth:`end`. ``in_force`` is the row r[k] of the SYNC that :meth:`begin` gave last, None while it has none.
+    of :meth:`end`. ``wiring`` tells how an axis' drive is mapped; it is asked at each takeover. ``in_force`` is the
+    row r[k] of the SYNC that :meth:`begin` gave last, None while it has none.
     """
 
-    def __init__(self, config: MachineConfig) -> None:
+    def __init__(self, config: MachineConfig, wiring: Callable[[str], Wiring]) -> None:
         period = config.machine.sync_period_s
         self.axes = tuple(config.axis)
         self.events: list[Event] = []
@@ -77,7 +78,9 @@ class NcController:
             )
             for name, axis in config.axis.items()
         ]
+        self._wiring = wiring
         self._by_node = {(link.bus, link.node_id): link for link in self._links}
+        self._by_answer: dict[tuple[str, int], DriveLink] = {}
         self._buses = list(dict.fromkeys(link.bus for link in self._links))
         self._delay = max(link.delay for link in self._links)
         slope = min(a / v for a, v in zip(self._accelerations, self._speeds, strict=True))
@@ -172,19 +175,13 @@ class NcController:
         return [(bus, (0x80, bytes([self._counter]))) for bus in self._buses]
 
     def hear(self, bus: str, frame: Frame) -> None:
-        """Take what a drive sent: TPDO1 (position first), TPDO2 (statusword first), SDO answers."""
+        """Take what a drive sent: the TPDOs that it is wired to, SDO answers."""
         can_id, data = frame
-        link = self._by_node.get((bus, can_id & 0x7F))
-        if link is None:
-            return
-        kind = can_id & ~0x7F
-        if kind == 0x280 and len(data) >= 2:
-            link.status = data[0] | data[1] << 8
-            link.silent = 0
-        elif kind == 0x180 and len(data) >= 4:
-            link.position = int.from_bytes(data[:4], "little", signed=True)
-        elif kind == 0x580 and len(data) == 8:
-            self._answer(link, data)
+        link = self._by_answer.get((bus, can_id))
+        if link is not None:
+            link.hear(can_id, data)
+        elif can_id & ~0x7F == 0x580 and len(data) == 8 and (bus, can_id & 0x7F) in self._by_node:
+            self._answer(self._by_node[bus, can_id & 0x7F], data)
 
     def end(self) -> list[BusFrame]:
         """Return what is sent after this period's SYNC: the set-points of the next one, or the steps of a takeover."""
@@ -210,8 +207,9 @@ class NcController:
         for link in self._links:
             link.status = link.position = None
             link.word = SHUTDOWN
+            mode = self._wiring(link.axis).mode
             self._requests.append(SdoWrite(link, 0x1019, COUNTER_OVERFLOW, required=False))
-            self._requests.append(SdoWrite(link, 0x6060, 8, required=True))
+            self._requests.append(SdoWrite(link, 0x6060, mode, required=True))
 
     def _nmt(self, command: int) -> list[BusFrame]:
         return [(link.bus, (0x000, bytes([command, link.node_id]))) for link in self._links]
@@ -220,8 +218,7 @@ class NcController:
         frames = self._nmt(0x80) if self._waited == 0 else []
         self._waited += 1
         if not self._requests:
-            self.phase, self._waited = Phase.ENABLE, 0
-            return self._nmt(0x01)
+            return self._start()
         request = self._requests[0]
         if not request.sent:
             request.sent = True
@@ -230,6 +227,18 @@ class NcController:
         if request.cycles * self._period_s > _ANSWER_S:
             self._give_up(f"drive {request.link.axis} does not answer; check that it is powered")
         return frames
+
+    def _start(self) -> list[BusFrame]:
+        """Start the drives by the PDOs that they have."""
+        for link in self._links:
+            link.wiring = self._wiring(link.axis)
+            if link.wiring.missing:
+                what = " and ".join(link.wiring.missing)
+                self._give_up(f"drive {link.axis} has {what} in no PDO; set its mapping up (0x1400 to 0x1BFF)")
+                return []
+        self._by_answer = {(link.bus, pdo.cob_id): link for link in self._links for pdo in link.wiring.answers}
+        self.phase, self._waited = Phase.ENABLE, 0
+        return self._nmt(0x01)
 
     def _answer(self, link: DriveLink, data: bytes) -> None:
         if not self._requests or not self._requests[0].sent or self._requests[0].link is not link:
@@ -249,7 +258,7 @@ class NcController:
 
     def _enable(self) -> list[BusFrame]:
         self._waited += 1
-        frames = [frame for link in self._links if (frame := link.walk()) is not None]
+        frames = [frame for link in self._links for frame in link.walk()]
         if all(link.state is State.OPERATION_ENABLED for link in self._links):
             self._position = [(link.position or 0) / link.increments_per_mm for link in self._links]
             self.phase = Phase.READY
@@ -271,7 +280,7 @@ class NcController:
             return frames
         for link in self._links:
             link.word = SHUTDOWN
-        return [link.set_point(link.position) for link in self._links if link.position is not None]
+        return [frame for k in self._links if k.position is not None for frame in k.set_point(k.position)]
 
     def _let_go(self) -> None:
         self.phase = Phase.OFF
@@ -304,7 +313,7 @@ class NcController:
     def _stream(self) -> list[BusFrame]:
         self._supervise()
         self._rows.append(self._advance())
-        frames = []
+        frames: list[BusFrame] = []
         for place, link in enumerate(self._links):
             if self.phase is Phase.FAULTED and link.state is not State.OPERATION_ENABLED:
                 link.word = SHUTDOWN
@@ -313,7 +322,7 @@ class NcController:
                 link.word = ENABLED
                 row = self._rows[link.delay - self._delay - 1]
                 target = round(row.position_mm[place] * link.increments_per_mm)
-            frames.append(link.set_point(target))
+            frames += link.set_point(target)
         return frames
 
     def _advance(self) -> Row:
@@ -346,7 +355,7 @@ class NcController:
         if self.phase is Phase.FAULTED:
             return
         for link in self._links:
-            if link.silent > _SILENCE_CYCLES:
+            if link.silent > link.wiring.patience:
                 why = "sends no statusword any more"
             elif link.status is None or link.status & 0x6F != State.OPERATION_ENABLED.value:
                 why = f"left Operation enabled for {link.state.name}"

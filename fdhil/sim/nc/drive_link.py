@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 
+from fdhil.sim.drive.modes import CYCLIC_POSITION
+from fdhil.sim.drive.pdo import Pdo
 from fdhil.sim.drive.power import State
 from fdhil.sim.frame import BusFrame
 
+CONTROLWORD, STATUSWORD, TARGET, POSITION, MODE = 0x604000, 0x604100, 0x607A00, 0x606400, 0x606000
+_OFFSETS = frozenset({0x60B000, 0x60B100, 0x60B200})
+_SILENCE_CYCLES = 5
 ENABLED = 0x0F
 SHUTDOWN = 0x06
 _WORDS = {
@@ -29,9 +35,45 @@ def power_state(statusword: int) -> State:
     return State.NOT_READY
 
 
+@dataclass(frozen=True, slots=True)
+class Wiring:
+    """The PDOs by which the NC leads a drive, and its ``mode`` of cyclic set-points.
+
+    ``missing`` are the objects that the NC needs and no valid PDO carries.
+    """
+
+    setpoints: tuple[Pdo, ...] = ()
+    answers: tuple[Pdo, ...] = ()
+    missing: tuple[str, ...] = ()
+    mode: int = CYCLIC_POSITION
+
+    @classmethod
+    def of(cls, rpdos: Iterable[Pdo], tpdos: Iterable[Pdo], mode: int) -> Wiring:
+        """Choose among a drive's PDOs: as few as do, and none that carries an offset where another does."""
+        received = sorted(rpdos, key=lambda pdo: (CONTROLWORD not in pdo.keys, not _OFFSETS.isdisjoint(pdo.keys)))
+        received.sort(key=lambda pdo: not {CONTROLWORD, TARGET}.issubset(pdo.keys))
+        sent = list(tpdos)
+        chosen = {}
+        for key, pdos in ((TARGET, received), (CONTROLWORD, received), (STATUSWORD, sent), (POSITION, sent)):
+            chosen[key] = next((pdo for pdo in pdos if key in pdo.keys), None)
+        used = {pdo.cob_id: pdo for pdo in chosen.values() if pdo is not None}
+        return cls(
+            tuple(pdo for pdo in used.values() if pdo in received),
+            tuple(pdo for pdo in used.values() if pdo in sent),
+            tuple(f"{key >> 8:04X}" for key, pdo in chosen.items() if pdo is None),
+            mode,
+        )
+
+    @property
+    def patience(self) -> float:
+        """SYNCs after which a drive is silent that sends no statusword; one that sends it by event never is."""
+        kind = next((pdo.kind for pdo in self.answers if STATUSWORD in pdo.keys), 255)
+        return _SILENCE_CYCLES * max(kind, 1) if kind <= 240 else float("inf")
+
+
 @dataclass(slots=True)
 class DriveLink:
-    """One drive as the NC sees it: its default TPDO1 and TPDO2, and the controlword it was given last.
+    """One drive as the NC sees it, by the PDOs it was wired to, and the controlword it was given last.
 
     ``increments_per_mm`` has the sign of the axis; ``silent`` counts the SYNCs since the last statusword.
     """
@@ -41,6 +83,7 @@ class DriveLink:
     node_id: int
     increments_per_mm: float
     delay: int
+    wiring: Wiring = field(default_factory=Wiring)
     word: int = SHUTDOWN
     status: int | None = None
     position: int | None = None
@@ -51,14 +94,29 @@ class DriveLink:
         """The power state that its last statusword shows."""
         return State.NOT_READY if self.status is None else power_state(self.status)
 
-    def set_point(self, target: int) -> BusFrame:
-        """RPDO1: controlword and target position."""
-        return self.bus, (0x200 + self.node_id, struct.pack("<Hi", self.word, target))
+    def set_point(self, target: int) -> list[BusFrame]:
+        """Controlword and target position; what else those RPDOs carry stays at rest."""
+        values = {CONTROLWORD: self.word, TARGET: target, MODE: self.wiring.mode}
+        return [
+            (self.bus, (pdo.cob_id, pdo.codec.pack(*[0 if key is None else values.get(key, 0) for key in pdo.keys])))
+            for pdo in self.wiring.setpoints
+        ]
 
-    def walk(self) -> BusFrame | None:
+    def hear(self, can_id: int, data: bytes) -> None:
+        """Take a TPDO; one that is shorter than its mapping says nothing."""
+        for pdo in self.wiring.answers:
+            if pdo.cob_id != can_id or len(data) < pdo.codec.size:
+                continue
+            for key, value in zip(pdo.keys, pdo.codec.unpack_from(data), strict=True):
+                if key == STATUSWORD:
+                    self.status, self.silent = value, 0
+                elif key == POSITION:
+                    self.position = value
+
+    def walk(self) -> list[BusFrame]:
         """One step toward Operation enabled, with the actual position as target."""
         if self.position is None:
-            return None
+            return []
         if self.state is State.FAULT:  # a reset is a rising edge
             self.word = 0x00 if self.word == 0x80 else 0x80
         else:
@@ -80,5 +138,5 @@ class SdoWrite:
     @property
     def frame(self) -> BusFrame:
         """The expedited download (CiA 301, 7.2.4.3.3)."""
-        write = struct.pack("<BHBI", 0x2F, self.index, 0, self.value)
+        write = struct.pack("<BHBB3x", 0x2F, self.index, 0, self.value & 0xFF)
         return self.link.bus, (0x600 + self.link.node_id, write)

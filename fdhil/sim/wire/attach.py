@@ -31,7 +31,12 @@ def attach(name: str, bus: CanBus) -> Attachment:
     """Attach to the bus ``[bus.name]``; ConnectError when it cannot be had."""
     if bus.interface == "socketcand":
         return Hub(bus.channel, bus.host, bus.port)
-    return SocketCan(name, bus) if bus.interface == "socketcan" else VirtualBus(bus)
+    if bus.interface == "socketcan":
+        return SocketCan(name, bus)
+    if bus.interface == "virtual":
+        return VirtualBus(bus)
+    text = f"the simulated drives cannot be behind a {bus.interface} adapter; set interface to socketcand or socketcan"
+    raise ConnectError(f"bus {name}", text)
 
 
 def _no_bus(name: str, bus: CanBus, error: OSError) -> ConnectError:
@@ -72,7 +77,7 @@ class SocketCan(Attachment):
         return time.monotonic() + _RETRY_S if self._out else None
 
     def pump(self, ready: Sequence[object], handler: Handler) -> None:
-        """Give every frame that has come to ``handler``; error and remote frames are no business of the twin."""
+        """Give every frame that has come to ``handler``: a remote frame as one without data, no error frames."""
         if self._socket not in ready:
             return
         for _ in range(_FRAMES_PER_TURN):
@@ -80,8 +85,8 @@ class SocketCan(Attachment):
                 can_id, length, data = _CAN_FRAME.unpack(self._socket.recv(_CAN_FRAME.size))
             except OSError:  # nothing more, or the interface went down
                 return
-            if not can_id & (_ERROR_FRAME | _REMOTE_FRAME):
-                handler((can_id, data[:length]))
+            if not can_id & _ERROR_FRAME:
+                handler((can_id & ~_REMOTE_FRAME, b"" if can_id & _REMOTE_FRAME else data[:length]))
 
     def send(self, frames: Sequence[Frame]) -> None:
         self._out.extend(frames)
@@ -149,5 +154,5 @@ class VirtualBus(Attachment):
             message = self._bus.recv(0.1)
             if message is not None:
                 can_id = message.arbitration_id | EXTENDED if message.is_extended_id else message.arbitration_id
-                self._in.append((can_id, bytes(message.data)))
+                self._in.append((can_id, b"" if message.is_remote_frame else bytes(message.data)))
                 self._pipe.wake()

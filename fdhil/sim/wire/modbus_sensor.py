@@ -1,6 +1,6 @@
 """Serves the separate voltage sensor of an axis by Modbus TCP, with a small sample memory that can be latched.
 
-Registers, 16 bit, 32 bit values in two with the high word first, the same as input (fc 4) and holding registers (fc 3):
+Its own registers, 16 bit, 32 bit values in two with the high word first, the same as input (fc 4) and holding ones (3):
 
     0-1     newest voltage, float32             10      trigger: 1 latches the newest samples, at most 100, that were
     2-3     counter of the newest sample                not latched before (fc 6, 16)
@@ -21,7 +21,6 @@ import struct
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 
 import numpy as np
 from pymodbus.constants import ExcCodes
@@ -29,24 +28,14 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 from fdhil.errors import ConnectError
-from fdhil.sim.signal_fault import SignalFault
+from fdhil.sim.wire.registers import RegisterMap
+from fdhil.sim.wire.sensor_faults import SensorFaults
 
 REGISTERS = 116
 BLOCK = 100
 TRIGGER, STATUS, FIRST_SAMPLE = 10, 11, 16
 _READS, _WRITES = (3, 4), (6, 16)
 _NOISE_BLOCK = 1024
-
-
-@dataclass(slots=True)
-class SensorFaults:
-    """Errors of a sensor: ``silent`` answers nothing, ``slow_s`` answers late, ``exception`` answers every
-    request with this code, ``signal`` spoils the samples (V)."""
-
-    silent: bool = False
-    slow_s: float = 0.0
-    exception: int = 0
-    signal: SignalFault = field(default_factory=SignalFault)
 
 
 class VoltageSensor:
@@ -102,6 +91,28 @@ class VoltageSensor:
         head = struct.pack(">fIfff", newest, count & 0xFFFFFFFF, self.rate_hz, self.volts_per_count, self.celsius)
         return [*_words(head), 0, *self._block]
 
+    trigger: int | None = TRIGGER
+
+    def words(self) -> dict[int, int]:
+        """Return all registers by address."""
+        return dict(enumerate(self.registers()))
+
+    def newest(self, number: int) -> tuple[int, list[float]]:
+        """Return how many samples there were so far, and at most ``number`` of the newest, the oldest first."""
+        with self._lock:
+            return self._count, list(self._recent)[-number:]
+
+
+def _words(data: bytes) -> list[int]:
+    return list(struct.unpack(f">{len(data) // 2}H", data))
+
+
+class _TcpUnit:
+    """A register map as a device of pymodbus."""
+
+    def __init__(self, registers: RegisterMap, faults: SensorFaults) -> None:
+        self._registers, self._faults = registers, faults
+
     async def access(
         self,
         function_code: int,
@@ -112,10 +123,10 @@ class VoltageSensor:
         values: list[int] | list[bool] | None,
     ) -> ExcCodes | None:
         """Serve one request: pymodbus calls it before it reads ``current`` or writes ``values`` into it."""
-        if self.faults.slow_s:
-            await asyncio.sleep(self.faults.slow_s)
-        if self.faults.exception:
-            return ExcCodes(self.faults.exception)
+        if self._faults.slow_s:
+            await asyncio.sleep(self._faults.slow_s)
+        if self._faults.exception:
+            return ExcCodes(self._faults.exception)
         if not values and function_code in _WRITES:
             return None  # a write is read back for its answer
         if function_code not in (_WRITES if values else _READS):
@@ -123,29 +134,45 @@ class VoltageSensor:
         if values:
             if list(values) != [1]:
                 return ExcCodes.ILLEGAL_VALUE
-            self.latch()
-        current[:REGISTERS] = self.registers()
+            self._registers.latch()
+        for place, word in self._registers.words().items():
+            if 0 <= place - start_address < len(current):
+                current[place - start_address] = word
         return None
 
     def device(self) -> SimDevice:
         """Return the device for pymodbus: only the trigger may be written, other addresses do not exist."""
-
-        def block(address: int, count: int, readonly: bool) -> SimData:
-            return SimData(address, values=[0] * count, datatype=DataType.REGISTERS, readonly=readonly)
-
-        parts = [block(0, TRIGGER, True), block(TRIGGER, 1, False), block(STATUS, REGISTERS - STATUS, True)]
+        parts, trigger = [], self._registers.trigger
+        for first, count in _stretches(sorted(self._registers.words()), trigger):
+            own = first == trigger
+            parts.append(SimData(first, values=[0] * count, datatype=DataType.REGISTERS, readonly=not own))
         return SimDevice(id=0, simdata=parts, action=self.access)
 
 
-def _words(data: bytes) -> list[int]:
-    return list(struct.unpack(f">{len(data) // 2}H", data))
+def _stretches(addresses: list[int], alone: int | None) -> list[tuple[int, int]]:
+    """Return begin and length of each run of addresses; ``alone`` is one of its own."""
+    runs: list[tuple[int, int]] = []
+    for at in addresses:
+        begin, length = runs[-1] if runs else (at, 0)
+        if runs and at == begin + length and alone not in (at, at - 1):
+            runs[-1] = begin, length + 1
+        else:
+            runs.append((at, 1))
+    return runs
 
 
 class SensorServers:
     """The Modbus TCP servers of a machine, in one thread; ``ports`` by axis once :meth:`start` has returned."""
 
-    def __init__(self, sensors: Mapping[str, VoltageSensor], addresses: Mapping[str, tuple[str, int]]) -> None:
+    def __init__(
+        self,
+        sensors: Mapping[str, VoltageSensor],
+        addresses: Mapping[str, tuple[str, int]],
+        maps: Mapping[str, RegisterMap] | None = None,
+    ) -> None:
+        """Serve the sensors that have an address, each with the registers of ``maps`` in place of its own."""
         self._sensors, self._addresses = sensors, addresses
+        self._maps: Mapping[str, RegisterMap] = sensors if maps is None else maps
         self._servers: list[ModbusTcpServer] = []
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run, name="sim-modbus", daemon=True)
@@ -174,9 +201,10 @@ class SensorServers:
         self._loop.run_forever()
 
     async def _open(self) -> None:
-        for axis, sensor in self._sensors.items():
-            host, port = self._addresses[axis]
-            server = ModbusTcpServer(sensor.device(), address=(host, port), trace_packet=_muffled(sensor))
+        for axis, (host, port) in self._addresses.items():
+            sensor = self._sensors[axis]
+            unit = _TcpUnit(self._maps[axis], sensor.faults)
+            server = ModbusTcpServer(unit.device(), address=(host, port), trace_packet=_muffled(sensor))
             try:
                 await server.serve_forever(background=True)
             except RuntimeError:

@@ -1,0 +1,100 @@
+"""``fdhil doctor``: what is wrong with this PC, bus, drive, sensor, store, clock and rights; the cause comes first."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from fdhil import config as machine_config
+from fdhil.cli.doctor.trouble import Trouble
+from fdhil.errors import ConfigError
+
+if TYPE_CHECKING:
+    from rich.text import Text
+
+    from fdhil.config import MachineConfig
+
+SCHEMA = "fdhil-doctor-1"
+
+
+@click.command()
+@click.argument("config", type=click.Path(path_type=Path))
+@click.option("--offline", is_flag=True, help="Look at this PC alone, and leave buses and sensors in peace.")
+@click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+def doctor(config: Path, offline: bool, as_json: bool) -> int:
+    """Tell what is wrong with this PC, bus, drives, sensors, store, clock and rights: what to mend first comes first.
+
+    Only looks: it writes nothing, and sends nothing where an NC runs the bus (with the NC off the drives are read, as
+    by fdhil check). What cannot be examined before something else is mended is left out, so mend, and run it again.
+    Exit codes: 0 nothing grave is wrong, 1 something is, 2 wrong option.
+    """
+    found = _examined(config, offline)
+    if as_json:
+        grave = sum(trouble.grave for trouble in found)
+        click.echo(json.dumps({"schema": SCHEMA, "healthy": not grave, "troubles": [asdict(t) for t in found]}))
+    else:
+        _show(found)
+    return int(any(trouble.grave for trouble in found))
+
+
+def _examined(path: Path, offline: bool) -> list[Trouble]:
+    try:
+        config = machine_config.load(path)
+    except ConfigError as error:
+        means = "nothing of fdhil starts with this file"
+        return [
+            Trouble("Config", f.path, f.what, means, f.suggestion or "correct it in the file") for f in error.faults
+        ]
+    found = list(_in_order(config, offline))
+    return sorted(found, key=lambda trouble: not trouble.grave)  # the order of causes stays, within each half
+
+
+def _in_order(config: MachineConfig, offline: bool) -> Iterator[Trouble]:
+    """Examine from the cause to what depends on it: this PC, its interfaces, the devices behind them, the guard."""
+    from fdhil.cli.doctor import computer, devices, storage  # late: --help imports nothing heavy
+
+    yield from storage.examine_store(config)
+    yield from computer.examine_clock(storage.newest_record_s(config.store.directory))
+    yield from computer.examine_processors()
+    secrets = list(storage.examine_secrets(config))
+    yield from secrets
+    buses = computer.examine_buses(config)
+    for troubles in buses.values():
+        yield from troubles
+    if not offline:
+        heard = {name for name, troubles in buses.items() if not any(trouble.grave for trouble in troubles)}
+        recorded = {trouble.place for trouble in secrets if trouble.code == storage.RECORD_BAD}
+        yield from devices.examine_devices(config, heard, recorded, _progress)
+    yield from devices.examine_guard(config)
+
+
+def _progress(text: str) -> None:
+    if sys.stderr.isatty():
+        click.echo(text, err=True)
+
+
+def _show(found: list[Trouble]) -> None:
+    from fdhil.cli.status_view import open_console
+
+    out = open_console()
+    for number, trouble in enumerate(found, 1):
+        out.print(_told(number, trouble), soft_wrap=True)
+    grave = sum(trouble.grave for trouble in found)
+    if found:
+        out.print(f"{grave} to mend, {len(found) - grave} that could be better; mend the first and run it again")
+    else:
+        out.print("nothing is wrong that could be seen")
+
+
+def _told(number: int, trouble: Trouble) -> Text:
+    from rich.text import Text
+
+    colour = "red" if trouble.grave else "yellow"
+    head = Text.assemble((f"{number}. {trouble.place}: ", colour), trouble.what)
+    return head.append(f"\n   means: {trouble.means}\n   mend:  {trouble.mend}")

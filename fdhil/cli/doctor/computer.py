@@ -1,0 +1,154 @@
+"""Examines the PC: its CAN interfaces and hubs, its clock, its processors."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from fdhil.cli.doctor.trouble import Trouble
+from fdhil.config import CanBus, MachineConfig
+
+INTERFACES = Path("/sys/class/net")
+LARGEST_RECEIVE_BUFFER = Path("/proc/sys/net/core/rmem_max")
+GOVERNOR = Path("/sys/devices/system/cpu/cpu0/cpufreq/scaling_governor")
+ENOUGH_BUFFER_BYTES = 1 << 20  # the kernel's own limit holds some 300 frames: 35 ms of a full bus
+HUB_S = 2.0
+TOOL_S = 5.0
+UP = 1  # IFF_UP
+RELEASED_S = 1_767_225_600.0  # 1 January 2026: this program is younger than any clock before it
+NO_CAN_ADDRESS = "its kernel knows no CAN (AF_CAN)"
+BAD_STATES: Mapping[str, tuple[str, str]] = {
+    "BUS-OFF": ("is bus-off", "nothing is sent or heard there until it is started again"),
+    "ERROR-PASSIVE": ("is error-passive", "frames are lost, and it may fall off the bus"),
+}
+
+
+def examine_buses(config: MachineConfig) -> dict[str, list[Trouble]]:
+    """Return what keeps each CAN bus that an axis uses from being heard, as far as this PC knows."""
+    used = dict.fromkeys(axis.drive.bus for axis in config.axis.values())
+    return {name: list(_bus(f"bus {name}", config.bus[name])) for name in used}
+
+
+def _bus(place: str, bus: CanBus) -> Iterator[Trouble]:
+    if bus.interface == "socketcand":
+        yield from _hub(place, bus)
+    elif bus.interface == "socketcan":
+        yield from _interface(place, bus)
+
+
+def _hub(place: str, bus: CanBus) -> Iterator[Trouble]:
+    means = "no drive can be heard"
+    if bus.port == 0:
+        what = "the config gives no port of the CAN hub"
+        yield Trouble("NoPort", place, what, means, "write the port that the hub or `fdhil sim` prints")
+        return
+    try:
+        with socket.create_connection((bus.host, bus.port), HUB_S):
+            pass
+    except OSError as error:
+        what = f"the CAN hub {bus.host}:{bus.port} cannot be reached ({error.strerror or error})"
+        yield Trouble("HubAway", place, what, means, f"start the hub (socketcand or `fdhil sim`) or correct [{place}]")
+
+
+def _interface(place: str, bus: CanBus) -> Iterator[Trouble]:
+    means, there = "no drive can be heard", INTERFACES / bus.channel
+    if not hasattr(socket, "AF_CAN") or not _opens_can():
+        mend = "load the kernel's modules can, can_raw and that of the adapter, or use a kernel that has them"
+        yield Trouble("NoKernelCan", place, NO_CAN_ADDRESS, means, mend)
+    elif not there.exists():
+        what = f"there is no CAN interface {bus.channel}"
+        mend = f"plug the adapter in, load its driver, then: {_bring_up(bus)}"
+        yield Trouble("InterfaceMissing", place, what, means, mend)
+    elif not int((there / "flags").read_text(), 16) & UP:
+        what = f"the CAN interface {bus.channel} is down"
+        yield Trouble("InterfaceDown", place, what, means, _bring_up(bus))
+    else:
+        yield from _controller(place, bus, link_details(bus.channel))
+        yield from _receive_buffer(place)
+
+
+def _opens_can() -> bool:
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except OSError:
+        return False
+    return True
+
+
+def _bring_up(bus: CanBus) -> str:
+    return f"sudo ip link set {bus.channel} up type can bitrate {bus.bitrate} restart-ms 100"
+
+
+def link_details(channel: str) -> Mapping[str, Any]:
+    """Return what ``ip`` knows of a CAN controller: its state, bit timing, restart; nothing where it is not told."""
+    tool = shutil.which("ip")
+    if tool is None:
+        return {}
+    command = [tool, "-details", "-json", "link", "show", channel]
+    with suppress(OSError, ValueError, KeyError, IndexError, TypeError, subprocess.SubprocessError):
+        answer = subprocess.run(command, capture_output=True, timeout=TOOL_S, check=True)
+        details = json.loads(answer.stdout)[0]["linkinfo"]["info_data"]
+        return details if isinstance(details, dict) else {}
+    return {}
+
+
+def _controller(place: str, bus: CanBus, details: Mapping[str, Any]) -> Iterator[Trouble]:
+    """What the adapter's controller says of itself; a virtual interface has none."""
+    bitrate = details.get("bittiming", {}).get("bitrate")
+    if bitrate and bitrate != bus.bitrate:
+        what = f"{bus.channel} runs at {bitrate} bit/s where the config has {bus.bitrate}"
+        mend = f"correct [{place}] bitrate, or: sudo ip link set {bus.channel} down, then {_bring_up(bus)}"
+        yield Trouble("BitrateDiffers", place, what, "nodes of another bit rate disturb each other's frames", mend)
+    if (state := str(details.get("state"))) in BAD_STATES:
+        what, means = BAD_STATES[state]
+        mend = f"check plugs, wiring, the two terminating resistors and the bit rate, then: {_bring_up(bus)}"
+        yield Trouble("BusOff" if state == "BUS-OFF" else "BusPassive", place, f"{bus.channel} {what}", means, mend)
+    if details.get("restart_ms") == 0:
+        what = f"{bus.channel} does not come back by itself after a bus-off"
+        means = "one disturbance ends all listening until somebody starts it again"
+        yield Trouble("NoRestart", place, what, means, _bring_up(bus), grave=False)
+
+
+def _receive_buffer(place: str) -> Iterator[Trouble]:
+    with suppress(OSError, ValueError):
+        largest = int(LARGEST_RECEIVE_BUFFER.read_text())
+        if largest < ENOUGH_BUFFER_BYTES:
+            what = f"the kernel's receive buffers are at most {largest} bytes"
+            means = "a busy computer loses frames, and windows are refused for that"
+            mend = f"sudo sysctl -w net.core.rmem_max={8 * ENOUGH_BUFFER_BYTES}"
+            yield Trouble("SmallBuffer", place, what, means, mend, grave=False)
+
+
+def examine_clock(newest_record_s: float | None) -> Iterator[Trouble]:
+    """Compare the PC's clock with the program's age and with the newest record (s since 1970) of the history."""
+    now_s, shown = time.time(), time.strftime("%Y-%m-%d %H:%M", time.gmtime())
+    means = "what is recorded now would stand in the wrong place of the history"
+    mend = "set the clock, or let it be set: sudo timedatectl set-ntp true"
+    if now_s < RELEASED_S:
+        yield Trouble("ClockNotSet", "clock", f"it is {shown} UTC by this PC, which cannot be", means, mend)
+    elif newest_record_s is not None and newest_record_s > now_s + 60.0:
+        ahead = (newest_record_s - now_s) / 3600.0
+        what = f"it is {shown} UTC by this PC, and the newest record is from {ahead:.1f} h later"
+        yield Trouble("ClockBehind", "clock", what, means, mend)
+
+
+def examine_processors() -> Iterator[Trouble]:
+    """Tell whether others use the PC up, or whether it saves power while frames wait."""
+    cores, load = os.cpu_count() or 1, os.getloadavg()[1]
+    if load > 1.5 * cores:
+        what = f"{load:.1f} processes wait for {cores} processors (mean of five minutes)"
+        means = "fits take longer, and at the worst the guard is late and lands every correction"
+        yield Trouble("BusyHost", "processors", what, means, "end what need not run beside a machine", grave=False)
+    with suppress(OSError):
+        if GOVERNOR.read_text().strip() == "powersave":
+            means = "frames are read late after each pause"
+            mend = "sudo cpupower frequency-set -g performance"
+            yield Trouble("PowerSaving", "processors", "they run at their lowest speed", means, mend, grave=False)

@@ -1,0 +1,116 @@
+"""Examines the store and what must be kept secret: folders, rights, free space, history, records, token."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+from fdhil.arming.token import TOKEN_NAME, read_token
+from fdhil.cli.doctor.trouble import Trouble
+from fdhil.commissioning.record import load_record
+from fdhil.commissioning.void import is_void
+from fdhil.config import MachineConfig
+from fdhil.errors import DeviceError, StoreError
+from fdhil.guard.protocol import SOCKET_NAME
+from fdhil.store.history import History
+
+LEAST_FREE_BYTES = 256 << 20
+WINDOW_BYTES = 100_000  # of one recorded rapid, about
+LONGEST_SOCKET_PATH = 107  # sun_path without its closing zero
+RECORD_BAD = "RecordBad"
+COMMISSION = "run `fdhil commission`"
+
+
+def examine_store(config: MachineConfig) -> Iterator[Trouble]:
+    """Tell whether what is recorded can be kept: the folder, its rights, the disk, the history in it."""
+    folder = config.store.directory
+    base = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    means = "nothing that is measured is kept, and nothing can be armed"
+    if not base.is_dir():
+        what, mend = f"{base} is a file where [store] wants a folder", "move it away or correct [store] directory"
+        yield Trouble("StoreNoFolder", "store", what, means, mend)
+        return
+    if not may_write(base):
+        mend = f"give this user ({_user()}) the right to write there, or correct [store] directory"
+        yield Trouble("StoreReadOnly", "store", f"{base} may not be written", means, mend)
+    free = shutil.disk_usage(base).free
+    if free < LEAST_FREE_BYTES:
+        what = f"{free / 1e6:.0f} MB are free on the disk of {base}, which is {free // WINDOW_BYTES} rapids"
+        yield Trouble("DiskFull", "store", what, means, "free space, or lower keep_windows in [store]")
+    yield from _history(folder)
+
+
+def may_write(folder: Path) -> bool:
+    """Return whether this user may make files in a folder."""
+    return os.access(folder, os.W_OK | os.X_OK)
+
+
+def _history(folder: Path) -> Iterator[Trouble]:
+    try:
+        with History.read(folder):
+            pass
+    except StoreError as error:
+        if error.code != "NoHistory":
+            what, _, mend = str(error).partition("; ")
+            yield Trouble(error.code, "store", what, "no parameter of before is known", mend)
+
+
+def newest_record_s(folder: Path) -> float | None:
+    """Return when the newest record of the history was written, in s since 1970; None where nothing tells."""
+    with suppress(StoreError), History.read(folder) as history:
+        notices = [stamp.wall_s for stamp, _ in history.notices(limit=1)]
+        return max([*notices, *(window.stamp.wall_s for window in history.windows(limit=1))], default=None)
+    return None
+
+
+def _user() -> str:
+    return os.environ.get("USER") or str(os.getuid())
+
+
+def examine_secrets(config: MachineConfig) -> Iterator[Trouble]:
+    """Tell whether sockets, token and records are there, and whether only those read them who may."""
+    for folder in dict.fromkeys((config.run_directory, config.guard_directory)):
+        yield from _run_directory(folder)
+    if (config.run_directory / TOKEN_NAME).is_symlink() or (config.run_directory / TOKEN_NAME).exists():
+        try:
+            read_token(config.run_directory)
+        except DeviceError as error:
+            what, _, mend = str(error).partition("; ")
+            yield Trouble("TokenOpen", "token", what, "nothing can be armed", mend)
+    for name, axis in config.axis.items():
+        if axis.correction is not None:
+            yield from _record(config, name)
+
+
+def _run_directory(folder: Path) -> Iterator[Trouble]:
+    path = str((folder / SOCKET_NAME).absolute())
+    if len(os.fsencode(path)) > LONGEST_SOCKET_PATH:
+        what = f"{path} is too long a name for a socket ({len(path)} letters, {LONGEST_SOCKET_PATH} are possible)"
+        mend = "give [store] run_directory a shorter one, such as /run/fdhil"
+        yield Trouble("SocketPathLong", "sockets", what, "neither daemon nor guard can be asked", mend)
+    with suppress(OSError):
+        mode = stat.S_IMODE(folder.stat().st_mode)
+        if mode & 0o002:
+            what = f"{folder} has mode {mode:04o}: anybody may put a socket of his own there"
+            yield Trouble("RunDirectoryOpen", "sockets", what, "commands may reach another than fdhil", "chmod 0700 it")
+
+
+def _record(config: MachineConfig, axis: str) -> Iterator[Trouble]:
+    place, means = f"axis {axis}", "nothing can be armed there"
+    directory = config.store.directory
+    try:
+        record = load_record(directory, axis, config.store.commissioning_key, may_lack_key=True)
+    except StoreError as error:
+        what, _, mend = str(error).partition("; ")
+        yield Trouble(RECORD_BAD, place, what, means, mend)
+        return
+    if record is None:
+        mend = f"{COMMISSION} with the NC off and the axis free to move"
+        yield Trouble("NotCommissioned", place, "it has [correction], and was not commissioned", means, mend, False)
+    elif is_void(directory, axis):
+        what = "something was seen that speaks against its commissioning record"
+        yield Trouble("RecordVoid", place, what, means, "run `fdhil check` with the NC off: it compares the drive")

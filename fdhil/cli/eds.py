@@ -1,0 +1,154 @@
+"""``fdhil eds``: what fdhil can and cannot do with a drive, by its maker's EDS or DCF file."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fdhil import tables
+from fdhil.errors import ConfigError, ConfigFault
+
+if TYPE_CHECKING:
+    from fdhil.drivers.cia402.abilities import Ability
+    from fdhil.drivers.cia402.device import Device, DeviceObject
+    from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
+
+SCHEMA = "fdhil-eds-1"
+COLOURS = {"yes": "green", "perhaps": "yellow", "no": "red"}
+CANDIDATES = {"voltage": "a motor voltage or duty", "dc_link": "the DC link", "current": "a current"}
+MOST_NAMED = 6
+
+
+@click.command()
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("--profile", "name", help="Judge by this profile, a packaged name or a TOML file; left out: its maker's.")
+@click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
+def eds(file: Path, name: str | None, as_json: bool) -> int:
+    """Tell from FILE, an EDS or DCF, what fdhil can and cannot do with this drive, and why.
+
+    Suggests a profile by the maker, and the PDOs to set up; names the objects that may be a motor voltage, a DC link or
+    a current. Nothing is sent. An EDS is what the maker says: the drive itself may differ. Exit codes: 0 it can be
+    listened to, 1 it cannot, 2 wrong option or profile, 3 the file cannot be read.
+    """
+    from fdhil.drivers.cia402.abilities import abilities, named_alike, suggest_profile  # late: --help imports nothing
+    from fdhil.drivers.cia402.device import read_device
+    from fdhil.drivers.cia402.profile_file import read_profile
+
+    if name is not None and name not in tables.DRIVE_PROFILES and not name.endswith(".toml"):
+        near = difflib.get_close_matches(name, tables.DRIVE_PROFILES, n=1)
+        advice = f"one of {', '.join(tables.DRIVE_PROFILES)}, or a TOML file"
+        fault = ConfigFault("--profile", f"there is no {name[:60]!r}", f"did you mean {near[0]!r}?" if near else advice)
+        raise ConfigError("fdhil eds", [fault])
+    device = read_device(file)
+    suggested = suggest_profile(device)
+    profile = read_profile(name or suggested, file)
+    found = abilities(device, profile)
+    alike = {what: named_alike(device, what) for what in ("voltage", "dc_link", "current")}
+    if as_json:
+        click.echo(json.dumps(_document(device, profile, suggested, found, alike)))
+    else:
+        _show(device, profile, suggested, found, alike)
+    return int(any(ability.what == "listen" and ability.answer == "no" for ability in found))
+
+
+def _document(
+    device: Device,
+    profile: DriveProfile,
+    suggested: str,
+    found: Sequence[Ability],
+    alike: Mapping[str, Sequence[DeviceObject]],
+) -> dict[str, Any]:
+    return {
+        "schema": SCHEMA,
+        "file": device.file,
+        "device": {
+            "vendor": device.vendor_name,
+            "product": device.product_name,
+            "vendor_id": device.vendor_id,
+            "product_code": device.product_code,
+            "is_drive": device.is_drive,
+            "axes": list(device.axes),
+            "objects": len(device.objects),
+            "rpdos": len(device.rpdos),
+            "tpdos": len(device.tpdos),
+        },
+        "profile": profile.name,
+        "suggested_profile": suggested,
+        "notes": list(profile.notes),
+        "abilities": [asdict(ability) for ability in found],
+        "named_alike": {what: [_object(at) for at in objects] for what, objects in alike.items()},
+        "pdos": [_pdo(spec) for spec in (*profile.rpdos, *profile.tpdos)],
+    }
+
+
+def _object(at: DeviceObject) -> dict[str, Any]:
+    in_tpdo = "yes" if at.in_tpdo else "perhaps" if at.perhaps_in_tpdo else "no"
+    said = {"index": at.key[0], "sub": at.key[1], "name": at.name, "bits": at.bits, "signed": at.signed}
+    return said | {"access": at.access, "in_tpdo": in_tpdo}
+
+
+def _pdo(spec: PdoSpec) -> dict[str, Any]:
+    entries = [[e.index, e.sub, e.bits, e.signed] for e in spec.entries]
+    return {
+        "name": spec.name,
+        "cob_base": spec.cob_base,
+        "every_sync": spec.every_sync,
+        "valid": spec.valid,
+        "entries": entries,
+    }
+
+
+def _show(
+    device: Device,
+    profile: DriveProfile,
+    suggested: str,
+    found: Sequence[Ability],
+    alike: Mapping[str, Sequence[DeviceObject]],
+) -> None:
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    from fdhil.cli.status_view import open_console
+
+    out = open_console()
+    who = " ".join(filter(None, (device.vendor_name, device.product_name))) or "unnamed"
+    out.print(Text(f"{device.file}: {who}, vendor {device.vendor_id:08X}, product {device.product_code:08X}"))
+    if len(device.axes) > 1:
+        others = ", ".join(map(str, device.axes[1:]))
+        out.print(Text(f"it has axes {others} besides: set drive.logical_axis for these"), soft_wrap=True)
+    by = "suggested" if profile.name == suggested else f"{suggested} is suggested"
+    title = f" ({profile.title})" if profile.title else ""
+    out.print(Text(f"judged by profile {profile.name}{title}; {by}"), soft_wrap=True)
+    table = Table("", "", "why", box=box.SIMPLE_HEAD, pad_edge=False)
+    for ability in found:
+        why = f"{ability.why}; {ability.advice}" if ability.advice else ability.why
+        table.add_row(Text(ability.what), Text(ability.answer, COLOURS[ability.answer]), Text(why))
+    out.print(table)
+    for what, objects in alike.items():
+        if objects:
+            out.print(Text(f"by its name may be {CANDIDATES[what]}: {_named(objects)}"), soft_wrap=True)
+    for note in profile.notes if device.is_drive else ():
+        out.print(Text(f"note: {note}"), soft_wrap=True)
+    _show_pdos(out, profile if device.is_drive else None)
+
+
+def _named(objects: Sequence[DeviceObject]) -> str:
+    listed = [f"{at.key[0]:04X}:{at.key[1]:02X} {at.name}{'' if at.in_tpdo else ' (SDO)'}" for at in objects]
+    more = f" and {len(listed) - MOST_NAMED} more" if len(listed) > MOST_NAMED else ""
+    return "; ".join(listed[:MOST_NAMED]) + more
+
+
+def _show_pdos(out: Any, profile: DriveProfile | None) -> None:
+    from rich.text import Text
+
+    for spec in (*profile.rpdos, *profile.tpdos) if profile else ():
+        entries = ", ".join(f"{e.index:04X}:{e.sub:02X}/{e.bits}" for e in spec.entries)
+        every = f"every {spec.every_sync} SYNC" if spec.valid else "not valid"
+        out.print(Text(f"{spec.name} {spec.cob_base:03X}+node, {every}: {entries}"), soft_wrap=True)

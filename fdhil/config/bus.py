@@ -1,0 +1,65 @@
+"""[bus.NAME]: a CAN bus and the way onto it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from fdhil.config.section import Finite, Section
+
+Whole = Annotated[int, Field(ge=-1_000_000_000, le=1_000_000_000)]
+OWN_WAYS = frozenset({"socketcan", "socketcand", "virtual"})
+
+
+class CanBus(Section):
+    """[bus.NAME]: a CAN bus."""
+
+    interface: Literal[
+        "socketcan",
+        "socketcand",
+        "virtual",
+        "slcan",
+        "pcan",
+        "kvaser",
+        "gs_usb",
+        "ixxat",
+        "vector",
+        "seeedstudio",
+        "serial",
+        "robotell",
+        "canalystii",
+        "cantact",
+        "neovi",
+        "systec",
+        "usb2can",
+    ] = Field(
+        "socketcand",
+        description="socketcand is a hub, virtual one process; from slcan on: python-can, for listening only",
+    )
+    channel: str = Field(
+        "can0",
+        description="socketcan: the network interface; socketcand: the bus behind the hub; else python-can's channel",
+    )
+    host: str = Field("127.0.0.1", description="socketcand: address of the hub")
+    port: int = Field(0, ge=0, le=65535, description="socketcand: TCP port of the hub; 0 lets the simulator choose one")
+    bitrate: int = Field(
+        1_000_000, ge=10_000, le=1_000_000, description="bit/s, for the bus load; an adapter of python-can is set to it"
+    )
+    frames: Literal["all", "drives"] = Field(
+        "all",
+        description="drives: SYNC, NMT and the drives' frames alone are taken; bus load and black box lack others",
+    )
+    listen_only: bool = Field(
+        True,
+        description="python-can: acknowledge nothing, so that a wrong bit rate disturbs nobody, where it can be told",
+    )
+    options: Mapping[str, bool | Whole | Finite | str] = Field(
+        {}, description="python-can: what its interface takes besides, e.g. { tty_baudrate = 3000000 }"
+    )
+
+    @property
+    def may_send(self) -> bool:
+        """Whether fdhil can send here: an adapter of python-can is listened to, and no more."""
+        return self.interface in OWN_WAYS

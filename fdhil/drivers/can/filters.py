@@ -1,0 +1,23 @@
+"""Says which frames of a bus are needed, as filters for the kernel or an adapter."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from fdhil.drivers.can.frames import EXTENDED_FLAG
+from fdhil.drivers.can.port import Filter
+
+_NODE = 0x07F
+_COB_ID = 0x7FF
+
+
+def drive_filters(node_ids: Iterable[int], cob_ids: Iterable[int]) -> list[Filter]:
+    """Return filters for NMT, SYNC and TIME, for all that the predefined connection set gives these nodes, SDO and
+    EMCY included (a black box without them would tell little), and for ``cob_ids`` besides.
+
+    >>> [(hex(wanted), hex(mask)) for wanted, mask in drive_filters([5], [0x185, 0x33])]
+    [('0x0', '0x8000007f'), ('0x5', '0x8000007f'), ('0x33', '0x800007ff')]
+    """
+    nodes = sorted({0, *node_ids})
+    others = sorted({cob_id for cob_id in cob_ids if cob_id & _NODE not in nodes})
+    return [(node, EXTENDED_FLAG | _NODE) for node in nodes] + [(i, EXTENDED_FLAG | _COB_ID) for i in others]

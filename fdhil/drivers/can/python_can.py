@@ -1,0 +1,134 @@
+"""Listens through python-can: to adapters that have no SocketCAN driver, and to the bus inside one process."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import can
+
+from fdhil import config
+from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, FrameRing
+from fdhil.drivers.can.host_clock import DistantClock, WallClock, monotonic_ns
+from fdhil.drivers.can.port import BusEnded, Filter, Stamps
+from fdhil.errors import ConnectError
+
+FRAMES_PER_TURN = 4096
+CLOCK_WINDOW_S = 2.0
+# what an interface of the library raises without its driver, its Python package, its device or the right options
+_CANNOT_OPEN = (can.CanError, OSError, ImportError, ValueError, TypeError, NameError, AttributeError)
+_BROKEN = (can.CanError, OSError, ValueError, LookupError)
+# how an interface is told to acknowledge nothing; one that is not listed cannot be told
+LISTEN_ONLY: Mapping[str, Mapping[str, Any]] = {
+    "slcan": {"listen_only": True},
+    "pcan": {"state": can.BusState.PASSIVE},
+    "kvaser": {"driver_mode": False},
+    "vector": {"listen_only": True},
+    "seeedstudio": {"operation_mode": "silent"},
+    "cantact": {"monitor": True},
+    "systec": {"state": can.BusState.PASSIVE},
+}
+# the library stamps their frames itself, when it reads them
+_WITHOUT_CLOCK = ("slcan", "robotell", "seeedstudio")
+
+# what the library logs when it looks for drivers is no news of ours: a port that cannot be opened says why
+logging.getLogger("can").addHandler(logging.NullHandler())
+
+
+class PythonCanPort:
+    """An adapter that python-can opens, for listening.
+
+    The stamps are those of the adapter's own clock, of unknown beginning, brought onto the host's by the quickest
+    frames; or the library's own, taken when a frame was read. What the adapter or its driver lost nobody counts.
+    """
+
+    holds_back = False
+    kernel_drops = 0
+
+    def __init__(self, name: str, settings: config.CanBus, filters: Sequence[Filter] = ()) -> None:
+        self._what = f"the {settings.interface} adapter {settings.channel}"
+        self.stamps: Stamps = "host" if settings.interface in _WITHOUT_CLOCK else "adapter"
+        self._clock = DistantClock(CLOCK_WINDOW_S)
+        try:
+            self._bus = can.Bus(**arguments(settings), can_filters=_library_filters(filters), ignore_config=True)
+        except _CANNOT_OPEN as error:
+            advice = "plug it in, install its driver and its Python package, or use SocketCAN"
+            raise ConnectError(name, f"{self._what} cannot be opened ({_one_line(error)}); {advice}") from None
+
+    def receive(self, ring: FrameRing, timeout_s: float) -> None:
+        """Append one frame, and all others that wait."""
+        wait: float = timeout_s
+        for _ in range(FRAMES_PER_TURN):
+            try:
+                message = self._bus.recv(wait)
+            except _BROKEN as error:
+                raise BusEnded(f"{self._what} is gone, or sent what is no frame ({_one_line(error)})") from None
+            if message is None:
+                return
+            now_ns, stamp_ns = time.monotonic_ns(), round(message.timestamp * 1e9)
+            append(ring, message, min(now_ns, stamp_ns - self._clock.ahead_ns(stamp_ns, now_ns)))
+            wait = 0.0
+
+    def close(self) -> None:
+        """Give the adapter back; one that is gone cannot be told so."""
+        try:
+            self._bus.shutdown()
+        except _BROKEN:
+            return
+
+
+def arguments(settings: config.CanBus) -> dict[str, Any]:
+    """Return what python-can is asked for; ``options`` of the config come last."""
+    channel: str | int = int(settings.channel) if settings.channel.isdecimal() else settings.channel
+    quiet = LISTEN_ONLY.get(settings.interface, {}) if settings.listen_only else {}
+    asked = {"interface": settings.interface, "channel": channel, "bitrate": settings.bitrate}
+    return asked | dict(quiet) | dict(settings.options)
+
+
+def append(ring: FrameRing, message: can.Message, stamp_ns: int) -> None:
+    """Put a message of the library into the ring."""
+    can_id = message.arbitration_id | (EXTENDED_FLAG if message.is_extended_id else 0)
+    can_id |= (ERROR_FLAG if message.is_error_frame else 0) | (REMOTE_FLAG if message.is_remote_frame else 0)
+    ring.append(stamp_ns, can_id, bytes(message.data[:8]))
+
+
+def _library_filters(filters: Sequence[Filter]) -> list[dict[str, Any]] | None:
+    plain = EXTENDED_FLAG | REMOTE_FLAG
+    return [{"can_id": i & ~plain, "can_mask": m & ~plain, "extended": False} for i, m in filters] or None
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
+
+
+class VirtualPort:
+    """python-can's bus inside one process; the sender's stamps are the wall clock's."""
+
+    stamps: Stamps = "sender"
+    holds_back = False
+    kernel_drops = 0
+
+    def __init__(self, name: str, settings: config.CanBus, _filters: Sequence[Filter] = ()) -> None:
+        self._name = name
+        self._wall_clock = WallClock()
+        try:
+            self._bus = can.Bus(interface="virtual", channel=settings.channel)
+        except can.CanError as error:
+            raise ConnectError(name, f"the virtual bus {settings.channel} cannot be opened ({error})") from None
+
+    def receive(self, ring: FrameRing, timeout_s: float) -> None:
+        """Append one frame, and all others that wait; the stamps become monotonic ones."""
+        wait: float = timeout_s
+        wall_ahead_ns = self._wall_clock.ahead_ns()
+        for _ in range(FRAMES_PER_TURN):
+            message = self._bus.recv(wait)
+            if message is None:
+                return
+            append(ring, message, monotonic_ns(int(message.timestamp * 1e9), wall_ahead_ns))
+            wait = 0.0
+
+    def close(self) -> None:
+        """Leave the channel."""
+        self._bus.shutdown()

@@ -1,0 +1,169 @@
+"""Says what an EDS or DCF file offers, as plain records: the device's identity, its objects and its PDOs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fdhil.cia402 import LOGICAL_AXES, LOGICAL_AXIS_STEP, Object
+from fdhil.drivers.cia402.profile import ObjectKey
+
+MOST_PDOS = 512
+DRIVE = 402
+_NODE = 1  # resolves $NODEID; taken off again
+# data types of CiA 301, 7.4.7.1: bits and whether signed; what is no integer cannot be decoded from a PDO
+_INTEGERS: Mapping[int, tuple[int, bool]] = {
+    0x01: (1, False), 0x02: (8, True), 0x03: (16, True), 0x04: (32, True), 0x05: (8, False), 0x06: (16, False),
+    0x07: (32, False), 0x10: (24, True), 0x12: (40, True), 0x13: (48, True), 0x14: (56, True), 0x15: (64, True),
+    0x16: (24, False), 0x18: (40, False), 0x19: (48, False), 0x1A: (56, False), 0x1B: (64, False),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceObject:
+    """One variable of the dictionary; ``bits`` 0: it is no integer. ``default`` None: the file gives none."""
+
+    key: ObjectKey
+    name: str
+    bits: int
+    signed: bool
+    access: str
+    mappable: bool
+    default: int | None
+
+    @property
+    def in_rpdo(self) -> bool:
+        """Whether an RPDO can carry it (CiA 306: rww, or rw)."""
+        return self.mappable and self.bits > 0 and self.access in ("rw", "wo", "rww")
+
+    @property
+    def in_tpdo(self) -> bool:
+        """Whether a TPDO can carry it (CiA 306: ro, rwr, or rw)."""
+        return self.mappable and self.bits > 0 and self.access in ("ro", "rw", "rwr", "const")
+
+    @property
+    def perhaps_in_tpdo(self) -> bool:
+        """Whether a TPDO might carry it: many drives take more than the ``rww`` of their file says."""
+        return self.mappable and self.bits > 0 and self.access == "rww"
+
+
+@dataclass(frozen=True, slots=True)
+class PdoPlace:
+    """One PDO of the device: its number, default COB-ID less the node-ID, and how many objects it can map.
+
+    ``mapped`` are the default mapping words; ``fixed``: they cannot be written. ``cob_base`` None: the file gives none.
+    """
+
+    number: int
+    cob_base: int | None
+    valid: bool
+    kind: int | None
+    room: int
+    mapped: tuple[int, ...]
+    fixed: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Device:
+    """What a file says of its device; numbers are 0 where it does not say them."""
+
+    file: str
+    vendor_name: str
+    product_name: str
+    vendor_id: int
+    product_code: int
+    objects: Mapping[ObjectKey, DeviceObject]
+    rpdos: tuple[PdoPlace, ...]
+    tpdos: tuple[PdoPlace, ...]
+
+    def find(self, key: ObjectKey) -> DeviceObject | None:
+        """Return an object, None where the device has none."""
+        return self.objects.get(key)
+
+    def default(self, index: int, sub: int = 0) -> int | None:
+        """Return an object's default value, None where the device or the file has none."""
+        found = self.find((index, sub))
+        return None if found is None else found.default
+
+    def entry(self, key: ObjectKey) -> tuple[int, int, int, bool] | None:
+        """Return an object as a mapping entry; None where it is none."""
+        found = self.find(key)
+        return None if found is None or not found.bits else (*key, found.bits, found.signed)
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """The logical axes of CiA 402 that it has a controlword for: its objects lie 0x800 higher for each."""
+        words = {axis: (Object.CONTROLWORD + (axis - 1) * LOGICAL_AXIS_STEP, 0) for axis in LOGICAL_AXES}
+        return tuple(axis for axis, key in words.items() if key in self.objects)
+
+    @property
+    def is_drive(self) -> bool:
+        """Whether it is a CiA 402 drive: by its device type, else by its control- and statusword."""
+        kind = self.default(Object.DEVICE_TYPE)
+        words = self.find((Object.CONTROLWORD, 0)) is not None and self.find((Object.STATUSWORD, 0)) is not None
+        return words and (not kind or kind & 0xFFFF == DRIVE)
+
+
+def read_device(path: Path) -> Device:
+    """Read an EDS or DCF file; EdsError when it cannot be read. A DCF's values count as its defaults."""
+    from fdhil.drivers.cia402.eds import load_eds  # late: most profiles need no EDS, and its library loads slowly
+
+    dictionary = load_eds(path, _NODE)
+    told = dictionary.device_information
+    objects = {found.key: found for found in _objects(dictionary)}
+    identity = [objects.get((int(Object.IDENTITY), sub)) for sub in (1, 2)]
+    vendor, product = (0 if found is None else found.default or 0 for found in identity)
+    return Device(
+        file=path.name,
+        vendor_name=str(told.vendor_name or ""),
+        product_name=str(told.product_name or ""),
+        vendor_id=int(told.vendor_number or 0) or vendor,
+        product_code=int(told.product_number or 0) or product,
+        objects=objects,
+        rpdos=_pdos(objects, Object.RPDO_PARAMETER, Object.RPDO_MAPPING),
+        tpdos=_pdos(objects, Object.TPDO_PARAMETER, Object.TPDO_MAPPING),
+    )
+
+
+def _objects(dictionary: Any) -> Iterable[DeviceObject]:
+    for index in dictionary:
+        entry = dictionary[index]
+        for sub, variable in getattr(entry, "subindices", {0: entry}).items():
+            bits, signed = _INTEGERS.get(variable.data_type, (0, False))
+            value = variable.default if variable.value is None else variable.value
+            yield DeviceObject(
+                key=(index, sub),
+                name=entry.name if entry.name == variable.name else f"{entry.name}: {variable.name}",
+                bits=bits,
+                signed=signed,
+                access=str(variable.access_type).lower(),
+                mappable=bool(variable.pdo_mappable),
+                default=value if isinstance(value, int) else None,
+            )
+
+
+def _pdos(objects: Mapping[ObjectKey, DeviceObject], parameter: int, mapping: int) -> tuple[PdoPlace, ...]:
+    found = []
+    for place in range(MOST_PDOS):
+        cob, kind = (objects.get((parameter + place, sub)) for sub in (1, 2))
+        slots = [objects[mapping + place, sub] for sub in range(1, 65) if (mapping + place, sub) in objects]
+        if cob is None:
+            continue
+        count = objects.get((mapping + place, 0))
+        words = [slot.default or 0 for slot in slots]
+        mapped = words[: len(words) if count is None or count.default is None else count.default]
+        number = None if cob.default is None else cob.default & 0x7FF
+        found.append(
+            PdoPlace(
+                number=place + 1,
+                cob_base=number - _NODE if number else None,
+                valid=cob.default is None or not cob.default >> 31 & 1,
+                kind=None if kind is None else kind.default,
+                room=len(slots),
+                mapped=tuple(word for word in mapped if word),
+                fixed=bool(slots) and all(slot.access in ("ro", "const") for slot in slots),
+            )
+        )
+    return tuple(found)

@@ -1,0 +1,103 @@
+"""Suggests PDOs for a device by its EDS: what must be heard with every SYNC, what now and then, what is sent.
+
+The PDOs lie as the packaged profiles have them: position and speed first, then statusword, current and voltage; demand
+and offset in a slower one. Where the device's mapping is fixed, its own is taken as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+from fdhil.cia402 import COB_RPDO, COB_TPDO, Object, lay_out
+from fdhil.drivers.cia402.device import Device, PdoPlace
+from fdhil.drivers.cia402.profile import ObjectKey, PdoSpec
+
+SLOW_EVERY = 10
+MAX_BITS = 64
+Entry = tuple[int, int, int, bool]
+
+
+def suggest_rpdos(device: Device, target: ObjectKey, offset: ObjectKey, fed: Sequence[ObjectKey]) -> list[PdoSpec]:
+    """Return RPDOs: controlword and target, the offset in one of its own, speed and torque offset not exchanged."""
+    groups = [[(int(Object.CONTROLWORD), 0), target], [offset], list(fed)]
+    places = list(device.rpdos)
+    found: list[PdoSpec] = []
+    for keys in groups:
+        entries = [device.entry(key) for key in keys if _sent(device, key)]
+        whole = [entry for entry in entries if entry is not None]
+        if len(whole) < len(keys) or not places:
+            continue
+        place = places.pop(0)
+        spec = _fixed(device, place, "RPDO", COB_RPDO) if place.fixed else _spec(place, "RPDO", COB_RPDO, whole)
+        if spec is not None:
+            found.append(spec if keys is not groups[2] else _not_exchanged(spec))
+    return found
+
+
+def suggest_tpdos(device: Device, fast: Iterable[ObjectKey], slow: Iterable[ObjectKey]) -> list[PdoSpec]:
+    """Return TPDOs that carry ``fast`` with every SYNC and ``slow`` now and then, as far as there is room."""
+    if device.tpdos and all(place.fixed for place in device.tpdos):
+        kept = [_fixed(device, place, "TPDO", COB_TPDO) for place in device.tpdos]
+        return [spec for spec in kept if spec is not None]
+    free = [place for place in device.tpdos if not place.fixed]
+    filled: list[tuple[PdoPlace, list[Entry], int]] = []
+    for every, keys in ((1, fast), (SLOW_EVERY, slow)):
+        for entry in filter(None, (device.entry(key) for key in keys if _heard(device, key))):
+            mine = [pdo for pdo in filled if pdo[2] == every and _fits(pdo, entry)]
+            if not mine and free:
+                filled.append((free.pop(0), [], every))
+                mine = [filled[-1]]
+            for _, entries, _ in (mine or [pdo for pdo in filled if _fits(pdo, entry)])[:1]:
+                entries.append(entry)
+    return [_spec(place, "TPDO", COB_TPDO, entries, every) for place, entries, every in filled]
+
+
+def offered(device: Device, pdos: Sequence[PdoSpec], *, sent: bool) -> list[PdoSpec]:
+    """Return a profile's PDOs with what the device has of them, in the device's sizes; an empty one is left out."""
+    found = []
+    for spec in pdos:
+        keys = [(entry.index, entry.sub) for entry in spec.entries]
+        kept = [device.entry(key) for key in keys if (_sent if sent else _heard)(device, key)]
+        entries = lay_out([entry for entry in kept if entry is not None])
+        if entries and any(place.number == spec.number for place in (device.rpdos if sent else device.tpdos)):
+            found.append(replace(spec, entries=entries))
+    return found
+
+
+def _fits(pdo: tuple[PdoPlace, list[Entry], int], entry: Entry) -> bool:
+    place, entries, _ = pdo
+    return len(entries) < place.room and sum(e[2] for e in entries) + entry[2] <= MAX_BITS
+
+
+def _sent(device: Device, key: ObjectKey) -> bool:
+    found = device.find(key)
+    return found is not None and found.in_rpdo
+
+
+def _heard(device: Device, key: ObjectKey) -> bool:
+    found = device.find(key)
+    return found is not None and (found.in_tpdo or found.perhaps_in_tpdo)
+
+
+def _not_exchanged(spec: PdoSpec) -> PdoSpec:
+    return replace(spec, valid=False)
+
+
+def _spec(place: PdoPlace, kind: str, bases: Sequence[int], entries: Sequence[Entry], every: int = 1) -> PdoSpec:
+    return PdoSpec(f"{kind}{place.number}", place.number, _cob_base(place, bases), lay_out(entries), every)
+
+
+def _cob_base(place: PdoPlace, bases: Sequence[int]) -> int:
+    """The default of CiA 301 for the first four, else the device's own."""
+    return bases[place.number - 1] if place.number <= len(bases) else place.cob_base or bases[-1]
+
+
+def _fixed(device: Device, place: PdoPlace, kind: str, bases: Sequence[int]) -> PdoSpec | None:
+    """The device's own mapping; None where a word of it is no object of the device's."""
+    entries = [device.entry((word >> 16, word >> 8 & 0xFF)) for word in place.mapped]
+    whole = [entry for entry in entries if entry is not None]
+    if not whole or len(whole) < len(entries) or sum(entry[2] for entry in whole) > MAX_BITS:
+        return None
+    base = place.cob_base or _cob_base(place, bases)
+    return PdoSpec(f"{kind}{place.number}", place.number, base, lay_out(whole), place.kind or 1, place.valid)

@@ -1,0 +1,46 @@
+"""Watches for TPDOs that never come though SYNC runs: they are told by name, and are not lost frames. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+
+from fdhil.cia402 import Nmt
+from fdhil.drivers.can.sync_grid import Ticked
+from fdhil.drivers.cia402.profile import PdoSpec
+from fdhil.records import Notice
+
+PATIENCE_S = 10.0  # of SYNC: an NC may run it for a while before it starts its drives
+
+
+class PdoWatch:
+    """Watches the TPDOs of one drive; ``needed`` are the names of those without which it has no samples."""
+
+    def __init__(
+        self, axis: str, node_id: int, tpdos: Collection[PdoSpec], needed: Collection[str], period_s: float
+    ) -> None:
+        self._axis, self._node_id, self._needed = axis, node_id, needed
+        self._missing = {spec.cob_base + node_id: spec.name for spec in tpdos if spec.valid}
+        self._patience = round(PATIENCE_S / period_s)
+        self._told = False
+
+    def feed(self, ticked: Ticked, nmt: Nmt | None) -> list[Notice]:
+        """Take a block of frames and the drive's NMT state, None while it is not known."""
+        if not self._missing:
+            return []
+        for can_id in np.intersect1d(ticked.can_id, list(self._missing)).tolist():
+            del self._missing[can_id]
+        if self._told and not self._missing:
+            return [Notice("PdoMissing", "info", f"Drive {self._axis} sends all its TPDOs now.", self._axis)]
+        if self._told or not self._missing or ticked.last_tick < self._patience:
+            return []
+        self._told = True
+        names = ", ".join(f"{name} ({can_id:03X})" for can_id, name in self._missing.items())
+        if nmt in (None, Nmt.OPERATIONAL):
+            advice = "compare its mapping, COB-IDs and transmission types by fdhil check"
+        else:
+            advice = f"its NMT state is {nmt.name.lower().replace('_', '-')}: let the NC start it"
+        text = f"Drive {self._axis} (node-ID {self._node_id}) never sent {names} though SYNC runs; {advice}."
+        serious = any(name in self._needed for name in self._missing.values())
+        return [Notice("PdoMissing", "MAJOR" if serious else "minor", text, self._axis)]

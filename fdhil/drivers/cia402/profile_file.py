@@ -1,0 +1,224 @@
+"""Reads drive profiles: packaged ones by name, the user's own from a TOML file, the generic one from an EDS.
+
+A file may begin with ``base = "epos4"``: what it does not say is then that profile's. A table or list that it gives
+(``rpdos``, ``tpdos``) takes the place of the other's as a whole.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from pydantic import TypeAdapter, ValidationError
+
+from fdhil import tables
+from fdhil.cia402 import LOGICAL_AXIS_STEP, Object, lay_out
+from fdhil.config import Drive
+from fdhil.drivers.cia402.device import read_device
+from fdhil.drivers.cia402.mapping import offered, suggest_rpdos, suggest_tpdos
+from fdhil.drivers.cia402.profile import LOGICAL_AXIS_PDOS, DriveProfile, ObjectKey, PdoSpec, speed_unit_of
+from fdhil.errors import ConfigError, ConfigFault
+
+MAX_PROFILE_BYTES = 64 * 1024
+MOST_BASES = 8
+NO_OFFSET_ADVICE = "let the NC play the corrected demand of `fdhil correct --out`; this axis needs no commissioning"
+_PDO_KEYS = frozenset({"name", "cob_base", "entries", "every_sync", "valid"})
+_KINDS: Mapping[str, TypeAdapter[Any]] = {
+    name: TypeAdapter(hint) for name, hint in get_type_hints(DriveProfile).items() if name not in ("rpdos", "tpdos")
+}
+
+
+def load_profile(drive: Drive) -> DriveProfile:
+    """Return the profile that ``[axis.X.drive]`` names, for that axis of its device.
+
+    ConfigError when its file cannot be read, or says what no profile can, or maps less than must be heard. A process
+    reads a file once: what is changed on disk counts from its next start.
+    """
+    profile = read_profile(drive.profile, drive.eds)
+    if deaf := profile.unheard:
+        what = f"no TPDO of every SYNC carries its {', '.join(deaf)}"
+        raise _fault(
+            profile.name, "tpdos", what, "`fdhil eds` tells what the drive has; base a profile of your own on it"
+        )
+    if drive.logical_axis == profile.logical_axis:
+        return profile
+    if profile.logical_axis != 1:
+        what = f"it is of axis {profile.logical_axis} of its device, the configuration has {drive.logical_axis}"
+        raise _fault(profile.name, "logical_axis", what, "make both the same")
+    return _of_axis(profile, drive.logical_axis)
+
+
+def require_offset(profile: DriveProfile, axis: str) -> None:
+    """ConfigError where the drive takes no offset: what to do instead."""
+    if not profile.takes_offset:
+        raise _fault("config", f"axis.{axis}.drive.profile", no_offset(profile), NO_OFFSET_ADVICE)
+
+
+def no_offset(profile: DriveProfile) -> str:
+    """Return why nothing can be added to the set-points of this drive."""
+    if profile.find_rpdo(profile.offset) is not None and profile.unshown:
+        unseen = ", ".join(f"{index:04X}:{sub:02X}" for index, sub in profile.unshown)
+        return f"profile {profile.name} maps {unseen} into no TPDO, and no offset is sent that cannot be seen"
+    index, sub = profile.offset
+    return f"profile {profile.name} maps no offset ({index:04X}:{sub:02X}) into a valid RPDO: none can be sent"
+
+
+@cache
+def read_profile(name: str, eds: Path | None = None) -> DriveProfile:
+    """Return a packaged or own profile by its name or path, also one that maps too little; ConfigError, EdsError.
+
+    With the drive's EDS it maps what that offers, and no more.
+    """
+    document, title = _document(name), name if name in tables.DRIVE_PROFILES else Path(name).stem
+    if "tpdos" not in document and "rpdos" not in document:
+        return profile_of(_mapped(document, name, eds), title, name)
+    profile = profile_of(document, title, name)
+    if eds is None:
+        return profile
+    device = read_device(eds)
+    rpdos, tpdos = offered(device, profile.rpdos, sent=True), offered(device, profile.tpdos, sent=False)
+    return replace(profile, rpdos=tuple(rpdos), tpdos=tuple(tpdos))
+
+
+def _mapped(document: Mapping[str, Any], name: str, eds: Path | None) -> dict[str, Any]:
+    """Return a profile that names no PDOs with those that its EDS offers; ConfigError without an EDS."""
+    if eds is None:
+        advice = "give drive.eds, the file that the drive's maker has for it"
+        raise _fault(name, "tpdos", "are not in this profile, and there is no EDS to take them from", advice)
+    device = read_device(eds)
+    told: dict[str, Any] = {"vendor_id": device.vendor_id or None}
+    if unit := speed_unit_of(device.default(Object.VELOCITY_UNIT)):
+        told["speed_unit"] = unit
+    if not device.find((0x6078, 0)) and "current" not in document:
+        told |= {"current": (0x6077, 0), "current_unit": "permille_of_rated_torque"}
+    said = told | dict(document)
+    bare = profile_of(said | {"rpdos": (), "tpdos": ()}, name, name)
+    fast = (bare.position, bare.speed, bare.statusword, bare.current, bare.voltage, bare.dc_link)
+    slow = (bare.position_demand, bare.offset, (int(Object.MODE_DISPLAY), 0), bare.digital_inputs)
+    rpdos = suggest_rpdos(device, bare.target, bare.offset, (bare.speed_offset, bare.torque_offset))
+    tpdos = suggest_tpdos(device, [key for key in fast if key is not None], slow)
+    return said | {"rpdos": rpdos, "tpdos": tpdos}
+
+
+def _document(name: str, depth: int = 0) -> dict[str, Any]:
+    """Read the file of a profile, and those it is based on."""
+    if depth > MOST_BASES:
+        raise _fault(name, "base", "its bases have no end", "base it on a packaged profile")
+    document = _toml(name)
+    base = document.pop("base", None)
+    if base is None:
+        return document
+    if not isinstance(base, str) or (base not in tables.DRIVE_PROFILES and not base.endswith(".toml")):
+        raise _fault(name, "base", f"is no profile: {str(base)[:60]!r}", f"one of {', '.join(tables.DRIVE_PROFILES)}")
+    if base.endswith(".toml"):
+        base = str(Path(name).parent / base)
+    return _document(base, depth + 1) | document
+
+
+def _toml(name: str) -> dict[str, Any]:
+    if name in tables.DRIVE_PROFILES:
+        package, _, file = tables.DRIVE_PROFILES[name].partition(":")
+        return tomllib.loads((files(package) / file).read_text("utf-8"))
+    try:
+        with Path(name).open("rb") as file_:
+            raw = file_.read(MAX_PROFILE_BYTES + 1)
+    except OSError as error:
+        advice = "drive.profile is a packaged name, or a path from the configuration's folder"
+        raise _fault(name, "file", f"cannot be read: {error.strerror}", advice) from None
+    if len(raw) > MAX_PROFILE_BYTES:
+        raise _fault(name, "file", f"is larger than {MAX_PROFILE_BYTES >> 10} KiB", "a profile is a few kB")
+    try:
+        return tomllib.loads(raw.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise _fault(name, "file", f"is no TOML: {str(error)[:80]}", "check the line it names") from None
+
+
+def profile_of(document: Mapping[str, Any], name: str, source: str) -> DriveProfile:
+    """Build a profile from the tables of its file; ConfigError with every fault and its place."""
+    faults: list[ConfigFault] = []
+    values: dict[str, Any] = {}
+    known = {field.name for field in fields(DriveProfile)} - {"name"}
+    for key, given in document.items():
+        if key not in known:
+            faults.append(ConfigFault(key, "is no key of a profile", f"one of {', '.join(sorted(known))}"))
+        elif key not in ("rpdos", "tpdos"):
+            try:
+                values[key] = _KINDS[key].validate_python(given)
+            except ValidationError as error:
+                faults.append(ConfigFault(key, error.errors(include_url=False)[0]["msg"]))
+    values |= {kind: _pdos(document.get(kind), kind, faults) for kind in ("rpdos", "tpdos")}
+    if faults:
+        raise ConfigError(source, faults)
+    return DriveProfile(name, **values)
+
+
+def _pdos(given: Any, kind: str, faults: list[ConfigFault]) -> tuple[PdoSpec, ...]:
+    if not isinstance(given, Sequence) or isinstance(given, str):
+        faults.append(ConfigFault(kind, "is missing", f"a table [[{kind}]] for each PDO"))
+        return ()
+    found = []
+    for place, table in enumerate(given, 1):
+        try:
+            found.append(table if isinstance(table, PdoSpec) else _pdo(table))
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            text = f"has no {error}" if isinstance(error, KeyError) else str(error)
+            advice = "name = 'TPDO1', cob_base = 0x180, entries = [[index, sub-index, bits, signed], ...]"
+            faults.append(ConfigFault(f"{kind}.{place}", text, advice))
+    return tuple(found)
+
+
+def _pdo(table: Mapping[str, Any]) -> PdoSpec:
+    """Lay the entries (index, sub-index, bits, signed) out; the PDO's number is the digits at the end of its name."""
+    if unknown := table.keys() - _PDO_KEYS:
+        raise ValueError(f"{', '.join(sorted(unknown))} is no key of a PDO")
+    name = str(table["name"])
+    digits = name.removeprefix(name.rstrip("0123456789"))
+    if not digits or not 1 <= int(digits) <= 512:
+        raise ValueError(f"its name {name[:20]!r} does not end in the number of the PDO")
+    entries = [_entry(each) for each in table["entries"]]
+    every_sync, valid = int(table.get("every_sync", 1)), table.get("valid", True)
+    if not 1 <= every_sync <= 240 or type(valid) is not bool or not 0x180 <= table["cob_base"] <= 0x57F:
+        raise ValueError(
+            "every_sync is not from 1 to 240, valid not true or false, or cob_base not from 0x180 to 0x57F"
+        )
+    return PdoSpec(name, int(digits), int(table["cob_base"]), lay_out(entries), every_sync, valid)
+
+
+def _entry(given: Sequence[Any]) -> tuple[int, int, int, bool]:
+    index, sub, bits, signed = given
+    if not 1 <= index <= 0xFFFF or not 0 <= sub <= 0xFF or not 1 <= bits <= 64 or type(signed) is not bool:
+        raise ValueError(f"{list(given)} is no [index, sub-index, bits, signed]")
+    return int(index), int(sub), int(bits), signed
+
+
+def _of_axis(profile: DriveProfile, number: int) -> DriveProfile:
+    """Return the profile of the ``number``-th axis of one device, made of that of the first.
+
+    Its objects are 0x800 higher (CiA 402-2), its PDOs 64 higher (CiA 402-3), and their COB-IDs those of the node-ID
+    that many higher, which the device must be set to: CiA 301 has no default for them.
+    """
+    places = [field.name for field in fields(profile) if isinstance(getattr(profile, field.name), tuple)]
+    keys = [name for name in places if name not in ("rpdos", "tpdos", "notes", "strict_abort_options")]
+    up = number - 1
+
+    def moved(key: ObjectKey) -> ObjectKey:
+        return key[0] + up * LOGICAL_AXIS_STEP if 0x6000 <= key[0] < 0x6800 else key[0], key[1]
+
+    def pdo(spec: PdoSpec) -> PdoSpec:
+        place = spec.number + up * LOGICAL_AXIS_PDOS
+        entries = tuple(replace(entry, index=moved((entry.index, entry.sub))[0]) for entry in spec.entries)
+        name = f"{spec.name.rstrip('0123456789')}{place}"
+        return replace(spec, name=name, number=place, cob_base=spec.cob_base + up, entries=entries)
+
+    values: dict[str, Any] = {name: moved(getattr(profile, name)) for name in keys}
+    values |= {kind: tuple(map(pdo, getattr(profile, kind))) for kind in ("rpdos", "tpdos")}
+    return replace(profile, logical_axis=number, **values)
+
+
+def _fault(source: str, path: str, what: str, advice: str) -> ConfigError:
+    return ConfigError(source, [ConfigFault(path, what, advice)])

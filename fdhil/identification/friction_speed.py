@@ -1,0 +1,73 @@
+"""Finds the speed at which friction falls off, from the nearest on the grid: Gauss-Newton beside all that is free."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from fdhil.identification.fit import Fit, fit
+from fdhil.identification.kalman import DELAY
+from fdhil.identification.motion import Course, Motion
+from fdhil.identification.normal import inverse_of
+from fdhil.identification.terms import stribeck, stribeck_slope
+from fdhil.records import Float
+
+TURNS = 3
+SPREAD = 0.5  # of the speed: what is known of it beforehand
+ENOUGH = 0.2  # deviations of the speed, by which a step may miss it
+MOST = 1.6  # times: a step beyond the neighbours on the grid is none of a straight line
+
+
+def marginal(result: Fit, courses: Sequence[Sequence[Course]], prior: float) -> tuple[float, float, Float]:
+    """Return step and deviation of an amplitude beside all that is free, and what the latter makes of free entries.
+
+    ``courses`` has one course for each window, ``prior`` is the information about it that the data do not hold.
+    """
+    direction = result.problem.answer(result.theta, courses)[:, 0]
+    shares = inverse_of(result.information)[0] @ (result.jacobian.T @ direction)
+    beyond = direction - result.jacobian @ shares
+    information = float(beyond @ beyond) + prior
+    return float(beyond @ result.residuals) / information, information**-0.5, -(information**-0.5) * shares
+
+
+def place(motions: Sequence[Motion]) -> int | None:
+    """Return where friction at low speed stands among the courses, None where it did not join."""
+    return next((k for k, course in enumerate(motions[0].courses) if course.name == "stribeck"), None)
+
+
+def slope(result: Fit, k: int) -> tuple[list[list[Course]], float]:
+    """Return how that friction changes with its speed in each window, N.m per rad/s, and the prior information."""
+    size, speed = float(result.theta[DELAY + 1 + k]), result.problem.motions[0].courses[k].speed_rad_s
+    made = [stribeck_slope(m, m.courses[k]) for m in result.problem.motions]
+    return [[replace(course, values=course.values * size)] for course in made], (SPREAD * speed) ** -2
+
+
+def sharpened(result: Fit) -> Fit:
+    """Return the fit with friction at low speed at the speed that explains most; itself without such friction."""
+    k = place(result.problem.motions)
+    if k is None:
+        return result
+    for _ in range(TURNS):
+        if not (result.converged and np.isfinite(result.residuals).all()):
+            return result
+        courses, prior = slope(result, k)
+        step, own, _ = marginal(result, courses, prior)
+        if abs(step) < ENOUGH * own:
+            return result
+        speed = result.problem.motions[0].courses[k].speed_rad_s
+        moved = _at(result, k, float(np.clip(speed + step, speed / MOST, speed * MOST)))
+        if not moved.converged:
+            return result
+        result = moved
+    return result
+
+
+def _at(result: Fit, k: int, speed_rad_s: float) -> Fit:
+    """Return the windows fitted with that speed."""
+    motions = []
+    for motion in result.problem.motions:
+        courses = (*motion.courses[:k], stribeck(motion, speed_rad_s), *motion.courses[k + 1 :])
+        motions.append(replace(motion, courses=courses))
+    return replace(fit(motions, result.theta, result.free, result.problem.noises), delay_doubt_s=result.delay_doubt_s)

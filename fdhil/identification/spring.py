@@ -1,0 +1,188 @@
+"""Takes a spring between motor and table into a window's fit: what the motor's encoder shows of a resonance.
+
+The spring's torque (:mod:`fdhil.identification.spring_torques`) is straight in the resonance f and in the table's share
+s of the inertia about the values found so far, so both are entries of the fit, a few times over.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fdhil.config import Axis
+from fdhil.identification.fit import Fit, fit, pose
+from fdhil.identification.innovations import whiten
+from fdhil.identification.kalman import LOAD
+from fdhil.identification.motion import BROKEN, UNKNOWN, Course, Modes, Motion
+from fdhil.identification.normal import inverse_of
+from fdhil.identification.spring_torques import LEAST_SHARE, MOST_OF_ROWS, MOST_SHARE, Spring, Torques
+from fdhil.records import Float
+
+RESONANCE, SHARE, DAMPING = "resonance", "resonance_share", "resonance_damping"
+USUAL_DAMPING, DAMPING_DOUBT = 0.03, 0.02  # the ratio of ordinary screws: it hardly shows
+USUAL_SHARE, SHARE_DOUBT = 0.5, 0.15  # of the inertia behind the spring, before any data
+TOLD_DOUBT = 0.05  # relative, of a resonance that is configured
+FOUND_DOUBT = 1.0  # relative, of one that is sought
+GRID = np.geomspace(40.0, 320.0, 24)  # Hz, where one is sought
+AROUND = np.array([0.92, 0.96, 1.0, 1.04, 1.08])  # of a configured resonance, where it may begin
+FAR, FIRM = 0.35, 1e4  # relative, of a resonance from the configured one; of the prior's information, to hold it
+TURNS = 4
+SETTLED = np.array([0.005, 0.01])  # relative in f, and in s
+STEP = 0.02  # of f and s, over which their derivatives are taken
+SURE = 40.0  # fall of minus twice the log likelihood, of which chance explains one in millions of a grid
+NEAR_REST_S = 0.025  # in which the motor does not tell when the table breaks loose, or stops
+LEAST_NOISE = 0.3  # of what readings show: with less, a swing that is not quite right would be no chance at all
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What is known of a spring before the data: f in Hz with its standard deviation; of s what is usual."""
+
+    hertz: float
+    hertz_std: float
+    damping: float = USUAL_DAMPING
+    firm: bool = False
+    """Whether the data are not asked for f and s."""
+
+    @property
+    def std(self) -> Float:
+        """The standard deviations (2,) of f and s."""
+        return np.array([self.hertz_std, SHARE_DOUBT])
+
+    def precision(self) -> Float:
+        """Return (2,) the information about f and s."""
+        return self.std**-2.0 * (FIRM if self.firm else 1.0)
+
+    def allows(self, spring: Spring) -> bool:
+        """Return whether data may tell such a spring: what they put far from it is something else."""
+        near = abs(spring.hertz / self.hertz - 1.0) < (FAR if self.hertz_std < self.hertz else FOUND_DOUBT)
+        return near and LEAST_SHARE < spring.share < MOST_SHARE
+
+    def away(self, spring: Spring) -> Float:
+        """Return (2,) how far f and s should move from ``spring`` by what is known alone."""
+        return np.array([self.hertz - spring.hertz, USUAL_SHARE - spring.share])
+
+    def cost(self, spring: Spring) -> float:
+        """Return minus twice the log likelihood of a spring by what is known."""
+        return float(self.precision() @ self.away(spring) ** 2)
+
+
+def sprung(base: Fit, axis: Axis | None) -> Fit | None:
+    """Return the fit of one window with the spring that the ``axis``' section tells of, or that the window shows.
+
+    f and s of a configured resonance are what both tell together. None where no spring is told, or surely shown.
+    """
+    motion = base.problem.motions[0]
+    if motion.slow is not None or not base.converged or not np.isfinite(base.residuals).all():
+        return None
+    told = None
+    if axis is not None and axis.resonance_hz is not None:
+        told = Told(axis.resonance_hz, TOLD_DOUBT * axis.resonance_hz, axis.resonance_damping)
+    grid = GRID if told is None else AROUND * told.hertz
+    # of a configured one that rows do not tell, they tell what it does below
+    grid = grid[grid * motion.dt_s < MOST_OF_ROWS * (1 if told is None else 2)]
+    if not grid.size:
+        return None
+    scores = _scores(base, grid)
+    best = float(grid[int(np.argmax(scores))])
+    if told is None and scores.max() < SURE:
+        return None
+    known = told or Told(best, FOUND_DOUBT * best)
+    found = _turned(base, Spring(best, USUAL_SHARE, known.damping), known)
+    if told is not None:
+        if found is None:
+            found = _turned(base, Spring(told.hertz, USUAL_SHARE, told.damping), replace(told, firm=True))
+        return None if found is None else found[0]
+    return found[0] if found is not None and _cost(base) - found[1] > SURE else None
+
+
+def _scores(base: Fit, grid: Float) -> Float:
+    """Return (g,) by how much minus twice the log likelihood would fall with a spring at each frequency."""
+    motion, theta = base.problem.motions[0], base.theta
+    torques = Torques.of(motion, theta)
+    springs = [Spring(float(hertz), USUAL_SHARE, USUAL_DAMPING) for hertz in grid]
+    columns = base.problem.answer(theta, [[Course(RESONANCE, LOAD, values) for values in torques.begun(springs)]])
+    jacobian, inverse = base.jacobian, inverse_of(base.information)[0]
+    beyond = columns - jacobian @ (inverse @ (jacobian.T @ columns))
+    powers = np.maximum(np.einsum("mg,mg->g", beyond, beyond), 1e-12)
+    scores: Float = np.square(beyond.T @ base.residuals) / powers
+    return scores
+
+
+def _turned(base: Fit, spring: Spring, told: Told) -> tuple[Fit, float] | None:
+    """Return the fit with the spring, and minus twice its log likelihood; None where it tells none."""
+    plain, theta = base.problem.motions[0], base.theta
+    free = (*base.free, theta.size, theta.size + 1)
+    for _ in range(TURNS):
+        made = fit([_bent(plain, theta, spring)], np.append(theta, [0.0, 0.0]), free)
+        if not made.converged or not np.isfinite(made.residuals).all():
+            return None
+        made = _with_prior(made, spring, told)
+        theta, before = made.theta[:-2], spring
+        spring = spring.moved(*made.theta[-2:])
+        if not told.allows(spring):
+            return None
+        if (np.abs([spring.hertz / before.hertz - 1, spring.share - before.share]) < SETTLED).all():
+            break
+    torques = Torques.of(plain, theta)
+    cost = _cost(made) + told.cost(spring) + torques.squeezed(torques.answer(spring))
+    return replace(made, delay_doubt_s=base.delay_doubt_s), cost
+
+
+def _bent(plain: Motion, theta: Float, spring: Spring) -> Motion:
+    """Return the motion with the spring: its torque at ``theta`` is known, f and s move about what they are."""
+    torques = Torques.of(plain, theta)
+    answer = torques.answer(spring)
+
+    def slope(hertz: float, share: float) -> Float:
+        high, low = (
+            replace(spring, hertz=spring.hertz + k * hertz, share=spring.share + k * share) for k in (0.5, -0.5)
+        )
+        return torques.slope(answer, high, low)
+
+    by_hertz = slope(STEP * spring.hertz, 0.0) / (STEP * spring.hertz)
+    return replace(
+        plain,
+        mode=_surely(plain),
+        noise_floor=LEAST_NOISE,
+        courses=(
+            *(torques.with_answer(course, answer) for course in plain.courses),
+            Course(RESONANCE, LOAD, by_hertz, about=spring.hertz),
+            Course(SHARE, LOAD, slope(0.0, STEP) / STEP, about=spring.share),
+        ),
+        known=(*plain.known, Course(DAMPING, LOAD, torques.felt(answer), about=spring.damping)),
+    )
+
+
+def _surely(motion: Motion) -> Modes:
+    """Return the modes (n,) without the rows near rest."""
+    reach = math.ceil(NEAR_REST_S / motion.dt_s)
+    near = np.convolve(motion.mode == UNKNOWN, np.ones(2 * reach + 1), "same") > 0.0
+    mode: Modes = np.where(near & (motion.mode != BROKEN), UNKNOWN, motion.mode).astype(np.int8)
+    return mode
+
+
+def _with_prior(made: Fit, spring: Spring, told: Told) -> Fit:
+    """Return the fit with what is known of f and s beforehand, as one more observation of each."""
+    prior, std = np.zeros((2, len(made.free)))
+    prior[-2:], std[-2:] = told.precision(), told.std
+    information = made.information + np.diag(prior)
+    theta, pull = made.theta.copy(), np.zeros(len(made.free))
+    pull[-2:] = prior[-2:] * (told.away(spring) - theta[-2:])
+    theta[list(made.free)] += inverse_of(information)[0] @ pull
+    problem = pose(made.problem.motions, theta, made.problem.noises)
+    residuals = problem.residuals(theta)
+    made = replace(made, theta=theta, information=information, residuals=residuals, problem=problem)
+    return replace(made, prior=prior, prior_std=std)
+
+
+def _cost(made: Fit) -> float:
+    """Return minus twice the log likelihood of a fit of one window, by its own noise, without the rows near rest."""
+    motion = made.problem.motions[0]
+    variances = np.maximum(made.problem.noises[0].vector(), LEAST_NOISE * motion.noise.vector()) ** 2
+    if not any(course.name == RESONANCE for course in motion.courses):
+        motion = replace(motion, mode=_surely(motion))
+    white, logdet = whiten(motion, made.theta[None], variances[None])
+    return float(np.square(white).sum() + logdet[0])

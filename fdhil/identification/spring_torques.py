@@ -1,0 +1,206 @@
+"""Tells the torque that a spring between motor and table adds to one stiff mass, over a window and by frequency.
+
+With the masses (1 - s) Jt of the motor and s Jt of the table, a torque T on the motor and dry friction F at the table,
+the motor accelerates by
+
+    Jt a = G T - (1 - H) F        G = 1 + H s / (1 - s)        H = p^2 / (p^2 + 2 zeta w p + w^2)
+
+where w = 2 pi f is the resonance of both against each other, the motor free to turn. Stiff masses have H = 0. All are
+means over intervals: what is linear makes of means the means of what it makes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from fdhil.identification.courses import FIRST_COURSE
+from fdhil.identification.filtering import quick_size
+from fdhil.identification.kalman import CD, FT, JT, LOAD, K
+from fdhil.identification.motion import Course, Motion
+from fdhil.records import Float
+
+Spectrum = npt.NDArray[np.complex128]
+
+MOST_OF_ROWS, SEEN_ORDER = 0.16, 12  # periods in a row, up to which rows tell a swing, and how sharply that ends
+RINGS_S = 0.5  # after which a spring has surely come to rest
+LEAST_SHARE, MOST_SHARE = 0.1, 0.9
+MOST_STEP = 0.25  # of f at once
+
+
+@dataclass(frozen=True, slots=True)
+class Spring:
+    """A spring: its resonance f in Hz, the table's share s of the inertia, and its damping ratio."""
+
+    hertz: float
+    share: float
+    damping: float
+
+    def moved(self, hertz: float, share: float) -> Spring:
+        """Return the spring with steps of both, within what a spring can be."""
+        near = float(np.clip(hertz, -MOST_STEP * self.hertz, MOST_STEP * self.hertz))
+        part = float(np.clip(self.share + share, LEAST_SHARE, MOST_SHARE))
+        return replace(self, hertz=self.hertz + near, share=part)
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What a spring makes of torques, by frequency (w,): ``swing`` H and ``motor`` G.
+
+    Current and acceleration both tell the torque on the motor, each with its noise; ``of_current`` is the share of the
+    current's. Where the two differ, stiff masses feel ``shaped`` of it: near the resonance, where the motor moves much,
+    its acceleration tells the torque, and no noise of the current is taken for a swing.
+    """
+
+    ratio: float
+    swing: Spectrum
+    motor: Spectrum
+    of_current: Float
+
+    @property
+    def shaped(self) -> Spectrum:
+        """What is left of a difference between what current and acceleration tell."""
+        return (1.0 + self.ratio * self.swing * self.of_current) / self.motor
+
+    @property
+    def on_motor(self) -> Spectrum:
+        """What a torque against the motor adds to itself."""
+        return self.shaped * self.motor - 1.0
+
+    @property
+    def on_table(self) -> Spectrum:
+        """What a torque against the table adds to itself."""
+        return self.shaped * (1.0 - self.swing) - 1.0
+
+    def added(self, motor: Spectrum, table: Spectrum) -> Spectrum:
+        """Return the torque against the positive direction that the spring adds, of torques on motor and table."""
+        return -self.swing * (self.ratio * motor + table)
+
+
+@dataclass(frozen=True, slots=True)
+class Torques:
+    """Spectra (w,) of a window's torques, N.m, and the power of the noise in what tells the motor's.
+
+    ``motor`` is that of the current less what drags there, ``table`` the dry friction, both of the six alone, and
+    ``..._whole`` with the terms; ``inertial`` is what the acceleration takes. ``seen`` is how much of a swing rows
+    tell.
+    """
+
+    n: int
+    p: Spectrum
+    motor: Spectrum
+    table: Spectrum
+    motor_whole: Spectrum
+    table_whole: Spectrum
+    inertial: Spectrum
+    noise_current: Float
+    noise_speed: Float
+    seen: Float
+
+    @classmethod
+    def of(cls, motion: Motion, theta: Float) -> Torques:
+        """Return the torques of a window: at rest friction holds whatever pulls."""
+        moving, dt_s = np.abs(motion.mode) == 1, motion.dt_s
+        motor = theta[K] * _means(motion.current) - theta[FT] * _means(motion.speed)
+        held = np.clip(motor, -abs(theta[CD]), abs(theta[CD]))
+        table = np.where(moving, theta[CD] * motion.mode, held)
+        motor_whole, table_whole = motor.copy(), table.copy()
+        for course, amplitude in zip(motion.courses, theta[FIRST_COURSE:], strict=False):
+            if course.kind == LOAD and of_motor(course):
+                motor_whole -= amplitude * course.values
+            elif course.kind == LOAD:
+                table_whole += amplitude * course.values
+        size = 2 * quick_size((motion.n + math.ceil(RINGS_S / dt_s) + 1) // 2)
+        turn = np.asarray(2 * math.pi * np.fft.rfftfreq(size), dtype=np.float64)
+        return cls(
+            n=motion.n,
+            p=(1j * turn / dt_s).astype(np.complex128),
+            motor=_spectrum(motor, size),
+            table=_spectrum(table, size),
+            motor_whole=_spectrum(motor_whole, size),
+            table_whole=_spectrum(table_whole, size),
+            inertial=_spectrum(theta[JT] * np.diff(motion.speed, append=motion.speed[-1]) / dt_s, size),
+            noise_current=np.square(theta[K] * motion.noise.current_a * np.cos(turn / 2)),
+            noise_speed=np.square(theta[JT] * motion.noise.speed_rad_s * 2 * np.sin(turn / 2) / dt_s),
+            seen=np.asarray(1.0 / (1.0 + (turn / (2 * math.pi * MOST_OF_ROWS)) ** SEEN_ORDER), dtype=np.float64),
+        )
+
+    def answer(self, spring: Spring) -> Answer:
+        """Return what a spring makes of torques."""
+        ratio, swing = spring.share / (1.0 - spring.share), self._swing(spring)
+        motor = 1.0 + ratio * swing
+        told = np.square(np.abs(motor)) * self.noise_current
+        return Answer(ratio, swing, motor, self.noise_speed / np.maximum(self.noise_speed + told, 1e-300))
+
+    def _swing(self, spring: Spring) -> Spectrum:
+        w, square = 2 * math.pi * spring.hertz, self.p**2
+        return self.seen * square / (square + (2 * spring.damping * w) * self.p + w**2)
+
+    def best(self, answer: Answer) -> Spectrum:
+        """Return the torque on the motor as current and acceleration tell it together."""
+        by_motion = (self.inertial + self.table_whole * (1.0 - answer.swing)) / answer.motor
+        return by_motion + answer.of_current * (self.motor_whole - by_motion)
+
+    def begun(self, springs: Sequence[Spring]) -> list[Float]:
+        """Return the torque (n,) that each spring would add to what so far is one stiff mass."""
+        still = Spring(springs[0].hertz, 0.0, springs[0].damping)
+        motor = self.best(self.answer(still))
+        ratios = [one.share / (1.0 - one.share) for one in springs]
+        return [
+            self.back(-self._swing(one) * (ratio * motor + self.table_whole))
+            for one, ratio in zip(springs, ratios, strict=True)
+        ]
+
+    def felt(self, answer: Answer) -> Float:
+        """Return the torque (n,) that the spring adds by the six alone: the terms' own courses have theirs."""
+        own = (answer.shaped - 1.0) * self.inertial - answer.on_motor * self.motor + answer.on_table * self.table
+        return self.back(own)
+
+    def slope(self, answer: Answer, high: Spring, low: Spring) -> Float:
+        """Return the torque (n,) by which two springs differ, about the one with this answer."""
+        torque = self.best(answer)
+        added = (self.answer(one).added(torque, self.table_whole) for one in (high, low))
+        return self.back(answer.shaped * (next(added) - next(added)))
+
+    def squeezed(self, answer: Answer) -> float:
+        """Return minus twice the logarithm of how much smaller innovations are than those of one stiff mass.
+
+        That is no likelihood: they are told by another measure.
+        """
+        return -2.0 * self.n * float(np.log(np.maximum(np.abs(answer.shaped), 1e-12)).mean())
+
+    def with_answer(self, course: Course, answer: Answer) -> Course:
+        """Return the course of a term as stiff masses would feel it."""
+        if course.kind != LOAD:
+            return course
+        gain = answer.on_motor if of_motor(course) else answer.on_table
+        return replace(course, values=course.values + self.back(gain * _spectrum(course.values, 2 * (self.p.size - 1))))
+
+    def back(self, spectrum: Spectrum) -> Float:
+        """Return the course (n,) of a spectrum."""
+        course: Float = np.fft.irfft(spectrum, 2 * (self.p.size - 1))[: self.n]
+        return course
+
+
+def of_motor(course: Course) -> bool:
+    """Return whether a term acts on the motor: a ripple of it or of the screw's bearing and nut."""
+    return course.name.startswith("ripple")
+
+
+def _spectrum(values: Float, size: int) -> Spectrum:
+    """Return the spectrum (w,) of a course (n,), which was as at first for long, led back to that at its end."""
+    n = values.size
+    whole = np.zeros(size)
+    whole[:n] = values - values[0]
+    whole[n:] = whole[n - 1] * (0.5 + 0.5 * np.cos(np.linspace(0.0, math.pi, size - n)))
+    spectrum: Spectrum = np.fft.rfft(whole).astype(np.complex128)
+    return spectrum
+
+
+def _means(values: Float) -> Float:
+    means: Float = (values + np.append(values[1:], values[-1])) / 2
+    return means

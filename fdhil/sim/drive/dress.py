@@ -1,0 +1,256 @@
+"""Lets the drive wear a vendor's EDS: its objects, types, access, defaults and PDOs, its identity and its units.
+
+The EDS says which objects there are; what the drive does not have is not there. Which of the vendor's objects show
+current, voltage or duty, and in what they count, no EDS says: the tables in ``dresses`` do, by vendor number, written
+from the vendors' documents and not from the profiles that the drivers read.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+from fdhil.config import MachineConfig, SimAxis
+from fdhil.sim.drive.dictionary import Entry, Object, Value
+from fdhil.sim.drive.modes import CYCLIC, CYCLIC_POSITION, SUPPORTED_MODES
+from fdhil.sim.drive.objects import DEVICE_NAME, PRODUCT_CODE, REVISION, VENDOR_ID, Ratings, drive_objects
+from fdhil.sim.drive.sheet import Sheet, read_sheet
+
+_MODES, _TARGET, _INTERPOLATION, _SPEED_UNIT = 0x650200, 0x607A00, 0x60C101, 0x60A900
+_INTERPOLATED = 7
+_VENDORS = range(0x2000, 0x6000)
+_APART = 1 << 24  # the vendor's values are kept apart from those of the twin's own vendor objects
+# A drive without these has no such service: no heartbeat, no SYNC counter. One without 0x6007 falls into fault when it
+# loses its master, as most do: no file says it.
+_NO_SERVICE = {0x101700: 0, 0x101900: 0}
+# what whoever sets a drive up for this machine must have entered: no default of a file fits it
+_SET_UP = frozenset(
+    index << 8 | sub
+    for indices, subs in (
+        (
+            (0x1006, 0x6065, 0x6067, 0x606D, 0x606F, 0x6072, 0x6073, 0x6075, 0x6076, 0x607F, 0x6080, 0x6081, 0x6083),
+            (0,),
+        ),
+        ((0x6084, 0x6085, 0x6087, 0x609A, 0x60C5, 0x60C6), (0,)),
+        ((0x607D, 0x608F, 0x6091, 0x6092, 0x6099, 0x60C2), (1, 2)),
+    )
+    for index in indices
+    for sub in subs
+)
+# speeds and accelerations count alike: in a speed unit, and that per second
+_SPEEDS = frozenset(
+    {
+        0x606B, 0x606C, 0x606D, 0x606F, 0x607F, 0x6081, 0x6083, 0x6084, 0x6085, 0x6099, 0x609A, 0x60B1, 0x60C5, 0x60C6,
+        0x60FF,
+    }
+)  # fmt: skip
+# revolutions/s and increments/s to a count; a millisecond's increments come as 16.16 fixed-point numbers
+_SPEED_UNITS = {
+    "increments_per_s": (0.0, 1.0),
+    "rpm": (1 / 60, 0.0),
+    "millirpm": (1 / 60e3, 0.0),
+    "increments_per_ms_16": (0.0, 1e3 / 65536),
+}
+# unit codes of 0x60A9 (CiA 303-2): revolutions, increments; seconds, minutes
+_REVOLUTIONS, _INCREMENTS, _PER = 0xB4, 0xB5, {0x03: 1.0, 0x47: 1 / 60}
+_UNITS = {"current_a": "A", "current_share": "", "voltage_v": "V", "dc_link_v": "V", "duty": ""}
+
+
+@dataclass(frozen=True, slots=True)
+class Gauge:
+    """An object that shows a signal (one of ``_UNITS``), ``per_count`` of its unit; ``magnitude``: without its sign."""
+
+    entry: Entry
+    signal: str
+    per_count: float
+    magnitude: bool = False
+
+    def counts(self, value: float) -> int:
+        """Return what the object shows of a value."""
+        return self.entry.counts(round((abs(value) if self.magnitude else value) / self.per_count))
+
+    def unit(self, sign: int) -> tuple[str, float]:
+        """Unit and amount per count in the direction of an axis with this sign."""
+        sided = not self.magnitude and self.signal != "dc_link_v"
+        return _UNITS[self.signal], sign * self.per_count if sided else self.per_count
+
+
+@dataclass(frozen=True, slots=True)
+class Dress:
+    """What the wire sees of a drive; without an EDS its own objects.
+
+    ``within``: entries that the drive needs and does not show. ``gauges``: what shows a signal in the vendor's way.
+    ``mode``: in which it follows set-points that come with every SYNC; its number is the vendor's where there is no
+    cyclic synchronous position.
+    """
+
+    objects: tuple[Object, ...]
+    vendor: int = VENDOR_ID
+    product: int = PRODUCT_CODE
+    revision: int = REVISION
+    name: str = DEVICE_NAME.decode()
+    within: tuple[Entry, ...] = ()
+    gauges: tuple[Gauge, ...] = ()
+    mode: int = CYCLIC_POSITION
+
+
+@dataclass(frozen=True, slots=True)
+class Tailoring:
+    """A file of ``dresses``: in what a vendor's drives count, and which objects show what is measured.
+
+    ``rated_torque_nm``: a count of 0x6076. ``rated_current``: the vendor's own object of it. ``setpoint``: the object
+    and the mode of cyclic set-points, of drives that have no cyclic synchronous position.
+    """
+
+    vendor: int = 0
+    speed: str = "increments_per_s"
+    rated_torque_nm: float = 1e-3
+    measured: tuple[Mapping[str, Any], ...] = ()
+    rated_current: Mapping[str, Any] | None = None
+    setpoint: Mapping[str, Any] | None = None
+
+
+def dress(config: MachineConfig, axis: str) -> Dress:
+    """Return what the axis' drive wears; EdsError when its EDS cannot be read."""
+    own = drive_objects(config, axis)
+    path = config.sim.axis.get(axis, SimAxis()).eds
+    if path is None:
+        return Dress(own)
+    ratings = Ratings.of(config, axis)
+    sheet = read_sheet(path, ratings.node_id)
+    return _Tailor(sheet, own, ratings, tailoring(sheet.vendor), 1001 + list(config.axis).index(axis)).dress()
+
+
+@cache
+def tailoring(vendor: int) -> Tailoring:
+    """Return the table of a vendor; of one that has none, plain CiA 402."""
+    for file in sorted(files("fdhil.sim.drive").joinpath("dresses").iterdir(), key=lambda file: file.name):
+        if file.name.endswith(".toml"):
+            said = tomllib.loads(file.read_text("utf-8"))
+            if said["vendor"] == vendor:
+                return Tailoring(**{**said, "measured": tuple(said.get("measured", ()))})
+    return Tailoring()
+
+
+class _Tailor:
+    """Fits the objects of a sheet on the drive's own."""
+
+    def __init__(self, sheet: Sheet, own: tuple[Object, ...], ratings: Ratings, cut: Tailoring, serial: int) -> None:
+        self._sheet, self._ratings, self._cut = sheet, ratings, cut
+        self._own = {entry.key: entry for item in own for entry in item.entries}
+        self._identity = {0x101801: sheet.vendor, 0x101802: sheet.product, 0x101803: sheet.revision, 0x101804: serial}
+        self._entries = {entry.key: entry for item in sheet.objects for entry in item.entries}
+        self._speed = self._increments_per_s()
+        self._setpoint, self._mode = self._stream()
+        self._modes = self._offered()
+
+    def _increments_per_s(self) -> float:
+        """What a count of its speeds is: by its own unit object, else as the vendor has it."""
+        revolutions, increments = _SPEED_UNITS[self._cut.speed]
+        unit = self._entries[_SPEED_UNIT].default if _SPEED_UNIT in self._sheet.given else 0
+        assert isinstance(unit, int)
+        kind, per, power = unit >> 16 & 0xFF, unit >> 8 & 0xFF, (unit >> 24 ^ 0x80) - 0x80
+        if kind in (_REVOLUTIONS, _INCREMENTS) and per in _PER:
+            share = _PER[per] * 10.0**power
+            revolutions, increments = (share, 0.0) if kind == _REVOLUTIONS else (0.0, share)
+        return revolutions * self._ratings.increments_per_rev + increments
+
+    def _stream(self) -> tuple[int | None, int]:
+        """The object of cyclic set-points where it is not 0x607A, and their mode."""
+        said = self._cut.setpoint
+        if said is not None and (said["object"][0] << 8 | said["object"][1]) in self._entries:
+            return said["object"][0] << 8 | said["object"][1], said["mode"]
+        bits = self._entries[_MODES].default if _MODES in self._sheet.given else 1 << CYCLIC_POSITION - 1
+        assert isinstance(bits, int)
+        interpolated = bits >> _INTERPOLATED - 1 & 1 and not bits >> CYCLIC_POSITION - 1 & 1
+        return (_INTERPOLATION, _INTERPOLATED) if interpolated and _INTERPOLATION in self._entries else (None, 8)
+
+    def _offered(self) -> int:
+        """Bits of the modes that it has, as in 0x6502: those of the file, or those that the twin can do."""
+        if _MODES in self._sheet.given:
+            bits = self._entries[_MODES].default
+            assert isinstance(bits, int)
+            return bits
+        if self._setpoint is None:
+            return SUPPORTED_MODES
+        own = SUPPORTED_MODES & ~sum(1 << mode - 1 for mode in CYCLIC)
+        return own | (1 << self._mode - 1 if self._mode > 0 else 0)
+
+    def dress(self) -> Dress:
+        objects = tuple(replace(item, entries=tuple(map(self._fit, item.entries))) for item in self._sheet.objects)
+        worn = {entry.place for item in objects for entry in item.entries}
+        entries = {entry.key: entry for item in objects for entry in item.entries}
+        return Dress(
+            objects, self._sheet.vendor, self._sheet.product, self._sheet.revision, self._sheet.name,
+            tuple(self._unshown(entry) for key, entry in self._own.items() if key not in worn),
+            tuple(self._gauges(entries)), self._mode,
+        )  # fmt: skip
+
+    def _fit(self, entry: Entry) -> Entry:
+        if entry.key == self._setpoint:
+            return replace(entry, home=_TARGET, default=0, low=None, high=None)
+        if entry.index in _VENDORS:
+            return self._fit_apart(entry)
+        if entry.key in (0x606000, 0x606100):
+            entry = self._fit_mode(entry)
+        if entry.key == _MODES and self._mode != CYCLIC_POSITION:
+            entry = replace(entry, renamed=(self._modes, self._modes | 1 << CYCLIC_POSITION - 1))
+        own = self._own.get(entry.key)
+        scale = self._scale(entry) if own is not None else 1.0
+        entry = replace(entry, scale=scale, default=self._default(entry, own, scale))
+        return replace(entry, low=None, high=None) if entry.key in _SET_UP else entry
+
+    def _fit_mode(self, entry: Entry) -> Entry:
+        """Only what it has can be chosen; its mode of cyclic set-points is the twin's cyclic synchronous position."""
+        modes = {mode for mode in range(1, 33) if self._modes & SUPPORTED_MODES >> mode - 1 & 1}
+        renamed = None if self._mode == CYCLIC_POSITION else (self._mode, CYCLIC_POSITION)
+        return replace(entry, choice=frozenset(modes | {0} | ({self._mode} if renamed else set())), renamed=renamed)
+
+    def _fit_apart(self, entry: Entry) -> Entry:
+        entry = replace(entry, home=entry.key | _APART)
+        rated = self._cut.rated_current
+        if rated is None or rated["object"] != [entry.index, entry.sub]:
+            return entry
+        return replace(entry, default=round(self._ratings.rated_current_a / rated["per_count"]), low=None, high=None)
+
+    def _default(self, entry: Entry, own: Entry | None, scale: float) -> Value:
+        given = entry.key in self._sheet.given
+        if entry.key == _MODES:
+            return self._modes
+        if entry.key in self._identity and not (given and entry.default):
+            return self._identity[entry.key]
+        if entry.index == 0x1008 and not given:
+            return self._sheet.name.encode("latin-1", "replace")
+        if entry.index in range(0x1600, 0x1800) or entry.index in range(0x1A00, 0x1C00):
+            return entry.default if given or entry.sub else self._mapped(entry.index)
+        if own is None or type(own.default) is not type(entry.default):
+            return entry.default
+        if given and entry.key not in _SET_UP:
+            return entry.default
+        if isinstance(own.default, int):
+            return replace(entry, scale=scale).counts(own.default)
+        return own.default
+
+    def _mapped(self, index: int) -> int:
+        """How many objects a PDO maps whose file does not say it: those that it names."""
+        item = next(item for item in self._sheet.objects if item.index == index)
+        return sum(1 for entry in item.entries if entry.sub and entry.default)
+
+    def _scale(self, entry: Entry) -> float:
+        if entry.index in _SPEEDS:
+            return self._speed
+        return self._cut.rated_torque_nm * 1e3 if entry.index == 0x6076 else 1.0
+
+    def _unshown(self, entry: Entry) -> Entry:
+        return replace(entry, default=_NO_SERVICE.get(entry.key, entry.default))
+
+    def _gauges(self, entries: Mapping[int, Entry]) -> Iterator[Gauge]:
+        for said in self._cut.measured:
+            index, sub = said["object"]
+            entry = entries.get(index << 8 | sub)
+            if entry is not None:
+                yield Gauge(entry, said["signal"], said["per_count"], said.get("magnitude", False))

@@ -1,0 +1,109 @@
+"""Runs a drive's cycles: set-points are taken, all objects sampled, the following error watched, motion integrated."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from fdhil.sim.drive.axis_plant import AxisPlant
+from fdhil.sim.drive.dictionary import Dictionary
+from fdhil.sim.drive.feedback import Feedback
+from fdhil.sim.drive.motion import Motion
+from fdhil.sim.drive.motion_objects import NO_WINDOW
+from fdhil.sim.drive.objects import Ratings
+from fdhil.sim.drive.physics import Loops
+from fdhil.sim.drive.power import PowerStage, State
+from fdhil.sim.drive.sensors import DriveFaults
+
+_CREEP_RAD_S = 1e-6  # slower than this an axis without power stands
+_NO_LIMIT = 0xFFFF
+
+
+class DriveCycle:
+    """One cycle is :meth:`begin`, then :meth:`integrate`; ``tick`` counts them.
+
+    ``table_mm`` is the true table position at the start of the cycle, in the axis' direction. ``ended`` is called after
+    each cycle with the mean voltage of the one before it.
+    """
+
+    def __init__(
+        self,
+        dictionary: Dictionary,
+        ratings: Ratings,
+        plant: AxisPlant,
+        power: PowerStage,
+        motion: Motion,
+        feedback: Feedback,
+        faults: DriveFaults,
+    ) -> None:
+        self._numbers = dictionary.numbers
+        self._ratings = ratings
+        self._plant = plant
+        self._power, self._motion, self._feedback, self._faults = power, motion, feedback, faults
+        self._loops = Loops.POSITION
+        self._limits = self._limit_objects
+        self.ended: Callable[[float], None] | None = None
+        self.tick = 0
+        self.table_mm = self._true_table_mm
+        self.reset()
+
+    def reset(self) -> None:
+        """The drive boots."""
+        self._over_window = self._last_offset = 0
+
+    @property
+    def stands(self) -> bool:
+        """Whether nothing can move: no current flows, and the axis is at rest."""
+        return not self._power.powered and abs(self._plant.physics.speed_rad_s) < _CREEP_RAD_S
+
+    def keep_offset(self) -> None:
+        """With the fault ``ignore_offset`` what was written to 0x60B0 is lost."""
+        if self._faults.ignore_offset:
+            self._numbers[0x60B000] = self._last_offset
+        self._last_offset = self._numbers[0x60B000]
+
+    def begin(self) -> bool:
+        """Take the set-points as they are and sample all objects; return whether the following error is too large."""
+        self._motion.begin_cycle(self._feedback.actual)
+        tripped = self._is_beyond(self._feedback.sample(self.tick))
+        self.table_mm = self._true_table_mm
+        return tripped
+
+    def integrate(self) -> None:
+        """Let the cycle pass."""
+        physics, motion = self._plant.physics, self._motion
+        ended_v = physics.voltage_mean_v
+        if motion.loops is not self._loops:
+            self._loops = motion.loops
+            physics.close_loops(motion.loops)
+        if self._limit_objects != self._limits:
+            self._limits = self._limit_objects
+            physics.limit_current(min(self._limits) * 1e-3 * self._ratings.rated_current_a)
+        command = motion.command
+        if motion.shift:
+            command = (command[0] + motion.shift, command[1] + motion.shift, *command[2:])
+        physics.load_torque_nm = float(self._faults.load_torque_nm)
+        physics.cycle(self._power.powered, command)
+        self.tick += 1
+        if self.ended is not None:
+            self.ended(ended_v)
+
+    @property
+    def _true_table_mm(self) -> float:
+        place = self._plant.physics.table_rad * self._plant.mm_per_rad
+        shift = self._motion.shift
+        return place - self._ratings.sign * shift / self._ratings.increments_per_mm if shift else place
+
+    @property
+    def _limit_objects(self) -> tuple[int, int]:
+        """Max torque and max current, 0.1 % of the rated ones."""
+        return self._numbers.get(0x607200, _NO_LIMIT), self._numbers.get(0x607300, _NO_LIMIT)
+
+    def _is_beyond(self, error: int) -> bool:
+        """Whether the following error has stayed beyond 0x6065 for 0x6066 milliseconds."""
+        window = self._numbers[0x606500]
+        if window == NO_WINDOW or not self._power.powered or abs(error) <= window:
+            self._over_window = 0
+            return False
+        self._over_window += 1
+        over_ms = (self._over_window - 1) * self._ratings.sync_period_s * 1e3
+        return over_ms >= self._numbers[0x606600] and self._power.state is not State.FAULT_REACTION_ACTIVE

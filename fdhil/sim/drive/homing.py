@@ -1,0 +1,162 @@
+"""Finds home as CiA 402-2 lists the ways (methods 1 to 6, 17 to 22, 33, 34, 35, 37): switches, the index pulse, here.
+
+Positions are raw here: those of the encoder, before any home offset. A switch is a bit of 0x60FD; the index pulse comes
+once per revolution, at whole ones.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import NamedTuple
+
+NEGATIVE, POSITIVE, HOME = 0, 1, 2  # bits of 0x60FD
+_WATCHED = {-1: NEGATIVE, 1: POSITIVE}
+
+
+class Homing(Enum):
+    """How far a run is."""
+
+    IDLE = auto()
+    RUNNING = auto()
+    DONE = auto()
+    ERROR = auto()
+
+
+class Leg(NamedTuple):
+    """One move of a search: which way, how fast, and the bit and its state that end it; no bit is the index pulse."""
+
+    direction: int
+    fast: bool
+    bit: int | None
+    state: bool = False
+
+
+class _Method(NamedTuple):
+    """The last edge of a method: on its way ``direction`` the switch goes to ``state``."""
+
+    direction: int
+    bit: int
+    state: bool
+
+
+# without index pulse; 1 to 6 are the same, then the pulse
+_EDGES = {
+    17: _Method(1, NEGATIVE, False),
+    18: _Method(-1, POSITIVE, False),
+    19: _Method(-1, HOME, False),
+    20: _Method(1, HOME, True),
+    21: _Method(1, HOME, False),
+    22: _Method(-1, HOME, True),
+}
+_PULSES = {33: -1, 34: 1}
+METHODS = frozenset({*_EDGES, *(method - 16 for method in _EDGES), *_PULSES, 35, 37})
+
+
+def legs(method: int, inputs: int) -> list[Leg]:
+    """Return the moves of a method from a place with these inputs.
+
+    >>> [leg.direction for leg in legs(17, 0)], [leg.direction for leg in legs(17, 1)]
+    ([-1, 1], [1])
+    """
+    if method in _PULSES:
+        return [Leg(_PULSES[method], False, None)]
+    edge = _EDGES.get(method, _EDGES.get(method + 16))
+    if edge is None:
+        return []
+    direction, bit, state = edge
+    back, last = Leg(-direction, True, bit, not state), Leg(direction, False, bit, state)
+    if bool(inputs >> bit & 1) != state:  # on the side from which the last edge is to be reached
+        way = [last] if not state else [Leg(direction, True, bit, state), back._replace(fast=False), last]
+    else:
+        way = [back, last]
+    return [*way, Leg(direction, False, None)] if method < 17 else way
+
+
+@dataclass(frozen=True, slots=True)
+class Switches:
+    """Where the machine's switches are, raw increments; None where there is none. Home is active from there on."""
+
+    negative: float | None = None
+    positive: float | None = None
+    home: float | None = None
+
+    @property
+    def mounted(self) -> bool:
+        """Whether there is any."""
+        return (self.negative, self.positive, self.home) != (None, None, None)
+
+    def inputs(self, raw: float) -> int:
+        """Return the bits of 0x60FD at a place."""
+        bits = int(self.negative is not None and raw <= self.negative)
+        bits |= (self.positive is not None and raw >= self.positive) << POSITIVE
+        return bits | (self.home is not None and raw >= self.home) << HOME
+
+    def has(self, bit: int | None) -> bool:
+        """Whether the switch of a bit is mounted; the index pulse always is."""
+        return bit is None or (self.negative, self.positive, self.home)[bit] is not None
+
+
+class HomingRun:
+    """One search after the other. ``home`` is the raw position that was found, ``leg`` the move to make now."""
+
+    def __init__(self, switches: Switches, increments_per_rev: int) -> None:
+        self.switches = switches
+        self._per_rev = increments_per_rev
+        self.reset()
+
+    def reset(self) -> None:
+        """Nothing was searched since power-on, or the mode was left."""
+        self.state = Homing.IDLE
+        self.home = 0.0
+        self._legs: list[Leg] = []
+        self._before = 0.0
+
+    def start(self, method: int, raw: float, inputs: int) -> None:
+        """Begin a search at ``raw``."""
+        self._legs = legs(method, inputs)
+        self._before = raw
+        self.state = Homing.RUNNING
+        self.home = raw
+        if method not in METHODS or not all(self.switches.has(leg.bit) for leg in self._legs):
+            self._fail()
+
+    @property
+    def leg(self) -> Leg | None:
+        """The move to make now; None: come to rest."""
+        return self._legs[0] if self._legs else None
+
+    def step(self, raw: float, inputs: int) -> None:
+        """A cycle brought the axis to ``raw``: go to the next leg where this one has found what it sought."""
+        leg = self.leg
+        if leg is None:
+            return
+        limit = _WATCHED[leg.direction]
+        if leg.bit is None:
+            found, place = self._pulse(leg.direction, raw)
+        else:
+            found, place = bool(inputs >> leg.bit & 1) == leg.state, raw
+        self._before = raw
+        if found:
+            self.home = place
+            self._legs.pop(0)
+        elif limit != leg.bit and inputs >> limit & 1:
+            self._fail()
+
+    def rested(self) -> bool:
+        """The axis stands; True when that ends a search that has found home."""
+        if self.state is not Homing.RUNNING or self._legs:
+            return False
+        self.state = Homing.DONE
+        return True
+
+    def _pulse(self, direction: int, raw: float) -> tuple[bool, float]:
+        turn = self._per_rev
+        first = math.floor(self._before / turn) + 1 if direction > 0 else math.ceil(self._before / turn) - 1
+        place = float(first * turn)
+        return (raw - place) * direction >= 0, place
+
+    def _fail(self) -> None:
+        self._legs = []
+        self.state = Homing.ERROR

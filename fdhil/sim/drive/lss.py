@@ -1,0 +1,111 @@
+"""Answers the layer setting services (CiA 305): the node-ID given over the bus, by identity or to the only node on it.
+
+A new node-ID holds from the next reset of the communication on; stored, also after the supply was cut. The bit rate of
+a simulated bus is nobody's to choose: every standard one is accepted and changes nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+REQUEST, RESPONSE = 0x7E5, 0x7E4
+UNCONFIGURED = 255
+_OK, _OUT_OF_RANGE = 0, 1
+_SELECT, _INQUIRE, _IDENTIFY = 0x40, 0x5A, 0x46
+_ENTER, _FOUND, _FOUND_UNCONFIGURED, _FASTSCAN = 0x44, 0x4F, 0x50, 0x51
+_BIT_RATES = frozenset({0, 1, 2, 3, 4, 6, 7, 8})  # indices of table 0; 5 is reserved
+
+
+class LssSlave:
+    """The LSS side of a node. ``identity`` gives the four numbers of 0x1018; ``node_id`` is the one in force.
+
+    ``pending`` is the node-ID that the next reset of the communication brings.
+    """
+
+    def __init__(self, node_id: int, identity: Callable[[], tuple[int, int, int, int]]) -> None:
+        self._identity = identity
+        self.node_id = self.pending = self._stored = node_id
+        self.reset()
+
+    def reset(self) -> None:
+        """The node boots: it waits to be switched to the configuration state."""
+        self._configuring = False
+        self._selected = 0
+        self._identified = 0
+        self._scanned = 0
+
+    def power_on(self) -> None:
+        """The stored node-ID is in force again."""
+        self.pending = self._stored
+
+    def receive(self, data: bytes) -> bytes | None:
+        """Take a request and return the answer, None where none is due."""
+        if len(data) != 8:
+            return None
+        command, number = data[0], int.from_bytes(data[1:5], "little")
+        if command == 0x04:
+            self._configuring, self._selected = data[1] == 1, 0
+        elif _SELECT <= command <= _SELECT + 3:
+            return self._select(command - _SELECT, number)
+        elif _IDENTIFY <= command <= _IDENTIFY + 5:
+            return self._identify(command - _IDENTIFY, number)
+        elif command == 0x4C and self.node_id == UNCONFIGURED:
+            return _answer(_FOUND_UNCONFIGURED)
+        elif command == _FASTSCAN and self.node_id == UNCONFIGURED and not self._configuring:
+            return self._fastscan(number, *data[5:8])
+        elif self._configuring:
+            return self._configure(command, data)
+        return None
+
+    def _select(self, place: int, number: int) -> bytes | None:
+        """Take one of the four numbers of a switch-selective; the last one that fits switches."""
+        fits = place == self._selected and self._identity()[place] == number
+        self._selected = place + 1 if fits else 0
+        if self._selected < 4:
+            return None
+        self._configuring, self._selected = True, 0
+        return _answer(_ENTER)
+
+    def _identify(self, place: int, number: int) -> bytes | None:
+        """Take vendor, product, and the bounds of revision and serial number; answer where all of them fit."""
+        vendor, product, revision, serial = self._identity()
+        fits = (
+            number == vendor, number == product, number <= revision, number >= revision, number <= serial,
+            number >= serial,
+        )  # fmt: skip
+        self._identified = place + 1 if place == self._identified and fits[place] else 0
+        if self._identified < 6:
+            return None
+        self._identified = 0
+        return _answer(_FOUND)
+
+    def _fastscan(self, number: int, checked: int, sub: int, following: int) -> bytes | None:
+        """Answer where the bits from ``checked`` upward are those of the number that is asked for."""
+        if checked == 0x80:
+            self._scanned = 0
+            return _answer(_FOUND)
+        if sub > 3 or checked > 31 or sub != self._scanned or (self._identity()[sub] ^ number) >> checked:
+            return None
+        self._scanned = following
+        if checked == 0 and following < sub:  # the whole identity fits
+            self._configuring, self._scanned = True, 0
+        return _answer(_FOUND)
+
+    def _configure(self, command: int, data: bytes) -> bytes | None:
+        if command == 0x11:
+            valid = 1 <= data[1] <= 127 or data[1] == UNCONFIGURED
+            if valid:
+                self.pending = data[1]
+            return _answer(command, _OK if valid else _OUT_OF_RANGE)
+        if command == 0x13:
+            return _answer(command, _OK if data[1] == 0 and data[2] in _BIT_RATES else _OUT_OF_RANGE)
+        if command == 0x17:
+            self._stored = self.pending
+            return _answer(command, _OK)
+        if _INQUIRE <= command <= _INQUIRE + 3:
+            return _answer(command, *self._identity()[command - _INQUIRE].to_bytes(4, "little"))
+        return _answer(command, self.pending) if command == 0x5E else None
+
+
+def _answer(command: int, *more: int) -> bytes:
+    return bytes([command, *more]).ljust(8, b"\0")

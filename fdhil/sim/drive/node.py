@@ -1,0 +1,267 @@
+"""Makes a device a CANopen node (CiA 301), sans-I/O: NMT, boot-up, SDO, RPDOs, heartbeats, guarding, EMCY, LSS.
+
+What the device does with a SYNC, with what it received and with an error is left to who derives from it.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+from fdhil.sim.drive import lss
+from fdhil.sim.drive.dictionary import Dictionary
+from fdhil.sim.drive.emergency_and_heartbeat import (
+    HEARTBEAT_LOST,
+    PDO_TOO_SHORT,
+    RPDO_TIMEOUT,
+    SYNC_LENGTH,
+    Emergencies,
+    HeartbeatConsumer,
+    HeartbeatProducer,
+    NodeGuarding,
+)
+from fdhil.sim.drive.object_write_rules import StoredParameters
+from fdhil.sim.drive.pdo import PdoEngine
+from fdhil.sim.drive.sdo import SdoServer
+from fdhil.sim.drive.sensors import DriveFaults
+from fdhil.sim.drive.service_objects import KEEP_STATE
+from fdhil.sim.frame import Frame
+
+OFF, INITIALISING, STOPPED, OPERATIONAL, PRE_OPERATIONAL = -1, 0x00, 0x04, 0x05, 0x7F
+_AFTER_ERROR = {0: PRE_OPERATIONAL, 2: STOPPED}  # 0x1029: the NMT state after a communication error; 1: as it is
+
+_SDO_PATIENCE_S = 1.0  # a client that was silent for so long within a block has gone: what comes is another's request
+
+
+class CanopenNode(ABC):
+    """One node on top of its object dictionary; ``boot_s`` is the time from a reset to the boot-up message.
+
+    ``nmt`` is the NMT state as a heartbeat shows it, -1 while the device is without supply.
+    """
+
+    def __init__(self, dictionary: Dictionary, node_id: int, faults: DriveFaults, boot_s: float) -> None:
+        self.dictionary = dictionary
+        self.node_id = node_id
+        self.faults = faults
+        self.nmt = OFF
+        self._boot_s = boot_s
+        self._boot_due_s: float | None = None
+        self._has_booted = False
+        self._sync_id = 0x80
+        self._sync_refused = False
+        self._after_error: int | None = None
+        self._now_s = self._sdo_s = 0.0
+        self.pdo = PdoEngine(dictionary, self._is_pre_operational, faults.drop_tpdo)
+        self._sdo = SdoServer(dictionary)
+        self._emergencies = Emergencies(dictionary)
+        self._consumer = HeartbeatConsumer(dictionary)
+        self._producer = HeartbeatProducer(dictionary, node_id)
+        self._guarding = NodeGuarding(dictionary)
+        self._lss = lss.LssSlave(node_id, self._identity)
+        self._stored = StoredParameters(dictionary)
+
+    # -- what the device does
+
+    @abstractmethod
+    def power_on(self) -> list[Frame]:
+        """Boot, or boot again; returns the boot-up message, if it comes at once."""
+
+    @abstractmethod
+    def _cycle_of_sync(self, counter: int | None) -> list[Frame]:
+        """A SYNC came: do its cycle and return the TPDOs."""
+
+    @abstractmethod
+    def _coast(self) -> None:
+        """A SYNC came that the device does not hear, without supply or not yet booted."""
+
+    @abstractmethod
+    def _received(self) -> None:
+        """An event-driven RPDO has changed the objects."""
+
+    @abstractmethod
+    def _react(self, code: int) -> None:
+        """A connection is lost, with this error code."""
+
+    @abstractmethod
+    def _abort_connection(self) -> None:
+        """The master has taken the connection away."""
+
+    @property
+    @abstractmethod
+    def _in_fault(self) -> bool:
+        """Whether a fault waits for its reset."""
+
+    # -- life
+
+    @property
+    def _mute(self) -> bool:
+        """Without supply, or not yet booted."""
+        return self.nmt in (OFF, INITIALISING)
+
+    def _is_pre_operational(self) -> bool:
+        return self.nmt == PRE_OPERATIONAL
+
+    def _identity(self) -> tuple[int, int, int, int]:
+        vendor, product, revision, serial = (self.dictionary.numbers.get(0x101800 | sub, 0) for sub in (1, 2, 3, 4))
+        return vendor, product, revision, serial
+
+    def power_off(self) -> None:
+        """Cut the supply: no frame is sent or answered; :meth:`power_on` ends it."""
+        self.nmt = OFF
+        self._boot_due_s = None
+        self.pdo.stop()
+        self._lss.power_on()
+
+    def _boot_up(self) -> list[Frame]:
+        self.nmt = INITIALISING
+        self.pdo.stop()
+        self._sdo.reset()
+        self._emergencies.drop()
+        self._consumer.configure()
+        self._producer.restart()
+        self._guarding.reset()
+        self._lss.reset()
+        self._communication_changed()
+        if self.node_id == lss.UNCONFIGURED:
+            return []
+        if self._boot_s and self._has_booted:
+            self._boot_due_s = self._now_s + self._boot_s
+            return []
+        return self._booted()
+
+    def _booted(self) -> list[Frame]:
+        self.nmt = PRE_OPERATIONAL
+        self._boot_due_s, self._has_booted = None, True
+        return [(0x700 + self.node_id, b"\0")]
+
+    def _take_node_id(self) -> None:
+        """Take over the node-ID that LSS has given."""
+        new, old = self._lss.pending, self.node_id
+        if new == old:
+            return
+        self.dictionary.renumber(new - old)
+        self.node_id = self._lss.node_id = new
+        self._producer = HeartbeatProducer(self.dictionary, new)
+
+    def _communication_changed(self) -> None:
+        self._sync_id = self.dictionary.number(0x1005) & 0x7FF
+
+    def _watch_connections(self) -> None:
+        """Report the heartbeats, guards and RPDOs that have just been missed."""
+        if not self.faults.no_heartbeat_consumer:
+            for node in self._consumer.expired(self._now_s):
+                self._connection_lost(HEARTBEAT_LOST, bytes([node]))
+        if self._guarding.expired(self._now_s):
+            self._connection_lost(HEARTBEAT_LOST, b"")
+        for number in self.pdo.overdue(self._now_s):
+            self._connection_lost(RPDO_TIMEOUT, bytes([number]))
+
+    def _on_time(self) -> list[Frame]:
+        """Return what is due by now: boot-up, heartbeat, errors, event-driven TPDOs."""
+        boot_due = self._boot_due_s is not None and self._now_s >= self._boot_due_s
+        frames = self._booted() if boot_due else []
+        if self._mute:
+            return []
+        frames += self._producer.due(self._now_s, self.nmt)
+        self._watch_connections()
+        frames += self._take_outgoing()
+        if self._after_error is not None:  # the error is told before the device falls silent
+            self._leave_operational(self._after_error)
+            self._after_error = None
+        return frames + self.pdo.on_events(self._now_s)
+
+    # -- frames
+
+    def receive(self, can_id: int, data: bytes) -> list[Frame]:
+        """Take one frame from the bus and return what the drive sends because of it; one without data asks for one."""
+        if can_id == self._sync_id:
+            return self._sync(data)
+        if can_id == lss.REQUEST and self.nmt not in (OFF, OPERATIONAL):
+            answer = self._lss.receive(data)
+            return [] if answer is None else [(lss.RESPONSE, answer)]
+        if self._mute:
+            return []
+        if can_id == 0x600 + self.node_id:
+            return self._sdo_request(data)
+        if can_id == 0x000:
+            return self._nmt(data)
+        if can_id == 0x700 + self.node_id:
+            return [] if data else [(can_id, self._guarding.request(self.nmt, self._now_s))]
+        if can_id > 0x700:
+            if len(data) == 1 and self._consumer.receive(can_id - 0x700, self._now_s):
+                self._emergencies.clear(in_fault=self._in_fault)
+            return self._take_outgoing()
+        if self.nmt != OPERATIONAL:
+            return []
+        return self._rpdo(can_id, data) if data else self.pdo.requested(can_id)
+
+    def _sdo_request(self, data: bytes) -> list[Frame]:
+        if self.nmt == STOPPED:
+            return []
+        if self._sdo.in_block and self._now_s - self._sdo_s > _SDO_PATIENCE_S:
+            self._sdo.reset()
+        self._sdo_s = self._now_s
+        answers: list[Frame] = [(0x580 + self.node_id, answer) for answer in self._sdo.request(data)]
+        return answers + self._take_outgoing()
+
+    def _nmt(self, data: bytes) -> list[Frame]:
+        if len(data) != 2 or data[1] not in (0, self.node_id):
+            return []
+        match data[0]:
+            case 0x01 if self.nmt != OPERATIONAL:
+                self.nmt = OPERATIONAL
+                self.pdo.configure()
+            case 0x02:
+                self._leave_operational(STOPPED)
+                self._abort_connection()
+            case 0x80:
+                self._leave_operational(PRE_OPERATIONAL)
+            case 0x81:
+                return self.power_on()
+            case 0x82:
+                self._abort_connection()
+                self._take_node_id()
+                self._stored.restore(lambda entry: entry.index < 0x2000)
+                return self._boot_up()
+        return self._take_outgoing()
+
+    def _leave_operational(self, state: int) -> None:
+        self.pdo.stop()
+        self.nmt = state
+
+    def _rpdo(self, can_id: int, data: bytes) -> list[Frame]:
+        try:
+            at_once = self.pdo.receive(can_id, data, self._now_s)
+        except LookupError:
+            return []
+        except ValueError:
+            self._emergencies.report(PDO_TOO_SHORT)
+            return self._take_outgoing()
+        if at_once is not None:
+            self.pdo.apply(at_once)
+            self._received()
+        return self._take_outgoing()
+
+    def _take_outgoing(self) -> list[Frame]:
+        """Return the EMCY frames that may leave now; in NMT stopped none ever does."""
+        if self.nmt == STOPPED or self._mute:
+            self._emergencies.drop()
+        return self._emergencies.take(self._now_s) if self._emergencies.waiting else []
+
+    def _sync(self, data: bytes) -> list[Frame]:
+        if self._mute:
+            self._coast()
+            return []
+        counter = data[0] if data else None
+        if counter is None and self.dictionary.numbers[0x101900]:
+            told, self._sync_refused = self._sync_refused, True
+            if not told:
+                self._emergencies.report(SYNC_LENGTH)
+            return self._take_outgoing()
+        self._sync_refused = False
+        return self._cycle_of_sync(counter)
+
+    def _connection_lost(self, code: int, detail: bytes) -> None:
+        self._emergencies.report(code, detail)
+        if self.nmt == OPERATIONAL:
+            self._after_error = _AFTER_ERROR.get(self.dictionary.numbers.get(0x102901, KEEP_STATE))
+        self._react(code)

@@ -1,0 +1,98 @@
+"""Computes the set-points of the modes with open outer loops: velocity and torque, profile and cyclic."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from fdhil.sim.drive import modes
+from fdhil.sim.drive.motion_limits import MotionLimits, Window
+from fdhil.sim.drive.objects import Ratings
+from fdhil.sim.drive.physics import Command
+from fdhil.sim.drive.setpoints import Ramp, Target
+
+_FADE = 0.05  # of the highest motor speed: over it a torque fades that would drive the motor beyond
+
+
+class Actual(NamedTuple):
+    """What the drive knows at the start of a cycle: increments, increments/s, A, and the bits of 0x60FD."""
+
+    position: int
+    speed: float
+    current_a: float
+    inputs: int
+
+
+class SpeedAndTorque:
+    """Ramps toward 0x60FF and 0x6071, and the cyclic set-points; ``at_speed`` and ``stands`` watch the actual speed."""
+
+    def __init__(self, numbers: Mapping[int, int], limits: MotionLimits, ratings: Ratings) -> None:
+        self._numbers, self._limits = numbers, limits
+        self._rad_per_increment = 2 * math.pi / ratings.increments_per_rev
+        self._amperes = ratings.rated_current_a * 1e-3  # per 0.1 %, of rated torque or rated current
+        period_s = ratings.sync_period_s
+        self._speed, self._torque = Ramp(period_s), Ramp(period_s)
+        self.at_speed = Window(numbers, 0x606D00, 0x606E00, period_s)
+        self.stands = Window(numbers, 0x606F00, 0x607000, period_s)
+
+    def start(self, actual: Actual) -> None:
+        """Go on from the speed and the torque that are."""
+        self._speed.start(actual.speed)
+        self._torque.start(actual.current_a / self._amperes)
+
+    def watch(self, actual: Actual) -> None:
+        """A cycle begins."""
+        self.at_speed.step(actual.speed - self._target_speed)
+        self.stands.step(actual.speed)
+
+    @property
+    def torque_reached(self) -> bool:
+        """Whether the torque ramp is at its target."""
+        return self._torque.before == self._torque.now
+
+    @property
+    def _target_speed(self) -> float:
+        return self._limits.speed(float(self._numbers.get(0x60FF00, 0)))
+
+    def velocity(self, actual: Actual) -> Command:
+        """Return the command of profile velocity: the ramp of 0x6083 and 0x6084 toward 0x60FF."""
+        ramp, limits = self._speed, self._limits
+        ramp.advance(self._target_speed, limits.acceleration(0x608300), limits.deceleration(0x608400))
+        place, scale = float(actual.position), self._rad_per_increment
+        return place, place, 0.0, 0.0, ramp.before * scale, ramp.now * scale, 0.0, 0.0
+
+    def torque(self, actual: Actual) -> Command:
+        """Return the command of profile torque: the slope of 0x6087 toward 0x6071."""
+        slope = float(self._numbers.get(0x608700, 0)) or math.inf
+        self._torque.advance(float(self._numbers.get(0x607100, 0)), slope, slope)
+        place, scale = float(actual.position), self._amperes * self._share(actual, self._torque.now)
+        return place, place, 0.0, 0.0, 0.0, 0.0, self._torque.before * scale, self._torque.now * scale
+
+    def target(self, mode: int, actual: Actual) -> Target:
+        """Return what was latched for a cyclic mode with open loops; its position is where the axis is."""
+        numbers = self._numbers
+        torque = numbers.get(0x60B200, 0)
+        if mode == modes.CYCLIC_VELOCITY:
+            speed = self._limits.speed(float(numbers.get(0x60FF00, 0) + numbers.get(0x60B100, 0)))
+            return Target(actual.position, 0.0, speed * self._rad_per_increment, torque * self._amperes)
+        return Target(actual.position, 0.0, 0.0, (torque + numbers.get(0x607100, 0)) * self._amperes)
+
+    def held(self, mode: int, actual: Actual) -> Target:
+        """Return the target that goes on as it is: what a cyclic mode starts from until its first one acts."""
+        speed = actual.speed * self._rad_per_increment if mode == modes.CYCLIC_VELOCITY else 0.0
+        return Target(actual.position, 0.0, speed, actual.current_a if mode == modes.CYCLIC_TORQUE else 0.0)
+
+    def cyclic(self, mode: int, actual: Actual, command: Command) -> Command:
+        """Return a cyclic command without what its open loops do not see."""
+        place, share = float(actual.position), 1.0
+        if mode == modes.CYCLIC_TORQUE:
+            share = self._share(actual, command[7])
+        return place, place, 0.0, 0.0, command[4], command[5], command[6] * share, command[7] * share
+
+    def _share(self, actual: Actual, torque: float) -> float:
+        """Return how much of a torque acts: none that drives the motor beyond 0x6080."""
+        highest = self._limits.motor_speed
+        if math.isinf(highest) or torque * actual.speed <= 0:
+            return 1.0
+        return min(max((highest - abs(actual.speed)) / (_FADE * highest), 0.0), 1.0)

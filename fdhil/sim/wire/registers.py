@@ -1,0 +1,137 @@
+"""What the registers of the simulated sensors hold: words by address, for whichever server they are read through.
+
+Written from the keys of the configuration as a maker of such a device would: numbers are packed here with ``struct``.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable
+from typing import Protocol
+
+from fdhil.config import Thermometer, Voltage
+from fdhil.config.sensors import VoltageBlock
+
+_FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f", "float64": ">d"}
+
+
+class Samples(Protocol):
+    """The sample memory of a sensor."""
+
+    celsius: float
+
+    def newest(self, number: int) -> tuple[int, list[float]]:
+        """Return how many samples there were so far, and at most ``number`` of the newest (V), the oldest first."""
+
+
+class RegisterMap(Protocol):
+    """A device's registers, the same as input and holding registers. Only ``trigger`` may be written, with 1."""
+
+    trigger: int | None
+
+    def words(self) -> dict[int, int]:
+        """Return all registers as they read now, by address."""
+
+    def latch(self) -> None:
+        """The trigger was written."""
+
+
+def packed(value: float, kind: str, order: str) -> list[int]:
+    """Return a number as registers; a whole number stops at the ends of its type, as a converter does."""
+    if not kind.startswith("float"):
+        bits = 8 * struct.calcsize(_FORMATS[kind])
+        low, high = (0, 2**bits - 1) if kind.startswith("u") else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
+        value = min(max(round(value), low), high) if math.isfinite(value) else high
+    data = struct.pack(_FORMATS[kind], value)
+    words = list(struct.unpack(f">{len(data) // 2}H", data))
+    return words if order == "big" else words[::-1]
+
+
+def _placed(address: int, words: list[int]) -> dict[int, int]:
+    return {address + place: word for place, word in enumerate(words)}
+
+
+class OneValue:
+    """A meter or a thermometer: one number, its newest."""
+
+    trigger: int | None = None
+
+    def __init__(self, settings: Voltage | Thermometer, kind: str, read: Callable[[], float]) -> None:
+        self._settings, self._kind, self._read = settings, kind, read
+
+    def words(self) -> dict[int, int]:
+        """Return the registers of the number."""
+        settings = self._settings
+        raw = (self._read() - settings.offset) / settings.scale
+        return _placed(settings.address, packed(raw, self._kind, settings.word_order))
+
+    def latch(self) -> None:
+        """There is nothing to latch."""
+
+
+class Block:
+    """A device that keeps its newest samples by number, at the registers of ``[axis.X.voltage.block]``."""
+
+    def __init__(self, settings: Voltage, block: VoltageBlock, kind: str, samples: Samples) -> None:
+        self.trigger = block.trigger_address
+        self._settings, self._block, self._kind, self._samples = settings, block, kind, samples
+        self._latched: dict[int, int] | None = None
+
+    def words(self) -> dict[int, int]:
+        """Return the registers of samples, count and number."""
+        if self.trigger is None:
+            return self._now()
+        if self._latched is None:
+            self.latch()
+        return {**(self._latched or {}), self.trigger: 0}
+
+    def latch(self) -> None:
+        """Put the newest samples into the block."""
+        self._latched = self._now()
+
+    def _now(self) -> dict[int, int]:
+        settings, block = self._settings, self._block
+        count, volts = self._samples.newest(block.samples)
+        held = volts[::-1] if block.newest_first else volts
+        raw = [(v - settings.offset) / settings.scale for v in held]
+        numbers = [word for v in raw for word in packed(v, self._kind, settings.word_order)]
+        size = block.samples * struct.calcsize(_FORMATS[self._kind]) // 2
+        words = _placed(settings.address, numbers + [0] * (size - len(numbers)))
+        told = (count - 1 if block.counter_of == "newest" else count - len(volts)) % (1 << 32)
+        told %= 1 << 8 * struct.calcsize(_FORMATS[block.counter_type])
+        words |= _placed(block.counter_address, packed(told, block.counter_type, settings.word_order))
+        if block.count_address is not None:
+            words[block.count_address] = len(volts)
+        return dict.fromkeys(range(min(words), max(words)), 0) | words  # one request reads them all
+
+
+class Joined:
+    """Several maps in one unit; where two have a register the later one's is read."""
+
+    def __init__(self, *maps: RegisterMap) -> None:
+        self._maps = maps
+        self.trigger = next((one.trigger for one in maps if one.trigger is not None), None)
+
+    def words(self) -> dict[int, int]:
+        """Return all registers."""
+        return {address: word for one in self._maps for address, word in one.words().items()}
+
+    def latch(self) -> None:
+        """Latch them all."""
+        for one in self._maps:
+            one.latch()
+
+
+def map_of(settings: Voltage, own: RegisterMap, samples: Samples) -> RegisterMap:
+    """Return the registers that a voltage sensor with these settings has; ``own`` are those that fdhil invented."""
+    if settings.source != "modbus" or settings.type is None:
+        return own
+    if settings.block is not None:
+        return Block(settings, settings.block, settings.type, samples)
+    return OneValue(settings, settings.type, lambda: (samples.newest(1)[1] or [0.0])[0])
+
+
+def thermometer_map(settings: Thermometer, samples: Samples) -> RegisterMap:
+    """Return the registers of a thermometer."""
+    return OneValue(settings, settings.type, lambda: samples.celsius)

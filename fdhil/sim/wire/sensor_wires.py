@@ -1,0 +1,81 @@
+"""Connects the sensors of the simulated machine as its configuration has them: Modbus TCP and RTU, lines of text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from fdhil.config import MachineConfig, Thermometer
+from fdhil.errors import ConnectError
+from fdhil.sim.wire.modbus_sensor import SensorServers, VoltageSensor
+from fdhil.sim.wire.registers import Joined, RegisterMap, map_of, thermometer_map
+from fdhil.sim.wire.serial_lines import Party, RtuUnits, SerialLines, TextInstrument
+
+
+class SensorWires:
+    """All sensors of a machine; ``ready`` says by axis where each voltage sensor is, once :meth:`start` has returned.
+
+    A drive's axis whose voltage comes from the drive has a sensor on Modbus TCP all the same. A thermometer is served
+    where its device is: on a serial line, or within the unit of the voltage sensor at the same address.
+    """
+
+    def __init__(self, config: MachineConfig, sensors: Mapping[str, VoltageSensor]) -> None:
+        self._config, self._sensors = config, sensors
+        self._parties: dict[str, Party] = {}
+        maps, addresses = {}, {}
+        for axis, sensor in sensors.items():
+            section = config.axis[axis]
+            voltage, thermometer = section.voltage, section.temperature
+            if thermometer is not None and thermometer.device:
+                self._on_a_line(axis, thermometer)
+            if voltage.separate and voltage.device:
+                self._on_a_line(axis, voltage)
+                continue
+            registers = map_of(voltage, sensor, sensor)
+            here = thermometer is not None and (thermometer.host, thermometer.port) == (voltage.host, voltage.port)
+            if thermometer is not None and here and thermometer.source == "modbus" and not thermometer.device:
+                registers = Joined(registers, thermometer_map(thermometer, sensor))
+            maps[axis], addresses[axis] = registers, (voltage.host, voltage.port)
+        self._tcp = SensorServers(sensors, addresses, maps)
+        self._lines = SerialLines(self._parties) if self._parties else None
+        self.ready: dict[str, dict[str, Any]] = {}
+
+    def _on_a_line(self, axis: str, settings: Any) -> None:
+        sensor = self._sensors[axis]
+        is_warmth = isinstance(settings, Thermometer)
+        if settings.source == "serial":
+            read = (lambda: sensor.celsius) if is_warmth else (lambda: (sensor.newest(1)[1] or [0.0])[0])
+            self._parties[settings.device] = TextInstrument(settings, read, sensor.faults)
+            return
+        party = self._parties.setdefault(settings.device, RtuUnits())
+        assert isinstance(party, RtuUnits)  # the configuration has text alone on its device
+        registers: RegisterMap = thermometer_map(settings, sensor) if is_warmth else map_of(settings, sensor, sensor)
+        if settings.unit in party.units:
+            registers = Joined(party.units[settings.unit][0], registers)
+        party.units[settings.unit] = registers, sensor.faults
+
+    def start(self) -> None:
+        """Open every port and device; ConnectError when one cannot be had."""
+        self._tcp.start()
+        try:
+            if self._lines is not None:
+                self._lines.start()
+        except ConnectError:
+            self._lines = None
+            self._tcp.stop()
+            raise
+        for axis in self._sensors:
+            voltage = self._config.axis[axis].voltage
+            port = self._tcp.ports.get(axis)
+            if port is not None:
+                self.ready[axis] = {"host": voltage.host, "port": port, "unit": voltage.unit}
+            elif voltage.source == "serial":
+                self.ready[axis] = {"device": voltage.device}
+            else:
+                self.ready[axis] = {"device": voltage.device, "unit": voltage.unit}
+
+    def stop(self) -> None:
+        """Close every port and take the devices away."""
+        if self._lines is not None:
+            self._lines.stop()
+        self._tcp.stop()

@@ -1,0 +1,268 @@
+"""fdhil doctor names each planted trouble first."""
+
+from __future__ import annotations
+
+import json
+import socket
+import sqlite3
+import stat
+import uuid
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from fdhil import config as machine_config
+from fdhil.cli.demo.toml import to_toml
+from fdhil.cli.doctor import doctor
+from fdhil.records import Notice
+from fdhil.store.history import FILE_NAME, History
+from fdhil.store.rows import Stamp
+from tests.bench import bench_document
+from tests.drivers.peer import DrivePeer
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorter waits than on a real machine, and a PC that nobody else uses."""
+    monkeypatch.setattr("fdhil.commissioning.config_check.LISTEN_S", 0.2)
+    monkeypatch.setattr("fdhil.drivers.can.sdo.QUIET_S", 0.05)
+    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("os.getloadavg", lambda: (0.1, 0.1, 0.1))
+    monkeypatch.setattr("fdhil.cli.doctor.computer.GOVERNOR", Path("/none"))
+
+
+class Pc:
+    """A PC with a machine: one axis on a bus of this process, which has a drive where ``peer`` was called."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.store = folder / "store"
+        self.bus: dict[str, Any] = {"interface": "virtual", "channel": uuid.uuid4().hex}
+        self.document = bench_document("X")
+        del self.document["axis"]["X"]["correction"]
+        self.document["store"] = {"directory": str(self.store)}
+
+    @property
+    def axis(self) -> dict[str, Any]:
+        axis = self.document["axis"]["X"]
+        assert isinstance(axis, dict)
+        return axis
+
+    @property
+    def run_directory(self) -> Path:
+        return self.store / "run"
+
+    def write(self) -> Path:
+        path = self.folder / "machine.toml"
+        path.write_text(to_toml({**self.document, "bus": {"can0": self.bus}}), "utf-8")
+        return path
+
+    def peer(self) -> DrivePeer:
+        return DrivePeer(machine_config.load(self.write()))
+
+    def examined(self, *options: str) -> tuple[int, list[dict[str, Any]]]:
+        result = CliRunner().invoke(doctor, [str(self.write()), "--json", *options], standalone_mode=False)
+        assert result.exception is None, result.exception
+        document = json.loads(result.stdout)
+        assert document["schema"] == "fdhil-doctor-1"
+        return int(result.return_value), document["troubles"]
+
+
+@pytest.fixture
+def pc(tmp_path: Path) -> Pc:
+    made = Pc(tmp_path)
+    made.run_directory.mkdir(parents=True, mode=0o700)
+    return made
+
+
+def faulty_config(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    pc.axis["screw_pich_mm"] = 20.0
+
+
+def store_is_a_file(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    (pc.folder / "occupied").write_text("x")
+    pc.document["store"]["directory"] = str(pc.folder / "occupied" / "store")
+
+
+def store_may_not_be_written(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    # root may write everywhere
+    patch.setattr("fdhil.cli.doctor.storage.may_write", lambda _: False)
+
+
+def little_room(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    patch.setattr("fdhil.cli.doctor.storage.LEAST_FREE_BYTES", 1 << 60)
+
+
+def damaged_history(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    (pc.store / FILE_NAME).write_bytes(b"no database" * 1000)
+
+
+def newer_history(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    History.open(pc.store).close()
+    with sqlite3.connect(pc.store / FILE_NAME) as db:
+        db.execute("PRAGMA user_version = 99")
+    db.close()
+
+
+def clock_never_set(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    patch.setattr("time.time", lambda: 0.0)
+
+
+def clock_set_back(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    with History.open(pc.store) as history:
+        now = Stamp.now()
+        history.add_notice(Notice("SyncLost", "info", "SYNC is back."), replace(now, wall_s=now.wall_s + 86400))
+
+
+def no_port(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    pc.bus = {"interface": "socketcand", "port": 0}
+
+
+def hub_is_away(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        pc.bus = {"interface": "socketcand", "port": free.getsockname()[1]}
+
+
+def kernel_without_can(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    pc.bus = {"interface": "socketcan", "channel": "can9"}
+    patch.setattr("fdhil.cli.doctor.computer._opens_can", lambda: False)
+
+
+def adapter(pc: Pc, patch: pytest.MonkeyPatch, flags: str | None, details: dict[str, Any] | None = None) -> None:
+    """A CAN interface as the kernel and ``ip`` tell of it; ``flags`` None: there is none."""
+    pc.bus = {"interface": "socketcan", "channel": "can9", "bitrate": 500_000}
+    patch.setattr("fdhil.cli.doctor.computer._opens_can", lambda: True)
+    patch.setattr("fdhil.cli.doctor.computer.INTERFACES", pc.folder)
+    if flags is not None:
+        (pc.folder / "can9").mkdir()
+        (pc.folder / "can9" / "flags").write_text(flags)
+    tool = pc.folder / "ip"
+    tool.write_text(f"#!/bin/sh\ncat <<'END'\n{json.dumps([{'linkinfo': {'info_data': details or {}}}])}\nEND\n")
+    tool.chmod(0o755)
+    patch.setattr("shutil.which", lambda name: str(tool))
+
+
+def no_adapter(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    adapter(pc, patch, None)
+
+
+def interface_down(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    adapter(pc, patch, "0x80\n")
+
+
+def bus_off(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    adapter(pc, patch, "0x81\n", {"state": "BUS-OFF", "bittiming": {"bitrate": 500_000}, "restart_ms": 100})
+
+
+def error_passive(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    adapter(pc, patch, "0x81\n", {"state": "ERROR-PASSIVE"})
+
+
+def other_bit_rate(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    adapter(pc, patch, "0x81\n", {"state": "ERROR-ACTIVE", "bittiming": {"bitrate": 250_000}})
+
+
+def drive_is_away(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    pc.axis["drive"] = {"node_id": 9}
+
+
+def other_rated_current(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    pc.axis["drive"] = {"rated_current_a": 10.0}
+
+
+def other_scale(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    pc.axis["drive"] = {"increments_per_rev": 4096}
+
+
+def sensor_is_away(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    pc.axis["voltage"] = {"source": "modbus", "host": "127.0.0.1", "port": 9, "timeout_s": 0.2}
+
+
+def socket_path_too_long(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    pc.document["store"]["run_directory"] = str(pc.folder / ("x" * 120))
+
+
+def anybody_may_write(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    pc.run_directory.chmod(stat.S_IMODE(0o777))
+
+
+def token_can_be_read(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    (pc.run_directory / "token").write_text("secret")
+    (pc.run_directory / "token").chmod(0o644)
+
+
+def corrected(pc: Pc) -> None:
+    pc.axis["correction"] = {"max_offset_um": 50.0}
+
+
+def damaged_record(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    corrected(pc)
+    (pc.store / "commissioning-X.json").write_text("{}")
+
+
+def guard_is_silent(pc: Pc, patch: pytest.MonkeyPatch) -> None:
+    with socket.socket(socket.AF_UNIX) as left:
+        left.bind(str(pc.run_directory / "guard.sock"))
+
+
+PLANTED: dict[Callable[[Pc, pytest.MonkeyPatch], None], str] = {
+    faulty_config: "Config",
+    store_is_a_file: "StoreNoFolder",
+    store_may_not_be_written: "StoreReadOnly",
+    little_room: "DiskFull",
+    damaged_history: "CorruptFile",
+    newer_history: "SchemaVersion",
+    clock_never_set: "ClockNotSet",
+    clock_set_back: "ClockBehind",
+    no_port: "NoPort",
+    hub_is_away: "HubAway",
+    kernel_without_can: "NoKernelCan",
+    no_adapter: "InterfaceMissing",
+    interface_down: "InterfaceDown",
+    bus_off: "BusOff",
+    error_passive: "BusPassive",
+    other_bit_rate: "BitrateDiffers",
+    drive_is_away: "DriveDiffers",
+    other_rated_current: "RatedCurrentDiffers",
+    other_scale: "ScaleDiffers",
+    sensor_is_away: "VoltageDiffers",
+    socket_path_too_long: "SocketPathLong",
+    anybody_may_write: "RunDirectoryOpen",
+    token_can_be_read: "TokenOpen",
+    damaged_record: "RecordBad",
+    guard_is_silent: "GuardSilent",
+}
+
+
+def test_nothing_is_wrong_with_a_machine_as_it_must_be(pc: Pc) -> None:
+    with pc.peer():
+        assert pc.examined() == (0, [])
+
+
+@pytest.mark.parametrize("plant", PLANTED, ids=lambda plant: plant.__name__)
+def test_a_planted_trouble_is_named_first(plant: Callable[..., None], pc: Pc, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pc.peer():
+        plant(pc, monkeypatch)
+        code, troubles = pc.examined()
+    assert troubles[0]["code"] == PLANTED[plant], troubles
+    assert code == 1
+    assert all(troubles[0][part] for part in ("place", "what", "means", "mend"))
+
+
+def test_what_could_be_better_comes_last_and_is_no_failure(pc: Pc, monkeypatch: pytest.MonkeyPatch) -> None:
+    corrected(pc)
+    monkeypatch.setattr("os.getloadavg", lambda: (99.0, 99.0, 99.0))
+    code, troubles = pc.examined("--offline")
+    assert (code, [t["code"] for t in troubles]) == (0, ["BusyHost", "NotCommissioned"])
+
+
+def test_it_reads_well(pc: Pc) -> None:
+    pc.axis["drive"] = {"bus": "can7"}
+    result = CliRunner().invoke(doctor, [str(pc.write())], standalone_mode=False)
+    assert "1 to mend, 0 that could be better" in result.stdout
+    assert "   mend:  " in result.stdout

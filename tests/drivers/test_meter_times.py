@@ -1,0 +1,77 @@
+"""When sensors that show one value are asked, and what number a value has that is told. Pure, but for no clock."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fdhil.drivers.asking_grid import AskingGrid
+from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.told_count import ToldCount
+from fdhil.records import TickTimes
+
+MS = 1_000_000
+
+
+def ticks_until(last: int, *, held_up_ms: int = 0) -> TickClock:
+    """SYNCs 1 ms apart from 0 ns on; the producer was held up after tick 500."""
+    clock = TickClock(0.001)
+    tick = np.arange(last + 1)
+    clock.add(TickTimes(tick, tick * MS + np.where(tick > 500, held_up_ms * MS, 0)))
+    return clock
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.5])
+def test_instants_lie_on_the_sync_count_wherever_its_producer_stood_still(phase: float) -> None:
+    grid, ticks = AskingGrid(0.01, 0.001, phase), ticks_until(1000, held_up_ms=80)
+    for now_ms in (1081, 1083, 1090, 1095):
+        number, due_ns = grid.next_instant(now_ms * MS, ticks)
+        tick = (number + phase) * 10
+        assert due_ns == (tick + 80) * MS
+        assert now_ms * MS <= due_ns
+    assert grid.missed == 0
+    number, _ = grid.next_instant(1300 * MS, ticks)
+    assert grid.missed > 0
+
+
+def test_an_answer_is_as_far_off_as_its_bounds_allow() -> None:
+    grid, ticks = AskingGrid(0.01, 0.001), ticks_until(1000)
+    number, due_ns = grid.next_instant(985 * MS, ticks)
+    due = round(due_ns)
+    assert due == 990 * MS
+    off = grid.off_ns(number, due + 200_000, due + 700_000, ticks)
+    assert off == pytest.approx(700_000, abs=1000)
+    assert grid.off_ns(number, due - 3 * MS, due + 100_000, ticks) == pytest.approx(3 * MS, abs=1000)
+
+
+def test_without_sync_the_computers_clock_does() -> None:
+    grid, ticks = AskingGrid(0.01, 0.001), TickClock(0.001)
+    number, due_ns = grid.next_instant(25 * MS, ticks)
+    assert (number, due_ns) == (3, 30 * MS)
+    assert grid.off_ns(number, 30 * MS, 31 * MS, ticks) == MS
+    assert grid.next_instant(26 * MS, ticks)[0] == 4
+    running = ticks_until(1000)
+    assert grid.next_instant(1001 * MS, running)[0] == 101
+    assert grid.missed == 0  # another count
+    assert grid.next_instant(1700 * MS, running)[0] == 170  # SYNC has ended
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    drift=st.floats(-200e-6, 200e-6),
+    late=st.lists(st.floats(0, 0.5), min_size=30, max_size=80),
+    lost=st.sets(st.integers(10, 79), max_size=4),
+    held_up=st.booleans(),
+)
+def test_values_keep_their_numbers_late_or_lost(drift: float, late: list[float], lost: set[int], held_up: bool) -> None:
+    """Either this computer was late by some values, all until then with it, or values were lost."""
+    count, last, right = ToldCount(0.01), 0.0, []
+    for k, delay in enumerate(late):
+        if k in lost and not held_up:
+            continue
+        held = 5 * delay if held_up and k % 7 == 3 else 0.0
+        last = max(last, (k * (1 + drift) + held) * 10 * MS)
+        right.append(count.number(round(last)) == k)
+    assert right.count(False) <= (0 if held_up else len(lost))  # the one behind a lost one is set right by the next

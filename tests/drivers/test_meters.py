@@ -1,0 +1,348 @@
+"""Sensors that are a few lines of configuration, read from simulated ones that are served by the same lines."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import re
+import time
+import tomllib
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil.config import MachineConfig, Voltage, parse
+from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.sensor_source import Record, Sensor, SensorSource, sensors_of
+from fdhil.errors import ConfigError, DeviceTimeout, ProtocolError
+from fdhil.records import Notice, Temperature, VoltageSamples
+from fdhil.sim.wire.modbus_sensor import VoltageSensor
+from fdhil.sim.wire.sensor_wires import SensorWires
+from tests.bench import bench_axis
+
+TYPES = {"int16": 0.01, "uint16": 0.01, "int32": 1e-4, "uint32": 1e-4, "float32": 1.0, "float64": 1.0}
+
+
+class Shop:
+    """The simulated sensors of a machine, served, and the drivers that its configuration gives."""
+
+    def __init__(self, document: dict[str, Any]) -> None:
+        self.document = document
+        made = parse(document)
+        self.memory = {axis: _memory(made, axis) for axis in made.axis}
+        self.wires = SensorWires(made, self.memory)
+
+    def config(self) -> MachineConfig:
+        """The configuration with the ports that were chosen."""
+        for axis, place in self.wires.ready.items():
+            self.document["axis"][axis]["voltage"] |= place
+        return parse(self.document)
+
+    def sensors(self, axis: str = "X") -> dict[str, Sensor]:
+        return sensors_of(axis, self.config())
+
+
+def _memory(made: MachineConfig, axis: str) -> VoltageSensor:
+    limit_v = made.axis[axis].regulators.voltage_limit_v
+    sensor = VoltageSensor(1000.0, limit_v, 0.0, np.random.default_rng(1))
+    sensor.feed(-12.34)
+    sensor.celsius = 21.5
+    return sensor
+
+
+@asynccontextmanager
+async def shop(*voltages: dict[str, Any], temperature: dict[str, Any] | None = None) -> AsyncIterator[Shop]:
+    axes = {}
+    for name, voltage in zip("XYZ", voltages, strict=False):
+        axes[name] = bench_axis(corrected=False, voltage=voltage)
+        if temperature is not None:
+            axes[name]["temperature"] = temperature
+    served = Shop({"machine": {"name": "bench"}, "axis": axes})
+    served.wires.start()
+    try:
+        yield served
+    finally:
+        served.wires.stop()
+
+
+async def volts_of(sensor: Sensor, polls: int = 1) -> np.ndarray:
+    await sensor.link.connect()
+    found: list[VoltageSamples] = []
+    async with asyncio.timeout(60):
+        while len(found) < polls:  # on a busy computer all values of a poll may come too late
+            found += [r for r in await sensor.poll(TickClock(0.001)) if isinstance(r, VoltageSamples)]
+    sensor.link.close()
+    return np.concatenate([r.voltage_v for r in found])
+
+
+@pytest.mark.parametrize("kind", TYPES)
+@pytest.mark.parametrize("order", ["big", "little"])
+@pytest.mark.parametrize("on_a_line", [False, True])
+async def test_a_plain_value_of_every_type(kind: str, order: str, on_a_line: bool, tmp_path: Path) -> None:
+    voltage = {"source": "modbus", "type": kind, "word_order": order, "scale": TYPES[kind], "period_s": 0.01}
+    voltage |= {"offset": -300.0, "address": 7, "function": 3, "unit": 9}
+    voltage |= {"device": str(tmp_path / "meter"), "baud_rate": 115200} if on_a_line else {}
+    async with shop(voltage) as served:
+        sensor = served.sensors()["voltage"]
+        volts = await volts_of(sensor)
+        assert volts.size
+        np.testing.assert_allclose(volts, -12.34, atol=TYPES[kind] if kind[0] != "f" else 1e-4)
+
+
+async def test_a_float_at_0_needs_one_line_more_than_its_place(tmp_path: Path) -> None:
+    for place in ({}, {"device": str(tmp_path / "meter")}):
+        async with shop({"source": "modbus", "type": "float32", **place}) as served:
+            sensor = served.sensors()["voltage"]
+            await sensor.link.connect()
+            assert await sensor.reading() == "-12.34 V at 50 Hz"
+            sensor.link.close()
+
+
+async def test_two_meters_and_a_thermometer_share_a_line(tmp_path: Path) -> None:
+    line = {"source": "modbus", "device": str(tmp_path / "line"), "baud_rate": 115200, "type": "int16", "scale": 0.01}
+    warmth = {"device": line["device"], "baud_rate": 115200, "unit": 3, "type": "int16", "scale": 0.1, "period_s": 0.02}
+    async with shop({**line, "unit": 1}, {**line, "unit": 2}, temperature=warmth) as served:
+        served.memory["Y"].feed(45.6)
+        found: list[Record] = []
+
+        def take(record: Record) -> None:
+            found.append(record)
+            if isinstance(record, VoltageSamples | Temperature):
+                heard[getattr(record, "sensor", "thermometer " + record.axis)].set()
+
+        sensors = [*served.sensors("X").values(), *served.sensors("Y").values()]
+        heard = {sensor.name: asyncio.Event() for sensor in sensors}
+        sources = [SensorSource(sensor, TickClock(0.001)) for sensor in sensors]
+        async with asyncio.timeout(20):
+            tasks = [asyncio.create_task(source.run(take)) for source in sources]
+            for sensor in sensors:
+                await heard[sensor.name].wait()
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+        for source in sources:
+            source.close()
+    told = {(r.axis, round(float(v), 6)) for r in found if isinstance(r, VoltageSamples) for v in r.voltage_v}
+    assert told == {("X", -12.34), ("Y", 45.6)}
+    assert {round(r.celsius, 6) for r in found if isinstance(r, Temperature)} == {21.5}
+
+
+async def test_values_are_on_a_grid_and_their_stamps_enclose_when_they_were_true() -> None:
+    settings = {"source": "modbus", "type": "float64", "period_s": 0.01, "renewed_s": 0.004, "delay_s": 0.02}
+    async with shop(settings) as served:
+        sensor = served.sensors()["voltage"]
+        await sensor.link.connect()
+        before_ns = time.monotonic_ns()
+        blocks: list[VoltageSamples] = []
+        async with asyncio.timeout(60):
+            while len(blocks) < 3:
+                blocks += [r for r in await sensor.poll(TickClock(0.001)) if isinstance(r, VoltageSamples)]
+        after_ns = time.monotonic_ns()
+        sensor.link.close()
+    counter = np.concatenate([b.counter for b in blocks])
+    due_ns = np.concatenate([b.t_ns for b in blocks]) + 0.022e9
+    error_ns = np.concatenate([b.t_error_ns for b in blocks])
+    assert {b.sample_rate_hz for b in blocks} == {100.0}
+    assert (np.diff(counter) >= 1).all()
+    assert counter[-1] - counter[0] + 1 <= counter.size + sensor.lost
+    assert sensor.samples == counter.size
+    assert (error_ns >= 0.002e9).all()
+    assert before_ns - 2e6 <= due_ns[0] <= due_ns[-1] <= after_ns
+    np.testing.assert_allclose(due_ns - due_ns[0], (counter - counter[0]) * 1e7, atol=1e3)
+
+
+@pytest.mark.parametrize("query", ["READ?\n", ""])
+async def test_an_instrument_that_tells_lines(query: str, tmp_path: Path) -> None:
+    voltage = {"source": "serial", "device": str(tmp_path / "dmm"), "baud_rate": 115200, "parity": "none"}
+    async with shop({**voltage, "query": query, "period_s": 0.01, "scale": 2.0}) as served:
+        sensor = served.sensors()["voltage"]
+        volts = await volts_of(sensor, 2)
+        assert volts.size
+        np.testing.assert_allclose(volts, -12.34, atol=2e-4)
+        served.memory["X"].faults.silent = True
+        with pytest.raises(DeviceTimeout, match="check the instrument, the baud rate"):
+            await volts_of(sensor, 3)
+        sensor.link.close()
+
+
+async def test_a_thermometer_that_tells_lines(tmp_path: Path) -> None:
+    warmth = {
+        "source": "serial",
+        "device": str(tmp_path / "t"),
+        "query": "T?\n",
+        "period_s": 0.01,
+        "pattern": r"\+([\d.]+)",
+    }
+    async with shop({"source": "drive"}, temperature=warmth) as served:
+        sensor = served.sensors()["temperature"]
+        await sensor.link.connect()
+        assert [r.celsius for r in await sensor.poll(TickClock(0.001)) if isinstance(r, Temperature)] == [21.5]
+        assert await sensor.reading() == "21.50 degC"
+        sensor.link.close()
+
+
+BLOCK = {"samples": 20, "counter_address": 40}
+
+
+@pytest.mark.parametrize(
+    "block",
+    [
+        {},
+        {"counter_of": "oldest", "newest_first": True},
+        {"count_address": 42, "counter_type": "uint16"},
+        {"trigger_address": 43},
+    ],
+)
+async def test_a_block_of_samples_by_number(block: dict[str, Any]) -> None:
+    voltage = {"source": "modbus", "scale": 0.01, "block": BLOCK | block}
+    async with shop(voltage) as served:
+        for _ in range(65530):
+            served.memory["X"].feed(0.0)
+        sensor = served.sensors()["voltage"]
+        await sensor.link.connect()
+        found: list[VoltageSamples] = []
+        for step in range(4):
+            for k in range(12):
+                served.memory["X"].feed(0.1 * (12 * step + k))
+            found += [r for r in await sensor.poll(TickClock(0.001)) if isinstance(r, VoltageSamples)]
+        sensor.link.close()
+    counter = np.concatenate([b.counter for b in found])
+    np.testing.assert_array_equal(np.diff(counter), 1)
+    assert sensor.lost == 0
+    np.testing.assert_allclose(np.concatenate([b.voltage_v for b in found])[-48:], 0.1 * np.arange(48), atol=0.006)
+
+
+@pytest.mark.parametrize(
+    ("read_as", "says"),
+    [
+        ({"type": "float32", "word_order": "little"}, "compare address, function, type, word_order and scale"),
+        ({"type": "int32"}, "register 0 gives"),
+        ({"type": "float32", "address": 1}, r"register 1 is refused \(illegal register address\)"),
+    ],
+)
+async def test_a_wrong_type_or_word_order_is_told_and_not_used(read_as: dict[str, Any], says: str) -> None:
+    async with shop({"source": "modbus", "type": "float32"}) as served:
+        config = served.config()
+        voltage = config.axis["X"].voltage.model_copy(update=read_as)
+        config.axis["X"].__dict__["voltage"] = voltage
+        sensor = sensors_of("X", config)["voltage"]
+        await sensor.link.connect()
+        with pytest.raises(ProtocolError, match=says):
+            await sensor.poll(TickClock(0.001))
+        sensor.link.close()
+
+
+async def test_a_sensor_that_is_asked_too_often_is_told_once() -> None:
+    async with shop({"source": "modbus", "type": "float32", "period_s": 0.002}) as served:
+        served.memory["X"].faults.slow_s = 0.005
+        sensor = served.sensors()["voltage"]
+        await sensor.link.connect()
+        notices: list[Notice] = []
+        async with asyncio.timeout(20):
+            while len(notices) < 1:
+                notices += [r for r in await sensor.poll(TickClock(0.001)) if isinstance(r, Notice)]
+        notices += [r for _ in range(3) for r in await sensor.poll(TickClock(0.001)) if isinstance(r, Notice)]
+        sensor.link.close()
+    assert [n.code for n in notices] == ["SampleTiming"]
+    assert "set axis.X.voltage.period_s above 0.002" in notices[0].text
+    assert sensor.lost > 0
+
+
+async def test_nothing_that_is_no_number_gets_through() -> None:
+    async with shop({"source": "modbus", "type": "float64"}) as served:
+        sensor = served.sensors()["voltage"]
+        await sensor.link.connect()
+        for wrong in (math.nan, math.inf, -math.inf, 1e30):
+            served.memory["X"].feed(wrong)
+            with pytest.raises(ProtocolError, match="register 0 gives"):
+                await sensor.poll(TickClock(0.001))
+        sensor.link.close()
+
+
+async def test_an_adapter_that_is_pulled_out_and_put_back_is_used_again(tmp_path: Path) -> None:
+    """Without a restart; the pause between tries grows, and both edges are told once."""
+    settings = {"source": "modbus", "type": "float32", "device": str(tmp_path / "meter")}
+    found: asyncio.Queue[Record] = asyncio.Queue()
+
+    async def until(code: str, severity: str) -> None:
+        async with asyncio.timeout(60):
+            while not (isinstance(r := await found.get(), Notice) and (r.code, r.severity) == (code, severity)):
+                pass
+
+    async with shop(settings) as served:
+        source = SensorSource(served.sensors()["voltage"], TickClock(0.001))
+        running = asyncio.create_task(source.run(found.put_nowait))
+        async with asyncio.timeout(60):
+            while not isinstance(await found.get(), VoltageSamples):
+                pass
+        served.wires.stop()
+        await until("ModbusPortGone", "MAJOR")
+        served.wires = SensorWires(served.config(), served.memory)
+        served.wires.start()
+        await until("ModbusPortGone", "info")
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        source.close()
+    assert source.counters()["failures"] >= 1
+
+
+def refused(**axes: dict[str, Any]) -> str:
+    document = {name: bench_axis(corrected=False, voltage=voltage) for name, voltage in axes.items()}
+    with pytest.raises(ConfigError) as caught:
+        parse({"machine": {"name": "bench"}, "axis": document})
+    return str(caught.value)
+
+
+LINE = {"source": "modbus", "device": "/dev/ttyUSB0", "type": "float32"}
+
+
+@pytest.mark.parametrize(
+    ("axes", "says"),
+    [
+        ({"X": {"source": "serial"}}, "a sensor on a serial line has one"),
+        ({"X": {**LINE, "unit": 0}}, "from 1 to 247"),
+        ({"X": {**LINE, "baud_rate": 9601}}, "must be one of 1200"),
+        ({"X": {**LINE, "scale": 0.0}}, "must be worth something"),
+        ({"X": {**LINE, "pattern": "([0-9]+"}}, "no regular expression"),
+        ({"X": {**LINE, "pattern": "[0-9]+"}}, "must have one group"),
+        ({"X": {**LINE, "type": "float16"}}, "float32"),
+        ({"X": {**LINE, "block": {"counter_address": 300}}}, "which no request reads"),
+        ({"X": LINE, "Y": {**LINE, "unit": 2, "parity": "none"}}, "axis.X.voltage sets the same device"),
+        ({"X": LINE, "Y": {**LINE, "source": "serial"}}, "is alone on its device"),
+        ({"X": {**LINE, "baud_rate": 9600}}, "of the time of /dev/ttyUSB0 at 9600 baud"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_its_key(axes: dict[str, dict[str, Any]], says: str) -> None:
+    assert says in refused(**axes)
+
+
+@pytest.mark.parametrize(
+    ("given", "kind", "sampling"),
+    [
+        ({"source": "modbus"}, None, "interval_mean"),
+        ({"source": "modbus", "address": 0}, "float32", "instant"),
+        ({"source": "modbus", "type": "int16", "sampling": "interval_mean"}, "int16", "interval_mean"),
+        ({"source": "modbus", "block": {}}, "int16", "interval_mean"),
+        ({"source": "serial", "device": "/dev/ttyUSB0"}, None, "instant"),
+        ({"source": "drive"}, None, "interval_mean"),
+    ],
+)
+def test_what_is_left_out_follows_from_what_is_given(given: dict[str, Any], kind: str | None, sampling: str) -> None:
+    voltage = Voltage.model_validate(given)
+    assert (voltage.type, voltage.sampling) == (kind, sampling)
+
+
+def pieces() -> list[str]:
+    page = Path(__file__).parents[2] / "docs" / "reference" / "instruments.md"
+    return re.findall(r"^```toml\n(.*?)^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("text", pieces())
+def test_what_is_told_of_an_instrument_is_a_sensor(text: str) -> None:
+    axis = bench_axis(corrected=False) | tomllib.loads(text)["axis"]["X"]
+    found = sensors_of("X", parse({"machine": {"name": "bench"}, "axis": {"X": axis}}))
+    assert len(found) == 1

@@ -1,0 +1,189 @@
+"""Adapters that python-can opens are listened to: a serial one on a pty, and what is said where there is none."""
+
+from __future__ import annotations
+
+import os
+import time
+import tty
+from collections.abc import Callable, Iterable, Iterator
+from typing import get_args
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from fdhil.commissioning.transmit import TransmitBus
+from fdhil.config import CanBus as BusSettings
+from fdhil.config import parse
+from fdhil.drivers.bus_source import BusSource
+from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.filters import drive_filters
+from fdhil.drivers.can.frames import EXTENDED_FLAG, REMOTE_FLAG, frames_of
+from fdhil.drivers.can.python_can import LISTEN_ONLY, arguments
+from fdhil.drivers.cia402.bus_decoder import BusDecoder
+from fdhil.errors import ConfigError, ConnectError
+from fdhil.guard.transmit_socket import connect_bus
+from fdhil.records import AxisSamples, Notice
+from fdhil.sim.wire.attach import attach
+from tests.bench import bench_document
+from tests.drivers.wire import Wire, machine
+
+ADAPTERS = [name for name in get_args(BusSettings.model_fields["interface"].annotation) if name not in (
+    "socketcan", "socketcand", "virtual",
+)]  # fmt: skip
+
+
+class SerialAdapter:
+    """The far end of a serial line with an adapter on it that speaks the slcan protocol."""
+
+    def __init__(self) -> None:
+        self.end, self.line = os.openpty()
+        tty.setraw(self.line)
+        self.path = os.ttyname(self.line)
+
+    def say(self, *lines: str) -> None:
+        os.write(self.end, "".join(line + "\r" for line in lines).encode())
+
+    def heard(self) -> str:
+        return os.read(self.end, 4096).decode()
+
+    def close(self) -> None:
+        for descriptor in (self.end, self.line):
+            os.close(descriptor)
+
+
+@pytest.fixture
+def adapter() -> Iterator[SerialAdapter]:
+    running = SerialAdapter()
+    yield running
+    running.close()
+
+
+def settings_of(adapter: SerialAdapter, **more: object) -> BusSettings:
+    document = {"interface": "slcan", "channel": adapter.path, "options": {"sleep_after_open": 0.0}, **more}
+    return BusSettings.model_validate(document)
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 100
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def test_a_serial_adapter_is_listened_to_and_acknowledges_nothing(adapter: SerialAdapter) -> None:
+    with CanBus("can0", settings_of(adapter)) as bus:
+        assert "S8\r" in (said := adapter.heard())  # 1 Mbit/s
+        assert "L\r" in said
+        assert "O\r" not in said
+        adapter.say("t0800", "t18181122334455667788", "T000001232AABB", "r2810")
+        wait_for(lambda: bus.counters()["frames"] == 4)
+        frames = bus.drain()
+        assert bus.stamps == "host"
+    assert frames["id"].tolist() == [0x80, 0x181, EXTENDED_FLAG | 0x123, REMOTE_FLAG | 0x281]
+    assert frames["dlc"].tolist()[:3] == [0, 8, 2]
+    assert int(frames["data"][1]) == 0x8877665544332211
+    assert sorted(frames["t_ns"].tolist()) == frames["t_ns"].tolist()
+    assert 0 <= time.monotonic_ns() - int(frames["t_ns"][-1]) < 100e9
+
+
+def test_on_demand_it_acknowledges(adapter: SerialAdapter) -> None:
+    with CanBus("can0", settings_of(adapter, listen_only=False, bitrate=500_000)):
+        said = adapter.heard()
+    assert "S6\r" in said
+    assert "O\r" in said
+
+
+def test_the_drives_frames_alone(adapter: SerialAdapter) -> None:
+    with CanBus("can0", settings_of(adapter, frames="drives"), filters=drive_filters([1], [0x33])) as bus:
+        adapter.say("t0800", "t1811AA", "t1821BB", "t0331CC", "t0341DD", "t7011EE", "T000000011FF", "t0011FF")
+        wait_for(lambda: bus.counters()["frames"] >= 5)
+        got = bus.drain()["id"].tolist()
+    assert got == [0x80, 0x181, 0x33, 0x701, 0x001]
+
+
+def test_an_adapter_that_talks_nonsense_or_goes_is_an_end_not_silence(adapter: SerialAdapter) -> None:
+    with CanBus("can0", settings_of(adapter)) as bus:
+        adapter.say("t1zz0")
+        wait_for(lambda: bus.ended is not None)
+        assert bus.ended is not None
+        assert "is gone, or sent what is no frame" in bus.ended
+    gone = SerialAdapter()
+    with CanBus("can0", settings_of(gone)) as bus:
+        gone.close()
+        wait_for(lambda: bus.ended is not None)
+
+
+def slcan(can_id: int, data: bytes) -> str:
+    return f"t{can_id:03X}{len(data)}{data.hex().upper()}"
+
+
+def test_a_drive_is_sampled_through_it_as_through_any_bus(adapter: SerialAdapter) -> None:
+    """Stamps in bursts cost no sample, and make no second SYNC producer of one."""
+    wire = Wire(n=400, counter=False)
+    config = machine(bus=settings_of(adapter).model_dump())
+    lines = [slcan(can_id, data) for _, can_id, data in wire.rows()]
+    expected = rows_of(BusDecoder("can0", config).feed(frames_of(wire.rows()), 0))
+    source = BusSource("can0", config)
+    source.open()
+    try:
+        got: list[object] = []
+        for first in range(0, len(lines), 60):
+            adapter.say(*lines[first : first + 60])
+            wait_for(lambda: source.counters()["frames"] == min(first + 60, len(lines)))  # noqa: B023 - it is asked now
+            got += source.step(time.monotonic_ns())
+    finally:
+        source.close()
+    assert np.array_equal(rows_of(got), expected)
+    assert expected.shape[1] > 380
+    told = [record for record in got if isinstance(record, Notice)]
+    assert [notice.code for notice in told] == ["CoarseStamps"]
+    assert "some 10 ms late" in told[0].text
+    assert source.counters()["lost"] == 0
+
+
+def rows_of(records: Iterable[object]) -> npt.NDArray[np.float64]:
+    """Tick, demand, position, speed and current of all samples, a column each."""
+    samples = [record for record in records if isinstance(record, AxisSamples)]
+    return np.hstack([np.stack([s.tick, s.demand_mm, s.position_mm, s.speed_rad_s, s.current_a]) for s in samples])
+
+
+@pytest.mark.parametrize("interface", ADAPTERS)
+def test_an_adapter_that_is_not_there_is_said(interface: str) -> None:
+    settings = BusSettings.model_validate({"interface": interface, "channel": "0"})
+    with pytest.raises(ConnectError, match=f"the {interface} adapter 0 cannot be opened .*or use SocketCAN") as said:
+        CanBus("can0", settings)
+    assert "\n" not in str(said.value)
+
+
+@pytest.mark.parametrize("interface", ADAPTERS)
+def test_what_an_adapter_is_asked_for(interface: str) -> None:
+    document = {"interface": interface, "channel": "1", "bitrate": 500_000, "options": {"bitrate": 250_000, "x": "y"}}
+    asked = arguments(BusSettings.model_validate(document))
+    assert asked == {
+        "interface": interface,
+        "channel": 1,
+        "bitrate": 250_000,
+        "x": "y",
+        **LISTEN_ONLY.get(interface, {}),
+    }
+    assert "listen_only" not in arguments(BusSettings.model_validate(document | {"listen_only": False}))
+
+
+@pytest.mark.parametrize("interface", ADAPTERS)
+def test_nothing_is_ever_sent_through_them(interface: str) -> None:
+    settings = BusSettings.model_validate({"interface": interface, "channel": "0"})
+    with pytest.raises(ConnectError, match="only listened to"):
+        TransmitBus("can0", settings)
+    with pytest.raises(ConnectError, match="for listening only"):
+        connect_bus("can0", settings)
+    with pytest.raises(ConnectError, match="cannot be behind"):
+        attach("can0", settings)
+
+
+def test_a_correction_on_a_bus_that_is_only_listened_to_is_refused() -> None:
+    document = bench_document("X") | {"bus": {"can0": {"interface": "pcan", "channel": "PCAN_USBBUS1"}}}
+    with pytest.raises(ConfigError, match=r"axis\.X\.correction: bus can0 is only listened to \(pcan\)"):
+        parse(document)
+    del document["axis"]["X"]["correction"]
+    assert not parse(document).bus["can0"].may_send

@@ -1,0 +1,87 @@
+"""Masters of other makes run the simulated drive: what listens beside them is right, and nothing is sent."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from fdhil import config as machine_config
+from fdhil.drivers import Record, open_machine
+from fdhil.records import AxisSamples, Notice
+from tests.daemon.shop import fdhil
+from tests.foreign.peers import ForeignProcess
+from tests.sim.twin_process import TwinProcess, write_config
+
+PERIOD_MS = 5
+MAKES = [pytest.param("master.js", marks=pytest.mark.debian), "python_master.py"]
+
+
+@pytest.fixture
+def twin(tmp_path: Path) -> Iterator[tuple[TwinProcess, Path]]:
+    """A simulated drive without an NC, and the configuration of who listens to it."""
+    path = write_config(tmp_path, bus='interface = "socketcand"\nport = 0', axes="X", sim="nc = false")
+    path.write_text(path.read_text().replace("sync_period_s = 0.001", f"sync_period_s = {PERIOD_MS / 1e3}"))
+    with TwinProcess(path) as running:
+        path.write_text(path.read_text().replace("port = 0", f"port = {running.bus_settings['port']}", 1))
+        yield running, path
+
+
+def master(make: str, twin: TwinProcess) -> ForeignProcess:
+    """SYNC with a counter that goes up to 10, where the make counts at all."""
+    settings = {"node": twin.ready["drives"]["X"]["node_id"], "own_node": 100, "period_ms": PERIOD_MS, "overflow": 10}
+    return ForeignProcess(make, {key: twin.bus_settings[key] for key in ("host", "port", "channel")}, **settings)
+
+
+@pytest.mark.parametrize("make", MAKES)
+async def test_a_drive_that_a_foreign_master_runs_is_sampled(make: str, twin: tuple[TwinProcess, Path]) -> None:
+    process, path = twin
+    records: list[Record] = []
+    enough = asyncio.Event()
+
+    def take(record: Record) -> None:
+        records.append(record)
+        if sum(each.tick.size for each in records if isinstance(each, AxisSamples)) >= 300:
+            enough.set()
+
+    async with open_machine(machine_config.load(path)) as source:
+        running = asyncio.create_task(source.run(take))
+        with master(make, process) as nc:
+            identity = await asyncio.to_thread(nc.event, "identity")
+            assert (identity["device_type"] & 0xFFFF, identity["name"]) == (402, "fdhil twin drive")
+            assert identity.get("by_block", identity["name"]) == identity["name"]
+            await asyncio.to_thread(nc.event, "enabled")
+            await asyncio.wait_for(enough.wait(), 300)
+        counters = source.counters()
+        running.cancel()
+    codes = {record.code for record in records if isinstance(record, Notice)}
+    assert not codes & {"SyncCollision", "ForeignProducer", "DemandMismatch", "PdoLength", "PdoMissing"}
+    assert counters["can0.pdo_lost"] == counters["can0.pdo_ambiguous"] == 0
+    enabled = [record for record in records if isinstance(record, AxisSamples) and record.tick.size]
+    assert int(enabled[-1].statusword[-1]) & 0x6F == 0x27
+
+
+@pytest.mark.parametrize("make", MAKES)
+def test_beside_a_foreign_master_nothing_is_asked(
+    make: str, twin: tuple[TwinProcess, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    process, path = twin
+    with master(make, process) as nc, process.join() as bus:
+        nc.event("enabled")
+        while bus.recv(0) is not None:
+            pass  # what the master itself asked
+        code, out, _ = fdhil("scan", path, "--json", capsys=capsys)
+        (found,) = json.loads(out)["buses"]
+        assert (code, found["master"], [node["answers"] for node in found["nodes"]]) == (0, "SYNC", [None])
+        _, out, _ = fdhil("check", path, "--json", capsys=capsys)
+        points = {point["point"]: point["state"] for point in json.loads(out)["points"]}
+        assert points["TPDO1"] == points["TPDO2"] == points["RPDO1"] == points["drive"] == "ok"
+        assert points["identity"] == points["device"] == "not compared"
+        code, _, err = fdhil("commission", path, "--yes", capsys=capsys)
+        assert code == 3
+        assert "an NC is sending SYNC or set-points" in err
+        heard = {message.arbitration_id for message in iter(lambda: bus.recv(0), None)}
+        assert not {can_id for can_id in heard if can_id & 0x780 in (0x580, 0x600)}

@@ -1,0 +1,168 @@
+"""Slaves of other makes: found, compared and refused for the right reason, and listened to beside a master."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from fdhil import config as machine_config
+from fdhil.cli.demo.processes import Process
+from fdhil.drivers.bus_source import BusSource
+from fdhil.records import AxisSamples, Notice
+from fdhil.sim.wire.hub import Hub
+from tests.daemon.shop import fdhil
+from tests.foreign.peers import ForeignProcess
+from tests.sim.hub_thread import joined, serving
+from tests.sim.twin_process import write_config
+
+NODE = 5
+DRIVE = {
+    "node": NODE,
+    "name": "foreign drive",
+    "heartbeat_ms": 0,
+    "identity": {"vendorId": 0x1234, "productCode": 7, "revisionNumber": 1, "serialNumber": 99},
+    "objects": [
+        [0x1000, "Device type", "UNSIGNED32", 0x00020192],
+        [0x6041, "Statusword", "UNSIGNED16", 0x0231],
+        [0x6064, "Position actual value", "INTEGER32", 1234],
+        [0x606C, "Velocity actual value", "INTEGER32", -5],
+    ],
+    "tpdos": [
+        {"cobId": 0x180, "kind": 1, "objects": [0x6064, 0x606C]},
+        {"cobId": 0x280, "kind": 1, "objects": [0x6041]},
+    ],
+}
+MODULE = {
+    **DRIVE,
+    "name": "foreign module",
+    "heartbeat_ms": 50,
+    "objects": [[0x1000, "Device type", "UNSIGNED32", 0x00030191], [0x6000, "Inputs", "UNSIGNED8", 0]],
+    "tpdos": [],
+}
+EDS = "[DeviceInfo]\nVendorNumber=0x1234\nProductNumber=0xFFFFFFFF\n[1000]\nParameterName=Type\nDataType=7\n"
+MAKES = [pytest.param("slave.js", marks=pytest.mark.debian), "python_slave.py"]
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorter waits than on a real machine."""
+    monkeypatch.setattr("fdhil.commissioning.scan.LISTEN_S", 0.4)
+    monkeypatch.setattr("fdhil.commissioning.config_check.LISTEN_S", 0.4)
+    monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.4)
+
+
+@pytest.fixture
+def hub() -> Iterator[Hub]:
+    with serving(Hub("can0")) as running:
+        yield running.hub
+
+
+@pytest.fixture
+def machine(hub: Hub, tmp_path: Path) -> Path:
+    """The configuration of a machine whose only drive is the foreign one."""
+    (tmp_path / "foreign.eds").write_text(EDS)
+    bus = f'interface = "socketcand"\nport = {hub.port}'
+    path = write_config(tmp_path, bus=bus, axes="X")
+    path.write_text(path.read_text() + f"[axis.X.drive]\nnode_id = {NODE}\n")
+    return path
+
+
+def slave(make: str, hub: Hub, settings: dict[str, Any]) -> ForeignProcess:
+    return ForeignProcess(make, {"host": hub.host, "port": hub.port, "channel": "can0"}, **settings)
+
+
+@pytest.mark.parametrize("make", MAKES)
+def test_a_foreign_drive_is_found_compared_and_refused(
+    make: str, hub: Hub, machine: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with slave(make, hub, DRIVE) as peer:
+        peer.event("ready")
+        code, out, err = fdhil("scan", machine, "--json", capsys=capsys)
+        assert (code, err) == (0, "")
+        (node,) = json.loads(out)["buses"][0]["nodes"]
+        said = node["answers"]
+        assert (node["node_id"], node["axis"], said["name"]) == (NODE, "X", "foreign drive")
+        assert said["identity"] == {"vendor_id": 0x1234, "product_code": 7, "revision": 1, "serial": 99}
+        assert said["eds"] == {"file": "foreign.eds", "fit": "any product"}
+        code, out, err = fdhil("check", machine, "--json", capsys=capsys)
+        assert (code, err) == (1, "")
+        points = {point["point"]: point for point in json.loads(out)["points"]}
+        assert {points[name]["state"] for name in ("device", "TPDO1")} == {"ok"}
+        assert points["TPDO2"]["state"] == "differs"
+        for name in ("mode", "cycle", "communication lost", "stop by a ramp", "following error"):
+            assert points[name]["state"] == "not compared"
+        code, _, err = fdhil("commission", machine, "--yes", capsys=capsys)
+        assert code == 1
+        assert err.startswith("refused: drive X: RPDO1 maps nothing where the profile has")
+
+
+@pytest.mark.parametrize("make", MAKES)
+def test_a_foreign_module_is_told_to_be_no_drive(
+    make: str, hub: Hub, machine: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with slave(make, hub, MODULE) as peer:
+        peer.event("ready")
+        code, out, _ = fdhil("check", machine, "--json", capsys=capsys)
+        differ = [point["point"] for point in json.loads(out)["points"] if point["state"] == "differs"]
+        assert (code, differ) == (1, ["device"])
+        code, _, err = fdhil("commission", machine, "--yes", capsys=capsys)
+        assert code == 1
+        assert "it is no CiA 402 drive: 0x1000 says CiA 401, an I/O module" in err
+
+
+@pytest.mark.parametrize("make", MAKES)
+def test_a_foreign_drive_without_the_profiles_tpdos_is_told_and_loses_nothing(
+    make: str, hub: Hub, machine: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside a master that starts it: TPDO1 is the profile's, TPDO2 is too short, the others never come."""
+    monkeypatch.setattr("fdhil.drivers.cia402.pdo_watch.PATIENCE_S", 0.2)
+    source = BusSource("can0", machine_config.load(machine))
+    with slave(make, hub, DRIVE) as peer, joined(hub) as (master,):
+        peer.event("ready")
+        source.open()
+        try:
+            master.send(can.Message(arbitration_id=0, data=[1, NODE], is_extended_id=False))
+            out = []
+            for k in range(300):
+                master.send(can.Message(arbitration_id=0x80, data=[k % 240 + 1], is_extended_id=False))
+                while (message := master.recv(5.0)) is not None and message.arbitration_id != 0x280 + NODE:
+                    pass  # the drive has answered this SYNC
+                assert message is not None
+            while source.counters()["frames"] < 901:
+                out += source.step(0)
+            out += source.step(0)
+        finally:
+            source.close()
+    told = {record.code: record.text for record in out if isinstance(record, Notice)}
+    assert set(told) == {"PdoLength", "PdoMissing"}
+    assert "never sent TPDO3 (385), TPDO4 (485) though SYNC runs" in told["PdoMissing"]
+    assert source.decoder.counters()["pdo_lost"] == 0
+    assert sum(record.tick.size for record in out if isinstance(record, AxisSamples)) == 0
+
+
+@pytest.mark.debian
+def test_the_daemon_waits_for_a_foreign_drive_that_says_nothing(hub: Hub, machine: Path, tmp_path: Path) -> None:
+    """With the NC off a drive without a heartbeat is silent: the daemon listens on, and hears it when the NC comes."""
+    log = tmp_path / "daemon.log"
+    with slave("slave.js", hub, DRIVE) as peer, joined(hub) as (master,):
+        peer.event("ready")
+        with Process("daemon", ["fdhil", "run", str(machine)], log) as daemon:
+            _wait(daemon, lambda: "BusSilent: Nothing is heard on bus can0" in log.read_text())
+            master.send(can.Message(arbitration_id=0, data=[1, NODE], is_extended_id=False))
+            for _ in range(20):
+                master.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+            _wait(daemon, lambda: "BusSilent: Bus can0 is heard again" in log.read_text())
+            assert daemon.stop() == 0
+    assert "ready: bench, axes X; listening, sending nothing" in log.read_text()
+
+
+def _wait(process: Process, done: Callable[[], bool]) -> None:
+    while not done():
+        process.check()
+        time.sleep(0.05)

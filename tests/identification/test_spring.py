@@ -1,0 +1,159 @@
+"""A resonance between motor and table is taken into the fit, and found, on machines of another simulation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fdhil.config import Axis, Identification
+from fdhil.identification.estimators import maximum_likelihood
+from fdhil.identification.kalman import LOAD
+from fdhil.identification.motion import Course, prepare
+from fdhil.identification.spring import RESONANCE, SHARE, sprung
+from fdhil.identification.spring_torques import Spring, Torques
+from fdhil.identification.windows import find_windows
+from fdhil.pipeline import analyse, pool
+from fdhil.pipeline.own_loops import OwnLoops, softened
+from fdhil.records import PARAMETERS, Window, WindowOutcome
+from studies.bench import shuttle
+from studies.real_plant import (
+    ORDINARY_LOOPS,
+    ORDINARY_MECHANICS,
+    ORDINARY_SENSORS,
+    SLOW,
+    SLOW_LOOPS,
+    Mechanics,
+    Sensors,
+    recording,
+    run,
+)
+from studies.reality import BASES, Machine, config_of
+from tests.identification.realistic import rapids
+
+SETTINGS = Identification()
+PERIOD_S = 1e-3
+
+
+def axis_of(mechanics: Mechanics, base: str, told_hz: float = 0.0) -> Axis:
+    """Return the section of a base's axis, with the resonance that is told."""
+    loops = SLOW_LOOPS if base == "slow" else BASES[base][1]
+    return config_of(Machine("", base, mechanics, loops, Sensors(), loops, told_hz)).axis["X"]
+
+
+def slow_rapids(mechanics: Mechanics, seed: int = 1) -> list[Window]:
+    """Return a rapid to and one fro of the axis where friction rules."""
+    _, _, rapid_m_s, acceleration_m_s2, _ = BASES["slow"]
+    moved = run(mechanics, shuttle(0.4, rapid_m_s, acceleration_m_s2, 2), SLOW_LOOPS)
+    return find_windows(recording(moved, mechanics, Sensors(), rapid_m_s, seed))
+
+
+def judged(windows: list[Window], axis: Axis) -> list[WindowOutcome]:
+    """Return the windows analysed through the axis."""
+    return [analyse(window, SETTINGS, axis, PERIOD_S) for window in windows]
+
+
+def test_no_table_adds_no_torque() -> None:
+    (window,) = rapids()
+    motion = prepare(window)
+    torques = Torques.of(motion, np.array([0.5, 0.005, 0.8, 0.075, 0.05, 5.0, 0.0]))
+    stiff = torques.answer(Spring(100.0, 0.0, 0.03))
+    ripple = Course("ripple_screw_1", LOAD, np.sin(motion.angle_rad))
+    assert np.allclose(torques.with_answer(ripple, stiff).values, ripple.values, atol=1e-12)
+    # its friction reaches the motor through the spring, whatever there is of it
+    assert np.abs(torques.felt(torques.answer(Spring(5000.0, 0.5, 0.03)))).max() < 0.05
+
+
+def test_a_told_resonance_takes_what_bends_the_six_away() -> None:
+    """A good encoder sees it: the table's share is told as well, and inertia and inductance no more bent."""
+    mechanics = replace(ORDINARY_MECHANICS, load_nm=0.0)
+    windows = rapids(mechanics, ORDINARY_SENSORS, ORDINARY_LOOPS, moves=2)
+    truth = np.array(list(mechanics.truth().values())) * np.array([1 / 1.01, 1 / 1.01, 1.0, 1.01, 1.01, 1.01])
+    for told, stiff in zip(
+        judged(windows, axis_of(mechanics, "bench", 125.0)), judged(windows, axis_of(mechanics, "bench")), strict=True
+    ):
+        assert told.verdict.accepted
+        assert told.estimate is not None
+        assert stiff.estimate is not None
+        assert told.estimate.value(RESONANCE) == pytest.approx(120.0, rel=0.03)
+        assert told.estimate.value(SHARE) == pytest.approx(0.6, abs=0.06)
+        errors = np.array([[e.value(n) for n in PARAMETERS] for e in (told.estimate, stiff.estimate)]) / truth - 1.0
+        assert abs(errors[0, 3]) < 0.001  # of the inertia
+        assert abs(errors[0, 1]) < min(0.003, 0.5 * abs(errors[1, 1]))  # of the inductance
+
+
+def test_what_is_told_is_no_news_of_every_window() -> None:
+    """Eight windows with the same doubt about the table's share know it no better than one."""
+    windows = slow_rapids(replace(SLOW, resonance_hz=150.0))
+    outcomes = judged(windows, axis_of(SLOW, "slow", 150.0))
+    for outcome in outcomes:
+        assert outcome.estimate is not None
+        assert outcome.estimate.std(SHARE) > 0.05
+    estimate, _ = pool(outcomes, SETTINGS)
+    assert estimate is not None
+    assert estimate.std(SHARE) > 0.7 * min(o.estimate.std(SHARE) for o in outcomes if o.estimate is not None)
+
+
+def test_a_told_resonance_is_replayed_where_friction_rules() -> None:
+    windows = slow_rapids(replace(SLOW, resonance_hz=80.0))
+    assert not any(o.verdict.accepted for o in judged(windows, axis_of(SLOW, "slow")))
+    for outcome in judged(windows, axis_of(SLOW, "slow", 80.0)):
+        assert outcome.verdict.accepted, outcome.verdict.reasons
+        assert outcome.verdict.unexplained_um is not None
+        assert outcome.verdict.unexplained_um < 0.3
+
+
+def test_a_resonance_that_is_not_there_is_named() -> None:
+    reasons = [r for o in judged(slow_rapids(SLOW, seed=2), axis_of(SLOW, "slow", 50.0)) for r in o.verdict.reasons]
+    assert reasons
+    assert all("resonance_hz" in reason.advice for reason in reasons)
+
+
+def test_a_resonance_that_nobody_told_is_found_by_the_replay() -> None:
+    axis = axis_of(SLOW, "slow")
+    windows = slow_rapids(replace(SLOW, resonance_hz=80.0))
+    softer = softened(judged(windows, axis), axis, PERIOD_S)
+    assert softer is not None
+    again = judged(windows, softer)
+    for outcome in again:
+        assert outcome.verdict.accepted
+        assert outcome.estimate is not None
+        # by the motor alone frequency and share trade: what the table does behind it is told
+        hertz, share = outcome.estimate.value(RESONANCE), outcome.estimate.value(SHARE)
+        assert hertz * (1 - share) ** 0.5 == pytest.approx(80.0 * 0.4**0.5, rel=0.15)
+
+
+def test_a_running_machine_goes_on_with_the_resonance_that_it_found() -> None:
+    windows = slow_rapids(replace(SLOW, resonance_hz=80.0))
+    loops = OwnLoops(axis_of(SLOW, "slow"), SETTINGS, PERIOD_S)
+    first, _ = loops.analyse(windows[0])
+    assert first.verdict.accepted
+    assert loops.axis is not None
+    assert loops.axis.resonance_hz is not None
+    second, _ = loops.analyse(windows[1])
+    assert second.verdict.accepted
+    assert second.estimate is not None
+    assert RESONANCE in second.estimate.terms
+
+
+@pytest.mark.parametrize(
+    "mechanics", [SLOW, replace(SLOW, static=-0.25, static_speed_rad_s=20.0)], ids=["stiff", "friction"]
+)
+def test_no_resonance_is_found_where_there_is_none(mechanics: Mechanics) -> None:
+    axis = axis_of(SLOW, "slow")
+    assert softened(judged(slow_rapids(mechanics), axis), axis, PERIOD_S) is None
+
+
+def test_without_regulators_one_joins_that_a_window_surely_shows() -> None:
+    (window,) = rapids(replace(Mechanics(), resonance_hz=60.0), Sensors(noise=0.0005, speed="difference"))
+    base = maximum_likelihood.fit_windows([window], SETTINGS)
+    assert base is not None
+    found = sprung(base, None)
+    assert found is not None
+    names = [course.name for course in found.problem.motions[0].courses]
+    assert names[-2:] == [RESONANCE, SHARE]
+    (plain,) = rapids(Mechanics(), Sensors(noise=0.0005, speed="difference"))
+    stiff = maximum_likelihood.fit_windows([plain], SETTINGS)
+    assert stiff is not None
+    assert sprung(stiff, None) is None

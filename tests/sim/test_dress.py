@@ -1,0 +1,274 @@
+"""The twin's drive in a vendor's dress: the EDS as it is found in the field, and what the wire then sees."""
+
+from __future__ import annotations
+
+import configparser
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import canopen
+import pytest
+
+from fdhil import config
+from fdhil.errors import EdsError
+from fdhil.sim.drive.dictionary import DataType
+from fdhil.sim.drive.eds import eds_text as own_eds_text
+from fdhil.sim.drive.sheet import Sheet, read_sheet
+from tests.bench import bench_document
+from tests.eds import SHEETS, eds_text, write_eds
+from tests.sim.bench_twin import TwinInHand, corner
+from tests.sim.canopen_peer import direct
+from tests.sim.rig import NO_NOISE, Abort, Rig
+
+RPM = 65536 / 60  # increments/s
+NODE = 1
+
+
+def dressed(eds: Path, **axis: Any) -> config.MachineConfig:
+    document = bench_document("X")
+    document["axis"]["X"].update(axis)
+    document["sim"] = {"axis": {"X": {"eds": str(eds)}}, "noise": NO_NOISE}
+    return config.parse(document)
+
+
+@pytest.fixture
+def wear(tmp_path: Path) -> Callable[[str], Rig]:
+    return lambda sheet: Rig(dressed(write_eds(sheet, tmp_path)))
+
+
+@pytest.fixture
+def epos4(wear: Callable[[str], Rig]) -> Rig:
+    return wear("epos4")
+
+
+def remap(rig: Rig, index: int, cob_id: int, kind: int, *mapped: int) -> None:
+    """Set a PDO up as a master does (CiA 301, 7.5.2.36): off, mapping, on."""
+    rig.write(index, 1, cob_id | 1 << 31, 4)
+    rig.write(index, 2, kind, 1)
+    rig.write(index + 0x200, 0, 0, 1)
+    for sub, word in enumerate(mapped, 1):
+        rig.write(index + 0x200, sub, word, 4)
+    rig.write(index + 0x200, 0, len(mapped), 1)
+    rig.write(index, 1, cob_id, 4)
+
+
+# -- the sheet
+
+
+def sheet_of(tmp_path: Path, text: str | bytes) -> Sheet:
+    path = tmp_path / "odd.eds"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return read_sheet(path, 5)
+
+
+def number(sheet: Sheet, index: int, sub: int = 0) -> int | bytes:
+    (entry,) = [e for item in sheet.objects for e in item.entries if (e.index, e.sub) == (index, sub)]
+    return entry.default
+
+
+VAR = "[{}]\nParameterName=x\nObjectType=7\nDataType={}\nAccessType=rw\nDefaultValue={}\n"
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "value"),
+    [
+        ("0x0007", "$NODEID+0x180", 0x185),
+        ("7", "0x40000180+$NODEID", 0x40000185),
+        ("0x7", "$NodeID", 5),
+        ("0x0006", "001", 1),
+        ("0x0006", "  # a comment", 0),
+        ("0x0006", "0x07 # VAR", 7),
+        ("0x0002", "0xfd", -3),
+        ("0x0003", "-32768", -32768),
+        ("0x0008", "0.5", 0x3F000000),
+        ("0x0009", "Gold Drive", b"Gold Drive"),
+        ("0x0007", "nonsense", 0),
+        ("0x0007", "0x10L", 16),
+    ],
+)
+def test_defaults_are_read_as_they_are_written_in_the_field(
+    tmp_path: Path, kind: str, text: str, value: int | bytes
+) -> None:
+    assert number(sheet_of(tmp_path, VAR.format("2000", kind, text)), 0x2000) == value
+
+
+def test_a_windows_text_with_a_section_and_a_key_twice_is_read(tmp_path: Path) -> None:
+    text = "\ufeff[DeviceInfo]\nVendorNumber=\nProductNumber=001\nProductName=“quoted”\n[Comments]\nLines=5\nLine1=a\n"
+    text += VAR.format("6040", "6", "0") + "DataType=0x0006\n[6040]\nPDOMapping=1\n"
+    sheet = sheet_of(tmp_path, text.encode("utf-8"))
+    assert (sheet.vendor, sheet.product, sheet.name) == (0, 1, "“quoted”")
+    assert sheet.objects[0].entries[0].mappable
+    assert sheet_of(tmp_path, text[1:].encode("cp1252")) == sheet
+
+
+def test_a_dcf_starts_with_what_it_configures(tmp_path: Path) -> None:
+    sheet = sheet_of(tmp_path, VAR.format("6065", "7", "2000") + "ParameterValue=500\n")
+    assert number(sheet, 0x6065) == 500
+
+
+def test_an_array_told_in_one_section_has_all_its_sub_objects(tmp_path: Path) -> None:
+    text = "[2010]\nParameterName=list\nObjectType=8\nDataType=6\nAccessType=ro\nDefaultValue=7\nCompactSubObj=3\n"
+    sheet = sheet_of(tmp_path, text + "[2010Value]\nNrOfEntries=1\n2=9\n")
+    assert [entry.default for entry in sheet.objects[0].entries] == [3, 7, 9, 7]
+    assert sheet.objects[0].entries[1].type is DataType.UNSIGNED16
+
+
+@pytest.mark.parametrize("text", ["", "[FileInfo]\nFileName=x\n", "no sections at all", b"\xff\0\x01"])
+def test_a_file_without_objects_is_no_data_sheet(tmp_path: Path, text: str | bytes) -> None:
+    with pytest.raises(EdsError, match=r"odd.eds.*no object"):
+        sheet_of(tmp_path, text)
+
+
+def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
+    with pytest.raises(EdsError, match="cannot be read"):
+        read_sheet(tmp_path / "none.eds", 1)
+
+
+# -- what the wire sees
+
+
+def test_identity_types_access_and_defaults_are_those_of_the_file(epos4: Rig) -> None:
+    assert [epos4.read(0x1018, sub) for sub in (1, 2, 3, 4)] == [0xFB, 0x60500000, 0x01500000, 1001]
+    assert epos4.read(0x605A) == 6
+    assert epos4.read(0x6007) == 3
+    assert epos4.read(0x1014) == 0x81
+    assert epos4.read(0x1000) & 0xFFFF == 402
+    with pytest.raises(Abort, match="06010002"):
+        epos4.write(0x1014, 0, 0x82, 4)
+
+
+@pytest.mark.parametrize("index", [0x6078, 0x6079, 0x6075, 0x608F, 0x1019, 0x1006, 0x2101, 0x6063])
+def test_what_the_drive_does_not_have_is_not_there(epos4: Rig, index: int) -> None:
+    with pytest.raises(Abort, match="06020000"):
+        epos4.read(index)
+    with pytest.raises(Abort, match="06040041"):
+        remap(epos4, 0x1800, 0x181, 1, index << 16 | 0x10)
+
+
+def test_what_fits_this_machine_alone_was_set_up(epos4: Rig) -> None:
+    """The window in increments, the rated torque in uN.m, the interpolation period, ramps in rpm/s."""
+    assert epos4.read(0x6065) == 32768
+    assert epos4.read(0x6076) == pytest.approx(0.8 * 50 * 1e6)
+    assert (epos4.read(0x60C2, 1), epos4.read(0x60C2, 2, signed=True)) == (1, -3)
+    assert epos4.read(0x6081) == 1500
+    assert epos4.read(0x6083) == 12000
+
+
+def test_no_heartbeat_is_sent_by_a_drive_whose_default_is_none(epos4: Rig) -> None:
+    assert [frame for n in range(5) for frame in epos4.drive.wall_clock(n * 0.3)] == []
+    epos4.write(0x1017, 0, 100, 2)
+    assert epos4.drive.wall_clock(2.0) == [(0x701, b"\x7f")]
+
+
+def test_the_default_mapping_is_the_vendors_and_can_be_changed(epos4: Rig) -> None:
+    epos4.nmt(0x01)
+    assert dict(epos4.sync()).keys() == {0x181}  # event-driven: the statusword, once
+    assert epos4.sync() == []
+    epos4.nmt(0x80)
+    remap(epos4, 0x1802, 0x381, 1, 0x60640020, 0x30D10220)
+    epos4.nmt(0x01)
+    assert len(dict(epos4.sync())[0x381]) == 8
+    epos4.nmt(0x80)
+    epos4.write(0x1802, 1, 0x80000381, 4)
+    with pytest.raises(Abort, match="06040042"):
+        epos4.write(0x1A02, 0, 13, 1)
+
+
+def test_the_vendors_objects_show_the_motor_in_the_vendors_units(epos4: Rig) -> None:
+    """Speed in rpm, current in mA, the duty without its sign, the supply in tenths of a volt."""
+    epos4.enable()
+    drive = epos4.drive
+    targets = [round(5.0 * n * 65536 / 1000) for n in range(400)]  # 5 revolutions/s
+    for target in targets:
+        epos4.send(0x401, struct.pack("<Hi", 0x0F, target))
+        duty = drive.physics.seen.voltage_v / 300
+        epos4.sync()
+    shown = epos4.read(0x606C, signed=True)
+    assert shown == pytest.approx(drive.dictionary.number(0x606C) / RPM, abs=0.5)
+    assert 250 < shown < 350
+    assert epos4.read(0x30D1, 2, signed=True) == epos4.read(0x30D1, 1, signed=True)
+    assert epos4.read(0x30D1, 2, signed=True) == pytest.approx(1e3 * (5.0 + 0.05 * 31.4) / 0.8, rel=0.1)
+    assert epos4.read(0x3203, 1) == round(1e3 * duty) > 50
+    assert epos4.read(0x2200, 1) == 3000
+
+
+def test_a_speed_offset_counts_in_the_vendors_unit(epos4: Rig) -> None:
+    remap(epos4, 0x1403, 0x501, 1, 0x60B10020, 0x60B20010)
+    epos4.nmt(0x01)
+    epos4.send(0x501, struct.pack("<ih", -60, 5))
+    epos4.sync()
+    assert epos4.drive.dictionary.number(0x60B1) == -65536
+    assert epos4.read(0x60B1, signed=True) == -60
+    assert epos4.read(0x60B2, signed=True) == 5
+
+
+def test_vendor_objects_do_not_touch_the_twins_own(tmp_path: Path) -> None:
+    text = eds_text("epos4") + "".join(VAR.format(index, "3", "1") for index in ("2101", "2110", "2121"))
+    path = tmp_path / "clash.eds"
+    path.write_text(text, encoding="utf-8")
+    rig = Rig(dressed(path))
+    rig.nmt(0x01)
+    rig.sync()
+    rig.drive.set_temperature(33.0)
+    assert [rig.read(index) for index in (0x2101, 0x2110, 0x2121)] == [1, 1, 1]
+    rig.write(0x2101, 0, -7, 2)
+    rig.sync()
+    assert rig.read(0x2101, signed=True) == -7
+
+
+def test_the_nc_leads_a_drive_by_the_mapping_that_it_has(tmp_path: Path) -> None:
+    twin = TwinInHand(dressed(write_eds("epos4", tmp_path)))
+    twin.switch_on()
+    twin.run(20)
+    (error,) = [event["text"] for event in twin.events if event["event"] == "error"]
+    assert error.startswith("drive X has 6064 in no PDO")
+    rig = Rig.of(twin.machine.units["X"].drive)
+    remap(rig, 0x1800, 0x181, 255, 0x60410010)
+    remap(rig, 0x1802, 0x381, 2, 0x30D10220, 0x60640020)
+    twin.switch_on()
+    rows = corner()[:, :1]
+    twin.play(rows, axes="X")
+    twin.run_until("finished")
+    assert rig.drive.table_mm == pytest.approx(rows[-1, 0], abs=1e-2)
+
+
+@pytest.mark.parametrize("sheet", SHEETS)
+def test_the_eds_it_writes_is_of_what_it_wears(wear: Callable[[str], Rig], sheet: str) -> None:
+    rig = wear(sheet)
+    worn = rig.drive.dictionary.entries
+    node, _ = direct(rig.drive)
+    assert {index << 8 for index in node.object_dictionary if index >= 0x1000} == {key & 0xFFFF00 for key in worn}
+    for key, entry in worn.items():
+        if entry.size and entry.access != "wo" and entry.index not in (0x1003, 0x1010, 0x1011):
+            assert int.from_bytes(node.sdo.upload(entry.index, entry.sub), "little") >= 0, f"{key:06X}"
+    assert isinstance(node.object_dictionary[0x6041], canopen.objectdictionary.ODVariable)
+    assert f"VendorNumber=0x{rig.drive.dress.vendor:08X}" in own_eds_text(rig.drive)
+
+
+@pytest.mark.parametrize("sheet", [None, *SHEETS])
+def test_the_eds_it_writes_keeps_the_rules(tmp_path: Path, sheet: str | None) -> None:
+    """CiA 306, as strict readers hold it: no DOMAIN has a mapping, each default is in its limits, counts are right."""
+    rig = Rig(dressed(write_eds(sheet, tmp_path))) if sheet else Rig()
+    eds = configparser.ConfigParser(strict=True, interpolation=None)
+    eds.read_string(own_eds_text(rig.drive))
+    listed = [
+        int(index, 0)
+        for group in ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects")
+        for key, index in eds[group].items()
+        if key != "supportedobjects"
+    ]
+    assert sorted(listed) == [item.index for item in rig.drive.dictionary]
+    for title in eds.sections():
+        section = eds[title]
+        if "ObjectType" not in section:
+            continue
+        if section["ObjectType"] == "0x2":
+            assert "PDOMapping" not in section
+        if "SubNumber" in section:
+            assert section.getint("SubNumber") == sum(name.startswith(f"{title}sub") for name in eds.sections())
+        default = section.get("DefaultValue", "")
+        for key, sign in (("LowLimit", 1), ("HighLimit", -1)):
+            if key in section:
+                assert sign * int(default) >= sign * int(section[key]), title

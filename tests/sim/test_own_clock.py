@@ -1,0 +1,231 @@
+"""The drive's own clock: motion without SYNC, with a SYNC at any period, and one that comes and goes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fdhil import config
+from fdhil.sim.drive.own_clock import OwnClock
+from fdhil.sim.fault_kinds import FaultEntry
+from tests.bench import bench_document
+from tests.sim.bench_twin import TwinInHand, corner, twin_config
+from tests.sim.rig import Abort, Rig, emergencies, machine
+
+INC_PER_MM = 3276.8
+MS = 1e-3
+
+
+def let_pass(rig: Rig, seconds: float, sync_s: float | None = None, step_s: float = 4 * MS) -> list[float]:
+    """Let time pass in steps, with a SYNC every ``sync_s``; return the table's position at each step."""
+    sent: list[tuple[int, bytes]] = []
+    places = []
+    start, now = getattr(rig, "now_s", 0.0), 0.0
+    next_sync = 0.0
+    while now < seconds - 1e-9:
+        now += step_s
+        while sync_s is not None and next_sync < now:
+            sent += rig.sync()
+            next_sync += sync_s
+        sent += rig.drive.wall_clock(start + now)
+        places.append(rig.drive.table_mm)
+    rig.now_s = start + now  # type: ignore[attr-defined]
+    rig.sent = sent  # type: ignore[attr-defined]
+    return places
+
+
+def by_sdo(mode: int, **sim_axis: Any) -> Rig:
+    """A drive that was enabled by SDO alone; nobody sends SYNC."""
+    rig = Rig(machine(**sim_axis))
+    let_pass(rig, 0.004)
+    rig.nmt(0x01)
+    rig.write(0x6060, 0, mode, 1)
+    for word in (0x06, 0x07, 0x0F):
+        rig.write(0x6040, 0, word, 2)
+    assert rig.status & 0x6F == 0x27
+    return rig
+
+
+def go(rig: Rig, target_mm: float, speed_mm_s: float = 100.0) -> None:
+    rig.write(0x607A, 0, round(target_mm * INC_PER_MM), 4)
+    rig.write(0x6081, 0, round(speed_mm_s * INC_PER_MM), 4)
+    rig.write(0x6083, 0, round(1000 * INC_PER_MM), 4)
+    rig.write(0x6084, 0, round(1000 * INC_PER_MM), 4)
+    rig.write(0x6040, 0, 0x1F, 2)
+
+
+@pytest.mark.parametrize("sync_s", [None, 0.5 * MS, 1 * MS, 1.05 * MS, 2 * MS, 7 * MS, 10 * MS, 100 * MS, 1.0])
+def test_a_profile_takes_its_time_at_any_period_of_sync(sync_s: float | None) -> None:
+    """30 mm at 100 mm/s and 1000 mm/s2: 0.1 s up, 0.2 s, 0.1 s down; half the way after 0.2 s."""
+    rig = by_sdo(1)
+    if sync_s is not None:
+        let_pass(rig, 0.3, sync_s)  # the SYNC runs already
+    go(rig, 30.0)
+    places = np.array(let_pass(rig, 1.0, sync_s))
+    assert places[49] == pytest.approx(15.0, abs=2.6)  # 0.2 s, to the 20 ms that a clock needs to notice
+    assert (places[120:] > 29.9).all()
+    assert rig.drive.table_mm == pytest.approx(30.0, abs=0.01)
+    assert rig.read(0x6041) & 1 << 10
+
+
+def test_a_sync_at_the_drive_s_own_period_leads() -> None:
+    """One cycle per SYNC, however late the host tells the time."""
+    rig = by_sdo(1)
+    let_pass(rig, 0.2, 1 * MS)
+    go(rig, 30.0)
+    before = rig.drive.tick
+    rng = np.random.default_rng(1)
+    now = rig.now_s  # type: ignore[attr-defined]
+    for n in range(400):
+        rig.sync()
+        if rng.random() < 0.3:
+            rig.drive.wall_clock(now + n * MS)
+    assert rig.drive.tick - before == 400
+
+
+def test_cyclic_set_points_are_bound_to_the_sync_of_a_slow_host() -> None:
+    rig = by_sdo(8)
+    let_pass(rig, 0.2, 1 * MS)
+    rig.cycle(0)
+    before = rig.drive.tick
+    let_pass(rig, 0.6, 3 * MS, step_s=12 * MS)
+    assert rig.drive.tick - before == 200
+
+
+def test_when_the_sync_ends_the_cyclic_set_point_is_held_and_quick_stop_still_stops() -> None:
+    rig = by_sdo(8)
+    for n in range(200):
+        rig.cycle(100 * n)
+        rig.drive.wall_clock(0.1 + n * MS)
+    rig.now_s = 0.3  # type: ignore[attr-defined]
+    let_pass(rig, 2.0)
+    assert rig.read(0x6064) == pytest.approx(19900, abs=20)
+    rig.write(0x6040, 0, 0x02, 2)
+    let_pass(rig, 1.0)
+    assert rig.read(0x6041) & 0x6F == 0x40
+
+
+def test_quick_stop_in_the_middle_of_a_profile_without_sync() -> None:
+    rig = by_sdo(1)
+    go(rig, 300.0)
+    let_pass(rig, 0.3)
+    start = rig.drive.table_mm
+    rig.write(0x6085, 0, round(500 * INC_PER_MM), 4)
+    rig.write(0x6040, 0, 0x0B, 2)
+    let_pass(rig, 0.1)
+    assert rig.read(0x6041) & 0x6F == 0x07
+    let_pass(rig, 0.2)
+    assert rig.drive.table_mm - start == pytest.approx(100**2 / 1000, abs=0.3)
+    assert rig.read(0x6041) & 0x6F == 0x40
+
+
+def test_homing_without_sync() -> None:
+    rig = by_sdo(6, limit_switches_mm=(-20.0, 60.0))
+    rig.write(0x6098, 0, 1, 1)
+    rig.write(0x6040, 0, 0x1F, 2)
+    let_pass(rig, 8.0)
+    assert rig.read(0x6041) & (1 << 10 | 1 << 12 | 1 << 13) == 1 << 10 | 1 << 12
+    assert rig.read(0x6064) == pytest.approx(0, abs=400)  # the first pulse beyond the switch
+    assert rig.drive.physics.table_rad == pytest.approx(0, abs=0.05)
+
+
+def test_a_jam_without_sync_is_told_by_emcy() -> None:
+    rig = by_sdo(1)
+    rig.write(0x6065, 0, 1000, 4)
+    go(rig, 30.0)
+    rig.drive.faults.load_torque_nm = 400.0
+    let_pass(rig, 0.5)
+    assert emergencies(rig.sent) == [0x8611]  # type: ignore[attr-defined]
+    assert rig.read(0x6041) & 0x4F == 0x08
+
+
+def test_an_axis_that_stands_without_power_runs_no_cycle() -> None:
+    rig = Rig()
+    let_pass(rig, 5.0)
+    assert rig.drive.tick == 0
+    rig.drive.set_object(0x6040, 0, 0)
+
+
+def test_the_clock_of_the_machine_s_own_nc_is_the_sync() -> None:
+    clock = OwnClock(MS)
+    assert clock.due(1.0, bound=False) == 0
+    assert clock.due(1.1, bound=False) > 0
+    clock.stop()
+    assert all(clock.sync() for _ in range(1000))
+
+
+@pytest.mark.parametrize("late_s", [0.015, 0.3])
+def test_a_pause_of_the_sync_is_made_up_for_or_lasts(late_s: float) -> None:
+    """A short one is the host's affair; in a long one the drive's own time goes on."""
+    clock = OwnClock(MS)
+    now, cycles = 0.0, 0
+    for _ in range(500):
+        now += MS
+        clock.due(now, bound=False)
+        cycles += clock.sync()
+    assert cycles == 500
+    own = 0
+    for _ in range(round(late_s / MS)):
+        now += MS
+        own += clock.due(now, bound=False)
+    assert own == (0 if late_s < 0.02 else pytest.approx(late_s / MS, abs=2))
+
+
+def test_while_the_nc_s_sync_fails_the_axes_go_on_to_their_last_set_point() -> None:
+    twin = TwinInHand(twin_config())
+    twin.switch_on()
+    twin.play(corner() + 5.0)
+    twin.run_until("playing")
+    twin.run(100)
+    drive = twin.machine.units["Y"].drive
+    tick, target = drive.tick, drive.dictionary.number(0x607A) / INC_PER_MM
+    assert abs(target - drive.table_mm) > 0.1
+    twin.machine.faults.add(FaultEntry(fault="sync_lost", at_sync=0, duration_s=0.2))
+    twin.run(150)
+    assert drive.tick == tick + 150
+    assert drive.table_mm == pytest.approx(target, abs=1.0)
+    assert abs(drive.physics.speed_rad_s) < 1.0
+
+
+def test_set_points_that_come_every_tenth_cycle_are_joined_by_straight_lines() -> None:
+    """0x60C2 says so; the speed demand has no stairs, and the set-point acts an interval and the delay late."""
+    rig = Rig()
+    rig.write(0x60C2, 1, 10, 1)
+    rig.write(0x1006, 0, 10_000, 4)
+    rig.enable()
+    tick = rig.drive.tick
+    demands, shown = [], []
+    for n in range(60):
+        rig.cycle(1000 * n)
+        demands.append(rig.read(0x606B, signed=True))
+        shown.append(rig.read(0x6062, signed=True))
+    assert rig.drive.tick - tick == 600
+    assert demands[20:] == pytest.approx([100_000] * 40, abs=60)
+    assert shown[10:] == [1000 * n - 200 for n in range(10, 60)]  # in the last of the ten cycles, two late
+
+
+@pytest.mark.parametrize("mode", [8, 9])
+def test_a_slow_sync_that_the_drive_was_told_of_leads_it(mode: int) -> None:
+    rig = Rig()
+    rig.write(0x60C2, 1, 10, 1)
+    rig.enable(mode=mode)
+    let_pass(rig, 1.0, 10 * MS)
+    before = rig.drive.tick
+    rig.write(0x60FF, 0, 65536, 4)
+    let_pass(rig, 1.0, 10.1 * MS)
+    assert rig.drive.tick - before == 1000
+    turned = rig.drive.physics.table_rad / (2 * np.pi)
+    assert turned == pytest.approx(1.0 if mode == 9 else 0.0, abs=0.05)
+
+
+def test_the_interpolation_time_is_whole_cycles_of_the_drive() -> None:
+    document = bench_document("X")
+    document["machine"]["sync_period_s"] = 0.0005
+    rig = Rig(config.parse(document))
+    rig.write(0x60C2, 1, 20, 1)
+    for value in (0, 7):
+        with pytest.raises(Abort) as abort:
+            rig.write(0x60C2, 1, value, 1)
+        assert abort.value.code == 0x06090030

@@ -1,0 +1,72 @@
+"""Network interfaces of SocketCAN as tests need them: frames on vcan0, up and down, a serial adapter on a pty."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import socket
+import struct
+import tty
+from typing import Self
+
+CAN_FRAME = struct.Struct("=IB3x8s")
+_IFREQ = struct.Struct("@16sh22x")
+_SIOCGIFFLAGS, _SIOCSIFFLAGS, _SIOCGIFNAME = 0x8913, 0x8914, 0x8910
+_TIOCSETD, _N_TTY, _N_SLCAN = 0x5423, 0, 17
+_IFF_UP = 1
+
+
+def raw_socket(channel: str = "vcan0") -> socket.socket:
+    """A raw socket that others on the interface hear."""
+    raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+    raw.bind((channel,))
+    return raw
+
+
+def send(raw: socket.socket, number: int, can_id: int = 0x181) -> None:
+    """Send a frame that carries a number."""
+    raw.send(CAN_FRAME.pack(can_id, 8, struct.pack("<Q", number)))
+
+
+def set_up(channel: str, up: bool) -> None:
+    """Do what ``ip link set CHANNEL up`` or ``down`` does."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
+        name, flags = _IFREQ.unpack(fcntl.ioctl(any_socket, _SIOCGIFFLAGS, _IFREQ.pack(channel.encode(), 0)))
+        flags = flags | _IFF_UP if up else flags & ~_IFF_UP
+        fcntl.ioctl(any_socket, _SIOCSIFFLAGS, _IFREQ.pack(name, flags))
+
+
+class SerialAdapter:
+    """A CAN interface of the kernel whose controller is this test: the slcan line discipline on a pty.
+
+    What it says makes genuine error frames and controller states; what nobody reads fills the transmit queue.
+    """
+
+    def __init__(self) -> None:
+        self._end, self._line = os.openpty()
+        tty.setraw(self._line)
+        fcntl.ioctl(self._line, _TIOCSETD, struct.pack("i", _N_SLCAN))
+        name = fcntl.ioctl(self._line, _SIOCGIFNAME, bytes(16))
+        self.channel = name.split(b"\0")[0].decode()
+        set_up(self.channel, True)
+
+    def say(self, line: str) -> None:
+        """Let the adapter say something; ``t1812AABB`` is a frame, ``sb255000`` a controller that is bus-off."""
+        os.write(self._end, f"{line}\r".encode())
+
+    def heard(self) -> str:
+        """What was sent to the adapter."""
+        return os.read(self._end, 1 << 16).decode()
+
+    def unplug(self) -> None:
+        """The adapter is gone, and its interface with it."""
+        for descriptor in (self._end, self._line):
+            if descriptor >= 0:
+                os.close(descriptor)
+        self._end = self._line = -1
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.unplug()
