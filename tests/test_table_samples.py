@@ -13,7 +13,7 @@ SPEED = 0.5  # mm a tick
 
 
 def motion(speed: float = SPEED) -> Motion:
-    return Motion(START, speed * np.arange(N), np.full(N, speed))
+    return Motion(START, frozen(speed * np.arange(N)), np.full(N, speed))
 
 
 def said(signal: TableSignal, tick: Float, values: Float, error: float = 0.0, rate: float = 1.0) -> TableSamples:

@@ -50,6 +50,10 @@ class Compliance:
     doubts: Float
     late_s: float
 
+    def keys(self) -> dict[str, float]:
+        """Return resonance and damping by the keys of the axis' section."""
+        return {"resonance_hz": float(self.values[0]), "resonance_damping": float(self.values[1])}
+
 
 def compliance(window: Window, parameters: Parameters) -> Compliance | None:
     """Return the spring that a window's sensors at the table show; None without any, or where none is surely seen.
@@ -234,11 +238,12 @@ def _apart(one: Float, other: Float) -> Float:
 
 
 def beside_the_config(found: Compliance, axis: Axis | None) -> list[Reason]:
-    """Return the warning of a table that surely swings at another frequency than the configured one."""
+    """Return the warning of a table that surely swings at another frequency than the one in use."""
     if axis is None or axis.resonance_hz is None:
         return []
     hertz, half = float(found.values[0]), INTERVAL_95 * math.sqrt(found.covariance[0, 0])
     if abs(hertz - axis.resonance_hz) <= max(half, SAME * hertz):
         return []
-    text = f"the table swings at {hertz:.1f} ± {half:.1f} Hz, and the configuration says {axis.resonance_hz:g} Hz"
+    text = f"the table swings at {hertz:.1f} ± {half:.1f} Hz, not at {axis.resonance_hz:.4g} Hz as configured or found "
+    text += "from the motor"
     return [Reason("ResonanceDiffers", text, "set resonance_hz of the axis to what its table does")]

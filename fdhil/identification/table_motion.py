@@ -91,8 +91,7 @@ class Motor:
 
     def time(self, rows: Bool) -> Float:
         """Return (m,) seconds since the first of some rows."""
-        seconds: Float = self.dt_s * (np.flatnonzero(rows) - int(np.argmax(rows)))
-        return seconds
+        return np.asarray(self.dt_s * (np.flatnonzero(rows) - int(np.argmax(rows))), dtype=np.float64)
 
     def beside(self, rows: Bool) -> list[Float]:
         """Return what a sensor at the table has of an offset, and of friction and pitch, by speed and angle."""

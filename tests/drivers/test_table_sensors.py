@@ -106,7 +106,7 @@ def test_before_much_has_arrived_the_nominal_rate_is_taken_and_a_restart_forgets
 
 
 def streamed(**keys: float) -> StreamedAccelerometer:
-    return StreamedAccelerometer("Y", Accelerometer(device="/dev/none", **{"scale": 0.01} | keys), 1e-3)  # type: ignore[arg-type]
+    return StreamedAccelerometer("Y", Accelerometer(device="/dev/none", **{"scale": 0.01} | keys), 1e-3)
 
 
 def lines(counts: list[int], text: str = "{},{},7,8") -> list[TextLine]:
@@ -213,4 +213,4 @@ async def test_a_module_on_modbus_is_placed_between_question_and_answer() -> Non
 )
 def test_a_table_encoder_that_cannot_be_is_refused(keys: dict[str, object], text: str) -> None:
     with pytest.raises(ValueError, match=text):
-        TableEncoder(**keys)  # type: ignore[arg-type]
+        TableEncoder(**keys)
