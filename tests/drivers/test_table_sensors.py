@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fdhil import config as machine_config
 from fdhil.config import Accelerometer, TableEncoder
 from fdhil.drivers.can.sync_grid import Ticked
 from fdhil.drivers.can.tick_clock import TickClock
@@ -21,6 +22,9 @@ from fdhil.drivers.table.modbus_encoder import ModbusEncoder
 from fdhil.drivers.table.tpdo_encoder import SILENT_TICKS, TpdoEncoder
 from fdhil.errors import ConnectError, DeviceTimeout, ProtocolError
 from fdhil.records import Notice, TableSamples, TickTimes, frozen_ints
+from fdhil.sim.wire.modbus_sensor import VoltageSensor
+from fdhil.sim.wire.sensor_wires import SensorWires
+from tests.bench import bench_document
 from tests.drivers.modbus_peer import sensor_peer
 
 MS = 1_000_000
@@ -214,3 +218,28 @@ async def test_a_module_on_modbus_is_placed_between_question_and_answer() -> Non
 def test_a_table_encoder_that_cannot_be_is_refused(keys: dict[str, object], text: str) -> None:
     with pytest.raises(ValueError, match=text):
         TableEncoder(**keys)
+
+
+async def test_the_simulated_module_on_a_serial_line_is_read(tmp_path: Path) -> None:
+    document = bench_document("X")
+    keys = {
+        "source": "modbus",
+        "device": str(tmp_path / "line"),
+        "type": "int32",
+        "word_order": "little",
+        "scale": 1e-4,
+    }
+    document["axis"]["X"]["table"] = keys | {"function": 3, "address": 30}
+    config = machine_config.parse(document)
+    sensor = VoltageSensor(1000.0, 300.0, 0.0, np.random.default_rng(1))
+    wires = SensorWires(config, {"X": sensor}, {"X": lambda: -123.4567})
+    wires.start()
+    settings = config.axis["X"].table
+    assert settings is not None
+    encoder = ModbusEncoder("X", settings)
+    try:
+        await encoder.link.connect()
+        assert await encoder.reading() == "-123.4567 mm"
+    finally:
+        encoder.link.close()
+        wires.stop()
