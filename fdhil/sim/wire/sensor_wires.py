@@ -60,9 +60,11 @@ class SensorWires:
             return
         party = self._parties.setdefault(settings.device, RtuUnits())
         assert isinstance(party, RtuUnits)  # the configuration has text alone on its device
-        registers: RegisterMap = thermometer_map(settings, sensor) if is_warmth else map_of(settings, sensor, sensor)
+        registers: RegisterMap
         if isinstance(settings, TableEncoder):
             registers = OneValue(settings, settings.type, self._places[axis])
+        else:
+            registers = thermometer_map(settings, sensor) if is_warmth else map_of(settings, sensor, sensor)
         if settings.unit in party.units:
             registers = Joined(party.units[settings.unit][0], registers)
         party.units[settings.unit] = registers, sensor.faults
