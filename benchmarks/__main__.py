@@ -26,6 +26,7 @@ BENCHMARKS = {
     "planner": "The planner: speed, LinuxCNC's own demand beside it, and what the correction makes of jerky demands",
     "feedforward": "The on-line feed-forward: what the targets on the bus alone take off the tracking error",
     "acquisition": "A full 1 Mbit/s bus through receive and decode, alone and beside a fit",
+    "adapters": "A serial CAN adapter through python-can, and the same through the kernel where it has vcan0",
     "guard_latency": "From SYNC to the offset frames",
     "whole_machine": "The daemon beside the twin in real time: 60 s of two drives at 1 kHz",
 }

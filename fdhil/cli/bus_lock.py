@@ -32,6 +32,8 @@ def lock_bus(bus: CanBus, transmit: socket.socket | None = None, run_directory: 
     process has it, ConnectError when the bus cannot be found.
     """
     places = [endpoint(bus, transmit)]
+    if bus.interface == "socketcan":  # an adapter that is plugged in again has another number and the same name
+        places.append(f"interface {bus.channel} of {_here()}")
     if run_directory is not None:
         places.append(f"directory {run_directory.resolve()}")
     try:
@@ -53,7 +55,7 @@ def endpoint(bus: CanBus, transmit: socket.socket | None = None) -> str:
 
     All addresses of this computer are one.
     """
-    here = f"this computer (network {Path('/proc/self/ns/net').stat().st_ino})"
+    here = _here()
     try:
         if bus.interface == "socketcan":
             index = socket.if_nametoindex(transmit.getsockname()[0] if transmit else bus.channel)
@@ -70,6 +72,10 @@ def endpoint(bus: CanBus, transmit: socket.socket | None = None) -> str:
         raise ConnectError(name, text) from None
     place = here if _is_here(str(address)) else address
     return f"{bus.channel} behind port {bus.port} of {place}"
+
+
+def _here() -> str:
+    return f"this computer (network {Path('/proc/self/ns/net').stat().st_ino})"
 
 
 def _is_here(address: str) -> bool:

@@ -249,16 +249,21 @@ def _open_points(found: Sequence[Place]) -> dict[tuple[str, str, str], list[str]
 @click.command()
 @CONFIG
 @click.option("--axis", "only", help="Commission this axis; left out: all, one after the other.")
-@click.option("--yes", is_flag=True, help="Do not ask before an axis moves.")
+@click.option(
+    "--set-pdos", is_flag=True, help="Write the PDOs of the drives' profiles, save them in the drives; no more."
+)
+@click.option("--yes", is_flag=True, help="Do not ask before an axis moves, or PDOs are written.")
 @AS_JSON
-def commission(config: Path, only: str | None, yes: bool, as_json: bool) -> int:
+def commission(config: Path, only: str | None, set_pdos: bool, yes: bool, as_json: bool) -> int:
     """Commission the drives of CONFIG, step by step: what arming a correction asks for.
 
     The NC must be off, the axis free to move a tenth of a millimetre, and the machine's own safety functions effective.
     Reads and compares the drive's set-up, asks, switches the drive on, moves the axis by 10 um, finds out where the
     offset acts, proves the drive's watchdog, and writes the signed record into the store. Whatever fails, also Ctrl-C,
-    the offset goes back to zero and the drive is switched off. Exit codes: 0 commissioned, 1 refused, by you or because
-    the drive is not set up as it must be, 2 wrong option or configuration, 3 the drive or the bus cannot be reached.
+    the offset goes back to zero and the drive is switched off. With --set-pdos nothing moves: what differs from the
+    profile in the drive's PDOs is written and saved, and that is all. Exit codes: 0 commissioned, 1 refused, by you or
+    because the drive is not set up as it must be, 2 wrong option or configuration, 3 the drive or the bus cannot be
+    reached.
     """
     machine = machine_config.load(config)
     axes = [only] if only else list(machine.axis)
@@ -270,7 +275,8 @@ def commission(config: Path, only: str | None, yes: bool, as_json: bool) -> int:
     with _stopped_like_ctrl_c():
         for axis in axes:
             try:
-                done[axis] = _commission_axis(machine, axis, yes, as_json)
+                step = _set_pdos if set_pdos else _commission_axis
+                done[axis] = step(machine, axis, yes, as_json)
             except DriveFault as fault_found:
                 refused = str(fault_found)
                 break
@@ -309,6 +315,28 @@ def _commission_axis(machine: MachineConfig, axis: str, yes: bool, quiet: bool) 
     return {**asdict(record), "record": str(path), "digest": record.digest}
 
 
+def _set_pdos(machine: MachineConfig, axis: str, yes: bool, quiet: bool) -> dict[str, Any]:
+    """Set the PDOs of one drive up; DriveFault when it refuses, or the operator does."""
+    from fdhil.cli.bus_lock import lock_bus
+    from fdhil.commissioning.master import Master
+    from fdhil.commissioning.pdo_setup import set_up_pdos
+    from fdhil.drivers.cia402.profile_file import load_profile
+
+    profile = load_profile(machine.axis[axis].drive)
+    if not yes:
+        question = (
+            f"The PDOs of drive {axis} are written as profile {profile.name} has them, and saved in it. May they?"
+        )
+        _confirm(axis, question, "nothing was written; start again with --yes where nobody can be asked")
+    with lock_bus(machine.bus[machine.axis[axis].drive.bus]), Master(machine, axis) as master:
+        done = set_up_pdos(master)
+    written = ", ".join(done.written) or "none, all were right"
+    kept = {True: ", saved in the drive", False: ", NOT saved: lost when the drive is off", None: ""}[done.saved]
+    if not quiet:
+        click.echo(f"axis {axis}: PDOs written: {written}{kept}")
+    return {"pdos_written": list(done.written), "saved": done.saved}
+
+
 def _guide(machine: MachineConfig, axis: str, yes: bool, quiet: bool) -> Callable[[str], None]:
     """Return the function that tells, and asks, before each step."""
     numbers = {step: number for number, step in enumerate(STEPS, 1)}
@@ -334,6 +362,10 @@ def _ask(machine: MachineConfig, axis: str) -> None:
         f"then up to {largest_move_um(machine, axis):.0f} um to and fro. Is it free to move, and may it?"
     )
     advice = "nothing was moved or written; start again when it may move, with --yes where nobody can be asked"
+    _confirm(axis, question, advice)
+
+
+def _confirm(axis: str, question: str, advice: str) -> None:
     try:
         agreed = click.confirm(question, err=True)
     except click.Abort:

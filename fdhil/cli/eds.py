@@ -73,6 +73,7 @@ def _document(
             "vendor_id": device.vendor_id,
             "product_code": device.product_code,
             "is_drive": device.is_drive,
+            "axes": list(device.axes),
             "objects": len(device.objects),
             "rpdos": len(device.rpdos),
             "tpdos": len(device.tpdos),
@@ -119,6 +120,9 @@ def _show(
     out = open_console()
     who = " ".join(filter(None, (device.vendor_name, device.product_name))) or "unnamed"
     out.print(Text(f"{device.file}: {who}, vendor {device.vendor_id:08X}, product {device.product_code:08X}"))
+    if len(device.axes) > 1:
+        others = ", ".join(map(str, device.axes[1:]))
+        out.print(Text(f"it has axes {others} besides: set drive.logical_axis for these"), soft_wrap=True)
     by = "suggested" if profile.name == suggested else f"{suggested} is suggested"
     title = f" ({profile.title})" if profile.title else ""
     out.print(Text(f"judged by profile {profile.name}{title}; {by}"), soft_wrap=True)

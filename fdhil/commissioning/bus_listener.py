@@ -22,18 +22,32 @@ UNREADABLE = (
     "set the bit rate of the bus on the interface, and check termination and wiring"
 )
 _TURN_S = 0.002
-_LSS_MASTER = 0x7E5
+_MASTER_FRAMES = {COB_SYNC: "SYNC", COB_NMT: "NMT commands", 0x7E5: "LSS commands"}
 _MASTER_FUNCTIONS = {0x200: "set-points", 0x300: "set-points", 0x400: "set-points", 0x500: "set-points"} | {
     COB_SDO_REQUEST: "SDO requests"
 }
+_REQUESTS = {COB_HEARTBEAT: "node guarding"}
 _NODE_FUNCTIONS = (0x080, 0x180, 0x280, 0x380, 0x480, COB_SDO_RESPONSE, COB_HEARTBEAT)
+
+
+def shows_master(can_id: int) -> str | None:
+    """What a frame with this id, its flags included, shows that only a master sends; None when a node may send it.
+
+    >>> shows_master(0x205)
+    'set-points'
+    """
+    if can_id & ~0x7FF == REMOTE_FLAG:
+        return _REQUESTS.get(can_id & 0x780, "requests for PDOs")
+    if can_id > 0x7FF:
+        return None
+    return _MASTER_FRAMES.get(can_id) or _MASTER_FUNCTIONS.get(can_id & 0x780)
 
 
 @dataclass(slots=True)
 class Traffic:
     """The frames heard: per COB-ID those counted, the newest length and data; heartbeats and EMCY per node; errors.
 
-    ``requests`` are the COB-IDs of remote frames.
+    ``requests`` are the COB-IDs of remote frames, with their flag.
     """
 
     count: dict[int, int] = field(default_factory=dict)
@@ -48,7 +62,7 @@ class Traffic:
     def take(self, frames: Frames) -> None:
         """Take a block of frames; those with 29 bit identifiers are left aside, error frames counted."""
         self.errors += int((frames["id"] & ERROR_FLAG != 0).sum())
-        self.requests |= set((frames["id"][frames["id"] & ~np.uint32(0x7FF) == REMOTE_FLAG] & 0x7FF).tolist())
+        self.requests |= set(frames["id"][frames["id"] & ~np.uint32(0x7FF) == REMOTE_FLAG].tolist())
         for frame in frames[frames["id"] <= 0x7FF]:
             can_id, stamp, data = int(frame["id"]), int(frame["t_ns"]), int(frame["data"])
             function, node = can_id & 0x780, can_id & 0x7F
@@ -64,15 +78,8 @@ class Traffic:
     @property
     def master(self) -> str | None:
         """What shows that a master runs the bus, None when nothing does."""
-        if self.sync_ns:
-            return "SYNC"
-        if COB_NMT in self.count:
-            return "NMT commands"
-        if _LSS_MASTER in self.count:
-            return "LSS commands"
-        if self.requests:
-            return "node guarding" if max(self.requests) > COB_HEARTBEAT else "requests for PDOs"
-        return next((_MASTER_FUNCTIONS[i & 0x780] for i in self.count if i & 0x780 in _MASTER_FUNCTIONS), None)
+        signs = [shows_master(can_id) for can_id in (*self.count, *self.requests)]
+        return "SYNC" if self.sync_ns else next((sign for sign in signs if sign), None)
 
     @property
     def nodes(self) -> set[int]:

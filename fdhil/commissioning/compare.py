@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from fdhil.commissioning.bus_listener import BusListener
+from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import CommissioningRecord, fingerprint, load_record
-from fdhil.commissioning.survey import Finding, Survey, survey
+from fdhil.commissioning.survey import Survey, survey
 from fdhil.commissioning.void import confirm_record, void_record
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.bus import CanBus

@@ -10,9 +10,10 @@ from collections.abc import Callable, Iterator, Sequence
 
 from fdhil.commissioning.bus_listener import LISTEN_S, BusListener, Traffic
 from fdhil.commissioning.compare import POINT, compare_record
+from fdhil.commissioning.finding import Finding, read_optional
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import load_record
-from fdhil.commissioning.survey import Finding, Survey, read_optional, survey
+from fdhil.commissioning.survey import Survey, survey
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.bus import CanBus
 from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
@@ -164,7 +165,7 @@ def _rapid(config: MachineConfig, profile: DriveProfile, read: Callable[[], int 
 def _voltage_object(config: MachineConfig, axis: str, profile: DriveProfile, master: Master) -> Iterator[Finding]:
     if config.axis[axis].voltage.separate:
         return
-    if profile.voltage is None:
+    if profile.voltage is None or not profile.voltage_objects:
         cause = f"profile {profile.name} has no object of the terminal voltage"
         yield Finding("voltage", "from the drive", "none", False, cause, "set voltage.source = 'modbus'")
         return

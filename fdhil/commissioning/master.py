@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import Self
 
 from fdhil import cia402
+from fdhil.commissioning.bus_listener import shows_master
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.frames import ERROR_FLAG
@@ -25,14 +26,16 @@ from fdhil.errors import DeviceError, DeviceTimeout
 
 @dataclass(slots=True)
 class Heard:
-    """The drive's newest: mapped objects by key, EMCY frames, its NMT state; and frames and error frames of the bus."""
+    """The drive's newest: mapped objects by key, EMCY frames, its NMT state; and frames and error frames of the bus.
+
+    ``master`` is what shows that another master runs the bus, None while nothing does.
+    """
 
     objects: dict[tuple[int, int], int] = field(default_factory=dict)
     cycle: dict[tuple[int, int], int] = field(default_factory=dict)
     emergencies: list[bytes] = field(default_factory=list)
     nmt: int | None = None
-    sync: int = 0
-    foreign_rpdo: int = 0
+    master: str | None = None
     frames: int = 0
     errors: int = 0
 
@@ -145,14 +148,13 @@ class Master:
     def _receive(self) -> None:
         node, heard = self.node_id, self.heard
         tpdos = {spec.cob_base + node: spec for spec in self.profile.tpdos}
-        rpdos = {spec.cob_base + node for spec in self.profile.rpdos}
         for frame in self.bus.drain():
             can_id, length = int(frame["id"]), int(frame["dlc"])
             data = int(frame["data"]).to_bytes(8, "little")[:length]
             error = bool(can_id & ERROR_FLAG)
             heard.errors, heard.frames = heard.errors + error, heard.frames + (not error)
-            if can_id == cia402.COB_SYNC:
-                heard.sync += 1
+            if (sign := shows_master(can_id)) is not None:
+                heard.master = heard.master or sign
             elif can_id in tpdos and length >= tpdos[can_id].length:
                 spec, self._answered = tpdos[can_id], self.cycle
                 for entry, value in zip(spec.entries, cia402.unpack(spec.entries, data), strict=True):
@@ -164,8 +166,6 @@ class Master:
                 heard.emergencies.append(data)
             elif can_id == cia402.COB_HEARTBEAT + node and data:
                 heard.nmt = data[0] & 0x7F
-            elif can_id in rpdos:
-                heard.foreign_rpdo += 1
 
     # what the steps use ---------------------------------------------------------------------------------------
 

@@ -16,13 +16,13 @@ from datetime import UTC, datetime
 from fdhil import cia402
 from fdhil.cia402 import Mode, NmtCommand, Object, State
 from fdhil.commissioning.feedforward import feedforward_open, prove_feedforward
+from fdhil.commissioning.finding import read_optional
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import CommissioningRecord, axis_digest
 from fdhil.commissioning.survey import (
     Survey,
     faulted,
     listen,
-    read_optional,
     require,
     require_alone,
     require_enabled,

@@ -1,6 +1,6 @@
 """Reads a drive by SDO and compares it with its configuration, the first half of commissioning. Nothing moves.
 
-``survey`` reads and compares everything and raises only for a drive that does not answer (SdoAbort, DeviceTimeout,
+``survey`` reads and compares everything and raises only for a drive that does not answer (DeviceTimeout,
 ProtocolError); ``require`` turns the first point that differs into a DriveFault.
 """
 
@@ -13,13 +13,14 @@ from dataclasses import dataclass
 
 from fdhil.cia402 import Mode, Object, State
 from fdhil.commissioning.bus_listener import UNREADABLE
+from fdhil.commissioning.compare_scales import compare_scales
 from fdhil.commissioning.device_type import describe, is_drive
+from fdhil.commissioning.finding import Finding, has_object, lacks, read_optional
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.record import SOFTWARE_LIMIT_KEYS
 from fdhil.config import CorrectionLimits
-from fdhil.drivers.can.sdo import NO_OBJECT, NO_SUB_INDEX
 from fdhil.drivers.cia402.profile import DriveProfile, PdoSpec
-from fdhil.errors import ConnectError, DeviceTimeout, DriveFault, ProtocolError, SdoAbort
+from fdhil.errors import ConnectError, DeviceTimeout, DriveFault, ProtocolError
 
 LISTEN_S = 2.0
 INVALID_COB_ID = 1 << 31
@@ -48,23 +49,6 @@ class Identity:
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
-    """One point of the set-up, expected and found; ``ok`` None: it could not be compared.
-
-    ``cause`` and ``advice`` are the halves of the sentence that tells what is wrong, or why it was not compared, and
-    what to do next. ``needed``: what cannot be compared here ends a commissioning.
-    """
-
-    point: str
-    expected: str
-    found: str
-    ok: bool | None = True
-    cause: str = ""
-    advice: str = ""
-    needed: bool = False
-
-
-@dataclass(frozen=True, slots=True)
 class Survey:
     """A drive as it was read: its identity, the mapping's fingerprint, its options, and every point compared.
 
@@ -79,23 +63,13 @@ class Survey:
     is_drive: bool = True
 
 
-def read_optional(master: Master, index: int, sub: int = 0, *, signed: bool = False) -> int | None:
-    """Read an integer object, None when the drive does not have it."""
-    try:
-        return master.sdo.read_int(index, sub, signed=signed)
-    except SdoAbort as abort:
-        if abort.code in (NO_OBJECT, NO_SUB_INDEX):
-            return None
-        raise
-
-
 def listen(master: Master) -> None:
     """Listen without sending, and beside an NC leave it at that: we are not the master then.
 
     On a silent bus the drive is asked what it is: with the NC off, one that sends no heartbeat (0x1017 = 0) is silent.
     """
     end = time.monotonic() + LISTEN_S
-    while time.monotonic() < end and master.heard.sync == 0:
+    while time.monotonic() < end and master.heard.master is None:
         master.check()
         time.sleep(0.01)
     require_alone(master)
@@ -117,8 +91,10 @@ def _ask_alone(master: Master) -> None:
 
 def require_alone(master: Master) -> None:
     """ProtocolError when another master was heard; to be asked before our own SYNC starts."""
-    if master.heard.sync or master.heard.foreign_rpdo:
-        text = "an NC is sending SYNC or set-points; switch it off while an axis is commissioned"
+    sign = master.heard.master
+    if sign is not None:
+        what = "SYNC or set-points" if sign in ("SYNC", "set-points") else sign
+        text = f"an NC is sending {what}; switch it off while an axis is commissioned"
         raise ProtocolError(f"bus {master.bus.name}", text)
 
 
@@ -135,8 +111,7 @@ def survey(master: Master) -> Survey:
         *(compare_pdo(spec, found, master.node_id) for spec, found in pdos),
         *compare_options(master, options),
         *compare_mode(master),
-        *compare_scale(master),
-        *compare_rating(master),
+        *compare_scales(master),
         *compare_window(master, options, window_um),
     )
     fingerprint = hashlib.sha256(repr([found.words for _, found in pdos]).encode()).hexdigest()[:16]
@@ -163,9 +138,10 @@ def compare_device(master: Master) -> Finding:
         return Finding("device", expected, expected)
     found = describe(own)
     if own is None or own & 0xFFFF == 0:  # some drives follow CiA 402 and do not say so
-        has_power_state = read_optional(master, 0x6041) is not None
-        cause = "it names no device profile (0x1000)" + ("" if has_power_state else " and has no statusword (0x6041)")
-        return Finding("device", expected, found, None if has_power_state else False, cause, advice)
+        cause = "it names no device profile (0x1000)"
+        if has_object(master, Object.STATUSWORD):
+            return Finding("device", expected, found, None, cause, "see in its manual that it follows CiA 402")
+        return Finding("device", expected, found, False, f"{cause} and has no statusword (0x6041)", advice)
     return Finding("device", expected, found, False, f"it is no CiA 402 drive: 0x1000 says {found}", advice)
 
 
@@ -174,9 +150,15 @@ def compare_identity(profile: DriveProfile, identity: Identity) -> Finding:
     wanted = ((profile.vendor_id, identity.vendor_id), (profile.product_code, identity.product_code))
     shown = f"vendor {identity.vendor_id:08X}, product {identity.product_code:08X}"
     vendor, product = ("any" if number is None else f"{number:08X}" for number, _ in wanted)
+    expected = f"vendor {vendor}, product {product}"
+    if all(found in (number, 0) or number is None for number, found in wanted) and (
+        any(number and not found for number, found in wanted)
+    ):
+        cause = f"it does not tell who it is: {shown} (0x1018)"
+        return Finding("identity", expected, shown, None, cause, "see by its label that the profile is the right one")
     same = all(number in (None, found) for number, found in wanted)
     cause = f"it is {shown}, which profile {profile.name} is not made for"
-    return Finding("identity", f"vendor {vendor}, product {product}", shown, same, cause, "choose another profile")
+    return Finding("identity", expected, shown, same, cause, "choose another profile")
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,8 +194,9 @@ def _read_pdo(master: Master, parameter: int, mapping: int) -> PdoFound:
     cob_id = read_optional(master, parameter, 1)
     if cob_id is None:
         return PdoFound(parameter, mapping, INVALID_COB_ID, 0, ())
-    mapped = tuple(master.sdo.read_int(mapping, sub) for sub in range(1, master.sdo.read_int(mapping, 0) + 1))
-    return PdoFound(parameter, mapping, cob_id, master.sdo.read_int(parameter, 2), mapped)
+    count = read_optional(master, mapping, 0) or 0
+    mapped = tuple(read_optional(master, mapping, sub) or 0 for sub in range(1, count + 1))
+    return PdoFound(parameter, mapping, cob_id, read_optional(master, parameter, 2) or 0, mapped)
 
 
 def compare_pdo(spec: PdoSpec, found: PdoFound, node_id: int) -> Finding:
@@ -233,7 +216,7 @@ def compare_pdo(spec: PdoSpec, found: PdoFound, node_id: int) -> Finding:
         _pdo_text(found.cob_id & 0x7FF, not found.cob_id & INVALID_COB_ID, found.kind, found.mapped),
         not cause,
         cause,
-        f"write 0x{found.parameter:04X} and 0x{found.mapping:04X} with the drive's tool, or choose another profile",
+        f"write 0x{found.parameter:04X} and 0x{found.mapping:04X} (fdhil commission --set-pdos), or change the profile",
     )
 
 
@@ -245,71 +228,28 @@ def _pdo_text(cob_id: int, valid: bool, kind: int, mapped: tuple[int, ...]) -> s
     return f"{cob_id:03X}, type {kind}: {_mapping(mapped)}" if valid else f"not valid: {_mapping(mapped)}"
 
 
-def _lacks(point: str, expected: str, *objects: str, needed: bool = False) -> Finding:
-    """A point that cannot be compared, for the drive has no such object."""
-    shown = " and ".join(objects)
-    advice = "its manual says what it does instead"
-    return Finding(point, expected, f"no {shown}", None, f"it has no {shown}", advice, needed)
-
-
 def compare_mode(master: Master) -> Iterator[Finding]:
     """The drive must offer cyclic synchronous position and interpolate at the machine's SYNC period."""
-    modes = read_optional(master, Object.SUPPORTED_MODES)
+    modes, mode = read_optional(master, Object.SUPPORTED_MODES), master.profile.mode
+    name = "cyclic synchronous position" if mode == Mode.CYCLIC_SYNC_POSITION else f"mode {mode}"
     if modes is None:
-        yield _lacks("mode", "cyclic synchronous position", "0x6502")
-    else:
-        offered = bool(modes >> (Mode.CYCLIC_SYNC_POSITION - 1) & 1)
-        cause = "it has no cyclic synchronous position mode (0x6502)"
+        yield lacks("mode", name, "0x6502")
+    elif mode > 0:  # a maker's own mode has no bit there
+        offered = bool(modes >> (mode - 1) & 1)
+        cause = f"it has no {name}{' mode' if mode == Mode.CYCLIC_SYNC_POSITION else ''} (0x6502)"
         shown = f"0x6502 = {modes:08X}"
-        yield Finding("mode", "cyclic synchronous position", shown, offered, cause, "it cannot be corrected")
+        yield Finding("mode", name, shown, offered, cause, "it cannot be corrected")
     value = read_optional(master, Object.INTERPOLATION_PERIOD, 1)
     exponent = read_optional(master, Object.INTERPOLATION_PERIOD, 2, signed=True)
     wanted = f"{master.period_s * 1e3:g} ms"
     if value is None or exponent is None:
-        yield _lacks("cycle", wanted, "0x60C2")
+        yield lacks("cycle", wanted, "0x60C2")
         return
     period_s = value * 10.0**exponent
     found = f"{period_s * 1e3:g} ms"
     same = abs(period_s - master.period_s) <= 1e-6
     cause = f"it interpolates over {found} (0x60C2) while SYNC comes every {wanted}"
     yield Finding("cycle", wanted, found, same, cause, "set 0x60C2 or machine.sync_period_s")
-
-
-def compare_scale(master: Master) -> Iterator[Finding]:
-    """Position increments per motor revolution from 0x6091 and 0x6092 (else 0x608F) must be the configured ones."""
-    expected = master.config.axis[master.axis].drive.increments_per_rev
-    feed = _ratio(master, Object.FEED_CONSTANT)
-    gear = _ratio(master, Object.GEAR_RATIO)
-    encoder = _ratio(master, Object.POSITION_ENCODER_RESOLUTION)
-    if feed is not None:
-        per_rev, source = feed / (gear or 1.0), "0x6092 and 0x6091"
-    elif encoder is not None:
-        per_rev, source = encoder, "0x608F"
-    else:
-        return
-    wanted, found = f"{expected} per revolution", f"{per_rev:g} per revolution"
-    same = abs(per_rev - expected) <= 1e-6 * expected
-    cause = f"its position counts {per_rev:g} per motor revolution ({source}) where the config has {expected}"
-    yield Finding("scale", wanted, found, same, cause, "correct the drive's factors or drive.increments_per_rev")
-
-
-def _ratio(master: Master, index: int) -> float | None:
-    upper, lower = read_optional(master, index, 1), read_optional(master, index, 2)
-    return None if upper is None or not lower else upper / lower
-
-
-def compare_rating(master: Master) -> Iterator[Finding]:
-    """0x6075 is what 0x6078 counts in: it must be the configured rated current."""
-    if master.profile.current_unit != "permille_of_rated":
-        return
-    milliamps = read_optional(master, Object.RATED_CURRENT)
-    expected = master.config.axis[master.axis].drive.rated_current_a
-    if milliamps is None:
-        return
-    wanted, found = f"{expected:g} A", f"{milliamps / 1e3:g} A"
-    same = abs(milliamps / 1e3 - expected) <= 0.01 * expected
-    cause = f"its rated current is {found} (0x6075) where the config has {wanted}"
-    yield Finding("rated current", wanted, found, same, cause, "correct drive.rated_current_a")
 
 
 def read_options(master: Master) -> dict[str, int]:
@@ -326,7 +266,7 @@ def compare_options(master: Master, options: Mapping[str, int]) -> Iterator[Find
     strict = " or ".join(map(str, master.profile.strict_abort_options))
     point, expected, abort = "communication lost", f"0x6007 = {strict}", options.get("6007")
     if abort is None:  # the watchdog test of the commissioning shows what it does
-        yield _lacks(point, expected, "0x6007")
+        yield lacks(point, expected, "0x6007")
     else:
         stops = abort in master.profile.strict_abort_options
         cause = f"0x6007 is {abort}: it goes on when communication is lost"
@@ -334,7 +274,7 @@ def compare_options(master: Master, options: Mapping[str, int]) -> Iterator[Find
     point, expected = "stop by a ramp", "0x605A and 0x605E not 0"
     found = {f"0x{key}": options.get(key) for key in ("605A", "605E")}
     if missing := [key for key, value in found.items() if value is None and 0 not in found.values()]:
-        yield _lacks(point, expected, *missing)
+        yield lacks(point, expected, *missing)
         return
     shown = ", ".join(f"{key} = {'missing' if value is None else value}" for key, value in found.items())
     cause = "0x605E or 0x605A is 0: it coasts instead of stopping by a ramp"
@@ -348,7 +288,7 @@ def compare_window(master: Master, options: Mapping[str, int], window_um: float)
     wanted = settings.drive.following_error_window_mm * 1e3
     point, expected = "following error", f"{wanted:g} um"
     if "6065" not in options:
-        yield _lacks(point, expected, "0x6065", needed=True)
+        yield lacks(point, expected, "0x6065", needed=True)
         return
     if options["6065"] in (0, NO_WINDOW):
         cause = "0x6065 is off: it never notices a following error"

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, PrivateAttr
 
 from fdhil import tables
 from fdhil.cia402 import Scaling
@@ -57,6 +58,23 @@ class FeedforwardLimits(Section):
 
 class Drive(Section):
     """[axis.X.drive]: how the drive is reached and scaled."""
+
+    _files: str = PrivateAttr("")
+
+    def placed(self, folder: Path) -> Drive:
+        """Return it with the paths of its files taken from ``folder``, and these files' digest."""
+        own = [] if self.profile in tables.DRIVE_PROFILES else [folder / self.profile]
+        eds = [] if self.eds is None else [folder / self.eds]
+        changes: dict[str, Any] = {"profile": str(own[0]) if own else self.profile, "eds": eds[0] if eds else None}
+        drive = self.model_copy(update=changes)
+        told = b"".join(path.read_bytes() for path in (*own, *eds) if path.is_file())
+        drive._files = hashlib.sha256(told).hexdigest() if own or eds else ""
+        return drive
+
+    @property
+    def files_digest(self) -> str:
+        """Of what its own profile and its EDS say, a part of what the configuration means; empty without such files."""
+        return self._files
 
     bus: str = Field("can0", description="the [bus.*] it is on")
     node_id: int | None = Field(
@@ -111,8 +129,7 @@ class Axis(Section):
         ge=5.0,
         le=2000.0,
         description="resonance of motor and table against each other, the motor free to turn, as the drive's frequency "
-        "response has it; left out, it is sought where replays of rapids leave much, else the table is where the motor "
-        "is",
+        "response has it; left out: sought where replays of rapids leave much, else the table is where the motor is",
     )
     resonance_damping: NotNegative = Field(0.03, le=0.7, description="damping ratio of that resonance")
     nominal: Nominal

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from pydantic import Field, ValidationInfo, model_validator
@@ -15,7 +15,7 @@ from fdhil.config.offset_bounds import limit_faults
 from fdhil.config.plausible import doubts
 from fdhil.config.regulators import period_faults
 from fdhil.config.section import AxisName, Positive, Section
-from fdhil.config.sensors import Thermometer, Voltage, line_faults
+from fdhil.config.sensors import WORDS, LineUser, line_faults, line_user
 from fdhil.config.service import Guard, Maintenance, Store
 from fdhil.config.simulation import Sim
 
@@ -57,7 +57,7 @@ class MachineConfig(Section):
             found = [] if (info.context or {}).get("made_up") else doubts(axis)
             faults += [f"axis.{name}.{doubt.key}: {doubt.text}" for doubt in found if limits or not doubt.possible]
             faults += limits
-        faults += line_faults(self.sensors)
+        faults += line_faults(self._line_users())
         # the PDOs of a device's second axis are those of the next node-ID
         ids = {(axis.drive.bus, self.node_id(name) + axis.drive.logical_axis) for name, axis in self.axis.items()}
         if len(ids) < len(self.axis):
@@ -67,15 +67,17 @@ class MachineConfig(Section):
             raise ValueError("\n".join(faults))
         return self
 
-    @property
-    def sensors(self) -> dict[str, Voltage | Thermometer]:
-        """The sections of all sensors, by their path."""
-        found: dict[str, Voltage | Thermometer] = {}
+    def _line_users(self) -> Iterator[LineUser]:
+        """Yield the sensors on serial devices."""
         for name, axis in self.axis.items():
-            found[f"axis.{name}.voltage"] = axis.voltage
+            yield from filter(None, [line_user(f"axis.{name}.voltage", axis.voltage)])
             if axis.temperature is not None:
-                found[f"axis.{name}.temperature"] = axis.temperature
-        return found
+                yield from filter(None, [line_user(f"axis.{name}.temperature", axis.temperature)])
+            table, accelerometer = axis.table, axis.accelerometer
+            if table is not None and table.source == "modbus" and table.device:
+                yield LineUser(f"axis.{name}.table", table, WORDS[table.type], table.period_s, False)
+            if accelerometer is not None:
+                yield LineUser(f"axis.{name}.accelerometer", accelerometer, 0, 1.0, True)
 
     def _listening(self, bus: str) -> str:
         interface = self.bus[bus].interface
@@ -98,4 +100,5 @@ class MachineConfig(Section):
     @property
     def digest(self) -> str:
         """SHA-256 of the configuration's meaning (not of its text), 16 hexadecimal digits."""
-        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
+        files = "".join(axis.drive.files_digest for axis in self.axis.values())
+        return hashlib.sha256(f"{self.model_dump_json()}{files}".encode()).hexdigest()[:16]

@@ -11,12 +11,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from fdhil.config.axis import Drive
 from fdhil.config.machine import MachineConfig
 from fdhil.config.plausible import doubts
 from fdhil.config.section import LARGEST, Section
 from fdhil.errors import ConfigError, ConfigFault
-from fdhil.tables import DRIVE_PROFILES
 
 MAX_CONFIG_BYTES = 256 * 1024
 MOST_FAULTS = 50
@@ -84,14 +82,8 @@ def parse(
         for name, axis in config.sim.axis.items()
     }
     sim = config.sim.model_copy(update={"axis": worn})
-    axes = {name: axis.model_copy(update={"drive": _placed(axis.drive, folder)}) for name, axis in config.axis.items()}
+    axes = {name: axis.model_copy(update={"drive": axis.drive.placed(folder)}) for name, axis in config.axis.items()}
     return config.model_copy(update={"store": store, "guard": guard, "axis": axes, "sim": sim})
-
-
-def _placed(drive: Drive, folder: Path) -> Drive:
-    """Return the drive with the paths of its files taken from ``folder``."""
-    profile = drive.profile if drive.profile in DRIVE_PROFILES else str(folder / drive.profile)
-    return drive.model_copy(update={"profile": profile, "eds": folder / drive.eds if drive.eds else None})
 
 
 def unlikely(config: MachineConfig) -> list[str]:

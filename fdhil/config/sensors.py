@@ -6,7 +6,8 @@ What kinds of sensor have in common is a class here: where a device is, and how 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -108,6 +109,11 @@ class Scaled(Section):
     offset: Finite = Field(0.0, description="what is added then")
 
 
+def _worth_something(value: Scaled) -> None:
+    if value.scale == 0:
+        raise ValueError("scale: what is read must be worth something; give the unit's worth of one count")
+
+
 class VoltageBlock(Section):
     """[axis.X.voltage.block]: where a Modbus device keeps its newest samples by number: voltage.address is the first
     of them, voltage.type what each is. Without this section a device shows one value, its newest."""
@@ -172,6 +178,7 @@ class Voltage(Scaled, TextValue, ModbusValue, ModbusPlace, Sourced):
 
     @model_validator(mode="after")
     def _complete(self) -> Voltage:
+        _worth_something(self)
         if self.source == "serial" and not self.device:
             raise ValueError("device: a sensor on a serial line has one, as device = '/dev/ttyUSB0'")
         if self.block is not None and block_registers(self)[1] > MOST_REGISTERS:
@@ -194,6 +201,7 @@ class Thermometer(Scaled, TextValue, ModbusValue, ModbusPlace, Sourced):
 
     @model_validator(mode="after")
     def _complete(self) -> Thermometer:
+        _worth_something(self)
         if self.source == "serial" and not self.device:
             raise ValueError("device: a thermometer on a serial line has one, as device = '/dev/ttyUSB0'")
         return self
@@ -215,36 +223,55 @@ def block_registers(voltage: Voltage) -> tuple[int, int]:
     return first, max(address + words for address, words in places) - first
 
 
-Sensors = Mapping[str, Voltage | Thermometer]
-"""The sensors of a machine by the path of their section."""
+@dataclass(frozen=True, slots=True)
+class LineUser:
+    """A sensor on a serial device; ``registers`` are read every ``period_s``, 0 where it is not asked for a value.
+
+    ``alone``: it tells lines of text, and can have no other beside it.
+    """
+
+    path: str
+    place: SerialPlace
+    registers: int
+    period_s: float
+    alone: bool
+
+    @property
+    def share(self) -> float:
+        """Which share of its line's time it takes."""
+        bits = 1 + 8 + (self.place.parity != "none") + self.place.stop_bits
+        characters = _REQUEST_CHARACTERS + _ANSWER_CHARACTERS + 2 * self.registers + _SILENT_CHARACTERS
+        return characters * bits / self.place.baud_rate / self.period_s if self.registers else 0.0
+
+
+def line_user(path: str, sensor: Voltage | Thermometer) -> LineUser | None:
+    """Return what a sensor takes of a serial device; None where it has none."""
+    if not sensor.device or sensor.source == tables.DRIVE_VOLTAGE:
+        return None
+    asked = sensor.source == "modbus" and getattr(sensor, "block", None) is None and sensor.type is not None
+    registers = WORDS[sensor.type] if asked and sensor.type is not None else 0
+    return LineUser(path, sensor, registers, sensor.period_s, sensor.source == "serial")
+
+
 _LINE_KEYS = ("baud_rate", "parity", "stop_bits")
 _REQUEST_CHARACTERS, _ANSWER_CHARACTERS, _SILENT_CHARACTERS = 8, 5, 7.0
 
 
-def line_faults(sensors: Sensors) -> Iterator[str]:
+def line_faults(users: Iterable[LineUser]) -> Iterator[str]:
     """Yield what cannot be of sensors on one serial device: other settings, text beside others, too much to ask."""
-    lines: dict[str, dict[str, Voltage | Thermometer]] = {}
-    for path, sensor in sensors.items():
-        if sensor.device and sensor.source != tables.DRIVE_VOLTAGE:
-            lines.setdefault(sensor.device, {})[path] = sensor
+    lines: dict[str, list[LineUser]] = {}
+    for user in users:
+        lines.setdefault(user.place.device, []).append(user)
     for device, members in lines.items():
-        (first, one), *others = members.items()
-        for path, other in others:
+        first = members[0]
+        for other in members[1:]:
             for key in _LINE_KEYS:
-                if getattr(other, key) != getattr(one, key):
-                    yield f"{path}.{key}: {first} sets the same device {device} to {getattr(one, key)}"
-            if "serial" in (one.source, other.source):
-                yield f"{path}.device: {first} has the device {device}, and an instrument that tells by text is alone"
-        share = sum(_share(sensor) for sensor in members.values())
+                wanted = getattr(first.place, key)
+                if getattr(other.place, key) != wanted:
+                    yield f"{other.path}.{key}: {first.path} sets the same device {device} to {wanted}"
+            if first.alone or other.alone:
+                yield f"{other.path}.device: {first.path} has {device}, and what tells by text is alone on its device"
+        share = sum(user.share for user in members)
         if share > 1.0:
-            text = f"{', '.join(members)} take {share:.0%} of the time of {device} at {one.baud_rate} baud"
-            yield f"{first}.period_s: {text}; ask more rarely or raise baud_rate"
-
-
-def _share(sensor: Voltage | Thermometer) -> float:
-    """Return which share of its line's time a sensor takes that is asked for its newest value."""
-    if sensor.source != "modbus" or sensor.type is None or getattr(sensor, "block", None) is not None:
-        return 0.0
-    bits = 1 + 8 + (sensor.parity != "none") + sensor.stop_bits
-    characters = _REQUEST_CHARACTERS + _ANSWER_CHARACTERS + 2 * WORDS[sensor.type] + _SILENT_CHARACTERS
-    return characters * bits / sensor.baud_rate / sensor.period_s
+            text = f"{', '.join(user.path for user in members)} take {share:.0%} of the time of {device}"
+            yield f"{first.path}.period_s: {text} at {first.place.baud_rate} baud; ask more rarely or raise baud_rate"

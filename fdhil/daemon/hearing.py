@@ -171,6 +171,9 @@ class Hearing:
         node = f"node {self._config.node_id(axis)} on {bus}"
         if self._counters.get(f"{bus}.{axis}.heard") == 0:
             text = f"the drive ({node}) was never heard, nothing is known of its axis"
+            if not synced:
+                text += "; without SYNC that is so where it sends no heartbeat (0x1017), else"
+                return "NodeNeverHeard", f"{text} check node_id in the config, its supply and its wiring"
             return "NodeNeverHeard", f"{text}; check node_id in the config, its supply and its wiring"
         age_s = self.samples_s_ago(axis, now_s)
         if synced and (age_s is None or age_s > LIVE_S):

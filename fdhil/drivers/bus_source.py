@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import Counter
+from collections.abc import Mapping
 
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.bus import CanBus
 from fdhil.drivers.can.frame_history import FrameHistory
+from fdhil.drivers.can.port import Stamps
 from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.cia402.bus_decoder import BusDecoder
 from fdhil.drivers.cia402.drive import InputSamples
@@ -19,6 +21,10 @@ from fdhil.records import AxisSamples, Notice, TickTimes
 
 DRAIN_S = 0.05
 SILENCE_S = 2.0
+STAMPS_COST: Mapping[Stamps, str] = {
+    "adapter": "the adapter's own clock, and are late by what its quickest frames are: about 1 ms over USB",
+    "host": "this program when it reads them: some 10 ms late and in bursts, more on a busy computer",
+}
 
 
 class BusSource:
@@ -36,6 +42,7 @@ class BusSource:
         self._silent = False
         self._before: Counter[str] = Counter()
         self._overflow_told = 0
+        self._stamping_told = False
 
     def open(self) -> None:
         """Open the bus; ConnectError when it cannot be reached."""
@@ -59,7 +66,18 @@ class BusSource:
                     out += source.feed(record)
             if not isinstance(record, InputSamples):
                 out.append(record)
-        return [*out, *self._overflow(bus), *self._silence(bus, now_ns)]
+        return [*out, *self._stamping(bus), *self._overflow(bus), *self._silence(bus, now_ns)]
+
+    def _stamping(self, bus: CanBus) -> list[Notice]:
+        """Say once what the time stamps of this way onto the bus are worth, where that is less than the kernel's."""
+        cost = STAMPS_COST.get(bus.stamps)
+        if cost is None or self._stamping_told or not bus.counters()["frames"]:
+            return []
+        self._stamping_told = True
+        text = (
+            f"Frames of bus {self.name} are stamped by {cost}. Samples follow SYNC and lose nothing; a voltage sensor"
+        )
+        return [Notice("CoarseStamps", "info", f"{text} of its own is placed no better, so that L is less certain.")]
 
     def _overflow(self, bus: CanBus) -> list[Notice]:
         lost = bus.counters()["lost"]

@@ -1,8 +1,8 @@
 """Asks a sensor that shows one value, its newest, again and again, and says when each value was true.
 
-A sensor that is asked is asked on a grid of instants of this computer's clock, so that its values are a signal with a
-rate; one that tells by itself keeps its own rate. A value that was not to be had in time is a hole in the count and is
-never put in another's place.
+A sensor that is asked is asked on a grid of instants, so that its values are a signal with a rate; one that tells by
+itself keeps its own rate. A value that was not to be had in time is a hole in the count and is never put in another's
+place.
 """
 
 from __future__ import annotations
@@ -10,14 +10,17 @@ from __future__ import annotations
 import asyncio
 import math
 import time
+from collections import deque
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from fdhil.config import MachineConfig
+from fdhil.drivers.asking_grid import AskingGrid
 from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.link import Link
+from fdhil.drivers.told_count import ToldCount
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
 from fdhil.records import Notice, VoltageSamples, frozen, frozen_ints
 
@@ -26,6 +29,11 @@ SYNC_LATENESS_NS = 200_000  # how late the stamp of a SYNC may be on a busy comp
 BEYOND_LIMIT = 4.0  # no terminal voltage is so many times what the drive can give
 TOLD_AFTER = 200  # values
 LOST_SHARE = 0.1
+TIMELY_NS = 2_000_000  # the voltage of a drive that accelerates changes by 1 V in each ms: so well it must be known
+SETTLED_NS = 50_000_000  # so many later SYNCs have shown which stamps around an answer were late
+IN_ORDER = 0.4  # of a period
+MOST_WAITING = 1000
+NEAR_S = 0.02
 
 
 class Meter(Protocol):
@@ -49,12 +57,12 @@ class Meter(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class _Value:
-    """A value, its number on the grid, when it was true and how far off that may be (ns)."""
+    """A value, its number, and when it was read at the earliest and at the latest (host-monotonic ns)."""
 
     number: int
-    value: float
-    t_ns: float
-    error_ns: float
+    volts: float
+    asked_ns: int
+    answered_ns: int
 
 
 class MeterVoltage:
@@ -68,80 +76,74 @@ class MeterVoltage:
         self._meter = meter
         self._sign = section.drive.sign
         self._limit_v = BEYOND_LIMIT * section.regulators.voltage_limit_v
-        self._period_ns = settings.period_s * 1e9
+        self._grid = AskingGrid(settings.period_s, config.machine.sync_period_s, _turn(axis, config))
+        self._told = ToldCount(settings.period_s)
         self._late_ns = (settings.delay_s + settings.renewed_s / 2) * 1e9
-        if settings.sampling == "interval_mean":
-            self._late_ns += self._period_ns  # a sample is placed where its interval begins
+        self._mean = settings.sampling == "interval_mean"
+        if self._mean:
+            self._late_ns += self._grid.period_ns  # a sample is placed where its interval begins
         self._renewed_ns = settings.renewed_s * 1e9
         self._together = math.ceil(GATHER_S / settings.period_s) + 1
-        self._origin_ns: float | None = None
-        self._next = 0
-        self._told_lost = False
-        self.samples = self.lost = 0
+        self._waiting: deque[_Value] = deque(maxlen=MOST_WAITING)
+        self._asked = self._holes = 0
+        self._newest = -1
+        self._told_holes = False
+        self.samples = 0
 
     @property
     def link(self) -> Link:
         """The meter's connection."""
         return self._meter.link
 
+    @property
+    def lost(self) -> int:
+        """How many values there should be and are not."""
+        return self._holes + self._grid.missed + self._told.missed
+
     async def poll(self, ticks: TickClock) -> list[VoltageSamples | Notice]:
-        """Ask for some values, one after the other; DeviceError when none came."""
-        found: list[_Value] = []
+        """Ask for some values, one after the other, and return those that can be placed; DeviceError when none came."""
+        came = False
         for left in range(self._together - 1, -1, -1):
             try:
-                value = await (self._told() if self._meter.tells_by_itself else self._asked())
-                found += [value] if value is not None else []
+                self._waiting.append(await (self._hear() if self._meter.tells_by_itself else self._ask(ticks)))
+                came = True
             except DeviceError as error:
                 ended = isinstance(error, ConnectError | DeviceTimeout)
-                if (ended or not left) and not found:
+                if (ended or not left) and not came:
                     raise
                 if ended:
                     break
-        out: list[VoltageSamples | Notice] = [*self._too_slow()]
-        return [*out, self._samples(found, ticks)] if found else out
+        return [*self._too_slow(), *self._placed(ticks)]
 
     async def reading(self) -> str:
         """Ask once, for people."""
-        return f"{await self._volts():.2f} V at {1e9 / self._period_ns:g} Hz"
+        return f"{await self._volts():.2f} V at {1e9 / self._grid.period_ns:g} Hz"
 
-    async def _asked(self) -> _Value | None:
-        """Wait for the next instant of the grid and ask; None where the answer was too late for it."""
-        now_ns = time.monotonic_ns()
-        if self._origin_ns is None:
-            self._origin_ns = now_ns
-        number = max(self._next, math.ceil((now_ns - self._origin_ns) / self._period_ns))
-        self.lost += number - self._next
-        self._next = number + 1
-        due_ns = self._origin_ns + number * self._period_ns
-        await asyncio.sleep(max(0.0, (due_ns - now_ns) / 1e9))
+    async def _ask(self, ticks: TickClock) -> _Value:
+        """Wait for the next instant and ask."""
+        number, due_ns = self._grid.next_instant(time.monotonic_ns(), ticks)
+        while (left_s := (due_ns - time.monotonic_ns()) / 1e9) > 0:
+            await asyncio.sleep(min(left_s, NEAR_S))
+            due_ns = self._grid.host_ns(number, ticks)  # SYNCs that came meanwhile tell it better
+        self._asked += 1
         try:
             volts = await self._volts()
         except DeviceError:
-            self.lost += 1
+            self._holes += 1
             raise
-        late_ns = self._meter.asked_ns - due_ns
-        if late_ns > self._period_ns / 2:  # another on the line was asked first
-            self.lost += 1
-            return None
-        return self._placed(number, volts, max(0.0, late_ns))
+        return _Value(number, volts, self._meter.asked_ns, self._meter.answered_ns)
 
-    async def _told(self) -> _Value:
-        """Wait for the next value that is told; what was missed meanwhile is a hole."""
-        volts = await self._volts()
+    async def _hear(self) -> _Value:
+        """Wait for the next value that is told; one that cannot be read is a hole."""
+        self._asked += 1
+        try:
+            volts = await self._volts()
+        except ProtocolError:
+            self._holes += 1
+            self._told.number(self._meter.answered_ns)
+            raise
         t_ns = self._meter.answered_ns
-        if self._origin_ns is not None:
-            missed = max(0, round((t_ns - self._origin_ns) / self._period_ns) - 1)
-            self.lost += missed
-            self._next += missed
-        self._origin_ns = t_ns
-        self._next += 1
-        return self._placed(self._next - 1, volts, 0.0)
-
-    def _placed(self, number: int, volts: float, late_ns: float) -> _Value:
-        meter = self._meter
-        middle_ns = (meter.asked_ns + meter.answered_ns) / 2
-        error_ns = (meter.answered_ns - meter.asked_ns) / 2 + self._renewed_ns / 2 + late_ns
-        return _Value(number, volts, middle_ns - self._late_ns, error_ns)
+        return _Value(self._told.number(t_ns), volts, self._meter.asked_ns, t_ns)
 
     async def _volts(self) -> float:
         volts = await self._meter.value()
@@ -151,24 +153,54 @@ class MeterVoltage:
 
     def _too_slow(self) -> list[Notice]:
         """Tell once that the sensor cannot be asked as often as the config has it."""
-        if self._told_lost or self._next < TOLD_AFTER or self.lost < LOST_SHARE * self._next:
+        due = self._asked + self._grid.missed + self._told.missed
+        if self._told_holes or due < TOLD_AFTER or self.lost < LOST_SHARE * due:
             return []
-        self._told_lost = True
+        self._told_holes = True
         took_ms = (self._meter.answered_ns - self._meter.asked_ns) / 1e6
-        text = f"Of {self._next} values of the {self.name} {self.lost} did not come in time (an answer takes "
-        text += f"{took_ms:.1f} ms), and a move with such a hole may be refused; set axis.{self.axis}.voltage.period_s "
-        text += f"above {self._period_ns / 1e9:g}."
+        text = f"Of {due} values of the {self.name} {self.lost} did not come in time (an "
+        text += f"answer takes {took_ms:.1f} ms): they are holes in what is identified; set "
+        text += f"axis.{self.axis}.voltage.period_s above {self._grid.period_ns / 1e9:g}, or give this computer less "
+        text += "else to do."
         return [Notice("SampleTiming", "minor", text, self.axis)]
 
-    def _samples(self, found: list[_Value], ticks: TickClock) -> VoltageSamples:
-        self.samples += len(found)
-        sync_ns = SYNC_LATENESS_NS if ticks.running else 0
-        return VoltageSamples(
-            sensor=self.name,
-            axis=self.axis,
-            counter=frozen_ints(np.array([one.number for one in found])),
-            t_ns=frozen_ints(np.array([round(one.t_ns) for one in found])),
-            t_error_ns=frozen_ints(np.array([max(1, round(one.error_ns + sync_ns)) for one in found])),
-            voltage_v=frozen(self._sign * np.array([one.value for one in found])),
-            sample_rate_hz=1e9 / self._period_ns,
-        )
+    def _placed(self, ticks: TickClock) -> list[VoltageSamples]:
+        """Return the values whose place among the SYNCs is known by now; those read too far from theirs are holes."""
+        counter, t_ns, error_ns, volts = [], [], [], []
+        while self._waiting and (not ticks.running or ticks.covers(self._waiting[0].answered_ns + SETTLED_NS)):
+            one = self._waiting.popleft()
+            at_ns, late_ns, off_ns = self._when(one, ticks)
+            if one.number <= self._newest if self._meter.tells_by_itself else not self._in_time(late_ns, off_ns):
+                self._holes += 1
+                continue
+            self._newest = one.number
+            counter.append(one.number)
+            t_ns.append(round(at_ns - self._late_ns))
+            error_ns.append(max(1, round(off_ns + self._renewed_ns / 2)))
+            volts.append(self._sign * one.volts)
+        self.samples += len(volts)
+        if not volts:
+            return []
+        rate_hz = 1e9 / self._grid.period_ns
+        placed = frozen_ints(np.array(counter)), frozen_ints(np.array(t_ns)), frozen_ints(np.array(error_ns))
+        on_grid = self._mean or self._meter.tells_by_itself
+        return [VoltageSamples(self.name, self.axis, *placed, frozen(np.array(volts)), rate_hz, on_grid)]
+
+    def _when(self, one: _Value, ticks: TickClock) -> tuple[float, float, float]:
+        """Return when (host ns) a value was true but for the meter's filter, how late that is, and how far off."""
+        if self._meter.tells_by_itself:
+            return one.answered_ns, 0.0, SYNC_LATENESS_NS
+        return self._grid.read_at(one.number, one.asked_ns, one.answered_ns, ticks)
+
+    def _in_time(self, late_ns: float, off_ns: float) -> bool:
+        """Whether a value can stand for its instant: a mean must lie there, an instant only keeps the order."""
+        allowed_ns = TIMELY_NS if self._mean else IN_ORDER * self._grid.period_ns
+        return off_ns <= TIMELY_NS and abs(late_ns) <= allowed_ns
+
+
+def _turn(axis: str, config: MachineConfig) -> float:
+    """Return by which share of its period a sensor is asked later, so that those on one line take turns."""
+    own = config.axis[axis].voltage
+    where = {name: section.voltage for name, section in config.axis.items() if section.voltage.separate}
+    peers = [name for name, v in where.items() if (v.device, v.host, v.port) == (own.device, own.host, own.port)]
+    return peers.index(axis) / len(peers)

@@ -11,6 +11,7 @@ from fdhil import tables
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.tick_clock import TickClock
 from fdhil.drivers.link import Link
+from fdhil.drivers.modbus.link import ModbusLink
 from fdhil.drivers.table.accelerometer import StreamedAccelerometer
 from fdhil.drivers.table.modbus_encoder import ModbusEncoder
 from fdhil.drivers.thermometer import SlidewayThermometer
@@ -96,8 +97,10 @@ class SensorSource:
             take(Notice(code, "MAJOR", str(error), self.sensor.axis))
 
     def counters(self) -> dict[str, int]:
-        """Samples received and lost, and failed polls."""
-        return {"samples": self.sensor.samples, "lost": self.sensor.lost, "failures": self._failures}
+        """Samples received and lost, failed polls, and what the line got over by itself."""
+        own = {"samples": self.sensor.samples, "lost": self.sensor.lost, "failures": self._failures}
+        link = self.sensor.link
+        return own | (dict(link.counted) if isinstance(link, ModbusLink) else {})
 
     def close(self) -> None:
         """End the connection."""

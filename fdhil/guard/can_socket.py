@@ -6,6 +6,7 @@ What may leave is checked here, where the bytes leave: our heartbeat and the con
 from __future__ import annotations
 
 import errno
+import fcntl
 import socket
 import struct
 from abc import ABC, abstractmethod
@@ -18,16 +19,20 @@ Frame = tuple[int, bytes, float]
 ERROR = -1
 _CAN_FRAME = struct.Struct("=IB3x8s")
 _CAN_FILTER = struct.Struct("=II")
+_IFREQ = struct.Struct("@16sH22x")
 _TIMEVAL = struct.Struct("@ll")
 SO_TIMESTAMP = 29
 SO_RXQ_OVFL = 40
 CAN_RAW_ERR_FILTER = 2
+SIOCGIFFLAGS = 0x8913
+IFF_UP = 1
 CAN_ERR_FLAG = 0x20000000
 CAN_SFF_ONLY = 0xC00007FF
 RETRY = (errno.EAGAIN, errno.EWOULDBLOCK, errno.EINTR)
 FULL = (errno.ENOBUFS, errno.EAGAIN, errno.EWOULDBLOCK)
 MAX_PENDING_BYTES = 1 << 16
 MOST_FRAMES = 256  # of one call: a flood must not keep the loop from sending
+MOST_TURNS = 16  # more than a socket holds
 
 
 class BusDown(Exception):
@@ -55,6 +60,10 @@ class CanSocket(ABC):
     def receive(self) -> list[Frame]:
         """Return the frames that wait, a few hundred at most, without waiting; BusDown when the bus is gone."""
 
+    def restored(self) -> bool:
+        """Whether a bus that was gone is back, what came before forgotten; a hub that hung up never is."""
+        return False
+
     def send(self, cob_id: int, data: bytes) -> bool:
         """Send one frame now; False when the queue is full. BusDown, ForbiddenFrame."""
         if cob_id not in self._allowed:
@@ -80,12 +89,26 @@ class RawCan(CanSocket):
 
     def __init__(self, descriptor: socket.socket, allowed: Iterable[int], wanted: Iterable[int]) -> None:
         super().__init__(descriptor, allowed)
-        filters = b"".join(_CAN_FILTER.pack(cob_id, CAN_SFF_ONLY) for cob_id in wanted)
-        descriptor.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
+        self._filters = b"".join(_CAN_FILTER.pack(cob_id, CAN_SFF_ONLY) for cob_id in wanted)
+        descriptor.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, self._filters)
         descriptor.setsockopt(socket.SOL_CAN_RAW, CAN_RAW_ERR_FILTER, 0x1FFFFFFF)
         descriptor.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMP, 1)
         descriptor.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
         self._overflow = 0
+        self._channel = descriptor.getsockname()[0]
+
+    def restored(self) -> bool:
+        """Bind again, as after an adapter was plugged in again, and see whether the interface is up."""
+        try:
+            self._socket.bind((self._channel,))
+            # an interface that was removed has taken the filters with it
+            self._socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, self._filters)
+            asked = _IFREQ.pack(self._channel.encode(), 0)
+            up = _IFREQ.unpack(fcntl.ioctl(self._socket.fileno(), SIOCGIFFLAGS, asked))[1] & IFF_UP
+            self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)  # that it was down is known
+            return bool(up) and any(not self.receive() for _ in range(MOST_TURNS))
+        except (OSError, BusDown):
+            return False
 
     def receive(self) -> list[Frame]:
         """Return the frames that wait, error frames as controller states."""

@@ -64,7 +64,7 @@ CATALOGUE: Mapping[str, tuple[Reaction, str, str]] = {
     "BusOff": (_F, "the CAN controller is bus-off", "hold the feed, check cable and termination, then adopt"),
     "ErrorPassive": (_R, "the CAN controller is error-passive", "check cable, termination and bit rate"),
     "BusRestarted": (_F, "the CAN controller restarted by itself", "hold the feed, then adopt"),
-    "BusDown": (_F, "the CAN bus is gone", "hold the feed, restore the interface, then restart the guard"),
+    "BusDown": (_F, "the CAN bus is gone", "hold the feed, restore the interface (a hub: restart the guard), adopt"),
     "TxQueueFull": (_R, "frames do not leave the transmit queue", "check that another node acknowledges"),
     "RxOverflow": (_R, "frames were lost before they were read", "give the guard a real-time priority"),
     "LoopOverrun": (_R, "the guard's loop was late for more than ten cycles", "give the guard a real-time priority"),

@@ -31,6 +31,7 @@ from fdhil.guard.state import Inputs, Output, Request, initial
 
 IDLE_S = 0.05
 REST_S = 0.001
+RESTORE_S = 0.5
 DECIDED = ("arm", "feedforward", "disarm", "adopt", "compared")
 
 
@@ -64,6 +65,7 @@ class Guard:
         self._silent = True
         self._stopping = False
         self._lost_seen = 0
+        self._restore_s = 0.0
         self._wake = wake
 
     # --- the loop ---
@@ -111,6 +113,8 @@ class Guard:
         ready = self._wait(rest_s)
         if self._can.fileno() in ready:
             self._bus()
+        elif self._listener.bus_state == "down":
+            self._restore(now_s)
         self._local_timer()
         if self._wake.fileno() in ready:
             self._stop()
@@ -163,6 +167,16 @@ class Guard:
     def _bus_down(self, error: BusDown) -> None:
         self._listener.error("down")
         self._journal.write("bus_down", text=str(error))
+
+    def _restore(self, now_s: float) -> None:
+        """See now and then whether a bus that was gone is back; what the drives hold by then is not known."""
+        if now_s < self._restore_s:
+            return
+        self._restore_s = now_s + RESTORE_S
+        if self._can.restored():
+            self._listener.error("restarted")
+            self._listener.forget_sync()
+            self._journal.write("bus_restored", text="the CAN bus is back; hold the feed, then adopt what is applied")
 
     def _sync(self, data: bytes, stamp_s: float, now_s: float, late: bool) -> None:
         self._last_sync_s, self._silent = now_s, False

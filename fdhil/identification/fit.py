@@ -238,9 +238,9 @@ def _slopes(problem: Problem, theta: Float, residuals: Float, free: Sequence[int
     return j, inverse_of(gram)[0], np.sqrt(np.diag(gram))
 
 
-def fit(motions: Sequence[Motion], start: Float, free: Sequence[int]) -> Fit:
-    """Alternate between the parameters and the noise levels, from ``start`` (k,)."""
-    theta, noises = start.copy(), [m.noise for m in motions]
+def fit(motions: Sequence[Motion], start: Float, free: Sequence[int], known: Sequence[Noise] = ()) -> Fit:
+    """Alternate between the parameters and the noise levels, from ``start`` (k,) and the ``known`` levels of a fit."""
+    theta, noises = start.copy(), list(known) or [m.noise for m in motions]
     for turn in range(RENEWALS):
         problem = Problem(tuple(motions), tuple(noises), ())
         before = theta
@@ -248,10 +248,10 @@ def fit(motions: Sequence[Motion], start: Float, free: Sequence[int]) -> Fit:
             likelihood = Likelihood(problem.motions, problem.noises)
             theta, residuals, j, converged = ascend(likelihood, theta, free, typical(theta, motions))
         else:
-            theta, residuals, j, converged = descend(problem, theta, free, CONVERGED if turn else ROUGH)
+            theta, residuals, j, converged = descend(problem, theta, free, CONVERGED if turn or known else ROUGH)
         information = j.T @ j
         moved = theta[list(free)] - before[list(free)]
-        if turn and float(moved @ information @ moved) < SETTLED:
+        if (turn or known) and float(moved @ information @ moved) < SETTLED:
             break
         noises = [fit_noise(m, theta, s) for m, s in zip(motions, noises, strict=True)]
     return Fit(theta, information, tuple(free), residuals, j, pose(motions, theta, problem.noises), converged)

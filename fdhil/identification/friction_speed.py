@@ -70,4 +70,4 @@ def _at(result: Fit, k: int, speed_rad_s: float) -> Fit:
     for motion in result.problem.motions:
         courses = (*motion.courses[:k], stribeck(motion, speed_rad_s), *motion.courses[k + 1 :])
         motions.append(replace(motion, courses=courses))
-    return replace(fit(motions, result.theta, result.free), delay_doubt_s=result.delay_doubt_s)
+    return replace(fit(motions, result.theta, result.free, result.problem.noises), delay_doubt_s=result.delay_doubt_s)

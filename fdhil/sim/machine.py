@@ -138,7 +138,10 @@ class Machine:
             if all(unit.sync_on for unit in self._of_bus[bus]):
                 frames.append((bus, frame))
                 frames += [(bus, answer) for answer in self._sync(bus, frame[1])]
-            elif bus == self._first_bus:  # the SYNC is lost by a fault, whose end must come all the same
+                continue
+            for unit in self._of_bus[bus]:
+                unit.drive.cycle_without_sync()
+            if bus == self._first_bus:  # the SYNC is lost by a fault, whose end must come all the same
                 self._run_faults(None)
                 self.tick += 1
         for bus, frame in self.nc.end():

@@ -63,6 +63,16 @@ def test_an_interface_is_known_by_its_number() -> None:
     assert str(os.getpid()) in endpoint(CanBus(interface="virtual"))
 
 
+def test_an_adapter_that_is_plugged_in_again_has_its_owner_still(monkeypatch: pytest.MonkeyPatch) -> None:
+    bus = CanBus(interface="socketcan", channel="can0")
+    monkeypatch.setattr("socket.if_nametoindex", lambda _name: 7)
+    with lock_bus(bus):
+        monkeypatch.setattr("socket.if_nametoindex", lambda _name: 8)
+        with pytest.raises(DeviceError, match="BusLocked"):
+            lock_bus(bus)
+        lock_bus(CanBus(interface="socketcan", channel="can1")).close()
+
+
 def test_a_run_directory_has_one_guard_too(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "run")
     with (

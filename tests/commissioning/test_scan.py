@@ -13,13 +13,16 @@ import pytest
 
 from fdhil.commissioning.bus_listener import Traffic
 from fdhil.commissioning.config_check import check_machine, compare_heard
+from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.scan import BusScanner, Description, EdsMatch, printable, read_descriptions, scan_bus
 from fdhil.commissioning.steps import check_axis
-from fdhil.commissioning.survey import Finding, Identity
-from fdhil.config import MachineConfig
+from fdhil.commissioning.survey import Identity, compare_identity
+from fdhil.config import Drive, MachineConfig
 from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, REMOTE_FLAG, frames_of
+from fdhil.drivers.cia402.profile_file import load_profile
 from fdhil.errors import ConnectError, DriveFault, ProtocolError
+from fdhil.sim.drive.dictionary import AbortCode, TransferAbort
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import Row, Wire, machine
 
@@ -208,7 +211,33 @@ def test_what_the_drive_does_not_have_is_not_compared(point: str, peer: tuple[Dr
     (finding,) = [finding for _, finding in check_machine(settings) if not finding.ok]
     shown = " and ".join(f"0x{index:04X}" for index in LACKING[point])
     assert (finding.point, finding.ok, finding.found) == (point, None, f"no {shown}")
-    assert finding.cause == f"it has no {shown}"
+    assert finding.cause == f"it has no {shown} that can be read"
+
+
+@pytest.mark.parametrize("code", [AbortCode.NO_DATA, AbortCode.DEVICE_STATE, AbortCode.READ_WRITE_ONLY])
+def test_an_object_that_the_drive_refuses_to_tell_ends_no_check(
+    code: AbortCode, peer: tuple[DrivePeer, MachineConfig]
+) -> None:
+    """Some drives have objects without a value, and one refusal must not hide all else."""
+    drive, settings = peer
+
+    def refuse() -> int:
+        raise TransferAbort(code)
+
+    for key in (0x100000, 0x101804, 0x600700, 0x607D01):
+        if key in drive.drive.dictionary.entries:
+            drive.drive.dictionary.read_hooks[key] = refuse
+    lacking(drive, 0x67FF)
+    found = {finding.point: finding for _, finding in check_machine(settings)}
+    assert {point for point, finding in found.items() if not finding.ok} == {"device", "communication lost"}
+    assert found["device"].ok is found["communication lost"].ok is None
+    assert (found["TPDO1"].ok, found["following error"].ok) == (True, True)
+
+
+def test_a_drive_that_does_not_say_who_it_is_is_not_compared_with_a_makers_profile() -> None:
+    profile = replace(load_profile(Drive()), vendor_id=0xFB)
+    told = {vendor: compare_identity(profile, Identity(vendor, 2, 3, 4)).ok for vendor in (0xFB, 0xFC, 0)}
+    assert told == {0xFB: True, 0xFC: False, 0: None}
 
 
 def test_a_drive_that_coasts_is_told_though_the_other_object_is_missing(peer: tuple[DrivePeer, MachineConfig]) -> None:
@@ -223,7 +252,10 @@ def test_a_drive_without_a_following_error_window_is_not_commissioned(peer: tupl
     """Nothing would stop it where it leaves its path, and no offset is small against a window that is not there."""
     drive, settings = peer
     lacking(drive, 0x6065)
-    with Master(settings, "X") as master, pytest.raises(DriveFault, match=r"it has no 0x6065; its manual"):
+    with (
+        Master(settings, "X") as master,
+        pytest.raises(DriveFault, match=r"it has no 0x6065 that can be read; its manual"),
+    ):
         check_axis(master)
 
 

@@ -321,13 +321,17 @@ def test_full_heartbeat_consumers_are_refused(peer: tuple[DrivePeer, MachineConf
         watchdog(master)
 
 
-def test_an_nc_on_the_bus_is_left_alone(peer: tuple[DrivePeer, MachineConfig]) -> None:
+@pytest.mark.parametrize(
+    ("can_id", "shown"), [(0x080, "SYNC or set-points"), (0x302, "SYNC or set-points"), (0x605, "SDO requests")]
+)
+def test_an_nc_on_the_bus_is_left_alone(can_id: int, shown: str, peer: tuple[DrivePeer, MachineConfig]) -> None:
+    """Whatever it is that only a master sends, also to another drive: its SDO channels are its own."""
     drive, settings = peer
     with can.Bus(interface="virtual", channel=settings.bus["can0"].channel) as nc, Master(settings, "X") as master:
-        nc.send(can.Message(arbitration_id=0x80, is_extended_id=False))
-        with pytest.raises(ProtocolError, match="an NC is sending"):
+        nc.send(can.Message(arbitration_id=can_id, is_extended_id=False))
+        with pytest.raises(ProtocolError, match=f"an NC is sending {shown}"):
             survey.listen(master)
-    assert drive.heard == [0x80]  # the NC's own
+    assert drive.heard == [can_id]  # the NC's own
 
 
 def test_on_a_silent_bus_the_drive_alone_is_asked_what_it_is(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,8 +9,9 @@ import pytest
 
 from fdhil import config as machine_config
 from fdhil.commissioning.compare import compare_again, compare_record, found_fingerprint
+from fdhil.commissioning.finding import Finding
 from fdhil.commissioning.record import CommissioningRecord, load_record, save_record
-from fdhil.commissioning.survey import Finding, Identity, Survey
+from fdhil.commissioning.survey import Identity, Survey
 from fdhil.commissioning.void import confirm_record, is_void, void_path, void_record
 from fdhil.errors import StoreError
 from tests.bench import bench_document

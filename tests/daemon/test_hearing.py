@@ -166,6 +166,21 @@ def test_a_drive_that_answers_but_does_not_sample_is_told_once_and_its_end_too(t
     assert 10.0 <= told[0][0] <= 11.0
 
 
+@pytest.mark.parametrize(
+    ("synced", "words"), [(True, "axis; check node_id"), (False, "no heartbeat (0x1017), else check")]
+)
+def test_a_drive_that_is_never_heard_may_be_one_without_a_heartbeat(synced: bool, words: str, tmp_path: Path) -> None:
+    hearing = Hearing(config_of(tmp_path), 0.0)
+    hearing.source_opened(0.0)
+    for k in range(1, 20):
+        ticks = np.arange(k * 250, k * 250 + 250)
+        if synced:
+            hearing.record_came(TickTimes(frozen_ints(ticks), frozen_ints(ticks * 1_000_000)), k * 0.25)
+        hearing.counted({"frames": k, "can0.frames": k, "can0.X.heard": 0}, k * 0.25)
+        told = hearing.troubles({}, k * 0.25)
+    assert words in told["NodeNeverHeard", "X"]
+
+
 def fed(config: MachineConfig, records: list[Record], windows: int = 0) -> dict[tuple[str, str], str]:
     """Return the troubles that a machine of ``config`` sees in the records of another."""
     hearing = Hearing(config, 0.0)

@@ -282,3 +282,21 @@ def test_a_drive_that_answers_to_node_guarding_is_not_missed_when_it_is_not_aske
     assert watch.feed(frames_of(rows), 2000 * MS) == []
     assert watch.feed(frames_of([]), 60_000 * MS) == []
     assert watch.nmt == 5
+
+
+def test_the_filters_let_all_through_that_is_read() -> None:
+    config = machine(axes="XY")
+    decoder = BusDecoder("can0", config)
+    read = {0x000, 0x080} | {pdo for each in decoder.decoders.values() for pdo in each.cob_ids}
+    for node in (1, 2, config.guard.node_id):
+        read |= {0x700 + node}
+    for node in (1, 2):
+        read |= {0x080 + node, 0x580 + node, 0x600 + node}
+    filters = decoder.filters()
+
+    def passes(can_id: int) -> bool:
+        return any(can_id & mask == wanted & mask for wanted, mask in filters)
+
+    assert [can_id for can_id in read if not passes(can_id)] == []
+    assert not any(passes(can_id) for can_id in (0x183, 0x703, 0x7FF, 0x80000001))
+    assert len(filters) < 10

@@ -105,6 +105,7 @@ def test_a_file_is_read(tmp_path: Path) -> None:
     [
         (b"", "line 1: it has no object"),
         (b"hello", "line 1: it has no object"),
+        (b"\xef\xbb\xbf<?xml version='1.0'?>\n<ISO15745ProfileContainer>\n", "line 1: it is XML (an XDD"),
         (GOOD.replace("ObjectType=0x7", "ObjectType=banana").encode(), "line 19: ObjectType is 'banana'"),
         (GOOD.replace("DataType=0x0007\n", "", 1).encode(), "line 17: [1000] is wrong"),
         (GOOD.replace("[1800]", "[1801]").encode(), "is wrong"),

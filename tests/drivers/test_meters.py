@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import math
+import re
+import socket
 import time
+import tomllib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -13,15 +16,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fdhil.config import MachineConfig, parse
+from fdhil.config import MachineConfig, Voltage, parse
 from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.modbus.link import ModbusLink
 from fdhil.drivers.sensor_source import Record, Sensor, SensorSource, sensors_of
-from fdhil.errors import DeviceTimeout, ProtocolError
+from fdhil.errors import ConfigError, DeviceTimeout, ProtocolError
 from fdhil.records import Notice, Temperature, VoltageSamples
 from fdhil.sim.wire.modbus_sensor import VoltageSensor
 from fdhil.sim.wire.sensor_wires import SensorWires
 from tests.bench import bench_axis
 
+PATIENCE_S = 10.0  # with a busy computer
 TYPES = {"int16": 0.01, "uint16": 0.01, "int32": 1e-4, "uint32": 1e-4, "float32": 1.0, "float64": 1.0}
 
 
@@ -56,9 +61,9 @@ def _memory(made: MachineConfig, axis: str) -> VoltageSensor:
 async def shop(*voltages: dict[str, Any], temperature: dict[str, Any] | None = None) -> AsyncIterator[Shop]:
     axes = {}
     for name, voltage in zip("XYZ", voltages, strict=False):
-        axes[name] = bench_axis(corrected=False, voltage=voltage)
+        axes[name] = bench_axis(corrected=False, voltage={"timeout_s": PATIENCE_S} | voltage)
         if temperature is not None:
-            axes[name]["temperature"] = temperature
+            axes[name]["temperature"] = {"timeout_s": PATIENCE_S} | temperature
     served = Shop({"machine": {"name": "bench"}, "axis": axes})
     served.wires.start()
     try:
@@ -69,9 +74,12 @@ async def shop(*voltages: dict[str, Any], temperature: dict[str, Any] | None = N
 
 async def volts_of(sensor: Sensor, polls: int = 1) -> np.ndarray:
     await sensor.link.connect()
-    records = [record for _ in range(polls) for record in await sensor.poll(TickClock(0.001))]
+    found: list[VoltageSamples] = []
+    async with asyncio.timeout(60):
+        while len(found) < polls:  # on a busy computer all values of a poll may come too late
+            found += [r for r in await sensor.poll(TickClock(0.001)) if isinstance(r, VoltageSamples)]
     sensor.link.close()
-    return np.concatenate([r.voltage_v for r in records if isinstance(r, VoltageSamples)])
+    return np.concatenate([r.voltage_v for r in found])
 
 
 @pytest.mark.parametrize("kind", TYPES)
@@ -132,25 +140,28 @@ async def test_values_are_on_a_grid_and_their_stamps_enclose_when_they_were_true
         sensor = served.sensors()["voltage"]
         await sensor.link.connect()
         before_ns = time.monotonic_ns()
-        blocks = [r for _ in range(3) for r in await sensor.poll(TickClock(0.001)) if isinstance(r, VoltageSamples)]
+        blocks: list[VoltageSamples] = []
+        async with asyncio.timeout(60):
+            while len(blocks) < 3:
+                blocks += [r for r in await sensor.poll(TickClock(0.001)) if isinstance(r, VoltageSamples)]
         after_ns = time.monotonic_ns()
         sensor.link.close()
     counter = np.concatenate([b.counter for b in blocks])
-    true_ns = np.concatenate([b.t_ns for b in blocks]) + 0.022e9
+    due_ns = np.concatenate([b.t_ns for b in blocks]) + 0.022e9
     error_ns = np.concatenate([b.t_error_ns for b in blocks])
     assert {b.sample_rate_hz for b in blocks} == {100.0}
     assert (np.diff(counter) >= 1).all()
-    assert counter[-1] + 1 == counter.size + sensor.lost
+    assert counter[-1] - counter[0] + 1 <= counter.size + sensor.lost
+    assert sensor.samples == counter.size
     assert (error_ns >= 0.002e9).all()
-    assert before_ns <= true_ns[0] <= true_ns[-1] <= after_ns
-    grid_ns = true_ns - counter * 1e7
-    assert (np.abs(grid_ns - grid_ns.min()) <= error_ns).all()
+    assert before_ns - 2e6 <= due_ns[0] <= due_ns[-1] <= after_ns
+    assert (np.abs(due_ns - counter * 1e7) < 0.5e7).all()  # each near its own instant
 
 
 @pytest.mark.parametrize("query", ["READ?\n", ""])
 async def test_an_instrument_that_tells_lines(query: str, tmp_path: Path) -> None:
     voltage = {"source": "serial", "device": str(tmp_path / "dmm"), "baud_rate": 115200, "parity": "none"}
-    async with shop({**voltage, "query": query, "period_s": 0.01, "scale": 2.0}) as served:
+    async with shop({**voltage, "query": query, "period_s": 0.01, "scale": 2.0, "timeout_s": 1.0}) as served:
         sensor = served.sensors()["voltage"]
         volts = await volts_of(sensor, 2)
         assert volts.size
@@ -211,7 +222,10 @@ async def test_a_block_of_samples_by_number(block: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("read_as", "says"),
     [
-        ({"type": "float32", "word_order": "little"}, "compare address, function, type, word_order and scale"),
+        (
+            {"type": "float32", "word_order": "little"},
+            r"\(with word_order = 'big' it would be -12\.34\); compare address",
+        ),
         ({"type": "int32"}, "register 0 gives"),
         ({"type": "float32", "address": 1}, r"register 1 is refused \(illegal register address\)"),
     ],
@@ -253,3 +267,111 @@ async def test_nothing_that_is_no_number_gets_through() -> None:
             with pytest.raises(ProtocolError, match="register 0 gives"):
                 await sensor.poll(TickClock(0.001))
         sensor.link.close()
+
+
+async def test_an_adapter_that_is_pulled_out_and_put_back_is_used_again(tmp_path: Path) -> None:
+    """Without a restart; the pause between tries grows, and both edges are told once."""
+    settings = {"source": "modbus", "type": "float32", "device": str(tmp_path / "meter")}
+    found: asyncio.Queue[Record] = asyncio.Queue()
+
+    async def until(code: str, severity: str) -> None:
+        async with asyncio.timeout(60):
+            while not (isinstance(r := await found.get(), Notice) and (r.code, r.severity) == (code, severity)):
+                pass
+
+    async with shop(settings) as served:
+        source = SensorSource(served.sensors()["voltage"], TickClock(0.001))
+        running = asyncio.create_task(source.run(found.put_nowait))
+        async with asyncio.timeout(60):
+            while not isinstance(await found.get(), VoltageSamples):
+                pass
+        served.wires.stop()
+        await until("ModbusPortGone", "MAJOR")
+        served.wires = SensorWires(served.config(), served.memory)
+        served.wires.start()
+        await until("ModbusPortGone", "info")
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        source.close()
+    assert source.counters()["failures"] >= 1
+
+
+def refused(**axes: dict[str, Any]) -> str:
+    document = {name: bench_axis(corrected=False, voltage=voltage) for name, voltage in axes.items()}
+    with pytest.raises(ConfigError) as caught:
+        parse({"machine": {"name": "bench"}, "axis": document})
+    return str(caught.value)
+
+
+LINE = {"source": "modbus", "device": "/dev/ttyUSB0", "type": "float32"}
+
+
+@pytest.mark.parametrize(
+    ("axes", "says"),
+    [
+        ({"X": {"source": "serial"}}, "a sensor on a serial line has one"),
+        ({"X": {**LINE, "unit": 0}}, "from 1 to 247"),
+        ({"X": {**LINE, "baud_rate": 9601}}, "must be one of 1200"),
+        ({"X": {**LINE, "scale": 0.0}}, "must be worth something"),
+        ({"X": {**LINE, "pattern": "([0-9]+"}}, "no regular expression"),
+        ({"X": {**LINE, "pattern": "[0-9]+"}}, "must have one group"),
+        ({"X": {**LINE, "type": "float16"}}, "float32"),
+        ({"X": {**LINE, "block": {"counter_address": 300}}}, "which no request reads"),
+        ({"X": LINE, "Y": {**LINE, "unit": 2, "parity": "none"}}, "axis.X.voltage sets the same device"),
+        ({"X": LINE, "Y": {**LINE, "source": "serial"}}, "is alone on its device"),
+        ({"X": {**LINE, "baud_rate": 9600}}, "of the time of /dev/ttyUSB0 at 9600 baud"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_its_key(axes: dict[str, dict[str, Any]], says: str) -> None:
+    assert says in refused(**axes)
+
+
+@pytest.mark.parametrize(
+    ("given", "kind", "sampling"),
+    [
+        ({"source": "modbus"}, None, "interval_mean"),
+        ({"source": "modbus", "address": 0}, "float32", "instant"),
+        ({"source": "modbus", "type": "int16", "sampling": "interval_mean"}, "int16", "interval_mean"),
+        ({"source": "modbus", "block": {}}, "int16", "interval_mean"),
+        ({"source": "serial", "device": "/dev/ttyUSB0"}, None, "instant"),
+        ({"source": "drive"}, None, "interval_mean"),
+    ],
+)
+def test_what_is_left_out_follows_from_what_is_given(given: dict[str, Any], kind: str | None, sampling: str) -> None:
+    voltage = Voltage.model_validate(given)
+    assert (voltage.type, voltage.sampling) == (kind, sampling)
+
+
+def pieces() -> list[str]:
+    page = Path(__file__).parents[2] / "docs" / "reference" / "instruments.md"
+    return re.findall(r"^```toml\n(.*?)^```", page.read_text("utf-8"), re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("text", pieces())
+def test_what_is_told_of_an_instrument_is_a_sensor(text: str) -> None:
+    axis = bench_axis(corrected=False) | tomllib.loads(text)["axis"]["X"]
+    found = sensors_of("X", parse({"machine": {"name": "bench"}, "axis": {"X": axis}}))
+    assert len(found) == 1
+
+
+async def test_units_behind_one_gateway_share_its_connection() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as chosen:
+        port = int(chosen.getsockname()[1])
+    value = {"source": "modbus", "type": "float32", "port": port, "timeout_s": 1.0}
+    async with shop({**value, "unit": 1}, {**value, "unit": 2}) as served:
+        served.memory["Y"].feed(45.6)
+        config = served.config()
+        x, y = (sensors_of(axis, config)["voltage"] for axis in "XY")
+        assert isinstance(x.link, ModbusLink)
+        assert isinstance(y.link, ModbusLink)
+        assert x.link.line is y.link.line
+        for sensor in (x, y):
+            await sensor.link.connect()
+        assert [await x.reading(), await y.reading()] == ["-12.34 V at 50 Hz", "45.60 V at 50 Hz"]
+        served.memory["X"].faults.silent = True
+        with pytest.raises(DeviceTimeout):
+            await x.reading()
+        await y.link.connect()  # the connection was given up, for an answer that may still come
+        assert await y.reading() == "45.60 V at 50 Hz"
+        for sensor in (x, y):
+            sensor.link.close()

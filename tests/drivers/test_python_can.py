@@ -5,22 +5,28 @@ from __future__ import annotations
 import os
 import time
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import get_args
 
+import numpy as np
+import numpy.typing as npt
 import pytest
 
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import CanBus as BusSettings
 from fdhil.config import parse
+from fdhil.drivers.bus_source import BusSource
 from fdhil.drivers.can.bus import CanBus
 from fdhil.drivers.can.filters import drive_filters
-from fdhil.drivers.can.frames import EXTENDED_FLAG, REMOTE_FLAG
+from fdhil.drivers.can.frames import EXTENDED_FLAG, REMOTE_FLAG, frames_of
 from fdhil.drivers.can.python_can import LISTEN_ONLY, arguments
+from fdhil.drivers.cia402.bus_decoder import BusDecoder
 from fdhil.errors import ConfigError, ConnectError
 from fdhil.guard.transmit_socket import connect_bus
+from fdhil.records import AxisSamples, Notice
 from fdhil.sim.wire.attach import attach
 from tests.bench import bench_document
+from tests.drivers.wire import Wire, machine
 
 ADAPTERS = [name for name in get_args(BusSettings.model_fields["interface"].annotation) if name not in (
     "socketcan", "socketcand", "virtual",
@@ -106,6 +112,40 @@ def test_an_adapter_that_talks_nonsense_or_goes_is_an_end_not_silence(adapter: S
     with CanBus("can0", settings_of(gone)) as bus:
         gone.close()
         wait_for(lambda: bus.ended is not None)
+
+
+def slcan(can_id: int, data: bytes) -> str:
+    return f"t{can_id:03X}{len(data)}{data.hex().upper()}"
+
+
+def test_a_drive_is_sampled_through_it_as_through_any_bus(adapter: SerialAdapter) -> None:
+    """Stamps in bursts cost no sample, and make no second SYNC producer of one."""
+    wire = Wire(n=400, counter=False)
+    config = machine(bus=settings_of(adapter).model_dump())
+    lines = [slcan(can_id, data) for _, can_id, data in wire.rows()]
+    expected = rows_of(BusDecoder("can0", config).feed(frames_of(wire.rows()), 0))
+    source = BusSource("can0", config)
+    source.open()
+    try:
+        got: list[object] = []
+        for first in range(0, len(lines), 60):
+            adapter.say(*lines[first : first + 60])
+            wait_for(lambda: source.counters()["frames"] == min(first + 60, len(lines)))  # noqa: B023 - it is asked now
+            got += source.step(time.monotonic_ns())
+    finally:
+        source.close()
+    assert np.array_equal(rows_of(got), expected)
+    assert expected.shape[1] > 380
+    told = [record for record in got if isinstance(record, Notice)]
+    assert [notice.code for notice in told] == ["CoarseStamps"]
+    assert "some 10 ms late" in told[0].text
+    assert source.counters()["lost"] == 0
+
+
+def rows_of(records: Iterable[object]) -> npt.NDArray[np.float64]:
+    """Tick, demand, position, speed and current of all samples, a column each."""
+    samples = [record for record in records if isinstance(record, AxisSamples)]
+    return np.hstack([np.stack([s.tick, s.demand_mm, s.position_mm, s.speed_rad_s, s.current_a]) for s in samples])
 
 
 @pytest.mark.parametrize("interface", ADAPTERS)

@@ -44,6 +44,10 @@ class Wire(CanSocket):
         waiting, self._waiting = self._waiting, []
         return waiting
 
+    def restored(self) -> bool:
+        self._waiting.clear()
+        return not self.down
+
     def _send(self, cob_id: int, data: bytes) -> bool:
         if self.down:
             raise OSError(100, "Network is down")

@@ -202,6 +202,30 @@ def test_a_bus_that_breaks_while_it_sends_is_down(make: Make) -> None:
     assert shop.state == "FROZEN"
 
 
+def test_a_bus_that_is_back_is_heard_again_and_what_stands_is_adopted(make: Make) -> None:
+    """The guard needs no restart; nothing is sent before the operator says so."""
+    shop = make()
+    client = shop.into_the_cut()
+    shop.wire.down = True
+    shop.wire.feed([])
+    shop.turn()
+    assert shop.state == "FROZEN"
+    sent = len(shop.wire.sent)
+    for later_s in (0.0, 10.0):
+        shop.guard._restore(shop.guard._restore_s + later_s)  # still gone
+    assert shop.guard._listener.bus_state == "down"
+    shop.wire.down, shop.playing = False, False
+    shop.guard._restore(shop.guard._restore_s)
+    assert [event["event"] for event in shop.events()].count("bus_restored") == 1
+    shop.run(100)
+    assert (shop.state, len(shop.wire.sent)) == ("FROZEN", sent)
+    assert shop.ask(client, {"request": "adopt", "token": TOKEN})["ok"]
+    shop.run(300)
+    assert shop.state == "OFF"
+    assert shop.offsets()[-1] == 0
+    inside(shop.offsets())
+
+
 def test_frames_that_do_not_leave_are_no_frames(make: Make) -> None:
     shop = make()
     shop.into_the_cut()

@@ -146,6 +146,23 @@ class Raw:
         self.waiting: list[tuple[bytes, list[tuple[int, int, bytes]]]] = []
         self.sent: list[bytes] = []
         self.error: OSError | None = None
+        self.is_there = True
+
+    def getsockname(self) -> tuple[str]:
+        return ("can0",)
+
+    def bind(self, address: tuple[str]) -> None:
+        assert address == ("can0",)
+        if not self.is_there:
+            raise OSError(19, "No such device")
+
+    def fileno(self) -> int:
+        return 5
+
+    def getsockopt(self, level: int, option: int) -> int:
+        assert (level, option) == (socket.SOL_SOCKET, socket.SO_ERROR)
+        error, self.error = self.error, None
+        return error.errno or 0 if error else 0
 
     def setblocking(self, flag: bool) -> None:
         assert not flag
@@ -197,6 +214,34 @@ def test_raw_frames_stamps_drops_and_controller_states() -> None:
         can.send(0x301, b"")
     with pytest.raises(BusDown):
         can.receive()
+
+
+def test_a_raw_socket_whose_interface_is_back_begins_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    raw, flags = Raw(), 0x40
+    monkeypatch.setattr("fcntl.ioctl", lambda _file, _request, asked: struct.pack("@16sH22x", asked[:16], flags))
+    can = RawCan(raw, {0x301}, {0x080})  # type: ignore[arg-type] # this host has no CAN
+    frame: tuple[bytes, list[tuple[int, int, bytes]]] = (struct.pack("=IB3x8s", 0x080, 1, b"\x05"), [])
+    raw.is_there = False
+    assert not can.restored()
+    raw.is_there = True
+    raw.error = OSError(100, "Network is down")
+    assert not can.restored()  # it is down
+    flags |= 1
+    raw.error = OSError(100, "Network is down")  # told when it was bound, and known
+    raw.waiting = [frame] * (MOST_FRAMES + 3)
+    raw.options.clear()
+    assert can.restored()
+    assert (socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER) in raw.options
+    assert can.receive() == []
+    raw.waiting = [frame] * 100_000
+    assert not can.restored()  # a flood is looked at the next time
+    monkeypatch.setattr(raw, "getsockopt", lambda *_: 0)
+    raw.waiting, raw.error = [], OSError(100, "Network is down")
+    assert not can.restored()  # down again at once
+
+
+def test_a_hub_that_hung_up_is_never_back(wire: tuple[SocketcandText, socket.socket]) -> None:
+    assert not wire[0].restored()
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,13 @@ def sections() -> dict[str, Any]:
 @pytest.fixture
 def client(bench: Bench, tmp_path: Path) -> Iterator[GuardClient]:
     """A guard that runs on the bench's bus."""
+    with guarded(bench, tmp_path) as guard_client:
+        yield guard_client
+
+
+@contextmanager
+def guarded(bench: Bench, tmp_path: Path) -> Iterator[GuardClient]:
+    """Run a guard on the bench's bus for the time of a with block."""
     document = json.loads(bench.config.model_dump_json(exclude_none=True))
     path = tmp_path / "machine.toml"
     path.write_text(toml(document), "utf-8")
@@ -70,6 +78,11 @@ def arm(client: GuardClient, token: str) -> dict[str, Any]:
 
 
 def test_every_offset_is_applied_in_its_own_cycle(bench: Bench, client: GuardClient, tmp_path: Path) -> None:
+    every_offset_is_applied_in_its_own_cycle(bench, client, tmp_path)
+
+
+def every_offset_is_applied_in_its_own_cycle(bench: Bench, client: GuardClient, tmp_path: Path) -> None:
+    """Arm a bump on a way that the NC plays, and compare what the drives applied."""
     way = np.concatenate([np.zeros(20), 2.5 * (1 - np.cos(np.linspace(0, np.pi, 500))), np.full(100, 5.0)])
     demand = tmp_path / "demand.csv"
     rows = [f"{k * 0.001:.3f},{x:.6f},{x:.6f}" for k, x in enumerate(way)]

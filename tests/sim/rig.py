@@ -39,6 +39,13 @@ class Rig:
         self.node = self.drive.node_id
         self.boot = self.drive.power_on()
 
+    @classmethod
+    def of(cls, drive: Drive) -> Rig:
+        """Take a drive that is already on."""
+        rig = cls.__new__(cls)
+        rig.drive, rig.node, rig.boot = drive, drive.node_id, []
+        return rig
+
     def send(self, can_id: int, data: bytes) -> list[Frame]:
         return self.drive.receive(can_id, data)
 

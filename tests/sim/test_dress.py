@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import configparser
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -9,6 +10,8 @@ from typing import Any
 
 import canopen
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from fdhil import config
 from fdhil.errors import EdsError
@@ -125,6 +128,49 @@ def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
         read_sheet(tmp_path / "none.eds", 1)
 
 
+LINES = st.sampled_from([line for sheet in SHEETS for line in eds_text(sheet).splitlines() if line])
+ODD = st.sampled_from(
+    [
+        "DataType=0x0009",
+        "DataType=0x0008",
+        "DefaultValue=",
+        "DefaultValue=0xFFFFFFFFFF",
+        "SubNumber=300",
+        "ObjectType=2",
+        "AccessType=",
+        "LowLimit=5",
+        "CompactSubObj=9",
+        "[1018]",
+        "[6040]",
+        "[1A00sub1]",
+        "[1A00sub0]",
+        "[6064]",
+        "[60C2]",
+        "[1016sub1]",
+        "[6502]",
+        "[60A9]",
+    ]
+)
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(LINES | ODD, min_size=1, max_size=60), st.integers(0, 500))
+def test_a_drive_can_wear_whatever_a_file_says(tmp_path: Path, lines: list[str], place: int) -> None:
+    """Or the file is refused in one sentence: a drive in odd clothes still boots, answers and goes with SYNC."""
+    whole = eds_text("nanotec").splitlines()
+    path = tmp_path / "odd.eds"
+    path.write_text("\n".join([*whole[:place], *lines, *whole[place:]]), encoding="utf-8")
+    try:
+        rig = Rig(dressed(path))
+    except EdsError:
+        return
+    rig.nmt(0x01)
+    rig.sync()
+    for index in (0x1000, 0x1018, 0x6040, 0x6064, 0x1A00):
+        rig.send(0x601, bytes([0x40, index & 0xFF, index >> 8, 0, 0, 0, 0, 0]))
+    own_eds_text(rig.drive)
+
+
 # -- what the wire sees
 
 
@@ -144,6 +190,12 @@ def test_what_the_drive_does_not_have_is_not_there(epos4: Rig, index: int) -> No
         epos4.read(index)
     with pytest.raises(Abort, match="06040041"):
         remap(epos4, 0x1800, 0x181, 1, index << 16 | 0x10)
+
+
+def test_it_has_no_more_pdos_than_its_file(wear: Callable[[str], Rig]) -> None:
+    pdo = wear("schunk").drive.pdo
+    assert (list(pdo.numbers("rpdo")), list(pdo.numbers("tpdo"))) == ([1, 2], [1, 2, 3, 4])
+    assert [p.number for p in pdo.configured("tpdo")] == [1, 2, 3]
 
 
 def test_what_fits_this_machine_alone_was_set_up(epos4: Rig) -> None:
@@ -223,8 +275,7 @@ def test_the_nc_leads_a_drive_by_the_mapping_that_it_has(tmp_path: Path) -> None
     twin.run(20)
     (error,) = [event["text"] for event in twin.events if event["event"] == "error"]
     assert error.startswith("drive X has 6064 in no PDO")
-    rig = Rig(twin.machine.config)
-    rig.drive = twin.machine.units["X"].drive
+    rig = Rig.of(twin.machine.units["X"].drive)
     remap(rig, 0x1800, 0x181, 255, 0x60410010)
     remap(rig, 0x1802, 0x381, 2, 0x30D10220, 0x60640020)
     twin.switch_on()
@@ -245,3 +296,30 @@ def test_the_eds_it_writes_is_of_what_it_wears(wear: Callable[[str], Rig], sheet
             assert int.from_bytes(node.sdo.upload(entry.index, entry.sub), "little") >= 0, f"{key:06X}"
     assert isinstance(node.object_dictionary[0x6041], canopen.objectdictionary.ODVariable)
     assert f"VendorNumber=0x{rig.drive.dress.vendor:08X}" in own_eds_text(rig.drive)
+
+
+@pytest.mark.parametrize("sheet", [None, *SHEETS])
+def test_the_eds_it_writes_keeps_the_rules(tmp_path: Path, sheet: str | None) -> None:
+    """CiA 306, as strict readers hold it: no DOMAIN has a mapping, each default is in its limits, counts are right."""
+    rig = Rig(dressed(write_eds(sheet, tmp_path))) if sheet else Rig()
+    eds = configparser.ConfigParser(strict=True, interpolation=None)
+    eds.read_string(own_eds_text(rig.drive))
+    listed = [
+        int(index, 0)
+        for group in ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects")
+        for key, index in eds[group].items()
+        if key != "supportedobjects"
+    ]
+    assert sorted(listed) == [item.index for item in rig.drive.dictionary]
+    for title in eds.sections():
+        section = eds[title]
+        if "ObjectType" not in section:
+            continue
+        if section["ObjectType"] == "0x2":
+            assert "PDOMapping" not in section
+        if "SubNumber" in section:
+            assert section.getint("SubNumber") == sum(name.startswith(f"{title}sub") for name in eds.sections())
+        default = section.get("DefaultValue", "")
+        for key, sign in (("LowLimit", 1), ("HighLimit", -1)):
+            if key in section:
+                assert sign * int(default) >= sign * int(section[key]), title

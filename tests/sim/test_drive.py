@@ -286,7 +286,10 @@ def test_two_runs_are_the_same_bit_by_bit() -> None:
 @settings(deadline=None, max_examples=60)
 @given(
     st.lists(
-        st.tuples(st.sampled_from([0, 0x80, 0x201, 0x301, 0x401, 0x601, 0x701, 0x764, 0x123]), st.binary(max_size=8)),
+        st.tuples(
+            st.sampled_from([0, 0x80, 0x201, 0x301, 0x401, 0x601, 0x701, 0x764, 0x123, 0x181, 0x7E5]),
+            st.binary(max_size=8),
+        ),
         max_size=60,
     )
 )

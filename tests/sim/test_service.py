@@ -54,10 +54,12 @@ class ServiceThread:
 
 
 @contextmanager
-def running(load: Callable[[Path, MachineConfig], Trajectory], folder: Path, **bus: Any) -> Iterator[ServiceThread]:
+def running(
+    load: Callable[[Path, MachineConfig], Trajectory], folder: Path, pace: str = "lockstep", **bus: Any
+) -> Iterator[ServiceThread]:
     document = bench_document()
     document["bus"] = {"can0": bus}
-    document["sim"] = {"pace": "lockstep"}
+    document["sim"] = {"pace": pace}
     document["store"] = {"directory": str(folder)}
     thread = ServiceThread(config.parse(document), load)
     try:

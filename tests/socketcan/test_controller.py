@@ -13,7 +13,7 @@ from fdhil.drivers.can.bus import CanBus
 from fdhil.drivers.can.error_frames import ErrorWatch
 from fdhil.errors import DeviceError
 from fdhil.guard.can_socket import ERROR, BusDown, RawCan
-from tests.socketcan.interface import SerialAdapter, raw_socket
+from tests.socketcan.interface import CAN_FRAME, SerialAdapter, raw_socket, send, set_up
 
 pytestmark = pytest.mark.socketcan
 SAID = [
@@ -92,5 +92,48 @@ def test_the_guard_hears_its_controller_and_drops_what_finds_no_room(adapter: Se
         adapter.unplug()
         with pytest.raises(BusDown):
             wait_for(lambda: can.receive() is None)
+    finally:
+        can.close()
+
+
+def test_the_guard_s_socket_is_back_when_the_interface_is() -> None:
+    can = RawCan(raw_socket(), allowed={0x301}, wanted={0x080})
+    try:
+        for _ in range(3):
+            with raw_socket() as other:
+                send(other, 1, 0x080)
+            set_up("vcan0", False)
+            with pytest.raises(BusDown):
+                can.receive()
+            with pytest.raises(BusDown):
+                can.send(0x301, bytes(4))
+            assert not can.restored()
+            set_up("vcan0", True)
+            assert can.restored()
+            assert can.receive() == []  # what came before is no news
+            with raw_socket() as other:
+                send(other, 2, 0x080)
+                send(other, 2, 0x081)
+                assert [(cob_id, data[0]) for cob_id, data, _ in can.receive()] == [(0x080, 2)]
+                assert can.send(0x301, b"\1\2\3\4")
+                assert CAN_FRAME.unpack(other.recv(16)) == (0x301, 4, b"\1\2\3\4\0\0\0\0")
+    finally:
+        set_up("vcan0", True)
+        can.close()
+
+
+def test_the_guard_s_socket_follows_an_adapter_that_is_plugged_in_again() -> None:
+    with SerialAdapter() as first:
+        channel = first.channel
+        can = RawCan(raw_socket(channel), allowed={0x301}, wanted={0x080})
+    try:
+        with pytest.raises(BusDown):
+            can.receive()
+        assert not can.restored()
+        with SerialAdapter() as second:
+            assert second.channel == channel
+            assert can.restored()
+            second.say("t0801FF")
+            wait_for(lambda: any(cob_id == 0x080 for cob_id, _, _ in can.receive()))
     finally:
         can.close()

@@ -6,8 +6,8 @@ from typing import Literal, Protocol
 
 from fdhil.drivers.can.frames import FrameRing
 
-Stamps = Literal["hardware", "kernel", "hub", "adapter", "host"]
-"""Who stamps the frames: the controller, the kernel, the hub, the adapter's firmware, this program when it reads."""
+Stamps = Literal["hardware", "kernel", "hub", "sender", "adapter", "host"]
+"""Who stamps the frames: controller, kernel, hub, sender, the adapter's firmware, this program when it reads them."""
 
 Filter = tuple[int, int]
 """An identifier with its flags and the mask of the bits that must be the same."""

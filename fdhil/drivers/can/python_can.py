@@ -100,13 +100,13 @@ def _library_filters(filters: Sequence[Filter]) -> list[dict[str, Any]] | None:
 
 
 def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())[:200] or type(error).__name__
+    return " ".join(str(error).split())[:200].rstrip(".") or type(error).__name__
 
 
 class VirtualPort:
     """python-can's bus inside one process; the sender's stamps are the wall clock's."""
 
-    stamps: Stamps = "host"
+    stamps: Stamps = "sender"
     holds_back = False
     kernel_drops = 0
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from fdhil import tables
-from fdhil.cia402 import Mode, Object
+from fdhil.cia402 import Object
 from fdhil.drivers.cia402.device import Device, DeviceObject, PdoPlace
 from fdhil.drivers.cia402.profile import DriveProfile, ObjectKey, PdoSpec
 from fdhil.drivers.cia402.profile_file import read_profile
@@ -181,28 +181,24 @@ def _demand(device: Device, profile: DriveProfile) -> Ability:
             what, "no", f"no RPDO carries its target ({shown(profile.target)})", "it can be identified alone"
         )
     modes = device.default(Object.SUPPORTED_MODES)
-    streamed = Mode.CYCLIC_SYNC_POSITION if profile.target[0] == Object.TARGET_POSITION else 7
+    if profile.mode < 1:
+        return Ability(what, "perhaps", f"set-points are streamed in the maker's mode {profile.mode}")
     if modes is None:
         return Ability(what, "perhaps", "its EDS does not say its modes (6502); ask the drive with `fdhil check`")
-    if modes >> (streamed - 1) & 1:
+    if modes >> (profile.mode - 1) & 1:
         return Ability(what, "yes", f"set-points are streamed to {shown(profile.target)} (6502 = {modes:08X})")
-    why = f"it has no mode {streamed} (6502 = {modes:08X}): set-points cannot be streamed"
+    why = f"it has no mode {profile.mode} (6502 = {modes:08X}): set-points cannot be streamed"
     return Ability(what, "no", why, "it can be identified, its path is not the NC's")
 
 
 def _correct(device: Device, profile: DriveProfile) -> Iterator[Ability]:
     what, advice = "correct on line", "let the NC play the corrected demand of `fdhil correct --out`"
     offset = device.find(profile.offset)
-    if not profile.takes_offset:
+    if offset is None or profile.find_rpdo(profile.offset) is None:
         why = "it has no position offset (60B0)" if offset is None else "no RPDO can carry its 60B0"
         yield Ability(what, "no", why, advice)
-        return
-    if offset is None or not offset.in_rpdo:
-        yield Ability(what, "no", "its 60B0 is not there, or for no RPDO", advice)
-        return
-    lacking = [key for key in (profile.offset, (int(Object.MODE_DISPLAY), 0)) if profile.find_tpdo(key) is None]
-    if lacking:
-        why = f"no TPDO shows its {', '.join(map(shown, lacking))}, and the guard sends nothing that it cannot see"
+    elif profile.unshown:
+        why = f"no TPDO shows its {', '.join(map(shown, profile.unshown))}, and no offset is sent that cannot be seen"
         yield Ability(what, "no", why, advice)
     elif not offset.in_tpdo:
         why = "its EDS gives 60B0 to RPDOs alone (rww): whether a TPDO takes it for the read-back, only the drive tells"

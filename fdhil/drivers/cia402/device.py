@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fdhil.cia402 import Object
+from fdhil.cia402 import LOGICAL_AXES, LOGICAL_AXIS_STEP, Object
 from fdhil.drivers.cia402.profile import ObjectKey
 
 MOST_PDOS = 512
@@ -91,6 +91,12 @@ class Device:
         """Return an object as a mapping entry; None where it is none."""
         found = self.find(key)
         return None if found is None or not found.bits else (*key, found.bits, found.signed)
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """The logical axes of CiA 402 that it has a controlword for: its objects lie 0x800 higher for each."""
+        words = {axis: (Object.CONTROLWORD + (axis - 1) * LOGICAL_AXIS_STEP, 0) for axis in LOGICAL_AXES}
+        return tuple(axis for axis, key in words.items() if key in self.objects)
 
     @property
     def is_drive(self) -> bool:

@@ -66,6 +66,13 @@ class VoltageObject:
         return np.asarray(product * abs(self.v_per_count) * sense, np.float64)
 
 
+def _as_shown(row: Int, shown: Int, n: int) -> SetpointRows:
+    """The demand (n,) on the rows (m,) on which the drive showed it (m,)."""
+    value, certain = np.zeros(n, np.int64), np.zeros(n, np.bool_)
+    value[row], certain[row] = shown, True
+    return SetpointRows(value, certain, 0)
+
+
 class Cia402Decoder:
     """Decodes one axis; ``feed`` takes ticked frames of its bus, ``counters`` tells what was lost.
 
@@ -84,6 +91,7 @@ class Cia402Decoder:
         self._queues = {s.name: PdoQueue(s, s.cob_base + self.node_id) for s in self.profile.tpdos}
         needed = [self.profile.position, self.profile.speed, self.profile.current, self.profile.statusword]
         self._places = {key: self._place(key) for key in (*needed, *self._voltage.keys)}
+        self._every_sync = {spec.name for spec in self.profile.tpdos if spec.every_sync == 1}
         self.required = list(dict.fromkeys(name for name, _ in self._places.values()))
         shown = (self.profile.position_demand, self.profile.offset, self.profile.digital_inputs)
         self._shown_places = {key: self._place(key) for key in shown if self.profile.find_tpdo(key)}
@@ -174,12 +182,8 @@ class Cia402Decoder:
     def _count(self, grids: Mapping[str, Dense], heard: Bool, first: int) -> int:
         """Count what is wrong with the frames of the rows' own ticks; returns the number lost."""
         rows = heard.size
-        lost = 0
-        for name, grid in grids.items():
-            begun = self._queues[name].first_tick
-            if begun is not None:
-                start = max(0, begun - first)
-                lost += int(np.count_nonzero((grid.missing[:rows] & heard)[start:]))
+        lost = sum(self._queues[name].lost(grid.missing[:rows], heard, first) for name, grid in grids.items())
+        self._irregular()
         ambiguous = np.zeros(rows, np.bool_)
         for grid in grids.values():
             self.counters.duplicates += int(grid.duplicates[:rows].sum())
@@ -188,6 +192,17 @@ class Cia402Decoder:
         self.counters.lost += lost
         self._foreign(ambiguous)
         return lost
+
+    def _irregular(self) -> None:
+        rare = [queue for queue in self._queues.values() if not queue.synchronous]
+        if rare:
+            names = ", ".join(f"{queue.spec.name} ({queue.cob_id:03X})" for queue in rare)
+            kinds = ", ".join(f"0x{0x1800 + queue.spec.number - 1:04X}:02" for queue in rare)
+            text = (
+                f"Drive {self.axis} sends {names} with few of the SYNCs, and its samples have holes; "
+                f"set the transmission type ({kinds}) to 1, or see whether it still is Operational."
+            )
+            self._tell("PdoIrregular", "MAJOR", text)
 
     def _foreign(self, ambiguous: Bool) -> None:
         clean = np.flatnonzero(~ambiguous)
@@ -254,12 +269,14 @@ class Cia402Decoder:
     def _read_back_demand(self, first: int, stop: int, offset: SetpointRows | None) -> SetpointRows | None:
         """The demand on rows [first, stop): sniffed and checked against what the drive shows, else what it shows.
 
-        0x6062 at SYNC k is r[k] + o[k].
+        0x6062 at SYNC k is r[k] + o[k]. A drive that makes its own path (profile position) may show it with every SYNC.
         """
         tick, shown = self._shown(self.profile.position_demand, first, stop)
         base = shown - (offset.value[tick - first] if offset is not None else 0)
         if self._target.queue.tick.size == 0 and shown.size:
             self._target.held = int(base[-1])
+            if self._shown_places[self.profile.position_demand][0] in self._every_sync:
+                return _as_shown(tick - first, base, stop - first)
         demand = self._target.rows(first, stop)
         if demand is not None and self._target.queue.tick.size and shown.size:
             sure = demand.certain[tick - first]

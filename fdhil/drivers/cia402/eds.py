@@ -118,6 +118,8 @@ def _sections(raw: bytes, name: str) -> list[_Section]:
             _store(current, key.strip(), value, number, name)
         if objects > MAX_OBJECTS:
             raise EdsError(name, f"line {number}: it has more than {MAX_OBJECTS} objects; this is no drive's EDS")
+    if raw.lstrip(b"\xef\xbb\xbf \r\n\t").startswith(b"<"):
+        raise EdsError(name, "line 1: it is XML (an XDD, or an ESI of EtherCAT); ask the drive's maker for its EDS")
     if not any(_OBJECT.match(title) for title in sections):
         raise EdsError(name, "line 1: it has no object at all; this is no EDS file")
     return _complete(sections)

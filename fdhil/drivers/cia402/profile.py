@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from fdhil.cia402 import LOGICAL_AXIS_STEP, PdoEntry, pdo_length
+from fdhil.cia402 import LOGICAL_AXIS_STEP, Mode, Object, PdoEntry, pdo_length
 from fdhil.config import Axis, SpeedUnit
 
 ObjectKey = tuple[int, int]
@@ -56,8 +56,9 @@ class DriveProfile:
     ``voltage_v_per_count`` is its scale, or, where it is the duty of the PWM, ``duty_per_count`` is its scale in shares
     of the DC link, which a TPDO tells (``dc_link``, ``dc_link_v_per_count``) or else the configuration
     (``drive.dc_link_v``). ``voltage_magnitude``: it has no sign of its own, that of R i + K w is taken.
-    ``strict_abort_options`` are the values of 0x6007 that stop the drive when communication is lost. ``vendor_id`` and
-    ``product_code`` None: any. ``logical_axis`` is the axis of a device with several of them.
+    ``mode`` is the one in which set-points are streamed to ``target``. ``strict_abort_options`` are the values of
+    0x6007 that stop the drive when communication is lost. ``vendor_id`` and ``product_code`` None: any.
+    ``logical_axis`` is the axis of a device with several of them. ``notes`` are told to whoever chooses the profile.
     """
 
     name: str
@@ -74,6 +75,7 @@ class DriveProfile:
     speed: ObjectKey = (0x606C, 0)
     current: ObjectKey = (0x6078, 0)
     statusword: ObjectKey = (0x6041, 0)
+    mode: int = Mode.CYCLIC_SYNC_POSITION
     position_demand: ObjectKey = (0x6062, 0)
     digital_inputs: ObjectKey = (0x60FD, 0)
     voltage: ObjectKey | None = None
@@ -100,9 +102,15 @@ class DriveProfile:
 
     @property
     def takes_offset(self) -> bool:
-        """Whether an offset can be sent to it in an RPDO of its own; else a correction can only go through the NC."""
+        """Whether an offset can be sent to it, and be seen; else a correction can only go through the NC."""
         found = self.find_rpdo(self.offset)
-        return found is not None and found[0].valid
+        return found is not None and found[0].valid and not self.unshown
+
+    @property
+    def unshown(self) -> tuple[ObjectKey, ...]:
+        """What no TPDO carries of offset, mode and demand: nothing is sent whose effect is not seen."""
+        keys = (self.offset, (self.object_index(Object.MODE_DISPLAY), 0), self.position_demand)
+        return tuple(key for key in keys if self.find_tpdo(key) is None)
 
     def find_tpdo(self, key: ObjectKey) -> tuple[PdoSpec, PdoEntry] | None:
         """Return the TPDO and entry that carry ``key``, or None."""

@@ -45,7 +45,12 @@ def load_profile(drive: Drive) -> DriveProfile:
         raise _fault(
             profile.name, "tpdos", what, "`fdhil eds` tells what the drive has; base a profile of your own on it"
         )
-    return profile if drive.logical_axis == 1 else _of_axis(profile, drive.logical_axis)
+    if drive.logical_axis == profile.logical_axis:
+        return profile
+    if profile.logical_axis != 1:
+        what = f"it is of axis {profile.logical_axis} of its device, the configuration has {drive.logical_axis}"
+        raise _fault(profile.name, "logical_axis", what, "make both the same")
+    return _of_axis(profile, drive.logical_axis)
 
 
 def require_offset(profile: DriveProfile, axis: str) -> None:
@@ -56,10 +61,11 @@ def require_offset(profile: DriveProfile, axis: str) -> None:
 
 def no_offset(profile: DriveProfile) -> str:
     """Return why nothing can be added to the set-points of this drive."""
+    if profile.find_rpdo(profile.offset) is not None and profile.unshown:
+        unseen = ", ".join(f"{index:04X}:{sub:02X}" for index, sub in profile.unshown)
+        return f"profile {profile.name} maps {unseen} into no TPDO, and no offset is sent that cannot be seen"
     index, sub = profile.offset
-    return (
-        f"profile {profile.name} maps no offset ({index:04X}:{sub:02X}) into a valid RPDO: nothing can be added on line"
-    )
+    return f"profile {profile.name} maps no offset ({index:04X}:{sub:02X}) into a valid RPDO: none can be sent"
 
 
 @cache
@@ -136,7 +142,7 @@ def profile_of(document: Mapping[str, Any], name: str, source: str) -> DriveProf
     """Build a profile from the tables of its file; ConfigError with every fault and its place."""
     faults: list[ConfigFault] = []
     values: dict[str, Any] = {}
-    known = {field.name for field in fields(DriveProfile)} - {"name", "logical_axis"}
+    known = {field.name for field in fields(DriveProfile)} - {"name"}
     for key, given in document.items():
         if key not in known:
             faults.append(ConfigFault(key, "is no key of a profile", f"one of {', '.join(sorted(known))}"))
@@ -191,7 +197,7 @@ def _entry(given: Sequence[Any]) -> tuple[int, int, int, bool]:
 
 
 def _of_axis(profile: DriveProfile, number: int) -> DriveProfile:
-    """Return the profile of the ``number``-th axis of one device.
+    """Return the profile of the ``number``-th axis of one device, made of that of the first.
 
     Its objects are 0x800 higher (CiA 402-2), its PDOs 64 higher (CiA 402-3), and their COB-IDs those of the node-ID
     that many higher, which the device must be set to: CiA 301 has no default for them.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from fdhil.config.sensors import ModbusPlace
 from fdhil.drivers.modbus.line import BUSY, Answer, DamagedAnswer, Line, ModbusRefused, Request
 from fdhil.drivers.modbus.lines import line_to
@@ -26,6 +28,11 @@ class ModbusLink:
         self._unit = place.unit
         self._timeout_s = place.timeout_s
         self.asked_ns = self.answered_ns = 0
+
+    @property
+    def counted(self) -> Mapping[str, int]:
+        """The faults by class that the line got over, whoever asked."""
+        return self.line.counted
 
     async def connect(self) -> None:
         """Connect where the line does not stand; ConnectError when nobody answers there."""

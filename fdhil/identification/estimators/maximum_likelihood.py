@@ -136,7 +136,7 @@ def _with_terms(base: Fit, command: bool, searched: bool) -> Fit:
         return result
     if DELAY in result.free:
         motions, free = result.problem.motions, but_delay(result.free)
-        result = fit(motions, with_delay(result.theta, 0.0), free)
+        result = fit(motions, with_delay(result.theta, 0.0), free, result.problem.noises)
     return _delay_told(result)
 
 

@@ -236,7 +236,8 @@ class Dictionary:
 
     def renumber(self, by: int) -> None:
         """The node-ID has changed: shift the defaults that are relative to it."""
-        self.entries = {key: entry.renumbered(by) for key, entry in self.entries.items()}
+        self.objects = tuple(replace(o, entries=tuple(e.renumbered(by) for e in o.entries)) for o in self.objects)
+        self.entries = {entry.key: entry for item in self.objects for entry in item.entries}
         self._within = tuple(entry.renumbered(by) for entry in self._within)
 
     def _store(self, entry: Entry, value: Value) -> None:

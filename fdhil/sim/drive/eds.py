@@ -48,7 +48,7 @@ CompactPDO=0
 GroupMessaging=0
 NrOfRXPDO={rpdos}
 NrOfTXPDO={tpdos}
-LSS_Supported=0
+LSS_Supported=1
 
 [DummyUsage]
 Dummy0001=0

@@ -68,7 +68,10 @@ class Feedback:
     @property
     def inputs(self) -> int:
         """0x60FD now."""
-        return self.digital_inputs | self._motion.homing.switches.inputs(self.true_position + self._motion.shift)
+        switches = self._motion.homing.switches
+        if not switches.mounted:
+            return self.digital_inputs
+        return self.digital_inputs | switches.inputs(self.true_position + self._motion.shift)
 
     @property
     def actual(self) -> Actual:

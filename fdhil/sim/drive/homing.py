@@ -82,6 +82,11 @@ class Switches:
     positive: float | None = None
     home: float | None = None
 
+    @property
+    def mounted(self) -> bool:
+        """Whether there is any."""
+        return (self.negative, self.positive, self.home) != (None, None, None)
+
     def inputs(self, raw: float) -> int:
         """Return the bits of 0x60FD at a place."""
         bits = int(self.negative is not None and raw <= self.negative)

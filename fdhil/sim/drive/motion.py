@@ -14,7 +14,7 @@ from fdhil.sim.drive.objects import Ratings
 from fdhil.sim.drive.physics import Command, Loops
 from fdhil.sim.drive.power import PowerStage, Ramp
 from fdhil.sim.drive.sensors import DriveFaults
-from fdhil.sim.drive.setpoints import CyclicSetpoints, Profile, Target
+from fdhil.sim.drive.setpoints import CyclicSetpoints, Interpolation, Profile, Target
 from fdhil.sim.drive.speed_and_torque import Actual, SpeedAndTorque
 
 _REST: Command = (0.0,) * 8
@@ -55,7 +55,8 @@ _LOOPS = {
 class Motion:
     """Set-point of each cycle, in increments. ``limited``: the software position limit cut it.
 
-    ``loops`` are those that ``command`` is for. ``shift`` is where the drive's zero is, raw increments: homing sets it.
+    ``loops`` are those that ``command`` is for; ``synced``: a SYNC begins the next cycle. ``shift`` is where the
+    drive's zero is, raw increments: homing sets it.
     """
 
     def __init__(
@@ -75,6 +76,8 @@ class Motion:
         self._rated_current_a = ratings.rated_current_a
         self._gain, self._feedforward = position_loop
         self.cyclic = cyclic
+        self.interpolation = Interpolation()
+        self.synced = False
         self.homing = HomingRun(switches, ratings.increments_per_rev)
         self.shift = 0
         self._limits = MotionLimits(self._numbers, ratings)
@@ -91,7 +94,7 @@ class Motion:
     def reset(self, position: int) -> None:
         """Power-on at ``position`` increments."""
         self._numbers[0x607A << 8] = position
-        self.cyclic.preset(Target(position, 0.0, 0.0, 0.0))
+        self._preset(Target(position, 0.0, 0.0, 0.0))
         self.source, self.loops, self.command = Source.OFF, Loops.POSITION, _REST
         self.homing.reset()
         self._target: float | None = None
@@ -112,7 +115,7 @@ class Motion:
     @property
     def bound(self) -> bool:
         """Whether the set-points come with the SYNC."""
-        return self.source is Source.CYCLIC
+        return self._power.powered and self._numbers[0x606000] in modes.CYCLIC
 
     # -- statusword and controlword
 
@@ -194,8 +197,10 @@ class Motion:
         self._position = actual.position
         if source is not Source.PROFILE and source is not Source.STOP:
             self._target = self._pending = None
-        if source is not Source.HOMING and self.source is Source.HOMING and self.homing.state is Homing.RUNNING:
-            self.homing.reset()
+        if source is not Source.HOMING:
+            self._homing_asked = False
+            if self.homing.state is Homing.RUNNING:
+                self.homing.reset()
         if self._numbers[0x606000] == modes.PROFILE_VELOCITY:
             self._open.watch(actual)
         self._loops_before, self.loops = self.loops, Loops.POSITION
@@ -220,16 +225,24 @@ class Motion:
         mode = self._numbers[0x606000]
         if mode in _LOOPS and mode in modes.CYCLIC:
             if mode != self._pushed_mode:
-                self.cyclic.preset(self._open.held(mode, actual))
+                self._preset(self._open.held(mode, actual))
             self._pushed_mode = mode
-            self.cyclic.push(self._open.target(mode, actual))
+            self._spread(self._open.target(mode, actual))
             return
         self._pushed_mode = modes.CYCLIC_POSITION
         position, offset, speed, torque, low, high = _cyclic(self._numbers)
         acting = offset * float(self._faults.offset_scale)
         self.limited = not low <= position + acting <= high
         target = min(max(position + acting, low), high) - acting if self.limited else position
-        self.cyclic.push(Target(target, acting, speed * self._rad_per_increment, torque * 1e-3 * self._rated_current_a))
+        self._spread(Target(target, acting, speed * self._rad_per_increment, torque * 1e-3 * self._rated_current_a))
+
+    def _spread(self, target: Target) -> None:
+        self.cyclic.push(self.interpolation.next(target, synced=self.synced))
+        self.synced = False
+
+    def _preset(self, target: Target) -> None:
+        self.cyclic.preset(target)
+        self.interpolation.preset(target)
 
     def _choose(self) -> Source:
         if not self._power.powered:
@@ -313,5 +326,5 @@ class Motion:
     def _set_zero(self, shift: int) -> None:
         """Count from another place: the axis stays where it is and has other coordinates."""
         self._profile.start(self._profile.now + self.shift - shift, 0.0)
-        self.cyclic.preset(Target(self._profile.now, 0.0, 0.0, 0.0))
+        self._preset(Target(self._profile.now, 0.0, 0.0, 0.0))
         self.shift = shift

@@ -29,6 +29,8 @@ from fdhil.sim.frame import Frame
 OFF, INITIALISING, STOPPED, OPERATIONAL, PRE_OPERATIONAL = -1, 0x00, 0x04, 0x05, 0x7F
 _AFTER_ERROR = {0: PRE_OPERATIONAL, 2: STOPPED}  # 0x1029: the NMT state after a communication error; 1: as it is
 
+_SDO_PATIENCE_S = 1.0  # a client that was silent for so long within a block has gone: what comes is another's request
+
 
 class CanopenNode(ABC):
     """One node on top of its object dictionary; ``boot_s`` is the time from a reset to the boot-up message.
@@ -46,7 +48,8 @@ class CanopenNode(ABC):
         self._has_booted = False
         self._sync_id = 0x80
         self._sync_refused = False
-        self._now_s = 0.0
+        self._after_error: int | None = None
+        self._now_s = self._sdo_s = 0.0
         self.pdo = PdoEngine(dictionary, self._is_pre_operational, faults.drop_tpdo)
         self._sdo = SdoServer(dictionary)
         self._emergencies = Emergencies(dictionary)
@@ -160,7 +163,11 @@ class CanopenNode(ABC):
             return []
         frames += self._producer.due(self._now_s, self.nmt)
         self._watch_connections()
-        return frames + self._take_outgoing() + self.pdo.on_events(self._now_s)
+        frames += self._take_outgoing()
+        if self._after_error is not None:  # the error is told before the device falls silent
+            self._leave_operational(self._after_error)
+            self._after_error = None
+        return frames + self.pdo.on_events(self._now_s)
 
     # -- frames
 
@@ -190,6 +197,9 @@ class CanopenNode(ABC):
     def _sdo_request(self, data: bytes) -> list[Frame]:
         if self.nmt == STOPPED:
             return []
+        if self._sdo.in_block and self._now_s - self._sdo_s > _SDO_PATIENCE_S:
+            self._sdo.reset()
+        self._sdo_s = self._now_s
         answers: list[Frame] = [(0x580 + self.node_id, answer) for answer in self._sdo.request(data)]
         return answers + self._take_outgoing()
 
@@ -252,7 +262,6 @@ class CanopenNode(ABC):
 
     def _connection_lost(self, code: int, detail: bytes) -> None:
         self._emergencies.report(code, detail)
-        state = _AFTER_ERROR.get(self.dictionary.numbers.get(0x102901, KEEP_STATE))
-        if state is not None and self.nmt == OPERATIONAL:
-            self._leave_operational(state)
+        if self.nmt == OPERATIONAL:
+            self._after_error = _AFTER_ERROR.get(self.dictionary.numbers.get(0x102901, KEEP_STATE))
         self._react(code)

@@ -88,6 +88,11 @@ def register_write_rules(
         if value and (value not in MODES or not offered >> (value - 1) & 1):
             raise TransferAbort(AbortCode.RANGE)
 
+    def interpolation_time(entry: Entry, value: int) -> None:
+        cycle = entry.default
+        if entry.low is not None and isinstance(cycle, int) and value % cycle:  # whole cycles of the drive
+            raise TransferAbort(AbortCode.RANGE)
+
     def homing_method(_entry: Entry, value: int) -> None:
         if value not in METHODS:
             raise TransferAbort(AbortCode.RANGE)
@@ -106,6 +111,7 @@ def register_write_rules(
             0x605A00: quick_stop,
             0x606000: mode,
             0x609800: homing_method,
+            0x60C201: interpolation_time,
         }
     )
     dictionary.written.update(

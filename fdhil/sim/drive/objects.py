@@ -230,7 +230,7 @@ def _ratio(index: int, name: str, upper: str, value: int, lower: str) -> Object:
 
 
 def _interpolation(sync_period_s: float) -> Object:
-    """0x60C2: value x 10^exponent seconds; the drive interpolates at the machine's SYNC period and no other."""
+    """0x60C2: value x 10^exponent seconds; set-points that come every so many SYNC periods of the machine."""
     exponent = -3
     while exponent > -6 and abs(sync_period_s / 10**exponent - round(sync_period_s / 10**exponent)) > 1e-9:
         exponent -= 1
@@ -238,7 +238,7 @@ def _interpolation(sync_period_s: float) -> Object:
     return record(
         0x60C2,
         "Interpolation time period",
-        Entry(0x60C2, 1, "Interpolation time period value", U8, "rw", value, low=value, high=value),
+        Entry(0x60C2, 1, "Interpolation time period value", U8, "rw", value, low=1),
         Entry(0x60C2, 2, "Interpolation time index", I8, "rw", exponent, low=exponent, high=exponent),
     )
 

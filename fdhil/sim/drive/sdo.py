@@ -63,6 +63,11 @@ class SdoServer:
         self._dictionary = dictionary
         self._transfer: _Upload | _Download | _BlockUpload | _BlockDownload | None = None
 
+    @property
+    def in_block(self) -> bool:
+        """Whether a block download waits for segments: every request is taken for one."""
+        return isinstance(self._transfer, _BlockDownload) and not self._transfer.complete
+
     def reset(self) -> None:
         """Forget the transfer that is going on."""
         self._transfer = None
@@ -73,7 +78,7 @@ class SdoServer:
             return []
         index, sub = int.from_bytes(data[1:3], "little"), data[3]
         goes_on = (data[0] >> 5 in (0, 3, 5) and data[0] & 0xE3 != 0xA0) or data[0] & 0xE1 == 0xC1
-        goes_on |= isinstance(self._transfer, _BlockDownload) and not self._transfer.complete
+        goes_on |= self.in_block
         if goes_on and self._transfer is not None:  # such a request does not repeat what it is about
             index, sub = self._transfer.index, self._transfer.sub
         try:

@@ -30,6 +30,8 @@ from fdhil.sim.drive.sensors import DriveFaults, Sensors
 from fdhil.sim.drive.setpoints import CyclicSetpoints
 from fdhil.sim.frame import Frame
 
+_MOST_CYCLES_PER_SYNC = 1000
+
 
 class Drive(CanopenNode):
     """One axis' drive with its motor and table.
@@ -75,6 +77,7 @@ class Drive(CanopenNode):
             self.dictionary, self.ratings, self._plant, self.power, self.motion, self.feedback, self.faults
         )
         self._clock = OwnClock(self.ratings.sync_period_s)
+        self._said_period = (0, 0)
         register_write_rules(
             self.dictionary,
             changeable=self._is_pre_operational,
@@ -141,9 +144,11 @@ class Drive(CanopenNode):
         return self._on_time()
 
     def _cycle_of_sync(self, counter: int | None) -> list[Frame]:
-        leads, operational = self._clock.sync() or self._cycle.stands, self.nmt == OPERATIONAL
+        cycles = self._cycles_per_sync()
+        leads, operational = self._clock.sync(cycles) or self._cycle.stands, self.nmt == OPERATIONAL
         if operational:
             self.pdo.latch()
+        self.motion.synced = True
         if leads:
             self._begin_cycle()
         else:
@@ -151,7 +156,19 @@ class Drive(CanopenNode):
         frames = self.pdo.at_sync(counter, self._now_s) if operational else []
         if leads:
             self._cycle.integrate()
+            for _ in range(cycles - 1):
+                self._begin_cycle()
+                self._cycle.integrate()
         return frames + self._take_outgoing() if self._emergencies.waiting else frames
+
+    def _cycles_per_sync(self) -> int:
+        """How many cycles of the drive a SYNC is said to come in: 0x60C2, value and power of ten of a second."""
+        said = self.dictionary.numbers.get(0x60C201, 0), self.dictionary.numbers.get(0x60C202, 0)
+        if said != self._said_period:
+            self._said_period = said
+            cycles = said[0] * 10.0 ** said[1] / self.ratings.sync_period_s
+            self.motion.interpolation.cycles = round(min(max(cycles, 1.0), _MOST_CYCLES_PER_SYNC))
+        return self.motion.interpolation.cycles
 
     def _coast(self) -> None:
         if self._clock.sync() or self._cycle.stands:
@@ -163,18 +180,23 @@ class Drive(CanopenNode):
         return self._clock.leads and not self._cycle.stands
 
     def _move_alone(self, now_s: float, alone: bool) -> None:
-        """Run the cycles that no SYNC has begun; a drive that stands needs none."""
+        """Run the cycles that no SYNC has begun."""
         if not alone:
             self._clock.stop()
             return
         declared_us = self.dictionary.numbers.get(0x100600, 0)
-        bound = self.motion.bound and declared_us in (0, round(self.ratings.sync_period_s * 1e6))
-        for _ in range(self._clock.due(now_s, bound=bound)):
-            if self._cycle.stands:
-                return
-            if not self._mute:
-                self._begin_cycle()
-            self._cycle.integrate()
+        cycles = self._cycles_per_sync()
+        bound = self.motion.bound and declared_us in (0, round(cycles * self.ratings.sync_period_s * 1e6))
+        for _ in range(self._clock.due(now_s, bound=bound, cycles=cycles)):
+            self.cycle_without_sync()
+
+    def cycle_without_sync(self) -> None:
+        """Run a cycle on what was latched last; a drive that stands needs none."""
+        if self._cycle.stands:
+            return
+        if not self._mute:
+            self._begin_cycle()
+        self._cycle.integrate()
 
     def _begin_cycle(self) -> None:
         """Take the set-points as they are, sample all objects, and supervise."""

@@ -69,6 +69,36 @@ class CyclicSetpoints:
         return slope + second.offset - first.offset if self._offset_in_feedforward else slope
 
 
+class Interpolation:
+    """Spreads set-points that come every ``cycles`` cycles (0x60C2) over these: straight, one interval late."""
+
+    def __init__(self) -> None:
+        self.cycles = 1
+        self._step = 0
+        self._from = self._to = Target(0.0, 0.0, 0.0, 0.0)
+
+    def preset(self, target: Target) -> None:
+        """Rest at a target."""
+        self._from = self._to = target
+        self._step = 0
+
+    def next(self, target: Target, *, synced: bool) -> Target:
+        """Return this cycle's set-point; ``target`` is what was received last, ``synced``: a SYNC begins the cycle."""
+        if self.cycles == 1:
+            self.preset(target)
+            return target
+        if synced or self._step >= self.cycles:
+            self._from, self._to, self._step = self._at(), target, 0
+        self._step += 1
+        return self._at()
+
+    def _at(self) -> Target:
+        if not 0 < self._step < self.cycles:
+            return self._to if self._step else self._from
+        part = self._step / self.cycles
+        return Target(*(a + (b - a) * part for a, b in zip(self._from, self._to, strict=True)))
+
+
 class Ramp:
     """A speed or a torque on its way to a target: ``before`` at the start of a cycle, ``now`` at its end."""
 

@@ -1,0 +1,93 @@
+"""Compares what a drive counts in with the configuration: increments, currents, torques, speeds and the DC link."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from fdhil.cia402 import Object
+from fdhil.commissioning.finding import Finding, lacks, read_optional
+from fdhil.commissioning.master import Master
+from fdhil.drivers.cia402.profile import speed_unit_of
+
+DC_LINK_TOLERANCE = 0.05
+
+
+def compare_scale(master: Master) -> Iterator[Finding]:
+    """Position increments per motor revolution from 0x6091 and 0x6092 (else 0x608F) must be the configured ones."""
+    expected = master.config.axis[master.axis].drive.increments_per_rev
+    feed = _ratio(master, Object.FEED_CONSTANT)
+    gear = _ratio(master, Object.GEAR_RATIO)
+    encoder = _ratio(master, Object.POSITION_ENCODER_RESOLUTION)
+    wanted = f"{expected} per revolution"
+    if feed is not None:
+        per_rev, source = feed / (gear or 1.0), "0x6092 and 0x6091"
+    elif encoder is not None:
+        per_rev, source = encoder, "0x608F"
+    else:
+        yield lacks("scale", wanted, "0x6092", "0x608F")
+        return
+    found = f"{per_rev:g} per revolution"
+    same = abs(per_rev - expected) <= 1e-6 * expected
+    cause = f"its position counts {per_rev:g} per motor revolution ({source}) where the config has {expected}"
+    yield Finding("scale", wanted, found, same, cause, "correct the drive's factors or drive.increments_per_rev")
+
+
+def _ratio(master: Master, index: int) -> float | None:
+    upper, lower = read_optional(master, index, 1), read_optional(master, index, 2)
+    return None if upper is None or not lower else upper / lower
+
+
+def compare_rating(master: Master) -> Iterator[Finding]:
+    """What the current is counted in, 0x6075 or 0x6076 (both in thousandths), must be what the config has."""
+    drive, unit = master.config.axis[master.axis].drive, master.profile.current_unit
+    if unit == "permille_of_rated":
+        place, what, symbol, key = Object.RATED_CURRENT, "rated current", "A", "rated_current_a"
+    elif unit == "permille_of_rated_torque":
+        place, what, symbol, key = Object.RATED_TORQUE, "rated torque", "N.m", "rated_torque_nm"
+    else:
+        return
+    expected = drive.rated_current_a if place == Object.RATED_CURRENT else drive.rated_torque_nm
+    told, wanted = read_optional(master, place), f"{expected:g} {symbol}"
+    if told is None:
+        yield lacks(what, wanted, f"0x{place:04X}")
+        return
+    found = f"{told / 1e3:g} {symbol}"
+    same = abs(told / 1e3 - expected) <= 0.01 * expected
+    cause = f"its {what} is {found} (0x{place:04X}) where the config has {wanted}"
+    yield Finding(what, wanted, found, same, cause, f"correct drive.{key}")
+
+
+def compare_speed_unit(master: Master) -> Iterator[Finding]:
+    """0x60A9 is what the speed counts in, where the drive has it."""
+    word = read_optional(master, Object.VELOCITY_UNIT)
+    if word is None:
+        return
+    wanted = master.config.axis[master.axis].drive.speed_unit or master.profile.speed_unit
+    found = speed_unit_of(word)
+    shown = f"0x60A9 = {word:08X}{f', {found}' if found else ''}"
+    cause = f"its speed counts in another unit ({shown}) than {wanted}"
+    advice = f"set drive.speed_unit = '{found}'" if found else "set 0x60A9 to 00B44700 (rpm) or FDB44700 (millirpm)"
+    yield Finding("speed unit", wanted, shown, found == wanted, cause, f"{advice}, or 0x60A9 with the drive's tool")
+
+
+def compare_dc_link(master: Master) -> Iterator[Finding]:
+    """The volts that a duty is multiplied by must be what the drive measures, where SDO alone tells."""
+    profile, drive = master.profile, master.config.axis[master.axis].drive
+    if not profile.duty_per_count or profile.dc_link is None or len(profile.voltage_objects) != 1:
+        return
+    counts = read_optional(master, *profile.dc_link)
+    if counts is None:
+        return
+    told = counts * profile.dc_link_v_per_count
+    found, wanted = f"{told:.1f} V", "not said" if drive.dc_link_v is None else f"{drive.dc_link_v:g} V"
+    same = drive.dc_link_v is not None and abs(told - drive.dc_link_v) <= DC_LINK_TOLERANCE * drive.dc_link_v
+    cause = f"its DC link has {found} where the config has {wanted}"
+    yield Finding("DC link", wanted, found, same, cause, f"set drive.dc_link_v = {told:.1f}")
+
+
+def compare_scales(master: Master) -> Iterator[Finding]:
+    """All of them."""
+    yield from compare_scale(master)
+    yield from compare_rating(master)
+    yield from compare_speed_unit(master)
+    yield from compare_dc_link(master)

@@ -1,0 +1,115 @@
+"""Sets a drive's PDOs up as its profile has them, by SDO, with no NC on the bus; nothing moves.
+
+The order is that of CiA 301, 7.5.2.36 and 7.5.2.38: the PDO is made invalid, its mapping emptied, written and counted,
+and only then it is valid again. What fails is given back as it was.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fdhil.cia402 import NmtCommand, Object, State, state_of
+from fdhil.commissioning.finding import read_optional
+from fdhil.commissioning.master import Master
+from fdhil.commissioning.survey import INVALID_COB_ID, PdoFound, compare_pdo, listen, read_pdos
+from fdhil.drivers.cia402.profile import PdoSpec
+from fdhil.errors import DeviceError, DriveFault, ProtocolError, SdoAbort
+
+NO_REMOTE_REQUEST = 1 << 30
+STORE = 0x1010
+SAVE = 0x65766173  # "save", CiA 301 7.5.2.13
+UNMAPPABLE = 0x06040041
+TOO_LONG = 0x06040042
+
+
+@dataclass(frozen=True, slots=True)
+class SetUp:
+    """What was done to a drive: the PDOs written (none: all were right), and whether it keeps them when it is off."""
+
+    written: tuple[str, ...]
+    saved: bool | None
+
+
+def set_up_pdos(master: Master) -> SetUp:
+    """Write what differs from the profile and save it; DriveFault when the drive refuses, all PDOs are then as before.
+
+    ``saved`` None: nothing was written, False: the drive has no 0x1010, or refuses it.
+    """
+    listen(master)
+    _require_disabled(master)
+    pdos = read_pdos(master)
+    wrong = [(spec, found) for spec, found in pdos if compare_pdo(spec, found, master.node_id).ok is False]
+    if not wrong:
+        return SetUp((), None)
+    master.nmt(NmtCommand.ENTER_PRE_OPERATIONAL)
+    begun: list[tuple[PdoSpec, PdoFound]] = []
+    try:
+        for spec, found in wrong:
+            begun.append((spec, found))
+            _write_spec(master, spec, found)
+        _require_same(master)
+    except BaseException as error:  # Ctrl-C, too: half a mapping is worse than the old one
+        _give_back(master, begun, error)
+        raise
+    return SetUp(tuple(spec.name for spec, _ in wrong), _save(master))
+
+
+def _require_disabled(master: Master) -> None:
+    word = read_optional(master, Object.STATUSWORD)
+    if word is not None and state_of(word) is State.OPERATION_ENABLED:
+        raise DriveFault(master.device, "it is in Operation enabled, and nothing was written; switch it off first")
+
+
+def _write_spec(master: Master, spec: PdoSpec, found: PdoFound) -> None:
+    cob_id = spec.cob_base + master.node_id | found.cob_id & NO_REMOTE_REQUEST
+    words = tuple(entry.mapping for entry in spec.entries)
+    wanted = cob_id if spec.valid else cob_id | INVALID_COB_ID
+    try:
+        _write(master, found, wanted, spec.every_sync, words)
+    except SdoAbort as abort:
+        why = {
+            UNMAPPABLE: "it maps one of its objects into no such PDO",
+            TOO_LONG: "it does not map so many objects or bytes",
+        }.get(abort.code, str(abort).removeprefix(f"{master.device}: "))
+        listed = ", ".join(f"{entry.index:04X}:{entry.sub:02X}" for entry in spec.entries)
+        advice = "its PDOs are as before; base a profile of your own on this one, with what the drive takes"
+        raise DriveFault(master.device, f"it refuses {spec.name} with {listed}: {why}; {advice}") from None
+
+
+def _write(master: Master, found: PdoFound, cob_id: int, kind: int, words: tuple[int, ...]) -> None:
+    write = master.sdo.write_int
+    write(found.parameter, 1, found.cob_id | INVALID_COB_ID, 4)
+    write(found.mapping, 0, 0, 1)
+    for sub, word in enumerate(words, 1):
+        write(found.mapping, sub, word, 4)
+    write(found.mapping, 0, len(words), 1)
+    write(found.parameter, 2, kind, 1)
+    write(found.parameter, 1, cob_id, 4)
+
+
+def _require_same(master: Master) -> None:
+    for spec, found in read_pdos(master):
+        finding = compare_pdo(spec, found, master.node_id)
+        if finding.ok is False:
+            raise DriveFault(
+                master.device, f"what was written is not what it holds ({finding.cause}); use its own tool"
+            )
+
+
+def _give_back(master: Master, begun: list[tuple[PdoSpec, PdoFound]], error: BaseException) -> None:
+    """Write the old PDOs again, the last first; ProtocolError when that fails too."""
+    for spec, found in reversed(begun):
+        try:
+            _write(master, found, found.cob_id, found.kind, found.mapped)
+        except DeviceError as left:
+            cause = str(error).removeprefix(f"{master.device}: ") or "it was interrupted"
+            text = f"{cause}; {spec.name} could not be given back ({left}); power the drive off and on again"
+            raise ProtocolError(master.device, text) from error
+
+
+def _save(master: Master) -> bool:
+    try:
+        master.sdo.write_int(STORE, 1, SAVE, 4)
+    except SdoAbort:
+        return False
+    return True

@@ -1,0 +1,73 @@
+"""Says when a sensor that shows one value is asked, and how far from that instant its answer may be. Pure.
+
+The instants are whole multiples of the period on the SYNC count, so that the values are a signal on the drive's clock;
+without SYNC they are so on this computer's clock.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from fdhil.drivers.can.tick_clock import TickClock
+
+SYNC_ENDED_NS = 500_000_000  # after so long a silence it does not run
+PACE_TICKS = 500
+
+
+class AskingGrid:
+    """Instants ``period_s`` apart, numbered; ``missed`` counts those at which nobody was asked.
+
+    ``phase`` (of a period) has them so much later: sensors on one line are asked in turn.
+    """
+
+    def __init__(self, period_s: float, sync_period_s: float, phase: float = 0.0) -> None:
+        self.period_ns = period_s * 1e9
+        self._phase = phase
+        self._ticks = period_s / sync_period_s
+        self._next: int | None = None
+        self._by_sync = False
+        self.missed = 0
+
+    def next_instant(self, now_ns: int, ticks: TickClock) -> tuple[int, float]:
+        """Return number and host time (ns) of the next instant."""
+        by_sync = ticks.running and ticks.covers(now_ns - SYNC_ENDED_NS)
+        newest, newest_ns, step_ns = _pace(ticks)
+        periods = (newest + (now_ns - newest_ns) / step_ns) / self._ticks if by_sync else now_ns / self.period_ns
+        number = math.ceil(periods - self._phase)
+        last, went_on = self._next, by_sync == self._by_sync
+        self._by_sync = by_sync
+        if went_on and last is not None and number - last + 1 >= 0:
+            number = max(number, last)
+            self.missed += number - last
+        self._next = number + 1
+        return number, self.host_ns(number, ticks)
+
+    def host_ns(self, number: int, ticks: TickClock) -> float:
+        """Return the host time of an instant, one that is to come by the pace at which the SYNCs came."""
+        if not self._by_sync:
+            return (number + self._phase) * self.period_ns
+        tick = (number + self._phase) * self._ticks
+        newest, newest_ns, step_ns = _pace(ticks)
+        return newest_ns + (tick - newest) * step_ns if tick > newest else float(ticks.time_ns(np.array([tick]))[0])
+
+    def read_at(self, number: int, asked_ns: int, answered_ns: int, ticks: TickClock) -> tuple[float, float, float]:
+        """Return when (host ns) a value was true that was read between question and answer, by how much that is later
+        than the instant of its number, and how far off both may be."""
+        between = ticks.bounds(asked_ns, answered_ns) if self._by_sync else None
+        if between is None:
+            middle = (asked_ns + answered_ns) / 2
+            return middle, middle - self.host_ns(number, ticks), (answered_ns - asked_ns) / 2
+        tick = (between[0] + between[1]) / 2
+        late = (tick - (number + self._phase) * self._ticks) * ticks.period_ns
+        return float(ticks.time_ns(np.array([tick]))[0]), late, (between[1] - between[0]) / 2 * ticks.period_ns
+
+
+def _pace(ticks: TickClock) -> tuple[int, float, float]:
+    """Return the newest tick, when it came, and the ns from one to the next: a simulated machine may be slower."""
+    newest = ticks.newest_tick
+    if not ticks.running:
+        return newest, 0.0, ticks.period_ns
+    before_ns, newest_ns = ticks.time_ns(np.array([newest - PACE_TICKS, newest]))
+    return newest, float(newest_ns), float(newest_ns - before_ns) / PACE_TICKS

@@ -1,0 +1,44 @@
+"""Numbers the values of an instrument that tells one each period by itself, from when they came. Pure.
+
+A value may come late, with those behind it close on its heels: none is missing then. One behind which nothing follows
+at once came in time, and if it is late all the same, others before it were lost.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+LATE = 0.6  # of a period
+KEPT = 64  # values that came, of which the earliest for its number came in time
+
+
+class ToldCount:
+    """Counts values ``period_s`` apart; ``missed`` counts those that were lost.
+
+    Where that was mistaken the count is set back: a number may then come again.
+    """
+
+    def __init__(self, period_s: float) -> None:
+        self._period_ns = period_s * 1e9
+        self._early: deque[float] = deque(maxlen=KEPT)
+        self._number = -1
+        self._last_ns: int | None = None
+        self.missed = 0
+
+    def number(self, t_ns: int) -> int:
+        """Return the number of a value that came at ``t_ns``."""
+        if self._last_ns is not None and t_ns - self._last_ns >= (1 - LATE) * self._period_ns:
+            self._settle(self._last_ns)
+        self._number += 1
+        self._last_ns = t_ns
+        return self._number
+
+    def _settle(self, t_ns: int) -> None:
+        """The newest value came at ``t_ns`` and in time: see whether its number is right."""
+        ahead = t_ns - self._number * self._period_ns
+        behind = (ahead - min(self._early)) / self._period_ns if self._early else 0.0
+        if abs(behind) > LATE:
+            self._number += round(behind)
+            self.missed = max(0, self.missed + round(behind))
+            ahead -= round(behind) * self._period_ns
+        self._early.append(ahead)

@@ -1,0 +1,108 @@
+"""The PDOs of a drive are written as its profile has them, or stay as they were."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil.commissioning.master import Master
+from fdhil.commissioning.pdo_setup import SetUp, set_up_pdos
+from fdhil.commissioning.survey import read_pdos, survey
+from fdhil.config import MachineConfig
+from fdhil.drivers.can.sdo import SdoLink
+from fdhil.errors import DriveFault
+from tests.dressed.wardrobe import OUTFITS, Outfit, dressed
+from tests.drivers.peer import DrivePeer
+from tests.drivers.wire import machine
+
+pytestmark = pytest.mark.usefixtures("quick_commissioning")
+
+
+def config(**sections: Any) -> MachineConfig:
+    return machine(bus={"interface": "virtual", "channel": uuid.uuid4().hex}, guard={"clock": "sync"}, **sections)
+
+
+@pytest.fixture
+def peer() -> Iterator[tuple[DrivePeer, MachineConfig]]:
+    settings = config()
+    with DrivePeer(settings) as running:
+        yield running, settings
+
+
+SPOILT: Mapping[str, tuple[Callable[[DrivePeer], object], str]] = {
+    "order": (lambda p: p.drive.remap(0x1A01, [(0x6041, 0, 16), (0x2101, 0, 16), (0x6078, 0, 16)]), "TPDO2"),
+    "event driven": (lambda p: p.drive.set_object(0x1800, 2, 255), "TPDO1"),
+    "another COB-ID": (lambda p: p.drive.set_object(0x1401, 1, 0x305), "RPDO2"),
+    "switched off": (lambda p: p.drive.set_object(0x1401, 1, 0x80000301), "RPDO2"),
+}
+
+
+@pytest.mark.parametrize("what", SPOILT)
+def test_what_differs_is_written(what: str, peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    spoil, name = SPOILT[what]
+    spoil(drive)
+    with Master(settings, "X") as master:
+        assert set_up_pdos(master).written == (name,)
+        points = {finding.point: finding.ok for finding in survey(master).findings}
+    assert points[name] is True
+    assert not {0x080, 0x201, 0x301} & set(drive.heard)  # no SYNC, no set-point: nothing can move
+
+
+@pytest.mark.parametrize("outfit", OUTFITS, ids=lambda outfit: outfit.name)
+def test_a_drive_of_every_make_is_set_up_as_it_comes(outfit: Outfit, tmp_path: Path) -> None:
+    settings = dressed(outfit, tmp_path, bus={"can0": {"interface": "virtual", "channel": uuid.uuid4().hex}})
+    with DrivePeer(settings), Master(settings, "X") as master:
+        done = set_up_pdos(master)
+        assert done.written
+        assert set_up_pdos(master) == SetUp((), None)
+
+
+def test_a_drive_that_is_right_is_left_alone(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    with Master(settings, "X") as master:
+        assert set_up_pdos(master) == SetUp((), None)
+    assert set(drive.heard) == {0x601}
+
+
+def test_a_drive_that_refuses_an_object_keeps_all_its_pdos(tmp_path: Path) -> None:
+    own = tmp_path / "own.toml"
+    own.write_text(
+        'base = "fdhil_twin"\n'
+        '[[tpdos]]\nname = "TPDO1"\ncob_base = 0x180\nentries = [[0x606C, 0, 32, true], [0x6064, 0, 32, true]]\n'
+        '[[tpdos]]\nname = "TPDO2"\ncob_base = 0x280\n'
+        "entries = [[0x6041, 0, 16, false], [0x6078, 0, 16, true], [0x605A, 0, 16, true]]\n"
+    )
+    settings = config(drive={"profile": str(own)})
+    with DrivePeer(settings), Master(settings, "X") as master:
+        before = [found for _, found in read_pdos(master)]
+        with pytest.raises(DriveFault, match="it refuses TPDO2 with 6041:00, 6078:00, 605A:00"):
+            set_up_pdos(master)
+        assert [found for _, found in read_pdos(master)] == before
+
+
+def test_an_enabled_drive_is_not_touched(peer: tuple[DrivePeer, MachineConfig]) -> None:
+    drive, settings = peer
+    drive.drive.set_object(0x1800, 2, 255)
+    drive.drive.set_object(0x6041, 0, 0x1237)
+    with Master(settings, "X") as master, pytest.raises(DriveFault, match="Operation enabled"):
+        set_up_pdos(master)
+    assert drive.drive.dictionary.number(0x1800, 2) == 255
+
+
+def test_the_objects_of_a_second_axis_are_asked_0x800_higher(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def upload(_link: SdoLink, index: int, _sub: int) -> bytes:
+        asked.append(index)
+        return bytes(2)
+
+    monkeypatch.setattr(SdoLink, "_upload", upload)
+    with Master(config(drive={"logical_axis": 2, "node_id": 1}), "X") as master:
+        for index in (0x6041, 0x68B0, 0x1018):
+            master.sdo.read_int(index)
+    assert asked == [0x6841, 0x68B0, 0x1018]

@@ -1,0 +1,1 @@
+"""Every packaged drive profile against the twin in the dress of that drive."""

@@ -1,0 +1,60 @@
+"""A cut on drives of every make: corrected on line by the offset, or by the demand that the NC is given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from fdhil import correction
+from fdhil.arming.guard_settings import settings_of
+from fdhil.cia402 import pack
+from fdhil.prediction.contour import contour_error_um
+from fdhil.records import Float, Parameters, Trajectory, frozen, rms
+from tests.dressed.wardrobe import LED, Outfit, dressed, started
+from tests.sim.bench_twin import PERIOD_S, TwinInHand, corner, trajectory
+
+DELAY = 2
+
+
+def played(twin: TwinInHand, demand: Trajectory, path: Float, offset_um: dict[str, Float] | None = None) -> float:
+    """Let the NC play a demand, offsets in time with it; return the contour error (RMS, um) to the path (n, 2)."""
+    table: list[list[float]] = []
+    senders = []
+    if offset_um:
+        settings = settings_of(twin.machine.config, "can0", Path(), "")
+        senders = [(axis.offset, offset_um[axis.name] * 1e-3 * axis.increments_per_mm) for axis in settings.axes]
+
+    def each_cycle() -> None:
+        row = twin.machine.nc.in_force
+        if row is None or not row.playing:
+            return
+        table.append([unit.drive.table_mm for unit in twin.machine.units.values()])
+        following = len(table) + DELAY  # the row whose target has just been sent
+        for pdo, increments in senders:
+            value = round(increments[following]) if following < increments.size else 0
+            twin.machine.receive("can0", (pdo.cob_id, pack(pdo.entries, [value])))
+
+    twin.each_cycle = each_cycle
+    twin.machine.nc.play("cut", demand)
+    twin.run_until("finished")
+    actual = np.array(table)[: len(path)]
+    return rms(contour_error_um(path, actual, PERIOD_S))
+
+
+@LED
+def test_a_corrected_cut_is_better(outfit: Outfit, tmp_path: Path) -> None:
+    config = dressed(outfit, tmp_path, "XY")
+    twin = started(config)
+    path = np.vstack([np.zeros((40, 2)), corner(), np.tile(corner()[-1:], (100, 1))])
+    demand = trajectory(path)
+    models = {axis: Parameters(**settings.nominal.model_dump()) for axis, settings in config.axis.items()}
+    planned = correction.plan(demand, models, config, "inverse")
+    before = played(twin, demand, path)
+    if outfit.on_line:
+        after = played(twin, demand, path, dict(planned.offset_um))
+    else:
+        moved = {axis: frozen(demand.position_mm[axis] + planned.offset_um[axis] * 1e-3) for axis in demand.axes}
+        after = played(twin, Trajectory(PERIOD_S, demand.time_s, moved, demand.rapid, demand.line), path)
+    assert before > 20
+    assert after < before / 10

@@ -1,0 +1,95 @@
+"""Scan, check and commissioning of drives of every make, over a bus."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import canopen
+import pytest
+
+from fdhil.commissioning.config_check import check_machine
+from fdhil.commissioning.finding import Finding
+from fdhil.commissioning.scan import read_descriptions, scan_bus
+from fdhil.commissioning.steps import commission
+from fdhil.config import MachineConfig
+from fdhil.errors import ConfigError, DriveFault
+from tests.dressed.wardrobe import OUTFITS, Outfit, dressed, set_up
+from tests.drivers.peer import DrivePeer
+from tests.eds import write_eds
+
+EVERY = pytest.mark.parametrize("outfit", OUTFITS, ids=lambda outfit: outfit.name)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorter waits than on a real machine; the simulated drive settles sooner."""
+    monkeypatch.setattr("fdhil.commissioning.survey.LISTEN_S", 0.15)
+    monkeypatch.setattr("fdhil.commissioning.scan.LISTEN_S", 0.15)
+    monkeypatch.setattr("fdhil.commissioning.config_check.LISTEN_S", 0.15)
+    monkeypatch.setattr("fdhil.drivers.can.sdo.QUIET_S", 0.1)
+    monkeypatch.setattr("fdhil.drivers.can.sdo.RESPONSE_TIMEOUT_S", 0.2)
+    monkeypatch.setattr("fdhil.commissioning.master.LOCKSTEP_WAIT_S", 1.0)
+    monkeypatch.setattr("fdhil.commissioning.steps.SETTLE_CYCLES", 120)
+    monkeypatch.setattr("fdhil.commissioning.steps.AVERAGE_CYCLES", 60)
+
+
+@contextmanager
+def on_a_bus(outfit: Outfit, folder: Path) -> Iterator[tuple[DrivePeer, MachineConfig]]:
+    """A drive of this make, set up over the bus by another maker's library."""
+    channel = uuid.uuid4().hex
+    config = dressed(outfit, folder, bus={"can0": {"interface": "virtual", "channel": channel}})
+    with DrivePeer(config) as peer:
+        network = canopen.Network()
+        network.connect(interface="virtual", channel=channel)
+        try:
+            node = network.add_node(config.node_id("X"), str(folder / f"{outfit.sheet}.eds"))
+
+            def write(index: int, sub: int, value: int, size: int) -> None:
+                node.sdo.download(index, sub, value.to_bytes(size, "little"))
+
+            set_up(config, "X", lambda index: index in node.object_dictionary, write)
+        finally:
+            network.disconnect()
+        yield peer, config
+
+
+def differing(config: MachineConfig) -> dict[str, Finding]:
+    return {finding.point: finding for _, finding in check_machine(config) if finding.ok is False}
+
+
+@EVERY
+def test_it_is_found_checked_and_commissioned(outfit: Outfit, tmp_path: Path) -> None:
+    with on_a_bus(outfit, tmp_path) as (peer, config):
+        descriptions, faults = read_descriptions([tmp_path / f"{outfit.sheet}.eds"])
+        assert not faults
+        (node,) = scan_bus("can0", config, descriptions).nodes
+        assert node.answers is not None
+        assert node.answers.identity.vendor_id == peer.drive.dictionary.number(0x1018, 1)
+        assert {k: v for k, v in differing(config).items() if k not in outfit.lacks} == {}
+        if outfit.on_line:
+            record = commission(config, "X")
+            assert record.watchdog == "proven"
+            assert record.sign_test_um == pytest.approx(10.0, abs=3.0)
+            return
+        with pytest.raises(DriveFault, match="corrected demand"):
+            commission(config, "X")
+
+
+def test_a_drive_as_it_comes_is_told_what_to_set_up(tmp_path: Path) -> None:
+    config = dressed(OUTFITS[0], tmp_path, bus={"can0": {"interface": "virtual", "channel": uuid.uuid4().hex}})
+    with DrivePeer(config):
+        found = differing(config)
+    assert {"RPDO1", "TPDO1", "TPDO2"} <= found.keys()
+    assert "0x1A01" in found["TPDO2"].advice
+
+
+def test_a_drive_that_tells_no_current_is_refused(tmp_path: Path) -> None:
+    from fdhil.drivers.cia402.profile_file import load_profile
+
+    config = dressed(Outfit("cia402", "plain"), tmp_path)
+    assert write_eds("plain", tmp_path).is_file()
+    with pytest.raises(ConfigError, match="current"):
+        load_profile(config.axis["X"].drive)

@@ -1,0 +1,35 @@
+"""The EDS that the simulated drive writes, of itself and of what it wears, as another CANopen stack reads it."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fdhil.sim.drive.dictionary import SIGNED
+from fdhil.sim.drive.eds import write_eds
+from tests.eds import SHEETS
+from tests.eds import write_eds as write_sheet
+from tests.foreign.peers import FOLDER, NODE
+from tests.sim.rig import Rig, machine
+
+pytestmark = pytest.mark.debian
+
+
+@pytest.mark.parametrize("sheet", [None, *SHEETS])
+def test_it_is_read_as_it_is_meant(sheet: str | None, tmp_path: Path) -> None:
+    worn: dict[str, Any] = {} if sheet is None else {"eds": str(write_sheet(sheet, tmp_path))}
+    drive = Rig(machine(**worn)).drive
+    path = write_eds(drive, tmp_path / "drive.eds")
+    command = [NODE, str(FOLDER / "read_eds.js"), json.dumps({"file": str(path)})]
+    read = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    assert int(read["vendor"], 16) == drive.dress.vendor
+    for entry in drive.dictionary.entries.values():
+        found = read["objects"][f"{entry.index}:{entry.sub}"]
+        assert found["type"] == entry.type
+        assert found["access"] == entry.access
+        if entry.type in SIGNED and not entry.node_relative:
+            assert found["value"] == entry.default, f"{entry.index:04X}:{entry.sub:02X}"

@@ -1,0 +1,385 @@
+"""The services around the drive, with the `canopen` library as the foreign master: LSS, guarding, blocks, RTR, boot."""
+
+from __future__ import annotations
+
+import binascii
+import socket
+import struct
+from typing import Any
+
+import can
+import canopen
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from fdhil.sim.drive.dictionary import AbortCode, DataType, Dictionary, var
+from fdhil.sim.drive.sdo import SdoServer
+from fdhil.sim.wire.attach import SocketCan
+from tests.sim.canopen_peer import direct, over_virtual_bus
+from tests.sim.rig import Abort, Rig, emergencies, machine
+from tests.sim.test_sdo import abort_code, head
+
+IDENTITY = (0x46444849, 0x0402, 0x00010000, 1001)
+
+
+# -- block download
+
+
+@settings(deadline=None, max_examples=25)
+@given(st.binary(min_size=1, max_size=3000), st.booleans())
+def test_block_download_by_the_library(content: bytes, crc: bool) -> None:
+    rig = Rig()
+    node, _ = direct(rig.drive)
+    size = len(content)
+    with node.sdo.open(0x2122, 0, "wb", size=size, block_transfer=True, request_crc_support=crc) as stream:
+        stream.write(content)
+    assert rig.drive.dictionary.texts[0x212200] == content
+    assert node.sdo.upload(0x2122, 0) == content
+
+
+def test_a_number_comes_in_blocks_and_is_checked() -> None:
+    node, _ = direct(Rig().drive)
+    with node.sdo.open(0x6083, 0, "wb", size=4, block_transfer=True) as stream:
+        stream.write((4711).to_bytes(4, "little"))
+    assert node.sdo[0x6083].raw == 4711
+    with pytest.raises(canopen.SdoAbortedError) as abort, node.sdo.open(0x6041, 0, "wb", size=2, block_transfer=True):
+        pass
+    assert abort.value.code == 0x06010002
+
+
+def server() -> SdoServer:
+    return SdoServer(Dictionary((var(0x2000, "Text", DataType.DOMAIN, "rw", b""),)))
+
+
+def send_block(sdo: SdoServer, content: bytes, skip: int = 0) -> list[bytes]:
+    """Send one block, the segment number ``skip`` lost; return what was answered."""
+    parts = [content[n : n + 7].ljust(7, b"\0") for n in range(0, len(content), 7)]
+    answers: list[bytes] = []
+    for number, part in enumerate(parts, 1):
+        if number != skip:
+            answers += sdo.request(bytes([number | (number == len(parts)) << 7]) + part)
+    return answers
+
+
+def test_a_lost_segment_of_a_download_is_asked_for_again() -> None:
+    content, sdo = bytes(range(70)), server()
+    (first,) = sdo.request(head(0xC6, 0x2000) + (70).to_bytes(4, "little"))
+    assert first == head(0xA4, 0x2000) + bytes([127, 0, 0, 0])
+    assert send_block(sdo, content, skip=4) == [bytes([0xA2, 3, 127]) + bytes(5)]
+    assert send_block(sdo, content[21:]) == [bytes([0xA2, 7, 127]) + bytes(5)]
+    crc = binascii.crc_hqx(content, 0).to_bytes(2, "little")
+    assert sdo.request(b"\xc1" + crc + bytes(5)) == [b"\xa1" + bytes(7)]
+    assert sdo.request(head(0x40, 0x2000) + bytes(4))[0][4:] == (70).to_bytes(4, "little")
+
+
+@pytest.mark.parametrize(
+    ("end", "code"),
+    [
+        (b"\xc1\0\0" + bytes(5), AbortCode.CRC),
+        (b"\xc5\0\0" + bytes(5), AbortCode.LENGTH),
+        (b"\x80" + bytes(7), None),
+    ],
+)
+def test_a_download_that_ends_wrongly_writes_nothing(end: bytes, code: AbortCode | None) -> None:
+    sdo = server()
+    sdo.request(head(0xC6, 0x2000) + (14).to_bytes(4, "little"))
+    assert len(send_block(sdo, bytes(range(14)))) == 1
+    answers = sdo.request(end)
+    assert answers == [] if code is None else abort_code(answers) == code
+    assert sdo.request(head(0x40, 0x2000) + bytes(4))[0][4:] == bytes(4)
+
+
+def test_a_client_that_has_gone_within_a_block_blocks_nobody() -> None:
+    rig = Rig()
+    rig.drive.wall_clock(1.0)
+    rig.sdo(head(0xC2, 0x2122) + (700).to_bytes(4, "little"))
+    rig.drive.wall_clock(1.9)
+    assert rig.send(0x601, bytes([0x40, 0, 0x10, 0]) + bytes(4)) == []
+    rig.drive.wall_clock(3.0)
+    assert rig.read(0x1000) == 0x00020192
+
+
+def test_a_download_that_is_too_long_or_out_of_order_is_given_up() -> None:
+    sdo = server()
+    assert abort_code(sdo.request(head(0xC2, 0x2000) + (1 << 20).to_bytes(4, "little"))) == AbortCode.LENGTH
+    sdo.request(head(0xC2, 0x2000) + (7).to_bytes(4, "little"))
+    sdo.request(b"\x01" + bytes(7))
+    assert abort_code(sdo.request(b"\x02" + bytes(7))) == AbortCode.LENGTH
+    sdo.request(head(0xC2, 0x2000) + (7).to_bytes(4, "little"))
+    assert abort_code(sdo.request(b"\x00" + bytes(7))) == AbortCode.SEQUENCE
+    assert abort_code(sdo.request(b"\xc1" + bytes(7))) == AbortCode.COMMAND
+
+
+@settings(deadline=None, max_examples=100)
+@given(st.binary(max_size=1200), st.lists(st.integers(1, 127), max_size=4))
+def test_a_download_with_losses_arrives_whole(content: bytes, lost: list[int]) -> None:
+    sdo, place = server(), 0
+    sdo.request(head(0xC0, 0x2000) + bytes(4))
+    while place < len(content):
+        skip = lost.pop() if lost else 0
+        answers = send_block_of(sdo, content, place, skip)
+        if not answers:
+            return  # the last segment was lost: the client's time-out ends it
+        place += 7 * answers[0][1]
+    if content:
+        sdo.request(bytes([0xC1 | (-len(content) % 7) << 2]) + bytes(7))
+        assert read_all(sdo) == content
+
+
+def send_block_of(sdo: SdoServer, content: bytes, place: int, skip: int) -> list[bytes]:
+    answers: list[bytes] = []
+    for number in range(1, 128):
+        start = place + 7 * (number - 1)
+        last = start + 7 >= len(content)
+        if number != skip:
+            answers += sdo.request(bytes([number | last << 7]) + content[start : start + 7].ljust(7, b"\0"))
+        if last:
+            break
+    return answers
+
+
+def read_all(sdo: SdoServer) -> bytes:
+    (first,) = sdo.request(head(0x40, 0x2000) + bytes(4))
+    if first[0] & 2:
+        return first[4 : 8 - (first[0] >> 2 & 3)]
+    data, toggle = b"", 0
+    while len(data) < int.from_bytes(first[4:], "little"):
+        (answer,) = sdo.request(bytes([0x60 | toggle << 4]) + bytes(7))
+        data, toggle = data + answer[1 : 8 - (answer[0] >> 1 & 7)], toggle ^ 1
+    return data
+
+
+# -- LSS
+
+
+class LssBus(can.BusABC):
+    """A bus without a wire between the library's LSS master and some drives."""
+
+    def __init__(self, *rigs: Rig) -> None:
+        super().__init__("lss")
+        self._is_shutdown = True
+        self.network = canopen.Network(bus=self)
+        self._rigs = rigs
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        for rig in self._rigs:
+            for can_id, data in rig.send(msg.arbitration_id, bytes(msg.data)):
+                self.network.notify(can_id, bytearray(data), 0.0)
+
+
+@pytest.fixture
+def lss(monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Rig, Rig]:
+    monkeypatch.setattr("canopen.lss.time.sleep", lambda _: None)  # nobody here needs a pause
+    first, second = Rig(machine("XY"), "X"), Rig(machine("XY"), "Y")
+    master: Any = LssBus(first, second).network.lss
+    master.RESPONSE_TIMEOUT = 0.001
+    return master, first, second
+
+
+def test_a_node_gets_its_id_by_its_identity(lss: tuple[Any, Rig, Rig]) -> None:
+    master, first, second = lss
+    assert master.send_switch_state_selective(*IDENTITY) is True
+    assert master.inquire_node_id() == 1
+    assert [master.inquire_lss_address(0x5A + n) for n in range(4)] == list(IDENTITY)
+    master.configure_node_id(17)
+    master.configure_bit_timing(0)
+    master.store_configuration()
+    master.send_switch_state_global(master.WAITING_STATE)
+    assert (first.drive.node_id, second.drive.node_id) == (1, 2)
+    assert first.send(0, b"\x82\x01") == [(0x711, b"\0")]
+    first.node = 17
+    assert first.read(0x1400, 1) == 0x211
+    assert first.read(0x1014) == 0x91
+    assert first.drive.wall_clock(1.0) == [(0x711, b"\x7f")]
+    first.drive.power_off()
+    assert first.drive.power_on() == [(0x711, b"\0")]
+    with pytest.raises(canopen.lss.LssError):
+        master.inquire_node_id()  # all of them wait
+
+
+def test_an_id_that_is_none_is_refused(lss: tuple[Any, Rig, Rig]) -> None:
+    master, _, _ = lss
+    master.send_switch_state_selective(*IDENTITY)
+    with pytest.raises(canopen.lss.LssError, match="Error"):
+        master.configure_node_id(200)
+    with pytest.raises(canopen.lss.LssError, match="Error"):
+        master.configure_bit_timing(5)
+
+
+def test_unconfigured_nodes_are_found_by_fastscan(lss: tuple[Any, Rig, Rig]) -> None:
+    master, first, second = lss
+    for rig, serial in ((first, 1001), (second, 1002)):
+        assert master.send_switch_state_selective(*IDENTITY[:3], serial) is True
+        master.configure_node_id(255)
+        master.send_switch_state_global(master.WAITING_STATE)
+        assert rig.nmt(0x81) == []  # it waits for an ID and says nothing
+        assert rig.drive.wall_clock(1.0) == []
+        assert rig.send(0x601, bytes([0x40, 0, 0x10, 0]) + bytes(4)) == []
+    master.send_identify_non_configured_remote_slave()
+    for node_id, expected in ((30, IDENTITY), (31, (*IDENTITY[:3], 1002))):
+        found, identity = master.fast_scan()
+        assert found
+        assert tuple(identity) == expected
+        master.configure_node_id(node_id)
+        master.send_switch_state_global(master.WAITING_STATE)
+        rig = first if expected == IDENTITY else second
+        assert rig.drive.power_on() == [(0x700 + node_id, b"\0")]
+    assert master.fast_scan() == (False, None)
+    assert first.send(0x7E5, bytes([0x46, *IDENTITY[0].to_bytes(4, "little"), 0, 0, 0])) == []
+
+
+def test_the_rest_of_lss() -> None:
+    rig = Rig()
+
+    def ask(*data: int) -> list[bytes]:
+        return [answer for can_id, answer in rig.send(0x7E5, bytes(data).ljust(8, b"\0")) if can_id == 0x7E4]
+
+    for place, number in enumerate((*IDENTITY[:2], 0x10000, 0x10000, 1000, 1002)):
+        answers = ask(0x46 + place, *number.to_bytes(4, "little"))
+    assert answers == [b"\x4f" + bytes(7)]
+    assert ask(0x11, 5) == []  # it waits
+    assert rig.send(0x7E5, b"\x04\x01") == []  # too short
+    rig.nmt(0x01)
+    assert ask(0x04, 1) == ask(0x5E) == []  # not in operational
+
+
+# -- node guarding
+
+
+def test_guarding_toggles_and_its_end_is_a_lost_connection() -> None:
+    rig = Rig()
+    rig.write(0x1017, 0, 0, 2)
+    rig.write(0x100C, 0, 100, 2)
+    rig.write(0x100D, 0, 2, 1)
+    rig.enable()
+    rig.drive.wall_clock(1.0)
+    assert rig.drive.wall_clock(1.5) == []  # it begins with the first request
+    assert rig.send(0x701, b"") == [(0x701, b"\x05")]
+    assert rig.send(0x701, b"") == [(0x701, b"\x85")]
+    assert rig.drive.wall_clock(1.7) == []
+    frames = rig.drive.wall_clock(1.71)
+    assert emergencies(frames) == [0x8130]
+    assert rig.status & 0x4F == 0x0F
+    rig.nmt(0x02)
+    assert rig.send(0x701, b"") == [(0x701, b"\x04")]  # the one answer in NMT stopped
+    rig.nmt(0x81)
+    assert rig.send(0x701, b"") == [(0x701, b"\x7f")]
+
+
+def test_the_library_guards_over_a_bus() -> None:
+    rig = Rig()
+    with over_virtual_bus(rig.drive) as node:
+        node.nmt.start_node_guarding(0.01)
+        assert node.nmt.wait_for_heartbeat(5) == "PRE-OPERATIONAL"
+        node.nmt.stop_node_guarding()
+
+
+# -- remote frames, NMT stopped, storage, boot
+
+
+def test_a_tpdo_answers_a_remote_frame_where_bit_30_lets_it() -> None:
+    rig = Rig()
+    rig.write(0x1801, 1, 0xC0000281, 4)
+    rig.write(0x1801, 1, 0x00000281, 4)
+    assert rig.send(0x281, b"") == []  # not yet operational
+    rig.nmt(0x01)
+    rig.sync()
+    assert rig.send(0x181, b"") == []
+    ((can_id, data),) = rig.send(0x281, b"")
+    assert (can_id, len(data)) == (0x281, 6)
+
+
+def test_remote_frames_of_the_kernel_come_as_frames_without_data() -> None:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with ours, theirs:
+        ours.setblocking(False)
+        attached = SocketCan.__new__(SocketCan)
+        attached._socket = ours
+        for can_id, length in ((0x701 | 1 << 30, 1), (0x123 | 1 << 29, 8), (0x601, 2)):
+            theirs.send(struct.pack("=IB3x8s", can_id, length, b"\x05\x06" + bytes(6)))
+        heard: list[tuple[int, bytes]] = []
+        attached.pump([ours], heard.append)
+        assert heard == [(0x701, b""), (0x601, b"\x05\x06")]  # the second was an error frame
+
+
+def test_nothing_but_heartbeats_leaves_in_nmt_stopped() -> None:
+    rig = Rig()
+    rig.write(0x1802, 2, 255, 1)
+    rig.write(0x6065, 0, 10, 4)
+    rig.enable(mode=1)
+    rig.nmt(0x02)
+    rig.drive.trip(0x3210)
+    sent = [frame for n in range(100) for frame in (*rig.sync(), *rig.drive.wall_clock(1 + n * 0.01))]
+    sent += rig.send(0x601, bytes([0x40, 0, 0x10, 0]) + bytes(4)) + rig.send(0x201, bytes(6)) + rig.send(0x181, b"")
+    assert {can_id for can_id, _ in sent} == {0x701}
+    rig.nmt(0x80)
+    assert rig.read(0x1003) == 1
+    assert emergencies(rig.sync()) == []  # it is in the history, and not told late
+
+
+def test_the_emergencies_keep_their_inhibit_time() -> None:
+    rig = Rig()
+    rig.write(0x1015, 0, 1000, 2)  # 100 ms
+    rig.drive.wall_clock(1.0)
+    for code in (0x2310, 0x3210, 0x4310):
+        rig.drive.trip(code)
+    told = {}
+    for n in range(100):
+        now = 1.0 + n * 0.005
+        told.update(dict.fromkeys(emergencies(rig.drive.wall_clock(now)), round(now, 3)))
+    assert told == {0x2310: 1.0, 0x3210: pytest.approx(1.1, abs=0.006), 0x4310: pytest.approx(1.2, abs=0.006)}
+
+
+@pytest.mark.parametrize(("behaviour", "state"), [(0, 0x7F), (1, 0x05), (2, 0x04)])
+def test_a_lost_heartbeat_changes_the_nmt_state_by_1029(behaviour: int, state: int) -> None:
+    rig = Rig()
+    rig.write(0x1029, 1, behaviour, 1)
+    rig.write(0x1016, 1, 100 << 16 | 60, 4)
+    rig.nmt(0x01)
+    rig.drive.wall_clock(1.0)
+    rig.send(0x764, b"\x05")
+    assert emergencies(rig.drive.wall_clock(1.1)) == [0x8130]
+    assert rig.drive.nmt == state
+
+
+def test_parameters_are_not_stored_while_current_flows() -> None:
+    rig = Rig()
+    rig.enable()
+    for index, word in ((0x1010, 0x65766173), (0x1011, 0x64616F6C)):
+        with pytest.raises(Abort) as abort:
+            rig.write(index, 1, word, 4)
+        assert abort.value.code == 0x08000022
+    rig.cycle(0, word=0x06)
+    for _ in range(10):
+        rig.cycle(0, word=0x06)
+    rig.write(0x1010, 1, 0x65766173, 4)
+
+
+def test_the_boot_up_comes_after_its_time_and_until_then_nothing() -> None:
+    rig = Rig(machine(boot_s=0.5))
+    assert rig.boot == [(0x701, b"\0")]  # it was switched on before anybody listened
+    rig.drive.wall_clock(1.0)
+    assert rig.nmt(0x81) == []
+    assert rig.send(0x601, bytes([0x40, 0, 0x10, 0]) + bytes(4)) == [] == rig.sync() == rig.nmt(0x01)
+    assert rig.drive.wall_clock(1.4999) == []
+    assert rig.drive.wall_clock(1.5) == [(0x701, b"\0"), (0x701, b"\x7f")]
+    assert rig.read(0x1000) == 0x00020192
+    rig.drive.power_off()
+    assert rig.drive.power_on() == []
+    assert rig.drive.wall_clock(2.0)[0] == (0x701, b"\0")
+
+
+def test_objects_that_drives_have() -> None:
+    rig = Rig()
+    for index in (
+        0x1006, 0x100C, 0x100D, 0x1012, 0x1013, 0x1014, 0x1015, 0x605D, 0x6067, 0x6068, 0x606D, 0x606E, 0x606F, 0x6070,
+        0x6072, 0x6073, 0x6074, 0x607C, 0x607E, 0x607F, 0x6080, 0x6086, 0x6087, 0x6098, 0x609A, 0x60C5, 0x60C6, 0x60FF,
+        0x6402, 0x67FF,
+    ):  # fmt: skip
+        rig.read(index)
+    for index in (0x1029, 0x6099, 0x60FE):
+        assert rig.read(index) >= 1
+    assert rig.read(0x6502) == 0x3AD
+    rig.drive.wall_clock(2.5)
+    assert rig.read(0x1013) == 2_500_000
