@@ -120,8 +120,8 @@ def _parted(p: Parameters, direction: int, current_a: float, share: float) -> tu
     """Return a drive that moves the same way in ``direction`` with a load, and the current that it holds at rest.
 
     With the friction Cd + D and a load D that helps the move it goes as with Cd. D is ``share`` of Cd, at least what
-    holds the shaft under the current; None where that is no share of this sign. Where no load holds it, it has friction at rest
-    that the model lacks, and the current is what the model holds.
+    holds the shaft under the current; None where that is no share of this sign. Where no load holds it, it has friction
+    at rest that the model lacks, and the current is what the model holds.
     """
     helping = share * p.Cd
     held, rests = direction * (p.K * current_a - p.term("load")), max(p.term("stribeck"), 0.0)
