@@ -66,6 +66,15 @@ def sharpened(result: Fit) -> Fit:
     return result
 
 
+def untold(motions: Sequence[Motion]) -> bool:
+    """Return whether friction at low speed has joined at a speed that rows do not tell."""
+    k = place(motions)
+    if k is None:
+        return False
+    low, high = _told(motions)
+    return not low < motions[0].courses[k].speed_rad_s < high
+
+
 def _told(motions: Sequence[Motion]) -> tuple[float, float]:
     """Return the least and the largest speed that rows tell: below it none moves so slowly, and any amplitude fits."""
     top = max(float(np.abs(m.speed).max()) for m in motions)

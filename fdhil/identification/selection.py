@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from fdhil.identification import friction_speed
 from fdhil.identification.covariance import SUMMED_LAGS
 from fdhil.identification.fit import Fit, fit
-from fdhil.identification.friction_speed import sharpened
 from fdhil.identification.kalman import DELAY, LOAD
 from fdhil.identification.motion import Course, Motion
 from fdhil.identification.normal import inverse_of
@@ -52,6 +52,8 @@ def joined(base: Fit, command: bool, told: Callable[[Fit], Estimate]) -> Fit:
             wider = _with(result, chosen)
             untold = set(told(base).missing) if untold is None else untold
             weak = _weak(told(wider), chosen, untold) if wider.converged else {chosen[-1].family}
+            if friction_speed.untold(wider.problem.motions):
+                weak |= {"stribeck"} & {c.family for c in chosen}
             if not weak:
                 break
             left = [c for c in left if c.family not in weak]
@@ -95,7 +97,7 @@ def _with(base: Fit, chosen: Sequence[Candidate]) -> Fit:
     added = sum(len(candidate.courses[0]) for candidate in chosen)
     start = np.append(base.theta, np.zeros(added))
     free = (*base.free, *range(base.theta.size, base.theta.size + added))
-    return sharpened(replace(fit(motions, start, free), delay_doubt_s=base.delay_doubt_s))
+    return friction_speed.sharpened(replace(fit(motions, start, free), delay_doubt_s=base.delay_doubt_s))
 
 
 def _chosen(base: Fit, left: Sequence[Candidate]) -> list[Candidate]:
