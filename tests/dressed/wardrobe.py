@@ -19,6 +19,7 @@ from tests.sim.bench_twin import TwinInHand
 from tests.sim.rig import NO_NOISE, Rig
 
 INVALID = 1 << 31
+MILLIRPM = 0xFDB44700  # as 0x60A9 has it
 Write = Callable[[int, int, int, int], None]
 """Index, sub-index, value, bytes."""
 
@@ -43,7 +44,7 @@ class Outfit:
 
 NO_CSP, NO_VOLTAGE = ("mode",), ("voltage",)
 OUTFITS = (
-    Outfit("epos4", "epos4", on_line=True, drive={"dc_link_v": 300.0}),
+    Outfit("epos4", "epos4", on_line=True, drive={"dc_link_v": 300.0, "speed_unit": "millirpm"}),
     Outfit("epos2", "epos2", narrow=True, lacks=(*NO_CSP, *NO_VOLTAGE)),
     Outfit("nanotec", "nanotec", on_line=True, lacks=NO_VOLTAGE),
     Outfit("elmo", "elmo", on_line=True, lacks=NO_VOLTAGE),
@@ -92,6 +93,8 @@ def set_up(config: MachineConfig, axis: str, has: Callable[[int], bool], write: 
             spec = next((spec for spec in specs if spec.number == number), None)
             if has(base + number - 1):
                 _map(base + number - 1, spec, node_id, write)
+    if config.axis[axis].drive.speed_unit == "millirpm":
+        write(0x60A9, 0, MILLIRPM, 4)
     for index, value, size in ((0x1017, 100, 2), (0x6007, 1, 2), (0x605A, 2, 2), (0x605E, 2, 2)):
         if has(index):
             write(index, 0, value, size)
