@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 
-from fdhil.cia402 import Object, State
+from fdhil.cia402 import NmtCommand, Object, State
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.survey import require_enabled
 from fdhil.drivers.can.sdo import NO_OBJECT, NO_SUB_INDEX
@@ -15,6 +15,7 @@ FEEDING_TRIES = 4
 FEEDING_S = 0.3
 STARVE_TIMEOUT_S = 1.0
 HEARTBEATS_MISSED = 3
+ANSWER_CYCLES = 20
 EMCY_HEARTBEAT = 0x8130
 
 
@@ -34,8 +35,11 @@ def watchdog_test(master: Master, enable: Callable[[Master], None]) -> str:
         told = len(master.heard.emergencies)
         master.heartbeat = False
         with contextlib.suppress(DeviceError):
-            master.wait(lambda: master.state() is not State.OPERATION_ENABLED, STARVE_TIMEOUT_S, "")
+            master.wait(lambda: _reacted(master, told), STARVE_TIMEOUT_S, "")
         master.check()
+        if master.state() is State.OPERATION_ENABLED:  # by 0x1029 it may have left Operational, and tell nothing
+            master.nmt(NmtCommand.START)
+            master.wait_cycles(ANSWER_CYCLES)
         if master.state() is State.OPERATION_ENABLED:
             text = "it went on although our heartbeat stopped: its watchdog does not work; check 0x1016 and 0x6007"
             raise DriveFault(master.device, text)
@@ -45,6 +49,10 @@ def watchdog_test(master: Master, enable: Callable[[Master], None]) -> str:
             text = f"it stopped with the EMCY {shown} instead of 8130; find out what else stops it"
             raise DriveFault(master.device, text)
     return "proven"
+
+
+def _reacted(master: Master, told: int) -> bool:
+    return master.state() is not State.OPERATION_ENABLED or len(master.heard.emergencies) > told
 
 
 def _feed(master: Master, sub: int, entry: int, enable: Callable[[Master], None]) -> None:

@@ -94,6 +94,8 @@ class AxisUnit:
 
     def turn_tpdo(self, number: int) -> None:
         """Let a TPDO carry its objects in the other order, as after another tool's visit; twice puts it right again."""
+        if number not in self.drive.pdo.numbers("tpdo"):
+            return
         index = 0x1A00 + number - 1
         count = self.drive.dictionary.number(index, 0)
         words = [self.drive.dictionary.number(index, sub) for sub in range(count, 0, -1)]

@@ -69,3 +69,29 @@ def test_frames_of_a_tpdo_that_comes_are_lost_as_ever() -> None:
     rows = [(t, i, d) for t, i, d in LATE.rows() if not (i == TPDO1 and (t - LATE.start_ns) // 1_000_000 in gone)]
     decoder, notices, _ = decoded(rows)
     assert (decoder.counters()["pdo_lost"], notices) == (200, [])
+
+
+def test_a_tpdo_that_is_sent_on_change_alone_is_told_and_not_lost() -> None:
+    """What most drives come with: transmission type 255."""
+    seldom = {LATE.time_ns(k, 0.1) for k in range(0, LATE.n, 37)}
+    rows = [(t, i, d) for t, i, d in LATE.rows() if i != TPDO1 or t in seldom]
+    decoder = BusDecoder("can0", machine())
+    told = [
+        each.text
+        for start in range(0, len(rows), 200)
+        for each in decoder.feed(frames_of(rows[start : start + 200]), rows[start][0])
+        if isinstance(each, Notice)
+    ]
+    assert told == [
+        "Drive X sends TPDO1 (181) with few of the SYNCs, and its samples have holes; "
+        "set the transmission type (0x1800:02) to 1, or see whether it still is Operational."
+    ]
+    assert decoder.counters()["pdo_lost"] < 1000
+
+
+def test_a_drive_that_stops_does_not_count_for_ever() -> None:
+    rows = [(t, i, d) for t, i, d in LATE.rows() if t < LATE.time_ns(3000, 0) or i not in (TPDO1, TPDO2)]
+    decoder = BusDecoder("can0", machine())
+    for start in range(0, len(rows), 200):
+        decoder.feed(frames_of(rows[start : start + 200]), rows[start][0])
+    assert decoder.counters()["pdo_lost"] < 5000

@@ -29,7 +29,7 @@ function cycle() {
 }
 
 async function main() {
-    await join(settings, device);
+    await join(settings.bus, device);
     device.start();
     const read = (index, dataType, blockTransfer = false) =>
         device.sdo.upload({ deviceId: drive, index, dataType, blockTransfer, timeout: 5000 });

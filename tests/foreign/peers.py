@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -15,11 +16,14 @@ NODE = shutil.which("node") or "node"
 
 
 class ForeignProcess:
-    """A peer that joins the hub of ``settings``; it tells events as JSON lines and ends when its input does."""
+    """A peer that joins ``bus`` as ``can.Bus`` would (those in JavaScript: a hub); it tells events as JSON lines.
 
-    def __init__(self, script: str, bus: dict[str, Any], **settings: Any) -> None:
+    It ends when its input does.
+    """
+
+    def __init__(self, script: str, bus: Mapping[str, Any], **settings: Any) -> None:
         program = [NODE] if script.endswith(".js") else [sys.executable]
-        text = json.dumps({**bus, **settings})
+        text = json.dumps({**settings, "bus": dict(bus)})
         command, pipe = [*program, str(FOLDER / script), text], subprocess.PIPE
         self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe)
 

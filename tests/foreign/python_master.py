@@ -26,7 +26,7 @@ def main() -> None:
     settings = json.loads(sys.argv[1])
     node, period_s = settings["node"], settings["period_ms"] / 1e3
     network: Any = canopen.Network()
-    network.connect(interface="socketcand", channel=settings["channel"], host=settings["host"], port=settings["port"])
+    network.connect(**settings["bus"])
     dictionary: Any = canopen.ObjectDictionary
     drive: Any = canopen.RemoteNode(node, dictionary())
     network.add_node(drive)

@@ -63,7 +63,7 @@ def main() -> None:
     """Serve until standard input ends."""
     settings = json.loads(sys.argv[1])
     network: Any = canopen.Network()
-    network.connect(interface="socketcand", channel=settings["channel"], host=settings["host"], port=settings["port"])
+    network.connect(**settings["bus"])
     node: Any = canopen.LocalNode(settings["node"], dictionary(settings))
     network.add_node(node)
     node.tpdo.read()

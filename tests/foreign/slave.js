@@ -25,7 +25,7 @@ for (const { cobId, kind, objects } of settings.tpdos)
         cobId: cobId + nodeId, transmissionType: kind, dataObjects: objects.map((index) => eds.getEntry(index)),
     });
 
-join(settings, device).then(() => {
+join(settings.bus, device).then(() => {
     device.start();
     tell('ready');
 });

@@ -33,7 +33,7 @@ def twin(tmp_path: Path) -> Iterator[tuple[TwinProcess, Path]]:
 def master(make: str, twin: TwinProcess) -> ForeignProcess:
     """SYNC with a counter that goes up to 10, where the make counts at all."""
     settings = {"node": twin.ready["drives"]["X"]["node_id"], "own_node": 100, "period_ms": PERIOD_MS, "overflow": 10}
-    return ForeignProcess(make, {key: twin.bus_settings[key] for key in ("host", "port", "channel")}, **settings)
+    return ForeignProcess(make, twin.bus_settings, **settings)
 
 
 @pytest.mark.parametrize("make", MAKES)

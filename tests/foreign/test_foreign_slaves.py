@@ -66,15 +66,39 @@ def hub() -> Iterator[Hub]:
 @pytest.fixture
 def machine(hub: Hub, tmp_path: Path) -> Path:
     """The configuration of a machine whose only drive is the foreign one."""
-    (tmp_path / "foreign.eds").write_text(EDS)
-    bus = f'interface = "socketcand"\nport = {hub.port}'
-    path = write_config(tmp_path, bus=bus, axes="X")
+    return configuration(tmp_path, f'interface = "socketcand"\nport = {hub.port}')
+
+
+def configuration(folder: Path, bus: str) -> Path:
+    (folder / "foreign.eds").write_text(EDS)
+    path = write_config(folder, bus=bus, axes="X")
     path.write_text(path.read_text() + f"[axis.X.drive]\nnode_id = {NODE}\n")
     return path
 
 
 def slave(make: str, hub: Hub, settings: dict[str, Any]) -> ForeignProcess:
-    return ForeignProcess(make, {"host": hub.host, "port": hub.port, "channel": "can0"}, **settings)
+    return ForeignProcess(make, hub.settings, **settings)
+
+
+def assert_compared(machine: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It is found, each point of it is compared or told as not there, and a commissioning is refused."""
+    code, out, err = fdhil("scan", machine, "--json", capsys=capsys)
+    assert (code, err) == (0, "")
+    (node,) = json.loads(out)["buses"][0]["nodes"]
+    said = node["answers"]
+    assert (node["node_id"], node["axis"], said["name"]) == (NODE, "X", "foreign drive")
+    assert said["identity"] == {"vendor_id": 0x1234, "product_code": 7, "revision": 1, "serial": 99}
+    assert said["eds"] == {"file": "foreign.eds", "fit": "any product"}
+    code, out, err = fdhil("check", machine, "--json", capsys=capsys)
+    assert (code, err) == (1, "")
+    points = {point["point"]: point for point in json.loads(out)["points"]}
+    assert {points[name]["state"] for name in ("device", "TPDO1")} == {"ok"}
+    assert points["TPDO2"]["state"] == "differs"
+    for name in ("mode", "cycle", "communication lost", "stop by a ramp", "following error"):
+        assert points[name]["state"] == "not compared"
+    code, _, err = fdhil("commission", machine, "--yes", capsys=capsys)
+    assert code == 1
+    assert err.startswith("refused: drive X: RPDO1 maps nothing where the profile has")
 
 
 @pytest.mark.parametrize("make", MAKES)
@@ -83,23 +107,7 @@ def test_a_foreign_drive_is_found_compared_and_refused(
 ) -> None:
     with slave(make, hub, DRIVE) as peer:
         peer.event("ready")
-        code, out, err = fdhil("scan", machine, "--json", capsys=capsys)
-        assert (code, err) == (0, "")
-        (node,) = json.loads(out)["buses"][0]["nodes"]
-        said = node["answers"]
-        assert (node["node_id"], node["axis"], said["name"]) == (NODE, "X", "foreign drive")
-        assert said["identity"] == {"vendor_id": 0x1234, "product_code": 7, "revision": 1, "serial": 99}
-        assert said["eds"] == {"file": "foreign.eds", "fit": "any product"}
-        code, out, err = fdhil("check", machine, "--json", capsys=capsys)
-        assert (code, err) == (1, "")
-        points = {point["point"]: point for point in json.loads(out)["points"]}
-        assert {points[name]["state"] for name in ("device", "TPDO1")} == {"ok"}
-        assert points["TPDO2"]["state"] == "differs"
-        for name in ("mode", "cycle", "communication lost", "stop by a ramp", "following error"):
-            assert points[name]["state"] == "not compared"
-        code, _, err = fdhil("commission", machine, "--yes", capsys=capsys)
-        assert code == 1
-        assert err.startswith("refused: drive X: RPDO1 maps nothing where the profile has")
+        assert_compared(machine, capsys)
 
 
 @pytest.mark.parametrize("make", MAKES)
@@ -144,6 +152,16 @@ def test_a_foreign_drive_without_the_profiles_tpdos_is_told_and_loses_nothing(
     assert "never sent TPDO3 (385), TPDO4 (485) though SYNC runs" in told["PdoMissing"]
     assert source.decoder.counters()["pdo_lost"] == 0
     assert sum(record.tick.size for record in out if isinstance(record, AxisSamples)) == 0
+
+
+@pytest.mark.socketcan
+def test_a_foreign_drive_is_found_and_compared_on_the_kernels_own_bus(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    machine = configuration(tmp_path, 'interface = "socketcan"\nchannel = "vcan0"')
+    with ForeignProcess("python_slave.py", {"interface": "socketcan", "channel": "vcan0"}, **DRIVE) as peer:
+        peer.event("ready")
+        assert_compared(machine, capsys)
 
 
 @pytest.mark.debian

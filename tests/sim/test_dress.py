@@ -10,6 +10,8 @@ from typing import Any
 
 import canopen
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from fdhil import config
 from fdhil.errors import EdsError
@@ -126,6 +128,49 @@ def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
         read_sheet(tmp_path / "none.eds", 1)
 
 
+LINES = st.sampled_from([line for sheet in SHEETS for line in eds_text(sheet).splitlines() if line])
+ODD = st.sampled_from(
+    [
+        "DataType=0x0009",
+        "DataType=0x0008",
+        "DefaultValue=",
+        "DefaultValue=0xFFFFFFFFFF",
+        "SubNumber=300",
+        "ObjectType=2",
+        "AccessType=",
+        "LowLimit=5",
+        "CompactSubObj=9",
+        "[1018]",
+        "[6040]",
+        "[1A00sub1]",
+        "[1A00sub0]",
+        "[6064]",
+        "[60C2]",
+        "[1016sub1]",
+        "[6502]",
+        "[60A9]",
+    ]
+)
+
+
+@settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(LINES | ODD, min_size=1, max_size=60), st.integers(0, 500))
+def test_a_drive_can_wear_whatever_a_file_says(tmp_path: Path, lines: list[str], place: int) -> None:
+    """Or the file is refused in one sentence: a drive in odd clothes still boots, answers and goes with SYNC."""
+    whole = eds_text("nanotec").splitlines()
+    path = tmp_path / "odd.eds"
+    path.write_text("\n".join([*whole[:place], *lines, *whole[place:]]), encoding="utf-8")
+    try:
+        rig = Rig(dressed(path))
+    except EdsError:
+        return
+    rig.nmt(0x01)
+    rig.sync()
+    for index in (0x1000, 0x1018, 0x6040, 0x6064, 0x1A00):
+        rig.send(0x601, bytes([0x40, index & 0xFF, index >> 8, 0, 0, 0, 0, 0]))
+    own_eds_text(rig.drive)
+
+
 # -- what the wire sees
 
 
@@ -145,6 +190,12 @@ def test_what_the_drive_does_not_have_is_not_there(epos4: Rig, index: int) -> No
         epos4.read(index)
     with pytest.raises(Abort, match="06040041"):
         remap(epos4, 0x1800, 0x181, 1, index << 16 | 0x10)
+
+
+def test_it_has_no_more_pdos_than_its_file(wear: Callable[[str], Rig]) -> None:
+    pdo = wear("schunk").drive.pdo
+    assert (list(pdo.numbers("rpdo")), list(pdo.numbers("tpdo"))) == ([1, 2], [1, 2, 3, 4])
+    assert [p.number for p in pdo.configured("tpdo")] == [1, 2, 3]
 
 
 def test_what_fits_this_machine_alone_was_set_up(epos4: Rig) -> None:

@@ -182,12 +182,8 @@ class Cia402Decoder:
     def _count(self, grids: Mapping[str, Dense], heard: Bool, first: int) -> int:
         """Count what is wrong with the frames of the rows' own ticks; returns the number lost."""
         rows = heard.size
-        lost = 0
-        for name, grid in grids.items():
-            begun = self._queues[name].first_tick
-            if begun is not None:
-                start = max(0, begun - first)
-                lost += int(np.count_nonzero((grid.missing[:rows] & heard)[start:]))
+        lost = sum(self._queues[name].lost(grid.missing[:rows], heard, first) for name, grid in grids.items())
+        self._irregular()
         ambiguous = np.zeros(rows, np.bool_)
         for grid in grids.values():
             self.counters.duplicates += int(grid.duplicates[:rows].sum())
@@ -196,6 +192,17 @@ class Cia402Decoder:
         self.counters.lost += lost
         self._foreign(ambiguous)
         return lost
+
+    def _irregular(self) -> None:
+        rare = [queue for queue in self._queues.values() if not queue.synchronous]
+        if rare:
+            names = ", ".join(f"{queue.spec.name} ({queue.cob_id:03X})" for queue in rare)
+            kinds = ", ".join(f"0x{0x1800 + queue.spec.number - 1:04X}:02" for queue in rare)
+            text = (
+                f"Drive {self.axis} sends {names} with few of the SYNCs, and its samples have holes; "
+                f"set the transmission type ({kinds}) to 1, or see whether it still is Operational."
+            )
+            self._tell("PdoIrregular", "MAJOR", text)
 
     def _foreign(self, ambiguous: Bool) -> None:
         clean = np.flatnonzero(~ambiguous)

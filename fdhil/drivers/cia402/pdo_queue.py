@@ -12,6 +12,9 @@ from fdhil.drivers.can.sync_grid import Ticked
 from fdhil.drivers.cia402.profile import PdoSpec
 from fdhil.records import Bool, Int
 
+JUDGED_TICKS = 1000
+MOST = 0.75
+
 Words = npt.NDArray[np.uint64]
 
 
@@ -38,7 +41,8 @@ class DecoderCounters:
 class PdoQueue:
     """Frames of one PDO that wait until their ticks are complete; ``tick`` (m,) never falls.
 
-    ``first_tick`` is that of the first whole one ever, None before it: what does not come yet is not lost.
+    ``first_tick`` is that of the first whole one ever, None before it. ``synchronous``: not missing in most of the
+    newest ``JUDGED_TICKS`` SYNCs; else it is sent on change, by a timer, or no more.
     """
 
     spec: PdoSpec
@@ -47,6 +51,9 @@ class PdoQueue:
     data: Words = field(default_factory=lambda: np.empty(0, np.uint64))
     length: int = field(init=False)
     first_tick: int | None = None
+    synchronous: bool = True
+    _due: int = 0
+    _gone: int = 0
 
     def __post_init__(self) -> None:
         self.length = self.spec.length
@@ -66,6 +73,21 @@ class PdoQueue:
             self.first_tick = int(ticked.tick[mine[0]])
         self.tick = np.concatenate([self.tick, ticked.tick[mine]])
         self.data = np.concatenate([self.data, ticked.data[mine]])
+
+    def lost(self, missing: Bool, due: Bool, first: int) -> int:
+        """Return the frames lost on rows (n,) from tick ``first`` on: those ``missing`` where one was ``due``.
+
+        None is lost before the first one ever, nor while it is not sent with SYNC.
+        """
+        if self.first_tick is None:
+            return 0
+        begun = slice(max(0, self.first_tick - first), None)
+        gone = int(np.count_nonzero(missing[begun] & due[begun]))
+        self._due, self._gone = self._due + int(np.count_nonzero(due[begun])), self._gone + gone
+        if self._due >= JUDGED_TICKS:
+            self.synchronous = self._gone <= MOST * self._due
+            self._due = self._gone = 0
+        return gone if self.synchronous else 0
 
     def forget(self, before_tick: int) -> None:
         """Drop what is older than ``before_tick``."""

@@ -15,7 +15,7 @@ from importlib.resources import files
 from typing import Any
 
 from fdhil.config import MachineConfig, SimAxis
-from fdhil.sim.drive.dictionary import Entry, Object, Value
+from fdhil.sim.drive.dictionary import DataType, Entry, Object, Value
 from fdhil.sim.drive.modes import CYCLIC, CYCLIC_POSITION, SUPPORTED_MODES
 from fdhil.sim.drive.objects import DEVICE_NAME, PRODUCT_CODE, REVISION, VENDOR_ID, Ratings, drive_objects
 from fdhil.sim.drive.sheet import Sheet, read_sheet
@@ -49,12 +49,7 @@ _SPEEDS = frozenset(
     }
 )  # fmt: skip
 # revolutions/s and increments/s to a count; a millisecond's increments come as 16.16 fixed-point numbers
-_SPEED_UNITS = {
-    "increments_per_s": (0.0, 1.0),
-    "rpm": (1 / 60, 0.0),
-    "millirpm": (1 / 60e3, 0.0),
-    "increments_per_ms_16": (0.0, 1e3 / 65536),
-}
+_SPEED_UNITS = {"increments_per_s": (0.0, 1.0), "rpm": (1 / 60, 0.0), "increments_per_ms_16": (0.0, 1e3 / 65536)}
 # unit codes of 0x60A9 (CiA 303-2): revolutions, increments; seconds, minutes
 _REVOLUTIONS, _INCREMENTS, _PER = 0xB4, 0xB5, {0x03: 1.0, 0x47: 1 / 60}
 _UNITS = {"current_a": "A", "current_share": "", "voltage_v": "V", "dc_link_v": "V", "duty": ""}
@@ -193,16 +188,19 @@ class _Tailor:
     def _fit(self, entry: Entry) -> Entry:
         if entry.key == self._setpoint:
             return replace(entry, home=_TARGET, default=0, low=None, high=None)
-        if entry.index in _VENDORS:
+        own = self._own.get(entry.key)
+        if entry.index in _VENDORS or (own is not None and not _alike(entry, own)):
             return self._fit_apart(entry)
         if entry.key in (0x606000, 0x606100):
             entry = self._fit_mode(entry)
         if entry.key == _MODES and self._mode != CYCLIC_POSITION:
             entry = replace(entry, renamed=(self._modes, self._modes | 1 << CYCLIC_POSITION - 1))
-        own = self._own.get(entry.key)
         scale = self._scale(entry) if own is not None else 1.0
         entry = replace(entry, scale=scale, default=self._default(entry, own, scale))
-        return replace(entry, low=None, high=None) if entry.key in _SET_UP else entry
+        if entry.key in _SET_UP:
+            return replace(entry, low=None, high=None)
+        # what CiA 301 defines has the limits that it says; real files forbid what their devices must take
+        return replace(entry, low=own.low, high=own.high) if own is not None and entry.index < 0x2000 else entry
 
     def _fit_mode(self, entry: Entry) -> Entry:
         """Only what it has can be chosen; its mode of cyclic set-points is the twin's cyclic synchronous position."""
@@ -227,7 +225,7 @@ class _Tailor:
             return self._sheet.name.encode("latin-1", "replace")
         if entry.index in range(0x1600, 0x1800) or entry.index in range(0x1A00, 0x1C00):
             return entry.default if given or entry.sub else self._mapped(entry.index)
-        if own is None or type(own.default) is not type(entry.default):
+        if own is None:
             return entry.default
         if given and entry.key not in _SET_UP:
             return entry.default
@@ -241,6 +239,8 @@ class _Tailor:
         return sum(1 for entry in item.entries if entry.sub and entry.default)
 
     def _scale(self, entry: Entry) -> float:
+        if entry.sub == 0 and entry.key | 1 in self._entries:  # a number of entries
+            return 1.0
         if entry.index in _SPEEDS:
             return self._speed
         return self._cut.rated_torque_nm * 1e3 if entry.index == 0x6076 else 1.0
@@ -254,3 +254,9 @@ class _Tailor:
             entry = entries.get(index << 8 | sub)
             if entry is not None:
                 yield Gauge(entry, said["signal"], said["per_count"], said.get("magnitude", False))
+
+
+def _alike(entry: Entry, own: Entry) -> bool:
+    """Whether both are texts or both integers, so that one can stand for the other."""
+    reals = (DataType.REAL32, DataType.REAL64)
+    return entry.type not in reals and (entry.size is None) == (own.size is None)

@@ -135,9 +135,11 @@ class PdoEngine:
     def numbers(self, direction: str) -> Iterator[int]:
         """Yield the PDOs that the device has: with a COB-ID and a mapping."""
         communication, mapping = _PLACES[direction]
-        entries = self._dictionary.entries
+        shown = (
+            self._dictionary.entries.keys() & self._dictionary.numbers.keys()
+        )  # no texts, and none that is not shown
         for n in range(_MOST_PDOS):
-            if communication + n << 8 | 1 in entries and mapping + n << 8 in entries:
+            if communication + n << 8 | 1 in shown and mapping + n << 8 in shown:
                 yield n + 1
 
     def _parameter(self, index: int, sub: int) -> int:
@@ -311,7 +313,7 @@ class PdoEngine:
         self._check_invalid(entry, value)
         if value > self._places(entry.index):
             raise TransferAbort(AbortCode.PDO_LENGTH)
-        mapped = [self._dictionary.number(entry.index, sub) for sub in range(1, value + 1)]
+        mapped = [self._parameter(entry.index, sub) for sub in range(1, value + 1)]
         for word in mapped:
             self._check_mappable(entry.index, word)
         if sum(word & 0xFF for word in mapped) > 64:

@@ -47,7 +47,8 @@ class SensorWires:
             if table is not None and there and table.source == "modbus" and not table.device:
                 registers = Joined(registers, OneValue(table, table.type, self._places[axis]))
             maps[axis], addresses[axis] = registers, (voltage.host, voltage.port)
-        self._tcp = SensorServers(sensors, addresses, maps)
+        units = {axis: config.axis[axis].voltage.unit for axis in addresses}
+        self._tcp = SensorServers(sensors, addresses, maps, units)
         self._lines = SerialLines(self._parties) if self._parties else None
         self.ready: dict[str, dict[str, Any]] = {}
 
