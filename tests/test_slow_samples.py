@@ -76,3 +76,18 @@ def test_a_sensor_as_fast_as_the_sync_is_placed_on_it() -> None:
     recording = recent.cut(500, 1500)
     assert recording.slow_voltage is None
     assert recording.voltage_v is not None
+
+
+def test_a_meter_that_was_asked_off_its_instants_keeps_the_time_of_each_value() -> None:
+    recent, _ = _recent(100.0, 0.0, 0)
+    rng, counter = np.random.default_rng(2), np.arange(195)
+    true = counter * 10.0 + rng.uniform(-4.0, 4.0, counter.size)
+    for part in np.array_split(counter, 40):
+        t_ns, error_ns = frozen_ints(np.round(true[part] * PERIOD_NS)), frozen_ints(np.full(part.size, 300_000))
+        recent.add(VoltageSamples("meter", "X", frozen_ints(part), t_ns, error_ns, frozen(part), 100.0, on_grid=False))
+    slow = recent.cut(500, 1500).slow_voltage
+    assert slow is not None
+    assert slow.late_s is not None
+    at = 500 + 1e3 * (slow.begin_s + slow.period_s * np.arange(slow.voltage_v.size) + slow.late_s)
+    np.testing.assert_allclose(at, true[slow.voltage_v.astype(int)], atol=0.1)
+    assert (np.diff(at) > 0).all()

@@ -320,10 +320,13 @@ def _set_pdos(machine: MachineConfig, axis: str, yes: bool, quiet: bool) -> dict
     from fdhil.cli.bus_lock import lock_bus
     from fdhil.commissioning.master import Master
     from fdhil.commissioning.pdo_setup import set_up_pdos
+    from fdhil.drivers.cia402.profile_file import load_profile
 
-    profile = machine.axis[axis].drive.profile
+    profile = load_profile(machine.axis[axis].drive)
     if not yes:
-        question = f"The PDOs of drive {axis} will be written as profile {profile} has them, and saved in it. May they?"
+        question = (
+            f"The PDOs of drive {axis} are written as profile {profile.name} has them, and saved in it. May they?"
+        )
         _confirm(axis, question, "nothing was written; start again with --yes where nobody can be asked")
     with lock_bus(machine.bus[machine.axis[axis].drive.bus]), Master(machine, axis) as master:
         done = set_up_pdos(master)

@@ -37,7 +37,8 @@ def one_of(table: Mapping[str, str], or_suffix: str | None = None) -> AfterValid
     def check(name: str) -> str:
         if name not in table and not (or_suffix and name.endswith(or_suffix)):
             near = difflib.get_close_matches(name, table, n=1)
-            raise ValueError(f"must be one of {', '.join(table)}" + (f"; did you mean {near[0]!r}?" if near else ""))
+            names = ", ".join(table) + (f", or a path that ends in {or_suffix}" if or_suffix else "")
+            raise ValueError(f"must be one of {names}" + (f"; did you mean {near[0]!r}?" if near else ""))
         return name
 
     return AfterValidator(check)

@@ -13,6 +13,7 @@ import numpy as np
 from fdhil.drivers.can.tick_clock import TickClock
 
 SYNC_ENDED_NS = 500_000_000  # after so long a silence it does not run
+PACE_TICKS = 500
 
 
 class AskingGrid:
@@ -32,9 +33,8 @@ class AskingGrid:
     def next_instant(self, now_ns: int, ticks: TickClock) -> tuple[int, float]:
         """Return number and host time (ns) of the next instant."""
         by_sync = ticks.running and ticks.covers(now_ns - SYNC_ENDED_NS)
-        newest = ticks.newest_tick
-        since = (now_ns - float(ticks.time_ns(np.array([newest]))[0])) / ticks.period_ns if by_sync else 0.0
-        periods = (newest + since) / self._ticks if by_sync else now_ns / self.period_ns
+        newest, newest_ns, step_ns = _pace(ticks)
+        periods = (newest + (now_ns - newest_ns) / step_ns) / self._ticks if by_sync else now_ns / self.period_ns
         number = math.ceil(periods - self._phase)
         last, went_on = self._next, by_sync == self._by_sync
         self._by_sync = by_sync
@@ -45,16 +45,29 @@ class AskingGrid:
         return number, self.host_ns(number, ticks)
 
     def host_ns(self, number: int, ticks: TickClock) -> float:
-        """Return the host time of an instant."""
+        """Return the host time of an instant, one that is to come by the pace at which the SYNCs came."""
         if not self._by_sync:
             return (number + self._phase) * self.period_ns
-        return float(ticks.time_ns(np.array([(number + self._phase) * self._ticks]))[0])
+        tick = (number + self._phase) * self._ticks
+        newest, newest_ns, step_ns = _pace(ticks)
+        return newest_ns + (tick - newest) * step_ns if tick > newest else float(ticks.time_ns(np.array([tick]))[0])
 
-    def off_ns(self, number: int, asked_ns: int, answered_ns: int, ticks: TickClock) -> float:
-        """Return how far off the instant of that number a value may be that was read between question and answer."""
+    def read_at(self, number: int, asked_ns: int, answered_ns: int, ticks: TickClock) -> tuple[float, float, float]:
+        """Return when (host ns) a value was true that was read between question and answer, by how much that is later
+        than the instant of its number, and how far off both may be."""
         between = ticks.bounds(asked_ns, answered_ns) if self._by_sync else None
         if between is None:
-            due_ns = self.host_ns(number, ticks)
-            return max(abs(asked_ns - due_ns), abs(answered_ns - due_ns))
-        due = (number + self._phase) * self._ticks
-        return max(abs(between[0] - due), abs(between[1] - due)) * ticks.period_ns
+            middle = (asked_ns + answered_ns) / 2
+            return middle, middle - self.host_ns(number, ticks), (answered_ns - asked_ns) / 2
+        tick = (between[0] + between[1]) / 2
+        late = (tick - (number + self._phase) * self._ticks) * ticks.period_ns
+        return float(ticks.time_ns(np.array([tick]))[0]), late, (between[1] - between[0]) / 2 * ticks.period_ns
+
+
+def _pace(ticks: TickClock) -> tuple[int, float, float]:
+    """Return the newest tick, when it came, and the ns from one to the next: a simulated machine may be slower."""
+    newest = ticks.newest_tick
+    if not ticks.running:
+        return newest, 0.0, ticks.period_ns
+    before_ns, newest_ns = ticks.time_ns(np.array([newest - PACE_TICKS, newest]))
+    return newest, float(newest_ns), float(newest_ns - before_ns) / PACE_TICKS

@@ -29,9 +29,11 @@ SYNC_LATENESS_NS = 200_000  # how late the stamp of a SYNC may be on a busy comp
 BEYOND_LIMIT = 4.0  # no terminal voltage is so many times what the drive can give
 TOLD_AFTER = 200  # values
 LOST_SHARE = 0.1
-TIMELY_NS = 2_000_000  # the voltage of a drive that accelerates changes by 1 V in each ms
+TIMELY_NS = 2_000_000  # the voltage of a drive that accelerates changes by 1 V in each ms: so well it must be known
 SETTLED_NS = 50_000_000  # so many later SYNCs have shown which stamps around an answer were late
+IN_ORDER = 0.4  # of a period
 MOST_WAITING = 1000
+NEAR_S = 0.02
 
 
 class Meter(Protocol):
@@ -77,7 +79,8 @@ class MeterVoltage:
         self._grid = AskingGrid(settings.period_s, config.machine.sync_period_s, _turn(axis, config))
         self._told = ToldCount(settings.period_s)
         self._late_ns = (settings.delay_s + settings.renewed_s / 2) * 1e9
-        if settings.sampling == "interval_mean":
+        self._mean = settings.sampling == "interval_mean"
+        if self._mean:
             self._late_ns += self._grid.period_ns  # a sample is placed where its interval begins
         self._renewed_ns = settings.renewed_s * 1e9
         self._together = math.ceil(GATHER_S / settings.period_s) + 1
@@ -119,7 +122,9 @@ class MeterVoltage:
     async def _ask(self, ticks: TickClock) -> _Value:
         """Wait for the next instant and ask."""
         number, due_ns = self._grid.next_instant(time.monotonic_ns(), ticks)
-        await asyncio.sleep(max(0.0, (due_ns - time.monotonic_ns()) / 1e9))
+        while (left_s := (due_ns - time.monotonic_ns()) / 1e9) > 0:
+            await asyncio.sleep(min(left_s, NEAR_S))
+            due_ns = self._grid.host_ns(number, ticks)  # SYNCs that came meanwhile tell it better
         self._asked += 1
         try:
             volts = await self._volts()
@@ -164,8 +169,8 @@ class MeterVoltage:
         counter, t_ns, error_ns, volts = [], [], [], []
         while self._waiting and (not ticks.running or ticks.covers(self._waiting[0].answered_ns + SETTLED_NS)):
             one = self._waiting.popleft()
-            at_ns, off_ns = self._when(one, ticks)
-            if one.number <= self._newest if self._meter.tells_by_itself else off_ns > TIMELY_NS:
+            at_ns, late_ns, off_ns = self._when(one, ticks)
+            if one.number <= self._newest if self._meter.tells_by_itself else not self._in_time(late_ns, off_ns):
                 self._holes += 1
                 continue
             self._newest = one.number
@@ -178,14 +183,19 @@ class MeterVoltage:
             return []
         rate_hz = 1e9 / self._grid.period_ns
         placed = frozen_ints(np.array(counter)), frozen_ints(np.array(t_ns)), frozen_ints(np.array(error_ns))
-        return [VoltageSamples(self.name, self.axis, *placed, frozen(np.array(volts)), rate_hz)]
+        on_grid = self._mean or self._meter.tells_by_itself
+        return [VoltageSamples(self.name, self.axis, *placed, frozen(np.array(volts)), rate_hz, on_grid)]
 
-    def _when(self, one: _Value, ticks: TickClock) -> tuple[float, float]:
-        """Return the host time at which a value was true, and how far off that may be, but for the meter's filter."""
+    def _when(self, one: _Value, ticks: TickClock) -> tuple[float, float, float]:
+        """Return when (host ns) a value was true but for the meter's filter, how late that is, and how far off."""
         if self._meter.tells_by_itself:
-            return one.answered_ns, SYNC_LATENESS_NS
-        off_ns = self._grid.off_ns(one.number, one.asked_ns, one.answered_ns, ticks)
-        return self._grid.host_ns(one.number, ticks), off_ns
+            return one.answered_ns, 0.0, SYNC_LATENESS_NS
+        return self._grid.read_at(one.number, one.asked_ns, one.answered_ns, ticks)
+
+    def _in_time(self, late_ns: float, off_ns: float) -> bool:
+        """Whether a value can stand for its instant: a mean must lie there, an instant only keeps the order."""
+        allowed_ns = TIMELY_NS if self._mean else IN_ORDER * self._grid.period_ns
+        return off_ns <= TIMELY_NS and abs(late_ns) <= allowed_ns
 
 
 def _turn(axis: str, config: MachineConfig) -> float:

@@ -31,7 +31,7 @@ def zero_phase(values: Float, lowpass_hz: float, dt_s: float) -> Float:
     after = 2 * values[..., -1:] - values[..., -2 : -pad - 2 : -1]
     extended = np.concatenate([before, values, after], axis=-1)
     size = quick_size(extended.shape[-1])
-    spectrum = np.fft.rfft(_lengthened(extended, size)) * gain(size, lowpass_hz, dt_s)
+    spectrum = np.fft.rfft(_lengthened(extended, size)) * _gain(size, lowpass_hz, dt_s)
     filtered: Float = np.fft.irfft(spectrum, size)[..., pad : pad + n]
     return filtered
 
@@ -59,7 +59,7 @@ def quick_size(least: int) -> int:
 
 
 @lru_cache(maxsize=64)
-def gain(size: int, lowpass_hz: float, dt_s: float) -> Float:
+def _gain(size: int, lowpass_hz: float, dt_s: float) -> Float:
     """Return the gain at the frequencies of a real transform of ``size`` rows: a Butterworth's, squared."""
     corner = np.tan(np.pi * min(lowpass_hz * dt_s, 0.475))
     # the bilinear transform's frequency axis; at the highest one the gain is 0
@@ -73,7 +73,7 @@ def impulse_response(lowpass_hz: float, dt_s: float) -> Float:
     """Return what the low-pass makes of one sample, centred (odd length)."""
     half = max(8, round(SPAN_PERIODS / lowpass_hz / dt_s))
     size = 2 * half + 1
-    response: Float = np.roll(np.fft.irfft(gain(size, lowpass_hz, dt_s), size), half)
+    response: Float = np.roll(np.fft.irfft(_gain(size, lowpass_hz, dt_s), size), half)
     return response
 
 

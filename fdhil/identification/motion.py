@@ -117,6 +117,7 @@ class Motion:
         if self.slow is None:
             return course
         begins = self.slow.begin_s + self.slow.period_s * np.arange(self.slow.voltage_v.size)
+        begins = begins if self.slow.late_s is None else begins + self.slow.late_s
         sampled: Float = np.interp(begins, np.arange(self.n) * self.dt_s, course)
         return sampled
 

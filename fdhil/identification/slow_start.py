@@ -88,6 +88,7 @@ def sample_rows(window: Window, delay_s: float, lowpass_hz: float) -> tuple[Floa
     assert slow is not None
     dt, last = window.dt_s, (window.n - 1) * window.dt_s
     begin = slow.begin_s - delay_s + slow.period_s * np.arange(slow.voltage_v.size)
+    begin = begin if slow.late_s is None else begin + slow.late_s
     inside = (begin >= 0) & (begin + slow.period_s <= last) & np.isfinite(slow.voltage_v)
     begin, voltage = begin[inside], slow.voltage_v[inside]
     time = np.arange(window.n) * dt

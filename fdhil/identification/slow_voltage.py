@@ -67,6 +67,8 @@ def marks_of(motion: Motion, delay_s: float, ordered_for_s: float) -> Marks:
     assert slow is not None
     m, last = slow.voltage_v.size, (n - 1) * motion.dt_s
     grid = slow.begin_s + slow.period_s * np.arange(m + 1)
+    if slow.late_s is not None:
+        grid[:m] += slow.late_s
     placed = grid - ordered_for_s
     inside = np.flatnonzero((placed >= 0.0) & (placed <= last))
     if motion.voltage_sampling == "instant":

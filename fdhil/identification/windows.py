@@ -172,7 +172,10 @@ def _slow_part(recording: Recording, a: int, b: int) -> SlowVoltage | None:
     first = max(0, math.ceil((begin - slow.begin_s) / slow.period_s - 1e-9))
     end = math.floor((last - slow.begin_s) / slow.period_s + 1e-9)
     moved = slow.begin_s + first * slow.period_s - begin
-    return replace(slow, begin_s=moved, voltage_v=read_only(slow.voltage_v[first:end])) if end > first else None
+    if end <= first:
+        return None
+    late = None if slow.late_s is None else read_only(slow.late_s[first:end])
+    return replace(slow, begin_s=moved, voltage_v=read_only(slow.voltage_v[first:end]), late_s=late)
 
 
 def _stages(speed: Float, run: Run, offset: int, dt: float) -> Stages:

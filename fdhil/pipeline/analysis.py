@@ -40,15 +40,23 @@ def analyse(
 
 
 def _with_table(outcome: WindowOutcome, signals: Evidence) -> WindowOutcome:
-    """Return the outcome with what sensors at the table show: the resonance, and the table's true error."""
+    """Return the outcome with what sensors at the table show: its true error, and a resonance.
+
+    That takes the place of a configured one, or of one that the motor shows, and the window is analysed with it.
+    """
     window, estimate, axis = signals.window, outcome.estimate, signals.axis
     if estimate is None or (window.table_mm is None and window.table_m_s2 is None):
         return outcome
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        found = compliance(window, estimate.parameters())
+    try:
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            found = compliance(window, estimate.parameters())
+    except GAVE_UP:  # signals that no table has
+        found = None
     if found is not None:
+        if axis is not None:
+            outcome = _analysed(replace(signals, axis=axis.model_copy(update=found.keys())))
         warnings = (*outcome.verdict.warnings, *beside_the_config(found, axis))
-        estimate = joined(estimate, found)
+        estimate = joined(outcome.estimate or estimate, found)
         outcome = replace(outcome, estimate=estimate, verdict=replace(outcome.verdict, warnings=warnings))
     seen = at_the_table(window, estimate.parameters(), axis, signals.sync_period_s)
     return outcome if seen is None else replace(outcome, at_table=seen)

@@ -34,6 +34,7 @@ from fdhil.records import (
 PLACING_BLOCKS = 40  # some 2 s of a sensor that is asked every 50 ms
 CLOCK_TOLERANCE = 500e-6  # two quartz clocks
 LEAST_FOR_RATE = 100  # samples from which the sensor's own rate is believed
+MOST_LATE = 0.499  # of a period: the samples keep their order
 RATE_TOLERANCE = 0.01  # a sensor's rate may be off a multiple of the SYNC rate by this much
 
 Block = TypeVar("Block")
@@ -180,9 +181,18 @@ class RecentSamples:
         if count < 1:
             return None
         values = _placed(((b.counter, b.voltage_v) for b in self._voltage), first, count)
+        late = None if self._voltage[-1].on_grid else self._late(line, first, count)
         error = float(np.median(np.concatenate([b.t_error_ns for b in self._voltage]))) * 1e-9
         period_s = self._period_ns * 1e-9
-        return SlowVoltage((line[0] + first * line[1] - start) * period_s, line[1] * period_s, error, values)
+        return SlowVoltage((line[0] + first * line[1] - start) * period_s, line[1] * period_s, error, values, late)
+
+    def _late(self, line: tuple[float, float], first: int, count: int) -> Float:
+        """Return by how much later (s) than on the line each value (count,) was true, 0 where there is none."""
+        tick_ns = np.concatenate([b.t_ns for b in self._times])
+        tick = np.concatenate([b.tick for b in self._times])
+        begins = ((b.counter, np.interp(b.t_ns, tick_ns, tick)) for b in self._voltage)
+        late = np.nan_to_num(_placed(begins, first, count) - (line[0] + line[1] * (first + np.arange(count))))
+        return frozen(np.clip(late, -MOST_LATE * line[1], MOST_LATE * line[1]) * self._period_ns * 1e-9)
 
     def _separate(self, start: int, n: int) -> tuple[Float | None, float | None]:
         place = self._placing()

@@ -37,7 +37,10 @@ class AxisSamples:
 @dataclass(frozen=True, slots=True)
 class VoltageSamples:
     """Samples of a separate voltage sensor: ``t_ns`` (n,) host-monotonic instants of the sensor's own grid,
-    with their uncertainty ``t_error_ns`` (n,), and ``voltage_v`` (n,). ``counter`` (n,) is the sensor's own count."""
+    with their uncertainty ``t_error_ns`` (n,), and ``voltage_v`` (n,). ``counter`` (n,) is the sensor's own count.
+
+    ``on_grid`` is False where a sensor was asked near its instants: ``t_ns`` is then when each value was true.
+    """
 
     sensor: str
     axis: str
@@ -46,6 +49,7 @@ class VoltageSamples:
     t_error_ns: Int
     voltage_v: Float
     sample_rate_hz: float
+    on_grid: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,12 +58,15 @@ class SlowVoltage:
 
     Sample j covers ``begin_s`` + j ``period_s`` after row 0 of the window and one period from there (or is the value at
     its begin, as the window's ``voltage_sampling`` says). ``error_s`` is how far off ``begin_s`` may be.
+    ``late_s`` (m,), of a sensor that was asked near its instants, is by how much later each value was true, less than
+    half a period.
     """
 
     begin_s: float
     period_s: float
     error_s: float
     voltage_v: Float
+    late_s: Float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -120,7 +120,9 @@ class SimService:
         for name in self.machine.buses:
             self._buses[name] = attach(name, self.config.bus[name])
         if self.config.sim.modbus:
-            sensors = SensorWires(self.config, {axis: unit.sensor for axis, unit in self.machine.units.items()})
+            units = self.machine.units
+            places = {axis: partial(getattr, unit.drive, "table_mm") for axis, unit in units.items()}
+            sensors = SensorWires(self.config, {axis: unit.sensor for axis, unit in units.items()}, places)
             sensors.start()
             self._sensors = sensors
         for axis in self.machine.tables.accelerometers:

@@ -58,7 +58,8 @@ def _number(value: float | None) -> str | None:
 
 def _samples(slow: SlowVoltage) -> dict[str, str]:
     """Return the headers that hold a slow sensor's samples; times are those of the rows, the first at 0 s."""
-    return {
+    late = {} if slow.late_s is None else {"voltage_late_s": " ".join(repr(float(value)) for value in slow.late_s)}
+    return late | {
         "voltage_begin_s": repr(slow.begin_s),
         "voltage_period_s": repr(slow.period_s),
         "voltage_error_s": repr(slow.error_s),

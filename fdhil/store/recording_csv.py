@@ -107,7 +107,20 @@ def _slow_voltage(headers: dict[str, str], start_s: float, dt_s: float, source: 
             "export it again"
         )
     error = _optional(headers, "voltage_error_s", source) or 0.0
-    return SlowVoltage(begin - start_s, period, abs(error), frozen(told))
+    return SlowVoltage(begin - start_s, period, abs(error), frozen(told), _late(headers, told.size, period, source))
+
+
+def _late(headers: dict[str, str], samples: int, period: float, source: str) -> Float | None:
+    """Return by how much later than its place each sample of a slow sensor was true, where the headers hold it."""
+    if "voltage_late_s" not in headers:
+        return None
+    try:
+        late = np.array(headers["voltage_late_s"][:MAX_SAMPLES_CHARS].split(), dtype=np.float64)
+    except ValueError:
+        late = np.zeros(0)
+    if late.size != samples or not (np.abs(late) < period / 2).all():
+        raise RecordingError(f"{source} has voltage_late_s that do not fit its voltage samples: export it again")
+    return frozen(late)
 
 
 def _split(text: str, source: str) -> tuple[dict[str, str], int, list[str]]:

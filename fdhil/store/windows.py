@@ -134,6 +134,8 @@ def _head(window: Window) -> dict[str, Any]:
     if slow is not None:
         grid = {"begin_s": slow.begin_s, "period_s": slow.period_s, "error_s": slow.error_s}
         plain["slow_voltage"] = grid | {"samples": slow.voltage_v.size}
+        if slow.late_s is not None:
+            plain["slow_voltage"]["late_s"] = slow.late_s.tolist()
     return plain | {"format": FORMAT, "clock": "SYNC tick", "stages": asdict(window.stages)}
 
 
@@ -179,7 +181,10 @@ def _decode(content: bytes) -> tuple[Window, str]:
     if grid is not None:
         samples = _values(table.column("slow_voltage_v"), {})[: int(grid["samples"])]
         begin, period, error = (float(grid[name]) for name in ("begin_s", "period_s", "error_s"))
-        arrays["slow_voltage"] = SlowVoltage(begin, period, error, samples)
+        late = read_only(np.array(grid["late_s"], np.float64)) if "late_s" in grid else None
+        if late is not None and late.shape != samples.shape:
+            raise ValueError("its slow voltage has not one time per sample")
+        arrays["slow_voltage"] = SlowVoltage(begin, period, error, samples, late)
     return _window(head, arrays), str(head["digest"])
 
 

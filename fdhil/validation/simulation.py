@@ -56,7 +56,11 @@ def _slow_fit_percent(window: Window, parameters: Parameters, delay_s: float) ->
     slow = window.slow_voltage
     assert slow is not None
     begin = slow.begin_s - delay_s + slow.period_s * np.arange(slow.voltage_v.size)
-    _, speed = simulate_plant(parameters, carried(slow.voltage_v), slow.period_s, window.voltage_sampling)
+    voltage = carried(slow.voltage_v)
+    if slow.late_s is not None:  # of a sensor that was asked: its values are brought to the grid, and across its holes
+        known = np.isfinite(slow.voltage_v)
+        voltage = np.interp(begin, (begin + slow.late_s)[known], slow.voltage_v[known]) if known.any() else voltage
+    _, speed = simulate_plant(parameters, voltage, slow.period_s, window.voltage_sampling)
     measured = np.interp(begin, np.arange(window.n) * window.dt_s, carried(window.speed_rad_s))
     return _explained_percent(measured, speed)
 

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -237,6 +238,26 @@ def test_nobody_moves_without_a_yes(fdhil: Said, bench: Bench) -> None:
     assert 0x601 in heard
     assert not {0x000, 0x080, 0x201, 0x301} & set(heard)
     assert load_record(config.parent / "fdhil-data", "X") is None
+
+
+def test_pdos_are_written_after_a_yes_and_nothing_moves(fdhil: Said, bench: Bench) -> None:
+    """By a profile that differs from the drive in one PDO; then by the one that the other tests need."""
+    own = bench.folder / "own.toml"
+    tpdo2 = "entries = [[0x6041, 0, 16, false], [0x2101, 0, 16, true], [0x6078, 0, 16, true]]"
+    packaged = files("fdhil.drivers.cia402.profiles").joinpath("fdhil_twin.toml").read_text("utf-8")
+    own.write_text(
+        packaged.replace("entries = [[0x6041, 0, 16, false], [0x6078, 0, 16, true], [0x2101, 0, 16, true]]", tpdo2)
+    )
+    other = bench.config("other.toml", DRIVE, f'[axis.X.drive]\nprofile = "{own}"\n{DRIVE}')
+    with overheard(bench) as heard:
+        code, _, err = fdhil("commission", other, "--axis", "X", "--set-pdos", said="n\n")
+        assert (code, "nothing was written" in err) == (1, True)
+        assert 0x601 not in heard
+        done = document(fdhil, "commission", other, "--axis", "X", "--set-pdos", "--yes")
+        assert done["axes"]["X"]["pdos_written"] == ["TPDO2"]
+        code, out, _ = fdhil("commission", bench.config(), "--axis", "X", "--set-pdos", "--yes")
+        assert (code, "PDOs written: TPDO2" in out) == (0, True)
+    assert not {0x080, 0x201, 0x301} & set(heard)
 
 
 @contextmanager

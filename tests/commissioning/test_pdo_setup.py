@@ -15,6 +15,7 @@ from fdhil.commissioning.survey import read_pdos, survey
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.sdo import SdoLink
 from fdhil.errors import DriveFault
+from tests.dressed.wardrobe import OUTFITS, Outfit, dressed
 from tests.drivers.peer import DrivePeer
 from tests.drivers.wire import machine
 
@@ -50,6 +51,15 @@ def test_what_differs_is_written(what: str, peer: tuple[DrivePeer, MachineConfig
         points = {finding.point: finding.ok for finding in survey(master).findings}
     assert points[name] is True
     assert not {0x080, 0x201, 0x301} & set(drive.heard)  # no SYNC, no set-point: nothing can move
+
+
+@pytest.mark.parametrize("outfit", OUTFITS, ids=lambda outfit: outfit.name)
+def test_a_drive_of_every_make_is_set_up_as_it_comes(outfit: Outfit, tmp_path: Path) -> None:
+    settings = dressed(outfit, tmp_path, bus={"can0": {"interface": "virtual", "channel": uuid.uuid4().hex}})
+    with DrivePeer(settings), Master(settings, "X") as master:
+        done = set_up_pdos(master)
+        assert done.written
+        assert set_up_pdos(master) == SetUp((), None)
 
 
 def test_a_drive_that_is_right_is_left_alone(peer: tuple[DrivePeer, MachineConfig]) -> None:

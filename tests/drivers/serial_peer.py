@@ -26,6 +26,15 @@ def framed(unit: int, body: bytes) -> bytes:
     return frame + struct.pack(">H", FramerRTU.compute_CRC(frame))
 
 
+async def until(condition: Callable[[], object]) -> None:
+    """Let others run until something is so; a minute of that is a fault."""
+    for _ in range(12_000):
+        if condition():
+            return
+        await asyncio.sleep(0.005)
+    raise TimeoutError
+
+
 class SerialPeer:
     """The master's side of a pseudo terminal; ``device`` is what a program opens."""
 

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from fdhil.commissioning.transmit import TransmitBus
 from fdhil.config import CanBus as BusSettings
 from fdhil.drivers.can.bus import CanBus
+from fdhil.drivers.can.filters import drive_filters
 from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, FrameRing
 from fdhil.drivers.can.ports import PORTS
 from fdhil.drivers.can.socketcand import HubClock, SocketcandPort
@@ -166,6 +167,16 @@ def test_virtual_bus_gives_what_it_got() -> None:
     assert (int(frame["id"]), int(frame["data"])) == (0x181, 0x0201)
     assert message is not None
     assert message.arbitration_id == 0x601
+
+
+def test_a_hub_s_frames_pass_the_filters_too(hub: MiniHub) -> None:
+    with CanBus("can0", settings_of(hub.port), filters=drive_filters([1], [0x33])) as bus:
+        for name in ("080", "181", "182", "033", "034", "00000001"):
+            hub.say(f"< frame {name} 1700000000.0001 11 >".encode())
+        hub.say(b"< error 20000040 1700000000.0002 >")
+        wait_for(lambda: bus.counters()["frames"] >= 7)
+        assert bus.drain()["id"].tolist() == [0x080, 0x181, 0x033, ERROR_FLAG | 0x40]
+        assert bus.counters()["frames"] == 7
 
 
 def test_hub_clock_takes_the_quickest_reading() -> None:

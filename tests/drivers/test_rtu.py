@@ -15,10 +15,10 @@ from fdhil.drivers.modbus.rtu import crc16, fault_in, find_answer, framed
 from fdhil.drivers.modbus.rtu_line import RtuLine
 from fdhil.errors import ConnectError, DeviceError, DeviceTimeout, ProtocolError
 from tests.drivers import serial_peer
-from tests.drivers.serial_peer import RtuPeer, rtu_peer
+from tests.drivers.serial_peer import RtuPeer, rtu_peer, until
 
 
-def link_to(peer: RtuPeer, unit: int = 1, timeout_s: float = 0.3, baud_rate: int = 115200) -> ModbusLink:
+def link_to(peer: RtuPeer, unit: int = 1, timeout_s: float = 10.0, baud_rate: int = 115200) -> ModbusLink:
     place = ModbusPlace(device=peer.device, unit=unit, timeout_s=timeout_s, baud_rate=baud_rate)
     return ModbusLink(f"sensor {unit}", place)
 
@@ -137,12 +137,11 @@ async def test_noise_before_an_answer_and_pieces_of_it_are_got_over(pieces: seri
 
 async def test_the_answer_of_another_unit_is_not_taken_and_ours_is_waited_for() -> None:
     async with rtu_peer(u1=[7, 8]) as peer:
-        link = link_to(peer)
+        link = link_to(peer, timeout_s=60.0)
         await link.connect()
         peer.spoil = [lambda frame: [serial_peer.framed(2, b"\x04\x04\x00\x63\x00\x63")]]
         asking = asyncio.create_task(link.read_input(0, 2))
-        await peer.heard.wait()
-        await asyncio.sleep(0.05)
+        await until(lambda: link.line.counted["ModbusUnit"])
         peer.put(answer(1, 7, 8))
         assert await asking == [7, 8]
         assert link.line.counted["ModbusUnit"] == 1
@@ -151,10 +150,12 @@ async def test_the_answer_of_another_unit_is_not_taken_and_ours_is_waited_for() 
 
 async def test_a_late_answer_is_not_taken_for_the_next() -> None:
     async with rtu_peer(u1=[7, 8]) as peer:
-        link = link_to(peer, timeout_s=0.1)
+        link = link_to(peer, timeout_s=0.4)
+        line = link.line
+        assert isinstance(line, RtuLine)
         await link.connect()
         peer.spoil = [lambda frame: []]
-        with pytest.raises(DeviceTimeout, match=r"was not answered within 0\.1 s"):
+        with pytest.raises(DeviceTimeout, match=r"was not answered within 0\.4 s"):
             await link.read_input(0, 2)
         asking = asyncio.create_task(link.read_input(0, 2))
         await asyncio.sleep(0.01)
@@ -163,7 +164,7 @@ async def test_a_late_answer_is_not_taken_for_the_next() -> None:
         assert await asking == [7, 8]
         assert link.line.counted["ModbusStale"] == 1
         peer.put(answer(1, 2, 2))  # and later still
-        await asyncio.sleep(0.01)
+        await until(lambda: line._port._chunks)
         assert await link.read_input(0, 2) == [7, 8]
         assert link.line.counted["ModbusStale"] == 2
         link.close()

@@ -16,6 +16,7 @@ from studies import bench
 from studies.judging import GOOD
 from studies.slow_recordings import recording_of
 from studies.slow_sensor import slow_windows
+from tests.asked import asked_windows
 
 SETTINGS = Identification()
 TRUTH = np.array([bench.Plant().truth()[name] for name in PARAMETERS])
@@ -95,3 +96,19 @@ def test_a_delay_that_least_squares_took_for_a_negative_l_is_found(seed: int) ->
     assert estimate.delay_s is not None
     assert estimate.value("L") / estimate.value("R") == pytest.approx(3.5e-3, rel=0.1)
     assert abs(estimate.delay_s) == pytest.approx(3.8e-3, rel=0.05)
+
+
+def test_a_meter_that_was_asked_off_its_instants_tells_as_much_as_one_that_was_not() -> None:
+    """Each value is taken at its own time; where all are taken at their instants the inductance suffers."""
+    on, off = (maximum_likelihood.estimate(asked_windows(timely=timely), SETTINGS) for timely in (True, False))
+    for estimate in (on, off):
+        assert not estimate.missing
+        assert (_errors_percent(estimate.values)[[0, 2, 3]] < (6.0, 0.6, 0.6)).all()
+    assert off.std("R") == pytest.approx(on.std("R"), rel=0.5)
+    window = asked_windows()[0]
+    assert window.slow_voltage is not None
+    assert analyse(window, SETTINGS).verdict.accepted
+    blind = replace(window, slow_voltage=replace(window.slow_voltage, late_s=None))
+    known, unknown = (maximum_likelihood.estimate([one], SETTINGS) for one in (window, blind))
+    assert abs(unknown.value("L") / TRUTH[1] - 1) > 1.5 * abs(known.value("L") / TRUTH[1] - 1)
+    assert unknown.std("L") / unknown.value("L") > 1.2 * known.std("L") / known.value("L")

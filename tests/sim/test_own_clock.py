@@ -64,14 +64,14 @@ def test_a_profile_takes_its_time_at_any_period_of_sync(sync_s: float | None) ->
         let_pass(rig, 0.3, sync_s)  # the SYNC runs already
     go(rig, 30.0)
     places = np.array(let_pass(rig, 1.0, sync_s))
-    assert places[49] == pytest.approx(15.0, abs=2.6)  # 0.2 s, to the 20 ms that a clock needs to notice
+    assert places[49] == pytest.approx(15.0, abs=2.6)  # 0.2 s, to the 20 ms that a clock may be wrong by
     assert (places[120:] > 29.9).all()
     assert rig.drive.table_mm == pytest.approx(30.0, abs=0.01)
     assert rig.read(0x6041) & 1 << 10
 
 
 def test_a_sync_at_the_drive_s_own_period_leads() -> None:
-    """One cycle per SYNC, however late the host tells the time."""
+    """One cycle per SYNC, although the host tells the time now and then only."""
     rig = by_sdo(1)
     let_pass(rig, 0.2, 1 * MS)
     go(rig, 30.0)
@@ -80,8 +80,8 @@ def test_a_sync_at_the_drive_s_own_period_leads() -> None:
     now = rig.now_s  # type: ignore[attr-defined]
     for n in range(400):
         rig.sync()
-        if rng.random() < 0.3:
-            rig.drive.wall_clock(now + n * MS)
+        if n % 4 == 0:
+            rig.drive.wall_clock(now + (n - rng.integers(2)) * MS)
     assert rig.drive.tick - before == 400
 
 
@@ -141,6 +141,21 @@ def test_a_jam_without_sync_is_told_by_emcy() -> None:
     assert rig.read(0x6041) & 0x4F == 0x08
 
 
+@pytest.mark.parametrize("mean_s", [0.9 * MS, 1 * MS, 1.1 * MS, 1.4 * MS, 3 * MS])
+def test_a_sync_of_a_host_that_stumbles_neither_hurries_nor_slows_the_drive(mean_s: float) -> None:
+    clock, rng = OwnClock(MS), np.random.default_rng(3)
+    next_sync = told = 0.0
+    cycles = 0
+    while told < 20.0:
+        if next_sync <= told:
+            cycles += clock.sync()
+            next_sync += mean_s * rng.exponential()
+        else:
+            cycles += clock.due(told, bound=False)
+            told += MS if clock.leads else 4 * MS
+    assert cycles == pytest.approx(20_000, rel=0.015)
+
+
 def test_an_axis_that_stands_without_power_runs_no_cycle() -> None:
     rig = Rig()
     let_pass(rig, 5.0)
@@ -156,7 +171,7 @@ def test_the_clock_of_the_machine_s_own_nc_is_the_sync() -> None:
     assert all(clock.sync() for _ in range(1000))
 
 
-@pytest.mark.parametrize("late_s", [0.015, 0.3])
+@pytest.mark.parametrize("late_s", [0.01, 0.3])
 def test_a_pause_of_the_sync_is_made_up_for_or_lasts(late_s: float) -> None:
     """A short one is the host's affair; in a long one the drive's own time goes on."""
     clock = OwnClock(MS)
@@ -170,7 +185,7 @@ def test_a_pause_of_the_sync_is_made_up_for_or_lasts(late_s: float) -> None:
     for _ in range(round(late_s / MS)):
         now += MS
         own += clock.due(now, bound=False)
-    assert own == (0 if late_s < 0.02 else pytest.approx(late_s / MS, abs=2))
+    assert own == (0 if late_s < 0.015 else pytest.approx(late_s / MS, abs=2))
 
 
 def test_while_the_nc_s_sync_fails_the_axes_go_on_to_their_last_set_point() -> None:

@@ -15,6 +15,7 @@ from fdhil.store.export import csv_lines
 from fdhil.store.recording_csv import parse_recording
 from fdhil.store.windows import decode_window, encode_window
 from studies.slow_sensor import slow_windows
+from tests.asked import asked_windows
 
 
 def test_the_sensors_own_grid_is_kept_bit_by_bit() -> None:
@@ -51,3 +52,24 @@ def test_samples_closer_than_the_rows_are_refused(period: str) -> None:
     lines = [line for line in csv_lines(slow_windows(0.005)[0]) if not line.startswith("# voltage_period_s")]
     with pytest.raises(RecordingError, match="closer than its rows"):
         parse_recording("\n".join([f"# voltage_period_s: {period}", *lines]) + "\n")
+
+
+def test_when_each_value_of_a_meter_was_true_is_kept_too() -> None:
+    window = asked_windows()[0]
+    assert window.slow_voltage is not None
+    assert window.slow_voltage.late_s is not None
+    back = decode_window(encode_window(window, "digest")).slow_voltage
+    assert back is not None
+    assert back.late_s is not None
+    np.testing.assert_array_equal(back.late_s, window.slow_voltage.late_s)
+    told = parse_recording("\n".join(csv_lines(window)) + "\n").slow_voltage
+    assert told is not None
+    assert told.late_s is not None
+    np.testing.assert_array_equal(told.late_s, window.slow_voltage.late_s)
+
+
+@pytest.mark.parametrize("late", ["0.001", "nonsense", "0.009 " * 500])
+def test_times_that_do_not_fit_the_values_are_refused(late: str) -> None:
+    lines = [line for line in csv_lines(asked_windows()[0]) if not line.startswith("# voltage_late_s")]
+    with pytest.raises(RecordingError, match="do not fit its voltage samples"):
+        parse_recording("\n".join([f"# voltage_late_s: {late}", *lines]) + "\n")

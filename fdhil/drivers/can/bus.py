@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Self
 
 from fdhil import config
+from fdhil.drivers.can.filters import passing
 from fdhil.drivers.can.frames import DEFAULT_RING_FRAMES, FrameRing, Frames
 from fdhil.drivers.can.port import BusEnded, Filter, Port, Stamps
 from fdhil.drivers.can.ports import open_port
@@ -39,6 +40,7 @@ class CanBus:
     ) -> None:
         self.name = name
         self.ended: str | None = None
+        self._filters = filters
         self._port = self._open(settings, filters)
         self._ring_frames = ring_frames
         self._ring = FrameRing(ring_frames)
@@ -69,8 +71,8 @@ class CanBus:
             self.ended = str(end)
 
     def drain(self) -> Frames:
-        """Return all frames received since the last call, in order of arrival."""
-        frames = self._ring.drain()
+        """Return all frames received since the last call that pass the filters, in order of arrival."""
+        frames = passing(self._ring.drain(), self._filters)  # not every way onto a bus has filters of its own
         if frames.size:
             self.last_frame_ns = int(frames["t_ns"][-1])
         return frames

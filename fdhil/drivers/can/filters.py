@@ -1,10 +1,12 @@
-"""Says which frames of a bus are needed, as filters for the kernel or an adapter."""
+"""Says which frames of a bus are needed, as filters for the kernel or an adapter, and drops the others of a block."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
-from fdhil.drivers.can.frames import EXTENDED_FLAG
+import numpy as np
+
+from fdhil.drivers.can.frames import ERROR_FLAG, EXTENDED_FLAG, Frames
 from fdhil.drivers.can.port import Filter
 
 _NODE = 0x07F
@@ -21,3 +23,14 @@ def drive_filters(node_ids: Iterable[int], cob_ids: Iterable[int]) -> list[Filte
     nodes = sorted({0, *node_ids})
     others = sorted({cob_id for cob_id in cob_ids if cob_id & _NODE not in nodes})
     return [(node, EXTENDED_FLAG | _NODE) for node in nodes] + [(i, EXTENDED_FLAG | _COB_ID) for i in others]
+
+
+def passing(frames: Frames, filters: Sequence[Filter]) -> Frames:
+    """Return the frames that pass a filter, and the error frames; all of them without filters."""
+    if not filters:
+        return frames
+    can_id = frames["id"]
+    passes = can_id & ERROR_FLAG != 0
+    for wanted, mask in filters:
+        passes |= (can_id ^ np.uint32(wanted)) & np.uint32(mask) == 0
+    return frames if passes.all() else frames[passes]

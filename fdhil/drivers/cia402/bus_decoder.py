@@ -68,6 +68,7 @@ class BusDecoder:
     def filters(self) -> list[Filter]:
         """Return filters for the frames that are needed here, the guard's heartbeat among them."""
         pdos = {cob_id for decoder in self.decoders.values() for cob_id in decoder.cob_ids}
+        pdos |= {encoder.cob_id for encoder in self.tables}
         return drive_filters([decoder.node_id for decoder in self.decoders.values()], pdos | {self._guard_heartbeat})
 
     def counters(self) -> dict[str, int]:

@@ -1,1 +1,1 @@
-"""Reads sensors on Modbus, each over a link of its own."""
+"""Reads sensors on Modbus, TCP or RTU, over lines that several may share."""

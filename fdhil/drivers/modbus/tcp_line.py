@@ -78,7 +78,7 @@ class TcpLine:
 
     def _call(self, request: Request) -> Awaitable[ModbusPDU]:
         if self._client is None:
-            raise ConnectError(request.name, f"the Modbus sensor {self._where} is not connected; connect first")
+            raise self._gone(request)
         if request.function == WRITE_REGISTER:
             return self._client.write_register(request.address, request.value, device_id=request.unit)
         read = self._client.read_input_registers
@@ -95,8 +95,7 @@ class TcpLine:
             raise self._silent(request) from None
         except ModbusException as error:
             if not self.connected:
-                text = f"the connection to the Modbus sensor {self._where} is gone; check its supply and cable"
-                raise ConnectError(request.name, text) from error
+                raise self._gone(request) from error
             raise self._silent(request) from error
         task = asyncio.current_task()
         if task is not None and task.cancelling():
@@ -105,6 +104,10 @@ class TcpLine:
         if answer.isError():
             raise ModbusRefused(request.name, request.address, int(answer.exception_code))
         return answer
+
+    def _gone(self, request: Request) -> ConnectError:
+        text = f"the connection to the Modbus sensor {self._where} is gone; check its supply and cable"
+        return ConnectError(request.name, text)
 
     def _silent(self, request: Request) -> DeviceError:
         # a late answer must not be taken for the next one's: the connection is made anew

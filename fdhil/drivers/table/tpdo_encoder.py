@@ -15,14 +15,14 @@ SILENT_TICKS = 3000  # of SYNC without that TPDO: then it is told
 
 
 class TpdoEncoder:
-    """The table encoder of one axis; ``feed`` takes ticked frames of its bus, ``short`` counts frames too short."""
+    """The table encoder of one axis; ``feed`` takes ticked frames of its bus, ``short`` counts those too short."""
 
     def __init__(self, axis: str, settings: TableEncoder) -> None:
         assert settings.cob_id is not None  # the configuration has seen to it
         self.axis = axis
         self.short = 0
         self._settings = settings
-        self._cob_id = settings.cob_id
+        self.cob_id = settings.cob_id
         bits = IN_A_FRAME[settings.type]
         self._entry = PdoEntry(0, 0, bits, settings.type.startswith("int"), 8 * settings.byte)
         self._newest = -1
@@ -32,7 +32,7 @@ class TpdoEncoder:
     def feed(self, ticked: Ticked) -> list[TableSamples | Notice]:
         """Return the samples of a block, and what must be told. Of two frames after one SYNC neither is sure."""
         out: list[TableSamples | Notice] = []
-        mine = (ticked.can_id == self._cob_id).nonzero()[0]
+        mine = (ticked.can_id == self.cob_id).nonzero()[0]
         long_enough = ticked.length[mine].astype(np.int64) * 8 >= self._entry.bit_offset + self._entry.bits
         self.short += int(np.count_nonzero(~long_enough))
         mine = mine[long_enough & (ticked.tick[mine] >= 0)]
@@ -52,7 +52,7 @@ class TpdoEncoder:
         was, self._silent = self._silent, last_tick - self._heard_at > SILENT_TICKS
         if self._silent and not was:
             text = (
-                f"No TPDO {self._cob_id:#x} with the place of table {self.axis} comes, its compliance is not seen; "
+                f"No TPDO {self.cob_id:#x} with the place of table {self.axis} comes, its compliance is not seen; "
                 "check that its node is started, that the TPDO is synchronous, and cob_id."
             )
             return [Notice("TableSilent", "minor", text, self.axis)]

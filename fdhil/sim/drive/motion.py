@@ -115,7 +115,7 @@ class Motion:
     @property
     def bound(self) -> bool:
         """Whether the set-points come with the SYNC."""
-        return self.source is Source.CYCLIC
+        return self._power.powered and self._numbers[0x606000] in modes.CYCLIC
 
     # -- statusword and controlword
 

@@ -8,11 +8,24 @@ time.
 
 from __future__ import annotations
 
-_PULL = 1 / 64  # of the way to the own time, per SYNC
-_FREE_S = 0.02  # how far the phase may be off: a SYNC whose period is wrong by a third of 1 ms is beyond it
-_BOUND_S = 0.5  # the same where the set-points come with the SYNC: a period nine times too long is beyond it
-_SYNCS = 4  # or, where that is longer, so many periods of the SYNC
-_MOST_S = 0.05  # of what was missed, this much is run
+import math
+from typing import NamedTuple
+
+_SYNCS = 4  # so many periods of the SYNC the phase may be late in any case
+_MOST_S = 0.6  # of what was missed, this much is run
+
+
+class _Patience(NamedTuple):
+    """How far a SYNC may be from its period: part of the way to the own time per SYNC, seconds late and early."""
+
+    pull: float
+    late_s: float
+    early_s: float
+
+
+_FREE = _Patience(1 / 256, 0.015, 0.006)  # some percent
+# where the set-points come with the SYNC: one of 1 ms may really come every 9 ms, or as fast as it likes
+_BOUND = _Patience(1 / 64, 0.5, math.inf)
 
 
 class OwnClock:
@@ -23,7 +36,8 @@ class OwnClock:
         self._now_s: float | None = None
         self._phase_s = 0.0
         self._run_s = 0.0
-        self._slack_s = _FREE_S
+        self._patience = _FREE
+        self._late_s = _FREE.late_s
         self.leads = False
 
     def stop(self) -> None:
@@ -39,29 +53,32 @@ class OwnClock:
         if self._now_s is None:
             self._phase_s = self._run_s = now_s
         self._now_s = now_s
-        self._slack_s = max(_BOUND_S if bound else _FREE_S, _SYNCS * cycles * self._period_s if cycles > 1 else 0.0)
+        self._patience = _BOUND if bound else _FREE
+        self._late_s = max(self._patience.late_s, _SYNCS * cycles * self._period_s if cycles > 1 else 0.0)
         self._judge()
         if not self.leads:
             return 0
         self._run_s = max(self._run_s, now_s - _MOST_S)
-        cycles = int((now_s - self._run_s) / self._period_s + 1e-6)
-        self._run_s += cycles * self._period_s
-        return cycles
+        missed = max(0, int((now_s - self._run_s) / self._period_s + 1e-6))
+        self._run_s += missed * self._period_s
+        return missed
 
     def sync(self, cycles: int = 1) -> bool:
         """A SYNC came that is said to come every so many cycles: return whether it begins them."""
         if self._now_s is None:
             return True
-        self._phase_s += cycles * self._period_s
-        self._phase_s += _PULL * (self._now_s - self._phase_s)
+        self._phase_s = self._drawn(self._phase_s + cycles * self._period_s, self._now_s)
         self._judge()
-        return not self.leads
+        if self.leads:
+            return False
+        self._run_s = self._drawn(self._run_s + cycles * self._period_s, self._now_s)
+        return True
+
+    def _drawn(self, phase_s: float, now_s: float) -> float:
+        return phase_s + self._patience.pull * (now_s - phase_s)
 
     def _judge(self) -> None:
         assert self._now_s is not None
-        furthest = 2 * self._slack_s  # so that a SYNC that comes back is soon believed again
+        furthest = 2 * self._late_s  # so that a SYNC that comes back is soon believed again
         self._phase_s = min(max(self._phase_s, self._now_s - furthest), self._now_s + furthest)
-        leads = abs(self._now_s - self._phase_s) > self._slack_s
-        if leads and not self.leads:
-            self._run_s = min(self._phase_s, self._now_s)  # what SYNC has not run since
-        self.leads = leads
+        self.leads = not -self._patience.early_s <= self._now_s - self._phase_s <= self._late_s

@@ -35,6 +35,7 @@ REGISTERS = 116
 BLOCK = 100
 TRIGGER, STATUS, FIRST_SAMPLE = 10, 11, 16
 _READS, _WRITES = (3, 4), (6, 16)
+_UNIT_BYTE = 6  # of a Modbus TCP packet
 _NOISE_BLOCK = 1024
 
 
@@ -140,13 +141,13 @@ class _TcpUnit:
                 current[place - start_address] = word
         return None
 
-    def device(self) -> SimDevice:
+    def device(self, unit: int) -> SimDevice:
         """Return the device for pymodbus: only the trigger may be written, other addresses do not exist."""
         parts, trigger = [], self._registers.trigger
         for first, count in _stretches(sorted(self._registers.words()), trigger):
             own = first == trigger
             parts.append(SimData(first, values=[0] * count, datatype=DataType.REGISTERS, readonly=not own))
-        return SimDevice(id=0, simdata=parts, action=self.access)
+        return SimDevice(id=unit, simdata=parts, action=self.access)
 
 
 def _stretches(addresses: list[int], alone: int | None) -> list[tuple[int, int]]:
@@ -169,9 +170,13 @@ class SensorServers:
         sensors: Mapping[str, VoltageSensor],
         addresses: Mapping[str, tuple[str, int]],
         maps: Mapping[str, RegisterMap] | None = None,
+        units: Mapping[str, int] | None = None,
     ) -> None:
-        """Serve the sensors that have an address, each with the registers of ``maps`` in place of its own."""
-        self._sensors, self._addresses = sensors, addresses
+        """Serve the sensors that have an address, each with the registers of ``maps`` in place of its own.
+
+        Those with one address are behind a gateway: each answers to its own number of ``units`` only.
+        """
+        self._sensors, self._addresses, self._units = sensors, addresses, units or {}
         self._maps: Mapping[str, RegisterMap] = sensors if maps is None else maps
         self._servers: list[ModbusTcpServer] = []
         self._loop = asyncio.new_event_loop()
@@ -201,22 +206,36 @@ class SensorServers:
         self._loop.run_forever()
 
     async def _open(self) -> None:
+        for axes in self._gateways():
+            port = await self._serve(axes)
+            self.ports |= dict.fromkeys(axes, port)
+
+    def _gateways(self) -> list[list[str]]:
+        """Return the axes by the server that they share; a port that is yet to be chosen is nobody else's."""
+        shared: dict[tuple[str, int | str], list[str]] = {}
         for axis, (host, port) in self._addresses.items():
-            sensor = self._sensors[axis]
-            unit = _TcpUnit(self._maps[axis], sensor.faults)
-            server = ModbusTcpServer(unit.device(), address=(host, port), trace_packet=_muffled(sensor))
-            try:
-                await server.serve_forever(background=True)
-            except RuntimeError:
-                raise ConnectError(
-                    f"voltage sensor {axis}",
-                    f"TCP port {port} of {host} cannot be had: end the program that holds it, or set "
-                    f"axis.{axis}.voltage.port to another one (0 lets the simulator choose one)",
-                ) from None
-            self._servers.append(server)
-            listener = server.transport
-            assert isinstance(listener, asyncio.Server)
-            self.ports[axis] = listener.sockets[0].getsockname()[1]
+            shared.setdefault((host, port or axis), []).append(axis)
+        return list(shared.values())
+
+    async def _serve(self, axes: list[str]) -> int:
+        """Serve the units of one address and return its port; ConnectError."""
+        host, port = self._addresses[axes[0]]
+        faults = {self._units.get(axis, 0) if len(axes) > 1 else 0: self._sensors[axis].faults for axis in axes}
+        parts = zip(axes, faults.items(), strict=True)
+        devices = [_TcpUnit(self._maps[axis], one).device(unit) for axis, (unit, one) in parts]
+        server = ModbusTcpServer(devices, address=(host, port), trace_packet=_muffled(faults))
+        try:
+            await server.serve_forever(background=True)
+        except RuntimeError:
+            raise ConnectError(
+                f"voltage sensor {axes[0]}",
+                f"TCP port {port} of {host} cannot be had: end the program that holds it, or set "
+                f"axis.{axes[0]}.voltage.port to another one (0 lets the simulator choose one)",
+            ) from None
+        self._servers.append(server)
+        listener = server.transport
+        assert isinstance(listener, asyncio.Server)
+        return int(listener.sockets[0].getsockname()[1])
 
     async def _close(self) -> None:
         for server in self._servers:
@@ -228,6 +247,11 @@ class SensorServers:
         await asyncio.gather(*others, return_exceptions=True)
 
 
-def _muffled(sensor: VoltageSensor) -> Callable[[bool, bytes], bytes]:
-    """Return the hook through which every packet goes: a silent sensor sends nothing."""
-    return lambda sending, packet: b"" if sending and sensor.faults.silent else packet
+def _muffled(faults: Mapping[int, SensorFaults]) -> Callable[[bool, bytes], bytes]:
+    """Return the hook through which every packet goes: a silent sensor sends nothing. 0 is whatever unit."""
+
+    def hook(sending: bool, packet: bytes) -> bytes:
+        told = faults.get(0) or faults.get(packet[_UNIT_BYTE]) if len(packet) > _UNIT_BYTE else None
+        return b"" if sending and told is not None and told.silent else packet
+
+    return hook

@@ -10,7 +10,7 @@ import struct
 from collections.abc import Callable
 from typing import Protocol
 
-from fdhil.config import Thermometer, Voltage
+from fdhil.config import TableEncoder, Thermometer, Voltage
 from fdhil.config.sensors import VoltageBlock
 
 _FORMATS = {"int16": ">h", "uint16": ">H", "int32": ">i", "uint32": ">I", "float32": ">f", "float64": ">d"}
@@ -57,7 +57,7 @@ class OneValue:
 
     trigger: int | None = None
 
-    def __init__(self, settings: Voltage | Thermometer, kind: str, read: Callable[[], float]) -> None:
+    def __init__(self, settings: Voltage | Thermometer | TableEncoder, kind: str, read: Callable[[], float]) -> None:
         self._settings, self._kind, self._read = settings, kind, read
 
     def words(self) -> dict[int, int]:

@@ -2,30 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from fdhil.config import MachineConfig, Thermometer
+from fdhil.config import MachineConfig, TableEncoder, Thermometer
 from fdhil.errors import ConnectError
 from fdhil.sim.wire.modbus_sensor import SensorServers, VoltageSensor
-from fdhil.sim.wire.registers import Joined, RegisterMap, map_of, thermometer_map
+from fdhil.sim.wire.registers import Joined, OneValue, RegisterMap, map_of, thermometer_map
 from fdhil.sim.wire.serial_lines import Party, RtuUnits, SerialLines, TextInstrument
 
 
 class SensorWires:
     """All sensors of a machine; ``ready`` says by axis where each voltage sensor is, once :meth:`start` has returned.
 
-    A drive's axis whose voltage comes from the drive has a sensor on Modbus TCP all the same. A thermometer is served
-    where its device is: on a serial line, or within the unit of the voltage sensor at the same address.
+    A drive's axis whose voltage comes from the drive has a sensor on Modbus TCP all the same. A thermometer, or a table
+    encoder on Modbus, is served where its device is: on a serial line, or within the unit of the voltage sensor at the
+    same address. ``places`` tell where the tables are, mm.
     """
 
-    def __init__(self, config: MachineConfig, sensors: Mapping[str, VoltageSensor]) -> None:
-        self._config, self._sensors = config, sensors
+    def __init__(
+        self,
+        config: MachineConfig,
+        sensors: Mapping[str, VoltageSensor],
+        places: Mapping[str, Callable[[], float]] | None = None,
+    ) -> None:
+        self._config, self._sensors, self._places = config, sensors, places or {}
         self._parties: dict[str, Party] = {}
         maps, addresses = {}, {}
         for axis, sensor in sensors.items():
             section = config.axis[axis]
-            voltage, thermometer = section.voltage, section.temperature
+            voltage, thermometer, table = section.voltage, section.temperature, section.table
+            if table is not None and table.source == "modbus" and table.device:
+                self._on_a_line(axis, table)
             if thermometer is not None and thermometer.device:
                 self._on_a_line(axis, thermometer)
             if voltage.separate and voltage.device:
@@ -35,8 +43,12 @@ class SensorWires:
             here = thermometer is not None and (thermometer.host, thermometer.port) == (voltage.host, voltage.port)
             if thermometer is not None and here and thermometer.source == "modbus" and not thermometer.device:
                 registers = Joined(registers, thermometer_map(thermometer, sensor))
+            there = table is not None and (table.host, table.port) == (voltage.host, voltage.port)
+            if table is not None and there and table.source == "modbus" and not table.device:
+                registers = Joined(registers, OneValue(table, table.type, self._places[axis]))
             maps[axis], addresses[axis] = registers, (voltage.host, voltage.port)
-        self._tcp = SensorServers(sensors, addresses, maps)
+        units = {axis: config.axis[axis].voltage.unit for axis in addresses}
+        self._tcp = SensorServers(sensors, addresses, maps, units)
         self._lines = SerialLines(self._parties) if self._parties else None
         self.ready: dict[str, dict[str, Any]] = {}
 
@@ -49,7 +61,11 @@ class SensorWires:
             return
         party = self._parties.setdefault(settings.device, RtuUnits())
         assert isinstance(party, RtuUnits)  # the configuration has text alone on its device
-        registers: RegisterMap = thermometer_map(settings, sensor) if is_warmth else map_of(settings, sensor, sensor)
+        registers: RegisterMap
+        if isinstance(settings, TableEncoder):
+            registers = OneValue(settings, settings.type, self._places[axis])
+        else:
+            registers = thermometer_map(settings, sensor) if is_warmth else map_of(settings, sensor, sensor)
         if settings.unit in party.units:
             registers = Joined(party.units[settings.unit][0], registers)
         party.units[settings.unit] = registers, sensor.faults

@@ -1,0 +1,251 @@
+"""What sensors at the table show of two masses on a spring, as columns that are linear beside resonance and damping.
+
+With q the table's share of the inertia J, w and z the resonance with the motor free and its damping, a and t the places
+of motor and table and T the motor's torque, free of friction:
+
+    table         (s^2 + 2 z' w' s + w'^2) t = (2 z' w' s + w'^2) a        w' = w sqrt(1 - q), z' = z sqrt(1 - q)
+    bend          a - t = T / (J (1 - q)) F                                F = 1 / (s^2 + 2 z w s + w^2)
+    acceleration  s^2 t = T / J (2 z w s + w^2) F
+    motor         s a   = T / J (1 / s + q / (1 - q) s F)
+
+w' and z' are those of the table with the motor held. While the table moves one way its friction is constant or follows
+speed and angle. So what friction bends, what swings since the table broke loose, the sensors' offsets and the screw's
+pitch are linear. What the motor's own sensors have of noise swings in the answer as the table does; its power is known,
+and all is weighed by it: the maximum likelihood of a system whose input is noisy, too.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from fdhil.identification.filtering import quick_size, zero_phase
+from fdhil.identification.motion import resolution
+from fdhil.identification.windows import bridged, longest, noise_of, smooth
+from fdhil.records import Bool, Float, Parameters, Window
+
+Complex = npt.NDArray[np.complex128]
+
+MOVING = 0.15  # of the top speed: below it friction changes with speed
+LEAST_ROWS = 80
+FINEST = 0.03  # of the encoder's noise: the least that a speed's may be taken for
+NIL = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Motor:
+    """What the motor does, (n,) rows dt apart, and the ``rows`` in which the table surely moves one way.
+
+    ``push`` is the torque per inertia, mm/s2 at the table. ``steps`` and ``pushes`` are the spectra of the way from row
+    to row and of ``push`` beside its line. ``place_noise`` is the power of the place's noise (mm2 a row) by frequency.
+    """
+
+    dt_s: float
+    place_mm: Float
+    speed_mm_s: Float
+    turns: Float  # as an angle, rad
+    push: Float
+    rows: Bool
+    omega: Float
+    steps: Complex
+    pushes: Complex
+    place_noise: Float
+
+    @classmethod
+    def of(cls, window: Window, parameters: Parameters) -> Motor | None:
+        """Return it of a window; None where too little of it is heard, or the torque's scale is not known."""
+        dt, mm_per_rad = window.dt_s, window.pitch_mm / (2 * math.pi)
+        known = np.isfinite(window.speed_rad_s) & np.isfinite(window.position_mm) & np.isfinite(window.current_a)
+        scale = parameters.K / parameters.Jt * mm_per_rad if parameters.Jt else math.nan
+        if np.count_nonzero(known) < LEAST_ROWS or not math.isfinite(scale):
+            return None
+        speed, push = bridged(window.speed_rad_s) * mm_per_rad, bridged(window.current_a) * scale
+        size = 2 * quick_size(speed.size)  # even, as the inverse transform takes it
+        place, noise = _place(bridged(window.position_mm), speed, dt, size)
+        slow = smooth(speed, dt)
+        first, last = longest(known & (window.direction * slow > MOVING * np.abs(slow).max()))
+        rows = np.zeros(place.size, np.bool_)
+        rows[first:last] = True
+        omega = np.asarray(2 * math.pi * np.fft.rfftfreq(size, dt), dtype=np.float64)
+        steps, pushes = np.fft.rfft(np.diff(place), size), np.fft.rfft(push - _line(push), size)
+        return cls(dt, place, speed, place / mm_per_rad, push, rows, omega, steps, pushes, noise)
+
+    def way(self, gain: Complex, steady_s: float, rows: Bool) -> Float:
+        """Return (m,) the motor's way, mm, through a gain that is ``steady_s`` s where all is slow."""
+        step = np.exp(1j * self.omega * self.dt_s) - 1.0
+        step[0] = 1.0
+        through = gain / step
+        through[0] = steady_s / self.dt_s
+        return self._rows(self.steps * through, rows)
+
+    def pushed(self, gain: Complex, rows: Bool) -> Float:
+        """Return (m,) what a system with this gain makes of the torque per inertia."""
+        return self._rows(self.pushes * gain, rows) + float(gain[0].real) * _line(self.push)[rows]
+
+    def _rows(self, spectrum: Complex, rows: Bool) -> Float:
+        values: Float = np.fft.irfft(spectrum, 2 * (self.omega.size - 1))[: rows.size][rows]
+        return values
+
+    def time(self, rows: Bool) -> Float:
+        """Return (m,) seconds since the first of some rows."""
+        return np.asarray(self.dt_s * (np.flatnonzero(rows) - int(np.argmax(rows))), dtype=np.float64)
+
+    def beside(self, rows: Bool) -> list[Float]:
+        """Return what a sensor at the table has of an offset, and of friction and pitch, by speed and angle."""
+        turns = self.turns[rows]
+        return [np.ones(turns.size), self.speed_mm_s[rows], np.sin(turns), np.cos(turns)]
+
+
+def _line(values: Float) -> Float:
+    return np.asarray(np.linspace(values[0], values[-1], values.size), dtype=np.float64)
+
+
+def _place(position_mm: Float, speed_mm_s: Float, dt: float, size: int) -> tuple[Float, Float]:
+    """Return the motor's place (n,), slow parts from the encoder's place and quick ones from the speed, and its noise.
+
+    Between two rows the speed is taken as a cubic. Summed up it drifts, so the encoder's place rules below the corner
+    where the noise of both is alike. The noise is its power in a row at the frequencies of ``size`` rows.
+    """
+    w = np.concatenate([speed_mm_s[:1], speed_mm_s, speed_mm_s[-1:]])
+    summed = np.concatenate([[0.0], np.cumsum(dt / 24 * (13 * (w[1:-2] + w[2:-1]) - w[:-3] - w[3:]))])
+    fine = noise(position_mm)
+    rough = max(dt * noise_of(speed_mm_s), FINEST * fine)
+    if rough > 2.0 * fine:
+        return position_mm, np.full(size // 2 + 1, fine**2)
+    corner = math.asin(0.5 * rough / fine) / (math.pi * dt)
+    impulse = np.zeros(size)
+    impulse[size // 2] = 1.0
+    share = np.abs(np.fft.rfft(zero_phase(impulse, corner, dt)))
+    swing = np.maximum(2 * np.sin(math.pi * np.fft.rfftfreq(size)), NIL)
+    power = (share * fine) ** 2 + ((1.0 - share) * rough / swing) ** 2
+    return summed + zero_phase(position_mm - summed, corner, dt), power
+
+
+def noise(values: Float) -> float:
+    """Return the deviation of a signal's noise from row to row, that of its steps at the least."""
+    known = values[np.isfinite(values)]
+    return max(noise_of(known), resolution(known) / math.sqrt(12.0), NIL)
+
+
+def flexible(omega: Float, w: float, z: float) -> Complex:
+    """Return F, 1 / (s^2 + 2 z w s + w^2), at angular frequencies (n,)."""
+    s = 1j * omega
+    return np.asarray(1.0 / (s * s + 2 * z * w * s + w * w), dtype=np.complex128)
+
+
+def swings(time_s: Float, w: float, z: float) -> Float:
+    """Return the columns (m, 2) of what swings by itself since the first row."""
+    turning, fades = w * math.sqrt(max(1.0 - z * z, 1e-6)) * time_s, np.exp(-z * w * time_s)
+    return np.column_stack([fades * np.cos(turning), fades * np.sin(turning)])
+
+
+def left(seen: Float, columns: Float, power: Float) -> Float:
+    """Return (m,) what columns (m, k) do not explain of what is seen, in deviations of noise of this power.
+
+    The noise' minimum-phase factor, made by its cepstrum ([OPP] 13.5), is undone: what is left of it is white.
+    """
+    size = 2 * (power.size - 1)
+    cepstrum = np.fft.irfft(np.log(power), size)[: size // 2]
+    cepstrum[0] *= 0.5
+    undone = np.exp(-np.fft.rfft(cepstrum, size))
+    both = np.column_stack([columns, seen])
+    white = np.fft.irfft(np.fft.rfft(both, size, axis=0) * undone[:, None], size, axis=0)[: seen.size]
+    q, _ = np.linalg.qr(white[:, :-1] / np.linalg.norm(white[:, :-1], axis=0))
+    out: Float = white[:, -1] - q @ (q.T @ white[:, -1])
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class Encoder:
+    """An encoder at the table: ``seen`` (m,) mm at its ``rows``, with its own noise a row."""
+
+    motor: Motor
+    seen: Float
+    rows: Bool
+    own: float
+
+    def stiff(self, late_s: float, power: Float | None = None) -> Float:
+        """Return what of it a screw that does not give leaves, in noise of its own or of another ``power``."""
+        moved = self.motor.place_mm[self.rows] - self.motor.way(self._late(late_s), late_s, self.rows)
+        own = self.motor.place_noise + self.own**2
+        return left(self.seen - moved, self._linear(), own if power is None else power)
+
+    def follows(self, w: float, z: float, late_s: float) -> Float:
+        """Return what a table leaves that follows the motor's place; ``w`` and ``z`` are those with the motor held."""
+        motor, rows = self.motor, self.rows
+        pulled = (2j * z * w * motor.omega + w * w) * flexible(motor.omega, w, z)
+        lags = motor.way(1.0 - pulled * (1.0 - self._late(late_s)), late_s, rows)
+        columns = np.column_stack([swings(motor.time(rows), w, z), self._linear()])
+        return left(self.seen - motor.place_mm[rows] + lags, columns, self.power(w, z))
+
+    def power(self, w: float, z: float) -> Float:
+        """Return the power of its noise and of what becomes of the motor's place's, a row."""
+        pulled = (2j * z * w * self.motor.omega + w * w) * flexible(self.motor.omega, w, z)
+        power: Float = np.abs(pulled) ** 2 * self.motor.place_noise + self.own**2
+        return power
+
+    def bends(self, w: float, z: float, q: float) -> Float:
+        """Return what a table leaves of the bend that the torque makes; ``w`` and ``z`` with the motor free."""
+        motor, rows = self.motor, self.rows
+        gain = flexible(motor.omega, w, z) / (1.0 - q)
+        columns = np.column_stack([swings(motor.time(rows), w, z), self._linear()])
+        power = np.abs(gain) ** 2 * noise_of(motor.push) ** 2 + motor.place_noise + self.own**2
+        return left(motor.place_mm[rows] - self.seen - motor.pushed(gain, rows), columns, power)
+
+    def _late(self, late_s: float) -> Complex:
+        return np.asarray(1.0 - np.exp(-1j * self.motor.omega * late_s), dtype=np.complex128)
+
+    def _linear(self) -> Float:
+        return np.column_stack([self.motor.turns[self.rows], *self.motor.beside(self.rows)])
+
+
+@dataclass(frozen=True, slots=True)
+class Accelerometer:
+    """An accelerometer at the table, ``seen`` (m,) mm/s2 at its ``rows``; its gain is known to some percent."""
+
+    motor: Motor
+    seen: Float
+    rows: Bool
+    own: float
+
+    def stiff(self, late_s: float, power: Float | None = None) -> Float:
+        """Return what of it a screw that does not give leaves, in noise of its own or of another ``power``."""
+        own = np.full(self.motor.omega.size, self.own**2)
+        return self._left(np.exp(-1j * self.motor.omega * late_s), [], own if power is None else power)
+
+    def follows(self, w: float, z: float, late_s: float) -> Float:
+        """Return what a table leaves that the torque moves; ``w`` and ``z`` are those with the motor free."""
+        omega = self.motor.omega
+        pulled = (2j * z * w * omega + w * w) * flexible(omega, w, z) * np.exp(-1j * omega * late_s)
+        return self._left(pulled, [swings(self.motor.time(self.rows), w, z)], self.power(w, z))
+
+    def power(self, w: float, z: float) -> Float:
+        """Return the power of its noise and of what becomes of the current's, a row."""
+        pulled = (2j * z * w * self.motor.omega + w * w) * flexible(self.motor.omega, w, z)
+        power: Float = np.abs(pulled) ** 2 * noise_of(self.motor.push) ** 2 + self.own**2
+        return power
+
+    def _left(self, gain: Complex, more: list[Float], power: Float) -> Float:
+        motor, rows = self.motor, self.rows
+        turns, speed = motor.turns[rows], motor.speed_mm_s[rows]
+        waves = [speed**2 * np.sin(turns), speed**2 * np.cos(turns)]
+        columns = np.column_stack([motor.pushed(gain, rows), *more, *motor.beside(rows), *waves])
+        return left(self.seen, columns, power)
+
+
+def shaft(motor: Motor, w: float, z: float, q: float) -> Float:
+    """Return (m,) what is left of the motor's own speed, from which a table with this share ``q`` takes momentum."""
+    rows, s = motor.rows, 1j * motor.omega
+    driven = motor.dt_s * np.cumsum(motor.push)[rows] + q / (1.0 - q) * motor.pushed(
+        s * flexible(motor.omega, w, z), rows
+    )
+    turns, time_s = motor.turns[rows], motor.time(rows)
+    own = [np.ones(turns.size), time_s, turns, np.sin(turns), np.cos(turns)]
+    columns = np.column_stack([driven, swings(time_s, w, z), *own])
+    s = np.maximum(motor.omega, motor.omega[1]) * 1j
+    gain = 1.0 / s + q / (1.0 - q) * s * flexible(motor.omega, w, z)
+    power = np.abs(gain) ** 2 * noise_of(motor.push) ** 2 + noise_of(motor.speed_mm_s) ** 2
+    return left(motor.speed_mm_s[rows], columns, power)

@@ -1,0 +1,245 @@
+"""Sensors at the table: a TPDO's place on its tick, a stream of lines on the SYNC count, a module that is asked."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import struct
+import tty
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fdhil import config as machine_config
+from fdhil.config import Accelerometer, TableEncoder
+from fdhil.drivers.can.sync_grid import Ticked
+from fdhil.drivers.can.tick_clock import TickClock
+from fdhil.drivers.serial.lines import TextLine
+from fdhil.drivers.table.accelerometer import StreamedAccelerometer
+from fdhil.drivers.table.arrivals import Arrivals
+from fdhil.drivers.table.modbus_encoder import ModbusEncoder
+from fdhil.drivers.table.tpdo_encoder import SILENT_TICKS, TpdoEncoder
+from fdhil.errors import ConnectError, DeviceTimeout, ProtocolError
+from fdhil.records import Notice, TableSamples, TickTimes, frozen_ints
+from fdhil.sim.wire.modbus_sensor import VoltageSensor
+from fdhil.sim.wire.sensor_wires import SensorWires
+from tests.bench import bench_document
+from tests.drivers.modbus_peer import sensor_peer
+
+MS = 1_000_000
+
+
+def ticked(frames: list[tuple[int, int, bytes]], last_tick: int = 0) -> Ticked:
+    """Return frames (tick, id, data) as the grid hands them over."""
+    data = [int.from_bytes(one.ljust(8, b"\0"), "little") for _, _, one in frames]
+    return Ticked(
+        np.array([can_id for _, can_id, _ in frames], np.uint32),
+        np.array([len(one) for _, _, one in frames], np.uint8),
+        np.array(data, np.uint64),
+        np.array([tick for tick, _, _ in frames], np.int64),
+        TickTimes(frozen_ints([]), frozen_ints([])),
+        max([last_tick, *(tick for tick, _, _ in frames)]),
+    )
+
+
+def clock(ticks: int = 4000) -> TickClock:
+    """Return a SYNC count whose tick k came at k ms."""
+    found = TickClock(1e-3)
+    found.add(TickTimes(frozen_ints(np.arange(ticks)), frozen_ints(np.arange(ticks) * MS)))
+    return found
+
+
+def test_a_place_in_a_tpdo_has_the_tick_of_its_sync() -> None:
+    encoder = TpdoEncoder("X", TableEncoder(cob_id=0x2A0, byte=2, scale=-1e-4, offset=10.0))
+    frames = [(k, 0x2A0, b"\xff\xff" + struct.pack("<i", -1000 - k)) for k in range(5)]
+    frames.insert(2, (1, 0x181, bytes(8)))
+    (samples,) = encoder.feed(ticked(frames))
+    assert isinstance(samples, TableSamples)
+    assert (samples.axis, samples.signal, samples.tick_error) == ("X", "table_mm", 0.0)
+    assert samples.tick.tolist() == [0, 1, 2, 3, 4]
+    assert samples.values.tolist() == pytest.approx([10.1 + 1e-4 * k for k in range(5)])
+
+
+def test_two_places_after_one_sync_and_short_frames_are_not_used() -> None:
+    encoder = TpdoEncoder("X", TableEncoder(cob_id=0x2A0, type="int16"))
+    frames = [(0, 0x2A0, b"\1\0"), (1, 0x2A0, b"\2\0"), (1, 0x2A0, b"\3\0"), (2, 0x2A0, b"\4")]
+    (samples,) = encoder.feed(ticked(frames))
+    assert isinstance(samples, TableSamples)
+    assert samples.tick.tolist() == [0]
+    assert encoder.short == 1
+
+
+def test_an_encoder_that_is_not_heard_is_told_once_and_when_it_is_back() -> None:
+    encoder = TpdoEncoder("X", TableEncoder(cob_id=0x2A0))
+    assert encoder.feed(ticked([], 10)) == []
+    (notice,) = encoder.feed(ticked([], 11 + SILENT_TICKS))
+    assert isinstance(notice, Notice)
+    assert notice.code == "TableSilent"
+    assert "0x2a0" in notice.text
+    assert encoder.feed(ticked([], 500 + SILENT_TICKS)) == []
+    back = encoder.feed(ticked([(600 + SILENT_TICKS, 0x2A0, bytes(4))]))
+    assert [type(one) for one in back] == [TableSamples, Notice]
+
+
+@pytest.mark.parametrize("off_rate", [1.0, 1.03, 0.98])
+def test_arrivals_are_placed_by_the_earliest_at_the_sensors_own_rate(off_rate: float) -> None:
+    rng = np.random.default_rng(1)
+    arrivals = Arrivals(800.0, 1e-3)
+    step = 1.25 / off_rate
+    for count in range(0, 4000, 16):  # 16 lines at a time, each up to 8 ms late
+        arrivals.add(count, 100.0 + step * count + rng.uniform(0.0, 8.0) ** 2 / 8.0)
+    line = arrivals.line()
+    assert line is not None
+    assert line.step == pytest.approx(step, rel=2e-4)
+    for count in (1000, 3000):
+        assert abs(line.at(count) - 100.0 - step * count) < 1.0 + line.error
+
+
+def test_before_much_has_arrived_the_nominal_rate_is_taken_and_a_restart_forgets() -> None:
+    arrivals = Arrivals(800.0, 1e-3)
+    assert arrivals.line() is None
+    arrivals.add(100, 50.0)
+    line = arrivals.line()
+    assert line is not None
+    assert (line.step, line.at(100)) == (1.25, 50.0)
+    arrivals.add(3, 90.0)
+    again = arrivals.line()
+    assert again is not None
+    assert again.at(3) == 90.0
+
+
+def streamed(**keys: float) -> StreamedAccelerometer:
+    return StreamedAccelerometer("Y", Accelerometer(device="/dev/none", **{"scale": 0.01} | keys), 1e-3)
+
+
+def lines(counts: list[int], text: str = "{},{},7,8") -> list[TextLine]:
+    return [TextLine(text.format(c, 100 + c), round(1.25 * c * MS)) for c in counts]
+
+
+def test_lines_become_accelerations_on_the_sync_count() -> None:
+    sensor = streamed(late_s=0.002)
+    found = [r for k in range(0, 1600, 40) for r in sensor.accept(lines(list(range(k, k + 40))), clock())]
+    samples = [r for r in found if isinstance(r, TableSamples)]
+    tick, values = np.concatenate([r.tick for r in samples]), np.concatenate([r.values for r in samples])
+    assert values.tolist() == pytest.approx([0.01 * (100 + c) for c in range(1600)])
+    assert np.abs(tick - (1.25 * np.arange(1600) - 2.0)).max() < 1.0
+    assert samples[-1].rate_per_tick == pytest.approx(0.8, rel=1e-3)
+    assert (sensor.samples, sensor.lost) == (1600, 0)
+
+
+def test_lost_lines_are_counted_and_told_and_a_count_may_begin_anew() -> None:
+    sensor = streamed()
+    told = sensor.accept(lines([10, 11, 14]), clock())
+    assert [r.code for r in told if isinstance(r, Notice)] == ["SampleTiming"]
+    assert sensor.lost == 2
+    wrapping = streamed()
+    wrapping.accept([TextLine("65534,1", 0), TextLine("65535,1", MS), TextLine("0,1", 2 * MS)], clock())
+    assert (wrapping.lost, wrapping.samples) == (0, 3)
+    restarted = streamed()
+    restarted.accept([TextLine("70000,1", 0), TextLine("1,1", MS)], clock())
+    assert restarted.lost == 0
+
+
+def test_without_a_count_every_line_is_the_next_sample() -> None:
+    sensor = StreamedAccelerometer("Y", Accelerometer(device="/dev/none", count_column=0, column=1, scale=1.0), 1e-3)
+    records = sensor.accept([TextLine("1.5 m/s2", 0), TextLine("-2.5 m/s2", MS)], clock())
+    assert [r.values.tolist() for r in records if isinstance(r, TableSamples)] == [[1.5, -2.5]]
+
+
+def test_the_line_under_way_at_the_start_is_left_out_and_other_text_is_told() -> None:
+    sensor = streamed()
+    sensor.accept([TextLine("23", 0), *lines([24, 25])], clock())
+    assert sensor.samples == 2
+    with pytest.raises(ProtocolError, match="has 0 numbers, and number 2 is asked for; compare column"):
+        streamed().accept([TextLine("booting", 0), TextLine("hello world", MS)], clock())
+
+
+async def test_it_is_read_from_a_serial_device(tmp_path: Path) -> None:
+    ours, theirs = os.openpty()
+    tty.setraw(theirs)
+    device = tmp_path / "accelerometer"
+    device.symlink_to(os.ttyname(theirs))
+    sensor = StreamedAccelerometer("Y", Accelerometer(device=str(device), scale=0.1), 1e-3)
+    await sensor.link.connect()
+    os.write(ours, b"1,-20,0,0\n2,-30,0,0\n")
+    assert await sensor.reading() == "-3.00 m/s2"
+    sensor.link.close()
+    for fd in (ours, theirs):
+        os.close(fd)
+
+
+async def test_silence_and_a_missing_device_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fdhil.drivers.table.accelerometer.SILENCE_NS", 1)
+    sensor = streamed()
+    with pytest.raises(ConnectError, match="no serial device /dev/none"):
+        await sensor.link.connect()
+    ours, theirs = os.openpty()
+    tty.setraw(theirs)
+    quiet = StreamedAccelerometer("Y", Accelerometer(device=os.ttyname(theirs)), 1e-3)
+    await quiet.link.connect()
+    await asyncio.sleep(0.001)
+    with pytest.raises(DeviceTimeout, match="check that the sensor streams") as caught:
+        await quiet.poll(clock())
+    assert quiet.link.fault_code(caught.value) == "TableSilent"
+    quiet.link.close()
+    for fd in (ours, theirs):
+        os.close(fd)
+
+
+async def test_a_module_on_modbus_is_placed_between_question_and_answer() -> None:
+    async with sensor_peer() as peer:  # 21.5 as a float32 from register 8 on
+        settings = TableEncoder(
+            source="modbus", port=peer.port, address=8, type="float32", scale=2.0, offset=1.0, period_s=0.001
+        )
+        encoder = ModbusEncoder("X", settings)
+        await encoder.link.connect()
+        assert await encoder.poll(TickClock(1e-3)) == []  # without SYNC there is no place on its count
+        ticks = TickClock(1e-3)
+        begun = encoder.link.asked_ns
+        ticks.add(TickTimes(frozen_ints(np.arange(4000)), frozen_ints(begun + np.arange(4000) * MS)))
+        (sample,) = await encoder.poll(ticks)
+        assert await encoder.reading() == "44.0000 mm"
+        encoder.link.close()
+    assert sample.values.tolist() == [44.0]
+    assert 0.0 < sample.tick[0] < 4000.0
+    assert sample.tick_error > 0.0
+
+
+@pytest.mark.parametrize(
+    ("keys", "text"),
+    [
+        ({}, "cob_id: is needed"),
+        ({"cob_id": 0x2A0, "byte": 5}, "byte: int32 from byte 5 on reaches beyond"),
+        ({"cob_id": 0x2A0, "type": "float32"}, "type: a TPDO carries"),
+        ({"cob_id": 0x2A0, "scale": 0.0}, "scale: a count must be worth something"),
+    ],
+)
+def test_a_table_encoder_that_cannot_be_is_refused(keys: dict[str, object], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        TableEncoder(**keys)
+
+
+async def test_the_simulated_module_on_a_serial_line_is_read(tmp_path: Path) -> None:
+    document = bench_document("X")
+    keys = {
+        "source": "modbus",
+        "device": str(tmp_path / "line"),
+        "type": "int32",
+        "word_order": "little",
+        "scale": 1e-4,
+    }
+    document["axis"]["X"]["table"] = keys | {"function": 3, "address": 30}
+    config = machine_config.parse(document)
+    sensor = VoltageSensor(1000.0, 300.0, 0.0, np.random.default_rng(1))
+    wires = SensorWires(config, {"X": sensor}, {"X": lambda: -123.4567})
+    wires.start()
+    settings = config.axis["X"].table
+    assert settings is not None
+    encoder = ModbusEncoder("X", settings)
+    try:
+        await encoder.link.connect()
+        assert await encoder.reading() == "-123.4567 mm"
+    finally:
+        encoder.link.close()
+        wires.stop()

@@ -1,0 +1,143 @@
+"""The guard on real interfaces, in the middle of a cut: one that goes down, a queue that is full, a bus-off."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from fdhil.guard.can_socket import Frame, RawCan
+from fdhil.guard.frames import Listener
+from tests.guard import shop as guard_shop
+from tests.guard.machine import commissioned, settings
+from tests.guard.shop import TOKEN, Shop
+from tests.socketcan.interface import CAN_FRAME, SerialAdapter, raw_socket, set_up
+
+pytestmark = pytest.mark.socketcan
+WANTED = Listener(commissioned(settings())).wanted_ids()
+
+
+class Wire(RawCan):
+    """The guard's own socket; what it sent is kept, and the drives and the NC are on the other side of the bus."""
+
+    def __init__(self, allowed: frozenset[int], channel: str) -> None:
+        super().__init__(raw_socket(channel), allowed, WANTED)
+        self.sent: list[tuple[int, bytes]] = []
+
+    def feed(self, frames: Sequence[Frame]) -> None:
+        raise NotImplementedError
+
+    def _send(self, cob_id: int, data: bytes) -> bool:
+        left = super()._send(cob_id, data)
+        self.sent.append((cob_id, data))
+        return left
+
+
+class OnVcan(Wire):
+    def __init__(self, allowed: frozenset[int]) -> None:
+        super().__init__(allowed, "vcan0")
+
+    def feed(self, frames: Sequence[Frame]) -> None:
+        with raw_socket() as others:
+            for cob_id, data, _ in frames:
+                others.send(CAN_FRAME.pack(cob_id, len(data), data))
+
+
+class OnAdapter(Wire):
+    """``stuck``: nobody acknowledges what is sent."""
+
+    def __init__(self, allowed: frozenset[int]) -> None:
+        self.adapter = SerialAdapter()
+        self.stuck = False
+        super().__init__(allowed, self.adapter.channel)
+
+    def feed(self, frames: Sequence[Frame]) -> None:
+        for cob_id, data, _ in frames:
+            self.adapter.say(f"t{cob_id:03X}{len(data)}{data.hex().upper()}")
+        if not self.stuck:
+            self.adapter.drain()
+        time.sleep(0.001)  # the line discipline has a thread of its own
+
+    def close(self) -> None:
+        super().close()
+        self.adapter.unplug()
+
+
+@pytest.fixture
+def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[type[Wire]], Shop]]:
+    made: list[Shop] = []
+
+    def build(wire: type[Wire]) -> Shop:
+        monkeypatch.setattr(guard_shop, "Wire", wire)
+        made.append(Shop(tmp_path))
+        return made[-1]
+
+    yield build
+    set_up("vcan0", True)
+    for shop in made:
+        shop.close()
+
+
+def until(shop: Shop, condition: Callable[[], bool], act: Callable[[], None]) -> None:
+    for _ in range(20_000):
+        if condition():
+            return
+        act()
+    raise AssertionError(shop.events()[-5:])
+
+
+def events(shop: Shop, name: str) -> int:
+    return sum(event["event"] == name for event in shop.events())
+
+
+def test_an_interface_that_goes_down_freezes_and_what_stands_is_adopted_when_it_is_back(
+    make: Callable[[type[Wire]], Shop],
+) -> None:
+    shop = make(OnVcan)
+    client = shop.into_the_cut()
+    set_up("vcan0", False)
+    until(shop, lambda: shop.state == "FROZEN", shop.turn)
+    assert shop.guard.state.cause is not None
+    assert shop.guard.state.cause.code == "BusDown"
+    sent = len(shop.wire.sent)
+    for _ in range(20):
+        shop.turn()
+    assert events(shop, "bus_restored") == 0
+    set_up("vcan0", True)
+    until(shop, lambda: events(shop, "bus_restored") == 1, shop.turn)
+    shop.playing = False
+    shop.run(50)
+    assert (shop.state, len(shop.wire.sent)) == ("FROZEN", sent)
+    assert shop.ask(client, {"request": "adopt", "token": TOKEN})["ok"]
+    until(shop, lambda: shop.state == "OFF", shop.cycle)
+    assert shop.offsets()[-1] == 0
+
+
+def test_bus_off_freezes(make: Callable[[type[Wire]], Shop]) -> None:
+    shop = make(OnAdapter)
+    shop.into_the_cut()
+    wire = shop.wire
+    assert isinstance(wire, OnAdapter)
+    wire.adapter.say("sb255000")
+    until(shop, lambda: shop.state == "FROZEN", shop.cycle)
+    assert shop.guard.state.cause is not None
+    assert shop.guard.state.cause.code == "BusOff"
+    sent = len(wire.sent)
+    shop.run(50)
+    assert len(wire.sent) == sent
+
+
+def test_a_full_queue_ramps_down_and_freezes_what_cannot_leave(make: Callable[[type[Wire]], Shop]) -> None:
+    shop = make(OnAdapter)
+    shop.into_the_cut()
+    wire = shop.wire
+    assert isinstance(wire, OnAdapter)
+    wire.stuck = True
+    until(shop, lambda: shop.state == "FROZEN", shop.cycle)
+    codes = [event.get("code") for event in shop.events() if event["event"] == "state"]
+    assert codes[-2:] == ["TxQueueFull", "TxQueueFull"]
+    sent = len(wire.sent)
+    shop.run(50)
+    assert len(wire.sent) == sent
