@@ -97,6 +97,15 @@ def test_both_see_the_table_and_not_the_motor(tmp_path: Path) -> None:
     assert np.abs(pushed).max() > 2.0
 
 
+def test_it_streams_on_where_no_sync_comes(tmp_path: Path) -> None:
+    hand = TwinInHand(twin(tmp_path))
+    sensor = hand.machine.tables.accelerometers["X"]
+    for k in range(251):
+        hand.machine.wall_clock(0.004 * k)
+    lines = sensor.take().decode().splitlines()
+    assert len(lines) == pytest.approx(800, abs=60)
+
+
 def test_a_stream_is_a_device_that_goes_with_the_simulator(tmp_path: Path) -> None:
     device = tmp_path / "sensor"
     port = StreamPort("accelerometer X", str(device))
