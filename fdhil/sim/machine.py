@@ -162,8 +162,8 @@ class Machine:
 
     def wall_clock(self, now_s: float) -> list[BusFrame]:
         """Run what depends on time and not on SYNC: heartbeats and their monitoring, and motion without SYNC."""
-        frames = self.tables.wall_clock(now_s)
         alone = self._realtime and not self.nc.on
+        frames = self.tables.wall_clock(now_s, [unit.drive for unit in self.units.values()] if alone else [])
         for unit in self.units.values():
             for frame in unit.drive.wall_clock(now_s, alone=alone):
                 frames.append((unit.bus, frame))

@@ -12,6 +12,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from fdhil.cli.main import cli
+from fdhil.cli.status_view import believed
 from studies import bench, real_plant
 from studies.real_plant import Mechanics, Sensors
 from tests.bench import bench_toml
@@ -92,6 +93,21 @@ def test_a_printers_accelerometer_file_is_laid_beside_the_recording(tmp_path: Pa
     for one in found:
         assert one["value"] == pytest.approx(HERTZ, rel=0.1)
     assert all("at_table" not in window for window in file["windows"])
+
+
+def test_status_says_what_the_table_did_and_how_it_swings() -> None:
+    figures = {"value": 60.0, "std": 1.0, "low": 58.0, "high": 62.0, "unit": "Hz"}
+    seen = {
+        "error_rms_um": 46.2,
+        "error_max_um": 103.0,
+        "unseen_rms_um": 21.0,
+        "unseen_max_um": 46.0,
+        "left_rms_um": 5.0,
+    }
+    text = believed({"terms": {"resonance": figures}, "last_window": {"at_table": seen}, "warnings": []})
+    assert "resonance 60" in text
+    assert "the table was 46.2 um RMS off in the last rapid" in text
+    assert "table" not in believed({"terms": {}, "last_window": {"at_table": None}})
 
 
 def test_a_file_of_another_run_or_kind_is_refused(tmp_path: Path) -> None:
