@@ -11,12 +11,13 @@ from fdhil.identification.fit import Fit, fit
 from fdhil.identification.kalman import DELAY
 from fdhil.identification.motion import Course, Motion
 from fdhil.identification.normal import inverse_of
-from fdhil.identification.terms import stribeck, stribeck_slope
+from fdhil.identification.terms import SPEEDS, stribeck, stribeck_slope
 from fdhil.records import Float
 
 TURNS = 3
 SPREAD = 0.5  # of the speed: what is known of it beforehand
 ENOUGH = 0.2  # deviations of the speed, by which a step may miss it
+BEYOND = 1.25  # times, by which it may lie beyond the grid
 MOST = 1.6  # times: a step beyond the neighbours on the grid is none of a straight line
 
 
@@ -57,11 +58,18 @@ def sharpened(result: Fit) -> Fit:
         if abs(step) < ENOUGH * own:
             return result
         speed = result.problem.motions[0].courses[k].speed_rad_s
-        moved = _at(result, k, float(np.clip(speed + step, speed / MOST, speed * MOST)))
+        low, high = _told(result.problem.motions)
+        moved = _at(result, k, float(np.clip(speed + step, max(low, speed / MOST), min(high, speed * MOST))))
         if not moved.converged:
             return result
         result = moved
     return result
+
+
+def _told(motions: Sequence[Motion]) -> tuple[float, float]:
+    """Return the least and the largest speed that rows tell: below it none moves so slowly, and any amplitude fits."""
+    top = max(float(np.abs(m.speed).max()) for m in motions)
+    return float(SPEEDS[0]) * top / BEYOND, float(SPEEDS[-1]) * top * BEYOND
 
 
 def _at(result: Fit, k: int, speed_rad_s: float) -> Fit:

@@ -29,7 +29,7 @@ from studies.real_plant import (
     recording,
     run,
 )
-from studies.reality import BASES, Machine, config_of
+from studies.reality import BASES, Machine, config_of, random_machines
 from tests.identification.realistic import rapids
 
 SETTINGS = Identification()
@@ -169,3 +169,16 @@ def test_a_load_that_just_holds_the_shaft_explains_how_a_move_begins() -> None:
     assert outcome.verdict.accepted, outcome.verdict.reasons
     assert outcome.verdict.unexplained_um is not None
     assert outcome.verdict.unexplained_um < 0.4
+
+
+def test_friction_at_low_speed_falls_off_where_rows_tell_it() -> None:
+    """Below all rows that surely move, any amplitude would fit: this machine's fourth rapid was given 5e17 N.m."""
+    machine = random_machines(12, 1)[11]
+    _, _, rapid_m_s, acceleration_m_s2, _ = BASES["slow"]
+    moved = run(machine.mechanics, shuttle(0.4, rapid_m_s, acceleration_m_s2, 4), machine.loops)
+    last = find_windows(recording(moved, machine.mechanics, machine.sensors, rapid_m_s, 65000))[-1]
+    (outcome,) = judged([last], config_of(machine).axis["X"])
+    assert outcome.verdict.accepted, outcome.verdict.reasons
+    assert outcome.estimate is not None
+    for name in {"stribeck"} & set(outcome.estimate.terms):
+        assert abs(outcome.estimate.value(name)) < 10.0
