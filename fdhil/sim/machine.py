@@ -81,7 +81,9 @@ class Machine:
 
     def _wiring(self, axis: str) -> Wiring:
         drive = self.units[axis].drive
-        return Wiring.of(drive.pdo.configured("rpdo"), drive.pdo.configured("tpdo"), drive.dress.mode)
+        return Wiring.of(
+            drive.pdo.configured("rpdo"), drive.pdo.configured("tpdo"), drive.dress.mode, drive.dress.mode_index
+        )
 
     @property
     def buses(self) -> tuple[str, ...]:

@@ -120,16 +120,18 @@ def _parted(p: Parameters, direction: int, current_a: float, share: float) -> tu
     """Return a drive that moves the same way in ``direction`` with a load, and the current that it holds at rest.
 
     With the friction Cd + D and a load D that helps the move it goes as with Cd. D is ``share`` of Cd, at least what
-    holds the shaft under the current; None where that is another share. Where no load holds it, it has friction at rest
-    that the model lacks, and the current is what the model holds.
+    holds the shaft under the current; None where that is no share of this sign. Where no load holds it, it has friction
+    at rest that the model lacks, and the current is what the model holds.
     """
     helping = share * p.Cd
     held, rests = direction * (p.K * current_a - p.term("load")), max(p.term("stribeck"), 0.0)
     least = (-held - p.Cd - rests) / 2.0
     if share == 0.0:
         helping = max(0.0, least, -p.Cd)  # a load that helps may be more than friction: then their sum is below 0
-    elif helping < max(least, -p.Cd):
-        return None
+    elif share < 0.0:
+        helping = max(helping, least, -p.Cd)  # so much of it as holds the shaft
+        if helping >= 0.0:
+            return None
     most = p.Cd + rests  # held less what the load takes is at most the friction at rest
     current = current_a - direction * max(0.0, held - most) / p.K
     if helping == 0.0:

@@ -161,3 +161,22 @@ def test_at_one_speed_the_sum_of_friction_is_known_better_than_its_parts() -> No
     assert told.std("Cd") > 5 * known[1]
     unknown = replace(told, values=frozen([*told.values[:4], np.nan, 5.0]))
     assert friction_at(unknown, RAPID) is None
+
+
+def test_a_term_that_windows_tell_each_in_its_own_way_bends_nothing_else() -> None:
+    """Two speeds put a resonance apart by twenty deviations; Jt hangs together with it, and stays where it is."""
+    assert FIRST is not None
+    names = (*PARAMETERS, "resonance")
+    plain = drawn(np.random.default_rng(6), [BENCH] * 8, [RAPID] * 8)
+    members = []
+    for place, one in enumerate(plain):
+        own = np.zeros((7, 7))
+        own[:6, :6], own[6, 6] = one.own, 1.0
+        own[3, 6] = own[6, 3] = 0.95 * np.sqrt(one.own[3, 3])
+        values = np.array([*one.values, 100.0 if place < 4 else 120.0])
+        members.append(Member(names, values, own, np.zeros((7, 6)), place, one.direction))
+    apart = between(members)
+    assert apart.scatter["resonance"] == pytest.approx(100.0, rel=0.3)  # 10 Hz to either side
+    found = pooled(members, FIRST, apart, joining=False)
+    assert abs(found.value("Jt") - BENCH.Jt) < 3 * found.std("Jt")
+    assert found.std("resonance") > 2.0

@@ -157,3 +157,15 @@ def test_without_regulators_one_joins_that_a_window_surely_shows() -> None:
     stiff = maximum_likelihood.fit_windows([plain], SETTINGS)
     assert stiff is not None
     assert sprung(stiff, None) is None
+
+
+def test_a_load_that_just_holds_the_shaft_explains_how_a_move_begins() -> None:
+    """After a move the other way the drive still pulls that way, as far as friction and load hold it."""
+    mechanics = replace(SLOW, load_nm=0.96, asymmetry=-0.09, static=0.08, static_speed_rad_s=17.0)
+    _, _, rapid_m_s, acceleration_m_s2, _ = BASES["slow"]
+    moved = run(mechanics, shuttle(0.4, rapid_m_s, acceleration_m_s2, 3), SLOW_LOOPS)
+    last = find_windows(recording(moved, mechanics, Sensors(), rapid_m_s, 1))[-1]
+    (outcome,) = judged([last], axis_of(SLOW, "slow"))
+    assert outcome.verdict.accepted, outcome.verdict.reasons
+    assert outcome.verdict.unexplained_um is not None
+    assert outcome.verdict.unexplained_um < 0.4
