@@ -99,12 +99,13 @@ class Machine:
 
     def _load(self, *, stuffed: bool) -> dict[str, float]:
         rate = 1 / self.period_s
-        sync = description.frame_bits(1, stuffed=stuffed) * rate
         loads = {}
         for bus, units in self._of_bus.items():
             bitrate = self.config.bus[bus].bitrate
             drives = sum(description.bus_load(unit.drive, rate, bitrate, stuffed=stuffed) for unit in units)
-            loads[bus] = round(sync / bitrate + drives, 4)
+            others = [1, *self.tables.frame_bytes(bus)]  # SYNC, and the encoders' places
+            each_sync = sum(description.frame_bits(size, stuffed=stuffed) for size in others)
+            loads[bus] = round(each_sync * rate / bitrate + drives, 4)
         return loads
 
     # -- frames

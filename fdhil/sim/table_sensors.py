@@ -50,6 +50,8 @@ class EncoderNode:
         self.cob_id = settings.cob_id
         self.node_id = settings.cob_id & 0x7F
         self.nmt = OPERATIONAL
+        low, high = LIMITS[settings.type]
+        self.frame_bytes = settings.byte + (high - low).bit_length() // 8
         self._settings = settings
         self._noise = _Noise(noise_um * 1e-3, rng)
         self._due_s = 0.0
@@ -153,6 +155,10 @@ class TableSensors:
             if section.accelerometer is not None:
                 settings = section.accelerometer
                 self.accelerometers[axis] = TableAccelerometer(settings, period_s, noise.table_m_s2, rngs[1])
+
+    def frame_bytes(self, bus: str) -> list[int]:
+        """Return the data bytes of what the encoders of a bus send at every SYNC."""
+        return [node.frame_bytes for axis, node in self._encoders.items() if self._bus[axis] == bus]
 
     def power_on(self) -> list[BusFrame]:
         """Return the boot-up messages."""

@@ -27,6 +27,7 @@ def node(**keys: Any) -> EncoderNode:
 
 def test_the_encoder_sends_its_place_after_a_sync_where_the_configuration_has_it() -> None:
     assert node(byte=2, offset=1.0).at_sync(1.5) == [(COB_ID, b"\0\0" + struct.pack("<i", 5000))]
+    assert node(byte=2).frame_bytes == 6
     assert node(type="uint16").at_sync(-1e-4) == [(COB_ID, b"\xff\xff")]  # a counter begins anew
 
 
