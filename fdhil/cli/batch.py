@@ -19,6 +19,7 @@ from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse, pool
 from fdhil.pipeline.own_loops import explained
 from fdhil.records import Estimate, LoopEstimate, Reason, Recording, Verdict, Window, WindowOutcome
+from fdhil.store.accelerometer_csv import with_accelerometer
 from fdhil.store.recording_csv import SOURCES, read_recording
 
 MANY_FILES = 16  # from here on further processes pay for their start
@@ -52,6 +53,7 @@ def analyse_files(
     settings: Identification,
     machine: MachineConfig | None = None,
     progress: Progress = unseen,
+    accelerometer: Path | None = None,
 ) -> Iterator[FileResult]:
     """Yield the result of each recording in order, also of those that cannot be read.
 
@@ -61,7 +63,7 @@ def analyse_files(
     """
     if len(paths) < MANY_FILES or _cores() < 2:
         for path in paths:
-            yield analyse_file(path, settings, machine, progress)
+            yield analyse_file(path, settings, machine, progress, accelerometer)
         return
     forewarn("identify")
     work = partial(analyse_file, settings=settings, machine=machine)
@@ -72,11 +74,17 @@ def analyse_files(
 
 
 def analyse_file(
-    path: Path, settings: Identification, machine: MachineConfig | None = None, progress: Progress = unseen
+    path: Path,
+    settings: Identification,
+    machine: MachineConfig | None = None,
+    progress: Progress = unseen,
+    accelerometer: Path | None = None,
 ) -> FileResult:
     """Return the windows of one recording analysed, and their pool, or why it cannot be read."""
     try:
         recording = read_recording(path)
+        if accelerometer is not None:
+            recording = with_accelerometer(recording, accelerometer)
     except FdhilError as error:
         progress(1.0)
         reason = Reason(type(error).__name__, str(error))

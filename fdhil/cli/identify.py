@@ -38,6 +38,11 @@ UNREADABLE = 3
     help="Write the validated pools as a model file, which --model of predict and correct reads.",
 )
 @click.option("--loops", "with_loops", is_flag=True, help="Identify the drive's own loops, too.")
+@click.option(
+    "--accelerometer",
+    type=click.Path(path_type=Path),
+    help="What an accelerometer at the table recorded of the same run (CSV, as Klipper writes it); for one RECORDING.",
+)
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout and nothing else.")
 def identify(
     recordings: tuple[Path, ...],
@@ -45,6 +50,7 @@ def identify(
     method: str | None,
     model: Path | None,
     with_loops: bool,
+    accelerometer: Path | None,
     as_json: bool,
 ) -> int:
     """Identify a drive from the rapid moves in each RECORDING (CSV).
@@ -58,9 +64,11 @@ def identify(
     pool is validated, 1 some pool is not, 2 wrong option or configuration, 3 a recording cannot be read (the others
     are identified all the same).
     """
+    if accelerometer is not None and len(recordings) > 1:
+        raise click.UsageError("--accelerometer belongs to one recording: give each with its own")
     settings, machine = _settings(config_path, method)
     axes = machine.axis if machine is not None else {}
-    results = [_against_data_sheet(r, axes) for r in _analyse(recordings, settings, machine)]
+    results = [_against_data_sheet(r, axes) for r in _analyse(recordings, settings, machine, accelerometer)]
     if model is not None:
         from fdhil.cli.model_file import write_model
 
@@ -103,7 +111,9 @@ def _against_data_sheet(result: FileResult, axes: Mapping[str, Axis]) -> FileRes
     return replace(result, verdict=replace(result.verdict, accepted=False, reasons=(reason,)))
 
 
-def _analyse(paths: Sequence[Path], settings: Identification, machine: MachineConfig | None) -> list[FileResult]:
+def _analyse(
+    paths: Sequence[Path], settings: Identification, machine: MachineConfig | None, accelerometer: Path | None
+) -> list[FileResult]:
     """Analyse the files, with a progress bar on stderr when that is a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
@@ -111,11 +121,11 @@ def _analyse(paths: Sequence[Path], settings: Identification, machine: MachineCo
     from fdhil.cli.batch import analyse_files
 
     if not sys.stderr.isatty():
-        return list(analyse_files(paths, settings, machine))
+        return list(analyse_files(paths, settings, machine, accelerometer=accelerometer))
     columns = (TextColumn("identifying"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("identifying", total=len(paths))
-        return list(analyse_files(paths, settings, machine, partial(progress.advance, task)))
+        return list(analyse_files(paths, settings, machine, partial(progress.advance, task), accelerometer))
 
 
 def _file_document(result: FileResult, axes: Mapping[str, Axis], with_loops: bool) -> dict[str, Any]:

@@ -17,7 +17,6 @@ __all__ = ["COMMANDS", "cli", "main", "run_safely"]
 # command -> ("module:function", the line of `fdhil --help`); listed here so that --help imports none of them
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "demo": ("fdhil.cli.demo:demo", "Run the whole loop on the simulated machine and write a report."),
-    "doctor": ("fdhil.cli.doctor:doctor", "Tell what is wrong with this PC, bus, drives, sensors, store, clock."),
     "scan": ("fdhil.cli.commissioning:scan", "List what is on the bus: nodes, identity, state, heartbeat."),
     "check": ("fdhil.cli.commissioning:check", "Check that the machine on the bus is the one in the config."),
     "commission": ("fdhil.cli.commissioning:commission", "Commission the drives, step by step."),
@@ -26,6 +25,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "arm": ("fdhil.cli.service:arm", "Arm the correction of one program."),
     "disarm": ("fdhil.cli.service:disarm", "Ramp the correction to zero and disarm."),
     "adopt": ("fdhil.cli.service:adopt", "Ramp to zero what an earlier correction may have left in the drives."),
+    "doctor": ("fdhil.cli.doctor:doctor", "Tell what is wrong with this PC, bus, drives, sensors, store, clock."),
     "eds": ("fdhil.cli.eds:eds", "Tell from a drive's EDS or DCF file what fdhil can and cannot do with it."),
     "sim": ("fdhil.cli.sim:sim", "Run the simulated machine: drives, sensors, NC."),
     "record": ("fdhil.cli.record:record", "Record the demand of an air cut from the bus, by listening."),

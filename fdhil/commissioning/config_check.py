@@ -196,6 +196,9 @@ def compare_heard(traffic: Traffic, config: MachineConfig, axis: str) -> Iterato
     target = profile.find_rpdo(profile.target)
     if target is not None:
         yield _heard_pdo(traffic, target[0], node_id)
+    table = config.axis[axis].table
+    if table is not None and table.cob_id is not None:
+        yield _heard_table(traffic, table.cob_id)
     yield from _rapid(config, profile, lambda: _heard_value(traffic, profile, node_id))
     yield from _not_compared(("device", *SDO_POINTS), "SDO belongs to the NC now", NC_OFF)
 
@@ -216,6 +219,15 @@ def _heard_pdo(traffic: Traffic, spec: PdoSpec, node_id: int) -> Finding:
         cause = f"{spec.name} ({cob_id:03X}) came {count} times in {syncs} SYNC where {due:.0f} are due"
     ok = length in (0, spec.length) and abs(count - due) <= max(2.0, RATE_TOLERANCE * due)
     return Finding(spec.name, expected, shown, ok, cause, advice)
+
+
+def _heard_table(traffic: Traffic, cob_id: int) -> Finding:
+    """Whether the TPDO of the table's encoder comes with every SYNC."""
+    count, syncs = traffic.count.get(cob_id, 0), len(traffic.sync_ns)
+    cause = f"the table encoder's TPDO {cob_id:03X} came {count} times in {syncs} SYNC"
+    advice = "start its node, make that TPDO synchronous (type 1), or correct cob_id of the table"
+    ok = abs(count - syncs) <= max(2.0, RATE_TOLERANCE * syncs) if syncs else None
+    return Finding("table encoder", f"{cob_id:03X} every SYNC", f"{count} in {syncs} SYNC", ok, cause, advice)
 
 
 def _heard_value(traffic: Traffic, profile: DriveProfile, node_id: int) -> int | None:

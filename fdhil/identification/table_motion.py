@@ -145,7 +145,7 @@ def swings(time_s: Float, w: float, z: float) -> Float:
 def left(seen: Float, columns: Float, power: Float) -> Float:
     """Return (m,) what columns (m, k) do not explain of what is seen, in deviations of noise of this power.
 
-    The noise' minimum-phase factor, made by its cepstrum ([OPP] 13.5), is undone: what is left of it is white.
+    The noise' minimum-phase factor, made by its cepstrum (Oppenheim and Schafer), is undone: what is left is white.
     """
     size = 2 * (power.size - 1)
     cepstrum = np.fft.irfft(np.log(power), size)[: size // 2]

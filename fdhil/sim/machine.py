@@ -81,7 +81,9 @@ class Machine:
 
     def _wiring(self, axis: str) -> Wiring:
         drive = self.units[axis].drive
-        return Wiring.of(drive.pdo.configured("rpdo"), drive.pdo.configured("tpdo"), drive.dress.mode)
+        return Wiring.of(
+            drive.pdo.configured("rpdo"), drive.pdo.configured("tpdo"), drive.dress.mode, drive.dress.mode_index
+        )
 
     @property
     def buses(self) -> tuple[str, ...]:
@@ -97,12 +99,13 @@ class Machine:
 
     def _load(self, *, stuffed: bool) -> dict[str, float]:
         rate = 1 / self.period_s
-        sync = description.frame_bits(1, stuffed=stuffed) * rate
         loads = {}
         for bus, units in self._of_bus.items():
             bitrate = self.config.bus[bus].bitrate
             drives = sum(description.bus_load(unit.drive, rate, bitrate, stuffed=stuffed) for unit in units)
-            loads[bus] = round(sync / bitrate + drives, 4)
+            others = [1, *self.tables.frame_bytes(bus)]  # SYNC, and the encoders' places
+            each_sync = sum(description.frame_bits(size, stuffed=stuffed) for size in others)
+            loads[bus] = round(each_sync * rate / bitrate + drives, 4)
         return loads
 
     # -- frames
@@ -160,8 +163,8 @@ class Machine:
 
     def wall_clock(self, now_s: float) -> list[BusFrame]:
         """Run what depends on time and not on SYNC: heartbeats and their monitoring, and motion without SYNC."""
-        frames = self.tables.wall_clock(now_s)
         alone = self._realtime and not self.nc.on
+        frames = self.tables.wall_clock(now_s, [unit.drive for unit in self.units.values()] if alone else [])
         for unit in self.units.values():
             for frame in unit.drive.wall_clock(now_s, alone=alone):
                 frames.append((unit.bus, frame))

@@ -225,8 +225,8 @@ class SimService:
             self._pace.sent(now_s)
             self._left = self._senders_left()
             self._send(self.machine.cycle())
-            for axis, stream in self._streams.items():
-                stream.send(self.machine.tables.accelerometers[axis].take())
+        for axis, stream in self._streams.items():
+            stream.send(self.machine.tables.accelerometers[axis].take())
         for event in self.machine.take_events():
             self._emit(event)
         for bus in buses:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -22,6 +23,8 @@ _NOISE_BLOCK = 1024
 OFF_RATE = 1.007  # of the nominal rate: the sensor's oscillator is no quartz
 TILT_M_S2 = 0.3  # what a sensor that is not quite level has of the earth's
 KEPT_LINES = 2000
+WITHOUT_SYNC_S = 0.05
+MOST_CYCLES = 200  # that are made up for at a time
 SEED = 406  # beside the machine's: the other sensors' noise stays what it is without these
 
 
@@ -47,6 +50,8 @@ class EncoderNode:
         self.cob_id = settings.cob_id
         self.node_id = settings.cob_id & 0x7F
         self.nmt = OPERATIONAL
+        low, high = LIMITS[settings.type]
+        self.frame_bytes = settings.byte + (high - low).bit_length() // 8
         self._settings = settings
         self._noise = _Noise(noise_um * 1e-3, rng)
         self._due_s = 0.0
@@ -138,6 +143,8 @@ class TableSensors:
         self._m_per_rad = {
             axis: section.drive.sign * section.screw_pitch_mm / (2e3 * math.pi) for axis, section in config.axis.items()
         }
+        self._period_s = period_s
+        self._synced, self._streamed_s = False, 0.0
         self._encoders: dict[str, EncoderNode] = {}
         self.accelerometers: dict[str, TableAccelerometer] = {}
         for place, (axis, section) in enumerate(config.axis.items()):
@@ -149,6 +156,10 @@ class TableSensors:
                 settings = section.accelerometer
                 self.accelerometers[axis] = TableAccelerometer(settings, period_s, noise.table_m_s2, rngs[1])
 
+    def frame_bytes(self, bus: str) -> list[int]:
+        """Return the data bytes of what the encoders of a bus send at every SYNC."""
+        return [node.frame_bytes for axis, node in self._encoders.items() if self._bus[axis] == bus]
+
     def power_on(self) -> list[BusFrame]:
         """Return the boot-up messages."""
         return [(self._bus[axis], frame) for axis, node in self._encoders.items() for frame in node.power_on()]
@@ -159,13 +170,24 @@ class TableSensors:
             return []
         return [one for axis, node in self._encoders.items() if self._bus[axis] == bus for one in node.receive(*frame)]
 
-    def wall_clock(self, now_s: float) -> list[BusFrame]:
-        """Return the heartbeats that are due."""
+    def wall_clock(self, now_s: float, alone: Sequence[Drive]) -> list[BusFrame]:
+        """Return the heartbeats that are due; accelerometers stream on at drives that no SYNC keeps the time of."""
+        if self._synced:
+            self._synced, self._streamed_s = False, now_s
+        elif now_s - self._streamed_s > WITHOUT_SYNC_S:
+            for drive in alone:
+                for _ in range(min(round((now_s - self._streamed_s) / self._period_s), MOST_CYCLES)):
+                    self._stream(drive.axis, drive.physics.table_speed_rad_s)
+            self._streamed_s = now_s
         return [(self._bus[axis], one) for axis, node in self._encoders.items() for one in node.wall_clock(now_s)]
 
     def at_sync(self, drive: Drive, table_rad_s: float) -> list[Frame]:
         """Return what an axis' encoder sends at a SYNC at which its table has this speed."""
-        if drive.axis in self.accelerometers:
-            self.accelerometers[drive.axis].at_sync(table_rad_s * self._m_per_rad[drive.axis])
+        self._synced = True
+        self._stream(drive.axis, table_rad_s)
         encoder = self._encoders.get(drive.axis)
         return [] if encoder is None else encoder.at_sync(drive.table_mm)
+
+    def _stream(self, axis: str, table_rad_s: float) -> None:
+        if axis in self.accelerometers:
+            self.accelerometers[axis].at_sync(table_rad_s * self._m_per_rad[axis])

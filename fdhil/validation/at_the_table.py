@@ -10,6 +10,7 @@ from fdhil.model import closed_loop
 from fdhil.records import AtTable, Float, Parameters, Window, rms
 
 LEAST_ROWS = 20
+LONGEST_MM = 1e6  # no axis is so long
 STANDSTILL_S = 0.05  # before the move, in which the zero of the table's encoder is taken
 
 
@@ -24,12 +25,12 @@ def at_the_table(
     """
     if window.table_mm is None:
         return None
-    table = window.table_mm - _zero(window)
-    rows = np.isfinite(table) & np.isfinite(window.demand_mm) & np.isfinite(window.position_mm)
+    rows = np.isfinite(window.table_mm) & np.isfinite(window.demand_mm) & np.isfinite(window.position_mm)
     first, last = moving_range(window)
     rows[:first] = rows[last:] = False
-    if np.count_nonzero(rows) < LEAST_ROWS:
+    if np.count_nonzero(rows) < LEAST_ROWS or np.abs(window.table_mm[rows]).max() > LONGEST_MM:
         return None
+    table = window.table_mm - _zero(window)
     error, unseen = (1e3 * (table - other)[rows] for other in (window.demand_mm, window.position_mm))
     predicted = _predicted(window, parameters, axis, sync_period_s or window.dt_s)
     left = None if predicted is None else float(np.std(1e3 * (table - predicted)[rows]))

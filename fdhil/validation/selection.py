@@ -16,7 +16,7 @@ import numpy.typing as npt
 from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.normal import inverse_gram, solve
 from fdhil.records import Float
-from fdhil.validation.structure import Bench, Finding
+from fdhil.validation.score_bench import Bench, Finding
 
 NO_WORSE = 3.0  # standard deviations by which what explains less may do so by chance
 

@@ -12,8 +12,8 @@ from fdhil.identification.fit import Fit
 from fdhil.identification.innovations import CURRENT, VOLTAGE, answers
 from fdhil.identification.normal import inverse_of
 from fdhil.records import Float
+from fdhil.validation.score_bench import Finding, courses, expected_correlation
 from fdhil.validation.significance import BUDGET
-from fdhil.validation.structure import Finding, courses, expected_correlation
 
 SMOOTHING_S = 0.010  # of the jerk-limited course of a rapid nothing is lost over this time
 LARGEST = 1.0  # samples: a recorder may assign a value to the SYNC before or after it

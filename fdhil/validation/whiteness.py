@@ -11,8 +11,8 @@ from fdhil.identification.estimators.maximum_likelihood import Fit
 from fdhil.identification.normal import inverse_of
 from fdhil.identification.slow_voltage import left_open_v
 from fdhil.records import Float, Reason, Window
+from fdhil.validation.score_bench import LAGS, expected_correlation
 from fdhil.validation.significance import BUDGET
-from fdhil.validation.structure import LAGS, expected_correlation
 
 PRACTICAL_CORRELATION = 0.25  # smaller ones come from the voltage's course within a sample and do no harm
 NOISE_RATIO = 1.6

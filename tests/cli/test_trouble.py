@@ -21,6 +21,7 @@ RECORDING = "time_s,voltage_V,current_A,speed_rad_per_s,position_m\n"
 WITH_CONFIG = {
     "scan": ["{config}"],
     "check": ["{config}"],
+    "doctor": ["{config}"],
     "commission": ["{config}"],
     "run": ["{config}"],
     "status": ["{config}"],

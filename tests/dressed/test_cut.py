@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from fdhil import correction
 from fdhil.arming.guard_settings import settings_of
 from fdhil.cia402 import pack
 from fdhil.prediction.contour import contour_error_um
 from fdhil.records import Float, Parameters, Trajectory, frozen, rms
-from tests.dressed.wardrobe import LED, Outfit, dressed, started
+from tests.dressed.wardrobe import LED, OUTFITS, Outfit, dressed, started
 from tests.sim.bench_twin import PERIOD_S, TwinInHand, corner, trajectory
 
 DELAY = 2
@@ -58,3 +59,11 @@ def test_a_corrected_cut_is_better(outfit: Outfit, tmp_path: Path) -> None:
         after = played(twin, Trajectory(PERIOD_S, demand.time_s, moved, demand.rapid, demand.line), path)
     assert before > 20
     assert after < before / 10
+
+
+@pytest.mark.parametrize("outfit", [o for o in OUTFITS if not o.led], ids=lambda outfit: outfit.name)
+def test_a_drive_without_cyclic_set_points_cannot_be_led(outfit: Outfit, tmp_path: Path) -> None:
+    twin = started(dressed(outfit, tmp_path))
+    twin.run(20)
+    (text,) = [event["text"] for event in twin.events if event["event"] == "error"]
+    assert text.startswith("drive X refuses 6060 = 8 with SDO abort 06090030")

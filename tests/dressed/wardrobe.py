@@ -19,6 +19,7 @@ from tests.sim.bench_twin import TwinInHand
 from tests.sim.rig import NO_NOISE, Rig
 
 INVALID = 1 << 31
+MILLIRPM = 0xFDB44700  # as 0x60A9 has it
 Write = Callable[[int, int, int, int], None]
 """Index, sub-index, value, bytes."""
 
@@ -43,7 +44,7 @@ class Outfit:
 
 NO_CSP, NO_VOLTAGE = ("mode",), ("voltage",)
 OUTFITS = (
-    Outfit("epos4", "epos4", on_line=True, drive={"dc_link_v": 300.0}),
+    Outfit("epos4", "epos4", on_line=True, drive={"dc_link_v": 300.0, "speed_unit": "millirpm"}),
     Outfit("epos2", "epos2", narrow=True, lacks=(*NO_CSP, *NO_VOLTAGE)),
     Outfit("nanotec", "nanotec", on_line=True, lacks=NO_VOLTAGE),
     Outfit("elmo", "elmo", on_line=True, lacks=NO_VOLTAGE),
@@ -55,6 +56,7 @@ OUTFITS = (
     Outfit("roboteq", "roboteq", led=False, lacks=NO_CSP),
     Outfit("cia402", "elmo", on_line=True, lacks=NO_VOLTAGE),
     Outfit("cia402", "ingenia", lacks=NO_VOLTAGE),
+    Outfit("cia402", "two_axes", on_line=True, drive={"logical_axis": 2}, lacks=NO_VOLTAGE),
 )
 LED = pytest.mark.parametrize("outfit", [o for o in OUTFITS if o.led], ids=lambda outfit: outfit.name)
 GENTLE_MM_S2 = 400.0
@@ -88,11 +90,14 @@ def set_up(config: MachineConfig, axis: str, has: Callable[[int], bool], write: 
     """Map the PDOs as the profile has them, as the drive's tool does, and turn what watches it on."""
     profile, node_id = load_profile(config.axis[axis].drive), config.node_id(axis)
     for base, specs in ((0x1400, profile.rpdos), (0x1800, profile.tpdos)):
-        for number in range(1, 5):
+        for number in (*range(1, 5), *range(65, 69)):
             spec = next((spec for spec in specs if spec.number == number), None)
             if has(base + number - 1):
                 _map(base + number - 1, spec, node_id, write)
-    for index, value, size in ((0x1017, 100, 2), (0x6007, 1, 2), (0x605A, 2, 2), (0x605E, 2, 2)):
+    if config.axis[axis].drive.speed_unit == "millirpm":
+        write(0x60A9, 0, MILLIRPM, 4)
+    up = 0x800 * (config.axis[axis].drive.logical_axis - 1)
+    for index, value, size in ((0x1017, 100, 2), (0x6007 + up, 1, 2), (0x605A + up, 2, 2), (0x605E + up, 2, 2)):
         if has(index):
             write(index, 0, value, size)
 

@@ -141,3 +141,21 @@ def test_the_table_s_true_error_is_told() -> None:
     assert at_table.unseen_max_um == pytest.approx(unseen_um.max(), abs=3.0)  # the zero is taken where it stands
     assert at_table.error_rms_um > at_table.unseen_rms_um > 5.0
     assert analyse(replace(window, table_mm=None), Identification()).at_table is None
+
+
+@pytest.mark.parametrize("name", ["table_mm", "table_m_s2"])
+@pytest.mark.parametrize("kind", ["constant", "nan", "huge", "infinite", "motor", "steps"])
+def test_whatever_a_sensor_tells_the_window_is_analysed(name: str, kind: str) -> None:
+    window = rapid(80.0)
+    values = {
+        "constant": np.zeros(window.n),
+        "nan": np.full(window.n, np.nan),
+        "huge": 1e200 * np.sin(np.arange(window.n)),
+        "infinite": np.where(np.arange(window.n) % 50 == 0, np.inf, window.position_mm),
+        "motor": window.position_mm,
+        "steps": np.round(window.position_mm, 0),
+    }[kind]
+    told = replace(window, table_mm=frozen(values) if name == "table_mm" else None)
+    outcome = analyse(replace(told, table_m_s2=frozen(values) if name != "table_mm" else None), Identification())
+    assert outcome.estimate is not None
+    assert outcome.estimate.value("Jt") == pytest.approx(TRUE.Jt, rel=0.05)

@@ -255,6 +255,19 @@ def test_a_speed_offset_counts_in_the_vendors_unit(epos4: Rig) -> None:
     assert epos4.read(0x60B2, signed=True) == 5
 
 
+def test_the_unit_of_speed_can_be_changed_and_stored(epos4: Rig) -> None:
+    """0x60A9 in the exponent of ten: a thousandth of a revolution per minute (CiA 303-2)."""
+    assert epos4.read(0x6081) == 1500
+    epos4.write(0x60A9, 0, 0xFDB44700, 4)
+    assert epos4.read(0x6081) == 1_500_000
+    epos4.write(0x1010, 1, 0x65766173, 4)
+    epos4.nmt(0x81)
+    assert (epos4.read(0x60A9), epos4.read(0x6081)) == (0xFDB44700, 1_500_000)
+    remap(epos4, 0x1800, 0x181, 1, 0x60810020)
+    epos4.nmt(0x01)
+    assert dict(epos4.sync())[0x181] == (1_500_000).to_bytes(4, "little")
+
+
 def test_vendor_objects_do_not_touch_the_twins_own(tmp_path: Path) -> None:
     text = eds_text("epos4") + "".join(VAR.format(index, "3", "1") for index in ("2101", "2110", "2121"))
     path = tmp_path / "clash.eds"

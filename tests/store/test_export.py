@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fdhil.records import frozen
 from fdhil.store.export import export_csv
 from fdhil.store.recording_csv import read_recording
 from fdhil.store.windows import decode_window, encode_window
@@ -47,3 +48,17 @@ def test_the_torque_constant_is_stored_with_a_window_that_tells_it() -> None:
     made = replace(window(), torque_constant_nm_per_a=0.3)
     assert decode_window(encode_window(made, "c0ffee")).torque_constant_nm_per_a == 0.3
     assert b"torque_constant" not in encode_window(window(), "c0ffee")
+
+
+def test_what_sensors_at_the_table_told_is_exported_with_its_lost_rows(tmp_path: Path) -> None:
+    made = window()
+    place = np.where(np.arange(made.n) % 7 == 0, np.nan, made.position_mm + 0.01)
+    made = replace(made, table_mm=frozen(place), table_m_s2=frozen(np.linspace(-1.0, 1.0, made.n)))
+    path = tmp_path / "table.csv"
+    export_csv(made, path)
+    read = read_recording(path)
+    kept = np.isfinite(made.speed_rad_s)
+    assert read.table_mm is not None
+    assert read.table_m_s2 is not None
+    assert np.array_equal(read.table_mm[kept], place[kept], equal_nan=True)
+    assert read.table_m_s2[kept].tolist() == np.linspace(-1.0, 1.0, made.n)[kept].tolist()

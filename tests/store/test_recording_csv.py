@@ -195,3 +195,18 @@ def test_a_recording_without_a_voltage_is_read_with_its_torque_constant() -> Non
 def test_a_wrong_header_of_the_signals_is_told(headers: dict[str, str], words: str) -> None:
     with pytest.raises(RecordingError, match=words):
         parse_recording(_deaf(**headers))
+
+
+def test_sensors_at_the_table_may_lack_rows_and_other_columns_may_not() -> None:
+    columns: dict[str, bench.Array] = dict.fromkeys(COLUMNS, np.linspace(0.0, 29.0, 30))
+    lacking = np.where(np.arange(30) == 5, np.nan, 1.0)
+    read = parse_recording(bench.table_text(0.001, columns | {"table_mm": lacking, "table_m_s2": -lacking}))
+    assert read.table_mm is not None
+    assert read.table_m_s2 is not None
+    assert np.flatnonzero(np.isnan(read.table_mm)).tolist() == [5]
+    assert read.table_m_s2[6] == -1.0
+    assert parse_recording(_text()).table_mm is None
+    with pytest.raises(RecordingError, match="line 13 has the non-finite value 'nan'"):
+        parse_recording(bench.table_text(0.001, columns | {"current_A": lacking}))
+    with pytest.raises(RecordingError, match="line 13 has the non-finite value 'inf'"):
+        parse_recording(bench.table_text(0.001, columns | {"table_mm": np.where(np.isnan(lacking), np.inf, 1.0)}))

@@ -44,12 +44,19 @@ def test_a_window_comes_back_bit_by_bit(raw: bool, scales: Any) -> None:
     [
         {"voltage_v": None, "voltage_delay_s": None, "temperature_c": None},
         {"stages": Stages(None, None, None), "gaps": (), "direction": -1, "voltage_sampling": "instant"},
+        {"table_mm": frozen(np.r_[np.nan, np.linspace(0.0, 1.0, 599)]), "table_m_s2": frozen(np.full(600, -0.1))},
         {"source": 'umlaut ä "quoted" \x1b[31m', "start_tick": 2**40},
     ],
 )
 def test_every_field_survives(changes: dict[str, Any]) -> None:
     made = window(**changes)
     assert same(decode_window(encode_window(made, "c0ffee", SCALES)), made)
+
+
+def test_a_window_without_sensors_at_the_table_is_stored_as_before_there_were_any() -> None:
+    head = json.loads(pq.ParquetFile(pa.BufferReader(encode_window(window(), "c0ffee"))).metadata.metadata[b"fdhil"])
+    assert not [name for name in head["columns"] if name.startswith("table")]
+    assert head["digest"].startswith("eca1bdd0318e6ce9")
 
 
 def test_a_drive_column_is_stored_as_the_drives_integers_and_described() -> None:

@@ -14,8 +14,8 @@ from fdhil.identification.windows import find_windows
 from fdhil.pipeline import analyse
 from fdhil.records import VoltageSampling, Window
 from fdhil.validation import Evidence
+from fdhil.validation.score_bench import expected_correlation
 from fdhil.validation.shifts import Shift, shifts
-from fdhil.validation.structure import expected_correlation
 from fdhil.validation.timing import searched, timing_faults
 from studies import drives, faults
 from studies.scenes import demand_of, measured, recorded

@@ -13,7 +13,6 @@ import click
 
 from fdhil import config as machine_config
 from fdhil.cli.doctor.trouble import Trouble
-from fdhil.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -32,27 +31,17 @@ def doctor(config: Path, offline: bool, as_json: bool) -> int:
 
     Only looks: it writes nothing, and sends nothing where an NC runs the bus (with the NC off the drives are read, as
     by fdhil check). What cannot be examined before something else is mended is left out, so mend, and run it again.
-    Exit codes: 0 nothing grave is wrong, 1 something is, 2 wrong option.
+    Exit codes: 0 nothing grave is wrong, 1 something is, 2 wrong option or
+    configuration: its faults come before all others.
     """
-    found = _examined(config, offline)
+    troubles = _in_order(machine_config.load(config), offline)
+    found = sorted(troubles, key=lambda trouble: not trouble.grave)  # the order of causes stays, within each half
     if as_json:
         grave = sum(trouble.grave for trouble in found)
         click.echo(json.dumps({"schema": SCHEMA, "healthy": not grave, "troubles": [asdict(t) for t in found]}))
     else:
         _show(found)
     return int(any(trouble.grave for trouble in found))
-
-
-def _examined(path: Path, offline: bool) -> list[Trouble]:
-    try:
-        config = machine_config.load(path)
-    except ConfigError as error:
-        means = "nothing of fdhil starts with this file"
-        return [
-            Trouble("Config", f.path, f.what, means, f.suggestion or "correct it in the file") for f in error.faults
-        ]
-    found = list(_in_order(config, offline))
-    return sorted(found, key=lambda trouble: not trouble.grave)  # the order of causes stays, within each half
 
 
 def _in_order(config: MachineConfig, offline: bool) -> Iterator[Trouble]:

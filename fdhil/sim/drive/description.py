@@ -36,7 +36,7 @@ def mapping(drive: Drive) -> dict[str, Any]:
     def unit(entry: Entry) -> tuple[str, float]:
         if entry.key in shown:
             return shown[entry.key]
-        name, scale = own.get(entry.index, ("", 1)) if entry.home is None else ("", 1)
+        name, scale = own.get(entry.place >> 8, ("", 1))
         return name, scale if entry.scale == 1.0 else scale * entry.scale
 
     def pdos(direction: str) -> list[dict[str, Any]]:

@@ -212,7 +212,7 @@ class Dictionary:
     ``numbers`` and ``texts`` (strings and domains) are kept by each entry's place, for ``within`` too: entries that the
     drive needs and does not show. ``check`` and ``written`` are called before and after an SDO write of the places they
     are registered for; ``check`` refuses by raising TransferAbort. ``read_hooks`` give what is computed when it is
-    asked for.
+    asked for. ``restored`` are called when the values of a boot are in place.
     """
 
     def __init__(self, objects: tuple[Object, ...], within: tuple[Entry, ...] = ()) -> None:
@@ -224,6 +224,7 @@ class Dictionary:
         self.check: dict[int, Callable[[Entry, int], None]] = {}
         self.written: dict[int, Callable[[int], None]] = {}
         self.read_hooks: dict[int, Callable[[], Value]] = {}
+        self.restored: list[Callable[[], None]] = []
         self._within = within
         self.foreign = bool(within)  # values may travel otherwise than they are kept
         self.reset(lambda _: True)

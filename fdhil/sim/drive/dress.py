@@ -8,21 +8,21 @@ from the vendors' documents and not from the profiles that the drivers read.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from typing import Any
 
 from fdhil.config import MachineConfig, SimAxis
-from fdhil.sim.drive.dictionary import DataType, Entry, Object, Value
+from fdhil.sim.drive.dictionary import DataType, Dictionary, Entry, Object, Value
 from fdhil.sim.drive.modes import CYCLIC, CYCLIC_POSITION, SUPPORTED_MODES
 from fdhil.sim.drive.objects import DEVICE_NAME, PRODUCT_CODE, REVISION, VENDOR_ID, Ratings, drive_objects
 from fdhil.sim.drive.sheet import Sheet, read_sheet
 
 _MODES, _TARGET, _INTERPOLATION, _SPEED_UNIT = 0x650200, 0x607A00, 0x60C101, 0x60A900
 _INTERPOLATED = 7
-_VENDORS = range(0x2000, 0x6000)
+_VENDORS, _PROFILE, _AXIS_STEP = range(0x2000, 0x6000), range(0x6000, 0x6800), 0x800
 _APART = 1 << 24  # the vendor's values are kept apart from those of the twin's own vendor objects
 # A drive without these has no such service: no heartbeat, no SYNC counter. One without 0x6007 falls into fault when it
 # loses its master, as most do: no file says it.
@@ -80,7 +80,7 @@ class Dress:
 
     ``within``: entries that the drive needs and does not show. ``gauges``: what shows a signal in the vendor's way.
     ``mode``: in which it follows set-points that come with every SYNC; its number is the vendor's where there is no
-    cyclic synchronous position.
+    cyclic synchronous position. ``mode_index``: the object that it is written to.
     """
 
     objects: tuple[Object, ...]
@@ -91,6 +91,7 @@ class Dress:
     within: tuple[Entry, ...] = ()
     gauges: tuple[Gauge, ...] = ()
     mode: int = CYCLIC_POSITION
+    mode_index: int = 0x6060
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,8 +117,10 @@ def dress(config: MachineConfig, axis: str) -> Dress:
     if path is None:
         return Dress(own)
     ratings = Ratings.of(config, axis)
-    sheet = read_sheet(path, ratings.node_id)
-    return _Tailor(sheet, own, ratings, tailoring(sheet.vendor), 1001 + list(config.axis).index(axis)).dress()
+    exchange = _Exchange(_AXIS_STEP * (config.axis[axis].drive.logical_axis - 1))
+    sheet = exchange.sheet(read_sheet(path, ratings.node_id))
+    serial = 1001 + list(config.axis).index(axis)
+    return exchange.dress(_Tailor(sheet, own, ratings, tailoring(sheet.vendor), serial).dress())
 
 
 @cache
@@ -131,6 +134,71 @@ def tailoring(vendor: int) -> Tailoring:
     return Tailoring()
 
 
+def increments_per_s(unit: Value, cut: Tailoring, ratings: Ratings) -> float:
+    """Return what a count of the drive's speeds is: by its own unit object, else as the vendor has it."""
+    revolutions, increments = _SPEED_UNITS[cut.speed]
+    word = unit if isinstance(unit, int) else 0
+    kind, per, power = word >> 16 & 0xFF, word >> 8 & 0xFF, (word >> 24 ^ 0x80) - 0x80
+    if kind in (_REVOLUTIONS, _INCREMENTS) and per in _PER:
+        share = _PER[per] * 10.0**power
+        revolutions, increments = (share, 0.0) if kind == _REVOLUTIONS else (0.0, share)
+    return revolutions * ratings.increments_per_rev + increments
+
+
+def follow_speed_unit(dictionary: Dictionary, worn: Dress, ratings: Ratings) -> None:
+    """Let the speeds count in what 0x60A9 says from its next writing or the next boot on."""
+    if not any(entry.place == _SPEED_UNIT for entry in dictionary.entries.values()):
+        return
+
+    def rescale(_unit: int = 0) -> None:
+        scale = increments_per_s(dictionary.numbers[_SPEED_UNIT], tailoring(worn.vendor), ratings)
+        for key, entry in dictionary.entries.items():
+            if entry.place >> 8 in _SPEEDS and not _counts_entries(entry, dictionary.entries):
+                assert isinstance(entry.default, int)
+                default = replace(entry, scale=scale).counts(entry.number(entry.default))
+                dictionary.entries[key] = replace(entry, scale=scale, default=default)
+
+    dictionary.written[_SPEED_UNIT] = rescale
+    dictionary.restored.append(rescale)
+
+
+@dataclass(frozen=True, slots=True)
+class _Exchange:
+    """Lets the objects of another axis of the device, ``step`` higher, and those of the first change places."""
+
+    step: int
+
+    def _index(self, index: int) -> int:
+        if _PROFILE.start <= index - self.step < _PROFILE.stop:
+            return index - self.step
+        return index + self.step if index in _PROFILE else index
+
+    def sheet(self, sheet: Sheet) -> Sheet:
+        """The axis as if it were the first, as which it is fitted."""
+        objects = [
+            replace(item, index=at, entries=tuple(replace(entry, index=at) for entry in item.entries))
+            for item in sheet.objects
+            for at in (self._index(item.index),)
+        ]
+        given = frozenset(self._index(key >> 8) << 8 | key & 0xFF for key in sheet.given)
+        return replace(sheet, objects=tuple(sorted(objects, key=lambda item: item.index)), given=given)
+
+    def dress(self, worn: Dress) -> Dress:
+        """The axis where it is again; its values stay where the drive works with them."""
+        if not self.step:
+            return worn
+        objects = [
+            replace(item, index=self._index(item.index), entries=tuple(map(self._entry, item.entries)))
+            for item in worn.objects
+        ]
+        gauges = tuple(replace(gauge, entry=self._entry(gauge.entry)) for gauge in worn.gauges)
+        objects.sort(key=lambda item: item.index)
+        return replace(worn, objects=tuple(objects), gauges=gauges, mode_index=self._index(worn.mode_index))
+
+    def _entry(self, entry: Entry) -> Entry:
+        return replace(entry, index=self._index(entry.index), home=entry.place)
+
+
 class _Tailor:
     """Fits the objects of a sheet on the drive's own."""
 
@@ -139,20 +207,10 @@ class _Tailor:
         self._own = {entry.key: entry for item in own for entry in item.entries}
         self._identity = {0x101801: sheet.vendor, 0x101802: sheet.product, 0x101803: sheet.revision, 0x101804: serial}
         self._entries = {entry.key: entry for item in sheet.objects for entry in item.entries}
-        self._speed = self._increments_per_s()
+        unit = self._entries[_SPEED_UNIT].default if _SPEED_UNIT in sheet.given else 0
+        self._speed = increments_per_s(unit, cut, ratings)
         self._setpoint, self._mode = self._stream()
         self._modes = self._offered()
-
-    def _increments_per_s(self) -> float:
-        """What a count of its speeds is: by its own unit object, else as the vendor has it."""
-        revolutions, increments = _SPEED_UNITS[self._cut.speed]
-        unit = self._entries[_SPEED_UNIT].default if _SPEED_UNIT in self._sheet.given else 0
-        assert isinstance(unit, int)
-        kind, per, power = unit >> 16 & 0xFF, unit >> 8 & 0xFF, (unit >> 24 ^ 0x80) - 0x80
-        if kind in (_REVOLUTIONS, _INCREMENTS) and per in _PER:
-            share = _PER[per] * 10.0**power
-            revolutions, increments = (share, 0.0) if kind == _REVOLUTIONS else (0.0, share)
-        return revolutions * self._ratings.increments_per_rev + increments
 
     def _stream(self) -> tuple[int | None, int]:
         """The object of cyclic set-points where it is not 0x607A, and their mode."""
@@ -239,9 +297,7 @@ class _Tailor:
         return sum(1 for entry in item.entries if entry.sub and entry.default)
 
     def _scale(self, entry: Entry) -> float:
-        if entry.sub == 0 and entry.key | 1 in self._entries:  # a number of entries
-            return 1.0
-        if entry.index in _SPEEDS:
+        if entry.index in _SPEEDS and not _counts_entries(entry, self._entries):
             return self._speed
         return self._cut.rated_torque_nm * 1e3 if entry.index == 0x6076 else 1.0
 
@@ -260,3 +316,8 @@ def _alike(entry: Entry, own: Entry) -> bool:
     """Whether both are texts or both integers, so that one can stand for the other."""
     reals = (DataType.REAL32, DataType.REAL64)
     return entry.type not in reals and (entry.size is None) == (own.size is None)
+
+
+def _counts_entries(entry: Entry, entries: Container[int]) -> bool:
+    """Whether it is the sub-index 0 of an array or record."""
+    return entry.sub == 0 and entry.key | 1 in entries

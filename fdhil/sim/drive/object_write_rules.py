@@ -26,6 +26,8 @@ class StoredParameters:
         """Give the chosen entries their defaults, or what was saved."""
         self._dictionary.reset(which)
         self._dictionary.numbers.update({e.place: v for e, v in self._values.items() if which(e)})
+        for call in self._dictionary.restored:
+            call()
 
     def save(self) -> None:
         """Keep all parameters; set-points and the controlword are none."""

@@ -14,7 +14,7 @@ import numpy as np
 from fdhil.config import MachineConfig, SimAxis
 from fdhil.sim.drive.axis_plant import AxisPlant, sensor_noise, switches
 from fdhil.sim.drive.dictionary import Dictionary
-from fdhil.sim.drive.dress import dress
+from fdhil.sim.drive.dress import dress, follow_speed_unit
 from fdhil.sim.drive.drive_cycle import DriveCycle
 from fdhil.sim.drive.emergency_and_heartbeat import FOLLOWING_ERROR
 from fdhil.sim.drive.feedback import INT16, Feedback, clip
@@ -50,6 +50,7 @@ class Drive(CanopenNode):
         real = real_loops(twin.reality, section.regulators)
         self.dress = dress(config, axis)
         objects = Dictionary(self.dress.objects, self.dress.within)
+        follow_speed_unit(objects, self.dress, self.ratings)
         super().__init__(objects, self.ratings.node_id, DriveFaults(), boot_s=twin.boot_s)
         self.power = PowerStage(self.dictionary.number)
         self.motion = Motion(

@@ -207,9 +207,9 @@ class NcController:
         for link in self._links:
             link.status = link.position = None
             link.word = SHUTDOWN
-            mode = self._wiring(link.axis).mode
+            wiring = self._wiring(link.axis)
             self._requests.append(SdoWrite(link, 0x1019, COUNTER_OVERFLOW, required=False))
-            self._requests.append(SdoWrite(link, 0x6060, mode, required=True))
+            self._requests.append(SdoWrite(link, wiring.mode_index, wiring.mode, required=True))
 
     def _nmt(self, command: int) -> list[BusFrame]:
         return [(link.bus, (0x000, bytes([command, link.node_id]))) for link in self._links]

@@ -37,7 +37,7 @@ def power_state(statusword: int) -> State:
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """The PDOs by which the NC leads a drive, and its ``mode`` of cyclic set-points.
+    """The PDOs by which the NC leads a drive, and its ``mode`` of cyclic set-points with the object it is written to.
 
     ``missing`` are the objects that the NC needs and no valid PDO carries.
     """
@@ -46,9 +46,10 @@ class Wiring:
     answers: tuple[Pdo, ...] = ()
     missing: tuple[str, ...] = ()
     mode: int = CYCLIC_POSITION
+    mode_index: int = 0x6060
 
     @classmethod
-    def of(cls, rpdos: Iterable[Pdo], tpdos: Iterable[Pdo], mode: int) -> Wiring:
+    def of(cls, rpdos: Iterable[Pdo], tpdos: Iterable[Pdo], mode: int, mode_index: int) -> Wiring:
         """Choose among a drive's PDOs: as few as do, and none that carries an offset where another does."""
         received = sorted(rpdos, key=lambda pdo: (CONTROLWORD not in pdo.keys, not _OFFSETS.isdisjoint(pdo.keys)))
         received.sort(key=lambda pdo: not {CONTROLWORD, TARGET}.issubset(pdo.keys))
@@ -62,6 +63,7 @@ class Wiring:
             tuple(pdo for pdo in used.values() if pdo in sent),
             tuple(f"{key >> 8:04X}" for key, pdo in chosen.items() if pdo is None),
             mode,
+            mode_index,
         )
 
     @property

@@ -1,0 +1,124 @@
+"""``fdhil identify`` with what was seen at the table: columns of the recording, or a printer's accelerometer file."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from fdhil.cli.main import cli
+from fdhil.cli.status_view import believed
+from studies import bench, real_plant
+from studies.real_plant import Mechanics, Sensors
+from tests.bench import bench_toml
+
+HERTZ = 60.0
+DEMAND_M = bench.shuttle(moves=2)
+SOFT = Mechanics(resonance_hz=HERTZ)
+
+
+@cache
+def signals() -> dict[str, bench.Array]:
+    """Return the columns of two rapids of an axis whose screw gives, the table's place among them."""
+    run = real_plant.run(SOFT, DEMAND_M, None, 1e-3)
+    told = real_plant.reported(run, SOFT, Sensors(noise=0.001, speed="difference"), 1)
+    return {**told, "table_mm": np.round(1e3 * run.table_m, 4)}
+
+
+def written(folder: Path, table: bool) -> Path:
+    columns = {name: values for name, values in signals().items() if table or name != "table_mm"}
+    path = folder / "soft.csv"
+    path.write_text(bench.table_text(1e-3, columns))
+    return path
+
+
+def printed(folder: Path, begin_s: float = 4321.0, lead: int = 400) -> Path:
+    """Write what an ADXL345 with 3200 samples a second makes of the same run: y against the axis, gravity on z."""
+    place = real_plant.run(SOFT, DEMAND_M, None, real_plant.STEP_S).table_m
+    push = np.gradient(np.gradient(place, real_plant.STEP_S), real_plant.STEP_S)
+    push = np.convolve(push, np.ones(10) / 10, "same")[::10]  # every 0.3125 ms
+    push = np.concatenate([np.zeros(lead), push, np.zeros(200)])
+    rng = np.random.default_rng(2)
+    axes = 1e3 * np.column_stack([0 * push + 0.1, -push - 0.2, 0 * push + 9.81]) + 50 * rng.standard_normal(
+        (push.size, 3)
+    )
+    rows = np.column_stack([begin_s + 3.125e-4 * np.arange(push.size), axes])
+    path = folder / "adxl345.csv"
+    path.write_text(
+        "#time,accel_x,accel_y,accel_z\n" + "".join(",".join(f"{v:.6f}" for v in row) + "\n" for row in rows)
+    )
+    return path
+
+
+def invoke(*arguments: object) -> Result:
+    return CliRunner().invoke(cli, ["identify", *map(str, arguments)], standalone_mode=False)
+
+
+def told(result: Result) -> dict[str, Any]:
+    (file,) = json.loads(result.stdout)["files"]
+    return dict(file)
+
+
+def test_an_encoder_at_the_table_tells_resonance_and_true_error(tmp_path: Path) -> None:
+    config = tmp_path / "machine.toml"
+    config.write_text(bench_toml("X", resonance_hz=45.0))
+    path = written(tmp_path, table=True)
+    file = told(invoke(path, "--config", config, "--json"))
+    for window in file["windows"]:
+        found = window["terms"]["resonance"]
+        assert found["unit"] == "Hz"
+        assert found["value"] == pytest.approx(HERTZ, rel=0.08)
+        assert abs(found["value"] - HERTZ) < 3 * found["std"]
+        assert {"resonance_damping", "resonance_share"} <= set(window["terms"])
+        assert any("ResonanceDiffers: the table swings at" in text for text in window["warnings"])
+        assert window["at_table"]["unseen_rms_um"] > 5.0
+        assert window["at_table"]["left_rms_um"] < window["at_table"]["unseen_rms_um"] / 2
+    assert file["pooled"]["terms"]["resonance"]["value"] == pytest.approx(HERTZ, rel=0.08)
+    shown = " ".join(invoke(path, "--config", config).stdout.split())
+    assert "resonance" in shown
+    assert "unseen by the drive's encoder" in shown
+    assert "not at 45 Hz as configured" in shown
+
+
+def test_a_printers_accelerometer_file_is_laid_beside_the_recording(tmp_path: Path) -> None:
+    path = written(tmp_path, table=False)
+    file = told(invoke(path, "--accelerometer", printed(tmp_path), "--json"))
+    found = [window["terms"]["resonance"] for window in file["windows"] if "resonance" in window["terms"]]
+    assert found
+    for one in found:
+        assert one["value"] == pytest.approx(HERTZ, rel=0.1)
+    assert all("at_table" not in window for window in file["windows"])
+
+
+def test_status_says_what_the_table_did_and_how_it_swings() -> None:
+    figures = {"value": 60.0, "std": 1.0, "low": 58.0, "high": 62.0, "unit": "Hz"}
+    seen = {
+        "error_rms_um": 46.2,
+        "error_max_um": 103.0,
+        "unseen_rms_um": 21.0,
+        "unseen_max_um": 46.0,
+        "left_rms_um": 5.0,
+    }
+    text = believed({"terms": {"resonance": figures}, "last_window": {"at_table": seen}, "warnings": []})
+    assert "resonance 60" in text
+    assert "the table was 46.2 um RMS off in the last rapid" in text
+    assert "table" not in believed({"terms": {}, "last_window": {"at_table": None}})
+
+
+def test_a_file_of_another_run_or_kind_is_refused(tmp_path: Path) -> None:
+    path, other = written(tmp_path, table=False), tmp_path / "other.csv"
+    rows = np.random.default_rng(1).standard_normal((4000, 3))
+    other.write_text("".join(f"{k * 1e-3:.4f},{a:.3f},{b:.3f},{c:.3f}\n" for k, (a, b, c) in enumerate(rows)))
+    file = told(invoke(path, "--accelerometer", other, "--json"))
+    assert "does not show the moves of the recording" in file["error"]["text"]
+    other.write_text("time,x\n1,2\n")
+    assert (
+        "is no recording of an accelerometer" in told(invoke(path, "--accelerometer", other, "--json"))["error"]["text"]
+    )
+    result = CliRunner().invoke(cli, ["identify", str(path), str(path), "--accelerometer", str(other)])
+    assert "belongs to one recording" in str(result.output) + str(result.exception)
