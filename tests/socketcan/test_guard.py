@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -16,6 +17,7 @@ from tests.guard.shop import TOKEN, Shop
 from tests.socketcan.interface import CAN_FRAME, SerialAdapter, raw_socket, set_up
 
 pytestmark = pytest.mark.socketcan
+DELIVERY_S = 0.5  # from the line to the sockets, on a host that is busy
 WANTED = Listener(commissioned(settings())).wanted_ids()
 
 
@@ -51,6 +53,8 @@ class OnAdapter(Wire):
     def __init__(self, allowed: frozenset[int]) -> None:
         self.adapter = SerialAdapter()
         self.stuck = False
+        self._ear = raw_socket(self.adapter.channel)
+        self._ear.settimeout(DELIVERY_S)
         super().__init__(allowed, self.adapter.channel)
 
     def feed(self, frames: Sequence[Frame]) -> None:
@@ -58,10 +62,19 @@ class OnAdapter(Wire):
             self.adapter.say(f"t{cob_id:03X}{len(data)}{data.hex().upper()}")
         if not self.stuck:
             self.adapter.drain()
-        time.sleep(0.001)  # the line discipline has a thread of its own
+        self._until_heard(*frames[-1][:2])
+        time.sleep(0.001)  # what the guard sent leaves by a thread of the line discipline's own
+
+    def _until_heard(self, cob_id: int, data: bytes) -> None:
+        """Wait until the kernel has taken all from the line; a controller that is off delivers nothing any more."""
+        last = CAN_FRAME.pack(cob_id, len(data), data)
+        with contextlib.suppress(TimeoutError):
+            while self._ear.recv(CAN_FRAME.size) != last:
+                pass
 
     def close(self) -> None:
         super().close()
+        self._ear.close()
         self.adapter.unplug()
 
 
