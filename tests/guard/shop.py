@@ -157,7 +157,7 @@ class Shop:
         client = self.arm()
         self.playing = True
         self.run(250)
-        assert self.state == "ACTIVE"
+        assert self.state == "ACTIVE", self.events()[-3:]
         assert abs(self.offsets()[-1]) > 50
         return client
 

@@ -60,10 +60,12 @@ class SerialAdapter:
         """Let the adapter say something; ``t1812AABB`` is a frame, ``sb255000`` a controller that is bus-off."""
         os.write(self._end, f"{line}\r".encode())
 
-    def drain(self) -> None:
-        """Take what was sent to the adapter, as a bus does on which others acknowledge."""
-        while select.select([self._end], [], [], 0)[0]:
-            os.read(self._end, 1 << 16)
+    def drain(self, wait_s: float = 0.0) -> int:
+        """Take what was sent to the adapter, as a bus does on which others acknowledge; return how many frames."""
+        frames = 0
+        while select.select([self._end], [], [], 0.0 if frames else wait_s)[0]:
+            frames += os.read(self._end, 1 << 16).count(b"\r")
+        return frames
 
     def unplug(self) -> None:
         """The adapter is gone, and its interface with it."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -53,6 +52,7 @@ class OnAdapter(Wire):
     def __init__(self, allowed: frozenset[int]) -> None:
         self.adapter = SerialAdapter()
         self.stuck = False
+        self._left = 0
         self._ear = raw_socket(self.adapter.channel)
         self._ear.settimeout(DELIVERY_S)
         super().__init__(allowed, self.adapter.channel)
@@ -60,10 +60,10 @@ class OnAdapter(Wire):
     def feed(self, frames: Sequence[Frame]) -> None:
         for cob_id, data, _ in frames:
             self.adapter.say(f"t{cob_id:03X}{len(data)}{data.hex().upper()}")
-        if not self.stuck:
-            self.adapter.drain()
         self._until_heard(*frames[-1][:2])
-        time.sleep(0.001)  # what the guard sent leaves by a thread of the line discipline's own
+        while not self.stuck and self._left < len(self.sent):  # it leaves by a thread of the line discipline's own
+            left = self.adapter.drain(DELIVERY_S)
+            self._left = self._left + left if left else len(self.sent)  # what left while nobody waited is not counted
 
     def _until_heard(self, cob_id: int, data: bytes) -> None:
         """Wait until the kernel has taken all from the line; a controller that is off delivers nothing any more."""
