@@ -23,7 +23,7 @@ from fdhil.validation.breakaway import Breakaway, breakaway
 from fdhil.validation.score_bench import Finding
 from fdhil.validation.selection import Lacking, lacking
 from fdhil.validation.sensor_reconstruction import Bridge
-from fdhil.validation.shifts import Shift, late_findings, shifts
+from fdhil.validation.shifts import LATE, Shift, late_findings, shifts
 from fdhil.validation.simulation import fit_percent
 from fdhil.validation.structure import DEAD_TIME, FRICTION, OFFSET_CURRENT, findings
 from fdhil.validation.table_error import TableError
@@ -34,6 +34,7 @@ from fdhil.validation.widening import widened
 STILL_MM = 0.004  # of the table at rest
 STILL_S, STILL_SHARE = 0.010, 0.02  # of the rapid speed
 SENSOR_KNOWN = 0.5  # of what a sensor's fault makes at the table: it resembles what is tried, and does not show there
+MOST_LATE = 3.0  # samples by which a signal may seem late for something else that the model lacks
 LEAST_ROWS = 32  # of a window that may hold a rapid move
 
 
@@ -195,9 +196,9 @@ class Evidence:
         """The estimate with the intervals that hold although the model lacks what was found."""
         if self.estimate is None or not self.sound:
             return self.estimate
+        restless = {name for name, _ in (*self.colour, *self.excess)}
         named = any(lack.finding.matters for lack in self.lacks)
-        nameless = set() if named else {name for name, _ in (*self.colour, *self.excess)}
-        return widened(self.estimate, self.on_time, self.lacks, nameless)
+        return widened(self.estimate, self.on_time, self.lacks, restless, nameless=bool(restless) and not named)
 
     @cached_property
     def colour(self) -> list[tuple[str, Reason]]:
@@ -227,6 +228,8 @@ class Evidence:
     def harmless(self) -> bool:
         """Whether the model explains the rapid at the table, and nothing it surely lacks makes a next one worse."""
         if self.weight is None or not self.weight.believed or (self.fit is not None and self.late_s):
+            return False
+        if any(lack.finding.name.endswith(LATE) and abs(lack.finding.amplitude) > MOST_LATE for lack in self.lacks):
             return False
         late = self.breakaway
         # a replay has the move's beginning, where a load that is held at rest may pass for friction that holds more

@@ -22,22 +22,24 @@ from fdhil.records import PARAMETERS, Estimate, Float, frozen
 from fdhil.validation.selection import Lacking
 
 UNKNOWN_WAY = 2.0  # times an interval
-LAG_ROWS = 2.0  # what a sensor may lag without being named: a lag looks like the winding's own
+LAG_ROWS = 3.0  # what a sensor may lag without being named: a lag looks like the winding's own
 
 
-def widened(estimate: Estimate, fit: Fit, lacks: Sequence[Lacking], nameless: Collection[str] = ()) -> Estimate:
+def widened(
+    estimate: Estimate, fit: Fit, lacks: Sequence[Lacking], restless: Collection[str] = (), nameless: bool = False
+) -> Estimate:
     """Return the estimate with the shifts by all that the model surely lacks added to its covariance.
 
-    ``nameless`` are the signals that show something beyond the model that no finding names: nobody knows which way that
-    moves the parameters. Every interval is doubled then; and where it shows in voltage or current, a sensor may lag,
-    which looks like another winding.
+    ``restless`` are the signals whose innovations hang together, or scatter more than they should. Where no finding
+    explains that (``nameless``), nobody knows which way it moves the parameters, and every interval is doubled. Where
+    it shows in voltage or current, a sensor may lag, which looks like another winding.
     """
     covariance = estimate.covariance
     for lack in lacks:
         covariance = covariance + _square(_worst(estimate, fit, lack))
     if nameless:
         covariance = UNKNOWN_WAY**2 * covariance
-    if {"voltage", "current"} & set(nameless):
+    if {"voltage", "current"} & set(restless):
         covariance = covariance + _square(_of_names(estimate, fit, _lag(fit)))
     return replace(estimate, covariance=frozen(covariance))
 
