@@ -23,7 +23,7 @@ from fdhil.records import PARAMETERS, Bool, Float, Parameters, Reason, Window, r
 from fdhil.validation.replay import Replay, replay_window
 from fdhil.validation.table_error import TableError
 
-MOST_SHARE = 0.1  # of what all torque makes: a model that leaves more of it is none, however much the axis lags
+MOST_SHARE = 0.15  # of what all torque makes: a model that leaves more of it is none, however much the axis lags
 NEXT_SPEED = 0.3  # of the rapid speed: that of a program that is cut
 SCATTER = 3.0  # deviations by which the power of noise may lie above what is expected
 BEGINNING_S = 0.060  # before the drive surely moves
