@@ -21,8 +21,6 @@ from fdhil.drivers.can.socketcan import CAN_FRAME, SocketCanPort
 from fdhil.drivers.can.socketcand import CONNECT_TIMEOUT_S, SocketcandPort
 from fdhil.errors import ConnectError, DeviceError
 
-QUEUE_FULL = "the transmit queue is full: no other node acknowledges, check the drives' supply, wiring and bit rate"
-
 
 class SendingPort(Port, Protocol):
     """A port that also sends."""

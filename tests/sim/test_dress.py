@@ -167,8 +167,9 @@ def test_a_drive_can_wear_whatever_a_file_says(tmp_path: Path, lines: list[str],
     rig.nmt(0x01)
     rig.sync()
     for index in (0x1000, 0x1018, 0x6040, 0x6064, 0x1A00):
-        rig.send(0x601, bytes([0x40, index & 0xFF, index >> 8, 0, 0, 0, 0, 0]))
-    own_eds_text(rig.drive)
+        ((cob_id, data),) = rig.send(0x601, bytes([0x40, index & 0xFF, index >> 8, 0, 0, 0, 0, 0]))
+        assert (cob_id, len(data)) == (0x581, 8)  # the value, or an abort
+    assert "[DeviceInfo]" in own_eds_text(rig.drive)
 
 
 # -- what the wire sees

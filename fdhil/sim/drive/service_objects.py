@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from fdhil.sim.drive.dictionary import ARRAY, U8, U16, U32, DataType, Entry, Object, record, var
 
-USER_DATA_BYTES = 1 << 16
 KEEP_STATE = 1  # 0x1029: what the drive does by itself is 0x6007's affair
 
 
