@@ -32,9 +32,13 @@ VOLTAGE_SOURCES: Mapping[str, str] = {
     "modbus": "fdhil.drivers.modbus.sources:modbus_voltage",
     "serial": "fdhil.drivers.serial.instrument:serial_voltage",
 }
+NC_SOURCES: Mapping[str, str] = {
+    "linuxcnc": "fdhil.drivers.nc.linuxcnc:LinuxCnc",
+}
 EVENT_SOURCES: Mapping[str, str] = {
     "inferred": "fdhil.drivers.moves.inferred:InferredG0",
     "digital_input": "fdhil.drivers.moves.digital_input:DigitalInputG0",
+    **dict.fromkeys(NC_SOURCES, "fdhil.drivers.moves.told:ToldG0"),
 }
 DRIVE_PROFILES: Mapping[str, str] = {
     "fdhil_twin": "fdhil.drivers.cia402.profiles:fdhil_twin.toml",
