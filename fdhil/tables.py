@@ -36,6 +36,20 @@ EVENT_SOURCES: Mapping[str, str] = {
     "inferred": "fdhil.drivers.moves.inferred:InferredG0",
     "digital_input": "fdhil.drivers.moves.digital_input:DigitalInputG0",
 }
+# file formats of recordings: modules that encode and decode; the suffix of the file's name is the key of the second
+RECORDING_FORMATS: Mapping[str, str] = {
+    "csv": "fdhil.store.recording_csv",
+    "parquet": "fdhil.store.recording_parquet",
+    "mat": "fdhil.store.recording_mat",
+    "mdf4": "fdhil.store.recording_mdf4",
+    "hdf5": "fdhil.store.recording_hdf5",
+}
+RECORDING_SUFFIXES: Mapping[str, str] = {
+    ".csv": "csv", ".parquet": "parquet", ".mat": "mat", ".mf4": "mdf4", ".h5": "hdf5", ".hdf5": "hdf5",
+}  # fmt: skip
+# logs of all frames of a bus, as python-can writes them
+BUS_LOG_FORMATS: Mapping[str, str] = {"candump": ".log", "blf": ".blf", "asc": ".asc", "trc": ".trc"}
+BUS_LOG_SUFFIXES: Mapping[str, str] = {suffix: name for name, suffix in BUS_LOG_FORMATS.items()}
 DRIVE_PROFILES: Mapping[str, str] = {
     "fdhil_twin": "fdhil.drivers.cia402.profiles:fdhil_twin.toml",
     "cia402": "fdhil.drivers.cia402.profiles:cia402.toml",
@@ -53,6 +67,6 @@ DRIVE_PROFILES: Mapping[str, str] = {
 
 
 def load(table: Mapping[str, str], name: str) -> Any:
-    """Import and return the factory that ``table`` lists under ``name``; KeyError when it lists none."""
+    """Import and return the factory or module that ``table`` lists under ``name``; KeyError when it lists none."""
     module, _, attribute = table[name].partition(":")
-    return getattr(import_module(module), attribute)
+    return getattr(import_module(module), attribute) if attribute else import_module(module)

@@ -11,7 +11,7 @@ from click.testing import CliRunner, Result
 
 from fdhil.cli.identify import identify
 from fdhil.cli.main import cli, run_safely
-from fdhil.store.export import export_csv
+from fdhil.store.export import export_table, table_of
 from studies import bench
 from studies.slow_sensor import slow_windows
 from tests.bench import bench_toml
@@ -65,7 +65,7 @@ def test_json_holds_every_window_and_the_pool(shuttle: Path) -> None:
 
 def test_the_delay_of_a_slow_sensor_is_told_with_its_deviation(tmp_path: Path) -> None:
     path = tmp_path / "slow.csv"
-    export_csv(slow_windows(0.005, delay_s=0.0012)[0], path)
+    export_table(table_of(slow_windows(0.005, delay_s=0.0012)[0]), path)
     result = invoke(path, "--json")
     assert result.return_value == 0
     (window,) = told_document(result)["files"][0]["windows"]

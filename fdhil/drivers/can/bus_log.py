@@ -1,0 +1,49 @@
+"""Logs of all frames of a bus, from one program's format to another's: candump, BLF, ASC, TRC (python-can's own)."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import can
+
+from fdhil import tables
+from fdhil.errors import RecordingError
+from fdhil.store.output import open_output
+
+_UNREADABLE = (
+    can.CanError,
+    ValueError,
+    LookupError,
+    OSError,
+    EOFError,
+    TypeError,
+    AttributeError,
+    struct.error,
+    zlib.error,
+)
+
+
+def convert_log(path: Path, out: Path, format_name: str) -> int:
+    """Write a log in one of ``tables.BUS_LOG_FORMATS``, whole or not at all; returns how many frames it has.
+
+    RecordingError when the log cannot be read, OutputError when it cannot be written.
+    """
+    with TemporaryDirectory() as folder:
+        part = Path(folder) / f"log{tables.BUS_LOG_FORMATS[format_name]}"
+        frames = 0
+        try:
+            with can.LogReader(path) as reader, can.Logger(part) as writer:
+                for message in reader:
+                    writer.on_message_received(message)
+                    frames += 1
+        except _UNREADABLE as error:
+            first = (str(error).splitlines() or [type(error).__name__])[0][:200]
+            raise RecordingError(f"{path} is no log of a bus that can be read: {first}; copy it again") from None
+        if not frames:
+            raise RecordingError(f"{path} has no frame: it is no log of a bus, or nothing was on it")
+        with open_output(out) as file:
+            file.write(part.read_bytes())
+    return frames
