@@ -11,7 +11,6 @@ import can
 
 from fdhil import tables
 from fdhil.errors import RecordingError
-from fdhil.store.output import open_output
 
 _UNREADABLE = (
     can.CanError,
@@ -26,11 +25,8 @@ _UNREADABLE = (
 )
 
 
-def convert_log(path: Path, out: Path, format_name: str) -> int:
-    """Write a log in one of ``tables.BUS_LOG_FORMATS``, whole or not at all; returns how many frames it has.
-
-    RecordingError when the log cannot be read, OutputError when it cannot be written.
-    """
+def converted_log(path: Path, format_name: str) -> tuple[bytes, int]:
+    """Return a log in one of ``tables.BUS_LOG_FORMATS``, and how many frames it has; RecordingError when it is none."""
     with TemporaryDirectory() as folder:
         part = Path(folder) / f"log{tables.BUS_LOG_FORMATS[format_name]}"
         frames = 0
@@ -44,6 +40,4 @@ def convert_log(path: Path, out: Path, format_name: str) -> int:
             raise RecordingError(f"{path} is no log of a bus that can be read: {first}; copy it again") from None
         if not frames:
             raise RecordingError(f"{path} has no frame: it is no log of a bus, or nothing was on it")
-        with open_output(out) as file:
-            file.write(part.read_bytes())
-    return frames
+        return part.read_bytes(), frames
