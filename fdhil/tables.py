@@ -32,9 +32,13 @@ VOLTAGE_SOURCES: Mapping[str, str] = {
     "modbus": "fdhil.drivers.modbus.sources:modbus_voltage",
     "serial": "fdhil.drivers.serial.instrument:serial_voltage",
 }
+NC_SOURCES: Mapping[str, str] = {
+    "linuxcnc": "fdhil.drivers.nc.linuxcnc:LinuxCnc",
+}
 EVENT_SOURCES: Mapping[str, str] = {
     "inferred": "fdhil.drivers.moves.inferred:InferredG0",
     "digital_input": "fdhil.drivers.moves.digital_input:DigitalInputG0",
+    **dict.fromkeys(NC_SOURCES, "fdhil.drivers.moves.told:ToldG0"),
 }
 # file formats of recordings: modules that encode and decode; the suffix of the file's name is the key of the second
 RECORDING_FORMATS: Mapping[str, str] = {
