@@ -62,9 +62,9 @@ def identify(
     nominal values: a sensor whose gain is wrong all along shows in no other way. A recording may have no voltage: then
     K is the one in its header torque_constant_nm_per_a, else the nominal one of --config. Where the configured
     regulators do not explain the rapids, and with --loops always, the drive's own are identified; those that explain
-    more are used. A RECORDING is CSV, Parquet, MATLAB, MDF 4 or HDF5; --columns reads what other programs wrote. Exit codes: 0 every file's
-    pool is validated, 1 some pool is not, 2 wrong option or configuration, 3 a recording cannot be read (the others
-    are identified all the same).
+    more are used. A RECORDING is CSV, Parquet, MATLAB, MDF 4 or HDF5; with --columns it is what another program wrote.
+    Exit codes: 0 every file's pool is validated, 1 some pool is not, 2 wrong option or configuration, 3 a recording
+    cannot be read (the others are identified all the same).
     """
     if accelerometer is not None and len(recordings) > 1:
         raise click.UsageError("--accelerometer belongs to one recording: give each with its own")
@@ -128,8 +128,8 @@ def _analyse(
 
     if not sys.stderr.isatty():
         return list(analyse_files(paths, settings, machine, accelerometer=accelerometer, columns=columns))
-    columns = (TextColumn("identifying"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    shown = (TextColumn("identifying"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*shown, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("identifying", total=len(paths))
         return list(analyse_files(paths, settings, machine, partial(progress.advance, task), accelerometer, columns))
 

@@ -112,7 +112,7 @@ def mapped(raw: RecordingTable, told: ColumnMap, source: str) -> RecordingTable:
     """
     headers = {"format": FORMAT, **raw.headers, **{key: _text(value) for key, value in told.headers.items()}}
     pitch_m = _number(headers.get("pitch_m_per_rev"), source)
-    columns = {
+    columns: dict[str, Float] = {
         signal: np.sum([_column(raw, c, _factor(signal, c.unit, pitch_m), source) for c in _as_tuple(of)], axis=0)
         for signal, of in told.columns.items()
     }

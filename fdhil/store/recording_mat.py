@@ -19,7 +19,9 @@ _NUMBERS = {"double", "single", "int8", "int16", "int32", "int64", "uint8", "uin
 
 def encode(table: RecordingTable) -> bytes:
     """Return a table as the bytes of a MATLAB file."""
-    from scipy.io import savemat  # late: scipy is slow to import
+    from scipy import io as scipy_io  # late: it is slow to import
+
+    savemat: Any = scipy_io.savemat  # its stubs know no file in memory
 
     units = {name: UNITS[name] for name in table.columns if name in UNITS}
     content = io.BytesIO()
@@ -34,8 +36,11 @@ def decode(content: bytes, source: str) -> RecordingTable:
         from fdhil.store import recording_hdf5
 
         return recording_hdf5.decode(content, source)
-    from scipy.io import loadmat, whosmat
+    from scipy import io as scipy_io
     from scipy.io.matlab import MatReadError
+
+    whosmat: Any = scipy_io.whosmat
+    loadmat: Any = scipy_io.loadmat
 
     try:
         told = whosmat(io.BytesIO(content))

@@ -5,11 +5,15 @@ The columns are one group of channels over ``time``; the headers stand as JSON i
 
 from __future__ import annotations
 
+import contextlib
+import gc
+import html
 import io
 import json
 import re
+import sys
+from collections.abc import Iterator
 from typing import Any
-from xml.sax.saxutils import unescape
 
 import numpy as np
 
@@ -43,15 +47,33 @@ def decode(content: bytes, source: str) -> RecordingTable:
     RecordingError when it is no MDF file.
     """
     asammdf = _asammdf()
+    if not content.startswith(b"MDF ") or content[64:68] != b"##HD":  # its reader cannot tell this quietly
+        raise unreadable(source, "MDF 4 file", ValueError("it does not begin as one"))
+    with _quiet():
+        try:
+            return _read(asammdf, content, source)
+        except (asammdf.blocks.utils.MdfException, *UNREADABLE) as error:
+            refusal = unreadable(source, "MDF 4 file", error)
+    raise refusal
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep the reader's half-made objects from complaining on standard error as they go."""
+    before = sys.unraisablehook
+    sys.unraisablehook = lambda _: None
     try:
-        with asammdf.MDF(io.BytesIO(content)) as file:
-            rows = [group.channel_group.cycles_nr for group in file.groups]
-            check_size(max(rows, default=0), sum(len(group.channels) for group in file.groups), source)
-            columns = _channels(file, rows)
-            headers = _headers(str(file.header.comment))
-    except (asammdf.blocks.utils.MdfException, *UNREADABLE) as error:
-        raise unreadable(source, "MDF 4 file", error) from None
-    return RecordingTable(headers, columns)
+        yield
+    finally:
+        gc.collect()
+        sys.unraisablehook = before
+
+
+def _read(asammdf: Any, content: bytes, source: str) -> RecordingTable:
+    with asammdf.MDF(io.BytesIO(content)) as file:
+        rows = [group.channel_group.cycles_nr for group in file.groups]
+        check_size(max(rows, default=0), sum(len(group.channels) for group in file.groups), source)
+        return RecordingTable(_headers(str(file.header.comment)), _channels(file, rows))
 
 
 def _channels(file: Any, rows: list[int]) -> dict[str, Float]:
@@ -73,7 +95,7 @@ def _headers(comment: str) -> dict[str, str]:
     """Return the headers in a file's comment; none where another program wrote it."""
     found = _COMMENT.search(comment)
     try:
-        told = json.loads(unescape(found[1]) if found else comment)
+        told = json.loads(html.unescape(found[1]) if found else comment)
     except ValueError:
         return {}
     return {str(key): str(value) for key, value in told.items()} if isinstance(told, dict) else {}

@@ -22,7 +22,7 @@ def read_recording(path: Path, columns: Path | None = None) -> Recording:
 
 
 def read_table(path: Path, columns: Path | None = None) -> RecordingTable:
-    """Read the headers and columns of a recording; what they mean is not looked at. Errors as :func:`read_recording`."""
+    """Read headers and columns of a recording without looking at what they mean. Errors as :func:`read_recording`."""
     told = None if columns is None else read_column_map(columns)
     content = read_content(path)
     name = tables.RECORDING_SUFFIXES.get(path.suffix.lower(), "csv")
