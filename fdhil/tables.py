@@ -40,7 +40,7 @@ EVENT_SOURCES: Mapping[str, str] = {
     "digital_input": "fdhil.drivers.moves.digital_input:DigitalInputG0",
     **dict.fromkeys(NC_SOURCES, "fdhil.drivers.moves.told:ToldG0"),
 }
-# file formats of recordings: modules that encode and decode; the suffix of the file's name is the key of the second
+# file formats of recordings: modules that encode and decode
 RECORDING_FORMATS: Mapping[str, str] = {
     "csv": "fdhil.store.recording_csv",
     "parquet": "fdhil.store.recording_parquet",
@@ -48,12 +48,6 @@ RECORDING_FORMATS: Mapping[str, str] = {
     "mdf4": "fdhil.store.recording_mdf4",
     "hdf5": "fdhil.store.recording_hdf5",
 }
-RECORDING_SUFFIXES: Mapping[str, str] = {
-    ".csv": "csv", ".parquet": "parquet", ".mat": "mat", ".mf4": "mdf4", ".h5": "hdf5", ".hdf5": "hdf5",
-}  # fmt: skip
-# logs of all frames of a bus, as python-can writes them
-BUS_LOG_FORMATS: Mapping[str, str] = {"candump": ".log", "blf": ".blf", "asc": ".asc", "trc": ".trc"}
-BUS_LOG_SUFFIXES: Mapping[str, str] = {suffix: name for name, suffix in BUS_LOG_FORMATS.items()}
 DRIVE_PROFILES: Mapping[str, str] = {
     "fdhil_twin": "fdhil.drivers.cia402.profiles:fdhil_twin.toml",
     "cia402": "fdhil.drivers.cia402.profiles:cia402.toml",

@@ -8,6 +8,7 @@ from typing import Any
 import click
 
 from fdhil import tables
+from fdhil.store import suffixes
 from fdhil.store.export import export_table
 from fdhil.store.output import open_output
 from fdhil.store.recordings import read_table
@@ -16,17 +17,17 @@ from fdhil.store.recordings import read_table
 def export_file(recording: Path, out: Path, format_name: str | None, columns: Path | None) -> dict[str, Any]:
     """Write ``recording`` to ``out`` and return what ``--json`` tells of it; click.BadParameter for what cannot be."""
     suffix = out.suffix.lower()
-    name = format_name or tables.RECORDING_SUFFIXES.get(suffix) or tables.BUS_LOG_SUFFIXES.get(suffix) or "csv"
-    is_log = recording.suffix.lower() in tables.BUS_LOG_SUFFIXES
-    if is_log != (name in tables.BUS_LOG_FORMATS):
-        what, others = "a recording", tables.RECORDING_FORMATS
+    name = format_name or suffixes.RECORDINGS.get(suffix) or suffixes.BUS_LOGS.get(suffix) or "csv"
+    is_log = recording.suffix.lower() in suffixes.BUS_LOGS
+    if is_log != (name in suffixes.BUS_LOGS.values()):
+        what, others = "a recording", [*tables.RECORDING_FORMATS]
         if is_log:
-            what, others = "a log of the bus", tables.BUS_LOG_FORMATS
+            what, others = "a log of the bus", [*suffixes.BUS_LOGS.values()]
         raise click.BadParameter(f"{recording} is {what}, which becomes {', '.join(others)}", param_hint="--format")
     if is_log:
         from fdhil.drivers.can.bus_log import converted_log
 
-        content, frames = converted_log(recording, name)
+        content, frames = converted_log(recording, suffixes.suffix_of(suffixes.BUS_LOGS, name))
         with open_output(out) as file:
             file.write(content)
         return {"format": name, "frames": frames}

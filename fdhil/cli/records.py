@@ -15,6 +15,7 @@ from fdhil import tables
 from fdhil.cli.compiling import forewarn
 from fdhil.cli.options import COLUMNS, OutputFile, Writing
 from fdhil.errors import RecordingError
+from fdhil.store import suffixes
 
 if TYPE_CHECKING:
     from fdhil.records import Outcome, Window
@@ -170,7 +171,7 @@ def _row(revision: Revision) -> dict[str, Any]:
 @click.option(
     "--format",
     "format_name",
-    type=click.Choice([*tables.RECORDING_FORMATS, *tables.BUS_LOG_FORMATS]),
+    type=click.Choice([*tables.RECORDING_FORMATS, *suffixes.BUS_LOGS.values()]),
     help="Left out: by the name of --out, else csv.",
 )
 @COLUMNS

@@ -8,6 +8,7 @@ from fdhil import tables
 from fdhil.csv_text import read_content
 from fdhil.errors import RecordingError
 from fdhil.records import Recording
+from fdhil.store import suffixes
 from fdhil.store.column_map import mapped, read_column_map
 from fdhil.store.recording_table import RecordingTable, recording_of
 from fdhil.store.trace_text import parse_trace
@@ -25,7 +26,7 @@ def read_table(path: Path, columns: Path | None = None) -> RecordingTable:
     """Read headers and columns of a recording without looking at what they mean. Errors as :func:`read_recording`."""
     told = None if columns is None else read_column_map(columns)
     content = read_content(path)
-    name = tables.RECORDING_SUFFIXES.get(path.suffix.lower(), "csv")
+    name = suffixes.RECORDINGS.get(path.suffix.lower(), "csv")
     if told is None:
         return _decoded(name, content, str(path))
     raw = parse_trace(content, told.text, str(path)) if name == "csv" else _decoded(name, content, str(path))

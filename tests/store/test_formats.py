@@ -13,12 +13,13 @@ import pytest
 from fdhil import tables
 from fdhil.errors import RecordingError
 from fdhil.records import Float, frozen
+from fdhil.store import suffixes
 from fdhil.store.export import export_table, table_of
 from fdhil.store.recording_table import UNITS, RecordingTable, recording_of
 from fdhil.store.recordings import read_recording, read_table
 from tests.store.made import window
 
-SUFFIX = {name: suffix for suffix, name in reversed([*tables.RECORDING_SUFFIXES.items()])}
+SUFFIX = {name: suffixes.suffix_of(suffixes.RECORDINGS, name) for name in tables.RECORDING_FORMATS}
 
 
 def _table() -> RecordingTable:

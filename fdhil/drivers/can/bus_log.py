@@ -9,7 +9,6 @@ from tempfile import TemporaryDirectory
 
 import can
 
-from fdhil import tables
 from fdhil.errors import RecordingError
 
 _UNREADABLE = (
@@ -25,10 +24,10 @@ _UNREADABLE = (
 )
 
 
-def converted_log(path: Path, format_name: str) -> tuple[bytes, int]:
-    """Return a log in one of ``tables.BUS_LOG_FORMATS``, and how many frames it has; RecordingError when it is none."""
+def converted_log(path: Path, suffix: str) -> tuple[bytes, int]:
+    """Return a log in the format of ``suffix``, and how many frames it has; RecordingError when it is none."""
     with TemporaryDirectory() as folder:
-        part = Path(folder) / f"log{tables.BUS_LOG_FORMATS[format_name]}"
+        part = Path(folder) / f"log{suffix}"
         frames = 0
         try:
             with can.LogReader(path) as reader, can.Logger(part) as writer:
