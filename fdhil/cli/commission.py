@@ -4,53 +4,35 @@ from __future__ import annotations
 
 import json
 import signal
-import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from fdhil import config as machine_config
-from fdhil.cli.commission_steps import FEEDFORWARD, STEPS, moves_of, planned
+from fdhil.cli.commission_guide import Asked, Guide, confirm, room_of
+from fdhil.cli.commission_steps import FEEDFORWARD, STEPS, planned, trial_moves
+from fdhil.cli.commission_trial import try_commissioned
 from fdhil.errors import ConfigError, ConfigFault, DriveFault
 
 if TYPE_CHECKING:
     from types import FrameType
 
-    from fdhil.commissioning.progress import Progress, Step
-    from fdhil.commissioning.record import CommissioningRecord
-    from fdhil.commissioning.strokes import Room
+    from fdhil.commissioning.progress import Progress
     from fdhil.config import MachineConfig
 
 SCHEMA = "fdhil-commission-1"
-
-
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """What the operator asked for; ``quiet``: only the JSON document goes to stdout."""
-
-    room: Room | None
-    yes: bool
-    again: bool
-    quiet: bool
-
-    def say(self, text: str) -> None:
-        """Show progress: on stdout, or on a terminal beside the JSON document."""
-        if not self.quiet:
-            click.echo(text)
-        elif sys.stderr.isatty():
-            click.echo(text, err=True)
 
 
 @click.command()
 @click.argument("config", type=click.Path(path_type=Path))
 @click.option("--axis", "only", help="Commission this axis; left out: all, one after the other.")
 @click.option("--room", nargs=2, type=float, metavar="BACK FORWARD",
-              help="How far, mm, each axis may go from where it stands: -20 200. The axis is then tried by a jog and by "
-              "rapids, and identified; left out, you are asked, and with --yes it is not tried.")  # fmt: skip
+              help="How far, mm, each axis may go from where it stands: -20 200. It is then tried by a jog and rapids, "
+              "and identified; left out, you are asked, and with --yes it is not tried.")  # fmt: skip
 @click.option("--dry-run", is_flag=True, help="Say what each step does and moves, and send nothing.")
 @click.option("--again", is_flag=True, help="Do all steps anew, also those that were done with this very drive.")
 @click.option(
@@ -85,7 +67,7 @@ def commission(
     if axes[0] not in machine.axis:
         fault = ConfigFault("--axis", f"there is no axis {only}", f"one of {', '.join(machine.axis)}")
         raise ConfigError(str(config), [fault])
-    asked = Asked(_room(room), yes, again, as_json)
+    asked = Asked(room_of(room), yes, again, as_json)
     if dry_run:
         return _tell_plan(machine, axes, asked)
     done: dict[str, Any] = {}
@@ -102,18 +84,6 @@ def commission(
     if refused is not None:
         click.echo(f"refused: {refused}", err=True)
     return int(refused is not None)
-
-
-def _room(given: tuple[float, float] | None) -> Room | None:
-    from fdhil.commissioning.strokes import Room
-
-    if given is None:
-        return None
-    back, forward = given
-    if not (-1e4 <= back <= 0.0 <= forward <= 1e4):
-        text = "--room wants two numbers of mm, 0 or less and 0 or more: how far it may go back, and forward"
-        raise click.BadParameter(text)
-    return Room(back, forward)
 
 
 @contextmanager
@@ -177,40 +147,28 @@ def _commission_axis(machine: MachineConfig, axis: str, asked: Asked) -> dict[st
     if asked.again:
         progress.forget()
     if asked.room is not None:
-        moves_of(machine, axis, asked.room)  # a room that is too small is told before anything is sent
+        trial_moves(machine, axis, asked.room)  # a room that is too small is told before anything is sent
     with lock_bus(machine.bus[machine.axis[axis].drive.bus]):  # the guard reads the record when it starts
-        record = steps.commission(machine, axis, _Guide(machine, axis, asked, STEPS, progress), progress)
+        record = steps.commission(machine, axis, _commissioning_guide(machine, axis, asked, progress), progress)
         path = save_record(record, machine.store.directory, machine.store.commissioning_key)
         asked.say(
             f"axis {axis} is commissioned: moved {record.sign_test_um:+.1f} um, "
             f"{FEEDFORWARD[record.offset_in_feedforward]}, watchdog {record.watchdog}; record {path}"
         )
-        tried = _try_axis(machine, axis, record, asked, progress)
+        tried = try_commissioned(machine, record, asked, progress)
     return {**asdict(record), "record": str(path), "digest": record.digest, "trial": tried}
 
 
-class _Guide:
-    """Tells of each step before it is done, or that it is kept, and asks before the axis is switched on."""
+def _commissioning_guide(machine: MachineConfig, axis: str, asked: Asked, progress: Progress) -> Callable[[str], None]:
+    """Return the function that tells of each step, and asks before the drive is switched on."""
+    guide = Guide(axis, asked, STEPS, progress)
 
-    def __init__(
-        self, machine: MachineConfig, axis: str, asked: Asked, steps: Mapping[str, str], progress: Progress
-    ) -> None:
-        self._machine, self._axis, self._asked, self._steps = machine, axis, asked, steps
-        progress.on_kept = self.kept
+    def report(step: str) -> None:
+        if step == "enable" and not asked.yes:
+            _ask(machine, axis)
+        guide(step)
 
-    def __call__(self, step: str) -> None:
-        """Tell what is done next; DriveFault when nobody says yes."""
-        if step == "enable" and not self._asked.yes:
-            _ask(self._machine, self._axis)
-        self._asked.say(f"{self._head(step)}: {self._steps[step]}")
-
-    def kept(self, name: str, step: Step) -> None:
-        """Tell that a step need not be done."""
-        found = ", ".join(f"{key} {value}" for key, value in step.found.items() if not isinstance(value, Mapping))
-        self._asked.say(f"{self._head(name)}: kept, it was done {step.done_utc} ({found}).")
-
-    def _head(self, step: str) -> str:
-        return f"axis {self._axis}, step {list(self._steps).index(step) + 1} of {len(self._steps)}, {step}"
+    return report
 
 
 def _set_pdos(machine: MachineConfig, axis: str, asked: Asked) -> dict[str, Any]:
@@ -225,7 +183,7 @@ def _set_pdos(machine: MachineConfig, axis: str, asked: Asked) -> dict[str, Any]
         question = (
             f"The PDOs of drive {axis} are written as profile {profile.name} has them, and saved in it. May they?"
         )
-        _confirm(axis, question, "nothing was written; start again with --yes where nobody can be asked")
+        confirm(axis, question, "nothing was written; start again with --yes where nobody can be asked")
     with lock_bus(machine.bus[machine.axis[axis].drive.bus]), Master(machine, axis) as master:
         done = set_up_pdos(master)
     written = ", ".join(done.written) or "none, all were right"
@@ -244,25 +202,4 @@ def _ask(machine: MachineConfig, axis: str) -> None:
         f"then up to {largest_move_um(machine, axis):.0f} um to and fro. Is it free to move, and may it?"
     )
     advice = "nothing was moved or written; start again when it may move, with --yes where nobody can be asked"
-    _confirm(axis, question, advice)
-
-
-def _confirm(axis: str, question: str, advice: str) -> None:
-    if not _agreed(question):
-        raise DriveFault(f"drive {axis}", f"nobody said yes; {advice}")
-
-
-def _agreed(question: str) -> bool:
-    """Whether the operator says yes; where nobody is there to be asked, nobody does."""
-    try:
-        return click.confirm(question, err=True)
-    except click.Abort:
-        if sys.stdin.isatty():
-            raise  # Ctrl-C
-        return False
-
-
-def _try_axis(
-    machine: MachineConfig, axis: str, record: CommissioningRecord, asked: Asked, progress: Progress
-) -> dict[str, Any] | None:
-    return None
+    confirm(axis, question, advice)

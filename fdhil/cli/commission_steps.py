@@ -1,4 +1,4 @@
-"""What each step of a commissioning does and moves, in words: said before it, and all at once by ``--dry-run``."""
+"""What each step of a commissioning does and moves, in words: said before it, and all together by ``--dry-run``."""
 
 from __future__ import annotations
 
@@ -32,47 +32,52 @@ FEEDFORWARD: Mapping[bool | None, str] = {
 NOTHING = "nothing"
 
 
-def moves_of(machine: MachineConfig, axis: str, room: Room | None) -> dict[str, str]:
-    """Return what each step moves, for ``room`` those of the trial too; DriveFault where the room is too small."""
-    from fdhil.commissioning.steps import RAMPS, SIGN_TEST_UM, largest_move_um
-    from fdhil.commissioning.strokes import plan_jog, plan_rapid
-    from fdhil.commissioning.trial import RAPIDS
-
-    largest = largest_move_um(machine, axis)
-    moves = dict.fromkeys(STEPS, NOTHING) | {
-        "enable": "nothing but what holding it takes",
-        "sign test": f"{SIGN_TEST_UM:g} um toward plus and back, by the offset",
-        "feed-forward test": f"{largest:.0f} um toward plus and back {RAMPS // 2} times, by the offset, at up to 2 mm/s",
-        "watchdog test": "nothing; the drive stops by itself and is switched on again",
-    }
-    if room is None:
-        return moves
-    settings = machine.axis[axis]
-    jog, rapid = plan_jog(axis, settings, room), plan_rapid(axis, settings, room)
-    return moves | {
-        "timing": NOTHING,
-        "jog": f"{jog}, and back",
-        "test rapids": f"{rapid} with {rapid.acceleration_mm_s2:g} mm/s2, and back, {RAPIDS // 2} times",
-        "identification": NOTHING,
-        "acceptance": NOTHING,
-    }
-
-
 TRIAL: Mapping[str, str] = {
     "timing": "Starting SYNC, the drive switched off: how evenly does it come, and how soon does the drive answer?",
     "jog": "Switching the drive on and moving the axis slowly: its way, and the unit and sign of speed, current and "
     "voltage must be right.",
-    "test rapids": "Moving the axis as fast as G0, and listening as the daemon does; while it accelerates the motor must "
-    "take power.",
+    "test rapids": "Moving the axis as fast as G0, and listening as the daemon does; while it accelerates the motor "
+    "must take power.",
+    "restore": "Switching the drive off and giving back what was changed.",
     "identification": "Identifying the drive from them.",
     "acceptance": "Comparing the last two with what the identified model predicts.",
 }
 
 
+def moves_of(machine: MachineConfig, axis: str) -> dict[str, str]:
+    """Return what each of the ``STEPS`` moves."""
+    from fdhil.commissioning.steps import RAMPS, SIGN_TEST_UM, largest_move_um
+
+    largest = largest_move_um(machine, axis)
+    return dict.fromkeys(STEPS, NOTHING) | {
+        "enable": "nothing but what holding it takes",
+        "sign test": f"{SIGN_TEST_UM:g} um toward plus and back, by the offset",
+        "feed-forward test": f"{largest:.0f} um toward plus and back, by the offset, {RAMPS // 2} times",
+        "watchdog test": "nothing; the drive stops by itself and is switched on again",
+    }
+
+
+def trial_moves(machine: MachineConfig, axis: str, room: Room) -> dict[str, str]:
+    """Return what each step of the ``TRIAL`` moves; DriveFault where the room is too small."""
+    from fdhil.commissioning.strokes import plan_jog, plan_rapid
+    from fdhil.commissioning.trial import RAPIDS
+
+    settings = machine.axis[axis]
+    jog, rapid = plan_jog(axis, settings, room), plan_rapid(axis, settings, room)
+    return dict.fromkeys(TRIAL, NOTHING) | {
+        "jog": f"{jog}, and back",
+        "test rapids": f"{rapid} with {rapid.acceleration_mm_s2:g} mm/s2, and back, {RAPIDS // 2} times",
+    }
+
+
 def planned(machine: MachineConfig, axis: str, room: Room | None, progress: Progress) -> list[dict[str, Any]]:
     """Return all steps of an axis, what each does and moves, and when it was done if it was; nothing is sent."""
-    moves, texts = moves_of(machine, axis, room), {**STEPS, **TRIAL}
     done = progress.done()
+    steps = [(STEPS, moves_of(machine, axis))]
+    if room is not None:
+        steps.append((TRIAL, trial_moves(machine, axis, room)))
     return [
-        {"step": step, "does": texts[step], "moves": moved, "done_utc": done.get(step)} for step, moved in moves.items()
+        {"step": step, "does": texts[step], "moves": moved, "done_utc": done.get(step)}
+        for texts, moves in steps
+        for step, moved in moves.items()
     ]

@@ -18,6 +18,7 @@ JOG_MM_S = 5.0
 JOG_ACCELERATION_MM_S2 = 50.0
 GENTLE = 0.1  # of the axis' own speed and acceleration: what a jog stays below
 CRUISE_S = 2 * PLATEAU_S
+USED = 0.98  # of the room: the rest is what a stop from within a cycle may take
 SLOWEST = RAPID_SHARE + 0.05  # of the rapid speed: what is slower counts as a feed
 
 
@@ -57,7 +58,7 @@ class Stroke:
 
 def plan_jog(axis: str, settings: Axis, room: Room) -> Stroke:
     """Return the jog, toward the side with more room; DriveFault where there is too little."""
-    side = room.farthest_mm
+    side = USED * room.farthest_mm
     if abs(side) < LEAST_JOG_MM:
         text = f"there is room from {room} for the jog, which needs {LEAST_JOG_MM:g} mm to one side"
         raise DriveFault(f"drive {axis}", f"{text}; give it more with --room, or leave --room out to move nothing")
@@ -71,14 +72,14 @@ def plan_rapid(axis: str, settings: Axis, room: Room) -> Stroke:
 
     As fast as G0, or as the room allows; DriveFault where that would be no rapid any more.
     """
-    side, top = room.farthest_mm, settings.rapid_speed_mm_s
+    side, top = USED * room.farthest_mm, settings.rapid_speed_mm_s
     acceleration, jerk = settings.max_acceleration_mm_s2, settings.jerk_mm_s3
     # v^2 / a + v (a / j + cruise) is the way of a rapid of speed v
     spent_s = acceleration / jerk + CRUISE_S
     fits = acceleration / 2 * (math.sqrt(spent_s**2 + 4 * abs(side) / acceleration) - spent_s)
     if fits < SLOWEST * top:
         least = SLOWEST * top * (SLOWEST * top / acceleration + spent_s)
-        text = f"there is room from {room} for test rapids, which need {math.ceil(least)} mm to one side"
+        text = f"there is room from {room} for test rapids, which need {math.ceil(least / USED)} mm to one side"
         raise DriveFault(f"drive {axis}", f"{text}; move the axis away from its end, and give it more with --room")
     speed = min(top, fits)
     way = min(abs(side), speed * (speed / acceleration + spent_s))
