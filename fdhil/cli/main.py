@@ -19,7 +19,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "demo": ("fdhil.cli.demo:demo", "Run the whole loop on the simulated machine and write a report."),
     "scan": ("fdhil.cli.commissioning:scan", "List what is on the bus: nodes, identity, state, heartbeat."),
     "check": ("fdhil.cli.commissioning:check", "Check that the machine on the bus is the one in the config."),
-    "commission": ("fdhil.cli.commissioning:commission", "Commission the drives, step by step."),
+    "commission": ("fdhil.cli.commission:commission", "Commission the drives, step by step."),
     "run": ("fdhil.cli.service:run", "Run the daemon: listen, identify, predict; correct only when armed."),
     "status": ("fdhil.cli.service:status", "Ask the running daemon how it is."),
     "arm": ("fdhil.cli.service:arm", "Arm the correction of one program."),
