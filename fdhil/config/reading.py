@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
+from pydantic.fields import FieldInfo
 
 from fdhil.config.machine import MachineConfig
 from fdhil.config.plausible import doubts
@@ -165,6 +166,12 @@ def _section(loc: tuple[int | str, ...]) -> type[Section]:
             return section
         section = inner[0]
     return section
+
+
+def field_at(path: str) -> FieldInfo | None:
+    """Return the field of a key, as ``axis.X.nominal.R``; None where there is none."""
+    *outer, key = path.split(".")
+    return _section(tuple(outer)).model_fields.get(key)
 
 
 def _arguments(annotation: Any) -> list[Any]:
