@@ -111,7 +111,9 @@ def filled(document: Mapping[str, Any], sources: Mapping[str, str], head: str = 
                 lines += _line(key, own[key], sources.get(f"{table.path}.{key}", ""))
             elif first:
                 lines += [*_comment(field.description or ""), f"#{key} = {toml(_example(table.path, key, field))}"]
-    text = "\n".join([*lines, "", *_comment(f"Further tables, which docs/reference/config.md explains: {', '.join(left)}")])
+    text = "\n".join(
+        [*lines, "", *_comment(f"Further tables, which docs/reference/config.md explains: {', '.join(left)}")]
+    )
     return text + "\n"
 
 

@@ -1,7 +1,7 @@
 """Takes from a LinuxCNC machine's own INI and HAL files what a configuration needs: axes, speeds, scales, the period.
 
-Units: the INI's own ([TRAJ] LINEAR_UNITS) are taken to millimetres. The smaller of [JOINT_n], [AXIS_x] and [TRAJ] holds,
-as it does in LinuxCNC's motion controller. Rotary axes and the second joint of a gantry are told and left out.
+Units: the INI's own ([TRAJ] LINEAR_UNITS) are taken to millimetres. The smaller of [JOINT_n], [AXIS_x] and [TRAJ]
+holds, as it does in LinuxCNC's motion controller. Rotary axes and the second joint of a gantry are told and left out.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ def _scale(ini: Ini, hal: Hal, joint: int, unit_mm: float) -> Scale | None:
     for pin in (f"joint.{joint}.motor-pos-fb", f"joint.{joint}.motor-pos-cmd"):
         for component in hal.around(pin):
             for name in _SCALE_PINS:
-                value = finite(hal.set.get(f"{component}.{name}", ""))
+                value = finite(hal.given.get(f"{component}.{name}", ""))
                 if value:
                     return Scale(value / unit_mm, f"LinuxCNC: {component}.{name}")
     for key in _SCALE_KEYS:
@@ -184,8 +184,8 @@ def _beside(ini: Ini, hal: Hal, letter: str, joint: int, unit_mm: float) -> Iter
     section = f"JOINT_{joint}"
     if (ini.number(section, "BACKLASH") or 0.0) > 0 or ini.text(section, "COMP_FILE"):
         yield (
-            f"axis {letter}: LinuxCNC compensates backlash or the screw ([{section}] BACKLASH, COMP_FILE); leave that on: "
-            "fdhil sees it in the demand, and judges programs by a recorded demand (fdhil record)"
+            f"axis {letter}: LinuxCNC compensates backlash or the screw ([{section}] BACKLASH, COMP_FILE); leave that "
+            "on: fdhil sees it in the demand, and judges programs by a recorded demand (fdhil record)"
         )
     if (ini.number(f"AXIS_{letter}", "OFFSET_AV_RATIO") or 0.0) > 0:
         yield (
@@ -194,7 +194,7 @@ def _beside(ini: Ini, hal: Hal, letter: str, joint: int, unit_mm: float) -> Iter
         )
     loops = [name for name in hal.around(f"joint.{joint}.motor-pos-cmd") if name.startswith("pid.")]
     for loop in loops:
-        gains = _gains(hal.set, loop)
+        gains = _gains(hal.given, loop)
         yield (
             f"axis {letter}: HAL's {loop} closes the position loop ({gains}); fdhil corrects drives that get position "
             "set-points (0x607A) as they are: wire joint's motor-pos-cmd to the drive, and switch this loop off"
@@ -202,8 +202,9 @@ def _beside(ini: Ini, hal: Hal, letter: str, joint: int, unit_mm: float) -> Iter
     least = ini.number(section, "MIN_FERROR")
     if least is not None and 0 < least * unit_mm < 2 * LARGEST_OFFSET_MM:
         yield (
-            f"axis {letter}: [{section}] MIN_FERROR is {least * unit_mm:g} mm; an offset is a following error to "
-            f"LinuxCNC: keep correction.max_offset_um below a quarter of it, or raise it to {4 * LARGEST_OFFSET_MM:g} mm"
+            f"axis {letter}: [{section}] MIN_FERROR is {least * unit_mm:g} mm; an offset is a following error "
+            f"to LinuxCNC: keep correction.max_offset_um below a quarter of it, or raise it to "
+            f"{4 * LARGEST_OFFSET_MM:g} mm"
         )
 
 

@@ -83,7 +83,7 @@ def _joined(text: str) -> Iterator[str]:
 class Hal:
     """Parameters that are set, and the pins that each signal joins."""
 
-    set: dict[str, str] = field(default_factory=dict)
+    given: dict[str, str] = field(default_factory=dict)
     nets: dict[str, set[str]] = field(default_factory=dict)
 
     def joined(self, pin: str) -> list[str]:
@@ -102,9 +102,9 @@ def parse_hal(text: str, ini: Ini, read: Read, hal: Hal, depth: int = 0) -> None
         words = words[: next((k for k, word in enumerate(words) if word.startswith("#")), len(words))]
         match words:
             case ["setp", pin, value, *_]:
-                hal.set[pin] = value
+                hal.given[pin] = value
             case [pin, "=", value, *_]:
-                hal.set[pin] = value
+                hal.given[pin] = value
             case ["net" | "linksp", signal, *pins]:
                 hal.nets.setdefault(signal, set()).update(pin for pin in pins if pin not in _HAL_ARROWS)
             case ["linkps", pin, *rest] if signals := [word for word in rest if word not in _HAL_ARROWS]:
