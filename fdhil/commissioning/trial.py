@@ -18,7 +18,7 @@ from fdhil.commissioning.progress import Found, Progress
 from fdhil.commissioning.record import CommissioningRecord
 from fdhil.commissioning.steps import enable, holds_for, prepare, rolled_back
 from fdhil.commissioning.strokes import Room, Stroke, plan_jog, plan_rapid
-from fdhil.commissioning.stroking import check_room, stroking
+from fdhil.commissioning.stroking import Travel, stroke, travel_of
 from fdhil.commissioning.survey import listen, require, require_alone, survey
 from fdhil.commissioning.timing import judge_answers, judge_sync, measure
 from fdhil.config import MachineConfig
@@ -82,7 +82,7 @@ def try_axis(
             operator.report("timing")
             prepare(master)
             trial.found["timing"] = time_bus(master)
-            travel_mm = check_room(master, record, room)
+            travel_mm = travel_of(master, record, room)
             if "jog" not in trial.found:
                 operator.report("jog")
                 enable(master)
@@ -120,12 +120,11 @@ def time_bus(master: Master) -> Found:
     return {finding.point: finding.found for finding in findings}
 
 
-def jog_to_and_fro(master: Master, travel_mm: tuple[float, float], jog: Stroke, operator: Operator) -> Found:
+def jog_to_and_fro(master: Master, travel_mm: Travel, jog: Stroke, operator: Operator) -> Found:
     """Jog an enabled axis and back: units and signs must be right, also in the eyes of the operator; DriveFault."""
     with Overhearing(master.config, master.axis) as heard:
-        with stroking(master, travel_mm, jog) as axis:
-            for stroke in (jog, jog.back()):
-                axis.move(stroke, REST_S)
+        for moved in (jog, jog.back()):
+            stroke(master, travel_mm, moved, REST_S)
         wait_heard(master, heard)
     findings = list(judge_jog(heard.recording(), jog.distance_mm))
     require(master, findings)
@@ -151,13 +150,12 @@ def wait_heard(master: Master, heard: Overhearing) -> None:
     master.wait(reached, patience_s, "its TPDOs are not heard any more; check the bus")
 
 
-def rapids_to_and_fro(master: Master, travel_mm: tuple[float, float], rapid: Stroke) -> Overhearing:
+def rapids_to_and_fro(master: Master, travel_mm: Travel, rapid: Stroke) -> Overhearing:
     """Move an enabled axis as fast as G0, to and fro, and return what was heard of it."""
     with Overhearing(master.config, master.axis, rapid.speed_mm_s) as heard:
         master.wait_cycles(round(REST_S / master.period_s))
-        with stroking(master, travel_mm, rapid) as axis:
-            for _ in range(RAPIDS // 2):
-                for stroke in (rapid, rapid.back()):
-                    axis.move(stroke, REST_S)
+        for _ in range(RAPIDS // 2):
+            for moved in (rapid, rapid.back()):
+                stroke(master, travel_mm, moved, REST_S)
         wait_heard(master, heard)
     return heard
