@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from fdhil.commissioning.compare import compare_record
-from fdhil.commissioning.identified import accept, identify, judge
+from fdhil.commissioning.identified import accept, identify, judge, voltage_late
 from fdhil.commissioning.master import Master
 from fdhil.commissioning.overhearing import Overhearing
 from fdhil.commissioning.polarity import judge_acceleration, judge_jog
@@ -99,6 +99,7 @@ def try_axis(
     trial.outcomes = tuple(identify(config, axis, heard.records, known))
     rapids = judge(axis, trial.outcomes)
     trial.found["identification"] = rapids.parameters
+    trial.found["test rapids"] = {**trial.found["test rapids"], **voltage_late(config, rapids)}
     operator.report("acceptance")
     trial.found["acceptance"] = accept(config, rapids)
     for step in FROM_RAPIDS:
