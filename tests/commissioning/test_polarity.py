@@ -102,7 +102,9 @@ def test_a_motor_takes_power_while_it_accelerates() -> None:
 
 def test_a_table_that_goes_another_way_is_told() -> None:
     jog = jogged()
-    seen = replace(jog, table_mm=frozen(np.where(np.arange(jog.position_mm.size) % 3 == 0, jog.position_mm + 7.0, np.nan)))
+    seen = replace(
+        jog, table_mm=frozen(np.where(np.arange(jog.position_mm.size) % 3 == 0, jog.position_mm + 7.0, np.nan))
+    )
     assert [f.point for f in judge_jog(seen, JOG) if f.ok][2] == "table"
     turned = replace(jog, table_mm=-jog.position_mm)
     assert "its table goes -1 times the way of its motor" in causes(turned)

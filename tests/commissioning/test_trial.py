@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 
+from fdhil.commissioning import moving
+from fdhil.commissioning.master import Master
 from fdhil.commissioning.progress import Progress
 from fdhil.commissioning.record import CommissioningRecord, load_record
+from fdhil.commissioning.set_points import SetPoints
 from fdhil.commissioning.strokes import Room
 from fdhil.commissioning.trial import STEPS, Operator, Trial, try_axis
 from fdhil.config import MachineConfig
@@ -112,22 +115,26 @@ def test_what_the_operator_did_not_see_ends_it(bench: Bench) -> None:
     [("current", "current times speed is negative"), ("voltage", "voltage times current, and times speed is negative")],
 )
 def test_a_wrong_sign_ends_it_before_a_rapid(signal: str, says: str, bench: Bench) -> None:
-    bench.peer.drive.faults.signal(signal).scale = -1.0
+    bench.peer.drive.faults.signal(signal).gain = -1.0
     with pytest.raises(DriveFault, match=f"SignOrScale: {says}"):
         bench.tried()
     assert "test rapids" not in bench.steps
 
 
-def test_an_operator_who_stops_it_finds_the_axis_braked(bench: Bench) -> None:
-    """Ctrl-C in the middle of a rapid."""
+def test_an_operator_who_stops_it_finds_the_axis_braked(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C in the middle of a rapid; the next trial goes on with the rapids."""
 
-    def interrupt(step: str) -> None:
-        if step == "test rapids":
-            bench.peer.interrupt_at_mm = 30.0
+    watch_power = moving.watch_power
 
-    bench.at = interrupt
-    with pytest.raises(KeyboardInterrupt):
-        bench.tried()
+    def watch(masters: Sequence[Master], path: SetPoints) -> None:
+        if abs(path.position[0]) > 30.0 * 3276.8:
+            raise KeyboardInterrupt
+        watch_power(masters, path)
+
+    with monkeypatch.context() as impatient:
+        impatient.setattr(moving, "watch_power", watch)
+        with pytest.raises(KeyboardInterrupt):
+            bench.tried()
     assert 30.0 < bench.stands_mm < 130.0
     assert Progress(bench.config.store.directory, "X").done().keys() == {"jog"}
 
@@ -146,7 +153,9 @@ def test_software_limits_that_are_nearer_are_respected(bench: Bench) -> None:
     record = load_record(bench.config.store.directory, "X")
     assert record is not None
     bench.record = record
-    with pytest.raises(DriveFault, match=r"stands at 0.000 mm and may go from -1.\d* to 250.\d* mm by its software limits"):
+    with pytest.raises(
+        DriveFault, match=r"stands at 0.000 mm and may go from -1.\d* to 250.\d* mm by its software limits"
+    ):
         bench.tried()
     assert bench.steps == ["timing"]
 
