@@ -14,18 +14,19 @@ Travel = tuple[float, float]
 
 
 def travel_of(master: Master, record: CommissioningRecord, room: Room) -> Travel:
-    """Return where the axis may go from where it stands; DriveFault where its software limits are nearer."""
+    """Return where the axis may go from where it stands; DriveFault where other limits of its travel are nearer."""
     scaling = master.config.axis[master.axis].scaling
     here = scaling.to_mm(master.heard.objects[master.profile.position])
     low, high = here + room.back_mm, here + room.forward_mm
+    limits = {}
     if record.travel is not None:
-        least, most = sorted(scaling.to_mm(limit) for limit in record.travel)
+        limits["its software limits (0x607D)"] = sorted(scaling.to_mm(limit) for limit in record.travel)
+    if (said := master.config.axis[master.axis].setpoints) is not None:
+        limits["[axis.*.setpoints]"] = sorted(said.travel_mm)
+    for by, (least, most) in limits.items():
         if low < least or high > most:
-            text = (
-                f"it stands at {here:.3f} mm and may go from {least:g} to {most:g} mm by its software limits (0x607D), "
-                f"not {room} from here; give it less with --room, or move it away from its end"
-            )
-            raise DriveFault(master.device, text)
+            text = f"it stands at {here:.3f} mm and may go from {least:g} to {most:g} mm by {by}, not {room} from here"
+            raise DriveFault(master.device, f"{text}; give it less with --room, or move it away from its end")
     return low, high
 
 

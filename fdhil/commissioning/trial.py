@@ -6,7 +6,8 @@ leave by ``set_points`` alone; whatever happens, also Ctrl-C, the axis is braked
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 
 from fdhil.commissioning.compare import compare_record
@@ -21,15 +22,17 @@ from fdhil.commissioning.strokes import Room, Stroke, plan_jog, plan_rapid
 from fdhil.commissioning.stroking import Travel, stroke, travel_of
 from fdhil.commissioning.survey import listen, require, require_alone, survey
 from fdhil.commissioning.timing import judge_answers, judge_sync, measure
+from fdhil.commissioning.watchdog import watched
 from fdhil.config import MachineConfig
 from fdhil.drivers.can.bus import CanBus
-from fdhil.errors import DriveFault
+from fdhil.errors import DeviceError, DriveFault
 from fdhil.pipeline import Known
 from fdhil.records import Outcome
 
 RAPIDS = 6
 TIMING_CYCLES = 1000
 REST_S = 0.8  # between two strokes: a window wants a quarter second before it, and a third after
+JOG_REST_S = 0.2
 LAST_REST_S = 1.8  # a separate sensor may deliver a second later
 HEARD_TIMEOUT_S = 10.0
 STEPS = ("timing", "jog", "test rapids", "identification", "acceptance")
@@ -83,15 +86,16 @@ def try_axis(
             prepare(master)
             trial.found["timing"] = time_bus(master)
             travel_mm = travel_of(master, record, room)
-            if "jog" not in trial.found:
-                operator.report("jog")
+            with guarded(master):
+                if "jog" not in trial.found:
+                    operator.report("jog")
+                    enable(master)
+                    trial.found["jog"] = jog_to_and_fro(master, travel_mm, jog, operator)
+                    progress.keep("jog", now, trial.found["jog"])
+                operator.report("test rapids")
                 enable(master)
-                trial.found["jog"] = jog_to_and_fro(master, travel_mm, jog, operator)
-                progress.keep("jog", now, trial.found["jog"])
-            operator.report("test rapids")
-            enable(master)
-            heard = rapids_to_and_fro(master, travel_mm, rapid)
-            operator.report("restore")
+                heard = rapids_to_and_fro(master, travel_mm, rapid)
+                operator.report("restore")
     balance = judge_acceleration(heard.recording())
     require(master, [balance])
     trial.found["test rapids"] = {"rapid": str(rapid), "moves": RAPIDS, balance.point: balance.found}
@@ -105,6 +109,22 @@ def try_axis(
     for step in FROM_RAPIDS:
         progress.keep(step, now, trial.found[step])
     return trial
+
+
+@contextmanager
+def guarded(master: Master) -> Iterator[None]:
+    """Have the drive watch our heartbeat, so that it stops by itself when this process or the bus is gone."""
+    play, loop = master.config.play, master.loop
+    with ExitStack() as undo:
+        undo.callback(setattr, loop, "heartbeat", None)
+        undo.enter_context(watched(master, play.node_id, play.heartbeat_s))
+        loop.heartbeat, loop.heartbeat_s = play.node_id, play.heartbeat_s
+        try:
+            yield
+        except BaseException:
+            with suppress(DeviceError):  # of a bus that is gone: why it ended is told already
+                undo.close()
+            raise
 
 
 def time_bus(master: Master) -> Found:
@@ -125,7 +145,7 @@ def jog_to_and_fro(master: Master, travel_mm: Travel, jog: Stroke, operator: Ope
     """Jog an enabled axis and back: units and signs must be right, also in the eyes of the operator; DriveFault."""
     with Overhearing(master.config, master.axis) as heard:
         for moved in (jog, jog.back()):
-            stroke(master, travel_mm, moved, REST_S)
+            stroke(master, travel_mm, moved, JOG_REST_S)
         wait_heard(master, heard)
     findings = list(judge_jog(heard.recording(), jog.distance_mm))
     require(master, findings)
