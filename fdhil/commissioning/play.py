@@ -186,7 +186,7 @@ class Bench:
         it takes the drives for set up anew.
         """
         node_id, beat_s = self._config.play.node_id, self._config.play.heartbeat_s
-        with contextlib.ExitStack() as undo:
+        with self._bus_loss_told(), contextlib.ExitStack() as undo:
             undo.callback(self._leave_bus, written)
             for master in self.masters:
                 undo.enter_context(self._given_back(watched(master, node_id, beat_s)))
@@ -201,6 +201,16 @@ class Bench:
                 enable(master)
             written()
             yield
+
+    @contextlib.contextmanager
+    def _bus_loss_told(self) -> Iterator[None]:
+        try:
+            yield
+        except DeviceError as error:
+            if not self.loop.lost:
+                raise
+            what = "nothing more can be sent: a drive that is on stops by itself when it misses our heartbeat (0x1016)"
+            raise DeviceError(error.device, f"{str(error).removeprefix(f'{error.device}: ')}; {what}") from None
 
     def _leave_bus(self, written: Callable[[], None]) -> None:
         with undisturbed():
