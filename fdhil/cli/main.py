@@ -17,6 +17,7 @@ __all__ = ["COMMANDS", "cli", "main", "run_safely"]
 # command -> ("module:function", the line of `fdhil --help`); listed here so that --help imports none of them
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "demo": ("fdhil.cli.demo:demo", "Run the whole loop on the simulated machine and write a report."),
+    "paper": ("fdhil.cli.paper:paper", "Reproduce the paper that fdhil goes back to, claim by claim."),
     "scan": ("fdhil.cli.commissioning:scan", "List what is on the bus: nodes, identity, state, heartbeat."),
     "check": ("fdhil.cli.commissioning:check", "Check that the machine on the bus is the one in the config."),
     "commission": ("fdhil.cli.commissioning:commission", "Commission the drives, step by step."),
