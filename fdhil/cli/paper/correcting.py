@@ -9,7 +9,7 @@ import numpy as np
 
 from fdhil.cli.paper import drawings, paths
 from fdhil.cli.paper.claims import Claim, Picture, Trial
-from fdhil.cli.paper.drawings import View
+from fdhil.cli.paper.drawings import Traced, View
 from fdhil.cli.paper.paths import CORNERS, PLACES
 from fdhil.cli.paper.predicting import FEW_UM, linear_response
 from fdhil.cli.paper.scenarios import DEMANDED, PATHS, machine
@@ -142,6 +142,19 @@ def turns(values: Float, least: float) -> int:
     return int(np.count_nonzero(np.diff(sides)))
 
 
+def _three(scenario: str, view: View, program: str = paths.SLOW) -> str:
+    """Draw a place with the desired path, the one without and the one with the mirror, and their errors."""
+    before, after = paths.predicted(scenario, program), paths.corrected(scenario, "mirror", program)
+    return drawings.place(
+        [
+            Traced("desired", paths.desired_mm(scenario, program)),
+            paths.traced("without", scenario, before, program),
+            paths.traced("with the mirror", scenario, after, program),
+        ],
+        view,
+    )
+
+
 def _oscillates() -> Claim:
     trials, pictures = [], []
     for name in PATHS:
@@ -152,14 +165,10 @@ def _oscillates() -> Claim:
             Trial(name, "of these more than without", float(now - then), "", least=1.0),
         ]
         if name in DRAWN:
-            curves = [
-                ("desired", paths.desired_mm(name)), ("without", paths.path_mm(before)),
-                ("with the mirror", paths.path_mm(after)),
-            ]  # fmt: skip
             pictures.append(Picture(
                 f"Path in area A without and with the mirror correction, 10 m/min, {PATHS[name].title}. The axes are "
-                "stretched, as the paper's.",
-                drawings.place(curves, View((0.0, 25.0), PLACES["A"], 25.0)),
+                "stretched, as the paper's; below, the contour errors.",
+                _three(name, View((0.0, 25.0), PLACES["A"], 25.0)),
             ))  # fmt: skip
     return Claim(
         key="figure-17", kind="figure", source="Figure 17, section 6",
@@ -194,11 +203,9 @@ def _straight(place: str, key: str, source: str) -> Claim:
         trials.append(Trial(name, f"largest error at {place}, with the mirror",
                             paths.largest_um(name, after, place), "um", most=FEW_UM))  # fmt: skip
         if name in DRAWN and place == "B":
-            curves = [("desired", paths.desired_mm(name)), ("without", paths.path_mm(paths.predicted(name))),
-                      ("with the mirror", paths.path_mm(after))]  # fmt: skip
             pictures.append(Picture(
                 f"Path in area B without and with the mirror correction, 10 m/min, {PATHS[name].title}.",
-                drawings.place(curves, View((30.0, 75.0), (52.5, 55.0), 22.5)),
+                _three(name, View((30.0, 75.0), (52.5, 55.0), 22.5)),
             ))  # fmt: skip
     return Claim(
         key=key, kind="figure" if place == "B" else "claim", source=source,
@@ -273,12 +280,10 @@ def _rounded(oscillation: bool) -> Claim:
         means = abs(float(one.mean())) / max(abs(float(other.mean())), 1e-9)
         trials.append(Trial(name, "mean error without over that with the mirror", means, "x", least=2.0))
         if name in DRAWN:
-            curves = [("desired", before.reference.path_mm), ("without", paths.path_mm(before)),
-                      ("with the mirror", paths.path_mm(after))]  # fmt: skip
             pictures.append(Picture(
                 f"Path of the cutter's centre at the end of the arc at A without and with the mirror, 10 m/min, "
                 f"{PATHS[name].title}.",
-                drawings.place(curves, View((5.0, 45.0), (25.0, 75.0), 20.0)),
+                _three(name, View((5.0, 45.0), (25.0, 75.0), 20.0), "rounded"),
             ))  # fmt: skip
     return Claim(
         key="figure-20-oscillation" if oscillation else "figure-20", kind="figure", source="Figure 20, section 6",

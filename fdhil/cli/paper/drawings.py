@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fdhil.cli.paper.operators import OPERATORS
-from fdhil.records import PARAMETERS, Float
+from fdhil.records import PARAMETERS, Bool, Float
 from fdhil.report.figures import COLOURS, INK, REFERENCE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-LEVEL = 0.3  # of a view: what is farther from its line is another piece of the path
+LEVEL = 0.15  # of a view: what is farther from its line is another piece of the path
 WIDTH, LEFT, BOTTOM, TOP, RIGHT = 6.4, 0.85, 0.6, 0.55, 0.2  # inches
 
 
@@ -104,16 +104,16 @@ def correlations(curves: Mapping[str, Float], bound: float) -> str:
 def drift(
     symbol: str, unit: str, series: Mapping[str, tuple[Float, Float, Float]], printed: tuple[float, float]
 ) -> str:
-    """A parameter against temperature with 95 % bars, a panel a scenario, and the paper's course of it."""
+    """A parameter against temperature with 95 % bars, a panel a scenario, and the paper's course of it in grey."""
     with drawing(1.4 + 1.3 * len(series), len(series)) as (panels, svg):
         for axes, (label, (celsius, value, std)), colour in zip(panels, series.items(), COLOURS, strict=False):
             axes.plot(celsius[[0, -1]], printed, color=REFERENCE, lw=2.4)
             axes.errorbar(celsius, value, 1.96 * std, fmt="o", ms=3.5, capsize=2, lw=1.0, color=colour, label=label)
             axes.locator_params(axis="y", nbins=4)
-            axes.ticklabel_format(axis="y", scilimits=(-2, 3))
-            axes.legend(loc="upper right")
+            axes.margins(y=0.15)
+            axes.legend(loc="lower left", handlelength=1.0)
         panels[-1].set_xlabel("slide-way temperature (°C)")
-        panels[len(panels) // 2].set_ylabel(f"{symbol} ({unit.replace('.', '·')})")
+        panels[len(panels) // 2].set_ylabel(f"{symbol} ({unit})")
     return svg[0]
 
 
@@ -138,45 +138,54 @@ class View:
     about: tuple[float, float]
     near_mm: float
 
+    def holds(self, path_mm: Float) -> Bool:
+        """Return the rows (n,) of a path that are near."""
+        return np.asarray(np.abs(path_mm - self.about).max(axis=1) < 1.2 * self.near_mm)
 
-def place(curves: Sequence[tuple[str, Float]], view: View) -> str:
-    """A place of the path, axes stretched to what is there: the first curve (n, 2) grey, the others in colour."""
-    with drawing(3.9) as ((axes,), svg):
-        _paths(axes, curves, view)
-        axes.set_xlabel("X (mm)")
+
+@dataclass(frozen=True, slots=True)
+class Traced:
+    """A path (n, 2) in mm and, where there is one, its distance (n,) in um from what it is compared with."""
+
+    label: str
+    path_mm: Float
+    apart_um: Float | None = None
+
+
+def place(traced: Sequence[Traced], view: View, below_label: str = "error (µm)") -> str:
+    """A place of the path, axes stretched to what is there, and below it the distances, which no path would show.
+
+    The first path is grey, the others are in colour.
+    """
+    with drawing(5.0, 2) as ((above, below), svg):
+        colours = [REFERENCE, *COLOURS]
+        for k, one in enumerate(traced):
+            rows = view.holds(one.path_mm)
+            shown = np.where(rows[:, None], one.path_mm, np.nan)
+            above.plot(*shown.T, color=colours[k], lw=1.2 if k else 2.8, label=one.label)
+            if one.apart_um is not None:
+                below.plot(shown[:, 0], np.where(rows, one.apart_um, np.nan), color=colours[k], lw=1.2)
+        _limit(above, [one.path_mm for one in traced], view)
+        above.set_ylabel("Y (mm)")
+        legend(above)
+        below.set_ylim(bottom=0.0)
+        below.set_xlabel("X (mm)")
+        below.set_ylabel(below_label)
     return svg[0]
 
 
-def _paths(axes: Axes, curves: Sequence[tuple[str, Float]], view: View) -> None:
-    seen = []
-    for k, (label, path) in enumerate(curves):
-        colour, width = (REFERENCE, 2.8) if k == 0 else (COLOURS[(k - 1) % len(COLOURS)], 1.2)
-        inside = np.abs(path - view.about).max(axis=1) < 1.2 * view.near_mm
-        shown = np.where(inside[:, None], path, np.nan)
-        axes.plot(*shown.T, color=colour, lw=width, label=label, ls="--" if k > 2 else "-")
-        beside = inside & (path[:, 0] >= view.x_mm[0]) & (path[:, 0] <= view.x_mm[1])
-        level = np.abs(path[:, 1] - view.about[1]) < LEVEL * view.near_mm
-        seen.append(path[beside & level, 1] if (beside & level).any() else path[beside, 1])
-    every = np.concatenate(seen)
+def _limit(axes: Axes, paths_mm: Sequence[Float], view: View) -> None:
+    """Set the limits: those in Y hold all that runs along near the level of the place."""
+    levels = []
+    for path in paths_mm:
+        beside = view.holds(path) & (path[:, 0] >= view.x_mm[0]) & (path[:, 0] <= view.x_mm[1])
+        levels.append(path[beside & (np.abs(path[:, 1] - view.about[1]) < LEVEL * view.near_mm), 1])
+    every = np.concatenate(levels)
     margin = max(0.08 * float(np.ptp(every)), 1e-4)
     axes.set_xlim(*view.x_mm)
     axes.set_ylim(every.min() - margin, every.max() + margin)
     axes.ticklabel_format(useOffset=False)
     axes.locator_params(nbins=6)
-    axes.set_ylabel("Y (mm)")
-    legend(axes)
-
-
-def two_paths(curves: Sequence[tuple[str, Float]], view: View, path_mm: Float, apart_um: Float) -> str:
-    """A place of the path above, and the distance of two of its curves along X below."""
-    with drawing(5.0, 2) as ((above, below), svg):
-        _paths(above, curves, view)
-        near = np.abs(path_mm - view.about).max(axis=1) < 1.2 * view.near_mm
-        below.plot(path_mm[near, 0], apart_um[near], color=COLOURS[1])
-        below.set_ylim(bottom=0.0)
-        below.set_xlabel("X (mm)")
-        below.set_ylabel("distance (µm)")
-    return svg[0]
 
 
 def prediction(time_s: Float, measured_um: Float, predicted_um: Float) -> str:

@@ -13,6 +13,7 @@ from fdhil.cli.paper.bench import COLD_C, WARM_C, Trouble
 from fdhil.cli.paper.claims import Claim, Picture, Trial
 from fdhil.cli.paper.methods import vector
 from fdhil.cli.paper.scenarios import machine
+from fdhil.cli.parameter_view import DISPLAY
 from fdhil.config import Identification
 from fdhil.identification.estimators import least_squares, maximum_likelihood
 from fdhil.identification.fit import fit
@@ -268,13 +269,21 @@ def _drifted(
             Picture(
                 f"{symbol} against the slide-ways' temperature, maximum likelihood, bars of 95 %; the line is the "
                 "machine's own course.",
-                drawings.drift(
-                    symbol, UNITS[symbol], {name: drift.series(symbol) for name, drift in drifts.items()}, printed
-                ),
+                _drift_picture(symbol, printed, drifts),
             )
         ],
         note=note,
     )  # fmt: skip
+
+
+def _drift_picture(symbol: str, printed: tuple[float, float], drifts: Mapping[str, Drift]) -> str:
+    unit, factor = DISPLAY[symbol]
+    series = {}
+    for name, drift in drifts.items():
+        celsius, values, std = drift.series(symbol)
+        series[name] = celsius, factor * values, factor * std
+    shown = factor * printed[0], factor * printed[1]
+    return drawings.drift(symbol, unit.replace(".", "·"), series, shown)
 
 
 def _behaviour() -> Claim:
@@ -292,7 +301,11 @@ def _behaviour() -> Claim:
             pictures.append(Picture(
                 "Above, the speed of the drive and the model's answer to the same voltage, noise of 0.5 %; below, what "
                 "is between them.",
-                drawings.overlay(np.arange(float(window.n)) * window.dt_s, window.speed_rad_s, simulated),
+                drawings.overlay(
+                    np.arange(float(window.n)) * window.dt_s,
+                    window.direction * window.speed_rad_s,
+                    window.direction * simulated,
+                ),
             ))  # fmt: skip
     return Claim(
         key="figure-8", kind="figure", source="Figure 8, section 4",

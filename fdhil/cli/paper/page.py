@@ -50,8 +50,8 @@ def page(claims: Sequence[Claim]) -> Page:
 def _verdicts(claims: Sequence[Claim]) -> Section:
     return Section(
         "Verdicts",
-        "A trial is a number that has to lie within bounds in a scenario. A claim holds where all its scenarios show it, "
-        "holds with a condition where some do, and is not reproduced where none does. Nothing but this rule decides. "
+        "A trial is a number that has to lie within bounds in a scenario. A claim holds where all its scenarios show "
+        "it, with a condition where some do, and is not reproduced where none does. Nothing but this rule decides. "
         "The safety ceiling of offsets on a machine does not apply: nothing here moves.",
         tables=[Table(SUMMARY_HEAD, summary_rows(claims))],
     )

@@ -13,6 +13,7 @@ from importlib.resources import as_file, files
 import numpy as np
 
 from fdhil.cli.demo.report import POINTS
+from fdhil.cli.paper.drawings import Traced
 from fdhil.cli.paper.scenarios import PATHS, machine
 from fdhil.config import MachineConfig
 from fdhil.correction import flatness, linear
@@ -109,9 +110,14 @@ def contour_um(scenario: str, answer: Prediction, program: str = SLOW) -> Float:
     return contour_error_um(desired_mm(scenario, program), path_mm(answer), answer.reference.dt_s)
 
 
+def traced(label: str, scenario: str, answer: Prediction, program: str = SLOW) -> Traced:
+    """Return a predicted path with its contour error, to be drawn."""
+    return Traced(label, path_mm(answer), contour_um(scenario, answer, program))
+
+
 def near(answer: Prediction, place: str, within_mm: float = NEAR_MM) -> Bool:
-    """Return the rows (n,) whose demand is near to a place."""
-    away = np.hypot(*(answer.reference.path_mm - PLACES[place]).T)
+    """Return the rows (n,) in which the table is near to a place; where it should be then may be far on."""
+    away = np.hypot(*(path_mm(answer) - PLACES[place]).T)
     return np.asarray(away < within_mm)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from fdhil.cli.paper import bench, drawings, paths
 from fdhil.cli.paper.claims import Claim, Picture, Trial
-from fdhil.cli.paper.drawings import View
+from fdhil.cli.paper.drawings import Traced, View
 from fdhil.cli.paper.paths import CORNERS, FAST, PLACES, SLOW, SMOOTH
 from fdhil.cli.paper.scenarios import CASCADES, DEMANDED, PATHS, machine
 from fdhil.config import Identification
@@ -19,7 +19,7 @@ from fdhil.prediction.models import nominal_models
 from fdhil.records import Float, Parameters, Prediction, rms
 from fdhil.report import Table, figures
 
-DRAWN = ("sharp-lag", "half")  # the loops whose paths are drawn
+DRAWN = ("full", "half", "sharp-lag")  # the loops whose paths are drawn
 LITTLE = 1.25  # the larger feed raises an error by less than a quarter
 FRICTION = (("ft", 0.01), ("Cd", 1.0))
 MASS = (("Jt", 0.085),)
@@ -189,18 +189,21 @@ def _feeds(place: str, number: int, little: bool) -> Claim:
     )
     pictures = []
     for name in DRAWN:
-        curves = [("desired, 10 m/min", paths.desired_mm(name))]
-        curves += [(p, paths.path_mm(paths.predicted(name, p))) for p in (SLOW, FAST)]
+        traced = [Traced("desired, 10 m/min", paths.desired_mm(name))]
+        traced += [paths.traced(p, name, paths.predicted(name, p), p) for p in (SLOW, FAST)]
         pictures.append(Picture(
-            f"Predicted path at {place} for two feeds, {PATHS[name].title}. The axes are stretched, as the paper's.",
-            drawings.place(curves, view(place, 10.0)),
+            f"Predicted path at {place} for two feeds, {PATHS[name].title}. The axes are stretched, as the paper's; "
+            "below, the distance of each from its own desired path.",
+            drawings.place(traced, view(place, 10.0)),
         ))  # fmt: skip
+    ratios = [trial.value for trial in trials]
     return Claim(
         key=f"figure-{number}", kind="figure", source=f"Figure {number}, section 5.3",
         says=says,
         paper="two curves of like size" if little else "the faster one clearly farther off",
         rule=f"the largest error grows by {'less' if little else 'more'} than a quarter from 10 to 20 m/min",
         trials=trials, pictures=pictures,
+        note=f"Here the larger feed makes the error at {place} {min(ratios):.1f} to {max(ratios):.1f} times as large.",
     )  # fmt: skip
 
 
@@ -247,16 +250,16 @@ def _drifted(number: int, changes: Sequence[tuple[str, float]], label: str) -> C
     ]  # fmt: skip
     pictures = []
     for name in DRAWN:
-        apart, drifted = apart_um(name, changes), paths.path_mm(paths.predicted(name, SLOW, tuple(changes)))
-        curves = [
-            ("desired", paths.desired_mm(name)),
-            ("nominal", paths.path_mm(paths.predicted(name))),
-            (label, drifted),
+        drifted = paths.path_mm(paths.predicted(name, SLOW, tuple(changes)))
+        traced = [
+            Traced("desired", paths.desired_mm(name)),
+            Traced("nominal", paths.path_mm(paths.predicted(name))),
+            Traced(label, drifted, apart_um(name, changes)),
         ]
         pictures.append(Picture(
             f"Predicted path at E, 10 m/min, {PATHS[name].title}: nominal, and with {label}. Below, the distance of "
             "the two along X.",
-            drawings.two_paths(curves, view("E", 5.0), drifted, apart),
+            drawings.place(traced, view("E", 5.0), "distance (µm)"),
         ))  # fmt: skip
     return Claim(
         key=f"figure-{number}", kind="figure", source=f"Figure {number}, section 5.3",
