@@ -31,6 +31,25 @@ class Trouble:
 
 
 @dataclass(frozen=True, slots=True)
+class Move:
+    """A rapid: how far, how fast, and how hard it accelerates."""
+
+    distance_mm: float
+    speed_mm_s: float
+    acceleration_mm_s2: float
+
+    @staticmethod
+    def measured(speed_share: float = 1.0) -> Move:
+        """Return that of figure 4, or a slower one."""
+        axis = machine().axis["X"]
+        return Move(STROKE_MM, speed_share * axis.rapid_speed_mm_s, axis.max_acceleration_mm_s2)
+
+
+QUICK = Move(400.0, 500.0, 4000.0)
+"""The rapid of a quicker machine: more than twice as fast, and ten times the acceleration."""
+
+
+@dataclass(frozen=True, slots=True)
 class Signals:
     """What is recorded, (n,) each: mean voltage of each cycle; current, speed and table at its begin."""
 
@@ -84,14 +103,12 @@ def cut(config: MachineConfig, models: Mapping[str, Parameters], demand_mm: Mapp
     return np.column_stack(axes)
 
 
-def stroke(config: MachineConfig, strokes: int = 1, speed_share: float = 1.0) -> Float:
+def stroke(move: Move, period_s: float, strokes: int = 1) -> Float:
     """Return the demand (n,) mm of rapids to and fro: trapezoids of speed, rounded over 20 ms."""
-    axis, period_s = config.axis["X"], config.machine.sync_period_s
-    top, rate = speed_share * axis.rapid_speed_mm_s, axis.max_acceleration_mm_s2
-    ramp = top / rate
-    duration = STROKE_MM / top + ramp
-    t = np.arange(0.0, duration + REST_S, period_s)
-    speed = np.clip(np.minimum(t, duration - t) * rate, 0.0, top)
+    ramp_s = move.speed_mm_s / move.acceleration_mm_s2
+    duration_s = move.distance_mm / move.speed_mm_s + ramp_s
+    t = np.arange(0.0, duration_s + REST_S, period_s)
+    speed = np.clip(np.minimum(t, duration_s - t) * move.acceleration_mm_s2, 0.0, move.speed_mm_s)
     lead = np.zeros(round(LEAD_S / period_s))
     speeds = np.concatenate([lead, *(speed * (-1) ** k for k in range(strokes))])
     smooth = np.convolve(speeds, np.full(SMOOTHED_ROWS, 1.0 / SMOOTHED_ROWS))[: speeds.size]
@@ -103,12 +120,13 @@ def rapid(
     celsius: float = COLD_C,
     trouble: Trouble = Trouble(),
     strokes: int = 1,
-    speed_share: float = 1.0,
+    move: Move | None = None,
 ) -> Recording:
-    """Record rapids of the measured machine's X axis, without noise."""
+    """Record rapids of the measured machine's X axis, without noise; ``move`` is left out for those of figure 4."""
     config = machine()
-    demand = stroke(config, strokes, speed_share)
+    move = move or Move.measured()
     axis, period_s = config.axis["X"], config.machine.sync_period_s
+    demand = stroke(move, period_s, strokes)
     signals = run(axis, period_s, parameters, demand, trouble=trouble)
     return Recording(
         axis="X",
@@ -121,7 +139,7 @@ def rapid(
         demand_mm=frozen(demand),
         voltage_sampling="interval_mean",
         pitch_mm=axis.screw_pitch_mm,
-        rapid_speed_rad_s=speed_share * axis.rapid_speed_rad_s,
+        rapid_speed_rad_s=move.speed_mm_s * axis.rapid_speed_rad_s / axis.rapid_speed_mm_s,
         temperature_c=celsius,
     )
 

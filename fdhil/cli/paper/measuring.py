@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 
 from fdhil.cli.paper import bench, drawings
-from fdhil.cli.paper.bench import COLD_C, WARM_C, Trouble
+from fdhil.cli.paper.bench import COLD_C, WARM_C, Move, Trouble
 from fdhil.cli.paper.claims import Claim, Picture, Trial
 from fdhil.cli.paper.methods import vector
 from fdhil.cli.paper.scenarios import machine
@@ -79,7 +79,7 @@ def _drifts() -> Mapping[str, Drift]:
     found: dict[str, list[Estimate]] = {"noise-0.1": [], "noise-0.5": [], "ten-rapids": []}
     for celsius in TEMPERATURES_C:
         plant = bench.plant(celsius=celsius)
-        fast, slow = (bench.rapid(plant, celsius, speed_share=share) for share in (1.0, SLOW))
+        fast, slow = (bench.rapid(plant, celsius, move=Move.measured(share)) for share in (1.0, SLOW))
         seed = round(10 * celsius)
         many = [w for k in range(5) for one in (fast, slow) for w in bench.noisy(one, 0.005, 1000 * k + seed)]
         for name, windows in (

@@ -104,6 +104,15 @@ def _voltage_left_raw(windows: Sequence[Window]) -> list[Window]:
     ]
 
 
+def left_raw_of(parameters: Parameters, recording: Recording, noise: float) -> tuple[Float, Float]:
+    """Return the relative error of L (1,) with the low-pass on every signal, and with none on the voltage."""
+    windows, true = noisy(recording, noise, 0), vector(parameters)
+    alike = least_squares_of(windows, Identification().lowpass_hz) / true - 1.0
+    apart = least_squares_of(_voltage_left_raw(windows), NO_LOWPASS_HZ) / true - 1.0
+    place = PARAMETERS.index("L")
+    return alike[[place]], apart[[place]]
+
+
 def bound(parameters: Parameters, recording: Recording, noise: float) -> Float:
     """Return the standard deviations (6,) of Cramer and Rao that the rows in which the drive surely moves allow."""
     theta = np.append(vector(parameters), 0.0)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fdhil.cli.paper import bench, drawings, paths
+from fdhil.cli.paper.bench import Move
 from fdhil.cli.paper.claims import Claim, Picture, Trial
 from fdhil.cli.paper.drawings import Traced, View
 from fdhil.cli.paper.paths import CORNERS, FAST, PLACES, SLOW, SMOOTH
@@ -104,7 +105,7 @@ def _feed_down() -> Claim:
 def identified() -> Parameters:
     """Identify the simulator's drive from a fast and a slow rapid each way, noise of 0.1 %."""
     true = nominal_models(machine())["X"]
-    recordings = [bench.rapid(true, strokes=2, speed_share=share) for share in (1.0, SLOW_SHARE)]
+    recordings = [bench.rapid(true, strokes=2, move=Move.measured(share)) for share in (1.0, SLOW_SHARE)]
     windows = [window for k, one in enumerate(recordings) for window in bench.noisy(one, 0.001, k)]
     return maximum_likelihood.estimate(windows, Identification()).parameters()
 
