@@ -13,16 +13,20 @@ from fdhil.config import MachineConfig
 
 
 def write_report(
-    machine: MachineConfig, rows: Sequence[Mapping[str, Any]], health: Mapping[str, Mapping[str, Any]], path: Path
+    machine: MachineConfig,
+    rows: Sequence[Mapping[str, Any]],
+    health: Mapping[str, Mapping[str, Any]],
+    path: Path,
+    pdf: Path | None = None,
 ) -> None:
     """Write the report of revisions and health (see ``fdhil history --json``). FdhilError without extra ``report``."""
-    from fdhil.report import Page, write
+    from fdhil.report import Page, deliver
 
     axes = sorted({row["axis"] for row in rows})
     sections = [_axis_section(axis, [row for row in rows if row["axis"] == axis], health.get(axis)) for axis in axes]
     headline = [(f"axis {axis}", f"{sum(row['axis'] == axis for row in rows)} revisions") for axis in axes]
     page = Page(f"{machine.machine.name}: identified drives", "parameters with 95 % intervals", headline, sections)
-    write(page, path)
+    deliver(page, path, pdf)
 
 
 def _axis_section(axis: str, rows: Sequence[Mapping[str, Any]], told: Mapping[str, Any] | None) -> Any:

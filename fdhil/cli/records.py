@@ -181,13 +181,14 @@ def export(recording: Path, out: Path, as_json: bool) -> None:
 @click.command(cls=Writing)
 @click.argument("config", type=FILE)
 @click.option("--out", required=True, type=OutputFile(), help="The HTML file to write.")
+@click.option("--pdf", type=OutputFile(".pdf"), help="Also print it as PDF (needs chromium).")
 @AS_JSON
-def report(config: Path, out: Path, as_json: bool) -> None:
+def report(config: Path, out: Path, pdf: Path | None, as_json: bool) -> None:
     """Write an HTML report of the stored history of CONFIG's machine."""
     machine = machine_config.load(config)
     from fdhil.cli.history_report import write_report
 
     rows, told = _history(machine, None)
-    write_report(machine, rows, told, out)
+    write_report(machine, rows, told, out, pdf)
     if as_json:
         click.echo(json.dumps({"schema": "fdhil-report-1", "file": str(out), "revisions": len(rows)}))
