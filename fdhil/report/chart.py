@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MOST_POINTS = 2000  # of a curve
+FEW_POINTS = 40  # up to which bars have caps: each is an element of the picture
 DIGITS = 5  # of what the page's script is told
 DAY_S = 86_400.0
 PANEL_GAP = 0.12  # inches
@@ -138,6 +139,8 @@ def draw(axes: Axes, panel: Panel, chart: Chart) -> None:
             axes.set_ylim(bottom=0.0)
     if chart.in_time:
         _dates(axes)
+    else:
+        axes.locator_params(axis="x", nbins=6)
 
 
 def _decade_below(panel: Panel) -> float:
@@ -153,7 +156,8 @@ def _draw_trace(axes: Axes, trace: Trace, in_time: bool) -> None:
         bars = None
         if trace.low is not None and trace.high is not None:
             bars = np.maximum(np.vstack([y - trace.low, trace.high - y]), 0.0)
-        axes.errorbar(x, y, bars, fmt="o", ms=3, capsize=2, lw=0.9, color=trace.colour, label=trace.label)
+        caps = 2 if x.size <= FEW_POINTS else 0
+        axes.errorbar(x, y, bars, fmt="o", ms=3, capsize=caps, lw=0.9, color=trace.colour, label=trace.label)
         return
     if trace.low is not None and trace.high is not None:
         axes.fill_between(x, trace.low, trace.high, color=trace.colour, alpha=0.2, lw=0)

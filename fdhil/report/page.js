@@ -72,6 +72,13 @@ function drawBeside(told, panel) {
   };
 }
 
+// days as month-day; within days the time, and the day where it begins
+function dates(plot, ticks, number, space, step) {
+  const told = ticks.map((tick) => new Date(tick * 1e3).toISOString());
+  if (step >= 86400) return told.map((date, k) => k && date.slice(0, 4) === told[k - 1].slice(0, 4) ? date.slice(5, 10) : `${date.slice(5, 10)}\n${date.slice(0, 4)}`);
+  return told.map((date, k) => k && date.slice(0, 10) === told[k - 1].slice(0, 10) ? date.slice(11, 16) : `${date.slice(11, 16)}\n${date.slice(5, 10)}`);
+}
+
 function reading(trace) {
   return (plot, value, series, at) => {
     const grid = plot.data[0];
@@ -107,7 +114,7 @@ function chart(picture, told, number) {
       tzDate: (seconds) => uPlot.tzDate(new Date(seconds * 1e3), "Etc/UTC"),
       scales: { x: { time: told.time }, y: { distr: panel.log ? 3 : 1, range: limits(panel, told.grids) } },
       axes: [
-        { ...axis, label: last ? told.x : undefined, labelSize: 20, size: last ? 34 : 8, ...(last ? {} : { values: () => [] }), ...(told.time ? {} : { space: 70 }) },
+        { ...axis, label: last ? told.x : undefined, labelSize: 20, size: last ? 34 : 8, ...(last ? {} : { values: () => [] }), space: 70, ...(last && told.time ? { values: dates } : {}) },
         { ...axis, label: panel.y, labelSize: 20, size: 62, space: panel.share < 1 ? 22 : 34, ...(panel.log ? {} : { values: numbers }) },
       ],
       series: [{ label: told.time ? "time (UTC)" : told.x, value: told.time ? (p, value) => value == null ? "" : new Date(value * 1e3).toISOString().slice(0, 16).replace("T", " ") : (p, value) => figures4(value) }, ...series],
