@@ -49,7 +49,7 @@ def correction_page(
     else:
         cases = [("uncorrected", before), (f"{planned.method} correction", after)]
         told = ""
-        verdict = [*_figures("corrected, predicted", after), *_promise(predicted)]
+        verdict = _promise(after, predicted)
     return Page(
         title=f"Correction of {name}",
         subtitle=f"Planned for {machine} with the method {planned.method}{_with(parameters)}; nothing was sent.",
@@ -63,13 +63,17 @@ def correction_page(
     )
 
 
-def _promise(predicted: Gain | None) -> list[tuple[str, str]]:
-    """Say how far the prediction of the gain goes; the model against itself is no gain."""
+def _promise(after: Prediction, predicted: Gain | None) -> list[tuple[str, str]]:
+    """Say what is predicted to be left, and how far that goes; the model against itself is no gain."""
+    left, largest = _figures("corrected, predicted", after)
     if predicted is None or predicted.half_um is None:
-        return [("how well the model fits this machine", "not known here")]
+        return [left, largest, ("how well the model fits this machine", "not known here")]
     sure = predicted.at_least
-    spread = [("95 % interval of it, RMS", plus_minus(predicted.half_um, 2) + " um")]
-    return [*spread, ("predicted smaller by at least", "not sure" if sure is None else f"{sure:.1f} x")]
+    return [
+        (f"{left[0]}, with its 95 % interval", f"{after.rms_um:.2f} {plus_minus(predicted.half_um, 2)} um"),
+        largest,
+        ("predicted smaller by at least", "not sure" if sure is None else f"{sure:.1f} x"),
+    ]
 
 
 def _with(parameters: str) -> str:

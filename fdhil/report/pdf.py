@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import tempfile
 from pathlib import Path
+from typing import IO
 
 from fdhil.errors import FdhilError
 from fdhil.report.page import Page, html, write
@@ -54,13 +55,23 @@ def write_pdf(page: Page, path: Path) -> None:
             file.write(printed.read_bytes())
 
 
-def run_browser(browser: str, folder: Path, *arguments: str) -> str:
-    """Run the browser with a profile of its own below ``folder``; return the last it said. FdhilError when it hangs."""
+def run_browser(browser: str, folder: Path, *arguments: str, output: IO[str] | None = None) -> str:
+    """Run the browser with a profile of its own below ``folder``; return the last it said. FdhilError when it hangs.
+
+    ``output`` gets what it prints.
+    """
     # the browser's own sandbox needs a user that is not root; what it opens is a page that we wrote
     sandbox = ["--no-sandbox"] if os.geteuid() == 0 else []
     command = [browser, *SWITCHES, *sandbox, f"--user-data-dir={folder / 'profile'}", *arguments]
     try:
-        ended = subprocess.run(command, capture_output=True, text=True, timeout=LONGEST_S, check=False)
+        ended = subprocess.run(
+            command,
+            stdout=output or subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=LONGEST_S,
+            check=False,
+        )
     except subprocess.TimeoutExpired:
         text = f"{browser} did not print within {LONGEST_S:.0f} s; print the HTML page from a browser instead"
         raise FdhilError(text) from None

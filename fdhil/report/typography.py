@@ -25,11 +25,14 @@ _ALONE = re.compile(
     r"(?<![\w./-])(" + "|".join(re.escape(unit) for unit in sorted(_PRINTED, key=len, reverse=True)) + r")(?!\w|[./]\w)"
 )
 _TIMES = re.compile(r"(?<=\d) x(?![\w.])")
+_EXPONENT = re.compile(r"(?<=\))e(-?\d+)")
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _TEXT = re.compile(r">[^<>]+<|aria-label=\"[^\"]*\"")
 
 
 def typeset(text: str) -> str:
     """Return plain text with its units and signs as they are printed; names of files stay as they are."""
+    text = _EXPONENT.sub(lambda found: "·10" + found[1].translate(_RAISED), text)
     return _TIMES.sub(" ×", _ALONE.sub(lambda found: _PRINTED[found[0]], text))
 
 
