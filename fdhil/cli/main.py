@@ -31,6 +31,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "adopt": ("fdhil.cli.service:adopt", "Ramp to zero what an earlier correction may have left in the drives."),
     "doctor": ("fdhil.cli.doctor:doctor", "Tell what is wrong with this PC, bus, drives, sensors, store, clock."),
     "eds": ("fdhil.cli.eds:eds", "Tell from a drive's EDS or DCF file what fdhil can and cannot do with it."),
+    "play": ("fdhil.cli.play:play", "Stream a program to the drives of a test bench that has no NC."),
     "sim": ("fdhil.cli.sim:sim", "Run the simulated machine: drives, sensors, NC."),
     "record": ("fdhil.cli.record:record", "Record the demand of an air cut from the bus, by listening."),
     "identify": ("fdhil.cli.identify:identify", "Identify a drive from recordings."),
