@@ -43,7 +43,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "replay": ("fdhil.cli.records:replay", "Analyse a recorded window again, bit by bit as the daemon did."),
     "history": ("fdhil.cli.records:history", "Show how the parameters moved."),
     "report": ("fdhil.cli.records:report", "Write an HTML report of the stored history."),
-    "export": ("fdhil.cli.records:export", "Write a recording as CSV."),
+    "export": ("fdhil.cli.records:export", "Write a recording, or a log of the bus, in another file format."),
 }
 
 # the matrices of a window are small: threads of the numeric libraries only spin, and this PC has an NC beside it
