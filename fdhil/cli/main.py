@@ -23,7 +23,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     ),
     "scan": ("fdhil.cli.commissioning:scan", "List what is on the bus: nodes, identity, state, heartbeat."),
     "check": ("fdhil.cli.commissioning:check", "Check that the machine on the bus is the one in the config."),
-    "commission": ("fdhil.cli.commissioning:commission", "Commission the drives, step by step."),
+    "commission": ("fdhil.cli.commission:commission", "Commission the drives, step by step."),
     "run": ("fdhil.cli.service:run", "Run the daemon: listen, identify, predict; correct only when armed."),
     "status": ("fdhil.cli.service:status", "Ask the running daemon how it is."),
     "arm": ("fdhil.cli.service:arm", "Arm the correction of one program."),

@@ -11,6 +11,7 @@ from pydantic import Field, ValidationInfo, model_validator
 from fdhil.config.axis import Axis
 from fdhil.config.bus import CanBus
 from fdhil.config.controller import G0, Correction, Identification, Nc
+from fdhil.config.nc_source import NcSource
 from fdhil.config.offset_bounds import limit_faults
 from fdhil.config.plausible import doubts
 from fdhil.config.regulators import period_faults
@@ -34,6 +35,7 @@ class MachineConfig(Section):
     axis: Mapping[AxisName, Axis] = Field(min_length=1)
     nc: Nc = Nc()
     g0: G0 = G0()
+    nc_source: NcSource = NcSource()
     identification: Identification = Identification()
     correction: Correction = Correction()
     bus: Mapping[str, CanBus] = Field(default_factory=lambda: {"can0": CanBus()})

@@ -6,6 +6,7 @@ name says ``_um``. Drive increments appear in none of them.
 
 from __future__ import annotations
 
+from fdhil.records.nc import NcState
 from fdhil.records.paths import Correction, Prediction, Skill, Trajectory, Zone
 from fdhil.records.signals import (
     AxisSamples,
@@ -66,6 +67,7 @@ __all__ = [
     "LoopEstimate",
     "MoveEvent",
     "MoveKind",
+    "NcState",
     "Notice",
     "Outcome",
     "ParameterSet",

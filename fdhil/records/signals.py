@@ -94,11 +94,14 @@ class TickTimes:
 
 
 class MoveKind(Enum):
-    """What the NC ordered."""
+    """What the NC ordered; UNKNOWN is what it did not tell."""
 
     RAPID = "rapid"
     FEED = "feed"
+    ARC = "arc"
     REST = "rest"
+    HOLD = "hold"
+    UNKNOWN = "unknown"
 
 
 @dataclass(frozen=True, slots=True)
