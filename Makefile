@@ -44,9 +44,10 @@ test: setup      ## the default tests: in-process bus and loopback hub, no Debia
 test-vcan: setup ## the integration suite and the socket tests on a real SocketCAN interface
 	@$(VCAN) $(BIN)/python -m pytest -q -p no:cacheprovider -m socketcan tests
 
-test-full: test  ## adds the tests against programs of others: LinuxCNC (linuxcnc-uspace), a CANopen stack (nodejs, npm)
+test-full: test  ## adds the tests against programs of others: LinuxCNC (linuxcnc-uspace), a CANopen stack (nodejs, npm), a browser (chromium)
 	@command -v rs274 >/dev/null || { echo "make test-full needs rs274: apt-get install linuxcnc-uspace" >&2; exit 1; }
 	@command -v npm >/dev/null || { echo "make test-full needs npm: apt-get install nodejs npm" >&2; exit 1; }
+	@command -v chromium >/dev/null || { echo "make test-full needs chromium: apt-get install chromium" >&2; exit 1; }
 	@npm ci --prefix tests/foreign --ignore-scripts --no-audit --no-fund --silent
 	@$(BIN)/python -m pytest -q -m debian
 

@@ -85,7 +85,8 @@ def parse(
     }
     sim = config.sim.model_copy(update={"axis": worn})
     axes = {name: axis.model_copy(update={"drive": axis.drive.placed(folder)}) for name, axis in config.axis.items()}
-    return config.model_copy(update={"store": store, "guard": guard, "axis": axes, "sim": sim})
+    nc_source = config.nc_source.placed(folder)
+    return config.model_copy(update={"store": store, "guard": guard, "axis": axes, "sim": sim, "nc_source": nc_source})
 
 
 def unlikely(config: MachineConfig) -> list[str]:
