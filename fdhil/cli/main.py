@@ -18,9 +18,13 @@ __all__ = ["COMMANDS", "cli", "main", "run_safely"]
 COMMANDS: Mapping[str, tuple[str, str]] = {
     "demo": ("fdhil.cli.demo:demo", "Run the whole loop on the simulated machine and write a report."),
     "paper": ("fdhil.cli.paper:paper", "Reproduce the paper that fdhil goes back to, claim by claim."),
+    "init": (
+        "fdhil.cli.init:init",
+        "Make a machine's configuration from nothing: the NC's files, the drives, questions.",
+    ),
     "scan": ("fdhil.cli.commissioning:scan", "List what is on the bus: nodes, identity, state, heartbeat."),
     "check": ("fdhil.cli.commissioning:check", "Check that the machine on the bus is the one in the config."),
-    "commission": ("fdhil.cli.commissioning:commission", "Commission the drives, step by step."),
+    "commission": ("fdhil.cli.commission:commission", "Commission the drives, step by step."),
     "run": ("fdhil.cli.service:run", "Run the daemon: listen, identify, predict; correct only when armed."),
     "status": ("fdhil.cli.service:status", "Ask the running daemon how it is."),
     "arm": ("fdhil.cli.service:arm", "Arm the correction of one program."),
@@ -28,6 +32,7 @@ COMMANDS: Mapping[str, tuple[str, str]] = {
     "adopt": ("fdhil.cli.service:adopt", "Ramp to zero what an earlier correction may have left in the drives."),
     "doctor": ("fdhil.cli.doctor:doctor", "Tell what is wrong with this PC, bus, drives, sensors, store, clock."),
     "eds": ("fdhil.cli.eds:eds", "Tell from a drive's EDS or DCF file what fdhil can and cannot do with it."),
+    "play": ("fdhil.cli.play:play", "Stream a program to the drives of a test bench that has no NC."),
     "sim": ("fdhil.cli.sim:sim", "Run the simulated machine: drives, sensors, NC."),
     "record": ("fdhil.cli.record:record", "Record the demand of an air cut from the bus, by listening."),
     "identify": ("fdhil.cli.identify:identify", "Identify a drive from recordings."),

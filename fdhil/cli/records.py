@@ -13,8 +13,9 @@ import click
 from fdhil import config as machine_config
 from fdhil import tables
 from fdhil.cli.compiling import forewarn
-from fdhil.cli.options import OutputFile, Writing
+from fdhil.cli.options import COLUMNS, OutputFile, Writing
 from fdhil.errors import RecordingError
+from fdhil.store import suffixes
 
 if TYPE_CHECKING:
     from fdhil.records import Outcome, Window
@@ -79,13 +80,15 @@ def _replayed(
 
 
 def read_windows(path: Path) -> list[Window]:
-    """Return the windows of a stored window (.parquet) or of a recording (.csv). RecordingError when it is neither."""
+    """Return the windows of a stored window (.parquet) or of a recording. RecordingError when it is neither."""
     if path.suffix == ".parquet":
+        from fdhil.store.recording_parquet import is_recording
         from fdhil.store.windows import read_window
 
-        return [read_window(path)]
+        if not is_recording(path):
+            return [read_window(path)]
     from fdhil.identification.windows import find_windows
-    from fdhil.store.recording_csv import read_recording
+    from fdhil.store.recordings import read_recording
 
     return find_windows(read_recording(path))
 
@@ -164,18 +167,27 @@ def _row(revision: Revision) -> dict[str, Any]:
 
 @click.command(cls=Writing)
 @click.argument("recording", type=FILE)
-@click.option("--out", required=True, type=OutputFile(), help="The CSV file to write.")
+@click.option("--out", required=True, type=OutputFile(), help="The file to write.")
+@click.option(
+    "--format",
+    "format_name",
+    type=click.Choice([*tables.RECORDING_FORMATS, *suffixes.BUS_LOGS.values()]),
+    help="Left out: by the name of --out, else csv.",
+)
+@COLUMNS
 @AS_JSON
-def export(recording: Path, out: Path, as_json: bool) -> None:
-    """Write a stored window (.parquet) as CSV of the recording format."""
-    from fdhil.store.export import export_csv
-    from fdhil.store.windows import read_window
+def export(recording: Path, out: Path, format_name: str | None, columns: Path | None, as_json: bool) -> None:
+    """Write RECORDING in another file format.
 
-    window = read_window(recording)
-    export_csv(window, out)
+    RECORDING is a stored window (.parquet), a recording in any format (csv, parquet, mat, mdf4, hdf5), or with
+    --columns another program's file. A log of the bus (.log of the black box or candump, .blf, .asc, .trc) becomes
+    another log of the bus. mdf4 needs the extra 'mdf', hdf5 the extra 'hdf5'.
+    """
+    from fdhil.cli.export_file import export_file
+
+    told = export_file(recording, out, format_name, columns)
     if as_json:
-        told = {"recording": str(recording), "file": str(out), "axis": window.axis, "rows": window.n}
-        click.echo(json.dumps({"schema": "fdhil-export-1"} | told))
+        click.echo(json.dumps({"schema": "fdhil-export-1", "recording": str(recording), "file": str(out)} | told))
 
 
 @click.command(cls=Writing)

@@ -22,7 +22,11 @@ _FILE = click.Path(path_type=Path)
 @click.argument("config", type=_FILE)
 @click.option("--json", "as_json", is_flag=True, help="Write events as JSON, one line each; the first is 'ready'.")
 @click.option("--faults", type=_FILE, help="A fault script: what breaks when (TOML).")
-@click.option("--demand", type=_FILE, help="A demand CSV that the NC plays at once.")
+@click.option(
+    "--demand",
+    type=_FILE,
+    help="A demand CSV that the NC plays at once; - takes it from standard input, row by row, as it comes.",
+)
 @click.option("--program", type=_FILE, help="An NC program that the NC plays at once.")
 @click.option("--trace", type=OutputFile(), help="Record what is played first: reference, true table and offset (CSV).")
 def sim(
@@ -41,7 +45,8 @@ def sim(
       {"command": "temperature", "celsius": 22}  {"command": "fault", "axis": "X", "fault": "reboot"}
       {"command": "trace", "file": "trace.csv"}  {"command": "stop"}  {"command": "quit"}
 
-    It ends on quit, Ctrl-C or SIGTERM; the end of standard input does not end it.
+    With --demand - the same lines may stand among the rows; the NC takes the bus with the first of them, and holds
+    still while none comes. It ends on quit, Ctrl-C or SIGTERM; the end of standard input does not end it.
     """
     if demand is not None and program is not None:
         raise click.UsageError("give --demand or --program, not both")
@@ -98,12 +103,14 @@ def _lines(event: dict[str, Any]) -> list[str]:
         case "nc":
             return [f"NC {'on: it sends SYNC and has enabled the drives' if event['on'] else 'off'}"]
         case "playing":
-            return [f"playing {event['file']}, {event['rows']} rows"]
+            rows = "as its rows come" if event["rows"] is None else f"{event['rows']} rows"
+            return [f"playing {event['file']}, {rows}"]
         case "finished":
             late = ", ".join(f"{axis} {n}" for axis, n in event["late_rpdo"].items())
             how = "stopped after" if event["stopped"] else "finished"
             trace = f", recorded to {event['trace']}" if event["trace"] else ""
-            return [f"{how} {event['rows']} rows of {event['file']}; late offset frames: {late}{trace}"]
+            missing = f"; {n} rows came late" if (n := event.get("starved")) else ""
+            return [f"{how} {event['rows']} rows of {event['file']}; late offset frames: {late}{missing}{trace}"]
         case "error":
             return [f"cannot: {event['text']}"]
     rest = ", ".join(f"{key} {value}" for key, value in event.items() if key != "event")

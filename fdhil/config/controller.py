@@ -46,7 +46,7 @@ class G0(Section):
     source: Annotated[str, one_of(tables.EVENT_SOURCES)] = Field(
         "inferred",
         description=f"{', '.join(tables.EVENT_SOURCES)}; inferred: from the demand's speed,"
-        " digital_input: the NC's signal",
+        " digital_input: the NC's signal; else what the NC tells by [nc_source]",
     )
     input_bit: int = Field(16, ge=0, le=31, description="digital_input: bit of 0x60FD that the NC raises")
 

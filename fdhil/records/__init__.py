@@ -6,11 +6,13 @@ name says ``_um``. Drive increments appear in none of them.
 
 from __future__ import annotations
 
+from fdhil.records.nc import NcState
 from fdhil.records.paths import Correction, Prediction, Skill, Trajectory, Zone
 from fdhil.records.signals import (
     AxisSamples,
     MoveEvent,
     MoveKind,
+    NcMove,
     Recording,
     SlowVoltage,
     Stages,
@@ -66,6 +68,8 @@ __all__ = [
     "LoopEstimate",
     "MoveEvent",
     "MoveKind",
+    "NcMove",
+    "NcState",
     "Notice",
     "Outcome",
     "ParameterSet",

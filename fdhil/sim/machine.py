@@ -18,8 +18,9 @@ from fdhil.sim.drive import description
 from fdhil.sim.drive.servo import Drive
 from fdhil.sim.fault_script import FaultSchedule
 from fdhil.sim.frame import BusFrame, Frame
-from fdhil.sim.nc.controller import Event, NcController, Row
+from fdhil.sim.nc.controller import Event, NcController
 from fdhil.sim.nc.drive_link import Wiring
+from fdhil.sim.nc.path import Row
 from fdhil.sim.recorder import Recorder
 from fdhil.sim.table_sensors import TableSensors
 from fdhil.sim.thermal import SlideWay

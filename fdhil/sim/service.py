@@ -25,6 +25,7 @@ from fdhil.sim.drive import eds
 from fdhil.sim.fault_kinds import FaultEntry
 from fdhil.sim.frame import BusFrame, Frame
 from fdhil.sim.machine import Machine
+from fdhil.sim.nc.stream import DemandStream, StreamError
 from fdhil.sim.operator_commands import MAX_LINE, CommandError, OperatorCommands
 from fdhil.sim.wire.attach import attach
 from fdhil.sim.wire.attachment import Attachment, Selectable, WakePipe
@@ -40,7 +41,9 @@ IDLE_PERIODS = 4  # in lockstep, of a machine that stands: whoever listens is no
 LOCKSTEP_WAIT_S = 0.5
 LOCKSTEP_HOLDING_WAIT_S = 8.0  # a listener takes ten seconds without SYNC for a bus that is dead
 _MIN_SPACING = 0.75  # of a period, between two SYNCs after a late one
+_CATCH_UP = 0.95  # of a period, between two SYNCs while a stream's rows pile up
 _MAX_WAIT_S = 0.25
+_STREAM = Path("-")
 
 
 class Pace:
@@ -62,14 +65,16 @@ class Pace:
             return self._next_s
         return self._last_s + IDLE_PERIODS * self._period_s if idle else 0.0
 
-    def sent(self, now_s: float) -> None:
+    def sent(self, now_s: float, *, behind: bool = False) -> None:
         """A SYNC went out: the next one is a period later on the grid, unless the host is late.
 
+        ``behind`` whoever orders the demand: the grid is a little tighter until the machine has caught up.
         In lockstep there is no grid: a machine that ran ahead of the clock must not stand still until the clock has
         caught up.
         """
         self._last_s = now_s
-        self._next_s = max(self._next_s + self._period_s, now_s + _MIN_SPACING * self._period_s)
+        spacing_s = self._period_s * (_CATCH_UP if behind else 1.0)
+        self._next_s = max(self._next_s + spacing_s, now_s + _MIN_SPACING * self._period_s)
 
 
 class SimService:
@@ -94,6 +99,8 @@ class SimService:
         self._panel = OperatorCommands(self.machine, self._play, self.stop)
         self._panel_fd = panel_fd
         self._line = b""
+        self._stream: DemandStream | None = None
+        self._streaming = False
         self._ending = False
         self._drive_time_s = 0.0
         self._wall_s = self._told_s = 0.0
@@ -185,18 +192,24 @@ class SimService:
         self._pipe.wake()
 
     def run(self, play: Path | None = None, trace: Path | None = None) -> None:
-        """Say that it is ready and serve until stopped. ``play`` is played at once, recorded to ``trace``."""
+        """Say that it is ready and serve until stopped. ``play`` is played at once, recorded to ``trace``.
+
+        ``-`` is the demand that comes by the panel's descriptor, among the commands, until its end; the NC takes the bus
+        with its first rows.
+        """
         try:
-            trajectory = None if play is None else self._load(play, self.config)
+            if play == _STREAM:
+                self._stream = DemandStream(tuple(self.config.axis), self.config.machine.sync_period_s)
+            demand = None if play is None or play == _STREAM else self._load(play, self.config)
             self._send(self.machine.power_on())
             self._emit(self.ready_event())
             self._serve_panel()
             if trace is not None:
                 self.machine.trace(trace)
-            if trajectory is not None or self.config.sim.nc:
+            if demand is not None or self.config.sim.nc:
                 self.machine.nc.switch(True)
-            if trajectory is not None:
-                self.machine.nc.play(str(play), trajectory)
+            if demand is not None:
+                self.machine.nc.play(str(play), demand)
             while not self._ending:
                 self._turn()
         finally:
@@ -206,7 +219,7 @@ class SimService:
         """One turn of the loop: wait, read, let time pass, send."""
         buses = self._buses.values()
         readers: list[int | Selectable] = [self._pipe]
-        if self._panel_fd is not None:
+        if self._panel_fd is not None and not (self._stream is not None and self._stream.full):
             readers.append(self._panel_fd)
         writers: list[Selectable] = []
         for bus in buses:
@@ -222,7 +235,7 @@ class SimService:
         if now_s >= self._wall_s:
             self._wall_clock(now_s)
         if self._sync_due_s() <= now_s:
-            self._pace.sent(now_s)
+            self._pace.sent(now_s, behind=self._stream is not None and self._stream.late)
             self._left = self._senders_left()
             self._send(self.machine.cycle())
         for axis, stream in self._streams.items():
@@ -253,7 +266,10 @@ class SimService:
         if not machine.nc.on or any(bus.congested for bus in self._buses.values()):
             return float("inf")
         waits = machine.waits() and self._senders_left() == self._left
-        return self._pace.due_s(waits=waits, idle=not machine.nc.busy, holds=waits and machine.holds_offset())
+        idle, dry = not machine.nc.busy, False
+        if self._stream is not None:
+            idle, dry = idle or self._stream.stands, self._stream.runs_dry
+        return self._pace.due_s(waits=waits or dry, idle=idle, holds=waits and machine.holds_offset())
 
     def _senders_left(self) -> int:
         return sum(bus.senders_left for bus in self._buses.values())
@@ -295,12 +311,30 @@ class SimService:
             lines, self._line = [*lines, self._line], b""
         for line in lines:
             self.command(line.decode("utf-8", "replace"))
+        if self._stream is not None:
+            self._serve_stream(self._stream)
+
+    def _serve_stream(self, stream: DemandStream) -> None:
+        """Begin with a stream that has rows enough; with standard input it ends."""
+        if self._panel_fd is None:
+            stream.close()
+        if self._streaming:
+            return
+        if stream.start_mm is not None:
+            self._streaming = True
+            self.machine.nc.switch(True)
+            self.machine.nc.play("standard input", stream)
+        elif stream.ended:
+            self._emit({"event": "error", "text": "standard input ended before a row of the demand came"})
 
     def command(self, line: str) -> None:
-        """Obey one command of the panel; what is wrong with it becomes an event."""
+        """Obey one command of the panel, or take a row of the stream; what is wrong with it becomes an event."""
         try:
-            self._panel.obey(line)
-        except CommandError as error:
+            if self._stream is None or line.startswith("{"):
+                self._panel.obey(line)
+            else:
+                self._stream.take(line)
+        except (CommandError, StreamError) as error:
             self._emit({"event": "error", "text": str(error)})
 
     def _play(self, file: Path) -> None:

@@ -16,7 +16,7 @@ from fdhil.cli.records import read_windows
 from fdhil.daemon.kernel_warmup import nominal_rapid
 from fdhil.daemon.outcome_store import OutcomeStore
 from fdhil.records import frozen
-from fdhil.store.recording_csv import read_recording
+from fdhil.store.recordings import read_recording
 from fdhil.store.windows import encode_window
 from studies.slow_sensor import slow_windows
 from tests.daemon.machine import config_of

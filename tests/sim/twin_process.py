@@ -69,8 +69,12 @@ class TwinProcess:
 
     def command(self, name: str, **keys: Any) -> None:
         """Give a command on the panel."""
+        self.send_line(json.dumps({"command": name, **keys}))
+
+    def send_line(self, line: str) -> None:
+        """Give it a line on standard input."""
         assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps({"command": name, **keys}).encode() + b"\n")
+        self._process.stdin.write(line.encode() + b"\n")
 
     def close_panel(self) -> None:
         """End standard input."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from enum import Enum, auto
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +18,8 @@ from fdhil.records import Trajectory
 from fdhil.sim.drive.power import State
 from fdhil.sim.frame import BusFrame, Frame
 from fdhil.sim.nc.drive_link import ENABLED, SHUTDOWN, DriveLink, SdoWrite, Wiring
-from fdhil.sim.nc.path import Job, PathRate, Pause, RowPlayer, Stage, rapid_rows
+from fdhil.sim.nc.path import Job, PathRate, Pause, Row, RowPlayer, Stage, rapid_rows
+from fdhil.sim.nc.stream import DemandStream
 
 Event = dict[str, Any]
 
@@ -40,14 +41,6 @@ class Phase(Enum):
     READY = auto()
     FAULTED = auto()
     RELEASE = auto()
-
-
-class Row(NamedTuple):
-    """The command for one SYNC: position (mm per axis), whether it is a rapid, whether a played file's row."""
-
-    position_mm: list[float]
-    rapid: bool
-    playing: bool
 
 
 class NcController:
@@ -110,13 +103,16 @@ class NcController:
             self._leaving = True
             self.stop()
 
-    def play(self, file: str, trajectory: Trajectory) -> None:
-        """Go to the trajectory's start in a rapid, then play it; an event tells what forbids it."""
-        refusal = self._refusal(trajectory)
-        if refusal:
+    def play(self, file: str, demand: Trajectory | DemandStream) -> None:
+        """Go to the demand's start in a rapid, then play it; an event tells what forbids it.
+
+        A stream is begun once it has rows enough, and may come to an end before.
+        """
+        job = Job(file, demand)
+        if refusal := self._refusal(job):
             self._complain(f"{file} cannot be played: {refusal}")
             return
-        self._job = Job(file, trajectory)
+        self._job = job
         self._played, self._given_up = 0, False
         if self.phase is Phase.READY:
             self._start_job()
@@ -125,6 +121,8 @@ class NcController:
         """Slow down along the path and give the rest of it up."""
         if self._stages:
             self._stopping = True
+        elif self._awaits_rows and self.phase is Phase.READY:
+            self._given_up = True
         elif self._job is not None and self.phase is not Phase.READY:
             self._job = None
 
@@ -148,17 +146,12 @@ class NcController:
         """Whether it has the bus."""
         return self.phase is not Phase.OFF
 
-    def _refusal(self, trajectory: Trajectory) -> str:
+    def _refusal(self, job: Job) -> str:
         if self._leaving or self.phase in (Phase.OFF, Phase.FAULTED, Phase.RELEASE):
             return "the NC does not have the drives; switch it on first"
         if self._job is not None:
             return f"{self._job.file} is being played; stop it first"
-        unknown = [axis for axis in trajectory.axes if axis not in self.axes]
-        if unknown:
-            return f"this machine has no axis {', '.join(unknown)}"
-        if abs(trajectory.dt_s - self._period_s) > 1e-9:
-            return f"its rows are {trajectory.dt_s:g} s apart, the SYNC period is {self._period_s:g} s"
-        return "" if trajectory.time_s.size else "it has no rows"
+        return job.refusal(self.axes, self._period_s)
 
     # -- the cycle
 
@@ -294,20 +287,27 @@ class NcController:
 
     def _start_job(self) -> None:
         assert self._job is not None
-        trajectory = self._job.trajectory
+        demand = self._job.demand
+        if isinstance(demand, DemandStream):
+            if demand.start_mm is not None:
+                self._begin(demand.start_mm, demand)
+            return
         columns = [
-            trajectory.position_mm[axis] if axis in trajectory.axes else np.full(trajectory.time_s.size, here)
+            demand.position_mm[axis] if axis in demand.axes else np.full(demand.time_s.size, here)
             for axis, here in zip(self.axes, self._position, strict=True)
         ]
         rows = np.column_stack(columns)
+        self._begin(rows[0].tolist(), RowPlayer(rows, demand.rapid))
+
+    def _begin(self, start_mm: list[float], motion: RowPlayer | DemandStream) -> None:
         self._rate.jump(0.0 if self._hold else self.override)
         rapid = rapid_rows(
-            self._position, rows[0], self._speeds, self._accelerations, self._smoothing_s, self._period_s
+            self._position, start_mm, self._speeds, self._accelerations, self._smoothing_s, self._period_s
         )
         if len(rapid):
             self._stages.append(Stage(RowPlayer(rapid, np.ones(len(rapid), dtype=bool))))
             self._stages.append(Stage(Pause(round(_SETTLE_S / self._period_s))))
-        self._stages.append(Stage(RowPlayer(rows, trajectory.rapid), playing=True))
+        self._stages.append(Stage(motion, playing=True))
         self._stages.append(Stage(Pause(round(TAIL_S / self._period_s)), playing=True))
 
     def _stream(self) -> list[BusFrame]:
@@ -336,6 +336,7 @@ class NcController:
             self._stages.popleft()
         if not self._stages:
             self._at_rest()
+        if not self._stages:
             return Row(self._position, False, False)
         stage = self._stages[0]
         if isinstance(stage.motion, Pause):
@@ -349,6 +350,8 @@ class NcController:
             self._rate.jump(self.override)
         if self._leaving and not any(row.playing for row in self._rows):
             self.phase, self._waited = Phase.RELEASE, 0
+        elif self._awaits_rows and self.phase is Phase.READY:
+            self._start_job()
 
     def _supervise(self) -> None:
         """A drive that is not enabled any more, or silent, makes the path stop."""
@@ -372,21 +375,24 @@ class NcController:
         if is_:
             self._played += 1
         if is_ and not was and self._job is not None:
-            rows = self._job.trajectory.time_s.size
-            self.events.append({"event": "playing", "file": self._job.file, "rows": rows})
+            self.events.append({"event": "playing", "file": self._job.file, "rows": self._job.rows})
         elif was and not is_:
             self._end_job(stopped=False)
-        elif self.phase in (Phase.READY, Phase.FAULTED) and not self._stages and not any(r.playing for r in self._rows):
+        elif self._stages or any(row.playing for row in self._rows):
+            return
+        elif self.phase is Phase.FAULTED or (self.phase is Phase.READY and not self._awaits_rows):
             self._end_job(stopped=True)
 
     def _end_job(self, *, stopped: bool) -> None:
         if self._job is None:
             return
-        rows = self._job.trajectory.time_s.size
-        stopped = stopped or self._given_up
-        played = min(self._played, rows) if stopped else rows
-        self.events.append({"event": "finished", "file": self._job.file, "rows": played, "stopped": stopped})
+        self.events.append(self._job.finished(self._played, stopped or self._given_up))
         self._job = None
+
+    @property
+    def _awaits_rows(self) -> bool:
+        """Whether a stream is to be played that has not brought rows enough to begin with."""
+        return self._job is not None and self._job.awaited and not self._given_up
 
     def _complain(self, text: str) -> None:
         self.events.append({"event": "error", "text": text})

@@ -6,12 +6,22 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fdhil.records import Bool, Float, Trajectory
+from fdhil.sim.nc.stream import DemandStream
 
 NEGLIGIBLE_MM = 1e-9  # far below an increment of any drive
+
+
+class Row(NamedTuple):
+    """The command for one SYNC: position (mm per axis), whether it is a rapid, whether a played file's row."""
+
+    position_mm: list[float]
+    rapid: bool
+    playing: bool
 
 
 def rapid_rows(
@@ -131,13 +141,41 @@ class Pause:
 class Stage:
     """Something to do along the path: a motion or a rest, and whether it is part of the played file."""
 
-    motion: RowPlayer | Pause
+    motion: RowPlayer | DemandStream | Pause
     playing: bool = False
 
 
 @dataclass(slots=True)
 class Job:
-    """A file that is to be played, and the demand that it holds."""
+    """A file that is to be played, and the demand that it holds or that comes by it."""
 
     file: str
-    trajectory: Trajectory
+    demand: Trajectory | DemandStream
+
+    @property
+    def rows(self) -> int | None:
+        """How many rows it has, None where only its end will tell."""
+        return None if isinstance(self.demand, DemandStream) else self.demand.time_s.size
+
+    def refusal(self, axes: Sequence[str], period_s: float) -> str:
+        """Say why a machine with these axes and this SYNC period cannot play it, "" where it can."""
+        if isinstance(self.demand, DemandStream):
+            return ""
+        if unknown := [axis for axis in self.demand.axes if axis not in axes]:
+            return f"this machine has no axis {', '.join(unknown)}"
+        if abs(self.demand.dt_s - period_s) > 1e-9:
+            return f"its rows are {self.demand.dt_s:g} s apart, the SYNC period is {period_s:g} s"
+        return "" if self.demand.time_s.size else "it has no rows"
+
+    @property
+    def awaited(self) -> bool:
+        """Whether it has not brought the rows yet to begin with."""
+        return isinstance(self.demand, DemandStream) and not self.demand.rows and not self.demand.ended
+
+    def finished(self, played: int, stopped: bool) -> dict[str, Any]:
+        """Return the event of its end: ``played`` rows, with the rest after it, until it was over or given up."""
+        if isinstance(self.demand, DemandStream):
+            what = {"rows": self.demand.rows, "starved": self.demand.starved}
+        else:
+            what = {"rows": min(played, self.demand.time_s.size) if stopped else self.demand.time_s.size}
+        return {"event": "finished", "file": self.file, "stopped": stopped, **what}

@@ -1,0 +1,145 @@
+"""Listens to LinuxCNC by its bridge (fdhil/bridges/linuxcnc.py): JSON lines over TCP, exact to a servo cycle.
+
+The first line tells what the bridge is, each later one the state in one servo cycle: a change of it with the cycle
+before, and a few in between. ``cycle`` is the count of the servo thread and ``mm`` its set-points.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Any, Self
+
+from fdhil.config import MachineConfig
+from fdhil.errors import ConnectError, DeviceError, ProtocolError
+from fdhil.records import MoveKind, NcState
+
+SCHEMA = "fdhil-linuxcnc-1"
+MOST_BYTES = 1 << 16
+CONNECT_S = 2.0
+
+
+class LinuxCnc:
+    """The NC source ``linuxcnc``."""
+
+    def __init__(self, config: MachineConfig) -> None:
+        settings = config.nc_source.linuxcnc
+        self._place = settings.host, settings.port
+        self._silence_s = config.nc_source.silence_s
+        self.name = f"LinuxCNC at {settings.host}:{settings.port}"
+        self._reader: asyncio.StreamReader | None = None
+        self._writer: asyncio.StreamWriter | None = None
+        self._period_s = 0.0
+        self._waiting: deque[bytes] = deque()  # lines
+        self._rest = b""  # the beginning of a line
+
+    async def __aenter__(self) -> Self:
+        host, port = self._place
+        self._waiting.clear()
+        self._rest = b""
+        try:
+            async with asyncio.timeout(CONNECT_S):
+                self._reader, self._writer = await asyncio.open_connection(host, port)
+        except (OSError, TimeoutError) as error:
+            cause = "no answer" if isinstance(error, TimeoutError) else error
+            text = f"nobody answers ({cause}); load the bridge in LinuxCNC's HAL file and start LinuxCNC"
+            raise ConnectError(self.name, text) from None
+        try:
+            async with asyncio.timeout(self._silence_s):
+                self._greet(await self._next())
+        except TimeoutError:
+            self._disconnect()
+            raise ProtocolError(self.name, "what answers there says nothing: it is not the bridge; see port") from None
+        except DeviceError:
+            self._disconnect()
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._disconnect()
+
+    def _disconnect(self) -> None:
+        if self._writer is not None:
+            self._writer.close()
+        self._reader = self._writer = None
+
+    async def read(self) -> Sequence[NcState]:
+        """Return the next states; those that have come already come together."""
+        states = [self._state(await self._next())]
+        while self._waiting:
+            states.append(self._state(await self._next()))
+        return states
+
+    async def _next(self) -> Mapping[str, Any]:
+        """Return what the next line says."""
+        while not self._waiting:
+            await self._receive()
+        line = self._waiting.popleft()
+        try:
+            told = json.loads(line)
+        except ValueError:
+            told = None
+        if not isinstance(told, dict):
+            raise ProtocolError(self.name, f"said {line[:60]!r}, which is no state; is this port the bridge's?")
+        return told
+
+    async def _receive(self) -> None:
+        assert self._reader is not None
+        try:
+            came = await self._reader.read(MOST_BYTES)
+        except OSError as error:
+            raise ConnectError(self.name, f"the bridge is lost ({error}); is LinuxCNC still running?") from None
+        if not came:
+            raise ConnectError(self.name, "the bridge has ended; start LinuxCNC again")
+        *lines, self._rest = (self._rest + came).split(b"\n")
+        self._waiting.extend(lines)
+        if len(self._rest) > MOST_BYTES:
+            raise ProtocolError(self.name, "sends no lines of text; is this port the bridge's?")
+
+    def _greet(self, told: Mapping[str, Any]) -> None:
+        period_s = told.get("servo_period_s")
+        if told.get("schema") != SCHEMA or not isinstance(period_s, float) or not 1e-5 < period_s < 1.0:
+            raise ProtocolError(self.name, f"is no bridge of this fdhil ({SCHEMA}); load the bridge that came with it")
+        self._period_s = period_s
+
+    def _state(self, told: Mapping[str, Any]) -> NcState:
+        """Return the state that one line tells; ProtocolError."""
+        try:
+            return NcState(
+                stamp_ns=int(told["stamp_ns"]),
+                error_ns=int(told["error_ns"]),
+                motion=MoveKind(told["motion"]),
+                line=_maybe(told, "line", int),
+                programmed_feed_mm_min=_maybe(told, "programmed_feed_mm_min", _finite),
+                feed_mm_min=_maybe(told, "feed_mm_min", _finite),
+                feed_override=_maybe(told, "feed_override", _finite),
+                rapid_override=_maybe(told, "rapid_override", _finite),
+                feed_hold=_maybe(told, "feed_hold", bool),
+                tool=_maybe(told, "tool", int),
+                program=_maybe(told, "program", str),
+                demand_mm={str(axis): _finite(mm) for axis, mm in told["mm"].items()},
+                nc_tick=int(told["cycle"]),
+                nc_period_s=self._period_s,
+            )
+        except (KeyError, ValueError, TypeError, AttributeError, OverflowError) as error:
+            raise ProtocolError(
+                self.name, f"a state cannot be read ({error!r}); use the bridge of this fdhil"
+            ) from None
+
+
+def _maybe(told: Mapping[str, Any], key: str, kind: Any) -> Any:
+    value = told.get(key)
+    return None if value is None else kind(value)
+
+
+def _finite(value: Any) -> float:
+    number = float(value)
+    if not math.isfinite(number):
+        raise ValueError(f"{value!r} is no number")
+    return number

@@ -1,0 +1,70 @@
+"""Listens to the NC for ever: enters its source, hands its states over, and begins anew when it is lost."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+
+from fdhil.config import MachineConfig
+from fdhil.drivers.nc import load_nc_source
+from fdhil.errors import DeviceError, DeviceTimeout
+from fdhil.records import MoveKind, NcState, Notice
+
+BACK_OFF_S = (0.1, 5.0)
+CODE = "NcSilent"
+EFFECT = "which moves are rapids is not known meanwhile, and none is used"
+
+
+class NcListener:
+    """The NC of a machine, by its source of ``tables.NC_SOURCES``; ``counters`` tells what was heard."""
+
+    def __init__(self, config: MachineConfig) -> None:
+        self._source = load_nc_source(config.g0.source)(config)
+        self._silence_s = config.nc_source.silence_s
+        self._states = self._failures = 0
+        self._silent = False
+
+    @property
+    def name(self) -> str:
+        """Which NC it is, for people."""
+        return self._source.name
+
+    async def run(self, take: Callable[[NcState | Notice], None]) -> None:
+        """Hand states over for ever; an NC that is not heard is UNKNOWN from then on, and told once."""
+        pause_s = BACK_OFF_S[0]
+        while True:
+            before = self._states
+            try:
+                await self._hear(take)
+            except DeviceError as error:
+                self._lost(error, take)
+            pause_s = BACK_OFF_S[0] if self._states > before else min(2 * pause_s, BACK_OFF_S[1])
+            await asyncio.sleep(pause_s)
+
+    async def _hear(self, take: Callable[[NcState | Notice], None]) -> None:
+        async with self._source as source:
+            while True:
+                try:
+                    async with asyncio.timeout(self._silence_s):
+                        states = await source.read()
+                except TimeoutError:
+                    text = f"said nothing for {self._silence_s:g} s; is the NC switched on and its interface running?"
+                    raise DeviceTimeout(source.name, text) from None
+                for state in states:
+                    take(state)
+                self._states += len(states)
+                if states and self._silent:
+                    self._silent = False
+                    take(Notice(CODE, "info", f"{source.name} is heard again."))
+
+    def _lost(self, error: DeviceError, take: Callable[[NcState | Notice], None]) -> None:
+        self._failures += 1
+        take(NcState(time.monotonic_ns(), 0, MoveKind.UNKNOWN))
+        if not self._silent:
+            self._silent = True
+            take(Notice(CODE, "MAJOR", f"{error}; {EFFECT}. It is tried again until it answers."))
+
+    def counters(self) -> dict[str, int]:
+        """States that were told, and how often the NC was lost or not reached."""
+        return {"states": self._states, "failures": self._failures}

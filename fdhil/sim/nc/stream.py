@@ -1,0 +1,138 @@
+"""Takes a demand row by row while another NC orders it, and hands it out one row per SYNC.
+
+The rows come on another clock than the SYNC, in lumps: a short lead is kept, so that a late lump is no jerk.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+
+LEAD_S = 0.25  # rows kept before the first is played, and again after a hole
+FULL_ROWS = 20_000  # no more is read while so many wait
+_STEP_TOLERANCE = 0.01  # of the SYNC period, between two rows
+_ROUNDING_S = 1.1e-6  # times may be written with 6 decimals
+
+
+class StreamError(ValueError):
+    """A row of the stream that cannot be played: what is wrong with it, and what the rows must be."""
+
+
+class DemandStream:
+    """A demand ``time_s,X_mm,Y_mm`` that arrives by :meth:`take` and is played by :meth:`step`, until :meth:`close`.
+
+    Without a row it holds still where it is: before the first, where rows come late, and at the end. ``rows`` counts
+    those played; ``starved`` those that were missing in the midst of a motion.
+    """
+
+    def __init__(self, axes: Sequence[str], period_s: float) -> None:
+        self.rows = self.starved = 0
+        self._axes, self._period_s = tuple(axes), period_s
+        self._lead = math.ceil(LEAD_S / period_s)
+        self._columns: list[int] | None = None
+        self._width = 0
+        self._waiting: deque[list[float]] = deque()
+        self._time_s: float | None = None
+        self._here: list[float] = []
+        self._flows = self._moving = self._closed = False
+
+    def take(self, line: str) -> None:
+        """Take one line: first the names of the columns, then rows; StreamError when it cannot be played.
+
+        That ends the stream: what follows is not looked at, for there would be a jump.
+        """
+        if self._closed or not line.strip():
+            return
+        try:
+            self._take(line.strip().split(","))
+        except StreamError:
+            self.close()
+            raise
+
+    def _take(self, cells: list[str]) -> None:
+        if self._columns is None:
+            self._name_columns(cells)
+            return
+        try:
+            numbers = [float(cell) for cell in cells]
+        except ValueError:
+            numbers = []
+        if len(numbers) != self._width or not all(map(math.isfinite, numbers)):
+            raise StreamError(f"the row {','.join(cells)[:60]!r} is not {self._width} finite numbers")
+        self._check_time(numbers[self._columns[0]])
+        self._waiting.append([numbers[k] for k in self._columns[1:]])
+        if not self._here:
+            self._forget_the_past()
+
+    def _name_columns(self, cells: list[str]) -> None:
+        names, wanted = [cell.strip() for cell in cells], ["time_s", *(f"{axis}_mm" for axis in self._axes)]
+        if absent := [name for name in wanted if name not in names]:
+            raise StreamError(f"there is no column {', '.join(absent)}; a demand begins with {','.join(wanted)}")
+        self._columns, self._width = [names.index(name) for name in wanted], len(names)
+
+    def _check_time(self, time_s: float) -> None:
+        before, self._time_s = self._time_s, time_s
+        off_s = 0.0 if before is None else abs(time_s - before - self._period_s)
+        if off_s > _STEP_TOLERANCE * self._period_s + 2 * _ROUNDING_S:
+            raise StreamError(
+                f"the row of {time_s:g} s follows that of {before:g} s; rows are one SYNC ({self._period_s:g} s) apart"
+            )
+
+    def _forget_the_past(self) -> None:
+        """Before the first row is played, a machine that stands need not be shown standing for longer than the lead."""
+        if len(self._waiting) > self._lead and self._waiting[0] == self._waiting[1]:
+            self._waiting.popleft()
+
+    def close(self) -> None:
+        """No more rows come; what is waiting is still played."""
+        self._closed = True
+
+    @property
+    def _enough(self) -> bool:
+        return bool(self._waiting) and (self._closed or len(self._waiting) >= self._lead)
+
+    @property
+    def start_mm(self) -> list[float] | None:
+        """The first row, once enough rows are there to begin with."""
+        return self._waiting[0] if self._enough else None
+
+    @property
+    def stands(self) -> bool:
+        """Whether it holds still until more rows come."""
+        return not self._closed and not self._flows and not self._enough
+
+    @property
+    def runs_dry(self) -> bool:
+        """Whether the next row is due, and is not there."""
+        return self._flows and not self._waiting and not self._closed
+
+    @property
+    def full(self) -> bool:
+        """Whether so many rows wait that no more should be read."""
+        return len(self._waiting) >= FULL_ROWS
+
+    @property
+    def late(self) -> bool:
+        """Whether more rows wait than the lead: the machine is behind who orders them."""
+        return len(self._waiting) > self._lead
+
+    @property
+    def ended(self) -> bool:
+        """Whether all rows have been played."""
+        return self._closed and not self._waiting
+
+    def step(self, rate: float) -> tuple[list[float], bool]:
+        """Return the next row (mm per axis) or where it holds still; ``rate`` is the other NC's affair, and not used.
+
+        Which rows are rapids the demand does not tell: none is.
+        """
+        self._flows = bool(self._waiting) and (self._flows or self._enough)
+        if self._flows:
+            row = self._waiting.popleft()
+            self._moving = bool(self._here) and row != self._here
+            self._here = row
+            self.rows += 1
+        elif self._moving:
+            self.starved += 1
+        return self._here, False
