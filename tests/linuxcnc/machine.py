@@ -21,7 +21,7 @@ from tests.program.linuxcnc_machine import AXIS, MACHINE, NOBODY
 from tests.sim.twin_process import TwinProcess
 
 HERE = Path(__file__).parent
-PATIENCE_S = 120.0
+PATIENCE_S = 300.0
 AXES = "XYZ"
 # what the how-to gives for a real machine: a row of the demand for each servo cycle of 1 ms
 ROWS = r"""stdbuf -oL halsampler -t | mawk -W interactive '
@@ -94,7 +94,8 @@ class LinuxCnc:
                 wire, _ = door.accept()
                 break
             except TimeoutError:
-                assert self._child.poll() is None and time.monotonic() < end, self._log()
+                assert self._child.poll() is None, self._log()
+                assert time.monotonic() < end, self._log()
         wire.settimeout(PATIENCE_S)
         self._lines = wire.makefile("rw")
         wire.close()
